@@ -28,7 +28,7 @@ validate: $(VENV)/.installed-test kernels ## long comparisons and statistics, be
 	$(BIN)/python -m pytest $(PARALLEL) -m validation
 
 kernels: $(VENV)/.installed-test # compiled once beside mypy, which leaves a core; else by each worker of the tests
-	@$(BIN)/python -c "from pcgraph.warmup import compile_kernels; compile_kernels()"
+	@$(BIN)/python -c "from pcgraph.all_kernels import compile_kernels; compile_kernels()"
 
 coverage: $(VENV)/.installed-test ## every test of both, and which lines none reaches; takes a third longer
 	$(BIN)/python -m pytest $(PARALLEL) --cov --cov-report=term

@@ -26,7 +26,7 @@ import numpy as np
 
 import rangesim
 from rangesim import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
-from rangesim.experiment.instrument import Instrument
+from rangesim.instrument.instrument import Instrument
 from rangesim.motion import Motion, PoseTrack, Timing, transport_moving
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"

@@ -23,13 +23,13 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from rangesim import StructuredLight, load_scene
+from rangesim import StructuredLight, load_scene, scan
 from rangesim.environment.backend import select_variant
-from rangesim.experiment.instrument import Instrument
-from rangesim.fusion import Dome, Turntable, align, fuse, pose_errors, scan, surface_error
+from rangesim.experiment import Dome, Turntable
+from rangesim.fusion import align, fuse, pose_errors, surface_error
 from rangesim.fusion.mesh_error import distances_to
-from rangesim.fusion.views import Scan
-from rangesim.point_cloud import from_range_image
+from rangesim.instrument.instrument import Instrument
+from rangesim.pipeline.views import Scan
 from rangesim.scene.triangles import true_surfaces
 from rangesim.triangle_mesh import TriangleMesh
 
@@ -182,7 +182,7 @@ def part() -> trimesh.Trimesh:
 
 def _readings(found: Scan, k: int, things: TriangleMesh) -> np.ndarray:
     """(n, 3) world points of view k on the things, by ground truth of place."""
-    points = from_range_image(found.images[k], "world").points.reshape(-1, 3).astype(np.float64)
+    points = found.images[k].to_point_cloud("world").points.reshape(-1, 3).astype(np.float64)
     points = points[np.isfinite(points).all(axis=1)]
     return points[distances_to(points, things) < 3 * VOXEL_M]
 

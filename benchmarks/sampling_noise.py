@@ -35,8 +35,8 @@ import numpy as np
 from rangesim import Capture, Signals, decode, expose, load_scene, transport
 from rangesim.evaluation.range_noise import robust_sigma
 from rangesim.experiment import Experiment
-from rangesim.experiment.instrument import Instrument, instrument
-from rangesim.experiment.pipeline import group_by_rig
+from rangesim.instrument.instrument import Instrument, instrument
+from rangesim.pipeline.passes import group_by_rig
 from rangesim.scene import Scene
 from rangesim.scene.materials import MATERIAL_CLASSES
 

@@ -43,6 +43,7 @@ from peers import PclSetting, run_lin, run_pcl
 
 import pcgraph
 from pcgraph import SupervoxelMethod, SurfaceGrowth, Vccs
+from pcgraph.all_kernels import compile_kernels
 from pcgraph.metrics import (
     NeighbourGraph,
     best_scales,
@@ -52,7 +53,6 @@ from pcgraph.metrics import (
     undersegmentation_error,
     weighted_overlap,
 )
-from pcgraph.warmup import compile_kernels
 
 TARGETS = (240, 400, 1000, 2200)
 COLUMNS = ("n", "UE", "BR", "BP", "rim", "CO", "s", "WOv")

@@ -79,7 +79,7 @@ def main() -> None:
 
 def against_vccs(clouds: list[LabelledCloud], rounds: int) -> dict[str, Any]:
     """Ratios of times on the clouds."""
-    from pcgraph.warmup import compile_kernels
+    from pcgraph.all_kernels import compile_kernels
 
     compile_kernels()
     speedups, nominal, cpu_ratios = {}, {}, []
@@ -173,7 +173,7 @@ def _room_in_children(n: int, rounds: int) -> dict[str, float]:
 def _segment_file(path: Path) -> dict[str, Any]:
     """What the child does: points of a file, segmented once."""
     import pcgraph
-    from pcgraph.warmup import compile_kernels
+    from pcgraph.all_kernels import compile_kernels
 
     compile_kernels()
     base_gb = _peak_gb()

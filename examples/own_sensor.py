@@ -37,6 +37,8 @@ class Gates(DenseResponse):
     """Path lengths whose light fills a gate."""
     width_m: float
 
+    type_name: ClassVar[str] = "gates"
+
     @property
     def channels(self) -> int:  # type: ignore[override]
         return len(self.delays_m)

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesim import StructuredLight, load_scene
-from rangesim.fusion import Turntable, align, fuse, pose_errors, scan, surface_error
+from rangesim import StructuredLight, load_scene, scan
+from rangesim.experiment import Turntable
+from rangesim.fusion import align, fuse, pose_errors, surface_error
 from rangesim.scene.triangles import true_surfaces
 from rangesim.triangle_mesh import TriangleMesh
 

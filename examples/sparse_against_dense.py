@@ -18,9 +18,9 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 
-from rangesim import StructuredLight, load_scene
+from rangesim import StructuredLight, load_scene, scan
+from rangesim.experiment import Dome
 from rangesim.fusion import (
-    Dome,
     Occupancy,
     Scan,
     Solid,
@@ -29,7 +29,6 @@ from rangesim.fusion import (
     attenuation_volume,
     filtered_back_projection,
     occupancy,
-    scan,
     with_photon_noise,
     xray_projections,
 )

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 def main() -> None:
     """Run the command line."""
-    from pcgraph.interrupts import end_on_signals, run
+    from pcgraph.plumbing.interrupts import end_on_signals, run
 
     end_on_signals("pcgraph", writes=True)
     from pcgraph.cli import main as command

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-import pcgraph
+from pcgraph import __version__
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, one_line, without_long_words
 from pcgraph.families import member
-from pcgraph.plain_files import said
+from pcgraph.plumbing.plain_files import said
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,7 +30,7 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_
 
 def _version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"pcgraph {pcgraph.__version__}")
+        typer.echo(f"pcgraph {__version__}")
         raise typer.Exit
 
 
@@ -116,6 +116,8 @@ def segment(
 
     Example: pcgraph segment scan.pcd --out results/ --voxel-size 0.005 --seed-size 0.03
     """
+    from pcgraph.io import read_cloud
+
     start = time.perf_counter()
     try:
         targets = _targets(cloud, out)
@@ -123,7 +125,7 @@ def segment(
             raise ValueError("expected --objects or --altitude, got both: choose one")
         if seed_size is not None and supervoxels is not None:
             raise ValueError("expected --seed-size or --supervoxels, got both: choose one")
-        read = pcgraph.read_cloud(cloud)
+        read = read_cloud(cloud)
         result = _segmented(
             cloud,
             read if color else replace(read, colors=None),
@@ -195,10 +197,16 @@ def _check_targets(targets: list[Path]) -> None:
 
 
 def _linkage(name: str) -> Linkage:
-    return pcgraph.LearnedLinkage.load(name) if name.lower().endswith(".json") else member("Linkage", name)
+    if not name.lower().endswith(".json"):
+        return member("Linkage", name)
+    from pcgraph.tree.learned import LearnedLinkage
+
+    return LearnedLinkage.load(name)
 
 
 def _segmented(path: Path, cloud: Cloud, **settings: Any) -> Segmentation:
+    from pcgraph import scan
+    from pcgraph.plausibility import CloudWarning
     from pcgraph.warmup import must_compile
 
     if must_compile():
@@ -206,11 +214,11 @@ def _segmented(path: Path, cloud: Cloud, **settings: Any) -> Segmentation:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            result = pcgraph.segment(cloud, **settings)
+            result = scan.segment(cloud, **settings)
         except ValueError as error:
             raise CloudReadError(f"cannot segment {path}: {error}") from None
     for warning in caught:
-        if issubclass(warning.category, pcgraph.CloudWarning):
+        if issubclass(warning.category, CloudWarning):
             typer.echo(f"pcgraph: warning: {one_line(warning.message)}.", err=True)
         else:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
@@ -219,7 +227,7 @@ def _segmented(path: Path, cloud: Cloud, **settings: Any) -> Segmentation:
 
 def _write(targets: list[Path], cloud: Cloud, result: Segmentation, labels: NDArray[np.int32]) -> None:
     from pcgraph.io.segmentation_files import encode_segmentation
-    from pcgraph.plain_files import write_files
+    from pcgraph.plumbing.plain_files import write_files
 
     contents = {target: encode_segmentation(target.name, cloud, result, labels) for target in targets}
     _check_targets(targets)  # the segmentation took its time

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from pcgraph.errors import CloudReadError
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 
 Columns = Mapping[str, NDArray[np.generic]]
 """One array per field of a file."""

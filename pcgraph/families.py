@@ -6,15 +6,18 @@ from __future__ import annotations
 import inspect
 import re
 from difflib import get_close_matches
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from types import ModuleType
 from typing import Any
 
-import pcgraph
 from pcgraph.errors import PcgraphError
-from pcgraph.python_files import run_python_file
+from pcgraph.plumbing.python_files import run_python_file
 
 _SEPARATOR = ".py:"
+_HOMES = {"Linkage": "pcgraph.tree.linkage", "SupervoxelMethod": "pcgraph.supervoxels.method"}
+"""The module of each family's base class. The members that pcgraph brings along stand in the same room."""
 
 
 def members(family: str) -> dict[str, type[Any]]:
@@ -24,9 +27,10 @@ def members(family: str) -> dict[str, type[Any]]:
     ----------
     family : "Linkage" or "SupervoxelMethod"
     """
-    for name in dir(pcgraph):
-        getattr(pcgraph, name)  # a class is known once it is loaded
-    waiting, found = [getattr(pcgraph, family)], {}
+    room = _HOMES[family].rpartition(".")[0]
+    for module in iter_modules(import_module(room).__path__):
+        import_module(f"{room}.{module.name}")  # a class is known once it is loaded
+    waiting, found = [_base(family)], {}
     while waiting:
         kind = waiting.pop()
         waiting += kind.__subclasses__()
@@ -63,14 +67,21 @@ def refusal(argument: str, family: str, given: object) -> str:
     """What to say of an argument that is no member of its family: which classes there are, and which may be meant."""
     known = members(family)
     own = {name: kind for name, kind in known.items() if kind.__module__.startswith("pcgraph.")}
+    own = {name: kind for name, kind in own.items() if not kind.__module__.startswith("pcgraph.own_files.")}
     classes = ", ".join(f"pcgraph.{kind.__name__}()" for kind in own.values())
     near = get_close_matches(given.lower(), own, 1) if isinstance(given, str) else []
     hint = f"; did you mean pcgraph.{own[near[0]].__name__}()?" if near else ""
     return f"expected a {argument} such as {classes}, got {ascii(given)[:100]}{hint}"
 
 
+def _base(family: str) -> type[Any]:
+    """The base class of a family."""
+    base: type[Any] = getattr(import_module(_HOMES[family]), family)
+    return base
+
+
 def _member_in(family: str, path: Path, attribute: str) -> Any:
-    base = getattr(pcgraph, family)
+    base = _base(family)
     found = getattr(_module(path), attribute, None)
     if isinstance(found, type) and issubclass(found, base):
         try:

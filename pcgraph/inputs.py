@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.cloud import Cloud, without_mask
 from pcgraph.columns import RobustScaling
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.sampling import sample
 

@@ -72,23 +72,6 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_lock)
 
 
-def compile_kernels() -> None:
-    """Compile what `pcgraph.segment` would otherwise compile in its first call.
-
-    It segments two small clouds, one as a list and one as a camera's image. Needed only where times are measured:
-    results are the same without it.
-    """
-    from pcgraph.scan import segment
-
-    image, normals = _step()
-    segment(image, np.full(image.shape, 0.5), normals, (0.0, 0.0, 0.0))
-    segment(image.reshape(-1, 3))
-    some_blocks(image.reshape(-1, 3))
-    _compile_pixels()
-    _compile_graph_and_tree()  # neither has gaps
-    _compile_levels()
-
-
 def must_compile() -> bool:
     """Whether the kernels that `pcgraph.segment` needs by default are still missing in numba's cache."""
     if _done or config.DISABLE_JIT:
@@ -131,7 +114,7 @@ def compile_voxels() -> None:
     planes = method.planes(grid, np.zeros(3))
     supervoxels = method.supervoxels(grid, planes.normals, 21.0 * _SPACING, np.full(grid.n_voxels, -1, np.int32))
     method.supervoxel_of_point(points, grid, planes, supervoxels)
-    seen = clean_cloud(_step()[0], None, None).points
+    seen = clean_cloud(image_of_a_step()[0], None, None).points
     every = np.arange(len(seen))
     DepthImage.of(seen, Pixels((len(seen), 1), every), np.zeros(3), None).flying()
     _compile_pixels()
@@ -181,16 +164,16 @@ def _compile_graph_and_tree() -> None:
     segmentation_tree(RegionLinkage().merges(graph, leaves), leaves).cut(altitude=0.5)
 
 
-def _compile_levels() -> None:
+def compile_levels() -> None:
     """Compile what voxels of several sizes take beside."""
     everywhere = Grading(np.array(list(np.ndindex(3, 3, 3))) - 1.0, np.ones(27, np.int8))
-    grid = voxel_grid(_step()[0].reshape(-1, 3), 3.5 * _SPACING, Warp(), everywhere)
+    grid = voxel_grid(image_of_a_step()[0].reshape(-1, 3), 3.5 * _SPACING, Warp(), everywhere)
     at_ends(grid, np.zeros(1, np.int64))
 
 
 def _compile_pixels() -> None:
     """Compile what asks lists of points, of some size, for the pixels they are."""
-    points = _step()[0].reshape(-1, 3)
+    points = image_of_a_step()[0].reshape(-1, 3)
     even_steps(points, thinned(points, len(points) // 2, bounding_box(points)), 0, -1)  # x is even
     pixel_lattice._find_near(0, 1, points, points[0], _SPACING)
     pixel_lattice._sharpness(points[:_EDGE], points[:1])
@@ -198,7 +181,7 @@ def _compile_pixels() -> None:
     pixels._find_pixels(0, 1, points, np.eye(3, 4), np.empty((2, 1), np.int64))
 
 
-def _step() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def image_of_a_step() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """An image of a plane with a step in depth, so that there are edges, and its normals."""
     steps = _SPACING * np.arange(_EDGE)
     x, y = np.meshgrid(steps, steps)
@@ -208,7 +191,7 @@ def _step() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def _step_in_voxels() -> tuple[NDArray[np.float64], VoxelGrid]:
     """The same as a list of points, and their voxels."""
-    points = _step()[0].reshape(-1, 3)
+    points = image_of_a_step()[0].reshape(-1, 3)
     warp = CameraWarp(np.zeros(3), 1.0)
     return points, with_means(voxel_grid(points, 3.5 * _SPACING, warp), np.full(points.shape, 0.5))
 

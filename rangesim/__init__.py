@@ -13,21 +13,28 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from typing import Any
 
     from rangesim.capture import Capture as Capture
-    from rangesim.capture.capture_files import import_capture as import_capture
-    from rangesim.capture.capture_files import load_capture as load_capture
     from rangesim.capture.exposure import expose as expose
     from rangesim.causes import explain as explain
     from rangesim.decoding import decode as decode
     from rangesim.decoding.range_image import RangeImage as RangeImage
-    from rangesim.decoding.range_image_files import load_range_image as load_range_image
     from rangesim.decoding.status import Status as Status
     from rangesim.electronics.ambient import Ambient as Ambient
     from rangesim.electronics.detector import Detector as Detector
     from rangesim.electronics.spad import SpadDetector as SpadDetector
     from rangesim.evaluation.comparison import compare as compare
-    from rangesim.light_transport.transport import transport as transport
+    from rangesim.instrument.transport import transport as transport
     from rangesim.light_transport.transport_settings import TransportSettings as TransportSettings
+    from rangesim.pipeline.views import scan as scan
     from rangesim.point_cloud import PointCloud as PointCloud
+    from rangesim.report import errors_markdown as errors_markdown
+    from rangesim.report import failures_markdown as failures_markdown
+    from rangesim.results.capture_files import import_capture as import_capture
+    from rangesim.results.capture_files import load_capture as load_capture
+    from rangesim.results.capture_files import save_capture as save_capture
+    from rangesim.results.range_image_files import load_range_image as load_range_image
+    from rangesim.results.range_image_files import save_range_image as save_range_image
+    from rangesim.results.signals_files import load_signals as load_signals
+    from rangesim.results.signals_files import save_signals as save_signals
     from rangesim.rig import Intrinsics as Intrinsics
     from rangesim.rig import Lens as Lens
     from rangesim.rig import Rig as Rig
@@ -43,7 +50,6 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from rangesim.sensors import StructuredLight as StructuredLight
     from rangesim.signals import Signals as Signals
     from rangesim.signals import StillSignals as StillSignals
-    from rangesim.signals.signals_files import load_signals as load_signals
 
 _HOME = {
     "Ambient": "rangesim.electronics.ambient",
@@ -68,16 +74,22 @@ _HOME = {
     "TransportSettings": "rangesim.light_transport.transport_settings",
     "compare": "rangesim.evaluation.comparison",
     "decode": "rangesim.decoding",
+    "errors_markdown": "rangesim.report",
     "explain": "rangesim.causes",
     "expose": "rangesim.capture.exposure",
-    "import_capture": "rangesim.capture.capture_files",
+    "failures_markdown": "rangesim.report",
+    "import_capture": "rangesim.results.capture_files",
     "load_calibration": "rangesim.rig.calibration_files",
-    "load_capture": "rangesim.capture.capture_files",
-    "load_range_image": "rangesim.decoding.range_image_files",
+    "load_capture": "rangesim.results.capture_files",
+    "load_range_image": "rangesim.results.range_image_files",
     "load_scene": "rangesim.scene",
-    "load_signals": "rangesim.signals.signals_files",
+    "load_signals": "rangesim.results.signals_files",
     "look_at": "rangesim.rig",
-    "transport": "rangesim.light_transport.transport",
+    "save_capture": "rangesim.results.capture_files",
+    "save_range_image": "rangesim.results.range_image_files",
+    "save_signals": "rangesim.results.signals_files",
+    "scan": "rangesim.pipeline.views",
+    "transport": "rangesim.instrument.transport",
 }
 
 __all__ = sorted(_HOME)

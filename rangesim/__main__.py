@@ -8,7 +8,7 @@ import sys
 
 def main() -> None:
     """Run the command line."""
-    from pcgraph.interrupts import end_on_signals, run
+    from pcgraph.plumbing.interrupts import end_on_signals, run
 
     end_on_signals("rangesim", writes=bool({"run", "scan", "decode", "report"} & set(sys.argv[1:3])))
     from rangesim.cli import main as command

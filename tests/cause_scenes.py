@@ -260,7 +260,7 @@ def glint() -> Case:
 def glint_by_energy(signals: Signals, capture: Capture) -> list[tuple[Any, Cause]]:
     detector = capture.detector
     assert isinstance(detector, Detector)
-    electrons = signals.energy.projector * detector.electrons_per_radiance(signals.rig) * capture.exposure_s
+    electrons = signals.energy.projector * detector.electron_rate_per_radiance(signals.rig) * capture.exposure_s
     knob = is_instance(signals, "knob")
     unlit = ~signals.truth.projector_visible & (signals.energy.direct == 0)
     known = [(electrons > detector.full_well_e, Cause.GLINT), (unlit, Cause.SHADOWED)]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from synthetic import plane_signals, signals_of_depth, stereo_rig
 
-from rangesim import Ambient, AmcwToF, Capture, Detector, DirectToF, SpadDetector, StructuredLight, expose
+from rangesim import Ambient, AmcwToF, Capture, Detector, DirectToF, SpadDetector, StructuredLight, expose, save_capture
 from rangesim import load_capture as load
 from rangesim.electronics.ambient import LUMINOUS_EFFICACY, Sun, Tungsten, WhiteLed, photopic
 from rangesim.electronics.detector import PhotoDetector
@@ -121,7 +121,7 @@ def test_sunlight_on_a_capture_is_what_the_law_says() -> None:
     sun = Ambient("sun", illuminance_lux=20_000.0)
     capture = expose(signals, SENSOR, detector, exposure_s=2e-5, ambient=sun)
     expected = 0.5 / np.pi * 20_000 / Sun().efficacy_lm_w * Sun().fraction(825, 875)
-    expected *= detector.electrons_per_radiance(signals.rig) * 2e-5
+    expected *= detector.electron_rate_per_radiance(signals.rig) * 2e-5
     assert electrons(capture)[-1].mean() == pytest.approx(expected, rel=0.01)
     np.testing.assert_allclose(
         expose(signals, SENSOR, ambient=sun).frames[-1], sun.scale * signals.energy.ambient, rtol=1e-5
@@ -141,7 +141,7 @@ def test_ambient_light_brings_its_shot_noise(width_m: float) -> None:
     detector = Detector(dark_current_e_s=0.0, full_well_e=60_000.0, bits=16, band_width_m=width_m)
     rig = stereo_rig(400, 300)
     flat = np.ones((300, 400), np.float32)
-    exposure, per_radiance = 1e-4, detector.electrons_per_radiance(rig) * 1e-4
+    exposure, per_radiance = 1e-4, detector.electron_rate_per_radiance(rig) * 1e-4
     signal_e, ambient = 2000.0, Ambient("sun", irradiance_w_m2=300.0)
     dark = signals_of_depth(rig, np.full((300, 400), 1.0), [SENSOR], albedo=0.0, ambient=1.0)
     ambient_e = ambient.in_band(850e-9, width_m) * per_radiance
@@ -172,7 +172,7 @@ def test_sun_in_a_photon_counter_is_poisson_in_every_bin() -> None:
     dark = signals_of_depth(stereo_rig(), np.full((120, 160), 1.0), [sensor], albedo=0.0, ambient=1.0)
     light = Ambient("sun", irradiance_w_m2=500.0)
     counts = expose(dark, sensor, detector, 1e-3, ambient=light).frames.astype(float)
-    expected = light.in_band(905e-9, detector.band_width_m) * detector.electrons_per_radiance(dark.rig) * 1e-3
+    expected = light.in_band(905e-9, detector.band_width_m) * detector.electron_rate_per_radiance(dark.rig) * 1e-3
     assert counts.sum(axis=0).mean() == pytest.approx(expected, rel=0.01)
     np.testing.assert_allclose(counts.mean(axis=(1, 2)), expected / 40, rtol=0.05)
     assert counts.var(axis=(1, 2)).mean() == pytest.approx(expected / 40, rel=0.02)
@@ -199,7 +199,7 @@ def test_settings_round_trip(tmp_path: Path) -> None:
     assert from_dict(PhotoDetector, to_dict(detector)) == detector  # type: ignore[type-abstract]
     for i, ambient in enumerate((None, Ambient("led", illuminance_lux=500.0))):
         capture = expose(plane_signals(stereo_rig(), SENSOR, ambient=0.1), SENSOR, detector, ambient=ambient)
-        capture.save(tmp_path / f"capture{i}")
+        save_capture(capture, tmp_path / f"capture{i}")
         loaded = load(tmp_path / f"capture{i}")
         assert (loaded.detector, loaded.ambient) == (detector, ambient)
 

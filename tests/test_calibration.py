@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from tiers import to_validate
 
 import rangesim
+from rangesim import save_capture
 from rangesim.calibration import (
     BoardView,
     Bundle,
@@ -25,7 +26,7 @@ from rangesim.calibration import (
     intrinsics_from_homographies,
 )
 from rangesim.calibration.suspects import find_suspects
-from rangesim.capture.capture_files import import_capture
+from rangesim.results.capture_files import import_capture
 from rangesim.rig import Intrinsics
 from rangesim.rig.calibration_files import load_calibration
 
@@ -563,7 +564,7 @@ def test_the_command_writes_what_calibration_reads_and_opencv_too(rendered, tmp_
 
     captures, rig = rendered
     for k, capture in enumerate(captures):
-        capture.save(tmp_path / f"pose_{k}")
+        save_capture(capture, tmp_path / f"pose_{k}")
     folders = [str(tmp_path / f"pose_{k}") for k in range(4)]
     options = ["--points", "9x6", "--spacing", "0.025", "--coefficients", "2"]
     monkeypatch.setattr(calibration, "calibrate_rig", once(calibrate_rig))  # two files of one result
@@ -591,7 +592,7 @@ def test_the_command_writes_what_calibration_reads_and_opencv_too(rendered, tmp_
 def test_a_rig_for_opencv_is_read_back_and_decodes(rendered, tmp_path):
     from rangesim.calibration.opencv_files import load_opencv, save_opencv
     from rangesim.cli import app
-    from rangesim.decoding.range_image_files import load_range_image
+    from rangesim.results.range_image_files import load_range_image
 
     captures, rig = rendered
     for name in ("rig.yml", "rig.xml"):
@@ -601,7 +602,7 @@ def test_a_rig_for_opencv_is_read_back_and_decodes(rendered, tmp_path):
             assert (one.width, one.height) == (other.width, other.height)
             assert np.allclose(lens(one), lens(other), rtol=1e-12)
         assert np.allclose(back.T_camera_projector, rig.T_camera_projector, atol=1e-12)
-    captures[0].save(tmp_path / "capture")
+    save_capture(captures[0], tmp_path / "capture")
     depths = []
     for name in ("rig.yml", "rig.xml"):
         arguments = ["--calibration", str(tmp_path / name), "--out", str(tmp_path / name.replace(".", "_"))]
@@ -615,11 +616,11 @@ def test_a_rig_for_opencv_is_read_back_and_decodes(rendered, tmp_path):
 def test_a_calibration_for_opencv_may_be_in_any_unit(rendered, tmp_path):
     from rangesim.calibration.opencv_files import load_opencv, save_opencv
     from rangesim.cli import app
-    from rangesim.decoding.range_image_files import load_range_image
+    from rangesim.results.range_image_files import load_range_image
     from rangesim.rig.calibration_files import save_calibration
 
     captures, rig = rendered
-    captures[0].save(tmp_path / "capture")
+    save_capture(captures[0], tmp_path / "capture")
     expected = rangesim.decode(captures[0]).z
     for k, (suffix, unit) in enumerate(((".yml", 1e-3), (".xml", 0.0254), (".yaml", 1.0))):
         place = tmp_path / f"rig{k}{suffix}"

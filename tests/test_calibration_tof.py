@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import signals_of_depth
 
 import rangesim
-from rangesim import AmcwToF, Intrinsics, Rig
+from rangesim import AmcwToF, Intrinsics, Rig, save_capture
 from rangesim.calibration import (
     Checkerboard,
     board_range,
@@ -266,7 +266,7 @@ def test_files_that_are_none_are_refused(calibration, tmp_path):
 
 def test_the_commands_calibrate_on_rendered_boards_and_decode_with_it(tmp_path, capsys):
     from rangesim.cli import app
-    from rangesim.decoding.range_image_files import load_range_image
+    from rangesim.results.range_image_files import load_range_image
 
     board, sensor = Checkerboard(5, 4, 0.16), AmcwToF((60e6,), waveform="square")
     camera = Intrinsics.from_fov(96, 72, 45.0)
@@ -278,7 +278,7 @@ def test_the_commands_calibrate_on_rendered_boards_and_decode_with_it(tmp_path, 
         T[:3, 3] = [0, 0, z] - T[:3, :3] @ board.points.mean(axis=0)
         scene = rangesim.load_scene(board.scene(T, 96, 72))
         signals = rangesim.transport(scene, rig(camera), [sensor], spp=16, seed=k)
-        rangesim.expose(signals, sensor, sensor.default_detector, seed=k).save(tmp_path / f"board_{k}")
+        save_capture(rangesim.expose(signals, sensor, sensor.default_detector, seed=k), tmp_path / f"board_{k}")
         true.append(signals.truth.range_m)
     folders = [str(tmp_path / f"board_{k}") for k in range(10)]
     found = find_board_ranges(board, [rangesim.load_capture(folder) for folder in folders])
@@ -295,7 +295,7 @@ def test_the_commands_calibrate_on_rendered_boards_and_decode_with_it(tmp_path, 
         image = load_range_image(tmp_path / name / "range.npz")
         errors.append(np.nanmedian(np.abs(image.range_m - true[4])))
     assert errors[1] < 6e-3
-    walls(SINE, [1.0])[0][0].save(tmp_path / "sine")
+    save_capture(walls(SINE, [1.0])[0][0], tmp_path / "sine")
     arguments = ["decode", str(tmp_path / "sine"), "--out", str(tmp_path / "no"), "--calibration"]
     with pytest.raises(ValueError, match="capture of the sensor that"):
         app([*arguments, str(tmp_path / "tof.npz")], standalone_mode=False)

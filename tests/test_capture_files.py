@@ -16,13 +16,14 @@ import pytest
 from PIL import Image
 from synthetic import plane_signals, stereo_rig
 
+from rangesim import save_capture
 from rangesim.capture import Capture
-from rangesim.capture.capture_files import SIDECAR, import_capture, load_capture
 from rangesim.capture.exposure import expose
 from rangesim.electronics.detector import Detector, PhotoDetector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import read_grey, write_grey
+from rangesim.results.capture_files import SIDECAR, import_capture, load_capture
 from rangesim.rig import Intrinsics
 from rangesim.rig.calibration_files import load_calibration, save_calibration
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
@@ -49,7 +50,7 @@ def small_capture(detector: PhotoDetector | None = None, sensor: Sensor = SMALL)
 )
 def test_captures_load_back_the_same(tmp_path: Path, sensor: Sensor, detector: PhotoDetector | None) -> None:
     capture = small_capture(detector, sensor)
-    capture.save(tmp_path / "out" / "capture")
+    save_capture(capture, tmp_path / "out" / "capture")
     loaded = load_capture(tmp_path / "out" / "capture")
     assert loaded.frames.dtype == capture.frames.dtype
     assert loaded.frames.tobytes() == capture.frames.tobytes()
@@ -64,21 +65,21 @@ def test_captures_load_back_the_same(tmp_path: Path, sensor: Sensor, detector: P
 def test_an_uncalibrated_capture_and_wide_counts_load_back(tmp_path: Path) -> None:
     sensor = DirectToF(bins=2, pulse_fwhm_s=0.0)
     capture = Capture(np.full((2, 3, 4), 60_000, dtype=np.uint32), sensor)
-    capture.save(tmp_path / "c")
+    save_capture(capture, tmp_path / "c")
     loaded = load_capture(tmp_path / "c")
     assert loaded.frames.dtype == np.uint32
     assert loaded.rig is None
     assert loaded.detector is None
     too_many = Capture(np.full((2, 3, 4), 70_000, dtype=np.uint32), sensor)
     with pytest.raises(FileFormatError, match="70000"):
-        too_many.save(tmp_path / "d")
+        save_capture(too_many, tmp_path / "d")
     assert not (tmp_path / "d").exists()
 
 
 def test_a_capture_from_before_a_setting_was_there_loads(tmp_path: Path) -> None:
     """Its laser is the usual one."""
     sensor = DirectToF(bins=20, bin_s=1e-9)
-    small_capture(SpadDetector(pile_up=False), sensor).save(tmp_path / "c")
+    save_capture(small_capture(SpadDetector(pile_up=False), sensor), tmp_path / "c")
     _edit(lambda s: s["sensor"].pop("laser"))(tmp_path / "c")
     loaded = load_capture(tmp_path / "c")
     assert loaded.sensor == sensor
@@ -86,17 +87,17 @@ def test_a_capture_from_before_a_setting_was_there_loads(tmp_path: Path) -> None
 
 
 def test_a_capture_is_replaced_and_nothing_else_is(tmp_path: Path) -> None:
-    small_capture(Detector()).save(tmp_path / "c")
-    small_capture(None).save(tmp_path / "c")
+    save_capture(small_capture(Detector()), tmp_path / "c")
+    save_capture(small_capture(None), tmp_path / "c")
     assert load_capture(tmp_path / "c").frames.dtype == np.float32
     assert not list((tmp_path / "c").glob("*.png"))
     precious = tmp_path / "precious"
     precious.mkdir()
     (precious / "thesis.txt").write_text("all my work")
     with pytest.raises(FileFormatError, match="nothing was written"):
-        small_capture().save(precious)
+        save_capture(small_capture(), precious)
     with pytest.raises(FileFormatError, match="no directory"):
-        small_capture().save(precious / "thesis.txt")
+        save_capture(small_capture(), precious / "thesis.txt")
     assert (precious / "thesis.txt").read_text() == "all my work"
 
 
@@ -142,7 +143,7 @@ FIRST = "000_columns_bit2.png"
     ],
 )
 def test_damaged_captures_are_refused(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
-    small_capture(Detector()).save(tmp_path / "c")
+    save_capture(small_capture(Detector()), tmp_path / "c")
     damage(tmp_path / "c")
     with pytest.raises(FileFormatError, match=message) as caught:
         load_capture(tmp_path / "c")
@@ -154,11 +155,11 @@ def test_failure_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytes
     def full(*_: object, **__: object) -> None:
         raise OSError("No space left on device")
 
-    small_capture().save(tmp_path / "old")
-    monkeypatch.setattr("rangesim.capture.capture_files.write_json", full)
+    save_capture(small_capture(), tmp_path / "old")
+    monkeypatch.setattr("rangesim.results.capture_files.write_json", full)
     for name in ("c", "not/yet/there", "old"):
         with pytest.raises(OSError, match="No space"):
-            small_capture(Detector()).save(tmp_path / name)
+            save_capture(small_capture(Detector()), tmp_path / name)
     assert [p.name for p in tmp_path.iterdir()] == ["old"]
     assert load_capture(tmp_path / "old").frames.dtype == np.float32
 

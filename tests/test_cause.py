@@ -34,6 +34,7 @@ from rangesim.causes.cause import DEFINITIONS, TITLES
 from rangesim.causes.light_budget import light_budget, white_radiance
 from rangesim.causes.reference_frames import single_path_frames
 from rangesim.decoding.status import Status
+from rangesim.report import failures_markdown
 from rangesim.report.tables import parts
 from rangesim.response import (
     CAUSTIC,
@@ -352,7 +353,7 @@ def test_shares_are_of_the_pixels_of_a_material() -> None:
     assert mirror == {"material": "mirror", "failed": 1.0, "causes": {"specular_away": 1.0}}
     assert everything["failed"] == 5 / 7
     assert list(everything["causes"]) == ["multipath", "shadowed", "specular_away"]
-    assert str(fractions).splitlines() == [
+    assert failures_markdown(fractions).splitlines() == [
         "| material | failed (%) | because (% of the pixels) |",
         "| --- | --- | --- |",
         "| matte | 66.7 | multipath 50.0, shadowed from projector 16.7 |",
@@ -362,7 +363,7 @@ def test_shares_are_of_the_pixels_of_a_material() -> None:
     assert json.loads(json.dumps(fractions)) == list(fractions)
     nowhere = replace(truth, z=np.full((2, 4), np.nan, np.float32))
     nothing = CauseMap(np.zeros((2, 4), np.uint8), 0.01).fractions(nowhere)
-    assert str(nothing).splitlines()[2:] == ["| all | – | – |"]
+    assert failures_markdown(nothing).splitlines()[2:] == ["| all | – | – |"]
 
 
 def test_every_cause_is_printed_in_the_words_of_the_page() -> None:
@@ -384,7 +385,10 @@ def test_every_cause_is_printed_in_the_words_of_the_page() -> None:
         assert [part.name for part in parts(row)] == [TITLES[c] for c in Cause if c]
     listed = ", ".join(f"{TITLES[c]} 6.7" for c in Cause if c)
     assert len(Cause) == 15
-    assert str(fractions).splitlines()[2:] == [f"| wall | 93.3 | {listed} |", f"| all | 93.3 | {listed} |"]
+    assert failures_markdown(fractions).splitlines()[2:] == [
+        f"| wall | 93.3 | {listed} |",
+        f"| all | 93.3 | {listed} |",
+    ]
 
 
 def test_wrong_arguments_are_refused() -> None:

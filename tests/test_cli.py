@@ -20,6 +20,7 @@ from PIL import Image
 from small_result import ROOT, SCENES, SENSORS, small_result
 
 import rangesim
+from rangesim import save_capture
 from rangesim.cli import main
 from rangesim.cli.progress import progress_bar
 from rangesim.rig.calibration_files import save_calibration
@@ -197,7 +198,7 @@ def _write_bad_files(folder: Path) -> None:
     white = next((folder / "crop").glob("*white.png"))
     with Image.open(white) as image:
         smaller = image.crop((0, 0, 60, 60))
-    smaller.save(white)
+    save_capture(smaller, white)
 
 
 @pytest.mark.parametrize(
@@ -368,7 +369,7 @@ def test_names_of_directories_give_no_orders_to_a_terminal(command: Command, tmp
 )
 def test_a_wrong_list_of_poses_is_named(tmp_path: Path, poses: Any) -> None:
     from rangesim.cli.scan import _path
-    from rangesim.fusion.paths import Dome
+    from rangesim.experiment.camera_paths import Dome
 
     place = tmp_path / "poses.json"
     place.write_text(json.dumps(poses))

@@ -15,6 +15,7 @@ from rangesim import IdealToF, decode, expose
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.evaluation.comparison import compare
+from rangesim.report import errors_markdown
 from rangesim.signals import GroundTruth
 
 
@@ -116,7 +117,7 @@ def test_tables_are_json_and_markdown(scene: tuple[np.ndarray, GroundTruth]) -> 
     assert rows[0]["bias_m"] is None
     assert rows[0]["completeness"] == 0
     assert math.isnan(result.table[0].bias_m)
-    lines = result.to_markdown().splitlines()
+    lines = errors_markdown(result).splitlines()
     assert len(lines) == 2 + len(result.table)
     assert len({line.count("|") for line in lines}) == 1
     nothing = truth_of(np.full_like(z, np.nan), np.full(z.shape, -1, np.int32))

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from synthetic import plane_signals, stereo_rig
 
+from rangesim import save_range_image
 from rangesim.capture import Capture
-from rangesim.capture.capture_files import import_capture
 from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
-from rangesim.decoding.range_image_files import load_range_image
 from rangesim.decoding.status import Status
 from rangesim.files.image_files import write_grey
+from rangesim.results.capture_files import import_capture
+from rangesim.results.range_image_files import load_range_image
 from rangesim.sensor import Sensor
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight
 
@@ -60,7 +61,7 @@ def test_the_range_image_of_frames_with_infinity_can_be_loaded(tmp_path: Path) -
     for i, frame in enumerate(patterns):
         write_grey(tmp_path / "images" / f"{i}.exr", frame)
     image = decode(import_capture(tmp_path / "images", sensor))
-    image.save(tmp_path / "range.npz")
+    save_range_image(image, tmp_path / "range.npz")
     loaded = load_range_image(tmp_path / "range.npz")
     assert (loaded.status[MASK] == Status.LOW_SIGNAL).all()
     assert (loaded.status != Status.OK).sum() == 20 * 30

@@ -14,6 +14,7 @@ from synthetic import plane_signals, stereo_rig
 from typer.testing import CliRunner
 
 import rangesim
+from rangesim import save_capture
 from rangesim.calibration.opencv_files import save_opencv
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
@@ -38,7 +39,7 @@ def decoded(capture: Capture, directory: Path, *options: str) -> tuple[str, dict
     """The line of `rangesim decode` for the images of a capture, and decoded.json."""
     sensor = capture.sensor
     assert isinstance(sensor, StructuredLight)
-    capture.save(directory / "images")
+    save_capture(capture, directory / "images")
     (directory / "images" / "capture.json").unlink()
     own = ["--projector", f"{sensor.projector_width}x{sensor.projector_height}", "--code", sensor.code]
     own += ["--axes", ",".join(sensor.axes), "--out", str(directory / "out")]

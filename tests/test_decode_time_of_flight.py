@@ -24,7 +24,7 @@ from rangesim.decoding.phase_shift import tap_phase
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
-from rangesim.experiment.instrument import Instrument
+from rangesim.instrument.instrument import Instrument
 from rangesim.response import SPEED_OF_LIGHT, LightPath, NumpyMath, TransientHistogram
 from rangesim.rig import Intrinsics, Rig, translation
 from rangesim.sensors import AmcwDecoder, AmcwToF, DirectToF, DirectToFDecoder, IdealToF

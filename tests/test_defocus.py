@@ -12,10 +12,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from synthetic import plane_signals, stereo_rig
 
-from rangesim.capture.capture_files import load_capture
+from rangesim import save_capture
 from rangesim.capture.exposure import expose
 from rangesim.response import Fringes, GrayBits, Images, LightPath, NumpyMath
-from rangesim.response.defocus import SWITCH, blurred_stripes
+from rangesim.response.defocus import MIN_HARMONIC_SIGMA, blurred_stripes
+from rangesim.results.capture_files import load_capture
 from rangesim.rig import Intrinsics, Lens, Rig
 from rangesim.sensors import IdealToF
 from rangesim.settings.config import to_dict
@@ -33,7 +34,9 @@ def path(u: np.ndarray, v: np.ndarray, blur_px: float | None) -> LightPath:
 
 
 @pytest.mark.parametrize("bit", [0, 2, 5])
-@pytest.mark.parametrize("periods", [1e-3, 0.01, 0.05, 0.99 * SWITCH, 1.01 * SWITCH, 0.1, 0.3, 1.0])
+@pytest.mark.parametrize(
+    "periods", [1e-3, 0.01, 0.05, 0.99 * MIN_HARMONIC_SIGMA, 1.01 * MIN_HARMONIC_SIGMA, 0.1, 0.3, 1.0]
+)
 def test_gray_stripes_out_of_focus_are_the_convolved_stripes(bit: int, periods: float) -> None:
     """Brute force: the stripes' spectrum times that of the Gaussian, 65536 samples per period."""
     period = 4 * 2**bit
@@ -127,9 +130,9 @@ def test_a_rig_s_optics_read_back_and_may_be_missing() -> None:
 def test_captures_keep_the_optics_and_older_ones_load_without(tmp_path: Path) -> None:
     sensor, plain = IdealToF(), stereo_rig(8, 6)
     rig = dataclasses.replace(plain, camera_lens=Lens(0.75e-3, focus_m=0.8), projector_lens=Lens(1e-3, vignetting=2.0))
-    expose(plane_signals(rig, sensor), sensor).save(tmp_path / "new")
+    save_capture(expose(plane_signals(rig, sensor), sensor), tmp_path / "new")
     assert load_capture(tmp_path / "new").rig == rig
-    expose(plane_signals(plain, sensor), sensor).save(tmp_path / "old")
+    save_capture(expose(plane_signals(plain, sensor), sensor), tmp_path / "old")
     sidecar = tmp_path / "old" / "capture.json"
     data = json.loads(sidecar.read_text())
     del data["rig"]["camera_lens"], data["rig"]["projector_lens"]

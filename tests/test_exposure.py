@@ -5,20 +5,18 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
 from synthetic import plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import BRIGHT_PERCENTILE
-from rangesim.capture.capture_files import load_capture
 from rangesim.capture.exposure import TARGET_FRACTION, expose, photons_per_pulse
 from rangesim.electronics.detector import Detector, PhotoDetector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import RangesimWarning
-from rangesim.experiment.instrument import Instrument
-from rangesim.experiment.pipeline import measure
+from rangesim.instrument.instrument import Instrument
+from rangesim.pipeline.experiment_run import measure
 from rangesim.response import SPEED_OF_LIGHT
 from rangesim.rig import Intrinsics
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
@@ -40,14 +38,14 @@ def test_photons_follow_from_the_etendue() -> None:
     rig = dataclasses.replace(stereo_rig(), camera=Intrinsics(100, 100, 800, 800, 50, 50))
     irradiance = 2.0 * np.pi * (rig.camera_lens.aperture_radius_m / (800 * 5e-6)) ** 2
     photons = irradiance * (5e-6) ** 2 * 1e-3 * detector.wavelength_m / (6.62607015e-34 * 299792458)
-    assert np.isclose(detector.electrons_per_radiance(rig) * 2.0 * 1e-3, 0.5 * photons)
+    assert np.isclose(detector.electron_rate_per_radiance(rig) * 2.0 * 1e-3, 0.5 * photons)
 
 
 def test_photon_transfer_curve_has_the_gain_for_slope_and_the_read_noise_at_zero() -> None:
     """EMVA 1288: sigma_y^2 = K^2 sigma_d^2 + 1/12 + K (mu_y - mu_y.dark)."""
     detector = Detector(read_noise_e=8.0, dark_current_e_s=0.0, offset_dn=40.0)
     rig = stereo_rig(200, 200)
-    level = 0.7 * detector.full_well_e / (detector.electrons_per_radiance(rig) * 1e-3)
+    level = 0.7 * detector.full_well_e / (detector.electron_rate_per_radiance(rig) * 1e-3)
     frames = uniform_frames(np.linspace(0, level, 12), detector, 1e-3)
     mean, variance = frames.mean(axis=(1, 2)), frames.var(axis=(1, 2))
     slope, start = np.polyfit(mean - detector.offset_dn, variance, 1)
@@ -71,7 +69,7 @@ def test_dark_current_grows_with_time() -> None:
 def test_saturated_pixels_read_the_largest_number(bits: int) -> None:
     detector = Detector(bits=bits, offset_dn=4.0)
     rig = stereo_rig(200, 200)
-    radiance = np.array([2.0, 1e6]) * detector.full_well_e / detector.electrons_per_radiance(rig)
+    radiance = np.array([2.0, 1e6]) * detector.full_well_e / detector.electron_rate_per_radiance(rig)
     frames = detector.read_out(
         np.broadcast_to(radiance[:, None, None], (2, 200, 200)), SENSOR.gate, rig, exposure_s=1.0, seed=0
     )
@@ -97,7 +95,7 @@ def test_auto_exposure_puts_the_bright_pixels_at_its_target() -> None:
 )
 @pytest.mark.parametrize("distance_m", [0.1, 1.0])
 def test_light_too_strong_for_the_shortest_exposure_is_said_with_its_share(
-    tmp_path: Path, sensor: Sensor, detector: Detector, distance_m: float
+    sensor: Sensor, detector: Detector, distance_m: float
 ) -> None:
     """A part of 60 mm before the default lamp lost 78 % of its matte table to saturation, and nothing said why."""
     rig, detector = stereo_rig(baseline_m=0.01), dataclasses.replace(detector, max_exposure_s=1.0)
@@ -116,20 +114,19 @@ def test_light_too_strong_for_the_shortest_exposure_is_said_with_its_share(
     with pytest.warns(
         RangesimWarning, match=r"near: the detector's shortest .* take less light .its power_w is 1."
     ) as said:
-        measure(near, signals, tmp_path / "long", 0)
-    capture = load_capture(tmp_path / "long" / "capture")
+        capture = measure(near, signals, 0).capture
     saturated = np.mean(capture.saturated(capture.frames)[lit])
     told = float(str(said[0].message).split("saturates ")[1].split(" %")[0])
     assert saturated > 0.5
     assert abs(told / 100 - saturated) <= 0.005
-    for name, instrument, light in (
-        ("short", dataclasses.replace(near, detector=short), signals),
-        ("stated", dataclasses.replace(near, exposure_s=long.min_exposure_s), signals),  # who says how long knows
-        ("weak", near, weak),
+    for instrument, light in (
+        (dataclasses.replace(near, detector=short), signals),
+        (dataclasses.replace(near, exposure_s=long.min_exposure_s), signals),  # who says how long knows
+        (near, weak),
     ):
         with warnings.catch_warnings(record=True) as said_else:
             warnings.simplefilter("always")
-            measure(instrument, light, tmp_path / name, 0)
+            measure(instrument, light, 0)
         assert not [w for w in said_else if "shortest exposure" in str(w.message)]
 
 
@@ -142,7 +139,7 @@ def test_same_seed_same_bytes_and_every_frame_its_own_noise(sensor: Sensor, dete
     one, two, other = (expose(signals, sensor, detector, seed=s).frames for s in (7, 7, 8))
     assert one.tobytes() == two.tobytes()
     assert one.tobytes() != other.tobytes()
-    level = 0.5 * Detector().full_well_e / Detector().electrons_per_radiance(signals.rig) / 1e-3
+    level = 0.5 * Detector().full_well_e / Detector().electron_rate_per_radiance(signals.rig) / 1e-3
     flat = np.full((2, 60, 80), level)
     a, b = Detector().read_out(flat, SENSOR.gate, signals.rig, 1e-3, seed=1).astype(float)
     assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.05
@@ -154,14 +151,14 @@ def test_the_filter_holds_back_ambient_light() -> None:
     detector = Detector(ambient_transmission=0.1, dark_current_e_s=0.0)
     capture = expose(signals, SENSOR, detector, exposure_s=2e-4)
     black = capture.frames[-1].mean() - detector.offset_dn
-    expected = 0.1 * ambient * detector.electrons_per_radiance(rig) * 2e-4 * detector.gain_dn_e
+    expected = 0.1 * ambient * detector.electron_rate_per_radiance(rig) * 2e-4 * detector.gain_dn_e
     assert abs(black / expected - 1) < 0.02
 
 
 def test_photon_counts_are_poisson() -> None:
     rig, sensor = stereo_rig(200, 200), DirectToF(bins=4, pulse_fwhm_s=0.0)
     detector = SpadDetector(dark_counts_hz=0.0, bits=16, pile_up=False)
-    radiance = 50 / detector.electrons_per_radiance(rig) / 1e-3
+    radiance = 50 / detector.electron_rate_per_radiance(rig) / 1e-3
     counts = detector.read_out(np.full((4, 200, 200), radiance), sensor.gate, rig, 1e-3, seed=0)
     assert abs(counts.mean() / 50 - 1) < 0.01
     assert abs(counts.var() / 50 - 1) < 0.02
@@ -177,7 +174,7 @@ def test_the_laser_fires_again_only_when_the_histogram_is_full(start_s: float) -
     assert detector.pulses(sensor.gate, exposure) == round(exposure / (start_s + 8e-9))
     open_s = exposure * 8e-9 / (start_s + 8e-9)
     counts = expose(signals, sensor, detector, exposure).frames.sum(axis=0).mean()
-    per_second = detector.electrons_per_radiance(rig)
+    per_second = detector.electron_rate_per_radiance(rig)
     signal = signals.channels[sensor.responses()[0]].sum(axis=0).mean() * per_second * exposure
     expected = signal + (0.5 * 2.0 * per_second + 2e5) * open_s
     assert abs(counts / expected - 1) < 0.01
@@ -281,5 +278,5 @@ def test_impossible_exposures_are_refused() -> None:
         expose(signals, SENSOR, SpadDetector(), 1e-3)
     with pytest.raises(ValueError, match="SpadDetector"):
         expose(signals, DirectToF(bins=4, pulse_fwhm_s=0.0), Detector(), 1e-3)
-    with pytest.raises(ValueError, match="trace it with this sensor"):
+    with pytest.raises(ValueError, match="run transport with this sensor"):
         expose(signals, AmcwToF(), Detector(), 1e-3)

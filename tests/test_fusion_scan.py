@@ -12,27 +12,14 @@ import trimesh
 from fusion_scenes import ball, block, mesh_depth, part, range_image
 
 import rangesim
-from rangesim import IdealToF, StructuredLight, load_scene
+from rangesim import IdealToF, StructuredLight, load_scene, scan
 from rangesim.errors import AlignmentWarning, sentence
-from rangesim.fusion import (
-    Dome,
-    HandHeld,
-    PairFit,
-    PoseList,
-    Scan,
-    Turntable,
-    Viewpoint,
-    align,
-    fuse,
-    multiway_registration,
-    pose_errors,
-    scan,
-    surface_error,
-)
+from rangesim.experiment import Dome, HandHeld, PoseList, Turntable, Viewpoint
+from rangesim.experiment.scan_settings import ScanSettings
+from rangesim.fusion import PairFit, Scan, align, fuse, multiway_registration, pose_errors, surface_error
 from rangesim.fusion.multiway_registration import _unchecked, _without_planes, check_first_pair
-from rangesim.fusion.scan_run import run_scan
-from rangesim.fusion.scan_settings import ScanSettings
 from rangesim.geometry import Registration
+from rangesim.pipeline.scan_run import run_scan
 from rangesim.rig import Intrinsics, look_at, translation
 from rangesim.scene.triangles import true_surfaces
 from rangesim.triangle_mesh import TriangleMesh

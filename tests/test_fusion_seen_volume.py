@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 from fusion_scenes import ball, block, mesh_depth, range_image, sphere_depth
 
-from rangesim.fusion import (
-    VoxelGrid,
-    VoxelState,
-    occupancy,
-    true_occupancy,
-    voxel_states,
-)
+from rangesim.fusion import VoxelGrid, VoxelState, occupancy, true_occupancy, voxel_states
 from rangesim.fusion.seen_volume import seen_surface
 from rangesim.rig import Intrinsics, look_at
 from rangesim.triangle_mesh import TriangleMesh
@@ -107,8 +101,8 @@ def test_grids_of_any_size_are_looked_at_in_parts(monkeypatch: pytest.MonkeyPatc
     grid = VoxelGrid((21, 5, 4), 0.004, (-0.042, -0.002, -0.002))
     shapes = {"wall": block((0.02, 0.2, 0.2))}
     whole = voxel_states(images, grid), true_occupancy(shapes, grid)
-    monkeypatch.setattr("rangesim.fusion.seen_volume.AT_ONCE", 41)
-    monkeypatch.setattr("rangesim.fusion.solids.AT_ONCE", 41)
+    monkeypatch.setattr("rangesim.fusion.seen_volume.VOXELS_AT_ONCE", 41)
+    monkeypatch.setattr("rangesim.fusion.solids.POINTS_AT_ONCE", 41)
     assert np.array_equal(voxel_states(images, grid), whole[0])
     assert np.array_equal(true_occupancy(shapes, grid), whole[1])
 

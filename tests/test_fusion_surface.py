@@ -282,7 +282,7 @@ def test_refuses_what_cannot_be_fused() -> None:
         ([image], {"voxel_m": 0.0}, "voxel_m to be positive"),
         ([image], {"voxel_m": np.nan}, "voxel_m to be positive"),
         ([image], {"voxel_m": "2mm"}, "voxel_m to be positive"),
-        ([image], {"voxel_m": 1.0}, "half of what the readings extend over"),
+        ([image], {"voxel_m": 1.0}, "half of the extent of the readings"),
         ([image], {"voxel_m": 1e-6}, "a tenth of the distance"),
         ([image], {"truncation_m": 1e-3}, "at least a voxel"),
         ([image], {"truncation_m": np.inf}, "truncation_m to be positive and finite"),

@@ -50,7 +50,7 @@ def test_voxels_are_those_whose_centres_lie_within():
 def test_the_volume_of_a_ball_in_voxels_is_its_volume():
     radius = 0.03
     grid = VoxelGrid.around(ball(radius).vertices, 0.001)
-    volume = np.count_nonzero(inside_voxels(ball(radius), grid)) * grid.voxel_volume_m3
+    volume = np.count_nonzero(inside_voxels(ball(radius), grid)) * grid.voxel_m**3
     assert volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.005)
 
 

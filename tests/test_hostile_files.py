@@ -19,13 +19,13 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.experiment import load_experiment
 from rangesim.files.array_files import read_arrays
 from rangesim.files.image_files import check_pixels, read_grey
 from rangesim.files.text_files import is_nested_deeper, read_json
 from rangesim.rig.calibration_files import load_calibration
+from rangesim.settings import limits
 
 
 @pytest.fixture(autouse=True)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -193,7 +194,7 @@ def test_sensors_of_one_pass_do_not_disturb_each_other(corner: rangesim.Scene) -
     rig, light = corner.rig(**SIZE), StructuredLight()
     alone = transport(corner, rig, [light], spp=8).frames(light)
     together = transport(corner, rig, all_sensors(), spp=8)
-    with pytest.raises(ValueError, match="trace it with this sensor"):
+    with pytest.raises(ValueError, match="run transport with this sensor"):
         together.frames(AmcwToF((1e6,)))
     both = transport(corner, rig, [light, *all_sensors()], spp=8).frames(light)
     np.testing.assert_allclose(both, alone, rtol=1e-6)
@@ -444,6 +445,19 @@ def test_patterns_fit_the_projector(corner: rangesim.Scene) -> None:
         transport(corner, rig, [Images(np.ones((2, 10, 10), np.float32))], spp=1)
     with pytest.raises(ValueError, match="a rig whose projector has 1280 x 800"):
         transport(corner, rig, [StructuredLight(640, 400)], spp=1)
+
+
+def test_equal_pattern_stacks_share_their_channels(corner: rangesim.Scene) -> None:
+    pixels = np.random.default_rng(0).random((2, 40, 64), dtype=np.float32)
+    images = Images(pixels)
+    copy, unpickled, other = Images(pixels.copy()), pickle.loads(pickle.dumps(images)), Images(pixels[:1])
+    assert images == copy == unpickled != other
+    assert hash(images) == hash(copy) == hash(unpickled)
+    signals = transport(corner, corner.rig(**SIZE, projector_size=(64, 40)), [images, copy, unpickled, other], spp=1)
+    assert list(signals.channels) == [images, other]
+    assert signals.channels[unpickled] is signals.channels[images]
+    pixels[:] = 0
+    assert images == copy  # it holds a copy
 
 
 def test_unlit_pixels_never_reach_a_response(tabletop: rangesim.Scene) -> None:

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from rangesim import limits
 from rangesim.experiment import Experiment
 from rangesim.motion import Timing
 from rangesim.response import Images
 from rangesim.rig import Intrinsics
 from rangesim.sensors import AmcwToF, DirectToF, StructuredLight
+from rangesim.settings import limits
 
 ROOT = Path(__file__).resolve().parent.parent
 

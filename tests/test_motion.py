@@ -21,11 +21,11 @@ from rangesim import AmcwToF, DirectToF, IdealToF, Intrinsics, Rig, Scene, Senso
 from rangesim.causes import Cause
 from rangesim.decoding.phase_shift import phase_of, tap_phase
 from rangesim.experiment import experiment_from_dict, experiment_to_dict
-from rangesim.experiment.pipeline import run
-from rangesim.experiment.result_files import load_result
 from rangesim.motion import ConstantTwist, Motion, MovingSignals, PoseTrack, Timing, transport_moving
 from rangesim.motion.passes import plan
+from rangesim.pipeline.experiment_run import run
 from rangesim.response import SPEED_OF_LIGHT
+from rangesim.results.run_files import load_result
 from rangesim.rig import translation
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
@@ -391,7 +391,7 @@ def test_ambient_light_is_filtered_frame_by_frame() -> None:
     for transmission in (0.0, 0.4, 1.0):
         off = np.abs(signals.frames(sensor, transmission) - static.frames(sensor, transmission))
         assert np.quantile(off, 0.95) < 1e-5 * static.frames(sensor, transmission).mean()
-    with pytest.raises(ValueError, match="whose frames these are"):
+    with pytest.raises(ValueError, match="the frames of this sensor alone"):
         signals.frames(AmcwToF((30e6,)))
 
 

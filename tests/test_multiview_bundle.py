@@ -394,7 +394,7 @@ def test_a_narrow_lens_that_sees_no_shape_is_refused() -> None:
 
 def test_a_descent_that_was_cut_short_says_so() -> None:
     scene = around(6, 60)
-    with pytest.warns(RangesimWarning, match="still goes down"):
+    with pytest.warns(RangesimWarning, match="still lowers the cost"):
         found = bundle_adjust(scene.tracks, scene.camera, *perturbed(scene, 0.02, 0.05, 0.1), max_steps=1)
     assert not found.has_converged
 
@@ -402,9 +402,9 @@ def test_a_descent_that_was_cut_short_says_so() -> None:
 def test_poses_and_images_that_are_none_are_refused() -> None:
     scene = small()
     for wrong in (scene.T * 1.3, scene.T @ np.diag([1, 1, -1, 1.0])):
-        with pytest.raises(ValueError, match="rigid poses"):
+        with pytest.raises(ValueError, match=r"T_camera_world\[\d+\] to be rigid"):
             bundle_adjust(scene.tracks, scene.camera, wrong, scene.X)
-        with pytest.raises(ValueError, match="rigid poses"):
+        with pytest.raises(ValueError, match=r"T_camera_world\[\d+\] to be rigid"):
             triangulate_many(scene.tracks, scene.camera, wrong)
     for images, message in (
         ([0, 0, 1], "different images"),

@@ -175,7 +175,7 @@ def test_a_misfit_is_told(wrong: str) -> None:
         bad = random.random(len(pixels)) < 0.6
         pixels[bad] = random.uniform(0, 960, (bad.sum(), 2))
     tracks = Tracks(scene.tracks.image, scene.tracks.point, pixels, 5, 60)
-    with pytest.warns(RangesimWarning, match="noise_px or the lens is another, or most tracks are wrong"):
+    with pytest.warns(RangesimWarning, match="noise_px or the lens is stated wrongly, or most tracks are wrong"):
         structure_from_motion(tracks, camera, noise_px=0.05 if wrong == "noise" else 0.5)
 
 

@@ -34,7 +34,7 @@ from rangesim.causes import Cause
 from rangesim.decoding.gray import GrayThresholds
 from rangesim.errors import FileFormatError
 from rangesim.experiment import experiment_from_dict, load_experiment
-from rangesim.experiment.instrument import Instrument
+from rangesim.instrument.instrument import Instrument
 from rangesim.sensor import Background
 from rangesim.sensors import AmcwDecoder, StructuredLightDecoder, presets, sensor_from_dict, sensor_of
 
@@ -325,7 +325,9 @@ def test_what_is_read_back_runs_no_file(tmp_path: Path) -> None:
 
 def test_an_experiment_names_files_from_its_own_folder(tmp_path: Path) -> None:
     text = (EXAMPLES / "own_sensor.py").read_text()
-    (tmp_path / "mine.py").write_text(text.replace("gated-camera", "my-gates").replace("gate-ratio", "my-ratio"))
+    for name, other in (("gated-camera", "my-gates"), ("gate-ratio", "my-ratio"), ('"gates"', '"my-pulse"')):
+        text = text.replace(name, other)
+    (tmp_path / "mine.py").write_text(text)
     (tmp_path / "mine.toml").write_text('scene = "plane"\n[[instrument]]\nsensor = "mine.py:GatedCamera"\n')
     (one,) = load_experiment(tmp_path / "mine.toml").instruments
     assert one.name == "my-gates"

@@ -16,8 +16,8 @@ from rangesim.causes.range_limits import fraction_beyond_range
 from rangesim.decoding import decode
 from rangesim.errors import RangesimWarning
 from rangesim.experiment import Experiment
-from rangesim.experiment.instrument import Instrument
-from rangesim.experiment.pipeline import run
+from rangesim.instrument.instrument import Instrument
+from rangesim.pipeline.experiment_run import run
 from rangesim.response import SPEED_OF_LIGHT
 from rangesim.sensor import Sensor
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tiers import to_validate
 
 from rangesim import AmcwToF, Capture, IdealToF, Scene, StructuredLight, compare, decode, expose, load_scene, transport
 from rangesim.causes import explain
 from rangesim.errors import RangesimWarning, SamplingWarning, warn
 from rangesim.evaluation.range_noise import Repeats, range_noise, robust_sigma, warn_of_sampling
-from rangesim.experiment.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
-from rangesim.experiment.instrument import Instrument
+from rangesim.instrument.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
+from rangesim.instrument.instrument import Instrument
 from rangesim.light_transport.loop import SampleAllocation
 from rangesim.light_transport.sampling_error import Halves
 
@@ -128,7 +129,7 @@ def test_two_samples_know_nothing_of_their_error(matte: Scene) -> None:
     ("name", "sensor", "spp", "seed"),
     [
         ("tabletop", StructuredLight(), 16, 3),
-        ("glassware", StructuredLight(), 16, 4),
+        *to_validate(("glassware", StructuredLight(), 16, 4)),
         ("tabletop", AmcwToF(), 16, 5),
         ("tabletop", AmcwToF(), "auto", 6),
     ],
@@ -161,9 +162,11 @@ def test_the_detectors_sigma_is_that_between_captures_of_one_render(
     ("name", "sensor", "seed", "width", "least"),
     [
         ("tabletop", StructuredLight(), 0, 96, 0.03),
-        ("tabletop", StructuredLight(), 1, 96, 0.03),
-        ("glassware", StructuredLight(), 1, 64, 0.08),
-        ("tabletop", AmcwToF(), 1, 96, 0.02),
+        *to_validate(
+            ("tabletop", StructuredLight(), 1, 96, 0.03),
+            ("glassware", StructuredLight(), 1, 64, 0.08),
+            ("tabletop", AmcwToF(), 1, 96, 0.02),
+        ),
     ],
 )
 def test_the_error_bar_of_completeness_covers_what_many_samples_read(
@@ -355,8 +358,8 @@ def test_samples_that_are_no_number_are_refused(matte: Scene) -> None:
 
 def test_a_run_keeps_the_noise_of_its_readings_and_warns_of_it(tmp_path: Path) -> None:
     from rangesim.experiment import Experiment
-    from rangesim.experiment.pipeline import run
-    from rangesim.experiment.result_files import load_result
+    from rangesim.pipeline.experiment_run import run
+    from rangesim.results.run_files import load_result
 
     instruments = (Instrument("amcw", AmcwToF()), Instrument("ideal", IdealToF()))
     experiment = Experiment("glassware", width=96, height=72, spp=4, instruments=instruments)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from rangesim.capture import Capture
-from rangesim.capture.capture_files import import_capture
 from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
+from rangesim.results.capture_files import import_capture
 from rangesim.rig import Rig
 from rangesim.rig.calibration_files import load_calibration
 from rangesim.sensors import StructuredLight

@@ -12,7 +12,6 @@ from synthetic import plane_signals, stereo_rig
 from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.decoding.status import Status
-from rangesim.point_cloud import from_range_image
 from rangesim.rig import Intrinsics
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
 
@@ -50,7 +49,7 @@ def test_camera_pixels_without_a_ray_are_out_of_range(sensor: Sensor) -> None:
     assert 0.02 < lost.mean() < 0.5
     expected = np.where(before.status == Status.OK, Status.OUT_OF_RANGE, before.status)
     np.testing.assert_array_equal(image.status[lost], expected[lost])
-    assert (np.isfinite(from_range_image(image).points).all(axis=-1) == image.valid).all()
+    assert (np.isfinite(image.to_point_cloud().points).all(axis=-1) == image.valid).all()
 
 
 @pytest.mark.parametrize("axes", [("columns",), ("columns", "rows")])

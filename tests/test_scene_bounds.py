@@ -20,11 +20,11 @@ import numpy as np
 import pytest
 
 import rangesim
-from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import write_grey
 from rangesim.scene import load_scene
 from rangesim.scene.nodes import check_type, shipped_types
+from rangesim.settings import limits
 
 CAMERA: dict[str, Any] = {
     "type": "perspective",

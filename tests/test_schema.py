@@ -14,8 +14,8 @@ import pytest
 from small_result import small_result
 
 from rangesim.errors import FileFormatError
-from rangesim.experiment.result_files import load_result
 from rangesim.report import render_report
+from rangesim.results.run_files import load_result
 
 Edit = Callable[[Any], object]
 

@@ -18,11 +18,11 @@ from delta_scenes import GLASS, matte, scene_of, wall
 import rangesim
 from rangesim import AmcwToF, Detector, DirectToF, Lens, Scene, SpadDetector, expose, transport
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
-from rangesim.experiment.pipeline import noise_seed
 from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.photons import trace_photons
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.motion import ConstantTwist, Motion, Timing, transport_moving
+from rangesim.pipeline.experiment_run import noise_seed
 
 SEEDS = tuple(
     dict.fromkeys(

@@ -111,7 +111,7 @@ def test_no_photons_and_no_end_of_them() -> None:
 def frames_of(mean_e: float, seed: int) -> np.ndarray:
     """(6, 300, 400) frames of uniform light, about `mean_e` electrons each, less their mean."""
     detector, rig = Detector(bits=16, full_well_e=65_000.0), stereo_rig(400, 300)
-    level = mean_e / detector.electrons_per_radiance(rig) / 1e-3
+    level = mean_e / detector.electron_rate_per_radiance(rig) / 1e-3
     radiance = np.full((6, 300, 400), level, dtype=np.float32)
     frames = detector.read_out(radiance, StructuredLight().gate, rig, 1e-3, seed).astype(np.float64)
     return frames - frames.mean()

@@ -6,9 +6,9 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -27,10 +27,12 @@ from rangesim import (
     expose,
     load_range_image,
     load_signals,
+    save_range_image,
+    save_signals,
 )
 from rangesim.decoding.phase_shift import PhaseThresholds
 from rangesim.errors import FileFormatError
-from rangesim.response import Images
+from rangesim.response import DenseResponse, Images, LightPath, Math
 from rangesim.sensors import AmcwDecoder
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -49,7 +51,7 @@ def traced() -> Signals:
 
 
 def test_signals_are_exposed_again_as_those_traced(traced: Signals, tmp_path: Path) -> None:
-    traced.save(tmp_path / "signals.npz")
+    save_signals(traced, tmp_path / "signals.npz")
     loaded = load_signals(tmp_path / "signals.npz")
     assert loaded.rig == traced.rig
     assert loaded.truncation == traced.truncation
@@ -64,18 +66,47 @@ def test_signals_are_exposed_again_as_those_traced(traced: Signals, tmp_path: Pa
 
 def test_signals_without_a_sampling_error_have_none_afterwards(tmp_path: Path) -> None:
     signals = plane_signals(stereo_rig(40, 30), AmcwToF())
-    signals.save(tmp_path / "plane.npz")
+    save_signals(signals, tmp_path / "plane.npz")
     loaded = load_signals(tmp_path / "plane.npz")
     assert loaded.sampling is None
     assert loaded.truncation is None
     np.testing.assert_array_equal(loaded.frames(AmcwToF()), signals.frames(AmcwToF()))
 
 
+@dataclass(frozen=True)
+class Nearby(DenseResponse):
+    """Light that travelled at most so far: a response from outside the package."""
+
+    farthest_m: float
+    channels: ClassVar[int] = 1  # type: ignore[misc]
+    type_name: ClassVar[str] = "nearby"
+
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        return [m.select(path.path_length_m < self.farthest_m, 1.0, 0.0)]
+
+
+@dataclass(frozen=True)
+class Nameless(DenseResponse):
+    channels: ClassVar[int] = 1  # type: ignore[misc]
+
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        return [1.0]
+
+
+def test_a_response_of_your_own_comes_back(tmp_path: Path) -> None:
+    signals = plane_signals(stereo_rig(40, 30), AmcwToF())
+    channels = {Nearby(3.0): np.ones((1, 30, 40), np.float32), **signals.channels}
+    save_signals(replace(signals, channels=channels), tmp_path / "own.npz")
+    assert list(load_signals(tmp_path / "own.npz").channels) == list(channels)
+
+
 def test_what_cannot_be_read_back_is_not_written(tmp_path: Path) -> None:
     signals = plane_signals(stereo_rig(40, 30), AmcwToF())
     images = Images(np.ones((2, 800, 1280), np.float32))
     with pytest.raises(ValueError, match="expected responses of numbers, got Images"):
-        replace(signals, channels={images: np.ones((2, 30, 40), np.float32)}).save(tmp_path / "images.npz")
+        save_signals(replace(signals, channels={images: np.ones((2, 30, 40), np.float32)}), tmp_path / "images.npz")
+    with pytest.raises(ValueError, match=r"expected responses with a type_name, .* got Nameless without one"):
+        save_signals(replace(signals, channels={Nameless(): np.ones((1, 30, 40), np.float32)}), tmp_path / "n.npz")
     assert not list(tmp_path.iterdir())
 
 
@@ -112,7 +143,7 @@ def changed(path: Path, settings: dict[str, Any] | None = None, **arrays: Any) -
 )
 def test_damaged_signals_are_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
     path = tmp_path / "signals.npz"
-    plane_signals(stereo_rig(40, 30), AmcwToF()).save(path)
+    save_signals(plane_signals(stereo_rig(40, 30), AmcwToF()), path)
     changed(path, **change)
     with pytest.raises(FileFormatError, match=message) as error:
         load_signals(path)
@@ -133,7 +164,7 @@ def test_range_images_come_back_with_camera_and_decoder(is_calibrated: bool, tmp
     sensor, decoder = AmcwToF(), AmcwDecoder(phase=PhaseThresholds(max_sigma_rad=0.1))
     capture = expose(plane_signals(stereo_rig(40, 30, baseline_m=0.03), sensor), sensor, sensor.default_detector)
     image = decode(capture if is_calibrated else replace(capture, rig=None), decoder)
-    image.save(tmp_path / "range.npz")
+    save_range_image(image, tmp_path / "range.npz")
     loaded = load_range_image(tmp_path / "range.npz")
     assert loaded.decoder == decoder
     assert loaded.camera == image.camera
@@ -144,7 +175,9 @@ def test_range_images_come_back_with_camera_and_decoder(is_calibrated: bool, tmp
 
 def test_a_range_image_is_read_where_no_sensor_is_loaded_yet(tmp_path: Path) -> None:
     sensor = AmcwToF()
-    decode(expose(plane_signals(stereo_rig(40, 30, baseline_m=0.03), sensor), sensor)).save(tmp_path / "range.npz")
+    save_range_image(
+        decode(expose(plane_signals(stereo_rig(40, 30, baseline_m=0.03), sensor), sensor)), tmp_path / "range.npz"
+    )
     code = f"import rangesim; print(rangesim.load_range_image({str(tmp_path / 'range.npz')!r}).decoder)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.startswith("AmcwDecoder(")
@@ -164,7 +197,7 @@ def test_a_range_image_is_read_where_no_sensor_is_loaded_yet(tmp_path: Path) -> 
 def test_damaged_range_images_are_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
     sensor = AmcwToF()
     path = tmp_path / "range.npz"
-    decode(expose(plane_signals(stereo_rig(40, 30, baseline_m=0.03), sensor), sensor)).save(path)
+    save_range_image(decode(expose(plane_signals(stereo_rig(40, 30, baseline_m=0.03), sensor), sensor)), path)
     changed(path, **change)
     with pytest.raises(FileFormatError, match=message) as error:
         load_range_image(path)

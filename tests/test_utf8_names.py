@@ -12,15 +12,16 @@ import pytest
 from synthetic import plane_signals, stereo_rig
 
 import rangesim
-from rangesim.capture.capture_files import import_capture, load_capture
+from rangesim import save_capture
 from rangesim.capture.exposure import expose
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment
-from rangesim.experiment.instrument import instrument
-from rangesim.experiment.pipeline import run
-from rangesim.experiment.result_files import load_result
 from rangesim.files.image_files import check_pixels, read_grey, write_grey
 from rangesim.files.utf8_names import is_utf8, utf8_name
+from rangesim.instrument.instrument import instrument
+from rangesim.pipeline.experiment_run import run
+from rangesim.results.capture_files import import_capture, load_capture
+from rangesim.results.run_files import load_result
 from rangesim.sensors import IdealToF
 
 NAMES = (b"caf\xe9", b"\xff\xfe", b"scan.\xe4", "Grüße".encode("utf-16-le"))
@@ -116,7 +117,7 @@ def test_captures_of_radiance_load_back_the_same(folder: Path) -> None:
     sensor = IdealToF()
     capture = expose(plane_signals(stereo_rig(32, 24), sensor, ambient=0.1), sensor, None)
     assert not capture.is_digital
-    capture.save(folder / "capture")
+    save_capture(capture, folder / "capture")
     np.testing.assert_array_equal(load_capture(folder / "capture").frames, capture.frames)
     np.testing.assert_array_equal(import_capture(folder / "capture", sensor).frames, capture.frames)
 

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 from pcgraph.features.nodes import unit_vector
 from pcgraph.features.primitives import finite_vectors
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.directions import plane_basis
 
 FLAT = 1e-7

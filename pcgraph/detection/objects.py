@@ -19,8 +19,8 @@ from pcgraph.detection.plane_detection import Planes, find_planes, members
 from pcgraph.detection.shapes import Shape, fit_shape
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.inputs import non_negative
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.segmentation import Segmentation, check_segmentation
-from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.directions import plane_basis
 
 MIN_HEIGHT = 3.0

@@ -19,8 +19,8 @@ from pcgraph.detection.region_growing import (
 )
 from pcgraph.features.nodes import node_features, unit_vector
 from pcgraph.inputs import positive
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.segmentation import Segmentation, check_segmentation
-from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.directions import plane_basis
 
 ROLE_ANGLE = np.radians(20.0)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.detection.boxes import OrientedBox, some_points, standing_box, tight_box
 from pcgraph.features.nodes import unit_vector
 from pcgraph.features.primitives import finite_vectors, fit_primitives, primitive_moments
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.directions import plane_basis
 
 Kind = Literal["plane", "box", "sphere", "cylinder"]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pcgraph.columns import group_means
 from pcgraph.parallel import in_blocks, kernel, routine, side_by_side
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.eigen import SYMMETRIC_INDICES
 
 

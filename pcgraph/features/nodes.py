@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.parallel import kernel, routine
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.eigen import symmetric_eigen
 
 _NO_PLANE = 1e-5  # second over first standard deviation below which points lie on a line

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.moments import accumulate_moments, moments_of_groups
 from pcgraph.parallel import kernel, routine
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 
 _STRAIGHT = 1e7  # radius over size above which a round shape is a plane
 _EXACT = 1e-6  # residual over size below which a fit counts as perfect: powers resolve no less

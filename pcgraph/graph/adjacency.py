@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.boundary import BoundaryStrength
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 
 if TYPE_CHECKING:
     import networkx
@@ -276,6 +276,6 @@ class AdjacencyGraph(ShortRepr):
         """
         from pcgraph.errors import CloudWriteError
         from pcgraph.graph.export import graphml
-        from pcgraph.plain_files import write_file
+        from pcgraph.plumbing.plain_files import write_file
 
         write_file(Path(path), graphml(self, occlusions), CloudWriteError)

@@ -26,7 +26,7 @@ from pcgraph.graph.spherical_image import (
 )
 from pcgraph.pairs import distinct_pairs, not_among, pair_keys
 from pcgraph.parallel import kernel
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.surface import Surface
 
 REACH, MIN_GAP = 8.0, 3.0

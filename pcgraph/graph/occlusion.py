@@ -16,7 +16,7 @@ from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.continuations import MIN_GAP, REACH, Continuations, continuations_of
 from pcgraph.graph.spherical_image import SphericalImage, View, depth_jumps, spherical_image, surfels_of, view_from
 from pcgraph.pairs import distinct_pairs
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.surface import Surface
 
 

@@ -12,7 +12,7 @@ from pcgraph.errors import CloudReadError
 from pcgraph.io.pcd import read_pcd
 from pcgraph.io.ply import read_ply
 from pcgraph.io.segmentation_files import write_segmentation
-from pcgraph.plain_files import read_file
+from pcgraph.plumbing.plain_files import read_file
 
 __all__ = ["read_cloud", "write_segmentation"]
 

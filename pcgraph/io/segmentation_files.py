@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.cloud import COLOR_NAMES, LABEL_NAMES, NORMAL_NAMES, PACKED_NAMES, Cloud, without_mask
 from pcgraph.errors import CloudWriteError
 from pcgraph.io.ply import encode_ply
-from pcgraph.plain_files import is_sealed, sealed, unsealed, write_file
+from pcgraph.plumbing.plain_files import is_sealed, sealed, unsealed, write_file
 
 if TYPE_CHECKING:
     from pcgraph.segmentation import Segmentation

@@ -15,7 +15,7 @@ from pcgraph.errors import CloudReadError, CloudWriteError
 from pcgraph.learning.classifier_file import StoredForest, decode_classifier, encode_classifier
 from pcgraph.learning.descriptors import leaf_descriptors
 from pcgraph.learning.propagation import unpool, votes
-from pcgraph.plain_files import read_file, write_file
+from pcgraph.plumbing.plain_files import read_file, write_file
 from pcgraph.segmentation import Segmentation
 
 try:

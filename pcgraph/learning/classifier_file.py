@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 
 _FORMAT = "pcgraph node classifier 1"
 _WRITE = "write it with NodeClassifier.save"

@@ -15,7 +15,7 @@ from pcgraph.metrics.boundary_metrics import NeighbourGraph, check_nearness
 from pcgraph.metrics.labellings import adjusted_rand_from_pairs, count_point_pairs
 from pcgraph.metrics.node_table import Cells, NodeTable, TreeLike, parents_and_altitudes
 from pcgraph.parallel import kernel
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from pcgraph.hierarchy import ChildLists, accumulate_sequential
 from pcgraph.metrics.labellings import count_point_pairs, largest_of_groups
 from pcgraph.metrics.node_table import NodeTable, TreeLike
 from pcgraph.parallel import kernel
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 
 
 def tree_oracle(tree: TreeLike, leaves: ArrayLike, truth: ArrayLike) -> float:

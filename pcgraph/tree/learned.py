@@ -17,7 +17,7 @@ from pcgraph.errors import CloudReadError, CloudWriteError
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.contacts import angle_between
-from pcgraph.plain_files import read_file, write_file
+from pcgraph.plumbing.plain_files import read_file, write_file
 from pcgraph.tree.average_linkage import average_linkage
 from pcgraph.tree.linkage import Linkage, Merges
 from pcgraph.tree.tree import segmentation_tree

@@ -13,7 +13,7 @@ from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
 from pcgraph.inputs import non_negative
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 
 
 @dataclass(frozen=True, eq=False)

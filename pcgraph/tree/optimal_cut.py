@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pcgraph.hierarchy import binary_children
 from pcgraph.parallel import kernel
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 
 _NONE = -1
 

@@ -14,7 +14,7 @@ from pcgraph.features.moments import Moments, moments_up_tree
 from pcgraph.features.nodes import NodeFeatures, node_features, rows, scalar_columns
 from pcgraph.hierarchy import lowest_common_ancestors, roots
 from pcgraph.inputs import non_negative
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.tree.cuts import horizontal_cut, numbered_segments, persistences, stable_cut
 from pcgraph.tree.linkage import Merges
 from pcgraph.tree.optimal_cut import Energy, appearance_scales

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pcgraph.columns import group_means
 from pcgraph.parallel import in_blocks, kernel, routine
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.cells import UNIT_CELLS, Lattice, cell_keys, gallop, sorted_keys, starts_of_runs
 from pcgraph.voxels.grading import BLOCK, Grading, enlarged
 from pcgraph.voxels.warp import Warp

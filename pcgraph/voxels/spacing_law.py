@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pcgraph.parallel import in_blocks, kernel, summing_routine
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.directions import sphere_directions
 from pcgraph.voxels.eigen import SYMMETRIC_INDICES, plane_normal

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, inlined, kernel, routine
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.eigen import plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 

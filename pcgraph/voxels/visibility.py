@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.depth_buffer import SAME_SURFACE_COSINE, cosines_towards, visibility_from
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 from pcgraph.voxels.ground_and_rooms import supporting_plane

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesim.calibration.boards import Board
 from rangesim.capture import Capture
+from rangesim.capture.exposure import expose
 from rangesim.geometry.correspondences import Array
 from rangesim.rig import Intrinsics, Rig
 from rangesim.sensors.structured_light import StructuredLight
@@ -55,15 +56,16 @@ def render_set(
     ValueError
         No pose is seen by both as a whole: they look at different places, or the margin is too wide.
     """
-    import rangesim
+    from rangesim.instrument.transport import transport
+    from rangesim.scene import load_scene
 
     random = np.random.default_rng(seed)
     poses = np.stack([_pose(board, rig, tilt_deg, margin_px, random) for _ in range(n)])
     captures = []
     for k, T in enumerate(poses):
-        scene = rangesim.load_scene(board.scene(rig.T_world_camera @ T, rig.camera.width, rig.camera.height))
-        signals = rangesim.transport(scene, rig, [sensor], spp=spp, seed=seed + k)
-        captures.append(rangesim.expose(signals, sensor, sensor.default_detector, seed=seed + k))
+        scene = load_scene(board.scene(rig.T_world_camera @ T, rig.camera.width, rig.camera.height))
+        signals = transport(scene, rig, [sensor], spp=spp, seed=seed + k)
+        captures.append(expose(signals, sensor, sensor.default_detector, seed=seed + k))
         if progress is not None:
             progress(k + 1)
     return RenderedSet(tuple(captures), poses)

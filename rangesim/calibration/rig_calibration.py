@@ -26,6 +26,7 @@ from rangesim.geometry.homography import homography_dlt
 from rangesim.geometry.projective_plane import map_points
 from rangesim.geometry.reprojection import LENS, POSE
 from rangesim.rig import Rig
+from rangesim.robust_scale import sigma_from_median
 from rangesim.sensors.structured_light import WHITE, StructuredLight, StructuredLightDecoder
 
 MIN_AROUND, MAX_AROUND = 24, 600
@@ -106,7 +107,7 @@ def _seen_through(here: Array, there: Array, corner: Array) -> Array | None:
             return None
         H = homography_dlt(here[kept], there[kept])
         errors = np.linalg.norm(map_points(H, here) - there, axis=-1)
-        spread = 1.4826 * float(np.median(errors[kept])) / 1.1774  # of a coordinate: errors are Rayleigh's
+        spread = sigma_from_median(errors[kept]) / 1.1774  # of a coordinate: errors are Rayleigh's
         within = errors <= OUTLIER * max(spread, 1e-6)
         if (within == kept).all():
             break

@@ -37,6 +37,7 @@ from rangesim.geometry.correspondences import Array, checked_array
 from rangesim.response import SPEED_OF_LIGHT
 from rangesim.rig import Intrinsics, Rig, pose
 from rangesim.rig.calibration_files import SEAL
+from rangesim.robust_scale import sigma_from_median
 from rangesim.sensor import Decoder
 from rangesim.sensors.amcw import TAPS_DEG, AmcwToF
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
@@ -476,7 +477,7 @@ def _fit(readings: list[_Readings], waves: Array, n_pixels: int) -> _Fit:
         middle[seen] = np.nanmedian(over[:, seen], axis=0)
         for k, r in enumerate(readings):
             residual = over[k, r.pixel] - middle[r.pixel]
-            spread[k] = 1.4826 * float(np.median(np.abs(residual - np.median(residual))))
+            spread[k] = sigma_from_median(residual, np.median(residual))
         # what orders beyond the series' leave is no noise, and no outlier
         wiggled = [float(np.mean(r.off - row[r.pixel])) for row, r in zip(over, readings, strict=True)]
         rest = SERIES_REST * float(np.std(wiggled))

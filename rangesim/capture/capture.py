@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -148,9 +147,3 @@ class Capture(ShortRepr):
     def noise(self, frame: np.ndarray) -> np.ndarray | None:
         """Standard deviation of the pixels of a frame, in its units; None if the detector is unknown, or counts."""
         return self.detector.noise_dn(frame) if self.detector else None
-
-    def save(self, directory: str | Path) -> None:
-        """Write the capture as a directory of images and a sidecar; see `rangesim.capture.capture_files`."""
-        from rangesim.capture.capture_files import save_capture
-
-        save_capture(self, directory)

@@ -129,7 +129,7 @@ def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetecto
     ----------
     radiance : (k, h, w) float, W/m2/sr, mean of the frames.
     """
-    level = bright_level(radiance.max(axis=0)) * detector.electrons_per_radiance(rig)
+    level = bright_level(radiance.max(axis=0)) * detector.electron_rate_per_radiance(rig)
     if level == 0:
         return detector.max_exposure_s
     wanted = TARGET_FRACTION * detector.capacity_e / level
@@ -149,7 +149,7 @@ def warn_of_overexposure(name: str, capture: Capture, signals: Signals) -> None:
     if detector is None or capture.exposure_s > detector.min_exposure_s:
         return
     radiance = _mean_radiance(signals, capture.sensor, detector, capture.ambient)
-    level = bright_level(radiance.max(axis=0)) * detector.electrons_per_radiance(rig)
+    level = bright_level(radiance.max(axis=0)) * detector.electron_rate_per_radiance(rig)
     if level * capture.exposure_s > detector.capacity_e:
         lit = signals.energy.projector > 0
         fraction = np.mean(capture.saturated(capture.frames), where=lit) if lit.any() else 0.0

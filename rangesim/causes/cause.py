@@ -75,19 +75,6 @@ TITLES = {
 """Names for tables and legends."""
 
 
-class FailureFractions(list[dict[str, Any]]):
-    """Failures of each material class, and why; see `CauseMap.fractions`. Printed, it is a table in Markdown."""
-
-    def to_markdown(self) -> str:
-        """Table in Markdown in the words of `TITLES`, as the report has them; fractions in percent of the pixels."""
-        from rangesim.report.tables import failures_markdown
-
-        return failures_markdown(self)
-
-    def __str__(self) -> str:
-        return self.to_markdown()
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class CauseMap(ShortRepr):
     """The cause of every failed pixel.
@@ -104,14 +91,14 @@ class CauseMap(ShortRepr):
         """(h, w) bool: there is a surface, but no reading of it to the tolerance."""
         return np.asarray(self.cause != Cause.NONE)
 
-    def fractions(self, truth: GroundTruth) -> FailureFractions:
+    def fractions(self, truth: GroundTruth) -> list[dict[str, Any]]:
         """Per material class of the first surface, "all" last: what failed, and why, as fractions of its pixels.
 
-        A list that prints as a table. Each is a dict of `material` (str), `failed` (fraction of the pixels of this
-        class; None if it has none) and `causes` (name in `Cause`, in lower case -> fraction of the pixels of this
-        class, largest first, none of them 0).
+        Each entry is a dict of `material` (str), `failed` (fraction of the pixels of this class; None if it has none)
+        and `causes` (name in `Cause`, in lower case -> fraction of the pixels of this class, largest first, none of
+        them 0). `rangesim.report.failures_markdown` makes a table of them.
         """
-        return FailureFractions(_row(name, self.cause[mask]) for name, mask in truth.classes().items())
+        return [_row(name, self.cause[mask]) for name, mask in truth.classes().items()]
 
 
 def _row(material: str, causes: np.ndarray) -> dict[str, Any]:

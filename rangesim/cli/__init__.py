@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
-import rangesim
-from pcgraph.plain_files import said
+from pcgraph.plumbing.plain_files import said
+from rangesim import __version__
 from rangesim.cli.calibrate import calibrate_command
 from rangesim.cli.decode import decode_command
 from rangesim.cli.results import compare_command, report_command, verify_command
@@ -35,7 +35,7 @@ app.command("doctor")(doctor_command)
 
 def _version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"rangesim {rangesim.__version__}")
+        typer.echo(f"rangesim {__version__}")
         raise typer.Exit
 
 

@@ -73,7 +73,7 @@ def calibrate_command(
 
       rangesim calibrate board_*/ --points 6x5 --spacing 0.12 --out tof.npz
     """
-    from pcgraph.plain_files import write_file
+    from pcgraph.plumbing.plain_files import write_file
     from rangesim.calibration import calibrate_rig
     from rangesim.calibration.opencv_files import SUFFIXES, save_opencv
     from rangesim.errors import FileFormatError
@@ -126,7 +126,7 @@ def check_places(out: Path, report: Path | None) -> None:
     FileFormatError
         A place is a directory, or holds a file that this command did not write, or that somebody changed since.
     """
-    from pcgraph.plain_files import is_sealed
+    from pcgraph.plumbing.plain_files import is_sealed
     from rangesim.errors import FileFormatError
     from rangesim.rig.calibration_files import SEAL
 

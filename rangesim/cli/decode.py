@@ -74,10 +74,11 @@ def decode_command(
 
       rangesim decode images --projector 1024x768 --calibration board.xml --code-step 2 --out out/board
     """
-    import rangesim
-    from pcgraph.output import check_directory
-    from rangesim.cli.decode_summary import summary
-    from rangesim.cli.decoded_files import DECODED, write_decoded
+    from rangesim.cli.decode_summary import likely_cause, status_fractions, summary
+    from rangesim.decoding import decode
+    from rangesim.files.result_directories import check_directory
+    from rangesim.report.figures import map_pictures
+    from rangesim.results.decoded_files import DECODED, Decoded, save_decoded
 
     _refuse_what_would_be_ignored(context, capture, calibration)
     say_where(out, check_directory(out, DECODED, inputs=[capture]))
@@ -91,15 +92,16 @@ def decode_command(
         image = _calibrated_tof(loaded, calibration)
     else:
         loaded = _calibrated(loaded, calibration, code_step, unit) if calibration else loaded
-        image = rangesim.decode(loaded)
-    write_decoded(image, loaded, out)
-    typer.echo(summary(image, loaded, out))
+        image = decode(loaded)
+    decoded = Decoded(image, loaded.sensor, loaded.rig, status_fractions(image), likely_cause(image, loaded))
+    save_decoded(decoded, out, map_pictures(image))
+    typer.echo(summary(decoded, out))
 
 
 def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibration: Path | None) -> None:
     """ValueError if an option was given that has no effect on this input."""
     from rangesim.calibration.opencv_files import SUFFIXES
-    from rangesim.capture.capture_files import SIDECAR
+    from rangesim.results.capture_files import SIDECAR
 
     given = {name for name in context.params if _from_command_line(context, name)}
     if (capture / SIDECAR).is_file() and (surplus := _options(OF_BARE_IMAGES, given)):
@@ -125,20 +127,19 @@ def _options(names: tuple[str, ...], given: set[str]) -> str:
 
 def load_frames(folder: Path, sensor: Sensor | None, bits: int | None) -> Capture:
     """The capture of a directory with a sidecar, or of bare images."""
-    import rangesim
-    from rangesim.capture.capture_files import SIDECAR
     from rangesim.errors import FileFormatError
+    from rangesim.results.capture_files import SIDECAR, import_capture, load_capture
 
     if not folder.is_dir():
         raise FileFormatError(f"{folder} is no directory; expected a capture or a folder of images.")
     if (folder / SIDECAR).is_file():
-        return rangesim.load_capture(folder)
+        return load_capture(folder)
     if sensor is None:
         raise ValueError(
             f"{folder} has no {SIDECAR}, so it holds bare images: expected --projector WIDTHxHEIGHT as well, or "
             "--sensor FILE.py:NAME."
         )
-    loaded = rangesim.import_capture(folder, sensor)
+    loaded = import_capture(folder, sensor)
     return loaded if bits is None else _full_scale(loaded, bits)
 
 
@@ -169,7 +170,7 @@ def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: flo
 
 def _is_opencv(calibration: Path) -> bool:
     """Whether a file is one that `rangesim calibrate` writes for OpenCV; another .xml is procam-calibration's."""
-    from pcgraph.plain_files import read_file
+    from pcgraph.plumbing.plain_files import read_file
     from rangesim.errors import FileFormatError
 
     if calibration.suffix.lower() in (".yml", ".yaml"):

@@ -12,6 +12,7 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.errors import one_line
 from rangesim.report.palette import STATUS_NAMES
+from rangesim.results.decoded_files import Decoded
 from rangesim.rig import Rig
 from rangesim.sensors import StructuredLight
 
@@ -98,9 +99,9 @@ def _changes(coordinate: np.ndarray) -> tuple[float, float]:
     return across, down
 
 
-def summary(image: RangeImage, capture: Capture, out: Path) -> str:
+def summary(decoded: Decoded, out: Path) -> str:
     """One line on the result: fractions of all statuses that pixels have, depths, and the likely cause."""
-    fractions = status_fractions(image)
+    image, fractions = decoded.image, dict(decoded.status)
     measured = fractions.pop(STATUS_NAMES[Status.OK])
     parts = [f"{100 * measured:.1f} % of the pixels {'decoded' if image.camera is None else 'measured'}"]
     if image.camera is not None and image.valid.any():
@@ -110,6 +111,6 @@ def summary(image: RangeImage, capture: Capture, out: Path) -> str:
         parts.append(others)
     if image.camera is None:
         parts.append("without --calibration there is no depth")
-    if cause := likely_cause(image, capture):
-        parts.append(cause)
+    if decoded.likely_cause:
+        parts.append(decoded.likely_cause)
     return f"{one_line(out)}: {'; '.join(parts)}."

@@ -15,7 +15,7 @@ import typer
 from rangesim.errors import TruncationWarning, one_line
 
 if TYPE_CHECKING:
-    from rangesim.experiment.cost import Cost
+    from rangesim.pipeline.cost import Cost
 
 
 @contextmanager

@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rangesim.errors import one_line
+
+if TYPE_CHECKING:
+    from rangesim.report.markdown_table import Table
 
 
 def compare_command(
@@ -21,8 +24,8 @@ def compare_command(
 
       rangesim compare out/tabletop out/matte
     """
-    from rangesim.experiment.result_files import read_rows, read_settings
-    from rangesim.report.tables import markdown as in_markdown
+    from rangesim.report.tables import comparison_markdown, comparison_tables
+    from rangesim.results.run_files import read_rows, read_settings
 
     tables = []
     for folder in results:
@@ -30,9 +33,9 @@ def compare_command(
             name = entry.name if len(results) == 1 else f"{folder}: {entry.name}"
             tables.append((name, read_rows(folder / entry.name)))
     if markdown:
-        typer.echo(in_markdown(tables), nl=False)
+        typer.echo(comparison_markdown(tables), nl=False)
     else:
-        for table in in_markdown(tables).split("\n\n"):
+        for table in comparison_tables(tables):
             _print(table)
 
 
@@ -49,9 +52,9 @@ def report_command(
 
       rangesim report out/tabletop
     """
-    from pcgraph.output import replace_listed_file
-    from rangesim.experiment.result_files import RESULT, load_result, read_settings
+    from rangesim.files.result_directories import replace_listed_file
     from rangesim.report import render_report
+    from rangesim.results.run_files import RESULT, load_result, read_settings
     from rangesim.sensors import sensor_of
 
     for name in sensor or ():
@@ -76,12 +79,12 @@ def verify_command(
 
       rangesim verify out/tabletop
     """
-    from pcgraph.output import verify_directory
-    from rangesim.capture.capture_files import CAPTURE
-    from rangesim.cli.decoded_files import DECODED
     from rangesim.errors import FileFormatError
-    from rangesim.experiment.result_files import RESULT
-    from rangesim.fusion.scan_run import SCAN
+    from rangesim.files.result_directories import verify_directory
+    from rangesim.results.capture_files import CAPTURE
+    from rangesim.results.decoded_files import DECODED
+    from rangesim.results.run_files import RESULT
+    from rangesim.results.scan_files import SCAN
 
     kinds = (RESULT, SCAN, CAPTURE, DECODED)
     kind = next((k for k in kinds if (directory / k.sidecar).is_file()), None)
@@ -102,23 +105,20 @@ def verify_command(
     typer.echo(f"{one_line(directory)}: all {found.files} files are as they were written.")
 
 
-def _print(markdown: str) -> None:
-    """Draw a Markdown table."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
+def _print(table: Table) -> None:
+    """Draw a table on the terminal; a cell of the first column that repeats the one above stays empty."""
+    from rich import box, console
+    from rich import table as drawn
     from rich.text import Text
 
-    from rangesim.report.markdown_table import cells
+    from rangesim.report.markdown_table import on_one_line
 
-    head, _, *lines = (cells(line) for line in markdown.splitlines())
-    table = Table(box=box.SIMPLE_HEAD)
-    for i, name in enumerate(head):
-        words = i < 2 or name.startswith("because")
-        table.add_column(name, justify="left" if words else "right", overflow="fold")
-    for before, line in zip([head, *lines], lines, strict=False):
-        table.add_row(*map(Text, ("" if line[0] == before[0] else line[0], *line[1:])))  # brackets are no markup
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=140)
-    console.print(table)
+    drawing = drawn.Table(box=box.SIMPLE_HEAD)
+    for i, head in enumerate(table.heads):
+        is_text = i < 2 or head.startswith("because")
+        drawing.add_column(head, justify="left" if is_text else "right", overflow="fold")
+    for before, row in zip([table.heads, *table.rows], table.rows, strict=False):
+        cells = ("" if row[0] == before[0] else row[0], *row[1:])
+        drawing.add_row(*(Text(on_one_line(cell)) for cell in cells))  # brackets are no markup
+    screen = console.Console()
+    (screen if screen.is_terminal else console.Console(width=140)).print(drawing)

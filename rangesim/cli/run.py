@@ -15,7 +15,8 @@ from rangesim.files.bundled_scenes import scene_names
 
 if TYPE_CHECKING:
     from rangesim.experiment import Experiment
-    from rangesim.experiment.instrument import Instrument
+    from rangesim.instrument.instrument import Instrument
+    from rangesim.results.run_files import Result
 
 
 def run_command(
@@ -109,55 +110,51 @@ def run_command(
         )
     if noise_free:
         experiment = replace(experiment, instruments=tuple(replace(i, noise=False) for i in experiment.instruments))
-    from pcgraph.output import check_directory
-    from rangesim.experiment import pipeline
-    from rangesim.experiment.result_files import RESULT
+    from rangesim.files.result_directories import check_directory
+    from rangesim.pipeline import experiment_run
+    from rangesim.results.run_files import RESULT
 
     if estimate or out is None:
-        cost = pipeline.estimate(experiment)
+        cost = experiment_run.estimate(experiment)
         typer.echo(cost)
         cost.check_memory()
         return
     target = check_directory(out, RESULT, inputs=[experiment.scene])
     say_where(out, target)
     with light_left_out_in_a_line(), progress_bar() as progress:
-        pipeline.run(experiment, out, progress, announce=announce)
-    _say_what_measured_nothing(target, experiment.scene)
+        result = experiment_run.run(experiment, out, progress, announce=announce)
+    _say_what_measured_nothing(result)
     typer.echo(one_line(out / "report.html"))
 
 
-def _say_what_measured_nothing(out: Path, scene: str) -> None:
+def _say_what_measured_nothing(result: Result) -> None:
     """A line on stderr for the instruments that have not a single point, of each cause that most of their pixels have.
 
-    Where that is too little light or a distance that cannot be read, the scene most often is not in metres.
-
-    scene : file or name of the scene, whose suffix tells how to bring it to metres.
+    Where that is too little light or a distance that cannot be read, the scene most often is not in metres: the suffix
+    of its file tells how to bring it to metres.
     """
     from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
-    from rangesim.experiment.result_files import MeasurementRecord, read_rows, read_settings
-    from rangesim.files.schema import read_record
     from rangesim.scene.mesh import MESH_SUFFIXES
     from rangesim.signals import ALL
 
     of_distance = (Cause.LOW_SIGNAL, Cause.RANGE_AMBIGUITY, Cause.RESOLUTION)
-    settings = read_settings(out)
     blind: dict[Cause, list[str]] = {}
-    for name in (entry.name for entry in settings.instruments):
-        if not read_record(out / name / "measurement.json", MeasurementRecord).points:
-            shares = next(row["causes"] for row in read_rows(out / name) if row["material"] == ALL)
-            cause = Cause[max(shares, key=shares.get).upper()] if shares else Cause.NONE
-            blind.setdefault(Cause.NONE if cause in of_distance else cause, []).append(name)
+    for measurement in result.measurements:
+        if not measurement.metadata.points:
+            fractions = next(row["causes"] for row in measurement.rows if row["material"] == ALL)
+            cause = Cause[max(fractions, key=fractions.get).upper()] if fractions else Cause.NONE
+            blind.setdefault(Cause.NONE if cause in of_distance else cause, []).append(measurement.name)
     for cause, names in blind.items():
         start = f"rangesim: {one_line(', '.join(names))} measured no pixel at all"
         if cause:
             typer.echo(f"{start}, most of all by {TITLES[cause]}: {DEFINITIONS[cause]}", err=True)
             continue
-        is_mesh = Path(scene).suffix.lower() in MESH_SUFFIXES
+        is_mesh = Path(result.experiment.scene).suffix.lower() in MESH_SUFFIXES
         advice = (
             "a mesh in millimetres needs --unit-m 0.001" if is_mesh else "scale the scene's shapes and camera to them"
         )
         typer.echo(
-            f"{start}, at a working distance of {settings.scene.working_distance_m:g} m; coordinates are metres "
+            f"{start}, at a working distance of {result.info.scene.working_distance_m:g} m; coordinates are metres "
             f"({advice}); in the dark, --spp or power helps.",
             err=True,
         )
@@ -165,7 +162,7 @@ def _say_what_measured_nothing(out: Path, scene: str) -> None:
 
 def _instruments(sensors: list[str]) -> tuple[Instrument, ...]:
     """An instrument for each sensor; those of files are called by their NAME there where their types are the same."""
-    from rangesim.experiment.instrument import instrument
+    from rangesim.instrument.instrument import instrument
     from rangesim.sensors import is_file_name
 
     found = [instrument(name) for name in sensors]

@@ -13,9 +13,9 @@ from rangesim.cli.progress import announce, light_left_out_in_a_line, progress_b
 from rangesim.errors import one_line
 
 if TYPE_CHECKING:
-    from rangesim.fusion.paths import Path as ScanPath
-    from rangesim.fusion.scan_run import ScanResult
-    from rangesim.fusion.scan_settings import ScanSettings
+    from rangesim.experiment.camera_paths import CameraPath
+    from rangesim.experiment.scan_settings import ScanSettings
+    from rangesim.results.scan_files import ScanResult
 
 PATHS = ("turntable", "dome", "hand-held")
 
@@ -74,8 +74,9 @@ def scan_command(
     """
     if out is None and not estimate:
         raise typer.BadParameter("expected --out DIRECTORY, unless --estimate is given.", param_hint="--out")
-    from pcgraph.output import check_directory
-    from rangesim.fusion.scan_run import SCAN, estimate_scan, run_scan
+    from rangesim.files.result_directories import check_directory
+    from rangesim.pipeline.scan_run import estimate_scan, run_scan
+    from rangesim.results.scan_files import SCAN
 
     given: dict[str, Any] = {"spp": spp, "width": width, "height": height, "seed": seed, "voxel_m": voxel}
     given |= {"material": material, "unit_m": unit_m}
@@ -104,8 +105,8 @@ def scan_command(
 
 
 def _settings(scene: Path | None, config: Path | None, given: dict[str, Any], sensor: str | None) -> ScanSettings:
-    from rangesim.experiment.instrument import instrument
-    from rangesim.fusion.scan_settings import ScanSettings, load_scan_settings
+    from rangesim.experiment.scan_settings import ScanSettings, load_scan_settings
+    from rangesim.instrument.instrument import instrument
 
     if config is None and scene is None:
         raise typer.BadParameter("expected a scene or --config FILE.", param_hint="SCENE")
@@ -118,11 +119,10 @@ def _settings(scene: Path | None, config: Path | None, given: dict[str, Any], se
     return replace(load_scan_settings(config), **given)
 
 
-def _path(before: ScanPath, name: str | None, views: int | None) -> ScanPath:
+def _path(before: CameraPath, name: str | None, views: int | None) -> CameraPath:
     """The path of a name, or the one there is, with another number of views."""
+    from rangesim.experiment.camera_paths import CameraPath, PoseList
     from rangesim.files.text_files import read_json
-    from rangesim.fusion.paths import Path as ScanPath
-    from rangesim.fusion.paths import PoseList
     from rangesim.settings.config import nearest, shown
 
     if name is not None and name.endswith(".json"):
@@ -139,7 +139,7 @@ def _path(before: ScanPath, name: str | None, views: int | None) -> ScanPath:
         raise ValueError(
             f"expected --path out of {', '.join(PATHS)} or a .json file, got {name!r}{nearest(name, PATHS)}."
         )
-    chosen = before if name in (None, before.type_name) else ScanPath.known[name]()
+    chosen = before if name in (None, before.type_name) else CameraPath.known[name]()
     if views is None:
         return chosen
     if isinstance(chosen, PoseList):
@@ -151,14 +151,12 @@ def _table(result: ScanResult) -> str:
     """Errors of the shapes, and of poses that were found."""
     lines = [f"{'shape':20s}{'material':14s}{'accuracy':>10s}{'complete':>10s}{'seen':>8s}"]
     for name in result.things:
-        error = result.errors[name]
-        accuracy = "-" if error is None else f"{1e3 * error.accuracy_m:.3f} mm"
-        recall = "-" if error is None else f"{error.recall:.1%}"
-        seen = "-" if result.seen is None else f"{result.seen.shapes[name].surface:.1%}"
-        lines.append(
-            f"{one_line(name)[:19]:20s}{one_line(result.materials[name]):14s}{accuracy:>10s}{recall:>10s}{seen:>8s}"
-        )
-    if all(result.errors[name] is None for name in result.things):
+        shape = result.shapes[name]
+        accuracy = "-" if shape.accuracy_m is None else f"{1e3 * shape.accuracy_m:.3f} mm"
+        recall = "-" if shape.recall is None else f"{shape.recall:.1%}"
+        seen = f"{result.seen.shapes[name].surface:.1%}"
+        lines.append(f"{one_line(name)[:19]:20s}{one_line(shape.material):14s}{accuracy:>10s}{recall:>10s}{seen:>8s}")
+    if all(result.shapes[name].accuracy_m is None for name in result.things):
         from rangesim.report.scan_page import NOTHING_SEEN
 
         lines.append(f"no view measured any of these: {NOTHING_SEEN}")

@@ -4,17 +4,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rangesim.decoding.status import Status
+from rangesim.point_cloud import PointCloud, organised_cloud
 from rangesim.rig import Intrinsics
 from rangesim.settings.config import ShortRepr
 
 if TYPE_CHECKING:
-    from rangesim.point_cloud import PointCloud
     from rangesim.sensor import Decoder
 
 
@@ -65,14 +64,18 @@ class RangeImage(ShortRepr):
         finite, ok = np.isfinite(self.z), self.valid
         return not (finite > ok).any() and (self.camera is None or not (finite < ok).any())
 
-    def save(self, path: str | Path) -> None:
-        """Write all of it to a compressed .npz file, which `rangesim.load_range_image` reads back equal."""
-        from rangesim.decoding.range_image_files import save_range_image
-
-        save_range_image(self, path)
-
     def to_point_cloud(self, coordinates: str = "camera") -> PointCloud:
-        """Organised point cloud of this image, with normals; see `rangesim.point_cloud`."""
-        from rangesim.point_cloud import from_range_image
+        """Organised point cloud (h, w) of this image, with normals, intensities and confidences.
 
-        return from_range_image(self, coordinates)
+        Parameters
+        ----------
+        coordinates : "camera" or "world".
+
+        Raises
+        ------
+        ValueError
+            The range image has no camera (uncalibrated capture), or these coordinates are unknown.
+        """
+        if self.camera is None or self.T_world_camera is None:
+            raise ValueError("expected a calibrated range image: without a rig there are no points.")
+        return organised_cloud(self.z, self.camera, self.T_world_camera, self.intensity, self.confidence, coordinates)

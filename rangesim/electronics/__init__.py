@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From radiance to digital numbers: detectors, noise, ambient light behind the filter."""
+"""Detectors, which turn radiance into digital numbers: their noise, and the ambient light behind their filter."""

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Light to digital numbers: what every detector has in common, and integrating image sensors after EMVA 1288.
+"""Detectors, which turn radiance into digital numbers: the base class, and linear image sensors after EMVA 1288.
 
-A pixel of a camera with entrance pupil radius a and focal length f collects from radiance L the irradiance
-E = L pi (a/f)^2, so E A t lambda / (h c) photons on its area A in the exposure t. With f = fx sqrt(A) the
-pixel pitch drops out: photons = L pi a^2 / (fx fy) t lambda / (h c), radiance times etendue. The fall-off
-towards the corners is the rig's (`Lens.vignetting`), and comes before the detector.
+A camera with entrance pupil radius a and focal length f turns the radiance L into the irradiance E = L pi (a/f)^2 on a
+pixel. On its area A and in the exposure time t, that is E A t lambda / (h c) photons. With f = fx sqrt(A) the pixel
+pitch cancels: photons = L pi a^2 / (fx fy) t lambda / (h c), which is radiance times etendue. The fall-off towards the
+image corners belongs to the rig (`Lens.vignetting`) and is part of the radiance already.
 """
 
 from __future__ import annotations
@@ -23,18 +23,20 @@ if TYPE_CHECKING:
     from rangesim.electronics.ambient import Ambient
 
 PLANCK_TIMES_C = 6.626_070_15e-34 * 299_792_458.0
-"""h c in joule metres, exact."""
-
-
+"""h c in joule metres, exact by the definition of the SI (2019)."""
 Bits = Annotated[int, Bounds("a number of bits", 1, 16)]
+"""Resolution of an analogue-to-digital converter or a counter, 1 to 16 bits, because digital numbers are stored as
+uint8 or uint16."""
 BandWidth = Annotated[float, Bounds("0 or positive", 1e-12, 2e-2, or_zero=True)]
-"""Metres."""
+"""Full width of a band-pass filter in metres; at most twice the longest wavelength, as the band ends above 0 m."""
 
 
 class Gate(NamedTuple):
-    """When a sensor counts photons: those of one bin after another, again and again with each pulse of its laser.
+    """Time bins in which a sensor counts photons; they follow each other, and start anew with each laser pulse.
 
-    period_s : from pulse to pulse. open_s : how much of it the bins cover. bins : as many as frames.
+    period_s : seconds from one pulse to the next.
+    open_s : seconds of each period that all bins together cover.
+    bins : number of bins, which is the number of frames.
     """
 
     period_s: float
@@ -43,10 +45,10 @@ class Gate(NamedTuple):
 
 
 class PhotoDetector(Named, ABC):
-    """What turns the radiance of a sensor's frames into digital numbers. Subclasses are frozen dataclasses.
+    """Electronics that turn the radiance of a sensor's frames into digital numbers; subclasses are frozen dataclasses.
 
-    Where a method takes a `gate`, it is `Sensor.gate`: when photons are counted; None for a sensor whose frames
-    integrate all light of an exposure.
+    The argument `gate` of methods is `Sensor.gate`: the time bins in which photons are counted. It is None for a sensor
+    whose frames integrate all light of an exposure.
     """
 
     known: ClassVar[dict[str, type[Any]]] = {}
@@ -62,15 +64,21 @@ class PhotoDetector(Named, ABC):
     @property
     @abstractmethod
     def capacity_e(self) -> float:
-        """Electrons (counts) at which a pixel saturates."""
+        """Number of electrons (or counts) at which a pixel saturates."""
 
     @abstractmethod
     def mean_electrons(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float) -> np.ndarray:
-        """(..., h, w) expected electrons (counts) of frames of `radiance` in W/m2/sr, dark ones included."""
+        """Expected electrons (or counts) of frames, dark electrons included: (..., h, w) float64.
+
+        radiance : (..., h, w) mean radiance of each frame, W/m2/sr.
+        """
 
     @abstractmethod
     def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
-        """(k, h, w) digital numbers with noise, of frames (k, h, w) of mean radiance, W/m2/sr.
+        """Digital numbers with noise: (k, h, w) uint8 or uint16, see `dtype`.
+
+        radiance : (k, h, w) mean radiance of each frame, W/m2/sr.
+        seed : the same seed gives the same noise.
 
         Raises
         ------
@@ -84,43 +92,47 @@ class PhotoDetector(Named, ABC):
 
     @property
     def black_level_dn(self) -> float:
-        """Digital number without light."""
+        """Mean digital number of a pixel without light."""
         return 0.0
 
     def own_noise_e2(self, dark_e: float) -> float:
-        """Variance, electrons squared, of what the detector itself adds to a frame with so many dark electrons."""
+        """Variance in electrons squared that the detector itself adds to a frame with `dark_e` dark electrons."""
         return dark_e
 
     def noise_dn(self, dn: np.ndarray) -> np.ndarray | None:
-        """Standard deviation of a pixel whose mean is `dn`, digital numbers; None where that says too little, as of
-        photon counts, whose decoders know their own statistics."""
+        """Standard deviation of pixels with the mean `dn`, digital numbers; None for a detector that counts photons.
+
+        The decoders of photon counts have their own statistics.
+        """
         return None
 
     def photons_per_pulse(self, radiance: np.ndarray, gate: Gate | None, rig: Rig) -> np.ndarray | None:
-        """(h, w) float64, photons that a pixel detects per laser pulse, on average, of frames (k, h, w) of mean
-        radiance, W/m2/sr; None of a detector that integrates."""
+        """Mean number of photons that a pixel detects per laser pulse: (h, w) float64; None if the detector integrates.
+
+        radiance : (k, h, w) mean radiance of each frame, W/m2/sr.
+        """
         return None
 
     def ambient_fraction(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
-        """Factor on the scene's ambient light for the part that counts: what passes the filter.
+        """Factor on the scene's ambient light for the part that passes the filter and is counted.
 
-        ambient : what kind of light it is, and how strong: the filter's band decides. None: unknown, so
-            `ambient_transmission` does.
+        ambient : spectrum and strength of that light; the filter's band then decides the factor. None: they are not
+            known, and the factor is `ambient_transmission`.
         """
         return self.ambient_transmission if ambient is None else ambient.in_band(self.wavelength_m, self.band_width_m)
 
     @property
     def max_dn(self) -> int:
-        """Largest digital number; a pixel that reads it is saturated."""
+        """Largest digital number; a pixel with this number is saturated."""
         return int(2**self.bits - 1)
 
     @property
     def dtype(self) -> type[np.unsignedinteger]:
-        """Smallest unsigned integer that holds a digital number."""
+        """Smallest unsigned integer type that holds all digital numbers."""
         return np.uint8 if self.bits <= 8 else np.uint16
 
-    def electrons_per_radiance(self, rig: Rig) -> float:
-        """Electrons per second of exposure for a radiance of 1 W/m2/sr."""
+    def electron_rate_per_radiance(self, rig: Rig) -> float:
+        """Electrons per second of exposure and per W/m2/sr of radiance."""
         camera = rig.camera
         etendue = np.pi * rig.camera_lens.aperture_radius_m**2 / (camera.fx * camera.fy)
         return float(etendue * self.quantum_efficiency * self.wavelength_m / PLANCK_TIMES_C)
@@ -128,7 +140,10 @@ class PhotoDetector(Named, ABC):
     def _check(self) -> None:
         check_fields(self)
         if self.band_width_m >= 2 * self.wavelength_m:
-            raise ValueError(f"expected a band_width_m whose filter ends above 0 m, got {self.band_width_m}.")
+            raise ValueError(
+                f"expected a band_width_m below {2 * self.wavelength_m:g}, twice the wavelength_m, "
+                f"got {self.band_width_m}."
+            )
         if self.min_exposure_s > self.max_exposure_s:
             raise ValueError(
                 f"expected min_exposure_s <= max_exposure_s, got {self.min_exposure_s} > {self.max_exposure_s}."
@@ -136,13 +151,17 @@ class PhotoDetector(Named, ABC):
 
 
 class LinearPixel(NamedTuple):
-    """What an exposure makes of radiance, in a `Detector`.
+    """The linear response of a `Detector` to radiance, for one exposure time.
 
-    electrons : per W/m2/sr. dark_e, max_mean_e, read_noise_e : electrons; beyond max_mean_e the pixel is saturated,
-    whatever its noise. gain_dn_e : digital numbers per electron. offset_dn, max_dn : digital numbers.
+    electrons_per_radiance : electrons per W/m2/sr.
+    dark_e : electrons of the dark current.
+    max_mean_e : electrons, largest expected number that is drawn; the pixel is saturated there, whatever its noise.
+    read_noise_e : electrons rms.
+    gain_dn_e : digital numbers per electron.
+    offset_dn, max_dn : digital numbers, black level and largest number.
     """
 
-    electrons: float
+    electrons_per_radiance: float
     dark_e: float
     max_mean_e: float
     read_noise_e: float
@@ -152,7 +171,7 @@ class LinearPixel(NamedTuple):
 
 
 def streams(seed: int, n: int) -> list[np.random.Generator]:
-    """`n` independent random generators; the same seed gives the same ones."""
+    """`n` independent random generators; the same seed gives the same generators."""
     return [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(n)]
 
 
@@ -162,22 +181,39 @@ class Detector(PhotoDetector):
 
     Parameters
     ----------
-    wavelength_m : float, metres, of the projector's light [lambda].
+    wavelength_m : float, metres, wavelength of the emitter's light [lambda].
     quantum_efficiency : float in (0, 1], fill factor and lens transmission included [eta].
-    full_well_e : float, electrons, saturation capacity [mu_e.sat]; it maps to the largest digital number
-        (the well itself is a little deeper, so that a saturated pixel reads that number in spite of its
-        noise).
+    full_well_e : float, electrons, saturation capacity [mu_e.sat]; it maps to the largest digital number. The well
+        itself is a little deeper, so a saturated pixel reads that number in spite of its noise.
     read_noise_e : float, electrons rms, temporal dark noise [sigma_d].
     dark_current_e_s : float, electrons per second [mu_I].
     bits : int in 1..16, ADC resolution.
     offset_dn : float, digital numbers, black level [mu_y.dark without dark current].
-    ambient_transmission : float in 0..1, fraction of ambient light that the band-pass filter lets through, where the
-        kind of light is not stated (`expose` without `ambient`); the default is that of sunlight in the default band.
-    band_width_m : float, metres, full width of the band-pass filter around wavelength_m, where the kind of light is
-        stated. In the band it passes ambient light as it does the projector's, whose losses are part of the
-        quantum efficiency; outside it passes nothing. 0: no ambient light at all.
-    pixel_pitch_m : float, metres; pixels are square [sqrt A]. Informative: it cancels, see the module.
+    ambient_transmission : float in 0..1, fraction of ambient light that the band-pass filter lets through. It is used
+        where the kind of light is not stated (`expose` without `ambient`); the default is right for sunlight and the
+        default band.
+    band_width_m : float, metres, full width of the band-pass filter around wavelength_m. It is used where the kind of
+        light is stated. Inside the band, ambient light has the same losses as the emitter's light, and they are part of
+        the quantum efficiency. Outside the band nothing passes. 0: no ambient light at all.
+    pixel_pitch_m : float, metres; pixels are square [sqrt A]. Nothing depends on it: it cancels, see
+        `rangesim.electronics.detector`.
     min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
+
+    Raises
+    ------
+    ValueError
+        A number out of its range, or a black level that is not below the largest digital number.
+
+    Examples
+    --------
+    The gain follows from the bits and the full well, and the noise at a digital number from the gain:
+
+    >>> from rangesim import Detector
+    >>> detector = Detector(bits=10, full_well_e=10_000, read_noise_e=4)
+    >>> detector.max_dn, round(detector.gain_dn_e, 4)
+    (1023, 0.1007)
+    >>> [round(float(sigma), 2) for sigma in detector.noise_dn([16, 500, 1000])]
+    [0.5, 7.0, 9.97]
     """
 
     wavelength_m: Wavelength = 850e-9
@@ -202,19 +238,19 @@ class Detector(PhotoDetector):
 
     @classmethod
     def time_of_flight(cls) -> Detector:
-        """A lock-in pixel as in indirect time-of-flight cameras: large, deep, noisier, behind a narrow filter."""
+        """A lock-in pixel of an indirect time-of-flight camera: large, deep, noisier, and behind a narrow filter."""
         return cls(full_well_e=100_000.0, read_noise_e=20.0, dark_current_e_s=1000.0, pixel_pitch_m=10e-6,
                    ambient_transmission=0.03, band_width_m=30e-9, max_exposure_s=0.02)  # fmt: skip
 
     @classmethod
     def ideal(cls) -> Detector:
-        """Shot noise and 16-bit quantisation alone: every photon counts, nothing is dark, the well is deep."""
+        """A detector with shot noise and 16-bit quantisation alone: no losses, no dark electrons, and a deep well."""
         return cls(quantum_efficiency=1.0, full_well_e=1e6, read_noise_e=0.0, dark_current_e_s=0.0, bits=16,
                    offset_dn=0.0, ambient_transmission=0.0, band_width_m=0.0)  # fmt: skip
 
     @property
     def gain_dn_e(self) -> float:
-        """Digital numbers per electron, overall system gain [K]."""
+        """Overall system gain in digital numbers per electron [K]."""
         return (self.max_dn - self.offset_dn) / self.full_well_e
 
     @property
@@ -234,7 +270,7 @@ class Detector(PhotoDetector):
 
     def mean_electrons(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float) -> np.ndarray:
         pixel = self._pixel(rig, exposure_s)
-        return np.asarray(pixel.electrons * np.asarray(radiance, dtype=np.float64) + pixel.dark_e)
+        return np.asarray(pixel.electrons_per_radiance * np.asarray(radiance, dtype=np.float64) + pixel.dark_e)
 
     def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
         self.check(gate)
@@ -253,7 +289,7 @@ class Detector(PhotoDetector):
 
     def _pixel(self, rig: Rig, exposure_s: float) -> LinearPixel:
         return LinearPixel(
-            electrons=self.electrons_per_radiance(rig) * exposure_s,
+            electrons_per_radiance=self.electron_rate_per_radiance(rig) * exposure_s,
             dark_e=float(self.dark_current_e_s * exposure_s),
             max_mean_e=10.0 * self.full_well_e + 1000,
             read_noise_e=float(self.read_noise_e),
@@ -263,8 +299,10 @@ class Detector(PhotoDetector):
         )
 
     def noise_dn(self, dn: np.ndarray) -> np.ndarray:
-        """Standard deviation of a pixel whose mean is `dn`, digital numbers:
-        sqrt(K^2 sigma_d^2 + 1/12 + K (mu - offset))."""
+        """Standard deviation of pixels with the mean `dn` (mu), in digital numbers: float32, in the shape of `dn`.
+
+        It is sqrt(K^2 sigma_d^2 + 1/12 + K (mu - offset)).
+        """
         k = self.gain_dn_e
         shot = k * np.maximum(np.asarray(dn, dtype=np.float32) - self.offset_dn, 0)
         return np.asarray(np.sqrt(np.float32(k**2 * self.read_noise_e**2 + 1 / 12) + shot), dtype=np.float32)

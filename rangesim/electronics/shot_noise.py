@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shot noise and read noise, drawn from their exact distributions in compiled loops.
 
-A photon count is the quantile of Poisson's distribution at a random number. From a mean of `SMALL_MEAN` on that number
-is a standard normal deviate w, and the quantile floor(x), where x(w) is an expansion in 1 / sqrt(mean) whose error is
-bounded. Where the bound leaves two whole numbers (one draw in a hundred at a mean of 4, one in ten thousand at large
-ones), the cumulative probability decides. So the distribution is exact, in a third of the time of a rejection method.
+A photon count is the quantile of the Poisson distribution at a random number (inversion). For means of `SMALL_MEAN` and
+more, the random number is a standard normal deviate w, and the quantile is floor(x). Here x(w) is an expansion in
+1 / sqrt(mean) with a bounded error. If two whole numbers lie within the bound, the cumulative probability decides. That
+happens once in a hundred draws at a mean of 4, and once in ten thousand at large means. The distribution is exact, and
+drawing takes a third of the time of a rejection method.
 
 References
 ----------
-Giles: "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM TOMS 42 (2016): the
-expansion, and the idea to correct it where it is ambiguous.
+Giles: "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM TOMS 42 (2016). The
+expansion is his, and so is the idea to correct it where it is ambiguous.
 """
 
 from __future__ import annotations
@@ -21,28 +22,34 @@ import numpy as np
 from pcgraph.kernel_cache import cached_njit
 
 SMALL_MEAN = 4.0
-"""From here on the expansion is used."""
+"""Mean count, in photons, from which on the expansion is used. The bound of its error holds for this mean and all
+larger ones (tests/test_shot_noise.py). Below it only a few probabilities have to be added up."""
 MAX_DEVIATE = 4.0
-"""Largest |w| for which the bound of the expansion's error holds."""
+"""Standard deviations: largest |w| for which the bound of the expansion's error holds (tests/test_shot_noise.py). One
+draw in 16 000 is beyond, and is then decided by the cumulative probability."""
 SUMMED = 8
-"""Terms of the cumulative probability that are always added, without a branch."""
+"""Count of terms of the cumulative probability that are always added, because a loop without a branch is faster. At the
+largest mean that they serve (4 photons), 2 % of the draws need more terms."""
 _RECIPROCAL = 1 / np.arange(1.0, SUMMED + 1)
+"""1, 1/2, 1/3 ... for the terms of `SUMMED`, as multiplying is faster than dividing."""
 NEGLIGIBLE = 1e-17
-"""Of a sum of probabilities: what is smaller does not change it."""
+"""Fraction of a sum of probabilities, so small that adding it no longer changes the sum in double precision."""
 SPARSE = 5.0
-"""Square of the photons expected over the pulses, up to which `pulses_hit` draws photons: about twice the number that
-share a pulse with an earlier one."""
+"""Limit in photons for n^2 / m, with n the expected photons and m the pulses; half of n^2 / m is the number of photons
+that share a pulse with an earlier one. Up to the limit `pulses_hit` draws photons, above it NumPy's binomial. Both are
+exact, so the value changes the speed alone."""
 
 
 @cached_njit(nogil=True, error_model="numpy")
 def read_frame(rng, radiance, pixel, dn):  # type: ignore[no-untyped-def]
-    """Write digital numbers `dn` (h, w) of a frame of mean radiance (h, w) float32, W/m2/sr.
+    """Write the digital numbers of a frame, with noise.
 
-    pixel : `rangesim.electronics.detector.LinearPixel`.
+    radiance : (h, w) float32, W/m2/sr, mean radiance. pixel : `rangesim.electronics.detector.LinearPixel`.
+    dn : (h, w) unsigned integers, the output.
     """
     for row in range(len(radiance)):
         for column in range(radiance.shape[1]):
-            mean = _within(pixel.electrons * radiance[row, column] + pixel.dark_e, pixel.max_mean_e)
+            mean = _within(pixel.electrons_per_radiance * radiance[row, column] + pixel.dark_e, pixel.max_mean_e)
             electrons = poisson(rng, mean) + pixel.read_noise_e * rng.standard_normal()
             number = np.rint(pixel.gain_dn_e * electrons + pixel.offset_dn)
             dn[row, column] = min(max(number, 0.0), pixel.max_dn)
@@ -50,21 +57,25 @@ def read_frame(rng, radiance, pixel, dn):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy")
 def count_photons(rng, radiance, pixel, counts):  # type: ignore[no-untyped-def]
-    """Write the counts (bins, w) of one image row of mean radiance (bins, w) float32, W/m2/sr: every photon.
+    """Write the photon counts of one image row; every photon counts.
 
-    pixel : `rangesim.electronics.spad.CountingPixel`.
+    radiance : (bins, w) float32, W/m2/sr, mean radiance. pixel : `rangesim.electronics.spad.CountingPixel`.
+    counts : (bins, w) unsigned integers, the output.
     """
     for b in range(len(radiance)):
         for column in range(radiance.shape[1]):
-            mean = _within(pixel.photons * radiance[b, column] + pixel.dark, pixel.max_mean)
+            mean = _within(pixel.counts_per_radiance * radiance[b, column] + pixel.dark, pixel.max_mean)
             counts[b, column] = min(poisson(rng, mean), pixel.max_dn)
 
 
 @cached_njit(nogil=True, error_model="numpy")
 def count_first_photons(rng, radiance, pixel, pulses, counts):  # type: ignore[no-untyped-def]
-    """As `count_photons`, but only the first photon of each of `pulses` pulses counts."""
+    """Write the photon counts of one image row; only the first photon of each of `pulses` pulses counts.
+
+    The other arguments are those of `count_photons`.
+    """
     unused = np.full(radiance.shape[1], pulses)
-    photons, dark, most = pixel.photons / pulses, pixel.dark / pulses, pixel.max_mean / pulses
+    photons, dark, most = pixel.counts_per_radiance / pulses, pixel.dark / pulses, pixel.max_mean / pulses
     for b in range(len(radiance)):
         for column in range(radiance.shape[1]):
             mean = _within(photons * radiance[b, column] + dark, most)
@@ -75,9 +86,10 @@ def count_first_photons(rng, radiance, pixel, pulses, counts):  # type: ignore[n
 
 @cached_njit(nogil=True, error_model="numpy", forceinline=True)
 def pulses_hit(rng, mean, pulses):  # type: ignore[no-untyped-def]
-    """How many of `pulses` bring a photon, or more, each `mean` photons on average: binomial, 1 - exp(-mean) each.
+    """Number of pulses that bring at least one photon, out of `pulses` with `mean` photons each on average.
 
-    Where few photons share a pulse, all are drawn, and those that fall into a pulse that has one are taken away.
+    It is binomial with the probability 1 - exp(-mean). Where few photons share a pulse, all photons are drawn, and
+    those in a pulse that already has one are subtracted.
     """
     expected = mean * pulses
     if expected * expected > SPARSE * pulses:
@@ -88,11 +100,11 @@ def pulses_hit(rng, mean, pulses):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy")
 def _shared(rng, photons, pulses):  # type: ignore[no-untyped-def]
-    """How many of `photons`, each in one of `pulses` by chance, fall into a pulse that has one before them.
+    """Number of photons that fall into a pulse that already has one, when each photon hits a random pulse.
 
-    By thinning: a photon is a candidate with probability 1 - exp(-rate), which exceeds photons / pulses, so that the
-    gaps between candidates are exponential; of these, the fraction is taken that makes it the pulses hit so far /
-    pulses.
+    The method is thinning. A photon is a candidate with the probability 1 - exp(-rate), which exceeds photons / pulses,
+    so gaps between candidates are exponential. A candidate is then accepted with the probability that makes the product
+    equal to the pulses hit so far over all pulses.
     """
     shared, number = 0, 1  # the first photon, number 0, finds all pulses empty
     rate = 2 * photons / pulses if photons < 0.75 * pulses else math.inf
@@ -106,7 +118,7 @@ def _shared(rng, photons, pulses):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy", forceinline=True)
 def poisson(rng, mean):  # type: ignore[no-untyped-def]
-    """A whole number (float64) of Poisson's distribution.
+    """A random whole number of the Poisson distribution, as float64.
 
     Raises
     ------
@@ -127,9 +139,10 @@ def poisson(rng, mean):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy", forceinline=True)
 def quantile(w, mean):  # type: ignore[no-untyped-def]
-    """x, whose floor is the Poisson quantile at the normal deviate w, and a bound of its error for |w| < MAX_DEVIATE.
+    """The number x whose floor is the Poisson quantile at the normal deviate w, and a bound of the error of x.
 
-    x solves Q(x, mean) = Phi(w) with Q the upper incomplete gamma function, regularised (Giles's equation 10).
+    x solves Q(x, mean) = Phi(w), with Q the regularised upper incomplete gamma function (Giles's equation 10). The
+    bound holds for |w| < MAX_DEVIATE.
     """
     inverse, square = 1 / math.sqrt(mean), w * w
     x = mean * (1 + inverse * w) + (2 + square) * (1 / 6 - (1 / 72) * w * inverse)
@@ -139,7 +152,7 @@ def quantile(w, mean):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy", forceinline=True)
 def _count_at(u, mean):  # type: ignore[no-untyped-def]
-    """The Poisson quantile at u in [0, 1), by adding up probabilities."""
+    """The Poisson quantile at u in [0, 1), found by adding up probabilities."""
     probability = math.exp(-mean)
     below, count = probability, 0
     for i in range(SUMMED):
@@ -155,7 +168,7 @@ def _count_at(u, mean):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy")
 def _search(w, mean, count):  # type: ignore[no-untyped-def]
-    """The Poisson quantile at the normal deviate w, beginning at `count`."""
+    """The Poisson quantile at the normal deviate w, searched from `count` on, up and down."""
     while _is_below(count, w, mean):
         count += 1
     while count > 0 and not _is_below(count - 1, w, mean):
@@ -165,7 +178,7 @@ def _search(w, mean, count):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy")
 def _is_below(count, w, mean):  # type: ignore[no-untyped-def]
-    """Whether P(N <= count) <= Phi(w); by the sums of the tail on w's side, which keep their precision."""
+    """Whether P(N <= count) <= Phi(w). Both are compared as tails on the side of w, which keep their precision."""
     tail, total = 0.5 * math.erfc(abs(w) * math.sqrt(0.5)), 0.0
     if w < 0:
         probability = _probability(count, mean)
@@ -184,12 +197,13 @@ def _is_below(count, w, mean):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy")
 def _probability(count, mean):  # type: ignore[no-untyped-def]
+    """Poisson probability of a count."""
     return math.exp(count * math.log(mean) - mean - math.lgamma(count + 1))
 
 
 @cached_njit(nogil=True, error_model="numpy")
 def _within(mean, most):  # type: ignore[no-untyped-def]
-    """`mean` between 0 and `most`; NaN stays."""
+    """`mean`, limited to 0..`most`; NaN stays NaN."""
     if mean < 0:
         return 0.0
     return most if mean > most else mean

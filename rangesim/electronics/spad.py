@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photon counters for direct time of flight."""
+"""Single-photon detectors (SPAD) for direct time of flight: a histogram of photon arrival times in each pixel."""
 
 from __future__ import annotations
 
@@ -17,16 +17,20 @@ if TYPE_CHECKING:
 
 
 MAX_MEAN = 1e9
-"""Photons of a bin, on average: more are drawn as this many, which saturates every counter."""
+"""Largest expected photon count of a bin that is drawn; larger ones are drawn with this one. It changes nothing, as a
+counter holds at most 65535 and saturates far below."""
 
 
 class CountingPixel(NamedTuple):
-    """What an exposure makes of radiance, in one bin of a `SpadDetector`.
+    """The linear response of one bin of a `SpadDetector` to radiance, for one exposure time.
 
-    photons : per W/m2/sr. dark, max_mean : counts. max_dn : digital numbers.
+    counts_per_radiance : expected counts per W/m2/sr.
+    dark : expected counts without light.
+    max_mean : counts, largest expected number that is drawn.
+    max_dn : digital numbers, largest count that the counter holds.
     """
 
-    photons: float
+    counts_per_radiance: float
     dark: float
     max_mean: float
     max_dn: int
@@ -34,21 +38,37 @@ class CountingPixel(NamedTuple):
 
 @dataclass(frozen=True)
 class SpadDetector(PhotoDetector):
-    """Single-photon counter with a histogram memory per pixel.
+    """Single-photon detector (SPAD) with a histogram memory in each pixel.
 
-    An exposure holds as many pulses of the laser's mean power as there are periods in it (`Gate.period_s`).
-    Ambient light and dark counts spread evenly over the bins; before start_s nothing is counted.
+    The number of laser pulses in an exposure is the exposure time over `Gate.period_s`, and their mean power is the
+    laser's. Ambient light and dark counts spread evenly over the bins. Nothing is counted outside the bins.
 
     Parameters
     ----------
-    wavelength_m : float, metres.
+    wavelength_m : float, metres, wavelength of the emitter's light.
     quantum_efficiency : float in (0, 1], photon detection efficiency, fill factor included.
     dark_counts_hz : float, counts per second per pixel.
-    bits : int in 1..16, depth of the counter of a bin.
-    pile_up : bool; True: only the first photon of each histogram is counted (Coates 1968), be it of an earlier
-        pulse. False: every photon.
-    ambient_transmission, band_width_m : the band-pass filter against ambient light, as of `Detector`.
+    bits : int in 1..16, depth of the counter of each bin.
+    pile_up : bool. True: after each pulse, only the first photon is counted (Coates 1968), even if it is light of an
+        earlier pulse. False: every photon is counted.
+    ambient_transmission, band_width_m : the band-pass filter against ambient light, see `Detector`.
     min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
+
+    Raises
+    ------
+    ValueError
+        A number out of its range.
+
+    Examples
+    --------
+    A laser with a pulse every 25.6 ns sends 3906 pulses in an exposure of 0.1 ms:
+
+    >>> from rangesim import DirectToF, SpadDetector
+    >>> detector = SpadDetector(bits=8)
+    >>> detector.max_dn
+    255
+    >>> detector.pulses(DirectToF(bins=256, bin_s=100e-12).gate, exposure_s=1e-4)
+    3906
     """
 
     wavelength_m: Wavelength = 905e-9
@@ -74,25 +94,29 @@ class SpadDetector(PhotoDetector):
         return float(self.max_dn)
 
     def pulses(self, gate: Gate | None, exposure_s: float) -> int:
-        """Number of laser pulses in an exposure."""
+        """Number of laser pulses in an exposure, at least 1."""
         return max(1, round(exposure_s / _counting(gate).period_s))
 
     def ambient_fraction(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
-        """Factor on the scene's ambient light: what passes the filter while the histogram is open."""
+        """Factor on the scene's ambient light for the part that passes the filter while photons are counted."""
         gate = _counting(gate)
         return super().ambient_fraction(gate, ambient) * gate.open_s / gate.period_s
 
     def mean_electrons(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float) -> np.ndarray:
         pixel = self._pixel(_counting(gate), rig, exposure_s)
-        return np.asarray(pixel.photons * np.asarray(radiance, dtype=np.float64) + pixel.dark)
+        return np.asarray(pixel.counts_per_radiance * np.asarray(radiance, dtype=np.float64) + pixel.dark)
 
     def photons_per_pulse(self, radiance: np.ndarray, gate: Gate | None, rig: Rig) -> np.ndarray:
-        """(h, w) float64, photons that a pixel detects per laser pulse, on average, ambient light and dark counts
-        included, as if each were counted: with `pile_up`, the histogram has a count of 1 - exp(-photons) of the pulses.
+        """Mean number of photons that a pixel detects per laser pulse: (h, w) float64.
+
+        Ambient light and dark counts are included, and each photon counts even with `pile_up`. With `pile_up`, the
+        fraction of pulses that add a count to the histogram is 1 - exp(-photons).
         """
         gate = _counting(gate)
         pixel = self._pixel(gate, rig, gate.period_s)  # an exposure of one pulse
-        return np.asarray(pixel.photons * radiance.sum(axis=0, dtype=np.float64) + len(radiance) * pixel.dark)
+        return np.asarray(
+            pixel.counts_per_radiance * radiance.sum(axis=0, dtype=np.float64) + len(radiance) * pixel.dark
+        )
 
     def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
         from pcgraph.parallel import MIN_ROWS, in_blocks
@@ -116,7 +140,7 @@ class SpadDetector(PhotoDetector):
     def _pixel(self, gate: Gate, rig: Rig, exposure_s: float) -> CountingPixel:
         pulses = self.pulses(gate, exposure_s)
         return CountingPixel(
-            photons=self.electrons_per_radiance(rig) * pulses * gate.period_s,
+            counts_per_radiance=self.electron_rate_per_radiance(rig) * pulses * gate.period_s,
             dark=float(self.dark_counts_hz * pulses * gate.open_s / gate.bins),
             max_mean=MAX_MEAN,
             max_dn=self.max_dn,
@@ -124,7 +148,7 @@ class SpadDetector(PhotoDetector):
 
 
 def _counting(gate: Gate | None) -> Gate:
-    """The gate; ValueError if there is none."""
+    """The gate of a sensor that counts photons; ValueError if there is none."""
     if gate is None:
         raise ValueError("expected a sensor that counts photons, such as DirectToF, for a SpadDetector.")
     return gate

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The solar reference spectrum ASTM G173-03: sunlight and sky on a plane tilted 37 degrees to the sun, air mass 1.5.
 
-Global irradiance, W/m2/nm, averaged over bins from the table that NREL publishes (SMARTS 2.9.2). The dips are the
-air's: oxygen at 760 nm, water vapour at 720, 820 and around 940 nm, where some sensors hide from the sun.
+The values are global irradiance in W/m2/nm, averaged over bins of the table that NREL publishes (SMARTS 2.9.2). The
+air absorbs at some wavelengths: oxygen at 760 nm, water vapour at 720, 820 and around 940 nm. Some sensors use 940 nm
+because there is less sunlight.
 """
 
 from __future__ import annotations
@@ -10,12 +11,12 @@ from __future__ import annotations
 import numpy as np
 
 TOTAL_W_M2 = 1000.37
-"""Irradiance of the whole table, 280 to 4000 nm."""
+"""Irradiance in W/m2 over the whole table of the standard, 280 to 4000 nm."""
 BELOW_W_M2 = 0.0015
-"""Of it, irradiance below 300 nm."""
+"""Irradiance in W/m2 from 280 to 300 nm, which is below the first bin; source: the same table."""
 
 EDGES_NM = np.concatenate([np.arange(300.0, 700.0, 10.0), np.arange(700.0, 1100.1, 5.0)])
-"""Edges of the bins, nm: 10 nm apart in the visible, 5 nm from 700 to 1100 nm."""
+"""Edges of the bins in nm: 10 nm apart up to 700 nm, and 5 nm apart from there to 1100 nm, where most sensors work."""
 
 # fmt: off
 SPECTRAL_W_M2_NM = np.array([

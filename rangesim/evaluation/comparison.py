@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -82,14 +82,6 @@ class Comparison(ShortRepr):
                 return row
         names = ", ".join(row.material for row in self.table)
         raise ValueError(f"expected a material class out of {names}, got {material!r}.")
-
-    def to_markdown(self) -> str:
-        """Table in Markdown; lengths in millimetres, fractions in percent."""
-        from rangesim.report.markdown_table import markdown_table
-
-        heads = [f.name.replace("_m", "_mm") if f.name.endswith("_m") else f.name for f in fields(ErrorStatistics)]
-        rows = [[_cell(name, value) for name, value in asdict(row).items()] for row in self.table]
-        return markdown_table([head.replace("_", " ") for head in heads], rows)
 
 
 def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = OUTLIER_M) -> Comparison:
@@ -180,13 +172,3 @@ def neighbours(values: np.ndarray, radius: int) -> list[np.ndarray]:
     h, w = values.shape
     size = 2 * radius + 1
     return [padded[y : y + h, x : x + w] for y in range(size) for x in range(size)]
-
-
-def _cell(name: str, value: Any) -> str:
-    if isinstance(value, float) and math.isnan(value):
-        return "-"
-    if name.endswith("_m"):
-        return f"{1000 * value:.2f}"
-    if isinstance(value, float):
-        return f"{100 * value:.1f} %"
-    return str(value)

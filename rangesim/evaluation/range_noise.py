@@ -23,14 +23,13 @@ from rangesim.capture import Capture
 from rangesim.capture.exposure import exposed_again, noise_free_capture
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import SamplingWarning, sentence, without_warnings
+from rangesim.robust_scale import sigma_from_median
 from rangesim.settings.seeds import SEEDS
 from rangesim.signals import ALL
 
 if TYPE_CHECKING:
     from rangesim.signals import GroundTruth, Signals
 
-TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution over the median of the absolute value."""
 SMALL = 0.5
 """Sampling noise over the detector's, above which a warning is due: the sum of both is an eighth larger then."""
 SMALL_LOSS = 0.03
@@ -220,6 +219,6 @@ def noise_ratio(row: dict[str, Any]) -> float:
 def robust_sigma(errors: np.ndarray) -> float | None:
     """Standard deviation about 0 from the median of the absolute value of those errors that are not NaN; None if there
     are none, or it is infinite."""
-    known = np.abs(errors[~np.isnan(errors)])
-    median = float(np.median(known)) if known.size else np.inf
-    return TO_SIGMA * median if np.isfinite(median) else None
+    known = errors[~np.isnan(errors)]
+    sigma = sigma_from_median(known) if known.size else np.inf
+    return sigma if np.isfinite(sigma) else None

@@ -1,16 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An experiment: what to measure and with what, its run, its cost, its results."""
+"""Settings of what is carried out: experiments, scans and the paths of their cameras; as files and as plain data."""
 
-from rangesim.experiment.experiment import (
-    Experiment,
-    experiment_from_dict,
-    experiment_to_dict,
-    load_experiment,
+from rangesim.experiment.camera_paths import CameraPath, Dome, HandHeld, PoseList, Turntable, Viewpoint
+from rangesim.experiment.experiment import Experiment, experiment_from_dict, experiment_to_dict, load_experiment
+from rangesim.experiment.scan_settings import (
+    ScanSettings,
+    load_scan_settings,
+    scan_settings_from_dict,
+    scan_settings_to_dict,
 )
 
 __all__ = [
+    "CameraPath",
+    "Dome",
     "Experiment",
+    "HandHeld",
+    "PoseList",
+    "ScanSettings",
+    "Turntable",
+    "Viewpoint",
     "experiment_from_dict",
     "experiment_to_dict",
     "load_experiment",
+    "load_scan_settings",
+    "scan_settings_from_dict",
+    "scan_settings_to_dict",
 ]

@@ -8,12 +8,12 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from rangesim import limits
 from rangesim.electronics.ambient import Ambient
-from rangesim.experiment.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
 from rangesim.files.settings_files import load_settings
+from rangesim.instrument.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
 from rangesim.motion import Motion
 from rangesim.motion.track import motion_from_dict
+from rangesim.settings import limits
 from rangesim.settings.bounds import Metres, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
 from rangesim.settings.seeds import check_seed
@@ -34,7 +34,7 @@ class Experiment:
     unit_m : metres per unit of a bare mesh, 0.001 for millimetres (None: 1); refused for a scene.
     width, height : pixels of the camera; None: as in the scene. The field of view is kept.
     spp : light paths per pixel; None: 8, and up to `max_spp` where these leave noise that is not small against that
-        of the detectors, see `rangesim.experiment.adaptive_sampling`.
+        of the detectors, see `rangesim.instrument.adaptive_sampling`.
     max_spp : light paths per pixel, at most, where `spp` is None.
     max_depth : longest path, in segments between surfaces that scatter it, up to the light; 2 is direct light alone.
         Glass and mirrors do not count.
@@ -83,7 +83,7 @@ class Experiment:
 
     def transport_settings(self, instruments: Sequence[Instrument]) -> TransportSettings:
         """How the light of a pass for these instruments is sampled."""
-        from rangesim.experiment.adaptive_sampling import AdaptiveSampling
+        from rangesim.instrument.adaptive_sampling import AdaptiveSampling
         from rangesim.light_transport.transport_settings import PHOTONS, TransportSettings
 
         spp: int | Literal["auto"] | AdaptiveSampling = "auto"
@@ -111,7 +111,7 @@ def load_experiment(path: str | Path) -> Experiment:
 def experiment_from_dict(data: Mapping[str, Any], files_in: Path | None = None) -> Experiment:
     """The experiment of plain data; each table under `instrument` is one instrument. ValueError as `from_dict`.
 
-    files_in : as for `rangesim.experiment.instrument.instrument_from_dict`.
+    files_in : as for `rangesim.instrument.instrument.instrument_from_dict`.
     """
     check_keys(data, ["instrument" if f.name == "instruments" else f.name for f in fields(Experiment)], "experiment")
     rest = {key: value for key, value in data.items() if key not in ("instrument", "motion")}

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files read within limits and checked against schemas: arrays, images, text, records."""
+"""Files read within limits and checked against schemas (arrays, images, text, records); directories written whole."""

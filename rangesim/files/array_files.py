@@ -19,9 +19,9 @@ from typing import IO, Any
 
 import numpy as np
 
-from pcgraph.plain_files import check_file, sealed, unsealed, write_file
-from rangesim import limits
+from pcgraph.plumbing.plain_files import check_file, sealed, unsealed, write_file
 from rangesim.errors import FileFormatError
+from rangesim.settings import limits
 from rangesim.settings.config import brief, shown
 
 Check = Callable[[str, str, tuple[int, ...], "np.dtype[Any]"], None]
@@ -40,7 +40,7 @@ _HEADERS = {
 def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], seal: str | None = None) -> None:
     """Write arrays to a compressed .npz file; the same arrays give the same bytes.
 
-    `seal` : its mark, see `pcgraph.plain_files.sealed`; None: no seal.
+    `seal` : its mark, see `pcgraph.plumbing.plain_files.sealed`; None: no seal.
 
     Raises
     ------

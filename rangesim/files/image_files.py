@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from pcgraph.plain_files import DISK, check_file
-from rangesim import limits
+from pcgraph.plumbing.plain_files import DISK, check_file
 from rangesim.errors import FileFormatError
 from rangesim.files.utf8_names import utf8_name
+from rangesim.settings import limits
 from rangesim.settings.config import brief
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".exr")

@@ -18,10 +18,10 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 import numpy as np
 
-from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.array_files import read_arrays
 from rangesim.files.text_files import read_json
+from rangesim.settings import limits
 from rangesim.settings.config import shown
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]

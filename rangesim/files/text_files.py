@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any, Protocol
 from xml.parsers import expat
 
-from pcgraph.plain_files import check_file
-from rangesim import limits
+from pcgraph.plumbing.plain_files import check_file
 from rangesim.errors import FileFormatError
+from rangesim.settings import limits
 from rangesim.settings.config import brief
 
 _LONG_KEY = r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){%d}"""
@@ -192,5 +192,5 @@ def _too_deep(path: str | Path) -> FileFormatError:
     most = limits.current().nesting
     return FileFormatError(
         f"expected at most {most} levels in {path}, got more; if this is meant, raise the limit with "
-        f"{limits.VARIABLE}=nesting=N or rangesim.limits.raised(nesting=N)."
+        f"{limits.VARIABLE}=nesting=N or rangesim.settings.limits.raised(nesting=N)."
     )

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Computed tomography: parallel-beam projections of solids, and their filtered back-projection. The dense counterpart
-of range data, which end at the first opaque surface.
+"""Computed tomography: parallel-beam projections of solids, and their filtered back-projection.
 
-A pencil of X-rays in the direction (cos a, sin a, 0) that passes the axis of rotation at the distance s measures, by
-Beer and Lambert,
+Its volumes are the dense counterpart of range data, which end at the first opaque surface. By the law of Beer and
+Lambert, a ray in the direction (cos a, sin a, 0) at the distance s from the axis of rotation measures
 
     I = I0 exp(-p),    p(a, s, z) = integral of mu along the ray
 
-(Kak, Slaney: "Principles of Computerized Tomographic Imaging", 1988, chapter 3). mu is the attenuation in 1/m, p has no
-unit. The axis is parallel to z, through the middle of the voxel [nx // 2, ny // 2], and s counts along
-(-sin a, cos a): scikit-image's convention, whose `iradon` filters and back-projects each slice.
+(Kak, Slaney: "Principles of Computerized Tomographic Imaging", 1988, chapter 3). mu is the attenuation in 1/m; p has no
+unit. The axis is parallel to z and passes through the centre of the voxels [nx // 2, ny // 2]. s is measured along
+(-sin a, cos a). This is the convention of scikit-image, whose `iradon` filters and back-projects each slice.
 
-Not simulated: scatter, and the spectrum of a tube with its beam hardening; in a real machine they add cups and streaks.
-Glass is to X-rays what it is by its attenuation: neither it nor a mirror deflects them.
+Scatter, and the spectrum of an X-ray tube with its beam hardening, are not simulated. In a real machine they cause
+cupping and streaks. X-rays go straight through glass and mirrors, which count by their attenuation alone.
 """
 
 from __future__ import annotations
@@ -24,33 +23,36 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rangesim import limits
 from rangesim.errors import EnvironmentProblem
 from rangesim.fusion.mesh_error import raycasting_scene
 from rangesim.fusion.solids import Solid, outermost_first, steps_of_attenuation
 from rangesim.fusion.voxel_grid import VoxelGrid
+from rangesim.settings import limits
 from rangesim.settings.config import ShortRepr, nearest, shown
 from rangesim.settings.seeds import check_seed
 from rangesim.triangle_mesh import TriangleMesh
 
 FILTERS = ("ramp", "shepp-logan", "cosine", "hamming", "hann")
-"""Of scikit-image's `iradon`: the ramp is exact, the others trade resolution for less noise."""
+"""Names of the filters of scikit-image's `iradon`. The ramp is exact; the others have less noise and resolution."""
 RAYS_AT_ONCE = 1 << 19
-SHIFTS = 8
-"""Times that a ray which meets an edge of the mesh is moved by a little."""
-SHIFT = 1e-3
-"""Of a voxel."""
-LEAST_COUNT = 0.5
-"""Photons that a pixel is taken to have counted which counted none."""
+"""Count of rays that are cast in one call, so that a call needs about a hundred megabytes."""
+MAX_SHIFTS = 8
+"""Largest number of times that a ray which meets an edge of the mesh is shifted. A shifted ray rarely meets another
+edge; the number is limited because rays through a hole in the mesh would be shifted forever."""
+SHIFT_VOXELS = 1e-3
+"""Length of such a shift in voxels, chosen far above the rounding of single precision and far below the resolution."""
+MIN_COUNT = 0.5
+"""Photons that replace a count of 0, as the logarithm of 0 is infinite: half-way between none and one photon."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sinogram(ShortRepr):
-    """Line integrals of attenuation.
+    """Line integrals of attenuation, for each angle and each pixel of a detector.
 
-    values : (n_angles, n, nz) float64, no unit. Pixel k of a row of n measures at s = (k - n // 2) voxel_m from the
-    axis; n covers the diagonal of the grid's slices. angles : (n_angles,) float64, radians. grid : the voxels that it
-    is made for, one row of the detector for each layer.
+    values : (n_angles, n, nz) float64, no unit. Pixel k of a row of n pixels is at s = (k - n // 2) voxel_m from the
+        axis. A row covers the diagonal of the grid's slices, and there is one row for each layer of voxels.
+    angles : (n_angles,) float64, radians.
+    grid : the voxels that the projections are made for.
     """
 
     values: np.ndarray
@@ -59,25 +61,50 @@ class Sinogram(ShortRepr):
 
 
 def sampling_angles(grid: VoxelGrid) -> np.ndarray:
-    """(n_angles,) float64, radians, evenly over half a turn: pi / 2 for each pixel of a row, which resolves as finely
-    along the rim as across (Kak, Slaney 1988, section 5.1)."""
+    """Angles that sample half a turn evenly: (n_angles,) float64, radians.
+
+    Their number is pi / 2 times the pixels of a row. Then the resolution at the edge of a slice is the same along the
+    edge as across it (Kak, Slaney 1988, section 5.1).
+
+    Examples
+    --------
+    >>> from rangesim.fusion import VoxelGrid, sampling_angles
+    >>> angles = sampling_angles(VoxelGrid((64, 64, 1), 0.001))
+    >>> len(angles), angles[:2].round(4).tolist()
+    (147, [0.0, 0.0214])
+    """
     count = math.ceil(math.pi / 2 * _row(grid))
     return np.pi * np.arange(count) / count
 
 
 def xray_projections(solids: Sequence[Solid], grid: VoxelGrid, angles: ArrayLike | None = None) -> Sinogram:
-    """Line integrals through solids, exact for their triangles: the chords of rays, one to the middle of each pixel.
+    """Line integrals of attenuation through solids, along one ray to the centre of each pixel.
+
+    They are exact for the triangles of the solids: sums of chords times attenuation, and no sums over voxels.
 
     Parameters
     ----------
-    solids : closed meshes, within one another or apart; see `Solid`. What lies outside the grid's inscribed cylinder
-        of rays is not measured.
-    angles : (n,) radians; None: `sampling_angles`.
+    solids : solids inside one another or apart, see `Solid`. Parts beyond the detector's rows are not measured.
+    grid : voxels that the detector fits to.
+    angles : (n,), radians; None: `sampling_angles`.
 
     Raises
     ------
     ValueError
-        Solids that cross, angles that are not finite, or a mesh whose chords do not close.
+        Solids that cross, angles that are not finite, or a mesh that rays do not leave as often as they enter.
+
+    Examples
+    --------
+    Along its axis, a ray through a cube of 0.1 m with 20 1/m measures 0.1 * 20 = 2:
+
+    >>> import trimesh
+    >>> from rangesim.fusion import Solid, VoxelGrid, xray_projections
+    >>> from rangesim.triangle_mesh import TriangleMesh
+    >>> made = trimesh.creation.box(extents=(0.1, 0.1, 0.1))
+    >>> cube = Solid("cube", TriangleMesh(made.vertices, made.faces), attenuation_per_m=20.0)
+    >>> sinogram = xray_projections([cube], VoxelGrid.around(cube.mesh.vertices, 0.02), angles=[0.0])
+    >>> sinogram.values[0, sinogram.values.shape[1] // 2].round(4).tolist()
+    [2.0, 2.0, 2.0, 2.0, 2.0]
     """
     ordered = outermost_first(solids)
     chosen = sampling_angles(grid) if angles is None else np.asarray(angles, dtype=np.float64)
@@ -93,30 +120,67 @@ def xray_projections(solids: Sequence[Solid], grid: VoxelGrid, angles: ArrayLike
 
 
 def with_photon_noise(sinogram: Sinogram, photons: float, seed: int = 0) -> Sinogram:
-    """The same with shot noise: p = ln(I0 / counts), counts ~ Poisson(I0 exp(-p)), I0 photons per pixel and angle.
+    """The same sinogram with shot noise.
 
-    The standard deviation is about exp(p / 2) / sqrt(I0) where counts are many. A pixel without a photon, behind too
-    much matter, is taken for half a photon.
+    The noisy values are ln(I0 / counts) with counts drawn from Poisson(I0 exp(-p)). Their standard deviation is about
+    exp(p / 2) / sqrt(I0) where counts are large. A count of 0, behind too much matter, is replaced by half a photon.
+
+    Parameters
+    ----------
+    photons : I0, number of photons that a pixel counts at each angle without solids, 1 to 1e15.
+    seed : the same seed gives the same noise.
+
+    Raises
+    ------
+    ValueError
+        A number of photons or a seed that is out of its range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.fusion import Sinogram, VoxelGrid, with_photon_noise
+    >>> empty = Sinogram(np.zeros((100, 93, 1)), np.linspace(0, np.pi, 100), VoxelGrid((64, 64, 1), 0.001))
+    >>> round(float(with_photon_noise(empty, photons=10_000).values.std()), 3)  # 1 / sqrt(10_000)
+    0.01
     """
     if not 1 <= photons <= 1e15:
         raise ValueError(f"expected 1 to 1e15 photons per pixel, got {photons!r}.")
     check_seed(seed)
     counts = np.random.default_rng(seed).poisson(photons * np.exp(-sinogram.values))
-    return replace(sinogram, values=np.log(photons / np.maximum(counts, LEAST_COUNT)))
+    return replace(sinogram, values=np.log(photons / np.maximum(counts, MIN_COUNT)))
 
 
 def filtered_back_projection(sinogram: Sinogram, filter_name: str = "ramp") -> np.ndarray:
-    """(nx, ny, nz) float64, 1/m, the attenuation whose projections these are, on the sinogram's grid.
+    """Attenuation that has these projections, on the sinogram's grid: (nx, ny, nz) float64, 1/m.
 
-    scikit-image's `iradon`, slice by slice, with linear interpolation between pixels. Values of air scatter about 0,
-    below it too; edges are spread over about a voxel, and ring.
+    Each slice is computed by scikit-image's `iradon` with linear interpolation between pixels. Values in air scatter
+    about 0 and may be negative. Edges are blurred by about a voxel, and ring.
+
+    Parameters
+    ----------
+    filter_name : one of `FILTERS`.
 
     Raises
     ------
     ValueError
         Another filter, or fewer than two angles.
     EnvironmentProblem
-        scikit-image is not there.
+        scikit-image is not installed.
+
+    Examples
+    --------
+    A cylinder of 20 1/m along z, from closed-form projections:
+
+    >>> import numpy as np
+    >>> from rangesim.fusion import Sinogram, VoxelGrid, filtered_back_projection, sampling_angles
+    >>> grid, radius_m = VoxelGrid((32, 32, 1), 0.001), 0.01
+    >>> s = 0.001 * (np.arange(49) - 24)
+    >>> chord = 2 * np.sqrt(np.maximum(radius_m**2 - s**2, 0))
+    >>> angles = sampling_angles(grid)
+    >>> values = np.tile(20.0 * chord[:, None], (len(angles), 1, 1))
+    >>> volume = filtered_back_projection(Sinogram(values, angles, grid))
+    >>> round(float(volume[12:20, 12:20].mean()))
+    20
     """
     try:
         from skimage.transform import iradon
@@ -129,7 +193,7 @@ def filtered_back_projection(sinogram: Sinogram, filter_name: str = "ramp") -> n
             f"expected a filter out of {', '.join(FILTERS)}, got {filter_name!r}{nearest(filter_name, FILTERS)}."
         )
     if len(sinogram.angles) < 2:
-        raise ValueError(f"expected at least two angles to see depth by, got {len(sinogram.angles)}.")
+        raise ValueError(f"expected at least two angles, got {len(sinogram.angles)}.")
     grid, degrees = sinogram.grid, np.degrees(sinogram.angles)
     n, (nx, ny, nz) = sinogram.values.shape[1], grid.shape
     left, top = n // 2 - nx // 2, n // 2 - ny // 2
@@ -143,13 +207,13 @@ def filtered_back_projection(sinogram: Sinogram, filter_name: str = "ramp") -> n
 
 
 def _row(grid: VoxelGrid) -> int:
-    """Pixels of a row of the detector: the diagonal of a slice, about the axis."""
+    """Number of pixels in a row of the detector, which covers the diagonal of a slice on both sides of the axis."""
     nx, ny, _ = grid.shape
     return 2 * math.ceil(math.hypot(nx // 2 + 0.5, ny // 2 + 0.5)) + 1
 
 
 def _chords(solid: Solid, grid: VoxelGrid, angles: np.ndarray) -> np.ndarray:
-    """(n_angles, n, nz) metres that each ray runs within a solid."""
+    """Length of each ray inside a solid: (n_angles, n, nz) float64, metres."""
     n, (nx, ny, nz) = _row(grid), grid.shape
     h, corner = grid.voxel_m, np.asarray(grid.corner_m)
     axis = corner[:2] + (np.array([nx // 2, ny // 2]) + 0.5) * h
@@ -163,7 +227,7 @@ def _chords(solid: Solid, grid: VoxelGrid, angles: np.ndarray) -> np.ndarray:
         return lengths
     s = (near - n // 2) * h
     at_once = max(1, RAYS_AT_ONCE // (len(s) * len(heights)))
-    caster = _Caster(solid, SHIFT * h)
+    caster = _Caster(solid, SHIFT_VOXELS * h)
     for first in range(0, len(angles), at_once):
         a = angles[first : first + at_once]
         along = np.stack([np.cos(a), np.sin(a), 0 * a], axis=-1)
@@ -179,7 +243,10 @@ def _chords(solid: Solid, grid: VoxelGrid, angles: np.ndarray) -> np.ndarray:
 
 
 class _Caster:
-    """Lengths of rays within one closed mesh."""
+    """Caster of rays that measures their lengths inside one closed mesh.
+
+    shift_m : metres, shift of a ray that meets an edge of the mesh.
+    """
 
     def __init__(self, solid: Solid, shift_m: float) -> None:
         self.name, self.shift_m = solid.name, shift_m
@@ -187,13 +254,16 @@ class _Caster:
         self.normals = _outward(solid.mesh)
 
     def lengths(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(m,) metres: sum of the ranges at which a ray leaves, less those at which it enters.
+        """Length of each ray inside the mesh: (m,) float64, metres.
 
-        A ray through an edge or a vertex may be told of one triangle twice or not at all; then its crossings do not
-        alternate, and it is shifted by a thousandth of a voxel.
+        It is the sum of the ranges at which the ray leaves the mesh, less those at which it enters. For a ray through
+        an edge or a vertex, Open3D may report a triangle twice or not at all. Its crossings then do not alternate
+        between in and out, and it is cast again, shifted sideways.
+
+        origins, directions : (m, 3), metres, world, and unit vectors.
         """
         found, closed = self._cast(origins, directions)
-        for k in range(1, SHIFTS + 1):
+        for k in range(1, MAX_SHIFTS + 1):
             if closed.all():
                 return found
             again = np.flatnonzero(~closed)
@@ -203,11 +273,12 @@ class _Caster:
         if not closed.all():
             raise ValueError(
                 f"expected a closed mesh that rays leave as often as they enter, but {np.count_nonzero(~closed)} of "
-                f"{len(closed)} do not through {self.name}; mend its holes and turned faces."
+                f"{len(closed)} rays through {self.name} do not; close its holes, and turn faces that point inward."
             )
         return found
 
     def _cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lengths of rays inside the mesh (m,), metres, and whether their crossings alternate between in and out."""
         import open3d as o3d
 
         rays = np.concatenate([origins - self.middle, directions], axis=1).astype(np.float32)
@@ -218,20 +289,20 @@ class _Caster:
         order = np.lexsort((range_m, ray))
         ray, range_m, sign = ray[order], range_m[order], np.where(leaves[order], 1, -1)
         m = len(origins)
-        depth = np.cumsum(sign) - np.repeat(*_before(sign, ray, m))  # -1 within, 0 outside
+        depth = np.cumsum(sign) - np.repeat(*_before(sign, ray, m))  # -1 inside, 0 outside
         closed = np.bincount(ray, sign, m) == 0
         closed &= np.bincount(ray, (depth != 0) & (depth != -1), m) == 0
         return np.bincount(ray, sign * range_m, m), closed
 
 
 def _before(sign: np.ndarray, ray: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sum of the signs before each ray's first crossing, and its number of crossings."""
+    """Sum of all signs before the first crossing of each ray, and the ray's number of crossings."""
     counts = np.bincount(ray, minlength=m)
     totals = np.concatenate([[0], np.cumsum(sign)])
     return totals[np.cumsum(counts) - counts], counts
 
 
 def _outward(mesh: TriangleMesh) -> np.ndarray:
-    """(k, 3) normals of the faces, not of unit length."""
+    """Outward normals of the faces: (k, 3) float64, not of unit length."""
     a, b, c = np.moveaxis(mesh.corners, 1, 0)
     return np.cross(b - a, c - a)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fused surface against the true one: accuracy, completeness, F-score, Chamfer distance.
+"""Error of a measured surface against the true one: accuracy, completeness, F-score, Chamfer distance.
 
-Points are sampled evenly over the area of either surface, and their distances to the other's *triangles* are taken, not
-to its samples: a distance between samples would never fall below their spacing.
+Points are sampled evenly over the area of each surface. Their distances are taken to the *triangles* of the other
+surface, not to its samples, because distances between samples are never below the spacing of the samples.
 """
 
 from __future__ import annotations
@@ -15,19 +15,24 @@ from rangesim.settings.config import ShortRepr, shown
 from rangesim.triangle_mesh import TriangleMesh
 
 SAMPLES = 100_000
-"""Points on each surface."""
+"""Default number of points on each surface. The standard error of a mean distance is then 0.3 % of the spread of the
+distances, and that of a fraction 0.2 % at most."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SurfaceError(ShortRepr):
-    """How two surfaces differ; metres, and fractions of area.
+    """Distances between a measured surface and the true one.
 
-    accuracy_m : mean distance of the measured surface to the true one. accuracy_rms_m, accuracy_p95_m : root mean
-    square, 95th percentile. completeness_m : mean distance of the true surface to the measured one. chamfer_m : the
-    mean of the two means, Chamfer distance.
-    precision, recall : fraction of the measured (true) surface within `threshold_m` of the other; recall is
-    completeness as a fraction. f_score : their harmonic mean (Knapitsch et al.: "Tanks and Temples", 2017).
-    measured_points, true_points : (n, 3) float64, metres, samples. measured_m, true_m : (n,) float64, their distances.
+    accuracy_m : metres, mean distance from the measured surface to the true one.
+    accuracy_rms_m, accuracy_p95_m : metres, root mean square and 95th percentile of the same distances.
+    completeness_m : metres, mean distance from the true surface to the measured one.
+    chamfer_m : metres, Chamfer distance: the mean of `accuracy_m` and `completeness_m`.
+    precision : fraction of the measured area that is within `threshold_m` of the true surface.
+    recall : fraction of the true area that is within `threshold_m` of the measured surface.
+    f_score : harmonic mean of precision and recall (Knapitsch et al.: "Tanks and Temples", 2017).
+    threshold_m : metres.
+    measured_points, true_points : (n, 3) float64, metres, world, samples of the two surfaces.
+    measured_m, true_m : (n,) float64, metres, distances of the samples to the other surface.
     """
 
     accuracy_m: float
@@ -48,17 +53,33 @@ class SurfaceError(ShortRepr):
 def surface_error(
     measured: TriangleMesh, truth: TriangleMesh, threshold_m: float, *, samples: int = SAMPLES, seed: int = 0
 ) -> SurfaceError:
-    """Distances between a measured and a true surface.
+    """Distances between a measured surface and the true one.
 
     Parameters
     ----------
-    threshold_m : metres, within which surface counts as right (precision) and as found (recall).
-    samples : points on each surface.
+    measured, truth : meshes, metres, in the same coordinates.
+    threshold_m : metres, distance up to which the measured surface counts as right (precision), and the true surface as
+        found (recall).
+    samples : number of points on each surface.
+    seed : of the random points; the same seed gives the same points.
 
     Raises
     ------
     ValueError
         A mesh without area, or a threshold or a number of samples that is not positive.
+
+    Examples
+    --------
+    A square that is measured 1 mm too high:
+
+    >>> import numpy as np
+    >>> from rangesim.fusion import surface_error
+    >>> from rangesim.triangle_mesh import TriangleMesh
+    >>> corners, faces = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]), [[0, 1, 2], [0, 2, 3]]
+    >>> square, higher = TriangleMesh(corners, faces), TriangleMesh(corners + [0, 0, 0.001], faces)
+    >>> error = surface_error(higher, square, threshold_m=0.002, samples=1000)
+    >>> round(error.accuracy_m, 6), round(error.chamfer_m, 6), error.f_score
+    (0.001, 0.001, 1.0)
     """
     if not threshold_m > 0:
         raise ValueError(f"expected a positive threshold_m in metres, got {shown(threshold_m)}.")
@@ -85,14 +106,20 @@ def surface_error(
 
 
 def distances_to(points: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
-    """(n,) float64, metres, distance of points (n, 3), world, to the nearest point of a mesh's triangles."""
+    """Distance of points to the triangles of a mesh: (n,) float64, metres.
+
+    points : (n, 3), metres, in the coordinates of the mesh.
+    """
     return np.asarray(np.linalg.norm(nearest_on(points, mesh) - points, axis=-1))
 
 
 def nearest_on(points: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
-    """(n, 3) float64, metres, world, the point of a mesh's triangles that is nearest to each point (n, 3).
+    """Nearest points on the triangles of a mesh: (n, 3) float64, metres.
 
-    Open3D finds the triangle in single precision, about the mesh's own middle.
+    Open3D finds the nearest triangle in single precision, in coordinates about the mean of the mesh's vertices. The
+    point on the triangle is then computed in double precision.
+
+    points : (n, 3), metres, in the coordinates of the mesh.
     """
     scene, middle = raycasting_scene(mesh)
     import open3d as o3d
@@ -102,7 +129,10 @@ def nearest_on(points: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
 
 
 def raycasting_scene(mesh: TriangleMesh):  # type: ignore[no-untyped-def]
-    """Open3D's scene of a mesh's triangles, and the point (3,), metres, world, that is its origin."""
+    """Open3D's RaycastingScene of a mesh, and the point (3,), metres, that is the scene's origin.
+
+    The origin is the mean of the vertices, because Open3D computes in single precision.
+    """
     import open3d as o3d
 
     if not len(mesh.faces):
@@ -115,9 +145,10 @@ def raycasting_scene(mesh: TriangleMesh):  # type: ignore[no-untyped-def]
 
 
 def _on_triangle(p: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(n, 3) the point of triangle corners[i] (n, 3, 3) nearest to p[i] (n, 3), in double precision.
+    """Point of the triangle corners[i] (n, 3, 3) that is nearest to p[i] (n, 3): (n, 3) float64.
 
-    Inside the triangle its foot on the plane, else the nearest point of the three edges.
+    It is the foot of the perpendicular on the triangle's plane, if that lies inside the triangle. Otherwise it is the
+    nearest point of the three edges.
     """
     a, b, c = np.moveaxis(corners, 1, 0)
     best, least = a, np.full(len(p), np.inf)

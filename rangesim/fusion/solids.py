@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Solids: closed meshes filled with matter, and their voxels. The truth of what lies inside things."""
+"""Solids, which are closed meshes filled with matter, and their voxels: the true inside of objects."""
 
 from __future__ import annotations
 
@@ -14,32 +14,46 @@ from rangesim.settings.config import ShortRepr, shown
 from rangesim.triangle_mesh import TriangleMesh
 
 TOUCHING = 1e-5
-"""Of a solid's extent: what is nearer to its surface lies on it."""
+"""Distance below which a point lies on a solid's surface, as a fraction of the solid's extent. It is above
+the rounding of Open3D (1e-7), because points on the surface must not count as inside or outside."""
 SAMPLES = 2000
-"""Points on a surface that are looked at, besides its vertices, to tell whether it crosses another."""
+"""Count of points on a surface, besides its vertices, by which crossings with another solid are found. A crossing that
+contains none of them is not found; twice as many points take twice the time."""
 VOTES = 3
-"""Rays by which Open3D decides whether a point lies inside."""
-AT_ONCE = 1 << 20
-"""Points that are looked at in one call."""
+"""Count of rays by whose majority Open3D decides whether a point is inside, because a single ray that hits an edge may
+be wrong. The count is odd so that there is always a majority."""
+POINTS_AT_ONCE = 1 << 20
+"""Number of points that are tested in one call, so that they take about 12 MB."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Solid(ShortRepr):
-    """A closed surface and the matter within it.
+    """Closed surface and the matter inside it.
+
+    Where one solid contains another, the inner one counts. So a hollow ball is a ball and a smaller ball of attenuation
+    0 inside it.
 
     Parameters
     ----------
-    name : of the part.
-    mesh : closed, its triangles counter-clockwise as seen from outside.
+    name : name of the part, not empty.
+    mesh : closed mesh, metres, world; triangles counter-clockwise as seen from outside.
     attenuation_per_m : 1/m, linear attenuation coefficient of the matter for X-rays; 0 is a cavity. Some values at
         60 keV (NIST XCOM): water 20.6, PMMA 22, glass (Pyrex) 57, aluminium 75, iron 950.
-
-    Where solids contain one another, the innermost counts: a hollow ball is a ball, and a smaller one of 0 within it.
 
     Raises
     ------
     ValueError
-        An empty name, a mesh that is not closed or turned inside out, or an attenuation that is negative or not finite.
+        An empty name, a mesh that is not closed or is inside out, or an attenuation that is negative or not finite.
+
+    Examples
+    --------
+    >>> import trimesh
+    >>> from rangesim.fusion import Solid
+    >>> from rangesim.triangle_mesh import TriangleMesh
+    >>> made = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
+    >>> ball = Solid("ball", TriangleMesh(made.vertices, made.faces), attenuation_per_m=22.0)
+    >>> round(1e6 * ball.mesh.volume_m3)  # cm3
+    266
     """
 
     name: str
@@ -66,9 +80,21 @@ class Solid(ShortRepr):
 
 
 def inside_voxels(mesh: TriangleMesh, grid: VoxelGrid) -> np.ndarray:
-    """(nx, ny, nz) bool, whether the centre of each voxel lies inside a closed mesh: the parity of crossings (Open3D).
+    """Whether the centre of each voxel is inside a closed mesh: (nx, ny, nz) bool.
 
-    Only voxels within the mesh's bounding box are looked at.
+    Open3D decides it by the parity of the crossings of rays, for voxels within the mesh's bounding box.
+
+    Examples
+    --------
+    A box of 0.2 x 0.2 x 0.1 m in voxels of 0.05 m:
+
+    >>> import trimesh
+    >>> from rangesim.fusion import VoxelGrid, inside_voxels
+    >>> from rangesim.triangle_mesh import TriangleMesh
+    >>> made = trimesh.creation.box(extents=(0.2, 0.2, 0.1))
+    >>> box = TriangleMesh(made.vertices, made.faces)
+    >>> int(inside_voxels(box, VoxelGrid.around(box.vertices, 0.05, margin_m=0.1)).sum())
+    32
     """
     import open3d as o3d
 
@@ -80,7 +106,7 @@ def inside_voxels(mesh: TriangleMesh, grid: VoxelGrid) -> np.ndarray:
         return found
     scene, middle = raycasting_scene(mesh)
     box = VoxelGrid(tuple(high - low), grid.voxel_m, tuple(corner + low * grid.voxel_m - middle))
-    slab = max(1, AT_ONCE // (box.shape[1] * box.shape[2]))
+    slab = max(1, POINTS_AT_ONCE // (box.shape[1] * box.shape[2]))
     for first in range(0, box.shape[0], slab):
         centres = box.centres(slice(first, first + slab)).astype(np.float32)
         inside = scene.compute_occupancy(o3d.core.Tensor(centres), nsamples=VOTES).numpy() > 0.5
@@ -90,7 +116,25 @@ def inside_voxels(mesh: TriangleMesh, grid: VoxelGrid) -> np.ndarray:
 
 
 def attenuation_volume(solids: Sequence[Solid], grid: VoxelGrid) -> np.ndarray:
-    """(nx, ny, nz) float64, 1/m, attenuation at the centre of each voxel: that of the innermost solid; 0 of air."""
+    """Attenuation at the centre of each voxel: (nx, ny, nz) float64, 1/m, of the innermost solid there; 0 in air.
+
+    Raises
+    ------
+    ValueError
+        No solids, two with the same name, or two that cross each other.
+
+    Examples
+    --------
+    >>> import trimesh
+    >>> from rangesim.fusion import Solid, VoxelGrid, attenuation_volume
+    >>> from rangesim.triangle_mesh import TriangleMesh
+    >>> def box(name, edge_m, attenuation_per_m):
+    ...     made = trimesh.creation.box(extents=(edge_m, edge_m, edge_m))
+    ...     return Solid(name, TriangleMesh(made.vertices, made.faces), attenuation_per_m)
+    >>> grid = VoxelGrid.around([[0.0, 0.0, 0.0]], 0.02, margin_m=0.07)
+    >>> attenuation_volume([box("wall", 0.1, 75.0), box("cavity", 0.06, 0.0)], grid)[3, 3].tolist()
+    [0.0, 75.0, 0.0, 0.0, 0.0, 75.0, 0.0]
+    """
     volume = np.zeros(grid.shape)
     for solid in outermost_first(solids):
         volume[inside_voxels(solid.mesh, grid)] = solid.attenuation_per_m
@@ -98,12 +142,12 @@ def attenuation_volume(solids: Sequence[Solid], grid: VoxelGrid) -> np.ndarray:
 
 
 def outermost_first(solids: Sequence[Solid]) -> list[Solid]:
-    """The solids in an order in which each comes after those that contain it.
+    """The solids in an order in which each one comes after those that contain it.
 
     Raises
     ------
     ValueError
-        There are none, two share a name, or two of them cross each other.
+        No solids, two with the same name, or two that cross each other.
     """
     chosen = list(solids)
     if not chosen or not all(isinstance(s, Solid) for s in chosen):
@@ -116,9 +160,9 @@ def outermost_first(solids: Sequence[Solid]) -> list[Solid]:
 
 
 def steps_of_attenuation(solids: Sequence[Solid]) -> list[float]:
-    """1/m, of each solid, in their order: its attenuation less that of what directly surrounds it.
+    """Step of attenuation at the surface of each solid, in 1/m: its own less that of the solid around it, or of air.
 
-    The line integral of the attenuation is the sum of these steps times the chords through the solids.
+    The line integral of the attenuation is the sum over the solids of this step times the chord through the solid.
     """
     containers = _containers(list(solids))
     steps = []
@@ -129,8 +173,11 @@ def steps_of_attenuation(solids: Sequence[Solid]) -> list[float]:
 
 
 def _containers(solids: Sequence[Solid]) -> list[list[int]]:
-    """Of each solid those that contain it, by the signed distances of its vertices and of points on its surface,
-    which may touch the other."""
+    """Indices of the solids that contain each solid.
+
+    A solid contains another if no vertex of the other, and none of the random points on its surface, is outside. The
+    points may touch the surface. ValueError if some are inside and some outside, or all on the surface.
+    """
     import open3d as o3d
 
     found: list[list[int]] = [[] for _ in solids]

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose of a camera from points that are known in space: perspective n points, with covariance and ambiguity.
+"""The pose of a camera from points with known positions (perspective-n-point), with covariance and ambiguity.
 
-The pose has 6 parameters, each point gives two equations; three points leave up to four poses, so four are needed.
-The image of a plane can be explained nearly as well by a second, mirrored tilt (Schweighofer, Pinz: "Robust pose
-estimation from a planar target", PAMI 2006): every pose that the noise does not tell from the best is reported.
+A pose has 6 parameters and each point gives two equations. Three points leave up to four poses, so four points are
+needed. A second, mirrored tilt can explain the image of a plane nearly as well (Schweighofer, Pinz: "Robust pose
+estimation from a planar target", PAMI 2006). So every pose is reported that the noise does not distinguish from the
+best one.
+
+Used by: rangesim.calibration.zhang and time_of_flight; rangesim.multiview.incremental_reconstruction and
+sliding_window.
 """
 
 from __future__ import annotations
@@ -29,23 +33,56 @@ from rangesim.geometry.least_squares import Minimum, minimise
 from rangesim.geometry.reprojection import reproject
 from rangesim.rig import Intrinsics
 
-PARAMETERS = 6
-PLANAR = 1e-3
-"""Points whose third principal extent is below this fraction of the first are also treated as a plane."""
+POSE_PARAMETERS = 6
+"""Number of parameters of a pose: three of the rotation and three of the translation."""
+
+MAX_PLANAR_FRACTION = 1e-3
+"""Ratio of the third principal extent of the points to the first up to which they are also treated as a plane. The
+solver for planes then adds starts, and the other solvers still run, so that a larger value costs only time and a
+smaller one may miss the second tilt of a target that is not quite flat."""
+
 MAX_ROTATION_DEVIATION = 0.3
-"""Radians; a pose known worse than this is no pose."""
-TRIPLES, STARTS = 20, 6
-"""Triples of points that are solved, and the best solutions that are refined."""
+"""Largest standard deviation of the rotation, in radians; a pose that is known less well is refused. At 17 degrees the
+linear covariance no longer holds; nobody measured a closer limit."""
+
+TRIPLES = 20
+"""Number of triples of points that P3P solves to find starts. More triples cost time and help only where the other
+solvers fail and noise spoils the first triples."""
+
+STARTS = 6
+"""Number of different starts from which the reprojection error is minimised: the best by that error. P3P has up to four
+solutions and a plane two, so that six leave room for both."""
+
+SAME_POSE = 1e-3
+"""Difference in radians, and as a ratio to the distance, up to which two minima are one and the same pose, because
+descents to one minimum end far nearer to each other."""
+
+SAME_START = 0.03
+"""Difference in radians, and as a ratio to the distance, up to which two starts count as one, because the descents from
+both usually end in the same minimum."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPose:
-    """Where a camera stands.
+    """The pose of a camera, with its covariance and the other poses that explain the same image.
 
-    T_camera_object : (4, 4) float64, maps coordinates of the points to the camera's, metres. covariance : (6, 6) of
-    (rotation vector applied after R, rad; t, metres). noise_px : standard deviation of a coordinate, as given or from
-    the residuals. inliers : (n,) bool. others : poses (4, 4) that the noise does not tell from this one, best first;
-    none if it is sure.
+    Attributes
+    ----------
+    T_camera_object : (4, 4) float64, maps object coordinates, those of the points, to camera coordinates, metres.
+    covariance : (6, 6) float64, covariance of (rotation vector applied after R, rad; t, metres).
+    noise_px : standard deviation of one coordinate of a pixel, as given or estimated from the residuals.
+    inliers : (n,) bool, the pairs that agree with the pose.
+    others : further poses (4, 4) that the noise does not distinguish from this one, best first; often empty.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim import Intrinsics
+    >>> camera = Intrinsics(640, 480, 800, 800, 320, 240)
+    >>> points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.5], [0.5, 0, 1]])
+    >>> pose = fit_camera_pose(points, camera.project(points + [0, 0, 5]), camera, noise_px=0.1)
+    >>> pose.T_camera_object[:3, 3].round(6) + 0.0, pose.is_ambiguous
+    (array([0., 0., 5.]), False)
     """
 
     T_camera_object: Array
@@ -56,32 +93,43 @@ class CameraPose:
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether another pose explains the points as well."""
+        """Whether another pose explains the image within the noise."""
         return len(self.others) > 0
 
 
 def fit_camera_pose(
     points: ArrayLike, pixels: ArrayLike, camera: Intrinsics, *, noise_px: float | None = None
 ) -> CameraPose:
-    """The pose of maximum likelihood for Gaussian noise of the pixels, all pairs being right, and its covariance.
+    """The maximum-likelihood pose for Gaussian noise of the pixels, with its covariance; all pairs must be correct.
 
-    Minimises the reprojection error through the lens, distortion included, by Levenberg-Marquardt over the 6
-    parameters, from OpenCV's SQPNP (Terzakis, Lourakis 2020), of planes its IPPE (Collins, Bartoli 2014), which gives
-    both tilts, and P3P of triples. Of the minima that differ, the best is the pose; those with posterior odds above
-    1e-5 are its `others`.
+    It minimises the reprojection error through the lens, with distortion, by Levenberg-Marquardt over the 6 parameters.
+    The starts come from OpenCV's SQPNP (Terzakis, Lourakis 2020), from P3P of triples, and for planes from IPPE
+    (Collins, Bartoli 2014), which gives both tilts. The best of the different minima is the pose. Minima with posterior
+    odds above 1e-5 are its `others`.
 
     Parameters
     ----------
-    points : (n, 3) metres, coordinates of the object, n >= 4; they may lie far from its origin, as map coordinates do.
-    pixels : (n, 2), as the camera shows them.
-    noise_px : standard deviation of a coordinate; None: from the residuals.
+    points : (n, 3) object coordinates, metres, n >= 4. They may lie far from the origin, as map coordinates do.
+    pixels : (n, 2) pixels of the distorted image.
+    camera : Intrinsics of the camera.
+    noise_px : standard deviation of one coordinate of a pixel; None estimates it from the residuals.
 
     Raises
     ------
     ValueError
-        Fewer than four different points; points on one line, or so nearly that the noise decides; pixels that no ray
-        of the lens reaches; no pose has the points in front of the camera; or the residuals are over three times the
-        stated noise.
+        There are fewer than four different points; the points lie on one line, or so nearly that the noise decides; no
+        ray through the lens reaches a pixel; no pose has the points in front of the camera; or the residuals are over
+        three times the stated noise.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim import Intrinsics
+    >>> camera = Intrinsics(640, 480, 800, 800, 320, 240)
+    >>> board = np.array([[x, y, 0] for x in (0, 0.1, 0.2) for y in (0, 0.1)])  # metres
+    >>> pose = fit_camera_pose(board, camera.project(board + [0, 0, 1]), camera, noise_px=0.2)
+    >>> pose.T_camera_object[:3, 3].round(6) + 0.0
+    array([0., 0., 1.])
     """
     X, x = _checked(points, pixels, camera, 4)
     check_noise(noise_px)
@@ -92,19 +140,36 @@ def fit_camera_pose(
 def find_camera_pose(
     points: ArrayLike, pixels: ArrayLike, camera: Intrinsics, noise_px: float = 1.0, *, seed: int = 0
 ) -> CameraPose:
-    """The pose that most pairs agree with: OpenCV's USAC over P3P, then `fit_camera_pose` until the inliers stay.
+    """The pose that most pairs agree with, although some pairs are wrong; with its covariance.
 
-    A pair is an inlier where its error is below the 99 % quantile at `noise_px`, in front of the camera. The same
-    seed gives the same result.
+    OpenCV's USAC with P3P proposes inliers. `fit_camera_pose` is then fitted to the inliers, and the inliers are chosen
+    again, until they no longer change. A pair is an inlier if its point lies in front of the camera and its error is
+    below the 99 % quantile of the errors that `noise_px` causes. The same seed gives the same result.
 
     Parameters
     ----------
-    points : (n, 3) metres, n >= 6. pixels : (n, 2). noise_px : of a right pair.
+    points : (n, 3) object coordinates, metres, n >= 6.
+    pixels : (n, 2) pixels of the distorted image.
+    camera : Intrinsics of the camera.
+    noise_px : standard deviation of one coordinate of a correct pixel.
+    seed : state of the random numbers that USAC draws samples with.
 
     Raises
     ------
     ValueError
-        As `fit_camera_pose`, or no more pairs agree than chance would let.
+        `fit_camera_pose` refuses the inliers, or no more pairs agree than chance explains.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim import Intrinsics
+    >>> camera = Intrinsics(640, 480, 800, 800, 320, 240)
+    >>> random = np.random.default_rng(0)
+    >>> points = random.uniform(-1, 1, (40, 3))
+    >>> pixels = camera.project(points + [0, 0, 6]) + random.normal(0, 0.5, (40, 2))
+    >>> pixels[:8] = random.uniform(0, 480, (8, 2))  # wrong pairs
+    >>> int(find_camera_pose(points, pixels, camera, noise_px=0.5).inliers[:8].sum())
+    0
     """
     import cv2
 
@@ -131,38 +196,38 @@ def find_camera_pose(
     model, inliers = consensus.consistent_set(chosen, threshold, fit, error, least=4)
     _refuse_chance(int(inliers.sum()), x, threshold)
     residuals = error(model)[inliers]
-    noise = float(np.sqrt(residuals @ residuals / (2 * len(residuals) - PARAMETERS)))
+    noise = float(np.sqrt(residuals @ residuals / (2 * len(residuals) - POSE_PARAMETERS)))
     covariance = model.covariance * (noise / noise_px) ** 2
     return _from_middle(replace(model, inliers=inliers, noise_px=noise, covariance=covariance), middle)
 
 
 def _fitted(X: Array, x: Array, camera: Intrinsics, noise_px: float | None) -> CameraPose:
-    """`fit_camera_pose` of points that are near the origin."""
+    """The result of `fit_camera_pose` for points X (n, 3) near the origin and pixels x (n, 2)."""
     extents = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
     if extents[1] <= ROUNDING * extents[0]:
         raise ValueError(
-            f"expected points that are not on one line, got {len(X)} that are: the turn about it is open; add points "
-            "beside it."
+            f"expected points that are not on one line, got {len(X)} that are: the rotation about that line is not "
+            "determined; add points beside it."
         )
     minima: list[Minimum[Array]] = []
-    for start in _starting_poses(X, x, camera, is_planar=extents[2] <= PLANAR * extents[0]):
+    for start in _starting_poses(X, x, camera, is_planar=extents[2] <= MAX_PLANAR_FRACTION * extents[0]):
         found = minimise(lambda T: _residuals(T, X, x, camera), _moved, start)
-        if not any(_is_same(found.state, other.state) for other in minima):
+        if not any(_is_same(found.state, other.state, SAME_POSE) for other in minima):
             minima.append(found)
     if not minima:
         raise ValueError(
-            "expected points in front of the camera, got pairs that no pose puts there; check them and the camera."
+            "expected points in front of the camera, got pairs that no pose puts there; check the pairs and the camera."
         )
     minima.sort(key=lambda minimum: minimum.cost)
-    best, freedom = minima[0], 2 * len(X) - PARAMETERS
+    best, freedom = minima[0], 2 * len(X) - POSE_PARAMETERS
     consensus.refuse_misfit(best.cost, freedom, noise_px, "one pose")
-    noise = best.noise(PARAMETERS) if noise_px is None else noise_px
+    noise = best.noise(POSE_PARAMETERS) if noise_px is None else noise_px
     covariance = best.covariance(max(noise, 1e-300))
     if not np.sqrt(np.trace(covariance[:3, :3])) <= MAX_ROTATION_DEVIATION:
         raise ValueError(
-            f"expected points that determine a pose, got some that leave its rotation open at a noise of {noise:.3g} "
-            "px: nearly on one line, too near to each other, or pairs that do not belong together; add points, or "
-            "look at the pairs."
+            "expected points that determine a pose, got some that do not determine its rotation at a noise of "
+            f"{noise:.3g} px: they are nearly on one line, too near to each other, or paired wrongly; add points, or "
+            "check the pairs."
         )
     rounding = consensus.rounding_of(x)
     others = tuple(
@@ -174,7 +239,7 @@ def _fitted(X: Array, x: Array, camera: Intrinsics, noise_px: float | None) -> C
 
 
 def _from_middle(found: CameraPose, middle: Array) -> CameraPose:
-    """The pose for the points as given, of the one for points moved by -middle (3,)."""
+    """The pose for the points as given, from the pose that was found for points moved by -middle (3,), metres."""
 
     def shifted(T: Array) -> Array:
         result = T.copy()
@@ -193,6 +258,7 @@ def _from_middle(found: CameraPose, middle: Array) -> CameraPose:
 
 
 def _checked(points: ArrayLike, pixels: ArrayLike, camera: Intrinsics, least: int) -> tuple[Array, Array]:
+    """Points (n, 3) and pixels (n, 2) as float64; ValueError unless `least` of each differ and the lens shows all."""
     X, x = checked_array("points", points, None, 3), checked_array("pixels", pixels, None, 2)
     if X.ndim != 2 or x.shape != (len(X), 2):
         raise ValueError(f"expected points (n, 3) and as many pixels (n, 2), got {X.shape} and {x.shape}.")
@@ -201,21 +267,24 @@ def _checked(points: ArrayLike, pixels: ArrayLike, camera: Intrinsics, least: in
     beyond = int(np.count_nonzero(~np.isfinite(camera.normalise(x)).all(axis=-1)))
     if beyond:
         raise ValueError(
-            f"expected pixels that a ray through the lens reaches, got {beyond} beyond its fold; leave them out."
+            f"expected pixels that a ray through the lens reaches, got {beyond} beyond its fold, where the distortion "
+            "turns back; leave them out."
         )
     return X, x
 
 
 def _refuse_chance(agreeing: int, pixels: Array, threshold: float) -> None:
+    """Raise ValueError if no more pairs agree with one pose, within `threshold` pixels, than chance explains."""
     area, _ = consensus.bounding_area(pixels)
     if consensus.agree_by_chance(agreeing, len(pixels), 3, np.pi * threshold**2 / area):
         raise ValueError(
             f"expected the image of points in one pose, got {len(pixels)} pairs of which at most {agreeing} agree, no "
-            "more than chance; the pairs are wrong, or the camera or noise_px is."
+            "more than chance; the pairs, the camera or noise_px are wrong."
         )
 
 
 def _moved(T: Array, delta: Array) -> Array:
+    """The pose T (4, 4) moved by a step (6,): a rotation vector applied after R, rad, and a translation, metres."""
     result = T.copy()
     result[:3, :3] = Rotation.from_rotvec(delta[:3]).as_matrix() @ T[:3, :3]
     result[:3, 3] = T[:3, 3] + delta[3:]
@@ -223,7 +292,10 @@ def _moved(T: Array, delta: Array) -> Array:
 
 
 def _residuals(T: Array, X: Array, x: Array, camera: Intrinsics) -> tuple[Array, Array]:
-    """(2n,) reprojection errors in pixels, and (2n, 6) their derivatives by the step of `_moved`."""
+    """(2n,) reprojection errors in pixels and their (2n, 6) derivatives by the step of `_moved`.
+
+    Points that do not appear in the image have an infinite error.
+    """
     turned = X @ T[:3, :3].T
     pixels, by_point, appears = reproject(camera, turned + T[:3, 3])
     off = pixels - x
@@ -234,21 +306,21 @@ def _residuals(T: Array, X: Array, x: Array, camera: Intrinsics) -> tuple[Array,
 
 
 def _errors(T: Array, X: Array, x: Array, camera: Intrinsics) -> Array:
-    """(n,) distances in pixels; infinite behind the camera."""
+    """(n,) reprojection errors in pixels; infinite for points behind the camera."""
     with np.errstate(invalid="ignore", over="ignore"):
         errors = np.linalg.norm(camera.project(X @ T[:3, :3].T + T[:3, 3]) - x, axis=-1)
     return np.nan_to_num(errors, copy=False, nan=np.inf, posinf=np.inf)
 
 
-def _is_same(T: Array, other: Array, tolerance: float = 1e-3) -> bool:
-    """Whether two poses differ by less than the tolerance, in radians and relative to the distance."""
+def _is_same(T: Array, other: Array, tolerance: float) -> bool:
+    """Whether two poses differ by less than the tolerance, in radians and as a ratio to the distance."""
     apart = np.linalg.norm(T[:3, 3] - other[:3, 3]) / np.linalg.norm(other[:3, 3])
     turned = np.linalg.norm(T[:3, :3] - other[:3, :3])  # Frobenius: 2 sqrt(2) sin(angle / 2)
     return bool(turned < math.sqrt(8) * math.sin(tolerance / 2) and apart < tolerance)
 
 
 def _starting_poses(X: Array, x: Array, camera: Intrinsics, is_planar: bool) -> list[Array]:
-    """Poses (4, 4) with all points in front of the camera, the best of what OpenCV's solvers find."""
+    """Poses (4, 4) with all points in front of the camera: the best `STARTS` that OpenCV's solvers find."""
     import cv2
 
     K, none, ideal = calibration_matrix(camera), np.zeros(5), ideal_pixels(camera, x)
@@ -279,7 +351,7 @@ def _starting_poses(X: Array, x: Array, camera: Intrinsics, is_planar: bool) -> 
     cost = np.array([(_errors(T, X, x, camera) ** 2).sum() for T in poses])
     starts: list[Array] = []
     for T in poses[np.argsort(cost, kind="stable")[: np.isfinite(cost).sum()]]:
-        if not any(_is_same(T, other, 0.03) for other in starts):
+        if not any(_is_same(T, other, SAME_START) for other in starts):
             starts.append(T)
         if len(starts) == STARTS:
             break

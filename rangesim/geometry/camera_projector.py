@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Projector coordinates to depth: where a camera ray meets the projector's light plane, or comes nearest to its ray.
+"""Depth from projector coordinates: where a camera ray meets the projector's light plane, or comes nearest to its ray.
 
-The ray of a camera pixel is known: the pixel is where its light was measured. What has an error is the projector
-coordinate decoded there. So the optimal triangulation of camera and projector moves the projector coordinate alone,
-to the nearest place on the ray's epipolar line; that of two cameras, which shares the correction between both views
-(`two_view_triangulation`), would give the depth of a ray that was not measured.
+The ray of a camera pixel is exact, because the pixel is the place where its light was measured. The projector
+coordinate decoded there has an error. So the optimal triangulation of camera and projector moves only the projector
+coordinate, to the nearest place on the epipolar line of the ray. The optimal triangulation of two cameras
+(`two_view_triangulation`) moves the pixels in both views; here it would give the depth of a ray that was not measured.
+
+Used by: rangesim.decoding.triangulate.
 """
 
 from __future__ import annotations
@@ -15,20 +17,38 @@ import numpy as np
 
 from rangesim.rig import Intrinsics, Rig
 
-ITERATIONS = 20
-"""Iterations, at most, that find the undecoded projector coordinate, which matters through the lens distortion only."""
+MAX_ITERATIONS = 20
+"""Largest number of iterations for the projector coordinate that was not decoded. It matters only through the lens
+distortion, so that a few iterations usually converge; the limit ends those of pixels that never do."""
+
 CONVERGED_PX = 1e-4
+"""Largest change of that coordinate, in projector pixels, at which the iterations end. A smaller change does not
+matter, because the noise of a decoded coordinate is far larger."""
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectorTriangulation:
-    """z : (n,) float64, metres, camera coordinates; NaN if not in front of both devices.
+    """Depths of camera rays from projector coordinates, with their sensitivity to errors.
 
-    epipolar_px : (n,) float64, distance in projector pixels between the decoded and the reprojected
-        coordinate, to the epipolar line; zero if only one axis was decoded.
-    relative_error : (n,) float64, error of z as a fraction of z that one projector pixel of error means, |dz/dx_p| / z.
-    behind_px : (n,) float64, where the rays meet behind a device, about how many projector pixels the coordinate is
-        from one that would make them parallel; 0 elsewhere.
+    Attributes
+    ----------
+    z : (n,) float64, depth in camera coordinates, metres; NaN where the point is not in front of both devices.
+    epipolar_px : (n,) float64, distance in projector pixels from the decoded coordinate to the epipolar line; 0 if only
+        one axis was decoded.
+    relative_error : (n,) float64, error of z, as a fraction of z, that an error of one projector pixel causes:
+        |dz / dx_p| / z, in 1 / px.
+    behind_px : (n,) float64, where the rays meet behind a device, the approximate distance in projector pixels from the
+        coordinate to one that would make them parallel; 0 elsewhere.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.rig import Intrinsics, Rig, translation
+    >>> device = Intrinsics(640, 480, 800, 800, 320, 240)
+    >>> rig = Rig(device, device, np.eye(4), translation(0.2, 0, 0))  # the projector stands 0.2 m to the right
+    >>> found = triangulate_coordinates(np.array([[0.0, 0.0, 1.0]]), rig, column=np.array([160.0]), row=None)
+    >>> found.z, found.relative_error
+    (array([1.]), array([0.00625]))
     """
 
     z: np.ndarray
@@ -42,23 +62,36 @@ def triangulate_coordinates(
 ) -> ProjectorTriangulation:
     """Depth of camera rays from projector coordinates.
 
-    With a = R^T d and b = -R^T t (camera ray d and camera centre in projector coordinates), the point at depth
-    z projects to x_p = (a_x + w b_x) / (a_z + w b_z) at inverse depth w = 1/z: the epipolar line through a and b.
-    Column x_p and row y_p each give an equation linear in w (ray meets plane). With both, they are first moved to the
-    nearest place on the line, in projector pixels, where the two equations agree: the maximum likelihood for errors
-    of one size in column and row. The relative error is z / |dx_p/dw| with dx_p/dw = f (b_x - x_p b_z) / (a_z + w
-    b_z), axes in quadrature (lens distortion left out).
+    Let a = R^T d be the camera ray d and b = -R^T t the camera centre, both in projector coordinates. The point at
+    depth z has the inverse depth w = 1 / z and projects to x_p = (a_x + w b_x) / (a_z + w b_z): a point of the epipolar
+    line through a and b. The column x_p and the row y_p each give one linear equation for w, that of a ray that meets a
+    plane. If both are given, they are first moved to the nearest place on the epipolar line, in projector pixels,
+    where the two equations agree. This is the maximum likelihood for errors of the same size in column and row.
+
+    The relative error is z / |dx_p/dw| with dx_p/dw = f (b_x - x_p b_z) / (a_z + w b_z), both axes added in quadrature,
+    without the lens distortion.
 
     Parameters
     ----------
-    directions : (n, 3) float64, camera rays with z = 1 (lens distortion already undone), camera coordinates.
-    column, row : (n,) float, projector pixel coordinates, pixel centres at integer + 0.5; None where not
+    directions : (n, 3) float64, camera rays with z = 1 in camera coordinates, lens distortion already removed.
+    rig : Rig, for the projector's intrinsics and `T_camera_projector`.
+    column, row : (n,) float, projector pixel coordinates, pixel centres at integer + 0.5; None for an axis that was not
         coded.
 
     Raises
     ------
     ValueError
         Neither axis is given.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.rig import Intrinsics, Rig, translation
+    >>> device = Intrinsics(640, 480, 800, 800, 320, 240)
+    >>> rig = Rig(device, device, np.eye(4), translation(0.2, 0, 0))
+    >>> rays = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]])
+    >>> triangulate_coordinates(rays, rig, column=np.array([160.0, 320.0]), row=None).z
+    array([1., 2.])
     """
     if column is None and row is None:
         raise ValueError("expected projector columns, rows or both, got neither.")
@@ -68,7 +101,7 @@ def triangulate_coordinates(
     both = column is not None and row is not None
     u = np.full(len(directions), projector.cx) if column is None else np.asarray(column, dtype=np.float64)
     v = np.full(len(directions), projector.cy) if row is None else np.asarray(row, dtype=np.float64)
-    rounds = 1 if both or not any(projector.distortion) else ITERATIONS
+    rounds = 1 if both or not any(projector.distortion) else MAX_ITERATIONS
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for _ in range(rounds):
             x, y = projector.normalise(np.stack([u, v], axis=-1)).T
@@ -95,7 +128,10 @@ def triangulate_coordinates(
 def _on_epipolar_line(
     a: np.ndarray, b: np.ndarray, x: np.ndarray, y: np.ndarray, projector: Intrinsics
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) x and y moved to the nearest place, in projector pixels, on the lines a cross b of rays a (3, n)."""
+    """(n,) x and y, each moved to the nearest place on its epipolar line, nearest in projector pixels.
+
+    x, y (n,) are normalised projector coordinates. The lines are a cross b, with rays a (3, n) and centre b (3,).
+    """
     line_x, line_y = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
     rest = a[0] * b[1] - a[1] * b[0]
     off = line_x * x + line_y * y + rest
@@ -105,14 +141,17 @@ def _on_epipolar_line(
 
 
 def _point(a: np.ndarray, b: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """(3, n) a + w b, times depth the points in projector coordinates."""
+    """(3, n) a + w b, which is w times the points in projector coordinates; w (n,) is their inverse depth."""
     return a + w * b[:, None]
 
 
 def _inverse_depth(
     a: np.ndarray, b: np.ndarray, x: np.ndarray | None, y: np.ndarray | None, projector: Intrinsics
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) w of the linear equations w (b_x - x b_z) = x a_z - a_x, in projector pixels; norm of their slopes."""
+    """(n,) inverse depth w from the linear equations w (b_x - x b_z) = x a_z - a_x, and the norm (n,) of their slopes.
+
+    The equations of both axes are weighted as errors in projector pixels. A coordinate x or y of None has no equation.
+    """
     numerator, denominator = np.zeros(a.shape[1]), np.zeros(a.shape[1])
     for axis, coordinate, focal in ((0, x, projector.fx), (1, y, projector.fy)):
         if coordinate is not None:
@@ -125,7 +164,10 @@ def _inverse_depth(
 def _complete(
     point: np.ndarray, projector: Intrinsics, u: np.ndarray, v: np.ndarray, columns_missing: bool
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """(u, v), the undecoded one from projecting `point` (3, n), projector coordinates; and its largest change."""
+    """Both projector pixel coordinates (u, v), and the largest change of the one that was not decoded, in pixels.
+
+    That one is found by projecting `point` (3, n), in projector coordinates.
+    """
     old = u if columns_missing else v
     new = projector.project(point.T)[:, 0 if columns_missing else 1]
     new = np.where(np.isfinite(new), new, old)

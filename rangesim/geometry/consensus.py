@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which correspondences agree with a model, whether more do than chance explains, and whether a simpler model would do.
+"""Statistical tests of robust estimates: inliers, agreement by chance, degenerate data, residuals against the noise.
 
-OpenCV's USAC (a RANSAC with local optimisation) proposes a model of data with outliers. What this adds is the
-judgement: `agree_by_chance` after Moisan and Stival ("A probabilistic criterion to detect rigid point matches between
-two images", IJCV 2004), and `simpler_model_suffices`, the F test of nested models, which finds degenerate data by the
-noise that they have instead of a threshold in pixels.
+OpenCV's USAC (a RANSAC with local optimisation) proposes a model for data with outliers. This module judges it.
+`agree_by_chance` follows Moisan and Stival ("A probabilistic criterion to detect rigid point matches between two
+images", IJCV 2004). `simpler_model_suffices` is the chi^2 or F test of nested models: it finds degenerate data by their
+noise and needs no threshold in pixels.
+
+Used by: rangesim.geometry.homography, two_view and camera_pose; rangesim.calibration.suspects;
+rangesim.multiview.bundle_adjustment, factorisation, incremental_reconstruction and nonrigid.
 """
 
 from __future__ import annotations
@@ -20,18 +23,28 @@ from rangesim.geometry.correspondences import ROUNDING, Array
 Model = TypeVar("Model")
 
 INLIER_PROBABILITY = 0.99
-"""Of a correct correspondence to count as one."""
+"""Probability that a correct correspondence counts as an inlier, as a fraction. It sets the threshold of the error and
+was chosen as a compromise: a smaller value loses correct pairs, a larger one lets more wrong pairs in."""
+
 SIGNIFICANCE = 1e-5
-"""Probability of taking degenerate data for sound ones, or chance for a model. Of planes and rotations it is an
-ideal: an F fits their noise better than its parameters say, and up to 5 times 1e-3 of them pass a test at 1e-3
-(measured)."""
+"""Probability, as a fraction, with which a test may take degenerate data for sound data, or chance for a model. For
+planes and rotations it is only nominal, because a fundamental matrix fits their noise better than its number of
+parameters says: at a level of 1e-3, up to five times as many passed (measured)."""
+
 MAX_ROUNDS = 20
+"""Largest number of times that a model is fitted and its inliers are chosen again. Sets that stay or return end sooner,
+so this is only a bound for sets that keep changing."""
+
 MAX_EXCESS = 3.0
-"""Times the stated noise that residuals may be."""
+"""Largest ratio of the residuals to the stated noise. Nobody measured it: three times leaves room for a noise that is
+stated too small, and larger residuals come from wrong pairs, which no covariance accounts for."""
 
 
 def usac(threshold_px: float, seed: int) -> Any:
-    """Settings of OpenCV's robust estimators: a fixed random state, so that the same data give the same model."""
+    """Settings for OpenCV's robust estimators.
+
+    The random state is fixed by `seed` and threads are off, so that the same data give the same model.
+    """
     import cv2
 
     settings = cv2.UsacParams()
@@ -47,7 +60,13 @@ def usac(threshold_px: float, seed: int) -> Any:
 
 
 def inlier_threshold(noise_px: float, dimensions: int) -> float:
-    """Pixels; error of `dimensions` coordinates with that noise that a correct correspondence exceeds once in 100."""
+    """The error in pixels that a correct correspondence exceeds once in 100 times.
+
+    Parameters
+    ----------
+    noise_px : standard deviation of one coordinate.
+    dimensions : number of coordinates that the error is the length of.
+    """
     return float(noise_px * np.sqrt(special.chdtri(dimensions, 1.0 - INLIER_PROBABILITY)))
 
 
@@ -58,12 +77,17 @@ def consistent_set(
     error: Callable[[Model], Array],
     least: int,
 ) -> tuple[Model, np.ndarray]:
-    """The model of the inliers, and the inliers of the model: fitted and chosen in turns until the set stays.
+    """A model and its (n,) bool inliers that agree: the fit to the inliers has these inliers.
+
+    Model and inliers are found in turns until the set of inliers no longer changes.
 
     Parameters
     ----------
-    inliers : (n,) bool, to start with. threshold : of the errors. least : inliers that a fit takes.
-    fit : (n,) bool -> model. error : model -> (n,) errors of all correspondences; NaN or infinite is none.
+    inliers : (n,) bool, the first set.
+    threshold : largest error of an inlier, in the unit of `error`.
+    fit : returns the model of an (n,) bool set.
+    error : returns the (n,) errors of all correspondences under a model; those with NaN or infinity are no inliers.
+    least : smallest number of inliers that a fit takes.
     """
     model = fit(inliers)
     seen = {inliers.tobytes()}
@@ -77,11 +101,11 @@ def consistent_set(
 
 
 def agree_by_chance(agreeing: int, total: int, minimal: int, probability: float) -> bool:
-    """Whether `agreeing` of `total` correspondences are no more than the best model of wrong ones would get.
+    """Whether `agreeing` of `total` correspondences are no more than the best model of wrong correspondences has.
 
-    A model through `minimal` of them fits these exactly, and each other one by accident with `probability`. Over all
-    choices of the minimal set, C(total, minimal) P(at least agreeing - minimal) models like this are expected of
-    noise alone; more than `SIGNIFICANCE` of them is chance.
+    A model through a minimal set of `minimal` correspondences fits these exactly. It fits each other, wrong one by
+    accident with the given probability. Noise alone lets C(total, minimal) P(at least agreeing - minimal) such models
+    be expected over all minimal sets. If that number exceeds `SIGNIFICANCE`, the agreement may be chance.
     """
     if agreeing <= minimal:
         return True
@@ -91,34 +115,41 @@ def agree_by_chance(agreeing: int, total: int, minimal: int, probability: float)
 
 
 def _log_choose(n: int, k: int) -> float:
+    """Natural logarithm of the binomial coefficient "n choose k"."""
     return float(np.log(np.arange(n - k + 1, n + 1) / np.arange(1, k + 1)).sum())
 
 
 def chi2_limit(freedom: int) -> float:
-    """What chi^2 of that many degrees of freedom exceeds by chance with a probability of `SIGNIFICANCE`; NaN, below
-    which nothing is, of none."""
+    """The value that chi^2 with `freedom` degrees of freedom exceeds with probability `SIGNIFICANCE`.
+
+    Without degrees of freedom it is NaN, so that no comparison with it is true.
+    """
     return float(special.chdtri(freedom, SIGNIFICANCE)) if freedom > 0 else np.nan
 
 
 def _f_limit(more: int, rest: int) -> float:
-    """The same of F of so many degrees of freedom, of its numerator and denominator."""
+    """The value that F exceeds with probability `SIGNIFICANCE`.
+
+    F has `more` degrees of freedom in its numerator and `rest` in its denominator.
+    """
     return float(special.fdtri(more, rest, 1.0 - SIGNIFICANCE))
 
 
 def simpler_model_suffices(
     simple: tuple[float, int], full: tuple[float, int], noise_px: float | None, rounding: float
 ) -> bool:
-    """Whether data do not reject a simpler model that a fuller one contains: the fuller one is not determined then.
+    """Whether the data fit a simpler model, which the full model contains; the full model is then not determined.
 
-    With known noise, the simple model's sum of squares over the variance follows chi^2 of its degrees of freedom.
-    Without, the rise of the sum of squares over what the full model leaves follows F. It is rejected where such a
-    value has a probability below `SIGNIFICANCE`.
+    If the noise is known, the simple model's sum of squares over the variance follows chi^2 with its degrees of
+    freedom. If it is unknown, the increase of the sum of squares over that of the full model follows F. The simple
+    model is rejected where its value has a probability below `SIGNIFICANCE`.
 
     Parameters
     ----------
-    simple, full : sum of squares in px^2, and degrees of freedom: residuals less parameters. Infinite: it does not
-        fit at all, and leaves nothing to tell the noise from.
-    rounding : px; residuals below are none.
+    simple, full : sum of squares in px^2, and degrees of freedom: the number of residuals less that of parameters. An
+        infinite sum means that the model does not fit at all; the noise can then not be estimated from it.
+    noise_px : standard deviation of a coordinate; None if it is unknown.
+    rounding : smaller residuals than this, in pixels, count as 0.
     """
     floor = rounding**2
     cost, freedom = simple
@@ -135,10 +166,10 @@ def simpler_model_suffices(
 
 
 def is_as_likely(cost: float, least: float, freedom: int, noise_px: float | None, rounding: float) -> bool:
-    """Whether data do not reject a model with a sum of squares `cost` beside the best one of its kind, with `least`.
+    """Whether the data also fit a second model of the same kind, with a sum of squares `cost` above the best, `least`.
 
-    Two such models, as the two poses of a plane, look at different components of the noise, so that their sums of
-    squares are nearly independent: the test is chi^2, or F if the noise is unknown, of all degrees of freedom.
+    Two such models, for example the two poses of a plane, see different components of the noise, so that their sums of
+    squares are nearly independent. The test is chi^2 with all degrees of freedom, or F if the noise is unknown.
     """
     if noise_px is not None:
         return bool(cost / noise_px**2 <= chi2_limit(freedom))
@@ -146,11 +177,11 @@ def is_as_likely(cost: float, least: float, freedom: int, noise_px: float | None
 
 
 def odds_are_open(cost: float, least: float, freedom: int, noise_px: float | None, rounding: float) -> bool:
-    """Whether a model with a sum of squares `cost` has posterior odds above `SIGNIFICANCE` against the one with
-    `least`.
+    """Whether the posterior odds of a second model against the best one exceed `SIGNIFICANCE`.
 
-    exp(-(cost - least) / 2 variance) with known noise; without, (least / cost)^(freedom / 2), that of the profile
-    likelihood. For two models of the same data without points in space to be found along with them.
+    The second model has the sum of squares `cost`, the best one `least`. The odds are exp(-(cost - least) / 2 variance)
+    if the noise is known, and (least / cost)^(freedom / 2), those of the profile likelihood, if it is unknown. This
+    holds for models that do not also estimate points in space.
     """
     if noise_px is not None:
         log_odds = -(cost - least) / (2 * noise_px**2)
@@ -161,34 +192,37 @@ def odds_are_open(cost: float, least: float, freedom: int, noise_px: float | Non
 
 
 def refuse_misfit(cost: float, freedom: int, noise_px: float | None, model: str) -> None:
-    """Raise ValueError if residuals are over three times the noise that was stated, and not by accident.
+    """Raise ValueError if the residuals are over three times the stated noise and chance does not explain it.
 
     Parameters
     ----------
-    cost, freedom : sum of squares in px^2 of what the model leaves, and its degrees of freedom.
+    cost : sum of squares of the residuals in px^2.
+    freedom : degrees of freedom: the number of residuals less that of parameters.
+    noise_px : standard deviation of a coordinate; None if it is unknown, which is never refused.
+    model : name of the model for the message.
     """
     if noise_px is None or freedom <= 0:
         return
     excess = cost / noise_px**2
     if excess > MAX_EXCESS**2 * freedom and excess > chi2_limit(freedom):
         raise ValueError(
-            f"expected pairs that {model} explains to their noise of {noise_px:.3g} px, got residuals of "
-            f"{np.sqrt(cost / freedom):.3g} px; some pairs are wrong (find them by the robust function), or noise_px "
-            "is."
+            f"expected pairs that {model} explains within their noise of {noise_px:.3g} px, got residuals of "
+            f"{np.sqrt(cost / freedom):.3g} px; some pairs are wrong (the robust function finds them), or noise_px "
+            "is too small."
         )
 
 
 def spread(points: Array) -> float:
-    """Extent of points (n, d): the root mean square of their distances from their centroid."""
+    """Extent of points (n, d), in their unit: the root mean square of their distances from their centroid."""
     return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=-1).mean()))
 
 
 def rounding_of(points: Array) -> float:
-    """Pixels; residuals of points (n, 2) that are rounding."""
+    """The size in pixels up to which residuals of points (n, 2) are rounding."""
     return ROUNDING * max(spread(points), float(np.abs(points).max()) * 1e-3)
 
 
 def bounding_area(points: Array) -> tuple[float, float]:
-    """Area and diagonal of the bounding box of points (n, 2): where a wrong correspondence may lie."""
+    """Area in px^2 and diagonal in px of the bounding box of points (n, 2), where a wrong correspondence may lie."""
     size = np.ptp(points, axis=0)
     return float(max(size.prod(), 1e-300)), float(np.hypot(*size))

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of the arrays that come in, and the coordinates in which linear equations of points are well conditioned.
+"""Checks of input arrays, and normalised coordinates in which linear equations of points are well conditioned.
 
-Points are pixel coordinates with pixel centres at integer + 0.5, as everywhere in rangesim. Nothing in this package
-depends on where zero lies, as long as points and calibration matrices agree; only images do (`stereo`).
+Points are pixel coordinates with pixel centres at integer + 0.5, as everywhere in rangesim. This convention does not
+matter in this package as long as points and calibration matrices use the same one; only images depend on it (`stereo`).
+
+Used by: every other module of rangesim.geometry except camera_projector; every module of rangesim.multiview;
+rangesim.calibration.bundle, rendered, rig_calibration, suspects, time_of_flight and zhang.
 """
 
 from __future__ import annotations
@@ -15,19 +18,28 @@ from numpy.typing import ArrayLike, NDArray
 from rangesim.settings.config import shown
 
 Array = NDArray[np.floating[Any]]
+"""An array of floating-point numbers, float64 unless a docstring says otherwise."""
 
 ROUNDING = 1e-9
-"""Relative size below which a number is rounding: of singular values, and of residuals in units of the points'
-spread."""
+"""Ratio below which a number counts as rounding: a singular value relative to the largest one, or a residual relative
+to the spread of the points. Solving can lose about half of the 16 digits of double precision, and the noise of measured
+pixels is far larger than 1e-9 of an image. A larger value refuses sound data; a smaller one lets degenerate exact data
+pass."""
 
 
 def checked_array(name: str, value: ArrayLike, *shape: int | None) -> Array:
-    """`value` as float64 with finite numbers, whose last dimensions are `shape`; None stands for any length.
+    """`value` as a float64 array of finite numbers, whose last dimensions are `shape`; None stands for any length.
 
     Raises
     ------
     ValueError
-        It is no array of numbers, of another shape, or holds NaN or infinity.
+        `value` is not an array of numbers, has another shape, or holds NaN or infinity.
+
+    Examples
+    --------
+    >>> checked_array("points", [[1, 2], [3, 4]], None, 2)
+    array([[1., 2.],
+           [3., 4.]])
     """
     wanted = "(..., " + ", ".join("n" if length is None else str(length) for length in shape) + ")"
     try:
@@ -44,12 +56,13 @@ def checked_array(name: str, value: ArrayLike, *shape: int | None) -> Array:
 
 
 def checked_pairs(first: ArrayLike, second: ArrayLike, least: int, purpose: str) -> tuple[Array, Array]:
-    """Corresponding points (n, 2) and (n, 2) float64, finite, at least `least` different ones in each image.
+    """Both arrays of corresponding points as (n, 2) float64, after a check of their shapes and their number.
 
     Raises
     ------
     ValueError
-        They are not that; the message says what `purpose` needs them.
+        The arrays are not finite or do not correspond, or an image has fewer than `least` different points. The message
+        names the `purpose` that needs them.
     """
     a, b = checked_array("first", first, None, 2), checked_array("second", second, None, 2)
     if a.ndim != 2 or a.shape != b.shape:
@@ -60,7 +73,7 @@ def checked_pairs(first: ArrayLike, second: ArrayLike, least: int, purpose: str)
 
 
 def check_distinct(name: str, points: Array, least: int, purpose: str) -> None:
-    """Raise ValueError unless `least` of the points (n, d) differ from each other."""
+    """Raise ValueError unless at least `least` of the points (n, d) differ from each other."""
     if len(points) < least:
         raise ValueError(f"expected at least {least} points for {purpose}, got {len(points)} in {name}.")
     different = len(np.unique(points, axis=0))
@@ -72,7 +85,7 @@ def check_distinct(name: str, points: Array, least: int, purpose: str) -> None:
 
 
 def check_noise(noise_px: float | None) -> None:
-    """Raise ValueError unless the standard deviation of a coordinate is positive, or None for unknown."""
+    """Raise ValueError unless the standard deviation of a coordinate is positive, or None, which means unknown."""
     if noise_px is not None and not (np.isfinite(noise_px) and noise_px > 0):
         raise ValueError(
             f"expected noise_px, the standard deviation of a coordinate, to be positive, got {noise_px!r}."
@@ -80,9 +93,9 @@ def check_noise(noise_px: float | None) -> None:
 
 
 def normalising_transform(points: Array) -> Array:
-    """(..., 3, 3) similarity that moves the centroid of points (..., n, 2) to 0 and their mean distance to sqrt(2).
+    """(..., 3, 3) float64 similarity after which points (..., n, 2) have centroid 0 and mean distance sqrt(2) from it.
 
-    In these coordinates the entries of the design matrices of homographies and fundamental matrices are of one size,
+    In these coordinates the entries of the design matrices of homographies and fundamental matrices have similar sizes,
     and the linear solution becomes usable (Hartley: "In defense of the eight-point algorithm", PAMI 1997).
     """
     centre = points.mean(axis=-2)
@@ -96,19 +109,20 @@ def normalising_transform(points: Array) -> Array:
 
 
 def apply_similarity(transform: Array, points: Array) -> Array:
-    """(..., n, 2) points under a transform (..., 3, 3) of `normalising_transform`."""
+    """(..., n, 2) images of points under a transform (..., 3, 3) that `normalising_transform` returned."""
     return np.asarray(points * transform[..., 0, 0][..., None, None] + transform[..., None, :2, 2])
 
 
 def unit_norm(matrix: Array) -> Array:
-    """A matrix (..., r, c) that stands for its multiples, divided by its Frobenius norm."""
+    """Matrices (..., r, c) divided by their Frobenius norm; for matrices whose scale has no meaning."""
     return np.asarray(matrix / np.linalg.norm(matrix, axis=(-2, -1), keepdims=True))
 
 
 def right_singular_vectors(matrix: Array) -> tuple[Array, Array]:
     """Singular values (..., min(m, k)), largest first, and all right singular vectors (..., k, k) of (..., m, k).
 
-    NumPy's full decomposition would also make the m left ones of m entries each: gigabytes for some thousand points.
+    The full decomposition of NumPy would also compute the m left singular vectors with m entries each, which takes
+    gigabytes for some thousand points.
     """
     rows, columns = matrix.shape[-2:]
     _, values, axes = np.linalg.svd(matrix, full_matrices=rows < columns)
@@ -116,9 +130,10 @@ def right_singular_vectors(matrix: Array) -> tuple[Array, Array]:
 
 
 def covariance_of_unit_norm(matrix: Array, linear_map: Array, covariance: Array) -> Array:
-    """(9, 9) covariance of the unit-norm matrix L m, of the row-major vector m with covariance C: J L C L^T J^T.
+    """(9, 9) float64 covariance of L m / |L m|, the linear image of a matrix scaled to unit norm.
 
-    J = (I - u u^T) / |L m| with u = L m / |L m| takes out the scale, so the covariance has a null vector, u itself.
+    m is the row-major vector of the matrix (3, 3), L the linear map (9, 9) and C the covariance (9, 9) of m. The result
+    is J L C L^T J^T, where J = (I - u u^T) / |L m| with u = L m / |L m| removes the scale. So u is a null vector of it.
     """
     vector = linear_map @ matrix.ravel()
     norm = np.linalg.norm(vector)

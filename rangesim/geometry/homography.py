@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Homographies x' = H x from corresponding points: linear, of maximum likelihood, robust; with covariance.
+"""Homographies x' = H x from corresponding points: linear, maximum-likelihood and robust estimates, with covariance.
 
-Each pair gives two equations, x' cross H x = 0, and H has 8 degrees of freedom: four pairs with no three collinear.
-Hartley, Zisserman: "Multiple View Geometry in Computer Vision", 2nd edition 2004 (HZ), chapters 4 and 5.
+Each pair gives two equations, x' cross H x = 0, and H has 8 degrees of freedom. So four pairs with no three collinear
+points determine H. Source: Hartley, Zisserman: "Multiple View Geometry in Computer Vision", 2nd edition 2004 (HZ),
+chapters 4 and 5.
+
+Used by: rangesim.geometry.two_view; rangesim.calibration.rig_calibration and zhang.
 """
 
 from __future__ import annotations
@@ -30,19 +33,38 @@ from rangesim.geometry.correspondences import (
 )
 from rangesim.geometry.least_squares import Minimum, minimise
 
-PARAMETERS = 8
-COLLINEAR = 1e-7
-"""Distance from a line, relative to the spread of the points, that is rounding."""
+HOMOGRAPHY_PARAMETERS = 8
+"""Number of degrees of freedom of a homography: 9 entries of H less its scale; source: HZ table 2.4."""
+
+COLLINEAR_FRACTION = 1e-7
+"""Distance from a line, as a fraction of the spread of the points, up to which a point without noise lies on it. It is
+far above the rounding of pixels in double precision, 1e-16, and far below any noise of measured points, which is tested
+by chi^2 instead."""
+
 Noisy = Literal["second", "both"]
+"""The images whose points have noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class Homography:
-    """A homography x' = H x and how well it is known.
+    """A homography x' = H x, with its covariance.
 
-    matrix : (3, 3) float64, Frobenius norm 1, determinant positive. covariance : (9, 9) float64 of `matrix`, row by
-    row, rank 8 (its scale is fixed); NaN if the noise is unknown. noise_px : standard deviation of one coordinate of
-    the points, as given, or as the residuals say; NaN with four pairs, which leave none. inliers : (n,) bool.
+    Attributes
+    ----------
+    matrix : (3, 3) float64, H with Frobenius norm 1 and positive determinant.
+    covariance : (9, 9) float64, covariance of the entries of `matrix`, row by row; rank 8, because its norm is fixed.
+        NaN if the noise is unknown.
+    noise_px : standard deviation of one coordinate of the points, as given, or estimated from the residuals. NaN with
+        four pairs, which leave no residuals.
+    inliers : (n,) bool, the pairs that agree with H.
+
+    Examples
+    --------
+    >>> found = fit_homography([[0, 0], [9, 0], [9, 9], [0, 9]], [[1, 2], [19, 2], [19, 20], [1, 20]], noise_px=0.1)
+    >>> (found.matrix / found.matrix[2, 2]).round(6) + 0.0
+    array([[2., 0., 1.],
+           [0., 2., 2.],
+           [0., 0., 1.]])
     """
 
     matrix: Array
@@ -51,17 +73,20 @@ class Homography:
     inliers: np.ndarray
 
     def transfer_covariance(self, points: ArrayLike) -> Array:
-        """(n, 2, 2) covariance in px^2 of where `points` (n, 2) are mapped to, by the uncertainty of H alone (HZ
-        5.12)."""
+        """(n, 2, 2) float64 covariance in px^2 of the images of `points` (n, 2) due to the covariance of H (HZ 5.12).
+
+        The noise of the points themselves is not included.
+        """
         first = checked_array("points", points, None, 2)
         _, by_matrix, _ = _transfer(self.matrix, first)
         return np.asarray(by_matrix @ self.covariance @ np.swapaxes(by_matrix, -1, -2))
 
 
 def homography_dlt(first: ArrayLike, second: ArrayLike) -> Array:
-    """(..., 3, 3) homographies of unit norm by the normalised direct linear transform (HZ algorithm 4.2), batched.
+    """(..., 3, 3) float64 homographies of unit norm by the normalised direct linear transform (HZ algorithm 4.2).
 
-    Minimises |A h| with two rows of A for each pair, in coordinates with mean distance sqrt(2) from the centroid.
+    It minimises |A h|, where each pair gives two rows of A, in coordinates whose mean distance from the centroid is
+    sqrt(2). Leading dimensions are a batch of independent sets.
 
     Parameters
     ----------
@@ -70,7 +95,16 @@ def homography_dlt(first: ArrayLike, second: ArrayLike) -> Array:
     Raises
     ------
     ValueError
-        Fewer than four pairs, NaN, or a set that does not determine H: repeated points, three of four collinear.
+        There are fewer than four pairs, a coordinate is NaN, or a set does not determine H: points are repeated, or
+        three of four are collinear.
+
+    Examples
+    --------
+    >>> H = homography_dlt([[0, 0], [9, 0], [9, 9], [0, 9]], [[1, 2], [19, 2], [19, 20], [1, 20]])
+    >>> (H / H[2, 2]).round(6) + 0.0
+    array([[2., 0., 1.],
+           [0., 2., 2.],
+           [0., 0., 1.]])
     """
     a, b = checked_array("first", first, None, 2), checked_array("second", second, None, 2)
     if a.shape != b.shape:
@@ -82,7 +116,7 @@ def homography_dlt(first: ArrayLike, second: ArrayLike) -> Array:
         )
     from_a, from_b = normalising_transform(a), normalising_transform(b)
     h, values = _null_vector(apply_similarity(from_a, a), apply_similarity(from_b, b))
-    # rank 8, and a map of the plane onto the plane
+    # H must be determined (rank 8 of A) and map the plane onto the whole plane (rank 3 of H)
     weak = (values[..., 7] <= ROUNDING * values[..., 0]) | (np.abs(np.linalg.det(h)) <= ROUNDING)
     if np.any(weak):
         where = "" if a.ndim == 2 else f" in {np.count_nonzero(weak)} of {weak.size} sets"
@@ -93,23 +127,35 @@ def homography_dlt(first: ArrayLike, second: ArrayLike) -> Array:
 def fit_homography(
     first: ArrayLike, second: ArrayLike, *, noisy: Noisy = "both", noise_px: float | None = None
 ) -> Homography:
-    """The homography of maximum likelihood for Gaussian noise, all pairs being right, and its covariance.
+    """The maximum-likelihood homography for Gaussian noise, with its covariance; all pairs must be correct.
 
-    "second": minimises the transfer error sum |x' - H x|^2, for exact points `first` such as those of a printed board.
-    "both": noise in both images; minimises sum e^T (I + A A^T)^-1 e with e = x' - H x and A = d(H x)/dx, which is
-    Sampson's first-order form of the reprojection error (HZ 4.2.6). Levenberg-Marquardt from `homography_dlt`, over
-    the 8 dimensions that a matrix of unit norm has. The covariance is noise^2 (J^T J)^-1, taken to the 9 entries.
+    It starts from `homography_dlt` and descends by Levenberg-Marquardt over the 8 dimensions of matrices of unit norm.
+    The covariance is noise^2 (J^T J)^-1, converted to the 9 entries.
 
     Parameters
     ----------
-    first, second : (n, 2) pixels, n >= 4.
-    noise_px : standard deviation of one coordinate; None: from the residuals, which takes five pairs.
+    first, second : (n, 2) corresponding points in pixels, n >= 4.
+    noisy : "second" for exact points `first`, such as those of a printed board. It minimises the transfer error
+        sum |x' - H x|^2. "both" for noise of the same size in both images. It minimises
+        sum e^T (I + A A^T)^-1 e with e = x' - H x and A = d(H x)/dx, which is Sampson's first-order form of the
+        reprojection error (HZ 4.2.6).
+    noise_px : standard deviation of one coordinate; None estimates it from the residuals, which takes five pairs.
 
     Raises
     ------
     ValueError
-        As `homography_dlt`; or all points but one lie on a line to their noise; or the residuals are over three times
-        the stated noise.
+        `homography_dlt` refuses the pairs; or all points but one lie on a line within their noise; or the residuals
+        are over three times the stated noise.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.geometry import map_points
+    >>> board = np.array([[x, y] for x in range(5) for y in range(4)])  # exact, in metres
+    >>> pixels = map_points([[90, 5, 200], [-4, 88, 150], [0.01, 0.02, 1]], board)
+    >>> found = fit_homography(board, pixels, noisy="second", noise_px=0.1)
+    >>> bool(transfer_error(found.matrix, board, pixels, "second").max() < 1e-6)
+    True
     """
     a, b = checked_pairs(first, second, 4, "a homography")
     check_noise(noise_px)
@@ -123,9 +169,9 @@ def fit_homography(
         start, apply_similarity(from_a, a), apply_similarity(from_b, b), from_b[0, 0] / from_a[0, 0], noisy
     )
     scale = from_b[0, 0]  # normalised units per pixel of the second image
-    consensus.refuse_misfit(found.cost / scale**2, 2 * len(a) - PARAMETERS, noise_px, "a homography")
-    noise = found.noise(PARAMETERS) / scale if noise_px is None else noise_px
-    to_pixels = np.kron(np.linalg.inv(from_b), from_a.T)  # of row-major vectors: vec(B^-1 H A)
+    consensus.refuse_misfit(found.cost / scale**2, 2 * len(a) - HOMOGRAPHY_PARAMETERS, noise_px, "a homography")
+    noise = found.noise(HOMOGRAPHY_PARAMETERS) / scale if noise_px is None else noise_px
+    to_pixels = np.kron(np.linalg.inv(from_b), from_a.T)  # vec(B^-1 H A) of row-major vectors
     covariance = np.full((9, 9), np.nan)
     if np.isfinite(noise):
         for name, points in (("first", a), ("second", b)):
@@ -141,20 +187,34 @@ def fit_homography(
 def find_homography(
     first: ArrayLike, second: ArrayLike, noise_px: float = 1.0, *, noisy: Noisy = "both", seed: int = 0
 ) -> Homography:
-    """The homography that most pairs agree with: OpenCV's USAC, then `fit_homography` to its inliers until they stay.
+    """The homography that most pairs agree with, although some pairs are wrong; with its covariance.
 
-    A pair is an inlier where its error is below the 99 % quantile of its distribution at `noise_px`. `noise_px` of the
-    result is that of the inliers. The same seed gives the same result.
+    OpenCV's USAC proposes inliers. `fit_homography` is then fitted to the inliers, and the inliers are chosen again,
+    until they no longer change. A pair is an inlier if its error is below the 99 % quantile of the errors that
+    `noise_px` causes. The `noise_px` of the result is estimated from the inliers. The same seed gives the same result.
 
     Parameters
     ----------
-    first, second : (n, 2) pixels, n >= 5.
-    noise_px : standard deviation of one coordinate of a right pair.
+    first, second : (n, 2) corresponding points in pixels, n >= 5.
+    noise_px : standard deviation of one coordinate of a correct pair.
+    noisy : the images whose points have noise, as for `fit_homography`.
+    seed : state of the random numbers that USAC draws samples with.
 
     Raises
     ------
     ValueError
-        As `fit_homography`, or no more pairs agree than chance would let.
+        `fit_homography` refuses the inliers, or no more pairs agree than chance explains.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.geometry import map_points
+    >>> random = np.random.default_rng(0)
+    >>> first = random.uniform(0, 640, (60, 2))
+    >>> second = map_points([[1.1, 0.1, 5], [-0.05, 0.9, 8], [1e-4, 0, 1]], first) + random.normal(0, 0.5, (60, 2))
+    >>> second[:15] = random.uniform(0, 640, (15, 2))  # wrong pairs
+    >>> int(find_homography(first, second, noise_px=0.5).inliers[:15].sum())
+    0
     """
     a, b = checked_pairs(first, second, 5, "a robust homography")
     check_noise(noise_px)
@@ -171,23 +231,38 @@ def find_homography(
     model, inliers = consensus.consistent_set(chosen, threshold, fit, error, least=5)
     _refuse_chance(int(inliers.sum()), b, threshold)
     residuals = error(model)[inliers]
-    noise = float(np.sqrt(residuals @ residuals / (2 * len(residuals) - PARAMETERS)))
+    noise = float(np.sqrt(residuals @ residuals / (2 * len(residuals) - HOMOGRAPHY_PARAMETERS)))
     return replace(model, inliers=inliers, noise_px=noise, covariance=model.covariance * (noise / noise_px) ** 2)
 
 
 def largest_plane(first: Array, second: Array, noise_px: float, noisy: Noisy = "both", seed: int = 0) -> np.ndarray:
-    """(n,) bool: the pairs of the homography that OpenCV's USAC finds most to agree with; none where it finds none."""
+    """(n,) bool, the pairs that agree with the homography that OpenCV's USAC finds; all False if it finds none."""
     import cv2
 
-    # OpenCV measures in the second image alone, where the noise of both adds up
+    # OpenCV measures errors in the second image alone, where the noise of both images adds up
     threshold = consensus.inlier_threshold(noise_px, 2) * (1.0 if noisy == "second" else np.sqrt(2))
     found, mask = cv2.findHomography(first, second, consensus.usac(threshold, seed))
     return np.zeros(len(first), dtype=bool) if found is None else np.asarray(mask.ravel() > 0)
 
 
 def transfer_error(H: ArrayLike, first: ArrayLike, second: ArrayLike, noisy: Noisy = "both") -> Array:
-    """(n,) pixels: |x' - H x|, or of both points together to their nearest exact pair (Sampson); see
-    `fit_homography`."""
+    """(n,) float64 errors of pairs under a homography, pixels.
+
+    For "second" the error is |x' - H x|. For "both" it is, to first order, the distance of the pair (x, x') from the
+    nearest pair that H maps exactly (Sampson); see `fit_homography`.
+
+    Parameters
+    ----------
+    H : (3, 3), x' = H x; any multiple is the same homography.
+    first, second : (n, 2) corresponding points in pixels.
+    noisy : "second" or "both".
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> transfer_error(np.eye(3), [[10, 20]], [[13, 24]], "second")
+    array([5.])
+    """
     residuals = _residuals(
         checked_array("H", H, 3, 3),
         checked_array("first", first, None, 2),
@@ -199,13 +274,15 @@ def transfer_error(H: ArrayLike, first: ArrayLike, second: ArrayLike, noisy: Noi
 
 
 def homography_error(first: Array, second: Array) -> float:
-    """Least sum of squared errors in px^2 of any homography between pairs (n, 2) with noise in both views."""
+    """The least sum of squared errors, in px^2, of any homography between pairs (n, 2) with noise in both views."""
     return nearest_homography(first, second)[1]
 
 
 def nearest_homography(first: Array, second: Array) -> tuple[Array, float]:
-    """(3, 3) the homography of maximum likelihood for noise in both views, of pairs (n, 2) in px that need not
-    determine it, and its sum of squared errors in px^2."""
+    """(3, 3) float64 homography of maximum likelihood for noise in both views, and its sum of squared errors in px^2.
+
+    The pairs (n, 2) in pixels need not determine the homography: one of those that fit best is returned.
+    """
     from_a, from_b = normalising_transform(first), normalising_transform(second)
     a, b = apply_similarity(from_a, first), apply_similarity(from_b, second)
     found = _maximum_likelihood(_null_vector(a, b)[0], a, b, from_b[0, 0] / from_a[0, 0], "both")
@@ -213,7 +290,13 @@ def nearest_homography(first: Array, second: Array) -> tuple[Array, float]:
 
 
 def rotation_homography_error(first: Array, second: Array, K_first: Array, K_second: Array) -> float:
-    """The same of the homographies K' R K^-1 of cameras that only rotate."""
+    """The least sum of squared errors, in px^2, of the homographies K' R K^-1 of a camera that only rotates.
+
+    Parameters
+    ----------
+    first, second : (n, 2) pixels with noise in both views.
+    K_first, K_second : (3, 3) calibration matrices K and K', pixels.
+    """
     inverse = np.linalg.inv(K_first)
 
     def matrix(R: Rotation) -> Array:
@@ -236,18 +319,18 @@ def rotation_homography_error(first: Array, second: Array, K_first: Array, K_sec
         for points, K in ((first, K_first), (second, K_second))
     ]
     rays = [directions / np.linalg.norm(directions, axis=1, keepdims=True) for directions in rays]
-    with warnings.catch_warnings():  # of collinear rays, of which any rotation will do
+    with warnings.catch_warnings():  # SciPy warns of collinear rays; any of their rotations will do as a start
         warnings.simplefilter("ignore", UserWarning)
         start, _ = Rotation.align_vectors(rays[1], rays[0])
     return minimise(residuals, step, start).cost
 
 
 def _refuse_collinear(name: str, points: Array, noise_px: float) -> None:
-    """Raise ValueError unless two of the points (n, 2) lie off every line through the others, to their noise.
+    """Raise ValueError if all points (n, 2), or all but one, lie on a line within their noise.
 
-    One point off a line is no fourth in general position. For each point, the smallest eigenvalue of the scatter of
-    the others is the sum of squared distances from their best line; over the variance it follows chi^2 if that is
-    noise.
+    A homography needs four points with no three collinear, so one point beside a line is not enough. Each point is
+    left out in turn. The smaller eigenvalue of the scatter of the others is the sum of their squared distances from
+    their best line; divided by the variance of the noise, it follows chi^2 if these distances are noise.
     """
     n, size = len(points), consensus.spread(points)
     unit = (points - points.mean(axis=0)) / size
@@ -256,26 +339,30 @@ def _refuse_collinear(name: str, points: Array, noise_px: float) -> None:
     least = half - np.sqrt(np.maximum(half**2 - product, 0))
     allowed = (noise_px / size) ** 2 * consensus.chi2_limit(n - 3)
     odd = int(np.argmin(least))
-    if least[odd] <= max(allowed, COLLINEAR**2 * n):
+    if least[odd] <= max(allowed, COLLINEAR_FRACTION**2 * n):
         others = np.delete(np.arange(n), odd).tolist()
         which = f"points {others} of {name}" if n == 4 else f"{n - 1} of the {n} points of {name}, or all,"
         raise ValueError(
-            f"expected four points with no three collinear, got {which} on one line to their noise of {noise_px:.3g} "
-            "px; add points away from it."
+            f"expected four points with no three collinear, got {which} on one line within their noise of "
+            f"{noise_px:.3g} px; add points away from it."
         )
 
 
 def _refuse_chance(agreeing: int, second: Array, threshold: float) -> None:
+    """Raise ValueError if no more pairs agree with a homography, within `threshold` pixels, than chance explains."""
     area, _ = consensus.bounding_area(second)
     if consensus.agree_by_chance(agreeing, len(second), 4, np.pi * threshold**2 / area):
         raise ValueError(
             f"expected points that a homography maps to each other, got {len(second)} pairs of which at most "
-            f"{agreeing} agree, no more than chance; the scene is not a plane, the pairs are wrong, or noise_px is."
+            f"{agreeing} agree, no more than chance; the scene is not a plane, or the pairs or noise_px are wrong."
         )
 
 
 def _null_vector(a: Array, b: Array) -> tuple[Array, Array]:
-    """(..., 3, 3) least right singular vectors of the design matrices, and their (..., 9) singular values."""
+    """(..., 3, 3) right singular vectors of the least singular value of the design matrices, and all (..., 9) values.
+
+    The design matrix of the points a, b (..., n, 2) has two rows per pair. Singular values are sorted, largest first.
+    """
     x, y, u, v = a[..., 0], a[..., 1], b[..., 0], b[..., 1]
     one, zero = np.ones_like(x), np.zeros_like(x)
     rows = [
@@ -290,12 +377,12 @@ def _null_vector(a: Array, b: Array) -> tuple[Array, Array]:
 
 
 def _oriented(h: Array) -> Array:
-    """At unit norm, with positive determinant."""
+    """Homographies (..., 3, 3) scaled to unit norm and positive determinant."""
     return np.asarray(unit_norm(h) * np.sign(np.linalg.det(h))[..., None, None])
 
 
 def _transfer(h: Array, points: Array) -> tuple[Array, Array, Array]:
-    """(n, 2) mapped points, (n, 2, 9) their derivatives by the matrix, (n, 2, 2) by the points."""
+    """(n, 2) images of points (n, 2), with their derivatives (n, 2, 9) by the matrix and (n, 2, 2) by the points."""
     xyw = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     image = xyw @ h.T
     mapped = image[:, :2] / image[:, 2:]
@@ -307,8 +394,13 @@ def _transfer(h: Array, points: Array) -> tuple[Array, Array, Array]:
 
 
 def _whitening(by_point: Array, ratio: float, noisy: Noisy) -> Array:
-    """(n, 2, 2) L^-1 with L L^T = I + ratio^2 A A^T, the covariance of x' - H x. ratio : of the noises, first /
-    second."""
+    """(n, 2, 2) matrices L^-1 that whiten x' - H x, whose covariance is L L^T = I + ratio^2 A A^T.
+
+    Parameters
+    ----------
+    by_point : (n, 2, 2) A, derivatives of H x by x.
+    ratio : noise of the first image over noise of the second.
+    """
     if noisy == "second":
         return np.broadcast_to(np.eye(2), by_point.shape)
     covariance = np.eye(2) + ratio**2 * by_point @ np.swapaxes(by_point, -1, -2)
@@ -316,24 +408,30 @@ def _whitening(by_point: Array, ratio: float, noisy: Noisy) -> Array:
 
 
 def _residuals(h: Array, a: Array, b: Array, ratio: float, noisy: Noisy) -> Array:
+    """(n, 2) whitened residuals of pairs a, b (n, 2) under the homography h; see `_whitening`."""
     mapped, _, by_point = _transfer(h, a)
     return np.asarray((_whitening(by_point, ratio, noisy) @ (b - mapped)[:, :, None])[..., 0])
 
 
 def _tangent(h: Array) -> Array:
-    """(9, 8) orthonormal, orthogonal to the matrix: the directions in which one of unit norm can change."""
+    """(9, 8) orthonormal directions, orthogonal to h (3, 3), in which a matrix of unit norm can change."""
     return np.linalg.svd(h.reshape(1, 9))[2][1:].T
 
 
 def _maximum_likelihood(start: Array, a: Array, b: Array, second_per_first: float, noisy: Noisy) -> Minimum[Array]:
-    """In normalised coordinates. second_per_first : how much larger a pixel is there in the second image."""
+    """The maximum-likelihood homography of pairs a, b (n, 2) in normalised coordinates, by descent from `start` (3, 3).
+
+    Parameters
+    ----------
+    second_per_first : size of a pixel of the second image over that of the first, in normalised coordinates.
+    """
     ratio = 1 / second_per_first
 
     def residuals(h: Array) -> tuple[Array, Array]:
         mapped, by_matrix, by_point = _transfer(h, a)
         whitening = _whitening(by_point, ratio, noisy)
-        # the derivative of the whitening, a product with small residuals, changes the path and not the end noticeably:
-        # the step is that of iteratively reweighted least squares
+        # The derivative of the whitening is left out, as in iteratively reweighted least squares: it is multiplied by
+        # small residuals, so that it changes the path of the descent but hardly its end.
         values = (whitening @ (b - mapped)[:, :, None])[..., 0]
         return values.ravel(), -(whitening @ by_matrix @ _tangent(h)).reshape(-1, 8)
 

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nonlinear least squares over rotations, directions and matrices up to scale: Levenberg and Marquardt on a manifold.
+"""Nonlinear least squares on manifolds (rotations, directions, matrices up to scale) by Levenberg-Marquardt.
 
-SciPy's solvers work on vectors. Here a state is anything, and a step is a vector in its tangent space, so that a
-rotation stays a rotation, no parameter is redundant and the inverse of J^T J is the covariance (Madsen, Nielsen,
-Tingleff: "Methods for non-linear least squares problems", 2004, for the damping).
+SciPy's solvers work on vectors. Here a state can be any object, and a step is a vector in the tangent space of the
+state. So a rotation stays a rotation, no parameter is redundant, and the inverse of J^T J gives the covariance. The
+damping follows Madsen, Nielsen, Tingleff: "Methods for non-linear least squares problems", 2004.
+
+Used by: rangesim.geometry.camera_pose, hand_eye, homography and two_view; rangesim.calibration.bundle, suspects and
+zhang; rangesim.multiview.bundle_adjustment, factorisation, nonrigid and orthographic.
 """
 
 from __future__ import annotations
@@ -20,16 +23,42 @@ State = TypeVar("State")
 Look = TypeVar("Look", bound="Descent")
 
 MAX_STEPS = 100
+"""Largest number of steps of a descent. A descent from a good start converges in far fewer; the limit ends those from a
+bad start, which are then judged by their cost."""
+
 CONVERGED = 1e-12
-"""Relative decrease of the cost at which it ends."""
+"""Relative decrease of the cost, as a ratio, at which a descent has converged. It lies a little above what double
+precision resolves, so that an estimate reaches its minimum; with a larger value the descent ends sooner, beside the
+minimum."""
+
+START_DAMPING = 1e-6
+"""Damping of the first step, as a ratio to the diagonal of J^T J. It is small because starts are good (Madsen, Nielsen,
+Tingleff 2004, section 3.2): nearly a Gauss-Newton step. From a bad start the damping grows until a step succeeds."""
+
 MAX_DAMPING = 1e12
+"""Damping at which a descent gives up, as a ratio to the diagonal of J^T J: steps are then below rounding, so that no
+step can lower the cost."""
+
 LEAST_DAMPING = 1e-15
-"""Of dense equations, which are solved in the least squares sense where they are singular."""
+"""Least damping of dense equations, as a ratio to the diagonal of J^T J. It may be as small as rounding, because
+`Minimum.damped_step` solves singular equations in the least-squares sense; sparse solvers state a larger one."""
+
+MIN_DETERMINED = 1e-10
+"""Ratio of the smallest to the largest singular value of a jacobian below which the residuals do not determine all
+parameters. It lies above the rounding of the singular values, 1e-16 times some thousand residuals, so that exact
+degeneracy is found; a larger value also refuses weakly determined parameters."""
 
 
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[State]):
-    """state : where the sum of squares is least. residuals : (m,) there. jacobian : (m, k) d residuals / d step."""
+    """A state at which a sum of squares is evaluated or least, with the residuals and their derivatives there.
+
+    Attributes
+    ----------
+    state : any object, such as a pose or a matrix.
+    residuals : (m,) float64.
+    jacobian : (m, k) float64 derivatives of the residuals by a step in the tangent space of the state.
+    """
 
     state: State
     residuals: Array
@@ -41,47 +70,70 @@ class Minimum(Generic[State]):
         return float(self.residuals @ self.residuals)
 
     def damped_step(self, damping: float) -> tuple[Array, float]:
-        """See `Descent`; in the least squares sense where the equations are singular."""
+        """The step and its predicted decrease of the cost; see `Descent.damped_step`.
+
+        Singular equations are solved in the least-squares sense.
+        """
         normal, slope = self.jacobian.T @ self.jacobian, self.jacobian.T @ self.residuals
         scale = np.maximum(np.diag(normal), 1e-30)
         delta = np.linalg.lstsq(normal + np.diag(damping * scale), -slope, rcond=None)[0]
         return delta, float(-delta @ (2 * slope + normal @ delta))
 
     def noise(self, parameters: int) -> float:
-        """Standard deviation of a residual: root of the sum of squares per degree of freedom; NaN if there is none."""
+        """Standard deviation of a residual: the root of the sum of squares per degree of freedom.
+
+        It is NaN if there are no more residuals than parameters.
+        """
         freedom = len(self.residuals) - parameters
         return float(np.sqrt(self.cost / freedom)) if freedom > 0 else float("nan")
 
     def covariance(self, noise: float) -> Array:
-        """(k, k) covariance of the step, noise^2 (J^T J)^-1: the Cramer-Rao bound for Gaussian noise.
+        """(k, k) float64 covariance of the step, noise^2 (J^T J)^-1: the Cramer-Rao bound for Gaussian noise.
 
-        Infinite along what the residuals do not determine (singular values below 1e-10 of the largest).
+        All entries are infinite if the residuals leave a direction open (`MIN_DETERMINED`).
+
+        Parameters
+        ----------
+        noise : standard deviation of a residual.
         """
         _, values, axes = np.linalg.svd(self.jacobian, full_matrices=False)
-        if len(values) < self.jacobian.shape[1] or not values[-1] > 1e-10 * values[0]:
+        if len(values) < self.jacobian.shape[1] or not values[-1] > MIN_DETERMINED * values[0]:
             return np.full((self.jacobian.shape[1],) * 2, np.inf)
         scaled = axes.T / values
         return np.asarray(noise**2 * scaled @ scaled.T)
 
 
 class Descent(Protocol):
-    """A sum of squares near a state: dense (`Minimum`) or sparse (`rangesim.multiview.schur_complement`)."""
+    """The quadratic model of a sum of squares about a state, from which a descent takes its steps.
+
+    `Minimum` is the dense one; `rangesim.multiview.schur_complement` has a sparse one.
+    """
 
     @property
     def cost(self) -> float:
-        """Sum of squares at the state."""
+        """Sum of squares of the residuals at the state."""
         ...
 
     def damped_step(self, damping: float) -> tuple[Any, float] | None:
-        """The step delta with (N + damping diag N) delta = -g, and the decrease of the cost that the linear model
-        predicts of it; None if the equations are singular. N = J^T J, g = J^T r."""
+        """The damped step, and the decrease of the cost that the quadratic model predicts for it.
+
+        The step delta solves (N + damping diag N) delta = -g with N = J^T J and g = J^T r. The result is None if these
+        equations are singular.
+        """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Descended(Generic[State, Look]):
-    """state : the last one. here : what `look` says of it. steps : how many were taken. has_converged : whether no step
-    lowers the cost any more."""
+    """The end of a descent.
+
+    Attributes
+    ----------
+    state : the last state.
+    here : the quadratic model there, as `look` returned it.
+    steps : number of steps that were taken.
+    has_converged : whether no step lowers the cost any more.
+    """
 
     state: State
     here: Look
@@ -98,15 +150,18 @@ def descend(
     converged: float = CONVERGED,
     least_damping: float = LEAST_DAMPING,
 ) -> Descended[State, Look]:
-    """Levenberg and Marquardt's descent from `start`, whatever the algebra.
+    """The descent of Levenberg and Marquardt from `start`, with dense or sparse equations.
 
     Parameters
     ----------
-    look : state -> the sum of squares there. step : state, step -> the state moved by it.
-    converged : relative decrease of the cost at which it ends.
+    look : returns the quadratic model of the sum of squares about a state.
+    step : returns the state moved by a step.
+    max_steps : largest number of steps.
+    converged : relative decrease of the cost at which the descent ends.
+    least_damping : lower limit of the damping, as a ratio to the diagonal of J^T J.
     """
     state, here = start, look(start)
-    damping, growth = max(1e-6, least_damping), 2.0
+    damping, growth = max(START_DAMPING, least_damping), 2.0
     taken = 0
     for _ in range(max_steps):
         found = here.damped_step(damping)
@@ -132,11 +187,23 @@ def descend(
 def minimise(
     residuals: Callable[[State], tuple[Array, Array]], step: Callable[[State, Array], State], start: State
 ) -> Minimum[State]:
-    """Local minimum of a sum of squares, from `start` downwards.
+    """The local minimum of a sum of squares that a descent from `start` reaches, with dense equations.
 
     Parameters
     ----------
-    residuals : state -> (m,) residuals and (m, k) their derivatives by the step at 0.
-    step : state, (k,) -> the state moved by a step of the tangent space.
+    residuals : returns the (m,) residuals at a state and their (m, k) derivatives by a step, at step 0.
+    step : returns the state moved by a step (k,) of its tangent space.
+
+    Examples
+    --------
+    The angle whose cosine is 0.5:
+
+    >>> found = minimise(
+    ...     lambda angle: (np.array([np.cos(angle) - 0.5]), np.array([[-np.sin(angle)]])),
+    ...     lambda angle, step: angle + step[0],
+    ...     start=1.0,
+    ... )
+    >>> float(round(found.state, 6))
+    1.047198
     """
     return descend(lambda state: Minimum(state, *residuals(state)), step, start).here

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where one point cloud lies in another: iterative closest points, and registration without a first guess, by Open3D.
+"""Registration of two point clouds: iterative closest points (ICP), and registration without a first guess, by Open3D.
 
-A failed registration looks like a result, so what could be one raises ValueError: too few points with a partner,
-surfaces that slide on each other (a plane, a sphere, a cylinder), and two poses that fit alike (a symmetric part, or
-too small an overlap), surfaces that lie across each other (another part, another scale).
+A failed registration looks like a successful one. So every case that could be a failure raises ValueError: too few
+points have a partner; the surfaces can slide on each other (a plane, a sphere, a cylinder); two poses fit equally well
+(a symmetric part, or too small an overlap); or the surfaces lie across each other (another part, another scale).
+
+A "spacing" below is the median distance of a point of the target from its nearest neighbour.
+
+Used by: rangesim.fusion.multiway_registration; rangesim.multiview.bundle_adjustment (`nearest_similarity`).
 """
 
 from __future__ import annotations
@@ -18,54 +22,105 @@ from scipy.spatial.transform import Rotation
 
 from rangesim.geometry.correspondences import Array, check_distinct, checked_array
 from rangesim.rig import pose
+from rangesim.robust_scale import sigma_from_median
 
-LEAST_POINTS = 20
+MIN_POINTS = 20
+"""Least number of different points of a cloud: as many as `NORMAL_NEIGHBOURS`, so that every normal has all its
+neighbours."""
+
 PARTNER_SPACINGS = 3.0
-"""Spacings of the target's points within which a point has a partner at the end."""
+"""Distance, in spacings, within which a point has a partner when a pose is judged. Chosen so that few points have no
+partner by chance: on a randomly sampled surface their fraction is 0.5^(d^2) at d spacings, 0.2 % at 3. A larger value
+finds partners on other surfaces."""
+
 FINAL_SPACINGS = 1.5
-"""The same that the last steps are taken with: what is beyond the other cloud's border pulls the less."""
+"""Distance of partners, in spacings, in the last steps of ICP. The smaller it is, the less points beyond the border of
+the other cloud pull. On a randomly sampled surface 21 % of the points have no partner at 1.5 spacings, and half of them
+at 1."""
+
 START_SPACINGS = 12.0
-"""The same at the start: how far, about, the first guess of `icp` may be off."""
+"""Distance of partners, in spacings, in the first steps of `icp` by default: about how far the first guess may be off.
+Chosen as three halvings above `FINAL_SPACINGS`; a larger value reaches farther, but pulls clouds that overlap only in
+part over each other."""
+
 NORMAL_NEIGHBOURS = 20
+"""Number of neighbours from which the normal of a point is estimated. More average more noise, but round off edges, as
+in any estimate of normals; either half of a cloud uses half as many, which reach as far."""
+
 MIN_CONSTRAINT = 3e-3
-"""Least ratio of the smallest eigenvalue of the normal equations to the largest: below, the surfaces slide. Measured:
+"""Ratio of the smallest eigenvalue of the normal equations to the largest below which the surfaces can slide. Measured:
 at most 0.0019 for planes, spheres, cylinders, cones and roofs of 600 and 2500 points with noise up to their spacing;
 0.0008 to 0.012 for tables with things on them, 0.2 for a box."""
+
 FEATURE_SPACINGS = 5.0
-"""Voxel for features, and for the samples of the global registration, in spacings."""
+"""Edge of the voxels for features and for the samples of RANSAC, in spacings. A voxel then holds about 25 points of a
+regularly sampled surface, 5 of a random one, so that noise averages; larger voxels lose small shapes."""
+
 MIN_FEATURE_FRACTION = 0.02
-"""The same as a fraction of the extent of the target: a few thousand voxels are enough, and quick."""
+"""Least edge of these voxels, as a fraction of the extent of the target. So there are a few thousand voxels at most,
+which suffice and take little time."""
+
 ATTEMPTS = 4
-"""Runs of RANSAC, with seeds of their own."""
+"""Number of times that RANSAC runs, each time with its own seed, because one run can miss the pose. The time grows with
+it."""
+
 COMPARED_POINTS = 3000
-"""Of the source, by which poses are compared."""
+"""Largest number of points of the source with which poses are compared in `register`. With more, `icp` from each of the
+starts takes longer; the chosen pose is refined with all points in any case."""
+
 MIN_AGREEMENT = 0.45
-"""Least mean of 1 - (d / s)^2 over the points with a partner, s the spacing, or the roughness of a cloud if larger.
-Measured: 0.47 to 0.96 for right poses, but 0.37 for a scan ten times as dense as the target with noise above the
-target's spacing; -0.1 to 0.44 for corrugated plates that lie askew and for parts 5 or 10 % off in scale."""
+"""Least mean of 1 - (d / s)^2, a ratio, over the points with a partner; d is their distance along the normal, s the
+spacing, or the roughness of a cloud if that is larger. Measured: 0.47 to 0.96 for correct poses, but 0.37 for a scan
+ten times as dense as the target with noise above the target's spacing; -0.1 to 0.44 for corrugated plates that lie
+askew and for parts 5 or 10 % off in scale."""
+
 FAR_EXTENTS = 5.0
-"""Clouds further than this from the origin, in units of their extent, are moved there before they are solved."""
+"""Distance of a cloud from the origin, as a ratio to its extent, beyond which it is moved to the origin before it is
+solved. At 5 extents a turn of 0.2 rad about the origin moves a cloud by its whole extent, so that steps of ICP are
+neither small nor exact. Nearer clouds stay where they are, so that their results stay the same to the last digit."""
+
 SLIDE_SPACINGS = 6.0
-"""Step, in spacings of the target, by which a result of `icp` is slid along the surface to look for other poses."""
+"""Step, in spacings, by which a result of `icp` is slid along the surface to look for other poses. ICP then starts
+there with the same reach, so that steps twice as long would leave gaps."""
+
 MAX_SLIDES = 6
-"""Largest number of such steps to either side."""
+"""Largest number of such steps to either side, because each takes one run of ICP. If the reach needs more, the steps
+become longer."""
+
 SLID_POINTS = 800
-"""Number of points of the source that are slid: a pose that fits as well does so by few points, too."""
-AS_GOOD = 0.95
-"""Fraction of the best agreement at which another pose fits alike."""
+"""Number of points of the source that are slid. With 800 instead of 3000 points `icp` takes 1.5 times the time that it
+takes without this test, and the same poses are found (measured)."""
+
+NEARLY_BEST = 0.95
+"""Ratio of an agreement to the best one from which on another pose fits as well. Nobody measured it: a larger ratio
+misses symmetric shapes whose noise makes one pose better by chance, a smaller one refuses sound results."""
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Where the source lies in the target.
+    """The pose of a source cloud in a target cloud, with measures of its quality.
 
-    T_target_source : (4, 4), maps source coordinates to target coordinates, metres. fitness : fraction of the source
-    points with a target point within 3 spacings. target_fitness : the same of the target's points: the overlap of
-    either. rms_m : root mean square distance of these partners along the target's normals, metres. constraint : least
-    over largest eigenvalue of the normal equations, in units of the cloud's size: how firmly the surfaces hold each
-    other. agreement : mean over the source of 1 - (d / spacing)^2, but at least -1, d the distance of partners along
-    the normal, and 0 without a partner: a pose that puts surfaces beside each other counts less than one that leaves
-    them apart. By it poses are compared.
+    Attributes
+    ----------
+    T_target_source : (4, 4) float64, maps source coordinates to target coordinates, metres.
+    fitness : fraction of the source points that have a target point within 3 spacings.
+    target_fitness : fraction of the target points that have a source point within 3 spacings. Both together say how far
+        the clouds overlap.
+    rms_m : root mean square distance of the source points from their partners, along the normals of the target, metres.
+    constraint : ratio of the smallest to the largest eigenvalue of the normal equations, with turns in units of the
+        size of the cloud. A small ratio means that the surfaces can slide on each other.
+    agreement : mean over all source points of 1 - (d / spacing)^2, but at least -1, where d is the distance from the
+        partner along its normal; a point without a partner counts 0. So a pose with two surfaces beside each other
+        counts less than one that leaves them apart. Poses are compared by it.
+
+    Examples
+    --------
+    `icp` and `register` return one; here it is made by hand:
+
+    >>> import numpy as np
+    >>> found = Registration(np.eye(4), 0.9, 0.8, rms_m=1e-4, constraint=0.2, agreement=0.85)
+    >>> found.fitness
+    0.9
     """
 
     T_target_source: Array
@@ -84,27 +139,38 @@ def icp(
     max_distance_m: float | None = None,
     min_fitness: float = 0.3,
 ) -> Registration:
-    """Refines a first guess: iterative closest points, point to plane (Chen, Medioni 1992), by Open3D.
+    """The pose of the source in the target, refined from a first guess by iterative closest points (ICP).
 
-    Minimises the distances of source points to the tangent planes of their nearest target points, within a distance
-    that is halved from `max_distance_m` to 1.5 spacings of the target; then again from half of it, a quarter and so
-    on. The result that agrees best counts: a large distance reaches far, but pulls clouds that overlap in part over
-    each other. It is slid along the surface, then, to see whether it fits there as well: by one rib of many.
+    ICP is Open3D's, point to plane (Chen, Medioni 1992): it minimises the distances of source points from the tangent
+    planes of their nearest target points, within a distance that is halved from `max_distance_m` down to 1.5 spacings
+    of the target. It runs again from half of `max_distance_m`, from a quarter and so on, and the result with the best
+    agreement counts: a large distance reaches far, but pulls clouds that overlap only in part over each other. The
+    result is then slid along the surface. If it fits as well there, as with one rib of many, it is refused.
+
+    The clouds may lie far from the origin, as map coordinates do: they are then solved about their middles.
 
     Parameters
     ----------
-    source, target : (n, 3), (m, 3) metres.
-    T_target_source : (4, 4) first guess; None: the identity.
-    max_distance_m : how far points may be from their partners at first; None: 12 spacings of the target.
-    min_fitness : least fraction of the source with a partner at the end.
-
-    The clouds may lie far from the origin, as at map coordinates: they are solved about their middles then.
+    source, target : (n, 3) and (m, 3) points, metres, each in its own coordinates.
+    T_target_source : (4, 4) first guess, maps source coordinates to target coordinates; None means the identity.
+    max_distance_m : largest distance between partners in the first steps, metres; None means 12 spacings of the target.
+    min_fitness : least fraction of the source points with a partner at the end.
 
     Raises
     ------
     ValueError
-        Fewer than 20 different points, fewer partners than `min_fitness`, surfaces that slide on each other or lie
-        across each other, or two poses that fit nearly alike.
+        A cloud has fewer than 20 different points, fewer points than `min_fitness` have a partner, the surfaces slide
+        on each other or lie across each other, or another pose fits nearly as well.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> def corner(seed):  # points on three faces of a box, metres
+    ...     points = np.random.default_rng(seed).uniform(0, 1, (300, 3))
+    ...     points[np.arange(300), np.arange(300) % 3] = 0
+    ...     return points * [0.3, 0.2, 0.1]
+    >>> icp(corner(0), corner(1) + [0.02, 0.01, 0]).T_target_source[:3, 3].round(2) + 0.0
+    array([0.02, 0.01, 0.  ])
     """
     moving, fixed, middles = _checked(source, target)
     given = np.eye(4) if T_target_source is None else pose(T_target_source, "T_target_source")
@@ -123,24 +189,35 @@ def icp(
 
 
 def register(source: ArrayLike, target: ArrayLike, *, min_fitness: float = 0.3, seed: int = 0) -> Registration:
-    """Finds the pose without a first guess: RANSAC over fast point feature histograms, then `icp`.
+    """The pose of the source in the target without a first guess, by RANSAC over point features and then ICP.
 
-    Features (FPFH: Rusu, Blodow, Beetz 2009) of both clouds at voxels of 5 spacings, or a fiftieth of the target's
-    extent if that is larger, are matched and three matches make a pose (Open3D's
-    `registration_ransac_based_on_feature_matching`). The results of four runs, and the best one turned by quarters
-    and halves about the target's principal axes, go through `icp`; the one that agrees best counts. The same seed
-    gives the same result, to the rounding of Open3D's parallel sums.
+    The features are fast point feature histograms (FPFH: Rusu, Blodow, Beetz 2009) of both clouds at voxels of 5
+    spacings, or of a fiftieth of the target's extent if that is larger. Three matches make a pose (Open3D's
+    `registration_ransac_based_on_feature_matching`). The results of four runs, and the best one turned by 90, 180 and
+    270 degrees about the target's principal axes, are refined by ICP. The one with the best agreement counts. The same
+    seed gives the same result, up to the rounding of Open3D's parallel sums.
 
     Parameters
     ----------
-    source, target : (n, 3), (m, 3) metres.
-    min_fitness : least fraction of the source with a partner at the end.
+    source, target : (n, 3) and (m, 3) points, metres, each in its own coordinates.
+    min_fitness : least fraction of the source points with a partner at the end.
+    seed : state of the random numbers of RANSAC.
 
     Raises
     ------
     ValueError
-        As `icp`; or another pose fits nearly as well: a symmetric shape, or one with too little to tell its sides
-        apart.
+        `icp` would refuse the result; or another pose fits nearly as well, because the shape is symmetric or has too
+        little detail to distinguish its sides.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> def corner(seed):  # points on three faces of a box, metres
+    ...     points = np.random.default_rng(seed).uniform(0, 1, (300, 3))
+    ...     points[np.arange(300), np.arange(300) % 3] = 0
+    ...     return points * [0.3, 0.2, 0.1]
+    >>> register(corner(0), corner(1) + [0.5, 1, 0]).T_target_source[:3, 3].round(2) + 0.0
+    array([0.5, 1. , 0. ])
     """
     moving, fixed, middles = _checked(source, target)
     _check_fraction(min_fitness)
@@ -161,9 +238,13 @@ def register(source: ArrayLike, target: ArrayLike, *, min_fitness: float = 0.3, 
 
 
 def nearest_similarity(source: Array, target: Array) -> Array:
-    """(4, 4) T_target_source: the scale, rotation and translation that bring points (n, 3) nearest to their partners.
+    """(4, 4) float64 T_target_source: the scale, rotation and translation that bring points nearest to their partners.
 
-    Source: Umeyama, PAMI 1991.
+    It minimises the sum of squared distances in closed form (Umeyama, PAMI 1991).
+
+    Parameters
+    ----------
+    source, target : (n, 3) points in one unit; rows correspond.
     """
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     u, values, vt = np.linalg.svd(b.T @ a)
@@ -175,31 +256,39 @@ def nearest_similarity(source: Array, target: Array) -> Array:
 
 
 class _Middles(NamedTuple):
-    """(3,) of the source and of the target, metres: where the origins of the solved clouds lie; 0 of a cloud near its.
+    """The points (3,) of the source and of the target, metres, that become the origin before the clouds are solved.
 
-    Far from the origin a turn about it moves the clouds by metres: the steps of ICP are then neither small nor exact.
+    The point is 0 for a cloud that is near the origin already. A turn about a far origin moves a cloud by metres, so
+    that the steps of ICP would be neither small nor exact.
     """
 
     source: Array
     target: Array
 
     def to_middles(self, T: Array) -> Array:
-        """T_target_source (4, 4) between the clouds moved to their middles."""
+        """T_target_source (4, 4) between the moved clouds, from T between the clouds as given."""
         result = T.copy()
         result[:3, 3] = T[:3, :3] @ self.source + T[:3, 3] - self.target
         return result
 
     def from_middles(self, T: Array) -> Array:
-        """T_target_source (4, 4) between the clouds as given."""
+        """T_target_source (4, 4) between the clouds as given, from T between the moved clouds."""
         result = T.copy()
         result[:3, 3] = T[:3, 3] + self.target - T[:3, :3] @ self.source
         return result
 
 
 class _Surface(NamedTuple):
-    """A target: its points (m, 3), with normals as Open3D's cloud, their search tree and median spacing in metres.
+    """A target cloud prepared for registration.
 
-    halves : the search tree and the normals (m / 2, 3) of either half of the points, whose errors are independent.
+    Attributes
+    ----------
+    points : (m, 3) metres.
+    cloud : the points with normals, as Open3D's point cloud.
+    tree : search tree of the points.
+    spacing : median distance of a point from its nearest neighbour, metres.
+    halves : search tree and normals (m / 2, 3) of each random half of the points. The errors of both estimates of the
+        normals are independent.
     """
 
     points: Array
@@ -210,6 +299,7 @@ class _Surface(NamedTuple):
 
     @classmethod
     def of(cls, points: Array) -> _Surface:
+        """The prepared target of points (m, 3), metres."""
         import open3d as o3d
 
         tree = cKDTree(points)
@@ -221,7 +311,7 @@ class _Surface(NamedTuple):
         return cls(points, cloud, tree, spacing, (first, second))
 
     def halved(self, distance_m: float | None) -> list[float]:
-        """Distances from `distance_m`, None being 12 spacings, halved down to 1.5 spacings."""
+        """Distances in metres from `distance_m`, halved down to 1.5 spacings; None stands for 12 spacings."""
         last = FINAL_SPACINGS * self.spacing
         distances = [max(last, START_SPACINGS * self.spacing if distance_m is None else distance_m)]
         while distances[-1] > last:
@@ -239,12 +329,15 @@ def _tree_and_normals(points: Array) -> tuple[Any, Array]:
 
 
 def _agreement(found: Registration) -> float:
+    """The agreement of a registration, as a key for `max`."""
     return found.agreement
 
 
 def _turned(T: Array, source: Array, target: Array) -> list[Array]:
-    """The pose followed by turns of 90, 180 and 270 degrees about the target's principal axes, through the source's
-    middle."""
+    """Nine poses (4, 4): T followed by turns of 90, 180 and 270 degrees about each principal axis of the target.
+
+    The axes go through the middle of the moved source.
+    """
     axes = np.linalg.svd(target - target.mean(axis=0), full_matrices=False)[2]
     middle = T[:3, :3] @ source.mean(axis=0) + T[:3, 3]
     result: list[Array] = []
@@ -258,28 +351,30 @@ def _turned(T: Array, source: Array, target: Array) -> list[Array]:
 
 
 def _checked(source: ArrayLike, target: ArrayLike) -> tuple[Array, Array, _Middles]:
-    """The clouds moved to their middles, and these."""
+    """The clouds (n, 3) and (m, 3), moved if they lie far from the origin, and how they were moved."""
     clouds = checked_array("source", source, None, 3), checked_array("target", target, None, 3)
     for name, points in zip(("source", "target"), clouds, strict=True):
         if points.ndim != 2:
             raise ValueError(f"expected {name} of shape (n, 3), got {points.shape}.")
-        check_distinct(name, points, LEAST_POINTS, "a registration")
+        check_distinct(name, points, MIN_POINTS, "a registration")
     middles = _Middles(*(_middle(points) for points in clouds))
     return clouds[0] - middles.source, clouds[1] - middles.target, middles
 
 
 def _middle(points: Array) -> Array:
-    """(3,) of the points; 0 where they are near the origin, as they are then solved as well as they stand."""
+    """(3,) mean of the points (n, 3), metres; 0 if they are near the origin, because they need not be moved then."""
     middle, extent = points.mean(axis=0), np.linalg.norm(np.ptp(points, axis=0))
     return np.asarray(middle if np.linalg.norm(middle) > FAR_EXTENTS * extent else np.zeros(3))
 
 
 def _check_fraction(min_fitness: float) -> None:
+    """Raise ValueError unless the fraction is above 0 and at most 1."""
     if not 0 < min_fitness <= 1:
         raise ValueError(f"expected min_fitness as a fraction, above 0 and at most 1, got {min_fitness!r}.")
 
 
 def _refuse_failure(found: Registration, min_fitness: float, hint: str) -> None:
+    """Raise ValueError if too few source points have a partner, or if the surfaces can slide on each other."""
     if not found.fitness >= min_fitness:
         raise ValueError(
             f"expected {min_fitness:.0%} of the source on the target, got {found.fitness:.1%} within "
@@ -293,7 +388,7 @@ def _refuse_failure(found: Registration, min_fitness: float, hint: str) -> None:
 
 
 def _refuse_disagreement(found: Registration, source: Array, surface: _Surface) -> None:
-    """Raise ValueError where the partners lie further from each other than the noise of the clouds."""
+    """Raise ValueError if partners lie farther from each other than the noise of the clouds explains."""
     if found.agreement >= MIN_AGREEMENT * found.fitness:
         return
     # noise above the spacing, as of a scan on a dense model, lowers the agreement of the right pose too
@@ -314,15 +409,22 @@ def _refuse_disagreement(found: Registration, source: Array, surface: _Surface) 
 
 
 def _refuse_slid(found: Registration, guess: Array, source: Array, surface: _Surface, reach: float) -> None:
-    """Raise ValueError where the source, slid along the surface, comes to lie as well, or better beyond the reach.
+    """Raise ValueError if the source fits as well after it was slid along the surface.
 
-    It is slid in the two directions in which the surface holds it least, by up to twice the reach: a guess that is off
-    by one rib of many ends at a neighbour of the right one.
+    It is slid in the two directions in which the surface constrains it least, by up to twice the reach, because a guess
+    that is off by one rib of many ends at a neighbour of the correct one. A pose farther than the reach from the guess
+    counts only if it fits better.
+
+    Parameters
+    ----------
+    found : result of `icp`, with the clouds `source` (n, 3) and `surface`.
+    guess : (4, 4) first guess T_target_source.
+    reach : largest distance in metres by which the guess may be off.
     """
     T = found.T_target_source
     few = source[np.random.default_rng(0).permutation(len(source))[:SLID_POINTS]]
     best = _judged(few, surface, T)
-    if best.agreement <= 0:  # noise above the spacing: without a partner a point agrees better
+    if best.agreement <= 0:  # with noise above the spacing, a point without a partner agrees better than one with it
         return
     moved = few @ T[:3, :3].T + T[:3, 3]
     distance, partner = surface.tree.query(moved, distance_upper_bound=PARTNER_SPACINGS * surface.spacing)
@@ -341,8 +443,8 @@ def _refuse_slid(found: Registration, guess: Array, source: Array, surface: _Sur
         [
             other
             for other in others
-            if other.fitness >= AS_GOOD * best.fitness
-            and (other.agreement > best.agreement / AS_GOOD or _distance(given, other, few) <= reach)
+            if other.fitness >= NEARLY_BEST * best.fitness
+            and (other.agreement > best.agreement / NEARLY_BEST or _distance(given, other, few) <= reach)
         ],
         few,
         surface,
@@ -350,23 +452,28 @@ def _refuse_slid(found: Registration, guess: Array, source: Array, surface: _Sur
 
 
 def _roughness(points: Array, spacing: float) -> float:
-    """Distance in metres of neighbours along the normals of their cloud, thinned to a spacing: noise, or curvature."""
+    """Typical distance in metres of neighbours from each other along their normals, from noise or curvature.
+
+    The cloud (n, 3) is thinned to a spacing in metres first. The distance is the standard deviation of Gaussian noise
+    with the same median absolute distance.
+    """
     import open3d as o3d
 
     points = np.random.default_rng(0).permutation(points)
-    while len(points) >= 2 * LEAST_POINTS and np.median(cKDTree(points).query(points, k=2)[0][:, 1]) < spacing:
+    while len(points) >= 2 * MIN_POINTS and np.median(cKDTree(points).query(points, k=2)[0][:, 1]) < spacing:
         points = points[: len(points) // 2]
     cloud = _cloud(points)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
     partner = cKDTree(points).query(points, k=NORMAL_NEIGHBOURS)[1][:, 1:]
     off = ((points[partner] - points[:, None]) * np.asarray(cloud.normals)[:, None]).sum(axis=-1)
-    return float(1.4826 * np.median(np.abs(off)))
+    return sigma_from_median(off)
 
 
 def _refuse_others(best: Registration, tried: list[Registration], source: Array, surface: _Surface) -> None:
+    """Raise ValueError if one of the tried poses is far from the best one and agrees nearly as well."""
     for other in tried:
         far = _distance(best, other, source) > 2 * PARTNER_SPACINGS * surface.spacing
-        if far and other.agreement >= AS_GOOD * best.agreement:
+        if far and other.agreement >= NEARLY_BEST * best.agreement:
             relative = _relative(best, other)
             angle = np.degrees(Rotation.from_matrix(relative[:3, :3]).magnitude())
             raise ValueError(
@@ -378,13 +485,14 @@ def _refuse_others(best: Registration, tried: list[Registration], source: Array,
 
 
 def _cloud(points: Array) -> Any:
+    """Points (n, 3) as Open3D's point cloud."""
     import open3d as o3d
 
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
 
 
 def _refined(source: Array, surface: _Surface, start: Array, distance_m: float) -> Registration:
-    """Result of ICP from one start, with a distance that is halved down to 1.5 spacings; whatever it is worth."""
+    """The result of ICP from one start, judged but not refused; the distance is halved down to 1.5 spacings."""
     import open3d as o3d
 
     registration = o3d.pipelines.registration
@@ -397,16 +505,18 @@ def _refined(source: Array, surface: _Surface, start: Array, distance_m: float) 
 
 
 def _judged(source: Array, surface: _Surface, T: Array) -> Registration:
+    """The quality of the pose T (4, 4) of the source (n, 3) on the target."""
     moved, reach = source @ T[:3, :3].T + T[:3, 3], PARTNER_SPACINGS * surface.spacing
     distance, partner = surface.tree.query(moved, distance_upper_bound=reach)
     has = np.isfinite(distance)
     other = np.isfinite(cKDTree(moved).query(surface.points, distance_upper_bound=reach)[0])
-    if has.sum() < 3:  # nothing that holds a pose, nor a size to measure turns by
+    if has.sum() < 3:  # too few partners to constrain a pose, or to give a size in which turns are measured
         return Registration(T, 0.0, float(other.mean()), float("nan"), 0.0, 0.0)
     n = np.asarray(surface.cloud.normals)[partner[has]]
     off = ((moved[has] - surface.points[partner[has]]) * n).sum(axis=-1)
-    # Gelfand, Ikemoto, Rusinkiewicz, Levoy: "Geometrically stable sampling for the ICP algorithm", 2003; but as the
-    # product of two estimates of the normals: errors of one alone would seem to hold what slides
+    # Constraint by Gelfand, Ikemoto, Rusinkiewicz, Levoy: "Geometrically stable sampling for the ICP algorithm", 2003,
+    # but as the product of two independent estimates of the normals: with one estimate alone, its errors would look
+    # like a constraint on surfaces that slide
     arm = moved[has] - moved[has].mean(axis=0)
     arm /= np.sqrt((arm**2).sum(axis=-1).mean())
     first, second = (normals[tree.query(moved[has])[1]] for tree, normals in surface.halves)
@@ -424,7 +534,7 @@ def _judged(source: Array, surface: _Surface, T: Array) -> Registration:
 
 
 def _feature_poses(source: Array, surface: _Surface, seed: int) -> list[Array]:
-    """(4, 4) poses that the matches of features propose, one of each run."""
+    """Poses (4, 4) that RANSAC finds from matches of features, one from each run that has a result."""
     import open3d as o3d
 
     extent = float(np.linalg.norm(np.ptp(surface.points, axis=0)))
@@ -433,7 +543,7 @@ def _feature_poses(source: Array, surface: _Surface, seed: int) -> list[Array]:
     for points in (source, surface.points):
         cloud = _cloud(points).voxel_down_sample(voxel)
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * voxel, 30))
-        cloud.orient_normals_towards_camera_location(cloud.get_center())  # a side that does not depend on the pose
+        cloud.orient_normals_towards_camera_location(cloud.get_center())  # which does not depend on the pose
         few.append(cloud)
         search = o3d.geometry.KDTreeSearchParamHybrid(5 * voxel, 100)
         features.append(o3d.pipelines.registration.compute_fpfh_feature(cloud, search))
@@ -455,10 +565,11 @@ def _feature_poses(source: Array, surface: _Surface, seed: int) -> list[Array]:
 
 
 def _relative(first: Registration, second: Registration) -> Array:
+    """(4, 4) motion of the source from the first pose to the second, in source coordinates."""
     return np.asarray(np.linalg.inv(first.T_target_source) @ second.T_target_source)
 
 
 def _distance(first: Registration, second: Registration, source: Array) -> float:
-    """Root mean square distance of the source's points under two poses, metres."""
+    """Root mean square distance in metres between the source points (n, 3) under two poses."""
     T = _relative(first, second)
     return float(np.sqrt(((source @ T[:3, :3].T + T[:3, 3] - source) ** 2).sum(axis=-1).mean()))

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stereo on parallel cameras: rectification, matching along rows, disparity to depth and its error.
+"""Stereo with two calibrated cameras: rectification, matching along rows, depth from disparity and its error.
 
-Two pinholes with parallel axes and one focal length f, a baseline b apart along x, see a point at depth z with the
-disparity d = x - x' = f b / z on the same row: F = [0, 0, 0; 0, 0, -1; 0, 1, 0], and the epipoles lie at infinity,
-(1, 0, 0). `rectify` makes any two calibrated cameras so by turning them about their centres (Fusiello, Trucco, Verri:
-"A compact algorithm for rectification of stereo pairs", 2000).
+Two pinholes with parallel axes, one focal length f and a baseline b along x see a point at depth z on the same row,
+with the disparity d = x - x' = f b / z. Their fundamental matrix is F = [0, 0, 0; 0, 0, -1; 0, 1, 0], and their
+epipoles lie at infinity, (1, 0, 0). `rectify` brings any two calibrated cameras into this arrangement by rotating them
+about their centres (Fusiello, Trucco, Verri: "A compact algorithm for rectification of stereo pairs", 2000).
 
-Here images meet coordinates. Pixel centres lie at integer + 0.5, OpenCV's at integers: `warp` converts, nothing else.
+Pixel centres lie at integer + 0.5 here and at integers in OpenCV. `RectifiedPair.warp` is the only place in this module
+that converts between the two.
+
+Used by: no other module of rangesim; it is for users alone (`examples/rectification.py`).
 """
 
 from __future__ import annotations
@@ -21,16 +24,46 @@ from rangesim.geometry.correspondences import Array, checked_array
 from rangesim.rig import Intrinsics, pose
 
 MAX_GROWTH = 4.0
-"""Times the pixels of the larger image that a rectified one may have: beyond, the cameras look along their baseline."""
+"""Largest ratio of the pixels of a rectified image to those of the larger original. With a field of view of 44 degrees
+it is exceeded where both cameras turn inwards by more than 25 degrees, or both look more than 40 degrees away from
+straight across the baseline (measured). The ratio grows without limit from there, and so does the distortion."""
+
+MIN_ACROSS = 1e-3
+"""Least part, across the baseline, of the sum of both optical axes (unit vectors), as a ratio to 1. Below it there is
+no direction for the common axis. The value hardly matters, because such cameras exceed `MAX_GROWTH` long before."""
+
 BORDER_POINTS = 33
-"""Of each side of an image, which say how far it reaches when it is turned."""
-LEVELS = 16
-"""Steps per pixel of OpenCV's disparities, and the multiple in which their range is counted."""
+"""Number of points per side of an image whose rays say how far the rectified image reaches. There are enough so that a
+border that distortion bends between two of them is cut off by no more than a fraction of a pixel."""
+
+STEPS_PER_PIXEL = 16
+"""Number of steps per pixel in OpenCV's disparities, which are integers with four fractional bits (source:
+StereoSGBM)."""
+
+DISPARITY_MULTIPLE = 16
+"""Number of pixels of which the range of disparities must be a multiple; source: OpenCV's StereoSGBM,
+numDisparities."""
 
 
 @dataclass(frozen=True)
 class ParallelCameras:
-    """What two parallel cameras measure. focal_px : f. baseline_m : b, positive: the second camera stands at x = b."""
+    """Two parallel cameras with one focal length, for depth from disparity.
+
+    Attributes
+    ----------
+    focal_px : focal length f, pixels.
+    baseline_m : baseline b, metres, positive; the second camera stands at x = b in the coordinates of the first.
+
+    Examples
+    --------
+    >>> cameras = ParallelCameras(focal_px=800, baseline_m=0.1)
+    >>> cameras.depth([80, 40, 0])
+    array([ 1.,  2., nan])
+    >>> cameras.disparity([1, 2])
+    array([80., 40.])
+    >>> cameras.depth_error(2, disparity_error_px=0.5)
+    array(0.025)
+    """
 
     focal_px: float
     baseline_m: float
@@ -42,15 +75,18 @@ class ParallelCameras:
             )
 
     def disparity(self, z_m: ArrayLike) -> Array:
-        """d = f b / z in pixels, of depths in metres; NaN where z is not positive."""
+        """Disparities d = f b / z in pixels, float64, for depths z in metres; NaN where z is not positive."""
         return self._over(z_m)
 
     def depth(self, disparity_px: ArrayLike) -> Array:
-        """z = f b / d in metres; NaN where d is not positive (at infinity, or behind the cameras)."""
+        """Depths z = f b / d in metres, float64, for disparities d in pixels; NaN where d is not positive.
+
+        The point of such a disparity lies at infinity or behind the cameras.
+        """
         return self._over(disparity_px)
 
     def depth_error(self, z_m: ArrayLike, disparity_error_px: ArrayLike) -> Array:
-        """z^2 / (f b) times the error of the disparity: that of the depth in metres, to first order."""
+        """Error of the depth in metres, z^2 / (f b) times the error of the disparity in pixels, to first order."""
         z = np.asarray(z_m, dtype=np.float64)
         return np.asarray(z**2 / (self.focal_px * self.baseline_m) * np.asarray(disparity_error_px, dtype=np.float64))
 
@@ -62,11 +98,24 @@ class ParallelCameras:
 
 @dataclass(frozen=True, eq=False)
 class RectifiedPair:
-    """Two cameras turned to be parallel, and how their images and pixels get there.
+    """Two cameras rotated to be parallel, with the maps of their images and pixels.
 
-    first, second : Intrinsics of the real cameras. camera : Intrinsics of both rectified ones, a pinhole, the image
-    large enough for all that either sees. R_rectified_first, R_rectified_second : (3, 3), turn camera coordinates
-    into rectified ones. baseline_m : metres; the second rectified camera stands there on the x axis of the first.
+    Attributes
+    ----------
+    first, second : Intrinsics of the real cameras.
+    camera : Intrinsics of both rectified cameras: a pinhole whose image holds all that either camera sees.
+    R_rectified_first, R_rectified_second : (3, 3) float64, map camera coordinates to rectified camera coordinates.
+    baseline_m : metres; the second rectified camera stands at this x in the coordinates of the first.
+
+    Examples
+    --------
+    >>> from rangesim.rig import Intrinsics, translation
+    >>> camera = Intrinsics(640, 480, 800, 800, 320, 240)
+    >>> pair = rectify(camera, camera, translation(-0.1, 0, 0))
+    >>> pair.parallel
+    ParallelCameras(focal_px=800.0, baseline_m=0.1)
+    >>> pair.pixels_of_first([[100, 200]]) - pair.pixels_of_second([[60, 200]])
+    array([[40.,  0.]])
     """
 
     first: Intrinsics
@@ -78,63 +127,74 @@ class RectifiedPair:
 
     @property
     def parallel(self) -> ParallelCameras:
-        """Focal length and baseline: disparity to depth."""
+        """Focal length and baseline of the rectified cameras, which convert disparity to depth."""
         return ParallelCameras(self.camera.fx, self.baseline_m)
 
     @property
     def H_first(self) -> Array:
-        """(3, 3) K_rect R K^-1: the homography of pixels of the first camera, lens distortion taken out."""
+        """(3, 3) float64 homography K_rect R K^-1 of undistorted pixels of the first camera to rectified pixels."""
         return _homography(self.first, self.camera, self.R_rectified_first)
 
     @property
     def H_second(self) -> Array:
-        """(3, 3) the same of the second camera."""
+        """(3, 3) float64 homography of undistorted pixels of the second camera to rectified pixels."""
         return _homography(self.second, self.camera, self.R_rectified_second)
 
     def pixels_of_first(self, pixels: ArrayLike) -> Array:
-        """(..., 2) rectified pixels of pixels (..., 2) as the first camera shows them, distortion included."""
+        """(..., 2) float64 rectified pixels of distorted pixels (..., 2) of the first camera."""
         return self.camera.project(self.first.directions(pixels) @ self.R_rectified_first.T)
 
     def pixels_of_second(self, pixels: ArrayLike) -> Array:
-        """(..., 2) the same of the second camera."""
+        """(..., 2) float64 rectified pixels of distorted pixels (..., 2) of the second camera."""
         return self.camera.project(self.second.directions(pixels) @ self.R_rectified_second.T)
 
     def warp(self, first: np.ndarray, second: np.ndarray) -> tuple[Array, Array]:
-        """The images (h, w) of both cameras as the rectified ones see them, float32; NaN where a camera sees
-        nothing."""
+        """The images (h, w) of both cameras as the rectified cameras see them, float32, in the unit of the images.
+
+        Pixels that a camera does not see are NaN.
+        """
         return (
             _warped(self.first, self.camera, self.R_rectified_first, first),
             _warped(self.second, self.camera, self.R_rectified_second, second),
         )
 
     def points(self, disparity_px: np.ndarray) -> Array:
-        """(h, w, 3) float64 points, metres, coordinates of the first camera as it really stands; NaN where there is
-        none.
+        """(h, w, 3) float64 points in metres, in the coordinates of the real first camera; NaN without a disparity.
 
         Parameters
         ----------
-        disparity_px : (h, w), of the first rectified image, as `match_rows` returns.
+        disparity_px : (h, w) disparities of the first rectified image in pixels, as `match_rows` returns.
         """
         rays = self.camera.directions(self.camera.pixel_centres())
         return np.asarray(rays * self.parallel.depth(disparity_px)[..., None] @ self.R_rectified_first)
 
 
 def rectify(first: Intrinsics, second: Intrinsics, T_second_first: ArrayLike) -> RectifiedPair:
-    """The pair of cameras turned so that epipolar lines are rows, and corresponding rows have one number.
+    """The pair of cameras, rotated so that epipolar lines are rows and corresponding rows have the same number.
 
-    The common x axis is the baseline, from the first to the second camera; z is the mean of both optical axes made
-    orthogonal to it. So the first camera is the left one: where it stands on the right, or below, images come out
-    turned by 180 or 90 degrees. The focal length is the mean of all; the image holds both cameras' whole fields.
+    The common x axis is the baseline, from the first to the second camera. The common z axis is the mean of both
+    optical axes, made orthogonal to the baseline. So the first camera becomes the left one: if it stands on the right
+    or below, the rectified images are turned by 180 or 90 degrees. The focal length is the mean of all four. The
+    rectified image holds the whole fields of view of both cameras.
 
     Parameters
     ----------
-    T_second_first : (4, 4) maps coordinates of the first camera to the second's, metres.
+    first, second : Intrinsics of both cameras.
+    T_second_first : (4, 4), maps coordinates of the first camera to those of the second, metres.
 
     Raises
     ------
     ValueError
-        The cameras stand in one place, look in opposite directions, or one sees the other, or nearly so: a camera that
-        moves forward has its epipole in the image, and no turn brings it to infinity.
+        The cameras have one centre, look in opposite directions, or look along their baseline. A camera that moves
+        forward has its epipole in the image, and no rotation brings it to infinity.
+
+    Examples
+    --------
+    >>> from rangesim.rig import Intrinsics, translation
+    >>> camera = Intrinsics(640, 480, 800, 800, 320, 240)
+    >>> pair = rectify(camera, camera, translation(-0.1, 0, 0))
+    >>> pair.baseline_m, pair.camera.width, pair.camera.height
+    (0.1, 640, 480)
     """
     T = pose(T_second_first, "T_second_first")
     R, t = T[:3, :3], T[:3, 3]
@@ -143,9 +203,9 @@ def rectify(first: Intrinsics, second: Intrinsics, T_second_first: ArrayLike) ->
     if not baseline > 0:
         raise ValueError("expected two cameras that stand apart, got a baseline of 0.")
     x = towards / baseline
-    looking = np.array([0.0, 0.0, 1.0]) + R[2]  # both optical axes, coordinates of the first camera
+    looking = np.array([0.0, 0.0, 1.0]) + R[2]  # the sum of both optical axes, in coordinates of the first camera
     z = looking - (looking @ x) * x
-    if np.linalg.norm(z) < 1e-3:
+    if np.linalg.norm(z) < MIN_ACROSS:
         raise ValueError(_ALONG_BASELINE.format(why="both look along it, or in opposite directions"))
     z = z / np.linalg.norm(z)
     turned = np.stack([x, np.cross(z, x), z])
@@ -175,24 +235,33 @@ _ALONG_BASELINE = (
 def match_rows(
     first: np.ndarray, second: np.ndarray, disparities_px: tuple[float, float], block_px: int = 5
 ) -> np.ndarray:
-    """(h, w) float32 disparities d = x - x' of the first image of a rectified pair, to 1/16 pixel; NaN where none is
-    sure.
+    """(h, w) float32 disparities d = x - x' in pixels for the first image of a rectified pair, in steps of 1/16 pixel.
 
-    OpenCV's semi-global matching (Hirschmueller, PAMI 2008; all eight directions), its usual penalties for steps of one
-    pixel and more, with the check that the match back from the second image agrees within one pixel.
+    Pixels without a reliable match are NaN. The method is OpenCV's semi-global matching (Hirschmueller, PAMI 2008) with
+    all eight directions and the penalties that OpenCV recommends. The match back from the second image must agree
+    within one pixel.
 
     Parameters
     ----------
-    first, second : (h, w) images, any unit; NaN where there is none, as `RectifiedPair.warp` returns. The second
-        should be exposed as the first.
-    disparities_px : least and largest that is looked for: `ParallelCameras.disparity` of the largest and least depth.
-    block_px : odd, side of the blocks that are compared.
+    first, second : (h, w) images in any unit, NaN where there is no image, as `RectifiedPair.warp` returns. Both should
+        have the same exposure.
+    disparities_px : least and largest disparity to look for: `ParallelCameras.disparity` of the largest and the least
+        depth.
+    block_px : side of the blocks that are compared, odd.
 
     Raises
     ------
     ValueError
-        Images that are not of one size or have no contrast, a range that is empty or wider than the image, an even
-        block.
+        The images differ in shape or have no contrast, the range is empty or wider than the image, or the block is
+        even.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> texture = np.random.default_rng(0).uniform(size=(60, 120))
+    >>> found = match_rows(texture[:, :100], texture[:, 8:108], (4, 12))
+    >>> float(np.nanmedian(found))
+    8.0
     """
     import cv2
 
@@ -209,8 +278,8 @@ def match_rows(
     known = np.isfinite(a)
     grey = _eight_bits(a, b)
     start = int(np.floor(least))
-    count = int(np.ceil((np.ceil(largest) - start + 1) / LEVELS)) * LEVELS
-    # the matcher leaves out the columns where its range of disparities begins: give it room
+    count = int(np.ceil((np.ceil(largest) - start + 1) / DISPARITY_MULTIPLE)) * DISPARITY_MULTIPLE
+    # the matcher leaves out as many columns at the left as its range is wide, so images get a margin of that width
     room = max(0, start + count)
     images = [cv2.copyMakeBorder(image, 0, 0, room, room, cv2.BORDER_REPLICATE) for image in grey]
     matcher = cv2.StereoSGBM_create(
@@ -223,9 +292,9 @@ def match_rows(
         uniquenessRatio=10,
         mode=cv2.STEREO_SGBM_MODE_HH,
     )
-    found = matcher.compute(*images)[:, room : room + a.shape[1]].astype(np.float32) / LEVELS
+    found = matcher.compute(*images)[:, room : room + a.shape[1]].astype(np.float32) / STEPS_PER_PIXEL
     found[(found < start) | (found > np.ceil(largest)) | ~known] = np.nan
-    # a match must lie where the second camera sees something
+    # a match must lie where the second camera has an image
     y, x = np.nonzero(np.isfinite(found))
     other = np.rint(x - found[y, x]).astype(int)
     inside = (other >= 0) & (other < a.shape[1])
@@ -236,7 +305,10 @@ def match_rows(
 
 
 def _eight_bits(first: Array, second: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Both images on one scale of 8 bits, from the 0.5 % to the 99.5 % quantile of the first; 0 where there is none."""
+    """Both images (h, w) as 8-bit integers on one scale, from the 0.5 % to the 99.5 % quantile of the first.
+
+    Pixels without an image become 0.
+    """
     low, high = np.nanquantile(first, [0.005, 0.995])
     if not high > low:
         raise ValueError("expected images with contrast, got a first image of one value.")
@@ -247,11 +319,12 @@ def _eight_bits(first: Array, second: Array) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _homography(real: Intrinsics, rectified: Intrinsics, rotation: Array) -> Array:
+    """(3, 3) homography of undistorted pixels of a real camera to pixels of the rectified one."""
     return np.asarray(calibration_matrix(rectified) @ rotation @ np.linalg.inv(calibration_matrix(real)))
 
 
 def _border(camera: Intrinsics) -> Array:
-    """(4 BORDER_POINTS, 2) pixels along the edge of the image."""
+    """(4 BORDER_POINTS, 2) pixels along the border of the image."""
     s = np.linspace(0, 1, BORDER_POINTS)
     zero, one = np.zeros_like(s), np.ones_like(s)
     around = [np.stack(side, axis=-1) for side in ((s, zero), (s, one), (zero, s), (one, s))]
@@ -259,6 +332,7 @@ def _border(camera: Intrinsics) -> Array:
 
 
 def _warped(real: Intrinsics, rectified: Intrinsics, rotation: Array, image: np.ndarray) -> Array:
+    """The image (h, w) of a real camera as the rectified one sees it, float32; NaN where the real one sees nothing."""
     import cv2
 
     pixels = checked_array("image", image, None, None)

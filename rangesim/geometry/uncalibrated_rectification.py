@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rectification of two images of which nothing is known but corresponding points: by the fundamental matrix alone.
+"""Rectification of two images without calibration, by their fundamental matrix and corresponding points.
 
-The second image is turned about its middle until its epipole lies on the x axis, at (r, 0, w), and G = [1, 0, 0; 0, 1,
-0; -w / r, 0, 1] moves that to infinity; about the middle G is nearly the identity. Rows of the first image that match
-these are then determined, but for where along a row a point comes to lie: the three numbers of that are fitted to the
-pairs, so that disparities are least (Hartley: "Theory and practice of projective rectification", IJCV 1999).
+The second image is rotated about its middle until its epipole lies on the x axis, at (r, 0, w). Then
+G = [1, 0, 0; 0, 1, 0; -w / r, 0, 1] moves the epipole to infinity; about the middle G is nearly the identity. This
+determines the matching rows of the first image, but not the position of a point along its row. The three parameters of
+that position are fitted to the pairs, so that disparities are as small as possible (Hartley: "Theory and practice of
+projective rectification", IJCV 1999).
 
-Rows then match, as `match_rows` wants them; what disparities mean in metres needs cameras (`rectify`).
+The rows of both images then match, as `match_rows` needs them. Depths in metres need calibrated cameras (`rectify`).
+
+Used by: no other module of rangesim; it is for users alone.
 """
 
 from __future__ import annotations
@@ -21,19 +24,39 @@ from rangesim.geometry.projective_plane import homogeneous, map_points
 from rangesim.geometry.two_view import epipoles
 
 MIN_PAIRS = 3
-LEAST_SCALE = 0.2
-"""Of the middle, how far the projective part may shrink a corner of an image; beyond, the epipole is near."""
+"""Least number of pairs of points: as many as there are parameters of the position along a row, so that the pairs
+determine them."""
+
+MIN_CORNER_SCALE = 0.2
+"""Least scale of the projective part at a corner of the image, as a ratio to its scale in the middle; its inverse is
+the largest one. Near an epipole the scale goes to 0 or infinity and the image is torn. Five times is strong but usable;
+a smaller ratio accepts epipoles nearer to the image."""
+
 MAX_GROWTH = 4.0
-"""Times the pixels of an image that a rectified one may have."""
+"""Largest ratio of the pixels of a rectified image to those of the original, the same as in `stereo`. A poorly known F
+shears images without limit; a larger value only delays that refusal."""
 
 
 @dataclass(frozen=True, eq=False)
 class UncalibratedPair:
-    """Two images brought to common rows.
+    """Two rectified images without calibration: corresponding points lie on the same row.
 
-    H_first, H_second : (3, 3) homographies of pixels to rectified ones. width, height : of the rectified images. size :
-    (width, height) of the images. disparity_px : (n,) x - x' of the pairs, rectified. row_error_px : root mean square
-    of y - y' of the pairs, rectified.
+    Attributes
+    ----------
+    H_first, H_second : (3, 3) float64 homographies of pixels to rectified pixels.
+    width, height : size of the rectified images, pixels.
+    size : (width, height) of the original images, pixels.
+    disparity_px : (n,) float64, x - x' of the rectified pairs, pixels.
+    row_error_px : root mean square of y - y' of the rectified pairs, pixels.
+
+    Examples
+    --------
+    `rectify_uncalibrated` returns such a pair; here it is made by hand, with the identity as both homographies:
+
+    >>> pair = UncalibratedPair(np.eye(3), np.eye(3), 4, 3, size=(4, 3), disparity_px=np.zeros(2), row_error_px=0.0)
+    >>> first, second = pair.warp(np.ones((3, 4)), np.zeros((3, 4)))
+    >>> first.shape, float(first.min()), float(second.max())
+    ((3, 4), 1.0, 0.0)
     """
 
     H_first: Array
@@ -45,10 +68,11 @@ class UncalibratedPair:
     row_error_px: float
 
     def warp(self, first: np.ndarray, second: np.ndarray) -> tuple[Array, Array]:
-        """Both images (h, w) rectified, float32; NaN where an image has nothing."""
+        """Both images (h, w) rectified, float32, in the unit of the images; NaN outside of an image."""
         return self._warped("first", self.H_first, first), self._warped("second", self.H_second, second)
 
     def _warped(self, name: str, H: Array, image: np.ndarray) -> Array:
+        """One image (h, w) rectified by H (3, 3), float32; NaN outside of it."""
         import cv2
 
         pixels = checked_array(name, image, None, None)
@@ -64,25 +88,38 @@ class UncalibratedPair:
 
 
 def rectify_uncalibrated(F: ArrayLike, first: ArrayLike, second: ArrayLike, size: tuple[int, int]) -> UncalibratedPair:
-    """Homographies that make epipolar lines rows, the same in both images.
+    """Homographies of two images that turn epipolar lines into rows with the same number in both images.
 
     Parameters
     ----------
-    F : (3, 3), x'^T F x = 0, as `find_fundamental` finds it. first, second : (n, 2) its pairs, n >= 3, not on a line;
-        of pinholes: a lens's distortion stays in and bends rows.
+    F : (3, 3), x'^T F x = 0, as `find_fundamental` returns it.
+    first, second : (n, 2) pixels of the pairs that agree with F, n >= 3, not on a line. They should be those of a
+        pinhole: lens distortion is not removed and bends the rows.
     size : (width, height) of both images, pixels.
 
     Raises
     ------
     ValueError
-        An epipole lies in an image or near it, as of a camera that moves forward: no homography brings it to infinity
-        without tearing the image; or the pairs lie on a line.
+        An epipole lies in an image or near it, as for a camera that moves forward, so that no homography brings it to
+        infinity without tearing the image; or the pairs lie on a line, or do not fit F.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.geometry import fundamental_from_cameras, project, projection_matrix
+    >>> from rangesim.rig import translation
+    >>> K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
+    >>> P, Q = projection_matrix(K), projection_matrix(K, translation(-0.1, 0.02, 0))
+    >>> points = np.random.default_rng(0).uniform([-1, -0.7, 3], [1, 0.7, 5], (30, 3))
+    >>> found = rectify_uncalibrated(fundamental_from_cameras(P, Q), project(P, points), project(Q, points), (640, 480))
+    >>> bool(found.row_error_px < 1e-6)
+    True
     """
     a, b = checked_pairs(first, second, MIN_PAIRS, "rectification")
     width, height = size
     if not (width >= 1 and height >= 1):
         raise ValueError(f"expected size as (width, height) in pixels, got {size!r}.")
-    # about the middle, half the larger side for unit: all matrices are then of one size
+    # coordinates about the middle of the image in units of half its larger side: all matrices then have similar sizes
     unit = max(width, height) / 2
     to_unit = np.array([[1 / unit, 0, -width / 2 / unit], [0, 1 / unit, -height / 2 / unit], [0, 0, 1.0]])
     from_unit = np.linalg.inv(to_unit)
@@ -101,7 +138,7 @@ def rectify_uncalibrated(F: ArrayLike, first: ArrayLike, second: ArrayLike, size
     H_second = to_infinity @ turn
     _check_scale(corners @ H_second[2], "second")
 
-    # the rows of the first: y and scale are those of H_second [e']x F, which knows them up to one sign
+    # the last two rows of H_first are those of H_second [e']x F, up to a common factor; its sign is chosen here
     rows = (H_second @ _cross(x, y, w) @ F_unit)[1:]
     rows = rows / np.abs(rows[1, 2] if abs(rows[1, 2]) > 1e-12 else np.linalg.norm(rows[1]))
     rows = rows * (1.0 if rows[1, 2] > 0 else -1.0)
@@ -114,7 +151,7 @@ def rectify_uncalibrated(F: ArrayLike, first: ArrayLike, second: ArrayLike, size
     H_first = np.stack([along, *rows])
     if np.linalg.det(H_first) <= 0:
         raise ValueError(
-            "expected pairs that one F explains from one side, got some that mirror the first image: check F and the "
+            "expected pairs that F maps without a reflection, got some that mirror the first image: check F and the "
             "pairs."
         )
     both = np.concatenate([map_points(H, corners[:, :2]) for H in (H_first, H_second)]) * unit
@@ -123,7 +160,7 @@ def rectify_uncalibrated(F: ArrayLike, first: ArrayLike, second: ArrayLike, size
     if out_width * out_height > MAX_GROWTH * width * height:
         raise ValueError(
             f"expected pairs from all over the image, got some that lead to rectified images of {out_width} x "
-            f"{out_height} pixels: F is that of cameras far apart, or is not well known."
+            f"{out_height} pixels: F belongs to cameras far apart, or is not known well."
         )
     place = np.array([[unit, 0, -low[0]], [0, unit, -low[1]], [0, 0, 1.0]])
     H_first, H_second = (place @ H @ to_unit for H in (H_first, H_second))
@@ -140,16 +177,23 @@ def rectify_uncalibrated(F: ArrayLike, first: ArrayLike, second: ArrayLike, size
 
 
 _NEAR = (
-    "expected epipoles outside the images and far from them, got one in the {which} image or near it, as of a camera "
+    "expected epipoles outside the images and far from them, got one in the {which} image or near it, as for a camera "
     "that moves forward: match along epipolar lines instead."
 )
 
 
 def _check_scale(denominators: Array, which: str) -> None:
-    """Raise ValueError if a homography of the last row's values at the corners, 1 in the middle, tears the image."""
-    if not denominators.min() > LEAST_SCALE or not denominators.max() < 1 / LEAST_SCALE:
+    """Raise ValueError if a homography tears the image.
+
+    Parameters
+    ----------
+    denominators : (4,) values of the homography's last row at the corners of the image; it is 1 in the middle.
+    which : name of the image for the message.
+    """
+    if not denominators.min() > MIN_CORNER_SCALE or not denominators.max() < 1 / MIN_CORNER_SCALE:
         raise ValueError(_NEAR.format(which=which))
 
 
 def _cross(x: float, y: float, z: float) -> Array:
+    """(3, 3) matrix [t]_x of t = (x, y, z), with [t]_x v = t x v."""
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -12,7 +12,7 @@ import numpy as np
 
 from rangesim.light_transport.scattering import Media, Medium
 from rangesim.rig import Intrinsics, Lens, Rig
-from rangesim.rig.distortion import Distorted, distort, undistort
+from rangesim.rig.camera_model import Distorted, distort, undistort
 
 MAX_REPROJECTION_PX = 1e-2
 """Largest error, in pixels, with which the ray found for a pixel may project back onto it. Where it is larger, the

@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pcgraph import interrupts
+from pcgraph.plumbing import interrupts
 
 LAUNCH_S = 1.0
 """Duration in seconds at which the size of launches aims. It is short, because Ctrl-C waits for a launch; the shorter

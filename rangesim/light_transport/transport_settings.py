@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal, TypedDict
 
-from rangesim.experiment.adaptive_sampling import AdaptiveSampling
+from rangesim.light_transport.sampler import Sampler
 from rangesim.settings.bounds import Bounds, check_fields, whole
 from rangesim.settings.config import check_keys, shown
 from rangesim.settings.seeds import check_seed
@@ -50,7 +50,7 @@ class TransportSettings:
         A setting is out of its range, or adaptive sampling has no sampling error to go by.
     """
 
-    spp: Annotated[int, whole(1, "spp")] | Literal["auto"] | AdaptiveSampling = "auto"
+    spp: Annotated[int, whole(1, "spp")] | Literal["auto"] | Sampler = "auto"
     max_depth: Annotated[int, whole(1, "depth")] = 5
     rr_depth: Annotated[int, whole(1, "depth")] = 5
     seed: int = 0
@@ -64,14 +64,14 @@ class TransportSettings:
     def __post_init__(self) -> None:
         object.__setattr__(self, "seed", check_seed(self.seed))
         check_fields(self)
-        if isinstance(self.spp, AdaptiveSampling) and not self.sampling_error:
-            raise ValueError("expected sampling_error=True with AdaptiveSampling, which goes by it.")
+        if isinstance(self.spp, Sampler) and not self.sampling_error:
+            raise ValueError(f"expected sampling_error=True with {type(self.spp).__name__}, which goes by it.")
 
 
 class TransportOptions(TypedDict, total=False):
     """The fields of `TransportSettings` by name, for editors and type checkers."""
 
-    spp: int | Literal["auto"] | AdaptiveSampling
+    spp: int | Literal["auto"] | Sampler
     max_depth: int
     rr_depth: int
     seed: int

@@ -84,9 +84,9 @@ def estimate_truncation(tally: np.ndarray, energy: EnergySplit, max_depth: int, 
     return Truncation(*(float(x) for x in parts / total)) if total else Truncation(0.0 * by_depth, 0.0, 0.0)
 
 
-def warn_of_truncation(truncation: Truncation, max_depth: int, of: str, stacklevel: int) -> None:
+def warn_of_truncation(truncation: Truncation | None, max_depth: int, of: str, stacklevel: int) -> None:
     """Warn if a pass left out more than `MAX_LEFT_OUT`; `of` names the camera, if there are several."""
-    if truncation.total <= MAX_LEFT_OUT:
+    if truncation is None or truncation.total <= MAX_LEFT_OUT:
         return
     why = f"a max_depth of {max_depth} ends light paths early; a larger one brings it"
     if not truncation.depth > truncation.chains + truncation.photons:

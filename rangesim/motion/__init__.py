@@ -1,5 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Captures of a world that moves: objects and rig on pose tracks, each exposure at its own time; see docs/motion.md."""
+"""Captures of moving scenes: objects and rig follow pose tracks, and each exposure has its own time (docs/motion.md).
+
+Examples
+--------
+An object moves to the right by 0.3 m/s, while patterns are projected and captured one by one:
+
+>>> from rangesim import StructuredLight
+>>> from rangesim.motion import ConstantTwist, Motion, Timing, transport_moving
+>>> motion = Motion({"large_ball": ConstantTwist(velocity_m_s=(0.3, 0.0, 0.0))})
+>>> timings = {StructuredLight(): Timing(frame_period_s=1 / 120)}
+>>> signals = transport_moving(scene, rig, timings, motion)  # doctest: +SKIP
+"""
 
 from rangesim.motion.moving_signals import MovingSignals
 from rangesim.motion.timing import Timing

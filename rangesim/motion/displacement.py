@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far the surface behind each pixel moves, from ground truth and pose tracks."""
+"""Distance that the surface behind each pixel moves, from ground truth and pose tracks."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from rangesim.rig import Rig
 from rangesim.signals import GroundTruth
 
 STILL = 1e-9
-"""Entries of a transform that differ less from the identity, in metres and radians, are roundings."""
+"""Metres, and radians: a transform whose entries all differ from the identity by less than this is at rest. Double
+precision rounds coordinates of up to kilometres by less."""
 
 
 def displacement(truth: GroundTruth, rig: Rig, start: Poses, end: Poses) -> np.ndarray:
-    """(h, w) float32, metres: how far the surface points that the pixels see move, as seen from the rig.
+    """Distance that the surface point behind each pixel moves, in camera coordinates: (h, w) float32, metres.
+
+    It is 0 where no surface is.
 
     Parameters
     ----------
-    truth : what the pixels of the camera see at `start`.
-    rig : Rig, where it stands without motion, with the camera that `truth` is of.
-    start, end : where everything is, before and after; both distances are taken in camera coordinates.
+    truth : ground truth of the camera at `start`.
+    rig : Rig without motion, with the camera that `truth` belongs to.
+    start, end : poses of everything that moves, before and after.
     """
     points = rig.camera.directions(rig.camera.pixel_centres()) * truth.z[..., None]
     result = np.zeros(truth.z.shape, dtype=np.float32)
@@ -34,7 +37,7 @@ def displacement(truth: GroundTruth, rig: Rig, start: Poses, end: Poses) -> np.n
 
 
 def _carry(name: str, start: Poses, end: Poses) -> np.ndarray:
-    """(4, 4) world transform that carries an object from one poses to another."""
+    """World transform (4, 4) that moves an object from its place in `start` to its place in `end`."""
     if name not in start.objects:
         return np.eye(4)
     return np.asarray(end.objects[name] @ np.linalg.inv(start.objects[name]))

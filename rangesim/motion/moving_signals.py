@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals whose frames were taken at different times, and how they are put together."""
+"""Signals whose frames were taken at different times, and the accumulator that collects them from several passes."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class MovingSignals(Signals):
 
     `rig`, `energy` and `truth` are those at the middle of the acquisition.
 
-    sensor : the one sensor these signals are of.
+    sensor : the sensor that the frames belong to.
     lit : (k, h, w) float32, W/m2/sr, the frames without ambient light.
     ambient : (e, h, w) float32, W/m2/sr, ambient light during each exposure, before any filter.
-    ambient_gain : (k,) float32, how much of it a frame holds.
-    exposure_of_frames : (k,) int, index into `ambient`.
+    ambient_gain : (k,) float32, fraction of the ambient light that each frame receives.
+    exposure_of_frames : (k,) int, exposure of each frame, an index into `ambient`.
     lit_error : (k, h, w) float32, W/m2/sr, a draw of the sampling error of `lit`; None: not known.
     """
 
@@ -43,7 +43,9 @@ class MovingSignals(Signals):
 
     def frames(self, sensor: Sensor, ambient_transmission: float = 1.0, sampling_errors: float = 0.0) -> np.ndarray:
         if sensor != self.sensor:
-            raise ValueError(f"expected {self.sensor}, whose frames these are, got {sensor}.")
+            raise ValueError(
+                f"expected {self.sensor}, as the signals are the frames of this sensor alone, got {sensor}."
+            )
         lit = self.lit
         if sampling_errors:
             if self.lit_error is None:
@@ -55,18 +57,20 @@ class MovingSignals(Signals):
 
 
 class FrameStack:
-    """The frames of one sensor, filled while pass after pass comes in; holds them and nothing of earlier passes.
+    """Accumulator for the frames of one sensor; each pass adds its part, and is not kept.
 
     Parameters
     ----------
-    sensor, timing : whose frames, and which exposures they share.
-    rig : Rig, where it stands without motion.
+    sensor : the sensor that the frames belong to.
+    timing : the times of its exposures, and which frames share one.
+    rig : Rig without motion.
     middle, at_middle : the pass at the middle of the acquisition, and its signals.
     """
 
     def __init__(self, sensor: Sensor, timing: Timing, rig: Rig, middle: Pass, at_middle: StillSignals) -> None:
         self.sensor, self.rig = sensor, rig
-        self.middle, self.at_middle = middle, replace(at_middle, channels={}, sampling=None)  # without what is large
+        self.middle = middle
+        self.at_middle = replace(at_middle, channels={}, sampling=None)  # without the large arrays
         self.exposure_of_frames = timing.exposure_of_frames(sensor)
         image = (rig.camera.height, rig.camera.width)
         self.lit = np.zeros((sensor.n_frames, *image), dtype=np.float32)
@@ -75,7 +79,7 @@ class FrameStack:
         self.motion_m = np.zeros(image, dtype=np.float32)
 
     def add(self, one: Pass, signals: StillSignals) -> None:
-        """Take what a pass has for this sensor."""
+        """Add the light that a pass has for the frames of this sensor, and update the motion of its pixels."""
         frames = signals.frames(self.sensor, 0.0)
         error = None if self.lit_error is None else signals.frames(self.sensor, 0.0, sampling_errors=1.0) - frames
         for part in one.contributions:
@@ -90,14 +94,14 @@ class FrameStack:
         comes = displacement(signals.truth, cropped, one.poses, self.middle.poses)
         moved = one.window.of(self.motion_m)
         np.maximum(moved, np.maximum(one.window.of(leaves), comes), out=moved)
-        # A shadow moves with what casts it, also over what stands still
+        # A shadow moves with the object that casts it, even over surfaces at rest
         lit_at_middle = one.window.of(self.at_middle.truth.projector_visible)
         passed_by_shadow = binary_dilation(lit_at_middle != signals.truth.projector_visible, np.ones((3, 3)))
         caster = max(np.nanmax(leaves, initial=0), np.nanmax(comes, initial=0))
         moved[passed_by_shadow] = np.maximum(moved[passed_by_shadow], caster)
 
     def signals(self) -> MovingSignals:
-        """The signals, when all passes are in."""
+        """The signals, after all passes have been added."""
         return MovingSignals(
             rig=self.at_middle.rig,
             energy=self.at_middle.energy,
@@ -114,6 +118,10 @@ class FrameStack:
 
 
 def _ambient_gain(sensor: Sensor) -> np.ndarray:
-    """(k,) float32: frames are affine in ambient light, so those of a pixel in ambient light of 1 alone tell all."""
+    """Fraction of the ambient light that each frame receives: (k,) float32.
+
+    Frames are affine in ambient light, so the frames of one pixel with an ambient radiance of 1 and no other light
+    give it.
+    """
     dark = [np.zeros((r.channels, 1, 1), dtype=np.float32) for r in sensor.responses()]
     return sensor.frames(dark, np.zeros((1, 1), np.float32), np.ones((1, 1), np.float32))[:, 0, 0]

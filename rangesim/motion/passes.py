@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which transport passes a set of captures needs: exposures between which nothing has moved share one."""
+"""Plan of the transport passes that a set of captures needs; exposures share a pass if nothing moves between them."""
 
 from __future__ import annotations
 
@@ -17,9 +17,12 @@ from rangesim.settings.seeds import derived_seed
 
 @dataclass(frozen=True, eq=False)
 class Contribution:
-    """What one sensor takes from a pass: a fraction (0..1) of the light of these frames, which one exposure fills.
+    """Part of a sensor's frames that one pass gives.
 
-    The pass at the middle of the acquisition may have no frames to give.
+    sensor : Sensor.
+    exposure : index of the exposure that these frames belong to.
+    frames : (n,) int, indices of the frames.
+    fraction : fraction (0..1) of the exposure that the pass stands for.
     """
 
     sensor: Sensor
@@ -30,9 +33,12 @@ class Contribution:
 
 @dataclass(frozen=True, eq=False)
 class Pass:
-    """Light transport with everything at one place, for a window of the image.
+    """One run of the light transport, with everything in one place, for a window of the image.
 
-    reference_of : the sensors whose middle of the acquisition this is.
+    poses : places of everything that moves.
+    window : part of the image that is rendered.
+    contributions : frames that this pass gives light to; none if it is the middle of an acquisition only.
+    reference_of : sensors that have the middle of their acquisition here.
     """
 
     poses: Poses
@@ -42,11 +48,11 @@ class Pass:
 
     @property
     def sensors(self) -> list[Sensor]:
-        """Those that take frames from this pass, in order of first appearance."""
+        """Sensors that take frames from this pass, in the order of their first contribution."""
         return list(dict.fromkeys(s.sensor for s in self.contributions))
 
     def rig(self, rig: Rig) -> Rig:
-        """The rig where it is, its camera cropped to the window."""
+        """The rig at its place in this pass, with its camera cropped to the window."""
         camera, window = rig.camera, self.window
         if window != Window.whole(camera):
             camera = replace(
@@ -59,8 +65,11 @@ class Pass:
         return replace(rig, camera=camera, T_world_camera=self.poses.place(rig))
 
     def seed(self, seed: int) -> int:
-        """Seed of the pass: the same at all times, so that what stands still has the same noise in all frames, but
-        another one for each place of the window, or every band of lines would repeat the noise of the first."""
+        """Seed of this pass, for a seed of the whole acquisition.
+
+        It is the same at all times, so surfaces at rest have the same noise in all frames. It differs between windows,
+        because otherwise every band of lines would repeat the noise of the first band.
+        """
         corner = (self.window.top, self.window.left)
         if not any(corner):
             return seed
@@ -68,7 +77,14 @@ class Pass:
 
 
 def plan(rig: Rig, timings: Mapping[Sensor, Timing], motion: Motion) -> list[Pass]:
-    """Passes for the captures of all sensors; those at the middle of an acquisition come first."""
+    """Passes for the captures of all sensors; the passes at the middle of an acquisition come first.
+
+    Parameters
+    ----------
+    rig : Rig without motion.
+    timings : Timing of each sensor.
+    motion : tracks of everything that moves.
+    """
     passes: dict[tuple[bytes, Window], Pass] = {}
 
     def at(time_s: float, window: Window) -> Pass:
@@ -88,8 +104,10 @@ def plan(rig: Rig, timings: Mapping[Sensor, Timing], motion: Motion) -> list[Pas
 
 
 def _joined(instants: Sequence[Instant], motion: Motion) -> list[Instant]:
-    """Fewer instants that mean the same: where nothing has moved from one to the next, equal windows become one
-    fraction, and then neighbouring bands one window."""
+    """The same instants, with those merged between which nothing moves.
+
+    Instants of the same window are merged by adding their fractions. Then neighbouring bands are merged to one window.
+    """
     at_place: dict[tuple[bytes, Window], Instant] = {}
     for instant in instants:
         place = (motion.at(instant.time_s).key, instant.window)
@@ -108,7 +126,7 @@ def _joined(instants: Sequence[Instant], motion: Motion) -> list[Instant]:
 
 
 def _touch(first: Window, second: Window) -> bool:
-    """Whether the second window follows right below, or right beside, the first."""
+    """Whether the second window is directly below the first, or directly to its right."""
     below = first.bottom == second.top and (first.left, first.right) == (second.left, second.right)
     beside = first.right == second.left and (first.top, first.bottom) == (second.top, second.bottom)
     return below or beside

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When the frames of a capture are taken."""
+"""Timing of the frames of a capture."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
-from rangesim import limits
 from rangesim.rig import Array, Intrinsics
 from rangesim.sensor import Sensor
+from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, Pause, check_fields, whole
 
 
 class Window(NamedTuple):
-    """A part of the image: rows from `top` to before `bottom`, columns from `left` to before `right`."""
+    """Rectangle of an image: rows `top` to `bottom` - 1, columns `left` to `right` - 1."""
 
     top: int
     bottom: int
@@ -24,16 +24,21 @@ class Window(NamedTuple):
 
     @classmethod
     def whole(cls, camera: Intrinsics) -> Window:
-        """All of a camera's image."""
+        """The window that is the whole image of a camera."""
         return cls(0, camera.height, 0, camera.width)
 
     def of(self, image: np.ndarray) -> np.ndarray:
-        """The window's pixels (..., rows, columns) of an image (..., h, w); a view."""
+        """Pixels of an image (..., h, w) inside the window: (..., rows, columns), a view and no copy."""
         return image[..., self.top : self.bottom, self.left : self.right]
 
 
 class Instant(NamedTuple):
-    """A time at which a window of the image is exposed, in seconds, and its fraction of the exposure."""
+    """One moment at which a window of the image is rendered.
+
+    time_s : seconds, on the clock of the pose tracks.
+    window : part of the image.
+    fraction : fraction (0..1) of the exposure that the moment stands for.
+    """
 
     time_s: float
     window: Window
@@ -42,32 +47,44 @@ class Instant(NamedTuple):
 
 @dataclass(frozen=True)
 class Timing:
-    """When a sensor takes its frames, in seconds on the clock of the pose tracks.
+    """Timing of a sensor's frames, in seconds on the clock of the pose tracks.
 
-    The middle of exposure k, in line r, is at start_s + k frame_period_s + r line_period_s. What fills one exposure
-    is up to the sensor: each pattern of structured light has its own, all bins of a direct time-of-flight camera
-    share one, and so do the four taps of an AMCW frequency, unless its pixels have but a `single_tap`.
+    The middle of exposure k in line r is at start_s + k frame_period_s + r line_period_s. The sensor decides which
+    frames share an exposure. Each pattern of structured light has its own exposure. All bins of a direct time-of-flight
+    camera share one. The four taps of an AMCW frequency share one too, but with `single_tap` each tap has its own.
 
     Parameters
     ----------
-    frame_period_s : float >= 0, from one exposure to the next.
-    line_period_s : float >= 0, from one line to the next as the camera reads them. 0: all lines at once (flash, global
-        shutter). The projector lights its whole field for every line, as it does at once. So this is a rolling shutter,
-        not a scanning beam: a beam would light one line alone, with all of its power and without the multipath of the
-        others.
+    frame_period_s : float >= 0, seconds from one exposure to the next.
+    line_period_s : float >= 0, seconds from one line to the next as the camera reads them. 0: all lines at once (global
+        shutter). The emitter lights its whole field for every line. So a line period makes a rolling shutter, not a
+        scanning beam: a beam would light one line at a time with its full power, and without the multipath of others.
     lines : "rows" from top to bottom, or "columns" from left to right.
-    bands : int >= 1, lines that are read one by one are rendered in so many bands (fewer if there are fewer lines),
-        each at the time of its middle. Every band is a pass of its own.
-    single_tap : bool, an AMCW camera takes its taps one after another. That is when they are taken, not how bright they
-        are: a pixel that collects half of the light for each has twice as much as `AmcwToF` gives a tap in an exposure.
-    start_s : float, middle of the first exposure.
-    exposure_s, exposure_samples : float >= 0 and int >= 1: the exposure is rendered at so many times, evenly spread,
-        and averaged. By default the motion within an exposure is neglected.
+    bands : int >= 1, number of bands of lines (fewer if there are fewer lines), if lines are read one by one. Each band
+        is a pass of its own, rendered at the time of its middle line.
+    single_tap : bool, whether an AMCW camera takes its taps one after another. This sets their times, not their signal:
+        a tap has the light that `AmcwToF` gives it, a quarter of an exposure. A real pixel with a single tap collects
+        half of the light of an exposure, which is twice as much.
+    start_s : float, seconds, middle of the first exposure.
+    exposure_s : float >= 0, seconds, over which the moments of `exposure_samples` are spread. 0: the motion within an
+        exposure is neglected.
+    exposure_samples : int >= 1, number of moments in an exposure that are rendered and averaged.
 
     Raises
     ------
     ValueError
         A number out of its range.
+
+    Examples
+    --------
+    >>> from rangesim import AmcwToF
+    >>> from rangesim.motion import Timing
+    >>> timing = Timing(frame_period_s=0.002)
+    >>> sensor = AmcwToF()
+    >>> timing.exposure_of_frames(sensor).tolist()
+    [0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2]
+    >>> timing.exposure_times_s(sensor).tolist()
+    [0.0, 0.002, 0.004]
     """
 
     frame_period_s: Pause = 1 / 60
@@ -83,11 +100,11 @@ class Timing:
         check_fields(self)
 
     def exposure_of_frames(self, sensor: Sensor) -> np.ndarray:
-        """(k,) int64, index of the exposure that fills each frame of a sensor."""
+        """Index of the exposure of each frame of a sensor: (k,) int64."""
         return np.arange(sensor.n_frames) // sensor.frames_per_exposure(self.single_tap)
 
     def exposure_times_s(self, sensor: Sensor) -> Array:
-        """(e,) float64, seconds, middle of each exposure in line 0."""
+        """Middle of each exposure, in line 0: (e,) float64, seconds."""
         exposures = int(self.exposure_of_frames(sensor)[-1]) + 1
         bands = self.bands if self.line_period_s else 1
         passes = exposures * bands * self.exposure_samples
@@ -95,12 +112,18 @@ class Timing:
         return np.asarray(self.start_s + self.frame_period_s * np.arange(exposures), dtype=np.float64)
 
     def reference_s(self, sensor: Sensor, camera: Intrinsics) -> float:
-        """Middle of the acquisition, seconds: between the first line of the first exposure and the last of the last."""
+        """Time of the middle of the acquisition, in seconds.
+
+        It is halfway between the first line of the first exposure and the last line of the last exposure.
+        """
         times = self.exposure_times_s(sensor)
         return float(0.5 * (times[0] + times[-1] + self.line_period_s * (self._lines(camera) - 1)))
 
     def instants(self, exposure_time_s: float, camera: Intrinsics) -> list[Instant]:
-        """When which window of the image is rendered for an exposure with that middle in line 0."""
+        """Moments at which the windows of the image are rendered, for one exposure.
+
+        exposure_time_s : seconds, middle of the exposure in line 0.
+        """
         n, whole = self.exposure_samples, Window.whole(camera)
         offsets = [self.exposure_s * ((i + 0.5) / n - 0.5) for i in range(n)]
         if self.line_period_s == 0:

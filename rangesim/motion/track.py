@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where things are at a time: pose tracks, and which object follows which."""
+"""Rigid motion over time: pose tracks, and the objects that follow them."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from rangesim.settings.bounds import Bounds, Coordinate, check_fields
 from rangesim.settings.config import Named, check_keys, from_dict, nearest, shown, to_dict
 
 Rate = Annotated[float, Bounds("a rate per second", -1e6, 1e6)]
+"""Velocity in m/s, or rotation rate in rad/s; the bounds exclude numbers that were given in a wrong unit."""
 
 
 class Track(Named, ABC):
-    """A rigid motion: a world transform T(t), applied to a thing as it stands in the scene file.
+    """Rigid motion: a world transform T(t) that is applied to an object as it stands in the scene file.
 
-    The identity means at rest. A world point x of the thing is at T(t) x at time t. Subclasses are frozen dataclasses.
+    The identity means that the object is at rest. A point x of the object (world) is at T(t) x at time t.
+    Subclasses are frozen dataclasses.
     """
 
     known: ClassVar[dict[str, type[Any]]] = {}
@@ -31,12 +33,15 @@ class Track(Named, ABC):
 
     @abstractmethod
     def at(self, time_s: float) -> Array:
-        """(4, 4) float64, rigid, the world transform at a time in seconds."""
+        """World transform at a time in seconds: (4, 4) float64, rigid, metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseTrack(Track):
-    """A motion given at some times; between them linear in translation and in angle (slerp), constant beyond the ends.
+    """Motion that is given by poses at some times.
+
+    Between two times, translation is interpolated linearly and rotation by slerp. Before the first time and after the
+    last, the object stands still.
 
     Parameters
     ----------
@@ -47,6 +52,16 @@ class PoseTrack(Track):
     ------
     ValueError
         Shapes that do not fit, times that do not increase, or a pose that is not rigid.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.motion import PoseTrack
+    >>> there = np.eye(4)
+    >>> there[0, 3] = 0.2
+    >>> track = PoseTrack(times_s=[0.0, 1.0], poses=[np.eye(4), there])
+    >>> track.at(0.25)[:3, 3].tolist()
+    [0.05, 0.0, 0.0]
 
     References
     ----------
@@ -95,13 +110,24 @@ class PoseTrack(Track):
 
 @dataclass(frozen=True)
 class ConstantTwist(Track):
-    """A motion of constant velocity and rotation rate, without end; at its place in the scene file at time 0.
+    """Motion of constant velocity and rotation rate, without end; at time 0 the object is where the scene file has it.
 
     Parameters
     ----------
     velocity_m_s : (vx, vy, vz), metres per second, world.
-    rotation_rad_s : (wx, wy, wz), radians per second about these world axes (a rotation vector per second).
-    centre_m : (x, y, z), metres, world, a point of the axis of rotation at time 0; it moves with the velocity.
+    rotation_rad_s : (wx, wy, wz), rotation vector per second, radians per second, world.
+    centre_m : (x, y, z), metres, world, a point on the axis of rotation at time 0; it moves with the velocity.
+
+    Raises
+    ------
+    ValueError
+        A number out of its range.
+
+    Examples
+    --------
+    >>> from rangesim.motion import ConstantTwist
+    >>> ConstantTwist(velocity_m_s=(0.3, 0.0, 0.0)).at(2.0)[:3, 3].tolist()
+    [0.6, 0.0, 0.0]
     """
 
     velocity_m_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
@@ -126,9 +152,10 @@ class ConstantTwist(Track):
 
 
 class Poses(NamedTuple):
-    """Where everything that moves is at one time.
+    """Places of everything that moves, at one time.
 
-    objects : shape name -> (4, 4) world transform. rig : (4, 4) world transform of camera and projector.
+    objects : shape name -> (4, 4) float64, world transform T(t) of the object.
+    rig : (4, 4) float64, world transform T(t) of camera and emitter.
     """
 
     objects: dict[str, Array]
@@ -136,25 +163,38 @@ class Poses(NamedTuple):
 
     @property
     def key(self) -> bytes:
-        """Equal for equal placements."""
+        """Bytes that are equal for equal places."""
         return b"".join((T + 0.0).tobytes() for T in (*self.objects.values(), self.rig))  # + 0.0: -0.0 becomes 0.0
 
     def place(self, rig: Rig) -> Array:
-        """(4, 4) T_world_camera of a rig that moves."""
+        """T_world_camera of a rig at this time: (4, 4) float64. The rig is given without motion."""
         return np.array(rig.T_world_camera) if np.array_equal(self.rig, np.eye(4)) else self.rig @ rig.T_world_camera
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What moves, and how.
+    """Tracks of all objects that move, and of the rig.
 
     Parameters
     ----------
     objects : shape name (id in the scene file) -> Track.
-    rig : Track of camera and projector together, or None: they stand. Like that of an object it is a world
-        transform of the rig as it stands: T_world_camera(t) = T(t) @ rig.T_world_camera. Hence moving the rig by T is
-        the same as moving all objects by the inverse of T. A recorded camera trajectory (n, 4, 4) becomes a track as
+    rig : Track of camera and emitter together; None: they stand still. As for objects, it is a world transform that is
+        applied to the rig as it stands: T_world_camera(t) = T(t) @ rig.T_world_camera. So moving the rig by T is the
+        same as moving all objects by the inverse of T. A recorded camera trajectory (n, 4, 4) becomes a track by
         `PoseTrack(times_s, trajectory @ np.linalg.inv(rig.T_world_camera))`.
+
+    Raises
+    ------
+    ValueError
+        Objects that are no mapping, or a track that is no `Track`.
+
+    Examples
+    --------
+    >>> from rangesim.motion import ConstantTwist, Motion
+    >>> motion = Motion({"large_ball": ConstantTwist(velocity_m_s=(0.3, 0.0, 0.0))})
+    >>> poses = motion.at(0.1)
+    >>> poses.objects["large_ball"][:3, 3].round(3).tolist(), poses.rig[:3, 3].tolist()
+    ([0.03, 0.0, 0.0], [0.0, 0.0, 0.0])
     """
 
     objects: Mapping[str, Track] = field(default_factory=dict)
@@ -168,7 +208,7 @@ class Motion:
                 raise ValueError(f"expected a PoseTrack or a ConstantTwist for {what!r}, got {shown(track)}.")
 
     def check(self, names: Iterable[str]) -> None:
-        """Raise ValueError if an object that moves is none of these shapes."""
+        """Raise ValueError if an object that moves is not among these shapes."""
         valid = list(names)
         for name in self.objects:
             if name not in valid:
@@ -177,13 +217,13 @@ class Motion:
                 )
 
     def at(self, time_s: float) -> Poses:
-        """Where everything that moves is at a time in seconds."""
+        """Places of everything that moves, at a time in seconds."""
         rig = np.eye(4) if self.rig is None else self.rig.at(time_s)
         return Poses({name: track.at(time_s) for name, track in self.objects.items()}, rig)
 
 
 def apply(T: ArrayLike, points: np.ndarray) -> np.ndarray:
-    """Points (..., 3) under a rigid transform (4, 4)."""
+    """Points (..., 3) after a rigid transform (4, 4), in the unit of the points."""
     matrix = np.asarray(T)
     return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3])
 
@@ -192,14 +232,17 @@ def apply(T: ArrayLike, points: np.ndarray) -> np.ndarray:
 
 
 def motion_from_dict(data: Any, place: str = "motion") -> Motion:
-    """The motion of a table `objects`, a track for each shape name, and a track `rig`; both may be left out.
+    """Motion from plain data, as experiment files have it.
 
+    The data is a table with the keys `objects`, a track for each shape name, and `rig`, a track. Both may be left out.
     A track is a table with a `type`: "constant-twist" (`ConstantTwist`) or "poses" (`PoseTrack`).
+
+    place : name of the table, for messages.
 
     Raises
     ------
     ValueError
-        Unknown keys or kinds of track, or values that a track refuses; the message names the place.
+        Unknown keys or types of track, or values that a track refuses; the message names the place in the data.
     """
     if not isinstance(data, Mapping) or not isinstance(data.get("objects", {}), Mapping):
         raise ValueError(f"{place}: expected a table of settings, got {shown(data)}.")

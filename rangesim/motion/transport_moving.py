@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One entry point: scene + rig + timed sensors + motion -> signals, each exposure at its own time."""
+"""Entry point for moving scenes: scene, rig, sensors with timings and motion in, signals of each sensor out."""
 
 from __future__ import annotations
 
@@ -31,60 +31,74 @@ def transport_moving(
     progress: Callable[[float], None] | None = None,
     **options: Unpack[TransportOptions],
 ) -> dict[Sensor, Signals]:
-    """Signals of sensors in a world that moves: every exposure, and every band of lines, at its own time.
+    """Signals of sensors in a moving scene; every exposure, and every band of lines, is rendered at its own time.
 
-    All that is taken with everything in one and the same place shares a transport pass, whatever the sensor: without
-    motion there is one pass, and the frames have the bytes of `transport`. A stack of k patterns of something that
-    moves costs k passes. Passes of the whole image share their random numbers, so that what stands still is the same
-    in all frames.
+    Exposures of all sensors share a transport pass if everything is in the same place at their times. So without motion
+    there is one pass, and the frames have the same bytes as those of `transport`. A stack of k patterns takes k passes
+    if something moves. All passes of the whole image use the same random numbers, so surfaces at rest look the same in
+    all frames.
 
     Parameters
     ----------
-    scene : Scene of `load_scene`; it stays as it is.
-    rig : Rig, where it stands without motion.
-    timings : sensor -> Timing, when it takes its frames.
-    motion : Motion, what moves.
-    settings : TransportSettings, of each pass; None: the defaults. No AdaptiveSampling: passes that sampled a thing
-        differently would make it differ from frame to frame.
-    progress : called with the fraction done, 0..1.
-    options : fields of `settings` in place of those, such as spp=64 or seed=1.
+    scene : Scene of `load_scene`; it is not changed.
+    rig : Rig without motion.
+    timings : sensor -> Timing, the times of its frames.
+    motion : Motion, the tracks of objects and rig.
+    settings : TransportSettings of each pass; None: the defaults. AdaptiveSampling is refused: passes would sample the
+        same surface differently, and it would differ from frame to frame.
+    progress : function that is called with the fraction done, 0..1.
+    options : single fields that replace those of `settings`, such as spp=64 or seed=1.
 
     Returns
     -------
     dict
-        sensor -> Signals for `expose`. `truth`, `energy` and `rig` (hence the pose that takes a point cloud to the
-        world) are those at the middle of the sensor's acquisition, `Timing.reference_s`. `motion_m` says how far
-        what a pixel sees moves: the largest distance, in camera coordinates, between a surface point at an exposure of
-        the pixel and the same point at that middle; of the point the pixel sees at the middle, and of those it sees
-        when it is exposed (something passing by). Where a shadow
-        passes, the distance is that of the fastest thing. None for a sensor whose one exposure holds everything.
+        sensor -> Signals for `rangesim.expose`. `truth`, `energy` and `rig` are those at the middle of the sensor's
+        acquisition, `Timing.reference_s`; so is the pose of a point cloud. `motion_m` is a distance for each pixel: the
+        largest distance, in camera coordinates, between a surface point at an exposure of the pixel and the same point
+        at that middle. It covers the point that the pixel sees at the middle and the points that it sees at its
+        exposures, such as those of an object that passes by. Where a shadow passes, it is the distance of the fastest
+        object. It is None if one pass serves all exposures of the sensor.
 
     Raises
     ------
     ValueError
-        No such shape, one that cannot be moved, or what `transport` refuses.
+        A shape that is not in the scene or cannot move, or settings that `transport` refuses.
+
+    Examples
+    --------
+    >>> import rangesim
+    >>> from rangesim.motion import ConstantTwist, Motion, Timing, transport_moving
+    >>> sensor, motion = rangesim.AmcwToF(), Motion({"large_ball": ConstantTwist(velocity_m_s=(0.3, 0, 0))})
+    >>> scene = rangesim.load_scene("matte")  # doctest: +SKIP
+    >>> rig = scene.rig(width=160)  # doctest: +SKIP
+    >>> signals = transport_moving(scene, rig, {sensor: Timing(frame_period_s=0.01)}, motion)  # doctest: +SKIP
+    >>> signals[sensor].motion_m.max()  # doctest: +SKIP
     """
-    from rangesim.experiment.adaptive_sampling import AdaptiveSampling
-    from rangesim.light_transport.transport import transport
+    from rangesim.light_transport.light_pass import trace_light
+    from rangesim.light_transport.sampler import Sampler
     from rangesim.light_transport.transport_settings import chosen
+    from rangesim.light_transport.truncation import warn_of_truncation
     from rangesim.scene.rigid_motion import MovingScene
 
     _check(scene, rig, timings, motion)
     settings = chosen(settings, options)
-    if isinstance(settings.spp, AdaptiveSampling):
-        raise ValueError('expected a number of samples or "auto" where something moves, got AdaptiveSampling.')
+    if isinstance(settings.spp, Sampler):
+        raise ValueError(
+            f'expected a number of samples or "auto" where something moves, got {type(settings.spp).__name__}.'
+        )
     passes = plan(rig, timings, motion)
     stage = MovingScene(scene, tuple(motion.objects))
     at_once: dict[Sensor, Signals] = {}
     stacks: dict[Sensor, FrameStack] = {}
     for number, one in enumerate(passes):
-        signals = transport(
+        (signals,) = trace_light(
             stage.at(one.poses.objects),
-            one.rig(rig),
+            [one.rig(rig)],
             [response for sensor in one.sensors for response in sensor.responses()],
             replace(settings, seed=one.seed(settings.seed)),
-            progress=progress and partial(_report, progress, number, len(passes)),
+            progress and partial(_report, progress, number, len(passes)),
         )
+        warn_of_truncation(signals.truncation, settings.max_depth, "", stacklevel=2)
         for sensor in one.reference_of:
             if any(sensor in other.sensors for other in passes if other is not one):
                 stacks[sensor] = FrameStack(sensor, timings[sensor], rig, one, signals)

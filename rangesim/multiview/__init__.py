@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras, points and shapes from tracks through many images; names load on first use. See docs/multiview.md."""
+"""Cameras, points and shapes from tracks through many images. Names load when first used. See docs/multiview.md.
+
+Used by: no other module of rangesim; it is for users alone, see `examples/structure_from_motion.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bundle adjustment: poses of all images, all points, and the lens if asked for, of least reprojection error.
+"""Bundle adjustment: the poses of all images, all points and optionally the lens, with the least reprojection error.
 
-Minimises sum over observations (i, j) of rho(|x_ij - f(K, k; R_i X_j + t_i)|^2), f the image through the lens with
-distortion: the maximum likelihood for Gaussian noise of the pixels with rho(z) = z. Levenberg-Marquardt on the normal
-equations, from which the points are eliminated (`schur_complement`; Brown 1958; Triggs, McLauchlan, Hartley,
-Fitzgibbon: "Bundle adjustment - a modern synthesis", 2000). `rangesim.calibration.bundle` is the other one: boards
-that are known instead of points that are not.
+It minimises the sum over observations (i, j) of rho(|x_ij - f(K, k; R_i X_j + t_i)|^2), where f projects through the
+lens with its distortion. With rho(z) = z this is the maximum likelihood for Gaussian noise of the pixels. The method is
+Levenberg-Marquardt on the normal equations, from which the points are eliminated (`schur_complement`; Brown 1958;
+Triggs, McLauchlan, Hartley, Fitzgibbon: "Bundle adjustment - a modern synthesis", 2000). `rangesim.calibration.bundle`
+is a different adjustment: there the points lie on boards and are known.
 
-Images fix the scene up to a similarity: 7 degrees of freedom, the gauge. The gauge here is that of the start: the pose
-of the first image, or of the one that is held, and its distance from the image farthest from it stay. Two or more
-held images leave no freedom.
+Images determine the scene up to a similarity of 7 degrees of freedom, the gauge. It is fixed by the start: the pose of
+the first image, or of the held image, stays, and so does the distance from it to the camera farthest from it. Two or
+more held images leave no freedom.
 
-Degenerate: an image, or a group of images, that shares too few points with the rest; a camera that only rotates (the
-points have no depth), or moves so little, or sees so little perspective, that the shape stays open. These are errors,
-told by the covariance, and by an F test of the cameras that were found against cameras that only rotate: noise can be
-explained by depths, and a covariance at such depths looks well.
+Some inputs do not determine the result: an image or a group of images that shares too few points with the others; a
+camera that only rotates, so that the points have no depth; a camera that moves so little, or sees so little
+perspective, that the shape stays open. These inputs raise an error. The covariance finds most of them. It does not find
+all, because depths can be fitted to noise, and at such depths the covariance looks good. So an F test also compares the
+cameras found with cameras that only rotate.
+
+Used by: `multi_view_triangulation`, `incremental_reconstruction`, `sliding_window` and `factorisation` (its checks) of
+`rangesim.multiview`; no other module of rangesim.
 """
 
 from __future__ import annotations
@@ -36,56 +40,108 @@ from rangesim.geometry.correspondences import Array, check_noise, checked_array
 from rangesim.geometry.least_squares import descend
 from rangesim.geometry.registration import nearest_similarity
 from rangesim.geometry.reprojection import POSE, by_lens, moved_lens, moved_pose, reproject, with_all_coefficients
-from rangesim.multiview.schur_complement import LEAST_DAMPING, NormalEquations, Sizes, Step, Term
+from rangesim.multiview.schur_complement import NormalEquations, Sizes, Step, Term
 from rangesim.multiview.tracks import Tracks
-from rangesim.rig import Intrinsics
+from rangesim.rig import Intrinsics, check_rigid
+from rangesim.robust_scale import sigma_from_median
 from rangesim.settings.config import shown
 
 LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+"""Names of the parameters of a lens, in the order of `Intrinsics` and of OpenCV's distortion."""
 Loss = Literal["linear", "huber", "soft_l1", "cauchy"]
-MAX_STEPS, ROUGH_STEPS = 1000, 200
-"""At the end, and of views to which others are still to come. Some steps are enough unless the views leave a direction
-nearly open, a long curved valley."""
+MAX_STEPS = 1000
+"""Largest number of steps of a final adjustment. The 100 views of docs/multiview.md need four. Hundreds are needed
+where the views leave a direction nearly open, because the descent then follows a long curved valley."""
+ROUGH_STEPS = 200
+"""Largest number of steps while more views are still to come. Such a result need not be at the minimum, because the
+next views change it anyway."""
 CONVERGED = 1e-8
-"""Relative decrease of the cost at which it ends: of a million residuals, 1e-8 of the cost is 1 % of the variance of
-one."""
+"""Relative decrease of the cost at which a descent ends. For a million residuals it is 1 % of the variance of one
+residual, so the parameters are within about 0.1 standard deviations of the minimum."""
+MIN_DAMPING = 1e-10
+"""Smallest damping of Levenberg-Marquardt, relative to the diagonal of the normal equations. It keeps them regular
+where the residuals leave parameters open, such as the gauge. Larger values slow the descent near the minimum."""
 MAX_ROTATION_DEVIATION = 0.3
-"""Radians; a pose known worse than this is no pose."""
+"""Largest standard deviation of a rotation, radians. Beyond about 17 degrees the covariance, which is linear in the
+rotation, means little, and the pose counts as undetermined."""
 MAX_RELATIVE_DEVIATION = 0.5
-"""Standard deviation of a point over its distance from the nearest camera beyond which it has no depth."""
+"""Largest standard deviation of a point over its distance from the nearest camera, a ratio. From half of the distance
+on, two standard deviations reach the camera, and the point has no depth."""
 ONE_PLACE = 1e-6
-"""Extent of the cameras of a start over the distance of the points below which they stand in one place."""
+"""Extent of the start's cameras over the median distance of the points, a ratio. Below it the cameras count as being in
+one place. It only has to exceed rounding: what noise leaves open is found after the descent."""
 MIN_IMAGES = 2
+"""Smallest number of images, and of images that see a point: one image has no depth."""
 MAX_SHAPE_DEVIATION = 0.5
-"""Of the points' extent; a shape whose median point is known worse is none."""
+"""Largest standard deviation of the median point over the extent of the points, a ratio. A shape that is known less
+well is refused: its errors would be as large as half of the shape."""
 SHAPE_SAMPLE = 200
-"""Points by which the deviation of the shape is judged."""
+"""Number of points whose joint covariance gives the deviation of the shape, about. Its matrix has three rows for each;
+twice the points take eight times the time."""
 TESTED_OBSERVATIONS = 30_000
-"""By which cameras that move are told from cameras that only rotate."""
-NO_PERSPECTIVE, SMALL_TURN = 0.1, np.radians(20)
-"""Depth over distance, and radians about the mean direction, below which a shape may look like one of other depth."""
-OTHER_DEPTHS, RELIEF_STEPS = (0.25, 0.5, 2.0, 4.0, 8.0, 16.0), 100
-"""Times the depth found, and steps of a descent from there."""
-ANOTHER_SHAPE, MAX_CURVED = 0.05, 2.0
-"""Of the extent, and times the deviation that the covariance tells, from which on a shape is another one."""
-ROTATION_ROUNDS, ROTATION_STEPS = 10, 30
-RIGHT = 4.0
-"""Standard deviations that a right observation is off at most, beside a robust loss."""
+"""Number of observations, about, in the F test against cameras that only rotate. It bounds the time of the test; fewer
+observations make it weaker for cameras that hardly move."""
+ROTATION_ROUNDS = 10
+"""Number of rounds that find rotations and mean directions in turns. The result is only the start of a descent, which
+more rounds make shorter."""
+ROTATION_STEPS = 30
+"""Largest number of steps of the descent of cameras that only rotate. It ends earlier where a step lowers the cost by
+less than 1e-4 of it."""
+MAX_INLIER_DEVIATIONS = 4.0
+"""Largest error of a right observation under a robust loss, in standard deviations of the noise. Gaussian noise exceeds
+four of them in one coordinate of 16 000."""
+
+
+@dataclass(frozen=True)
+class ReliefTest:
+    """The thresholds of the search for a shape of another depth that explains the same images."""
+
+    max_relief: float = 0.1
+    """Median depth of the shape over its distance from the cameras, a ratio. A deeper shape shows its depth by
+    perspective and is not tested."""
+    max_turn_rad: float = float(np.radians(20))
+    """Largest angle between a camera's direction and the mean direction, radians. Where a camera turns more, the turns
+    tell the depth, and the shape is not tested."""
+    factors: tuple[float, ...] = (0.25, 0.5, 2.0, 4.0, 8.0, 16.0)
+    """Factors on the depth from which a new descent starts. The valley of equal images is curved, so that one start
+    alone does not reach its far end."""
+    steps: int = 100
+    """Largest number of steps of each new descent."""
+    min_difference: float = 0.05
+    """Median distance of the points of two shapes over their extent, a ratio, below which they count as the same shape,
+    however small the stated deviation is."""
+    max_deviations: float = 2.0
+    """Largest median distance of the points of two shapes as a multiple of the stated deviation, above which the stated
+    deviation is wrong."""
+
+
+RELIEF = ReliefTest()
 
 
 @dataclass(frozen=True, eq=False)
 class BundleAdjustment:
-    """Cameras and points.
+    """The cameras and points that `bundle_adjust` found, with their covariance.
 
-    camera : Intrinsics. T_camera_world : (n_images, 4, 4) maps world coordinates to each camera's, in the units of the
-    start. points : (n_points, 3) world; NaN of those that were unknown or that fewer than two images see.
-    used : (m,) bool, the observations that took part. residuals_px : (m, 2) projected less seen; NaN of others.
-    noise_px : standard deviation of a coordinate, as given or from the residuals. covariance : (n_images, 6, 6) of
-    (rotation vector, rad, translation) both applied after T_camera_world, in the gauge (see the module): 0 of what is
-    held. lens_deviations : (9,) standard deviations of fx, fy, cx, cy, k1, k2, p1, p2, k3; 0 of what is held.
-    shape_deviation : standard deviation of a point, the median, over the points' extent (their median distance from
-    the middle), after the best similarity; what cameras and points leave open together. NaN if the noise is unknown.
-    steps : that were taken. has_converged : whether no step lowered the cost any more.
+    camera : Intrinsics of all images.
+    T_camera_world : (n_images, 4, 4), maps world coordinates to those of each camera, in the unit of the start.
+    points : (n_points, 3) float64, world, in the unit of the start; NaN for a point that was unknown in the start or
+        that fewer than two images see.
+    used : (m,) bool, whether an observation took part.
+    residuals_px : (m, 2) float64, projected pixel minus seen pixel; NaN for an observation that took no part.
+    noise_px : standard deviation of a pixel's coordinate, as given, or else from the residuals.
+    covariance : (n_images, 6, 6) float64, covariance of a rotation vector (radians) and a translation, both applied
+        after T_camera_world, in the gauge that the module describes; 0 for a held image.
+    lens_deviations : (9,) float64, standard deviations of fx, fy, cx, cy (pixels), k1, k2, p1, p2, k3; 0 for a
+        parameter that is not free.
+    shape_deviation : standard deviation of the median point after the best similarity, over the extent of the points
+        (their median distance from the middle), a ratio. It includes the errors of the cameras. NaN if the noise is
+        unknown.
+    steps : number of steps taken.
+    has_converged : whether the descent ended because no step lowered the cost any more.
+
+    Examples
+    --------
+    See `bundle_adjust`.
     """
 
     camera: Intrinsics
@@ -102,12 +158,15 @@ class BundleAdjustment:
 
     @property
     def rms_px(self) -> float:
-        """Root mean square of the distances between projected and seen pixels."""
+        """Root mean square distance between projected and seen pixels, over the observations that took part."""
         return float(np.sqrt((self.residuals_px[self.used] ** 2).sum(axis=1).mean()))
 
 
 class Views(NamedTuple):
-    """camera : of all images. T : (n_images, 4, 4) T_camera_world. X : (n_points, 3) world."""
+    """The state of a descent.
+
+    camera : Intrinsics of all images. T : (n_images, 4, 4), T_camera_world. X : (n_points, 3), world.
+    """
 
     camera: Intrinsics
     T: Array
@@ -127,31 +186,56 @@ def bundle_adjust(
     noise_px: float | None = None,
     max_steps: int = MAX_STEPS,
 ) -> BundleAdjustment:
-    """The cameras and points of least reprojection error, from a start downwards.
+    """The cameras and points with the least reprojection error, found by a descent from a start.
 
     Parameters
     ----------
-    tracks : of which all images are adjusted.
-    camera : the lens of all images.
-    T_camera_world : (n_images, 4, 4) to start with. points : (n_points, 3) to start with, world, in front of the
-        cameras that see them; NaN where unknown: these, and points in fewer than two images, are left out.
-    free : names of the lens's parameters that are adjusted, of fx, fy, cx, cy, k1, k2, p1, p2, k3.
-    held : images whose poses stay.
-    loss : of the distance d between projected and seen pixel, as SciPy's `least_squares`: "linear" d^2, "huber",
-        "soft_l1", "cauchy", which let wrong observations pull less beyond `loss_scale_px`.
-    noise_px : standard deviation of a coordinate; None: from the residuals (of a robust loss, from their median).
+    tracks : observations in all images that are adjusted.
+    camera : the lens of all images; where `free` names its parameters, their start.
+    T_camera_world : (n_images, 4, 4), poses to start from; they map world coordinates to those of each camera.
+    points : (n_points, 3), world, points to start from, in front of the cameras that see them. A point that is NaN, or
+        that fewer than two images see, is left out.
+    free : names of the parameters of the lens that are adjusted, out of fx, fy, cx, cy, k1, k2, p1, p2, k3.
+    held : numbers of the images whose poses stay.
+    loss : the loss of the distance d between projected and seen pixel, with the names of SciPy's `least_squares`:
+        "linear" is d^2; "huber", "soft_l1" and "cauchy" are robust: they grow more slowly beyond `loss_scale_px`, so
+        wrong observations have less influence.
+    loss_scale_px : distance at which a robust loss begins to grow more slowly than d^2, pixels.
+    noise_px : standard deviation of a pixel's coordinate. None estimates it from the residuals; with a robust loss,
+        from their median.
+    max_steps : largest number of steps.
 
     Raises
     ------
     ValueError
-        Fewer than two images; poses or points of other shapes; an image without points; images in groups that share no
-        points; poses that are not rigid; points behind the cameras; fewer equations than unknowns; cameras or a shape
-        that the tracks do not determine; or cameras that explain the tracks no better than one that only rotates.
+        There are fewer than two images, poses or points have other shapes, an image sees no points, groups of images
+        share no points, a pose is not rigid, points lie behind cameras that see them, or there are fewer equations than
+        unknowns. Or the tracks do not determine the cameras or the shape, or a camera that only rotates explains them
+        as well.
 
     Warns
     -----
     RangesimWarning
-        The descent did not end in `max_steps`: covariance and deviations do not hold.
+        The descent did not end within `max_steps`, so that covariance and deviations are not valid.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.multiview import Tracks
+    >>> from rangesim.rig import Intrinsics
+    >>> camera = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0)
+    >>> random = np.random.default_rng(0)
+    >>> world = random.uniform([-2, -1, 4], [3, 1, 7], (40, 3))
+    >>> T = np.tile(np.eye(4), (4, 1, 1))
+    >>> T[:, 0, 3] = [0.0, -0.5, -1.0, -1.5]  # four cameras at x = 0 to 1.5 m, which look along z
+    >>> pixels = np.stack([camera.project(world + pose[:3, 3]) for pose in T])
+    >>> tracks = Tracks.from_dense(pixels + random.normal(0, 0.5, pixels.shape))
+    >>> start = world + random.normal(0, 0.1, world.shape)
+    >>> found = bundle_adjust(tracks, camera, T, start)
+    >>> found.has_converged, round(found.noise_px, 1)
+    (True, 0.5)
+    >>> bool(np.abs(found.points - world).max() < 0.2)  # metres; noise of 0.5 px leaves some cm
+    True
     """
     found = adjusted_views(
         tracks, camera, T_camera_world, points, free, held, loss, loss_scale_px, noise_px, max_steps, is_last=True
@@ -161,9 +245,9 @@ def bundle_adjust(
     _refuse_other_relief(tracks, found, free, held, loss, loss_scale_px)
     if not found.has_converged:
         warn(
-            f"expected a descent that ends, got one that still goes down after {found.steps} steps: the answer is not "
-            "the best, and its deviations do not hold; raise max_steps, or add views from other sides, since some "
-            "direction is nearly open."
+            f"expected a descent that ends, got one that still lowers the cost after {found.steps} steps: the result "
+            "is not at the minimum, and its deviations are not valid; raise max_steps, or add views from other sides, "
+            "because the views hardly determine some of the unknowns."
         )
     return found
 
@@ -181,9 +265,9 @@ def adjusted_views(
     max_steps: int = ROUGH_STEPS,
     is_last: bool = False,
 ) -> BundleAdjustment:
-    """As `bundle_adjust`, of views to which others are still to come: a shape that is open yet is no error.
+    """The result of `bundle_adjust` while more views are still to come, so that an open shape is no error yet.
 
-    How far it is open is told where they are the last.
+    is_last : whether no more views follow; only then `shape_deviation` is computed, else it is NaN.
     """
     sizes, some, state = _checked(tracks, camera, T_camera_world, points, free, held, loss, loss_scale_px, noise_px)
     columns = [LENS_NAMES.index(name) for name in free]
@@ -199,7 +283,7 @@ def adjusted_views(
         moved = moved_lens(state.camera, lens) if columns else state.camera
         return Views(moved, moved_pose(state.T, step.images), state.X + step.points)
 
-    found = descend(look, move, state, max_steps=max_steps, converged=CONVERGED, least_damping=LEAST_DAMPING)
+    found = descend(look, move, state, max_steps=max_steps, converged=CONVERGED, least_damping=MIN_DAMPING)
     T, X, gauge = _in_gauge(state.T, found.state.T, found.state.X, list(held), len(columns))
     equations = look(Views(found.state.camera, T, X))
     residuals = reprojection_errors(Views(found.state.camera, T, X), some)
@@ -249,6 +333,7 @@ def _checked(
     loss_scale_px: float,
     noise_px: float | None,
 ) -> tuple[Sizes, Tracks, Views]:
+    """The sizes, the observations that take part and the start; ValueError for arguments that cannot be adjusted."""
     if tracks.n_images < MIN_IMAGES:
         raise ValueError(
             f"expected at least {MIN_IMAGES} images for a bundle adjustment, got {tracks.n_images}: one image has no "
@@ -257,7 +342,7 @@ def _checked(
     T = checked_array("T_camera_world", T_camera_world, 4, 4)
     if T.shape != (tracks.n_images, 4, 4):
         raise ValueError(f"expected T_camera_world of shape ({tracks.n_images}, 4, 4), got {T.shape}.")
-    check_rigid(T)
+    check_rigid(T, "T_camera_world")
     X = np.array(points, dtype=np.float64)
     if X.shape != (tracks.n_points, 3) or np.isinf(X).any():
         raise ValueError(f"expected points as ({tracks.n_points}, 3) finite numbers or NaN, got shape {X.shape}.")
@@ -281,44 +366,31 @@ def _checked(
         raise ValueError(
             f"expected points in front of the cameras that see them, got {len(hidden)} of {len(some)} observations "
             f"behind them or beyond the fold of the lens, such as point {some.point[i]} in image {some.image[i]}; set "
-            "these points to NaN, or mend the start."
+            "these points to NaN, or correct the start."
         )
     centres = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
     depth = float(np.median(np.linalg.norm(in_cameras(state, some), axis=1)))
     if not np.linalg.norm(centres - centres.mean(axis=0), axis=1).max() > ONE_PLACE * depth:
         raise ValueError(
-            f"expected cameras in different places, got {tracks.n_images} in one: a camera that only rotates sees no "
-            "depth; add views from other places."
+            f"expected cameras in different places, got {tracks.n_images} in one place: a camera that only rotates "
+            "sees no depth; add views from other places."
         )
     sizes = Sizes(len(free), tracks.n_images, POSE, tracks.n_points, 3)
     if _freedom(some, sizes, held) < 0:
         raise ValueError(
-            f"expected at least as many equations as unknowns, got {2 * len(some)} and "
-            f"{2 * len(some) - _freedom(some, sizes, held)} of {tracks.n_images} images and "
+            f"expected at least as many equations as unknowns, got {2 * len(some)} equations for "
+            f"{2 * len(some) - _freedom(some, sizes, held)} unknowns of {tracks.n_images} images and "
             f"{len(np.unique(some.point))} points; add observations."
         )
     return sizes, some, state
 
 
-def check_rigid(T: Array) -> None:
-    """Raise ValueError unless poses (n, 4, 4) are rotations and translations."""
-    R = T[:, :3, :3]
-    off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
-    sound = (off <= 1e-4) & (np.linalg.det(R) > 0) & (np.abs(T[:, 3] - [0, 0, 0, 1]) <= 1e-9).all(axis=1)
-    if not sound.all():
-        i = int(np.argmin(sound))
-        raise ValueError(
-            f"expected rigid poses T_camera_world, a rotation and a translation each, got {int((~sound).sum())} that "
-            f"are not, such as that of image {i}: {T[i].tolist()}."
-        )
-
-
 def check_connected(tracks: Tracks) -> None:
-    """Raise ValueError unless all images see points, and chains of shared points link them all."""
+    """Raise ValueError unless every image sees points, and shared points link all images into one group."""
     empty = np.flatnonzero(tracks.points_per_image == 0)
     if len(empty):
         raise ValueError(
-            f"expected points in every image that another one sees too, got none in image {empty[0]}"
+            f"expected every image to see points that another image sees too, got none in image {empty[0]}"
             f"{f' and {len(empty) - 1} more' if len(empty) > 1 else ''}; leave it out (Tracks.of_images) or add points."
         )
     links = coo_array(
@@ -330,24 +402,26 @@ def check_connected(tracks: Tracks) -> None:
         first = np.flatnonzero(groups == groups[0])
         raise ValueError(
             f"expected images that overlap, got {len(np.unique(groups))} groups that share no point, such as images "
-            f"{_some(first)} and {_some(np.flatnonzero(groups != groups[0]))}; add images between them, or solve each "
-            "group alone."
+            f"{_listed(first)} and {_listed(np.flatnonzero(groups != groups[0]))}; add images between them, or solve "
+            "each group alone."
         )
 
 
-def _some(numbers: np.ndarray) -> str:
+def _listed(numbers: np.ndarray) -> str:
+    """The first four numbers as text."""
     return ", ".join(str(n) for n in numbers[:4]) + (", ..." if len(numbers) > 4 else "")
 
 
 def _freedom(some: Tracks, sizes: Sizes, held: Sequence[int]) -> int:
-    """Equations less unknowns, the gauge taken out."""
+    """Degrees of freedom of the residuals: number of equations minus unknowns, where the gauge is no unknown."""
     gauge = {0: 7, 1: 1}.get(len(set(held)), 0)
     cameras = POSE * (sizes.images - len(set(held)))
     return 2 * len(some) - (sizes.shared + cameras + 3 * len(np.unique(some.point)) - gauge)
 
 
 def _refuse_undetermined(covariance: Array, T: Array, sizes: Sizes, is_free: np.ndarray, noise: float) -> None:
-    """Raise ValueError where poses are known worse than to `MAX_ROTATION_DEVIATION`, or than the cameras' extent."""
+    """Raise ValueError if the rotation of a pose has a deviation above `MAX_ROTATION_DEVIATION`, or its translation one
+    above the extent of all cameras."""
     of_images = np.diag(covariance)[sizes.shared :].reshape(-1, POSE)
     centres = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
     extent = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
@@ -356,14 +430,14 @@ def _refuse_undetermined(covariance: Array, T: Array, sizes: Sizes, is_free: np.
     bad = np.flatnonzero(is_free & ~((turn <= MAX_ROTATION_DEVIATION) & (move <= extent)))
     if len(bad):
         raise ValueError(
-            f"expected tracks that determine the cameras, got some that leave {len(bad)} of {len(T)} poses open at a "
-            f"noise of {noise:.3g} px, such as that of image {bad[0]}: too few points, points on a line, or a camera "
-            "that only rotates; add points or views from other places."
+            f"expected tracks that determine the cameras, got tracks that leave {len(bad)} of {len(T)} poses open at a "
+            f"noise of {noise:.3g} px, such as the pose of image {bad[0]}: there are too few points, the points lie on "
+            "a line, or the camera only rotates; add points or views from other places."
         )
 
 
 def _refuse_no_depth(equations: NormalEquations, some: Tracks, T: Array, X: Array, noise: float) -> None:
-    """Raise ValueError where most points are known worse, given the cameras, than to half their distance."""
+    """Raise ValueError if, with exact cameras, the median point has a deviation above `MAX_RELATIVE_DEVIATION`."""
     deviation = noise * np.sqrt(np.trace(equations.covariance_of_points(), axis1=1, axis2=2))
     centres = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
     distance = np.full(len(X), np.inf)
@@ -373,32 +447,36 @@ def _refuse_no_depth(equations: NormalEquations, some: Tracks, T: Array, X: Arra
         relative = float(np.median(deviation[known] / distance[known]))
     if relative > MAX_RELATIVE_DEVIATION:
         raise ValueError(
-            f"expected images with parallax, got some whose points are known to {relative:.0%} of their distance at a "
-            f"noise of {noise:.3g} px: the camera only rotates, or moves too little; add views from other places."
+            f"expected images with parallax, got points with a standard deviation of {relative:.0%} of their distance "
+            f"at a noise of {noise:.3g} px: the camera only rotates, or moves too little; add views from other places."
         )
 
 
 def _refuse_open_shape(found: BundleAdjustment) -> None:
+    """Raise ValueError if the shape has a deviation above `MAX_SHAPE_DEVIATION`."""
     if found.shape_deviation > MAX_SHAPE_DEVIATION:
         raise ValueError(
-            f"expected views that determine the shape, got some that leave its points open by "
-            f"{found.shape_deviation:.0%} of their extent at a noise of {found.noise_px:.3g} px: views from nearly one "
-            "direction, or too narrow a lens; add views from other sides."
+            f"expected views that determine the shape, got points with a standard deviation of "
+            f"{found.shape_deviation:.0%} of their extent at a noise of {found.noise_px:.3g} px: the views come from "
+            "nearly one direction, or the lens is too narrow; add views from other sides."
         )
 
 
 def _refuse_rotation_alone(
     tracks: Tracks, found: BundleAdjustment, free: Sequence[str], held: Sequence[int], loss: str
 ) -> None:
-    """Raise ValueError where a camera that only rotates explains the tracks to their noise as the cameras found do.
+    """Raise ValueError if a camera that only rotates explains the tracks as well as the cameras found.
 
-    The F test of nested models on some of the points: a rotation for each image and a direction for each point.
+    It is the F test of nested models, on some of the points. The simpler model has a rotation for each image and a
+    direction for each point.
     """
     if len(set(held)) > 1:
-        return  # a baseline that was given is no question
+        return  # two held poses state the baseline, so that it needs no test
     chosen = found.used.copy()
     if loss != "linear":
-        chosen &= (np.abs(np.nan_to_num(found.residuals_px, nan=np.inf)) <= RIGHT * found.noise_px).all(axis=1)
+        chosen &= (np.abs(np.nan_to_num(found.residuals_px, nan=np.inf)) <= MAX_INLIER_DEVIATIONS * found.noise_px).all(
+            axis=1
+        )
     stride = max(1, int(np.ceil(chosen.sum() / TESTED_OBSERVATIONS)))
     chosen &= np.cumsum(np.diff(tracks.point, prepend=-1) != 0) % stride == 0
     some = tracks.keep(chosen)
@@ -413,8 +491,8 @@ def _refuse_rotation_alone(
     simple = _cost_of_rotations(found.camera, found.T_camera_world, some)
     if simpler_model_suffices((simple, turning), (cost, freedom), None, rounding_of(some.pixels)):
         raise ValueError(
-            f"expected images with parallax, got some that a camera which only rotates explains within "
-            f"{np.sqrt(simple / turning):.3g} px, no worse than the poses found: depths would be fitted to the noise; "
+            f"expected images with parallax, got images that a camera which only rotates explains within "
+            f"{np.sqrt(simple / turning):.3g} px, as well as the poses found: depths would be fitted to the noise; "
             "add views from other places."
         )
 
@@ -422,12 +500,14 @@ def _refuse_rotation_alone(
 def _refuse_other_relief(
     tracks: Tracks, found: BundleAdjustment, free: Sequence[str], held: Sequence[int], loss: Loss, scale_px: float
 ) -> None:
-    """Raise ValueError where a flatter or deeper shape, seen by cameras that turn more or less, explains the tracks.
+    """Raise ValueError if a flatter or deeper shape, seen by cameras that turn more or less, explains the tracks, too.
 
-    Without perspective and under small turns w, images see w times depth alone (the bas-relief ambiguity: Belhumeur,
-    Kriegman, Yuille, IJCV 1999). Such a valley is curved, and at a bottom that the noise made the covariance looks
-    well. So a descent from shapes of other depth ends where the valley leads, and a rise of the sum of squares by r
-    noise^2 must not go that way farther than some times sqrt(r) deviations. Asked of flat scenes from near directions.
+    Without perspective and under small turns w, the images only show the product of w and depth (the bas-relief
+    ambiguity: Belhumeur, Kriegman, Yuille, IJCV 1999). The sum of squares then has a long curved valley. Noise makes
+    minima in it, and at such a minimum the covariance looks good although the valley goes on. So new descents start
+    from shapes of other depth. Where one ends with a sum of squares that is larger by r noise^2, its points may be away
+    by `max_deviations` times sqrt(r) stated deviations, not more. Only flat scenes that are seen from nearly one
+    direction are tested.
     """
     known = np.isfinite(found.points).all(axis=1)
     if len(set(held)) > 1 or known.sum() < 2 or not found.noise_px > 0:
@@ -439,12 +519,13 @@ def _refuse_other_relief(
     towards /= np.maximum(distance, 1e-300)[:, None]
     d = towards.mean(axis=0) / np.linalg.norm(towards.mean(axis=0))
     relief = (X - middle) @ d
-    if np.median(np.abs(relief)) > NO_PERSPECTIVE * np.median(distance) or (towards @ d).min() < np.cos(SMALL_TURN):
+    is_deep = np.median(np.abs(relief)) > RELIEF.max_relief * np.median(distance)
+    if is_deep or (towards @ d).min() < np.cos(RELIEF.max_turn_rad):
         return
     turns = np.cross(d, towards)
     cost = _loss_of(found.residuals_px[found.used], loss, scale_px)
     extent = float(np.median(np.linalg.norm(X - middle, axis=1)))
-    for deeper in OTHER_DEPTHS:
+    for deeper in RELIEF.factors:
         other = found.points.copy()
         other[known] += (deeper - 1) * relief[:, None] * d
         Q = Rotation.from_rotvec((1 - 1 / deeper) * turns).as_matrix()
@@ -453,9 +534,9 @@ def _refuse_other_relief(
         start[:, :3, 3] += np.einsum("nij,nj->ni", T[:, :3, :3], middle - Q @ middle)
         try:
             again = adjusted_views(
-                tracks, found.camera, start, other, free, held, loss, scale_px, found.noise_px, RELIEF_STEPS
+                tracks, found.camera, start, other, free, held, loss, scale_px, found.noise_px, RELIEF.steps
             )
-        except ValueError:  # behind a camera, or open altogether: no other answer
+        except ValueError:  # this start has points behind a camera, or ends undetermined: it is no other solution
             continue
         if (again.used != found.used).any():
             continue
@@ -463,21 +544,22 @@ def _refuse_other_relief(
         similarity = nearest_similarity(again.points[known], X)
         turned = again.points[known] @ similarity[:3, :3].T + similarity[:3, 3]
         apart = float(np.median(np.linalg.norm(turned - X, axis=1))) / extent
-        stated = MAX_CURVED * found.shape_deviation * np.sqrt(max(rise, 1.0))
-        if rise < chi2_limit(1) and apart > max(ANOTHER_SHAPE, stated):
+        stated = RELIEF.max_deviations * found.shape_deviation * np.sqrt(max(rise, 1.0))
+        if rise < chi2_limit(1) and apart > max(RELIEF.min_difference, stated):
             raise ValueError(
-                f"expected views that determine the shape, got some that another one explains as well, its points "
+                f"expected views that determine the shape, got views that another shape explains as well, with points "
                 f"off by {apart:.0%} of their extent: a flatter shape that turns more looks the same through a "
                 "narrow lens; add views from other sides, or from nearer."
             )
 
 
 def _loss_of(residuals: Array, loss: Loss, scale: float) -> float:
+    """Sum of the loss over residuals (m, 2), px^2."""
     return float(scale**2 * LOSSES[loss]((residuals**2).sum(axis=1) / scale**2)[0].sum())
 
 
 def _cost_of_rotations(camera: Intrinsics, T: Array, tracks: Tracks) -> float:
-    """Sum of squares in px^2 of the best rotations, about one centre, and directions of points."""
+    """Sum of squared errors, px^2, of the best cameras that only rotate about one centre, and directions of points."""
     rays = np.concatenate([camera.normalise(tracks.pixels), np.ones((len(tracks), 1))], axis=1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     R = _rotations_alone(T[:, :3, :3], rays, tracks)
@@ -503,12 +585,15 @@ def _cost_of_rotations(camera: Intrinsics, T: Array, tracks: Tracks) -> float:
     first = Views(with_all_coefficients(camera), start, X)
     if not np.isfinite(look(first).cost):
         return float("inf")  # a point behind a camera, or beyond the fold of its lens
-    return descend(look, move, first, max_steps=ROTATION_STEPS, converged=1e-4, least_damping=LEAST_DAMPING).here.cost
+    return descend(look, move, first, max_steps=ROTATION_STEPS, converged=1e-4, least_damping=MIN_DAMPING).here.cost
 
 
 def _rotations_alone(R: Array, rays: Array, tracks: Tracks) -> Array:
-    """Rotations (n, 3, 3) under which rays of the same point are parallel, from R on in turns with the points' mean
-    directions (Wahba's problem for each image)."""
+    """Rotations (n, 3, 3) that make the rays of each point parallel, as far as possible.
+
+    From the start R, each round takes the mean direction of each point's rays, and then the rotation of each image that
+    fits its rays to these directions (Wahba's problem).
+    """
     for _ in range(ROTATION_ROUNDS):
         X = np.zeros((tracks.n_points, 3))
         np.add.at(X, tracks.point, np.einsum("mji,mj->mi", R[tracks.image], rays))
@@ -530,10 +615,11 @@ def _shape_deviation(
     covariance: Array,
     noise: float,
 ) -> float:
-    """Deviation of the median point after the best similarity, over the points' extent, for a noise of 1 px.
+    """Standard deviation of the median point after the best similarity, over the points' extent, for a noise of 1 px.
 
-    Of some points X: with the response J = dX / d(lens, poses), cov X = J C J^T + diag(V^-1), less the components along
-    translation, rotation and scale of all of them.
+    It takes about `SHAPE_SAMPLE` of the points. With C the covariance of lens and poses, J = dX / d(lens, poses) the
+    response of the points, and V^-1 their covariance if the cameras are exact, cov X = J C J^T + diag(V^-1). The
+    components along translation, rotation and scale of all points are then removed.
     """
     numbers = np.unique(some.point)
     chosen = numbers[:: max(1, len(numbers) // SHAPE_SAMPLE)]
@@ -549,7 +635,7 @@ def _shape_deviation(
     known = np.isfinite(alone).all(axis=(1, 2))
     if not (extent > 0 and known.any() and noise > 0):
         return float("nan")
-    J = equations.response_of_points()[known].reshape(-1, sizes.eliminated)
+    J = equations.response_of_points()[known].reshape(-1, sizes.reduced)
     joint = J @ (covariance / noise**2) @ J.T + block_diag(*alone[known])
     Y = (X[known] - np.median(X[known], axis=0)) / extent
     along = np.zeros((len(Y), 3, 7))
@@ -567,13 +653,13 @@ def _shape_deviation(
 
 
 def in_cameras(state: Views, tracks: Tracks) -> Array:
-    """(m, 3) the observed points in coordinates of the cameras that observe them."""
+    """(m, 3) float64, the point of each observation in the coordinates of its camera."""
     R, X = state.T[tracks.image, :3, :3], state.X[tracks.point]
     return np.asarray((R @ X[:, :, None])[:, :, 0] + state.T[tracks.image, :3, 3])
 
 
 def reprojection_errors(state: Views, tracks: Tracks) -> Array:
-    """(m, 2) projected less seen, pixels; NaN behind the camera."""
+    """(m, 2) float64, projected minus seen pixel of each observation; NaN for a point behind its camera."""
     return state.camera.project(in_cameras(state, tracks)) - tracks.pixels
 
 
@@ -586,8 +672,11 @@ def normal_equations(
     loss: str,
     scale: float,
 ) -> NormalEquations:
-    """The sum of the loss over all observations, with the lens's parameters `columns` and the images `is_free` free;
-    infinite with a point behind a camera."""
+    """The normal equations of the sum of the loss; their cost is infinite if a point is behind a camera that sees it.
+
+    columns : indices in `LENS_NAMES` of the free parameters of the lens. is_free : (n_images,) bool, whether the pose
+    of an image is free. scale : of a robust loss, pixels.
+    """
     seen = in_cameras(state, tracks)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         pixels, by_seen, appears = reproject(state.camera, seen)
@@ -616,11 +705,13 @@ def normal_equations(
 
 
 def _huber(z: Array) -> tuple[Array, Array]:
+    """Huber's rho and its derivative."""
     root = np.sqrt(np.maximum(z, 1.0))
     return np.where(z <= 1, z, 2 * root - 1), 1 / root
 
 
 def _soft_l1(z: Array) -> tuple[Array, Array]:
+    """The rho of "soft_l1", a smooth absolute value, and its derivative."""
     root = np.sqrt(1 + z)
     return 2 * (root - 1), 1 / root
 
@@ -631,21 +722,28 @@ LOSSES = {
     "soft_l1": _soft_l1,
     "cauchy": lambda z: (np.log1p(z), 1 / (1 + z)),
 }
-"""rho and its derivative at z = (d / scale)^2."""
+"""Functions that return rho and its derivative at z = (d / scale)^2, by the name of the loss. They are those of SciPy's
+`least_squares`."""
 
 
 def _noise(residuals: Array, loss: str, freedom: int) -> float:
-    """Standard deviation of a coordinate: by the sum of squares, or for robust losses by the median of the absolute
-    values, each over the degrees of freedom; NaN if there are none."""
+    """Standard deviation of a pixel's coordinate, from residuals (m, 2); NaN if there are no degrees of freedom.
+
+    It comes from the sum of squares, or with a robust loss from the median of the absolute values. Both are corrected
+    for the degrees of freedom.
+    """
     if freedom <= 0:
         return float("nan")
     if loss == "linear":
         return float(np.sqrt((residuals**2).sum() / freedom))
-    return float(1.4826 * np.median(np.abs(residuals)) * np.sqrt(residuals.size / freedom))
+    return float(sigma_from_median(residuals) * np.sqrt(residuals.size / freedom))
 
 
 def _in_gauge(start: Array, T: Array, X: Array, held: list[int], shared: int) -> tuple[Array, Array, Array]:
-    """Poses and points moved and scaled into the gauge of the start, and the rows (q, k) that a step in it obeys."""
+    """Poses and points, moved and scaled into the gauge of the start, and the rows (q, k) of the gauge's conditions.
+
+    A step s of lens and poses, (k,), stays in the gauge where rows @ s = 0.
+    """
     centres = -np.einsum("nji,nj->ni", start[:, :3, :3], start[:, :3, 3])
     if len({*held}) > 1:
         return T, X, np.zeros((0, shared + POSE * len(T)))

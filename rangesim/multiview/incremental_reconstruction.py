@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras and points from tracks alone: a pair of images, then image after image, each adjusted with all before.
+"""Incremental structure from motion: cameras and points from tracks alone, one image after another.
 
-1. The pair with many common points seen from different sides, by `find_relative_pose`.
-2. Its points, triangulated; then the image that sees most of the known points, by `find_camera_pose`; its new points.
-3. Bundle adjustment, often at first and then whenever a fifth more images are in; wrong observations, by their
-   reprojection error, are left out.
+1. It starts with a pair of images that share many points and see them from different sides. `find_relative_pose` finds
+   their poses.
+2. The points of the pair are triangulated. The image that sees most of the known points comes next: `find_camera_pose`
+   finds its pose, and its new points are triangulated. This is repeated for the other images.
+3. Bundle adjustment runs each time the number of images has grown by a fifth. Observations with a large reprojection
+   error are left out as wrong.
 
 Snavely, Seitz, Szeliski: "Photo tourism", SIGGRAPH 2006; Schoenberger, Frahm: "Structure-from-motion revisited", CVPR
-2016. Images do not know the size of a scene: the first image is the world, and the camera farthest from it is 1 away.
+2016. Images do not determine the size of a scene. World coordinates are those of the first image, and the camera
+farthest from it is at distance 1.
+
+Used by: no module of rangesim; it is for users alone.
 """
 
 from __future__ import annotations
@@ -33,28 +38,45 @@ from rangesim.multiview.tracks import Tracks
 from rangesim.rig import Intrinsics
 
 MIN_COMMON = 12
-"""Points that a pair must share, at least."""
-MIN_KNOWN = 6
-"""Known points that an image must see to be placed."""
-CANDIDATES = 12
-"""Pairs that are tried as the first."""
+"""Smallest number of points that the images of the first pair share. A relative pose needs five; twelve leave some for
+wrong ones and for a test of the pose."""
+MIN_KNOWN_POINTS = 6
+"""Smallest number of known points that an image must see before its pose is found. A pose needs three, and a fourth to
+be unique; six leave two for wrong ones."""
+MAX_PAIRS = 12
+"""Largest number of pairs tried as the first one. More pairs take longer, and may find a pair with more parallax."""
 WIDE_RAD = np.radians(10)
-"""Angle between the rays of a point beyond which a wider one is no better."""
-GROWTH = 1.2
-MAX_EXCESS = 1.5
-"""Times the stated noise that observations that agree may be off."""
+"""Angle between the two rays of a point, radians, above which a wider angle makes a pair no better. The depth deviation
+falls as the inverse of the angle, but matches become rarer; nobody measured the value."""
+ADJUSTMENT_GROWTH = 1.2
+"""Growth of the number of images, a ratio, after which all of them are adjusted again. A smaller ratio needs more
+adjustments; a larger one lets the errors of new poses add up. With 1.2 the number of adjustments grows as the logarithm
+of the number of images."""
+MAX_NOISE_RATIO = 1.5
+"""Largest noise found over the noise stated, a ratio; above it the result comes with a warning."""
 MIN_AGREEING = 0.5
-"""Fraction of the observations of points in several images below which the answer comes with a warning."""
+"""Smallest fraction of observations that agree, among those of points in several images; below it the result comes with
+a warning, because most tracks are then wrong."""
 FINAL_ROUNDS = 4
+"""Largest number of rounds of bundle adjustment and outlier removal at the end. They end earlier if the inliers do not
+change."""
 
 
 @dataclass(frozen=True, eq=False)
 class StructureFromMotion:
-    """Cameras and points, in the frame of the first image, the camera farthest from it at distance 1.
+    """The cameras and points that `structure_from_motion` found, in the frame of the first image.
 
-    T_camera_world : (n_images, 4, 4) maps world coordinates to each camera's. points : (n_points, 3) world; NaN where
-    the tracks do not tell. inliers : (m,) bool, observations that agree. first_pair : the images it started from.
-    adjustment : BundleAdjustment at the end, over the inliers, with covariance.
+    The unit of length is the distance from the first camera to the camera farthest from it.
+
+    T_camera_world : (n_images, 4, 4) float64, maps world coordinates to those of each camera.
+    points : (n_points, 3) float64, world; NaN for a point that the tracks do not determine.
+    inliers : (m,) bool, whether an observation agrees with the cameras and points.
+    first_pair : numbers of the two images of the start.
+    adjustment : BundleAdjustment of the inliers at the end, with the covariance.
+
+    Examples
+    --------
+    See `structure_from_motion`.
     """
 
     T_camera_world: Array
@@ -65,35 +87,52 @@ class StructureFromMotion:
 
     @property
     def noise_px(self) -> float:
-        """Standard deviation of a pixel's coordinate, from the residuals of the inliers."""
+        """Standard deviation of a pixel's coordinate, estimated from the residuals of the inliers."""
         return self.adjustment.noise_px
 
 
 def structure_from_motion(
     tracks: Tracks, camera: Intrinsics, *, noise_px: float = 1.0, seed: int = 0
 ) -> StructureFromMotion:
-    """Cameras and points of maximum likelihood, from tracks of which some may be wrong.
+    """The cameras and points of maximum likelihood, from tracks of which some may be wrong.
 
     Parameters
     ----------
-    tracks : of at least two images, linked by shared points; 12 or more for the first pair, 6 for each other image.
-    camera : the lens of all images, distortion included.
-    noise_px : standard deviation of a coordinate of a right observation; one is wrong that is off by more than its
-        99 % quantile three times over while poses are rough, and by more than four standard deviations at the end.
-    seed : of the robust estimators.
+    tracks : which image sees which point; at least two images that shared points link. Two images must share 12 points
+        or more, and each other image must see 6 known points or more.
+    camera : the lens of all images, with its distortion.
+    noise_px : standard deviation of a coordinate of a right observation. While the poses are rough, an observation
+        counts as wrong if its distance from the projection is more than three times the 99 % quantile of this noise; at
+        the end, if it is more than 4 sqrt(2) noise_px.
+    seed : seed of the robust estimators.
 
     Raises
     ------
     ValueError
-        Fewer than two images; images that share no points, or too few to be placed; no pair with parallax: the same
-        view again, a camera that only rotates, points on one plane; a shape that stays open (`bundle_adjust`); pixels
-        that no ray of the lens reaches.
+        There are fewer than two images, images share no points or too few, or no pair has parallax: all images show the
+        same view, the camera only rotates, or all points lie on a plane. Or the shape stays open (`bundle_adjust`), or
+        no ray through the lens reaches a pixel.
 
     Warns
     -----
     RangesimWarning
-        Most observations are left out as wrong, or the others are off by half more than the stated noise: the lens or
-        the noise is another, or most tracks are wrong. Or the last descent did not end (`bundle_adjust`).
+        More than half of the observations are left out as wrong, or the noise of the others is more than 1.5 times the
+        stated one: the lens or the noise is stated wrongly, or most tracks are wrong. Or the last descent did not end
+        (`bundle_adjust`).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.multiview import Tracks
+    >>> from rangesim.rig import Intrinsics
+    >>> camera = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0)
+    >>> world = np.random.default_rng(0).uniform([-2, -1, 4], [3, 1, 7], (30, 3))
+    >>> T = np.tile(np.eye(4), (3, 1, 1))
+    >>> T[:, 0, 3] = [0.0, -0.5, -1.0]  # three cameras at x = 0, 0.5 and 1 m, which look along z
+    >>> tracks = Tracks.from_dense(np.stack([camera.project(world + pose[:3, 3]) for pose in T]))
+    >>> found = structure_from_motion(tracks, camera, noise_px=0.5)
+    >>> np.allclose(found.T_camera_world, T, atol=1e-6)  # here the farthest camera is really at 1 m
+    True
     """
     check_noise(noise_px)
     if tracks.n_images < 2:
@@ -101,7 +140,7 @@ def structure_from_motion(
     beyond = int(np.count_nonzero(~np.isfinite(camera.normalise(tracks.pixels)).all(axis=1)))
     if beyond:
         raise ValueError(
-            f"expected pixels that a ray through the lens reaches, got {beyond} beyond its fold; leave them out."
+            f"expected pixels that a ray through the lens reaches, got {beyond} beyond its fold; leave these out."
         )
     check_connected(tracks)
     (first, second), pose = _first_pair(tracks, camera, noise_px, seed)
@@ -116,7 +155,7 @@ def structure_from_motion(
             break
         T = _with_next(tracks, camera, T, X, waiting, noise_px, seed)
         placed = tracks.n_images - len(waiting) + 1
-        if placed >= GROWTH * adjusted or placed == tracks.n_images:
+        if placed >= ADJUSTMENT_GROWTH * adjusted or placed == tracks.n_images:
             T, X = _adjusted(tracks, camera, T, noise_px, rough, (first,))
             adjusted = placed
         else:
@@ -127,18 +166,23 @@ def structure_from_motion(
 
 
 def _warn_of_misfit(tracks: Tracks, found: StructureFromMotion, noise_px: float) -> None:
+    """Warn if many observations disagree, or the others agree less well than the stated noise says."""
     linked = tracks.images_per_point[tracks.point] > 1  # a point in one image agrees with anything
     agreeing = float(found.inliers[linked].mean())
-    if found.noise_px > MAX_EXCESS * noise_px or agreeing < MIN_AGREEING:
+    if found.noise_px > MAX_NOISE_RATIO * noise_px or agreeing < MIN_AGREEING:
         warn(
             f"expected most observations to agree to the stated noise of {noise_px:.3g} px, got {agreeing:.0%} that "
-            f"agree, off by {found.noise_px:.3g} px: noise_px or the lens is another, or most tracks are wrong; state "
-            "the noise, calibrate the lens, or free it in bundle_adjust."
+            f"agree, with a noise of {found.noise_px:.3g} px: noise_px or the lens is stated wrongly, or most tracks "
+            "are wrong; state the noise, calibrate the lens, or free it in bundle_adjust."
         )
 
 
 def _first_pair(tracks: Tracks, camera: Intrinsics, noise_px: float, seed: int) -> tuple[tuple[int, int], RelativePose]:
-    """The pair with the most points seen under wide angles, of those that promise most."""
+    """The pair of images with the most points seen under wide angles, and its relative pose.
+
+    Pairs are ranked by their number of points and the median distance between the pixels of a point. The best
+    `MAX_PAIRS` of them are tried.
+    """
     seen = tracks.seen().astype(np.int64)
     shared = seen @ seen.T
     pairs = [(i, j) for i, j in np.argwhere(np.triu(shared, 1) >= MIN_COMMON)]
@@ -152,6 +196,7 @@ def _first_pair(tracks: Tracks, camera: Intrinsics, noise_px: float, seed: int) 
     dense = ideal.dense()
 
     def promise(pair: tuple[int, int]) -> float:
+        """Number of shared points, times a measure from 0 to 1 of how far their pixels are apart."""
         i, j = pair
         apart = np.linalg.norm(dense[i] - dense[j], axis=1)
         return float(shared[i, j] * min(np.nanmedian(apart) / (2 * WIDE_RAD * camera.fx), 1.0))
@@ -159,11 +204,11 @@ def _first_pair(tracks: Tracks, camera: Intrinsics, noise_px: float, seed: int) 
     pairs.sort(key=promise, reverse=True)
     best: tuple[float, tuple[int, int], RelativePose] | None = None
     refusal = ""
-    for i, j in pairs[:CANDIDATES]:
+    for i, j in pairs[:MAX_PAIRS]:
         common = ideal.common(i, j)
         try:
             found = find_relative_pose(common.first, common.second, K, K, noise_px, seed=seed)
-        except ValueError as error:  # this pair is degenerate, another may not be
+        except ValueError as error:  # this pair is degenerate, but another one may not be
             refusal = str(error)
             continue
         angle = np.median(_ray_angles(K, found.T_second_first, common.first, common.second)[found.inliers])
@@ -172,14 +217,17 @@ def _first_pair(tracks: Tracks, camera: Intrinsics, noise_px: float, seed: int) 
             best = score, (int(i), int(j)), found
     if best is None:
         raise ValueError(
-            f"expected a pair of images with parallax to start from, got none among the {min(len(pairs), CANDIDATES)} "
-            f"most promising; of the last: {refusal}"
+            f"expected a pair of images with parallax to start from, got none among the {min(len(pairs), MAX_PAIRS)} "
+            f"best pairs; the error of the last pair: {refusal}"
         )
     return best[1], best[2]
 
 
 def _ray_angles(K: Array, T: Array, first: Array, second: Array) -> Array:
-    """(n,) radians between the rays of pixels (n, 2) of two cameras."""
+    """(n,) float64, radians between the rays of the pixels (n, 2) of two cameras.
+
+    T : (4, 4) maps coordinates of the first camera to those of the second.
+    """
     inverse = np.linalg.inv(K).T
     a = np.concatenate([first, np.ones((len(first), 1))], axis=1) @ inverse @ T[:3, :3].T
     b = np.concatenate([second, np.ones((len(second), 1))], axis=1) @ inverse
@@ -189,33 +237,37 @@ def _ray_angles(K: Array, T: Array, first: Array, second: Array) -> Array:
 def _with_next(
     tracks: Tracks, camera: Intrinsics, T: Array, X: Array, waiting: np.ndarray, noise_px: float, seed: int
 ) -> Array:
-    """The poses with that of one more image: of those that wait, the one that sees most known points."""
+    """The poses T (n, 4, 4) with that of one more image: the one of those waiting that sees most of the known points
+    X."""
     known = np.asarray(np.isfinite(X).all(axis=1))
     counts = np.bincount(tracks.image[known[tracks.point]], minlength=tracks.n_images)
     refusal = ""
     for image in waiting[np.argsort(-counts[waiting], kind="stable")]:
         mine = np.flatnonzero((tracks.image == image) & known[tracks.point])
-        if len(mine) < MIN_KNOWN:
+        if len(mine) < MIN_KNOWN_POINTS:
             break
         try:
             found = find_camera_pose(X[tracks.point[mine]], tracks.pixels[mine], camera, 2 * noise_px, seed=seed)
-        except ValueError as error:  # this image cannot be placed yet, another may
+        except ValueError as error:  # this image cannot be placed yet, but another one may
             refusal = str(error)
             continue
         T = T.copy()
         T[image] = found.T_camera_object
         return T
     raise ValueError(
-        f"expected images that see at least {MIN_KNOWN} points of the others, from several depths, got {len(waiting)} "
+        f"expected images that see at least {MIN_KNOWN_POINTS} known points at several depths, got {len(waiting)} "
         f"that cannot be placed, such as image {waiting[0]} with {counts[waiting[0]]} known points"
-        f"{'; of the last tried: ' + refusal if refusal else '; track points through more images.'}"
+        f"{'; the error of the last one: ' + refusal if refusal else '; track points through more images.'}"
     )
 
 
 def _adjusted(
     tracks: Tracks, camera: Intrinsics, T: Array, noise_px: float, limit: float, held: tuple[int, ...]
 ) -> tuple[Array, Array]:
-    """Poses and points after triangulation, bundle adjustment of what agrees, and triangulation."""
+    """Poses and points after triangulation, bundle adjustment of the observations that agree, and triangulation again.
+
+    limit : largest reprojection error of an observation that agrees, pixels. held : images whose poses stay.
+    """
     placed = np.flatnonzero(np.isfinite(T).all(axis=(1, 2)))
     found = triangulate_many(tracks, camera, T, noise_px=noise_px, max_error_px=limit)
     some = tracks.keep(found.agrees).of_images(placed)
@@ -238,6 +290,7 @@ def _adjusted(
 def _finished(
     tracks: Tracks, camera: Intrinsics, T: Array, noise_px: float, pair: tuple[int, int]
 ) -> StructureFromMotion:
+    """The result in the frame of the first image, after adjustments of the inliers until these stay the same."""
     T = T @ np.linalg.inv(T[0])
     centres = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
     T[:, :3, 3] /= np.linalg.norm(centres, axis=1).max()

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images without perspective of a shape, rigid or not: the sum of squares of factorisation and of non-rigid shape.
+"""Least squares for images without perspective of a shape, rigid or deforming.
 
     x_ij = s_i P R_i (B_0j + sum_k c_ik B_kj) + t_i,    P = [1 0 0; 0 1 0]
 
-with a rotation R_i, a translation t_i in pixels, perhaps a scale s_i (weak perspective; s_i = 1 is orthographic), and
-K - 1 coefficients c_i for each image, and K basis shapes B_k for each point: K = 1 is a rigid body. The model is linear
-in the points, so each step of the images is followed by the points that are best for them (variable projection: Golub,
-Pereyra 1973; Okatani, Yoshida, Deguchi: "Efficient algorithm for low-rank matrix factorization with missing
-components", ICCV 2011, for how much wider it converges).
+Each image i has a rotation R_i, a translation t_i in pixels, K - 1 coefficients c_i and, under weak perspective, a
+scale s_i; s_i = 1 is orthographic. Each point j has K basis shapes B_kj, and K = 1 is a rigid body. The model is linear
+in the points. So after each step of the images, the points are set to those that fit best (variable projection: Golub,
+Pereyra 1973). It then converges from farther away (Okatani, Yoshida, Deguchi: "Efficient algorithm for low-rank matrix
+factorization with missing components", ICCV 2011).
+
+Used by: `factorisation` and `nonrigid` of `rangesim.multiview`; no other module of rangesim.
 """
 
 from __future__ import annotations
@@ -22,12 +24,18 @@ from rangesim.geometry.least_squares import Descended, descend
 from rangesim.multiview.schur_complement import NormalEquations, Prior, Sizes, Step, Term
 from rangesim.multiview.tracks import Tracks
 
-LEAST_DAMPING = 1e-12
+MIN_DAMPING = 1e-12
+"""Smallest damping of Levenberg-Marquardt, relative to the diagonal of the normal equations. It keeps them regular
+along the gauge, which changes no residual."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """R : (n, 3, 3). t : (n, 2). scale : (n,). coefficients : (n, K), the first of which is 1. basis : (p, K, 3)."""
+    """The cameras of n images and the K basis shapes of p points, float64.
+
+    R : (n, 3, 3), rotates world coordinates to those of each camera. t : (n, 2), pixels. scale : (n,), a ratio.
+    coefficients : (n, K), the first of which is 1. basis : (p, K, 3), world, pixels.
+    """
 
     R: Array
     t: Array
@@ -37,25 +45,39 @@ class Shapes:
 
     @property
     def shapes(self) -> Array:
-        """(n, p, 3) the shape in each image, in coordinates of the world."""
+        """(n, p, 3) float64, the shape in each image, world, pixels."""
         return np.einsum("nk,pkd->npd", self.coefficients, self.basis)
 
     def project(self) -> Array:
-        """(n, p, 2) pixels."""
+        """(n, p, 2) float64, pixels of each point in each image."""
         turned = np.einsum("nad,npd->npa", self.R[:, :2], self.shapes)
         return np.asarray(self.scale[:, None, None] * turned + self.t[:, None])
 
 
 @dataclass(frozen=True)
 class TemporalPrior:
-    """How smoothly a shape deforms and a camera turns, as standard deviations of a Gaussian prior; None: as it likes.
+    """A Gaussian prior on how smoothly a shape deforms and a camera turns from image to image.
 
-    shape_bend_px : of a coordinate of S_i-1 - 2 S_i + S_i+1, S_i a point of the shape in image i, in the world, pixels:
-    how far, twice, it may lie off the middle between before and after. turn_step_rad : of the rotation vector between
-    consecutive images. The prior is on the shape, the sum over points of |sum_k (c_i-1,k - 2 c_ik + c_i+1,k) B_kj|^2,
-    and not on the coefficients, whose units the gauge leaves open: a prior on these alone would be met by making them
-    small and the basis large. It is on bends and not on steps, since a deformation that goes on for some images has
-    large steps, and a prior that takes them for chance makes it smaller.
+    shape_bend_px : standard deviation of a coordinate of the second difference S_i-1 - 2 S_i + S_i+1, pixels, where S_i
+        is a point of the shape in image i. The second difference is twice the distance of S_i from the middle of S_i-1
+        and S_i+1. None leaves the shape free.
+    turn_step_rad : standard deviation of a component of the rotation vector between consecutive images, radians. None
+        leaves the cameras free.
+
+    The prior is on the shape, with the sum over points of |sum_k (c_i-1,k - 2 c_ik + c_i+1,k) B_kj|^2. A prior on the
+    coefficients alone would have no effect, because their unit is free: small coefficients with a large basis make the
+    same shape. The prior is on second differences and not on first ones. A deformation that continues for some images
+    has large first differences, and a prior on these would make it smaller.
+
+    Raises
+    ------
+    ValueError
+        A standard deviation is not positive.
+
+    Examples
+    --------
+    >>> TemporalPrior(shape_bend_px=2.0)
+    TemporalPrior(shape_bend_px=2.0, turn_step_rad=None)
     """
 
     shape_bend_px: float | None = None
@@ -69,6 +91,7 @@ class TemporalPrior:
 
 
 NO_PRIOR = TemporalPrior()
+"""The prior that leaves shape and cameras free."""
 
 
 def adjust(
@@ -82,9 +105,12 @@ def adjust(
     max_steps: int = 300,
     converged: float = 1e-12,
 ) -> Descended[Shapes, NormalEquations]:
-    """The shapes of least squared error, over the noise, plus those of the prior, from a start downwards.
+    """The descent from a start to the shapes with the least squared errors of the pixels and of the prior.
 
-    has_scale, has_translation : whether scales and translations are free; else they stay.
+    Each error is divided by its standard deviation: the pixels' by `noise_px`, the prior's by its own.
+
+    has_scale, has_translation : whether the scales and the translations of the images are free.
+    max_steps, converged : see `rangesim.geometry.least_squares.descend`.
     """
     n, p, K = *start.coefficients.shape[:1], len(start.basis), start.coefficients.shape[1]
     sizes = Sizes(0, n, 5 + int(has_scale) + K - 1, p, 3 * K)
@@ -98,10 +124,11 @@ def adjust(
     def settled(shapes: Shapes) -> Shapes:
         return replace(shapes, basis=shapes.basis + look(shapes).step_of_points().reshape(shapes.basis.shape))
 
-    return descend(look, move, settled(start), max_steps=max_steps, converged=converged, least_damping=LEAST_DAMPING)
+    return descend(look, move, settled(start), max_steps=max_steps, converged=converged, least_damping=MIN_DAMPING)
 
 
 def _moved(shapes: Shapes, step: Step, has_scale: bool) -> Shapes:
+    """The shapes with the cameras and coefficients moved by a step, and the basis as it was."""
     images, K = step.images, shapes.coefficients.shape[1]
     coefficients = shapes.coefficients.copy()
     coefficients[:, 1:] += images[:, 5 : 5 + K - 1]
@@ -123,15 +150,16 @@ def _look(
     prior: TemporalPrior,
     noise_px: float,
 ) -> NormalEquations:
+    """The normal equations of the squared errors of the pixels and of the prior."""
     image, point = tracks.image, tracks.point
     m, K = len(tracks), shapes.coefficients.shape[1]
     scale, R, c = shapes.scale[image], shapes.R[image], shapes.coefficients[image]
     basis = shapes.basis[point]
-    # the basis shapes as the camera sees them, (m, K, 3), and their sum
+    # the basis shapes in coordinates of the camera (m, K, 3), and the sum of them that makes the shape (m, 3)
     seen = scale[:, None, None] * (basis @ np.swapaxes(R, 1, 2))
     y = (c[:, None, :] @ seen)[:, 0]
     values = y[:, :2] + shapes.t[image] - tracks.pixels
-    by_images = np.zeros((m, 2, 1, sizes.of_image))
+    by_images = np.zeros((m, 2, 1, sizes.per_image))
     by_images[:, 0, 0, 1], by_images[:, 0, 0, 2] = y[:, 2], -y[:, 1]
     by_images[:, 1, 0, 0], by_images[:, 1, 0, 2] = -y[:, 2], y[:, 0]
     by_images[:, 0, 0, 3] = by_images[:, 1, 0, 4] = float(has_translation)
@@ -151,11 +179,13 @@ def _look(
 
 
 def _flat(by_point: Array) -> Array:
+    """(m, d, K 3), from derivatives (m, d, K, 3) by the basis shapes of a point."""
     return np.ascontiguousarray(by_point.reshape(*by_point.shape[:2], -1))
 
 
 def _shape_bends(shapes: Shapes, sizes: Sizes, deviation: float) -> Term:
-    """Residuals (p (n - 2), 3) of each point of the shape, second differences over the images."""
+    """The term of the prior on the shape: second differences over the images of each point, residuals (p (n - 2),
+    3)."""
     n, K = shapes.coefficients.shape
     p = len(shapes.basis)
     point, middle = (a.ravel() for a in np.meshgrid(np.arange(p), np.arange(1, n - 1), indexing="ij"))
@@ -163,7 +193,7 @@ def _shape_bends(shapes: Shapes, sizes: Sizes, deviation: float) -> Term:
     weights = np.array([1.0, -2.0, 1.0])
     change = np.einsum("mek,e->mk", shapes.coefficients[images], weights)
     basis = shapes.basis[point]
-    by_images = np.zeros((len(point), 3, 3, sizes.of_image))
+    by_images = np.zeros((len(point), 3, 3, sizes.per_image))
     by_images[..., 5 : 4 + K] = np.swapaxes(basis[:, 1:], 1, 2)[:, :, None] * weights[:, None]
     by_point = change[:, None, :, None] * np.eye(3)[:, None, :]
     values = np.einsum("mk,mkd->md", change, basis)
@@ -172,8 +202,8 @@ def _shape_bends(shapes: Shapes, sizes: Sizes, deviation: float) -> Term:
 
 
 def _turn_steps(shapes: Shapes, sizes: Sizes, deviation: float) -> Prior:
-    """Residuals (3 (n - 1),) of the rotation between consecutive images, as rotation vectors."""
-    n, c = sizes.images, sizes.of_image
+    """The prior on the cameras: rotation vectors between consecutive images, residuals (3 (n - 1),)."""
+    n, c = sizes.images, sizes.per_image
     between = shapes.R[1:] @ np.swapaxes(shapes.R[:-1], 1, 2)
     vectors = Rotation.from_matrix(between).as_rotvec()
     by_step = np.zeros((n - 1, 3, n * c))
@@ -185,7 +215,7 @@ def _turn_steps(shapes: Shapes, sizes: Sizes, deviation: float) -> Prior:
 
 
 def _inverse_left_jacobian(v: Array) -> Array:
-    """(3, 3) J with log(exp(w) exp(v)) = v + J w to first order."""
+    """(3, 3) float64, J with log(exp(w) exp(v)) = v + J w to first order in w, for a rotation vector v."""
     angle = float(np.linalg.norm(v))
     cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
     square = 1 / 12 if angle < 1e-4 else 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))

@@ -1,18 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sums of squares over images and points whose normal equations are sparse: solved by the Schur complement on the
-points.
+"""Sparse normal equations of sums of squares over images and points, solved by the Schur complement on the points.
 
-A residual of an observation depends on its image (a block of parameters), on its point (another), and perhaps on
-parameters that all share, as a lens. The normal equations are then
+The residual of an observation depends on the parameters of its image, on those of its point, and perhaps on shared
+parameters, such as a lens. The normal equations are then
 
     [ U    W ] [ images ]     [ g_images ]
-    [ W^T  V ] [ points ] = - [ g_points ]      V block diagonal, a small block for each point,
+    [ W^T  V ] [ points ] = - [ g_points ]      V block diagonal, a small block for each point.
 
-and eliminating the points leaves S = U - W V^-1 W^T, as large as the images alone (Brown 1958; Triggs, McLauchlan,
-Hartley, Fitzgibbon: "Bundle adjustment - a modern synthesis", 2000, section 6.1). W is never kept: with V = L L^T,
-S = U - Y^T Y where Y = L^-1 W^T is made for some hundred points at a time, over the images that see them.
+The elimination of the points leaves S = U - W V^-1 W^T, which has rows for the shared and the image parameters only
+(Brown 1958; Triggs, McLauchlan, Hartley, Fitzgibbon: "Bundle adjustment - a modern synthesis", 2000, section 6.1). W is
+never stored. With V = L L^T, S = U - Y^T Y, where Y = L^-1 W^T is computed for some hundred points at a time, over the
+images that see them.
 
-S is dense: (images x parameters)^2 numbers, 0.3 GB for 1000 cameras.
+S is dense and has (images x parameters per image)^2 numbers, 0.3 GB for 1000 cameras.
+
+Used by: `bundle_adjustment`, `multi_view_triangulation`, `factorisation`, `orthographic` and `nonrigid` of
+`rangesim.multiview`; no other module of rangesim.
 """
 
 from __future__ import annotations
@@ -28,14 +31,17 @@ from scipy.linalg import cho_factor, cho_solve
 from pcgraph.parallel import in_blocks, kernel
 from rangesim.geometry.correspondences import Array
 
-LEAST_DAMPING = 1e-10
-"""Relative to the diagonal; it also holds what the residuals leave open, such as the gauge, where it is."""
 CHUNK_BYTES = 16e6
-"""Of Y at a time."""
+"""Largest size of Y at a time, bytes. Larger chunks need more memory; smaller ones make the matrix products less
+efficient."""
 
 
 class Step(NamedTuple):
-    """shared : (s,). images : (n_images, c). points : (n_points, p)."""
+    """A step of all parameters, float64.
+
+    shared : (s,), of the shared parameters. images : (n_images, c), of each image. points : (n_points, p), of each
+    point.
+    """
 
     shared: Array
     images: Array
@@ -43,10 +49,14 @@ class Step(NamedTuple):
 
 
 class Term(NamedTuple):
-    """Residuals of one kind and their derivatives by a step.
+    """Residuals of one kind, and their derivatives with respect to a step.
 
-    values : (m, d). point : (m,) int64, ascending. images : (m, e) int64, the e images that each depends on.
-    by_images : (m, d, e, c). by_point : (m, d, p). by_shared : (m, d, s).
+    values : (m, d) float64, m residual vectors of d components.
+    point : (m,) int64, the point of each residual vector, ascending.
+    images : (m, e) int64, the e images that each residual vector depends on.
+    by_images : (m, d, e, c) float64, derivatives by the parameters of these images.
+    by_point : (m, d, p) float64, derivatives by the parameters of the point.
+    by_shared : (m, d, s) float64, derivatives by the shared parameters.
     """
 
     values: Array
@@ -58,7 +68,11 @@ class Term(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """Residuals of shared and image parameters alone. values : (q,). by_step : (q, s + n_images c), shared first."""
+    """Residuals that depend on the shared and the image parameters, but on no point.
+
+    values : (q,) float64. by_step : (q, s + n_images c) float64, derivatives by the shared parameters, then by those of
+    each image.
+    """
 
     values: Array
     by_step: Array
@@ -66,29 +80,36 @@ class Prior(NamedTuple):
 
 @dataclass(frozen=True)
 class Sizes:
-    """Numbers of shared parameters, of images and parameters of each, of points and parameters of each."""
+    """The numbers of parameters.
+
+    shared : number s of shared parameters. images : number of images. per_image : number c of parameters of an image.
+    points : number of points. per_point : number p of parameters of a point.
+    """
 
     shared: int
     images: int
-    of_image: int
+    per_image: int
     points: int
-    of_point: int
+    per_point: int
 
     @property
-    def eliminated(self) -> int:
-        """Parameters that are left once the points are eliminated: shared ones first, then those of each image."""
-        return self.shared + self.images * self.of_image
+    def reduced(self) -> int:
+        """Number of rows of S, one for each parameter left: the shared ones first, then those of each image."""
+        return self.shared + self.images * self.per_image
 
 
 class NormalEquations:
-    """A sum of squares near a state, as `least_squares.descend` takes it; made of terms when a step is first asked for.
+    """The sum of squares near a state, in the form that `least_squares.descend` takes.
+
+    The matrices are computed when they are first needed. A parameter on which no residual depends, such as the pose of
+    a held image, gets a step of 0.
 
     Parameters
     ----------
-    cost : the sum of squares, or the sum of a robust loss that the weighted `terms` stand for.
-    terms : with rows already weighted. prior : on shared and image parameters.
-
-    Parameters that nothing depends on, such as those of images that are held, stay as they are.
+    cost : the sum of squares, or the sum of the robust loss that the weighted `terms` represent.
+    sizes : the numbers of parameters.
+    terms : residuals and derivatives, already weighted.
+    prior : residuals on the shared and the image parameters alone; None for none.
     """
 
     def __init__(self, cost: float, sizes: Sizes, terms: Sequence[Term], prior: Prior | None = None) -> None:
@@ -96,24 +117,24 @@ class NormalEquations:
 
     @cached_property
     def _starts(self) -> list[np.ndarray]:
-        """(n_points + 1,) of each term: where the residuals of each point start."""
+        """For each term, (n_points + 1,) int64: index of the first residual of each point, and the number of all."""
         numbers = np.arange(self.sizes.points + 1)
         return [np.searchsorted(term.point, numbers) for term in self.terms]
 
     @cached_property
-    def _of_points(self) -> tuple[Array, Array]:
-        """V and g of the points."""
+    def _point_equations(self) -> tuple[Array, Array]:
+        """V (n_points, p, p) and g (n_points, p) of the points."""
         sizes = self.sizes
-        V, h = np.zeros((sizes.points, sizes.of_point, sizes.of_point)), np.zeros((sizes.points, sizes.of_point))
+        V, h = np.zeros((sizes.points, sizes.per_point, sizes.per_point)), np.zeros((sizes.points, sizes.per_point))
         for term, starts in zip(self.terms, self._starts, strict=True):
             in_blocks(_add_points, sizes.points, starts, term.values, term.by_point, V, h, smallest=256)
         return V, h
 
     @cached_property
-    def _of_images(self) -> tuple[Array, Array]:
-        """U and g of shared and image parameters."""
+    def _image_equations(self) -> tuple[Array, Array]:
+        """U (k, k) and g (k,) of the shared and the image parameters, k = `Sizes.reduced`."""
         sizes = self.sizes
-        U, g = np.zeros((sizes.eliminated, sizes.eliminated)), np.zeros(sizes.eliminated)
+        U, g = np.zeros((sizes.reduced, sizes.reduced)), np.zeros(sizes.reduced)
         for term in self.terms:
             _add_images(term.values, term.images, term.by_images, term.by_shared, U, g)
         if self.prior is not None:
@@ -122,13 +143,13 @@ class NormalEquations:
         return U, g
 
     def reduced(self, damping: float) -> tuple[Array, Array, Array, Array, list[Array]] | None:
-        """S, its right side, and for the points: L^-1, L^-1 g, and the terms' by_point L^-T; None where V is singular.
+        """S, its right side, L^-1 and L^-1 g of the points, and by_point L^-T of each term; None if V is singular.
 
-        damping : relative, of all parameters.
+        damping : relative increase of the diagonals of U and V.
         """
-        (U, g), (V, h) = self._of_images, self._of_points
+        (U, g), (V, h) = self._image_equations, self._point_equations
         sizes = self.sizes
-        block = np.arange(sizes.of_point)
+        block = np.arange(sizes.per_point)
         V = V.copy()
         diagonal = V[:, block, block]
         V[:, block, block] = np.where(diagonal > 0, diagonal * (1 + damping), 1.0)
@@ -149,20 +170,20 @@ class NormalEquations:
         return S, right, inverse, scaled_h, by_points
 
     def _eliminate(self, by_points: list[Array], scaled_h: Array, S: Array, right: Array) -> None:
-        """S -= Y^T Y and right += Y^T L^-1 g, some points at a time."""
+        """Compute S -= Y^T Y and right += Y^T L^-1 g in place, for some points at a time."""
         sizes = self.sizes
-        at_once = int(max(1, CHUNK_BYTES / (8 * sizes.of_point * max(sizes.eliminated, 1))))
+        at_once = int(max(1, CHUNK_BYTES / (8 * sizes.per_point * max(sizes.reduced, 1))))
         for first in range(0, sizes.points, at_once):
             last = min(first + at_once, sizes.points)
             involved = np.zeros(sizes.images, dtype=bool)
             for term, starts in zip(self.terms, self._starts, strict=True):
                 involved[term.images[starts[first] : starts[last]]] = True
             if not involved.any():
-                continue  # points that nothing observes
+                continue  # no residual depends on these points
             images = np.flatnonzero(involved)
             place = np.full(sizes.images, -1)
             place[images] = np.arange(len(images))
-            Y = np.zeros((last - first, sizes.of_point, sizes.shared + len(images) * sizes.of_image))
+            Y = np.zeros((last - first, sizes.per_point, sizes.shared + len(images) * sizes.per_image))
             for term, starts, by_point in zip(self.terms, self._starts, by_points, strict=True):
                 in_blocks(
                     _fill,
@@ -181,17 +202,17 @@ class NormalEquations:
             columns = np.concatenate(
                 [
                     np.arange(sizes.shared),
-                    (sizes.shared + images[:, None] * sizes.of_image + np.arange(sizes.of_image)).ravel(),
+                    (sizes.shared + images[:, None] * sizes.per_image + np.arange(sizes.per_image)).ravel(),
                 ]
             )
-            if len(columns) == sizes.eliminated:
+            if len(columns) == sizes.reduced:
                 S -= flat.T @ flat
             else:
                 S[np.ix_(columns, columns)] -= flat.T @ flat
             right[columns] += flat.T @ scaled_h[first:last].ravel()
 
     def damped_step(self, damping: float) -> tuple[Step, float] | None:
-        """See `least_squares.Descent`."""
+        """The damped step and the decrease of the cost that it predicts; see `least_squares.Descent`."""
         found = self.reduced(damping)
         if found is None:
             return None
@@ -201,42 +222,45 @@ class NormalEquations:
         except np.linalg.LinAlgError:
             return None
         sizes = self.sizes
-        shared, images = of_images[: sizes.shared], of_images[sizes.shared :].reshape(sizes.images, sizes.of_image)
+        shared, images = of_images[: sizes.shared], of_images[sizes.shared :].reshape(sizes.images, sizes.per_image)
         for term, starts, by_point in zip(self.terms, self._starts, by_points, strict=True):
             arrays = term.images, term.by_images, term.by_shared, by_point, shared, images, scaled_h
-            in_blocks(_substitute, sizes.points, starts, *arrays, smallest=256)
+            in_blocks(_back_substitute, sizes.points, starts, *arrays, smallest=256)
         points = -(np.swapaxes(inverse, 1, 2) @ scaled_h[:, :, None])[:, :, 0]
-        (U, g), (V, h) = self._of_images, self._of_points
-        block = np.arange(sizes.of_point)
+        (U, g), (V, h) = self._image_equations, self._point_equations
+        block = np.arange(sizes.per_point)
         slope = float(of_images @ g + (points * h).sum())
         damped = float((of_images**2 * np.diag(U)).sum() + (points**2 * V[:, block, block]).sum())
         return Step(shared, images, points), -slope + damping * damped
 
     def step_of_points(self) -> Array:
-        """(n_points, p) the step of the points alone, images held; exact where residuals are linear in the points.
+        """(n_points, p) float64, the step of the points with all other parameters held.
 
-        Points that the residuals leave open take the smallest such step.
+        It ends at the minimum if the residuals are linear in the points. A point that its residuals do not determine
+        takes the shortest such step.
         """
-        V, h = self._of_points
+        V, h = self._point_equations
         return -(np.linalg.pinv(V, rcond=1e-12, hermitian=True) @ h[:, :, None])[:, :, 0]
 
     def response_of_points(self) -> Array:
-        """(n_points, p, k) d points / d (shared, images) at the minimum over the points: -V^-1 W^T."""
+        """(n_points, p, k) float64, -V^-1 W^T: how the best points move with the k shared and image parameters."""
         sizes = self.sizes
         found = self.reduced(1e-13)
         if found is None:
-            return np.full((sizes.points, sizes.of_point, sizes.eliminated), np.inf)
+            return np.full((sizes.points, sizes.per_point, sizes.reduced), np.inf)
         _, _, inverse, _, by_points = found
-        Y = np.zeros((sizes.points, sizes.of_point, sizes.eliminated))
+        Y = np.zeros((sizes.points, sizes.per_point, sizes.reduced))
         for term, starts, by_point in zip(self.terms, self._starts, by_points, strict=True):
             place = np.arange(sizes.images)
             _fill(0, sizes.points, 0, starts, place, term.images, term.by_images, term.by_shared, by_point, Y)
         return np.asarray(-np.swapaxes(inverse, 1, 2) @ Y)
 
     def covariance_of_points(self) -> Array:
-        """(n_points, p, p) V^-1: of each point given the images, for residuals of unit variance; infinite where the
-        residuals leave it open."""
-        V, _ = self._of_points
+        """(n_points, p, p) float64, V^-1: covariance of each point if all other parameters are exact.
+
+        It is for residuals of unit variance, and infinite for a point that its residuals do not determine.
+        """
+        V, _ = self._point_equations
         values, axes = np.linalg.eigh(V)
         sound = values[:, 0] > 1e-13 * values[:, -1]
         half = axes / np.sqrt(np.where(sound[:, None], values, 1.0))[:, None, :]
@@ -245,13 +269,18 @@ class NormalEquations:
         return np.asarray(result)
 
     def free_covariance(self, gauge: int) -> Array:
-        """(k, k) as `covariance`, with `gauge` freedoms spread over all parameters: S^+ less its `gauge` least
-        eigenvalues, that of smallest trace (inner constraints). Infinite if more are open."""
-        size = self.sizes.eliminated
+        """(k, k) float64, the covariance of the shared and image parameters in the gauge with the smallest trace.
+
+        S is scaled to a unit diagonal, and its inverse leaves out the `gauge` smallest eigenvalues (inner constraints).
+        The residuals have unit variance. All entries are infinite if more freedoms are open.
+
+        gauge : number of freedoms of the gauge.
+        """
+        size = self.sizes.reduced
         found = self.reduced(1e-13)
         if found is None:
             return np.full((size, size), np.inf)
-        scale = 1 / np.sqrt(np.maximum(np.diag(self._of_images[0]), 1e-300))
+        scale = 1 / np.sqrt(np.maximum(np.diag(self._image_equations[0]), 1e-300))
         values, axes = np.linalg.eigh(found[0] * np.outer(scale, scale))
         if not values[gauge] > 1e-11 * values[-1]:
             return np.full((size, size), np.inf)
@@ -259,21 +288,22 @@ class NormalEquations:
         return np.asarray(half @ half.T)
 
     def covariance(self, gauge: Array) -> Array:
-        """(k, k) inverse of S where gauge @ step = 0, k = `Sizes.eliminated`: of shared and image parameters, for
-        residuals of unit variance.
+        """(k, k) float64, the covariance of the k = `Sizes.reduced` shared and image parameters, in a gauge.
+
+        It is the inverse of S on the steps that obey the conditions of the gauge, for residuals of unit variance. All
+        entries are infinite if a parameter is still open under these conditions.
 
         Parameters
         ----------
-        gauge : (q, k) rows of the conditions that the step obeys. Zero columns of S and what they leave open are
-            infinite.
+        gauge : (q, k) conditions; a step obeys them if gauge @ step = 0.
         """
         found = self.reduced(1e-12)
-        size = self.sizes.eliminated
+        size = self.sizes.reduced
         if found is None:
             return np.full((size, size), np.inf)
         S = found[0]
-        scale = 1 / np.sqrt(np.maximum(np.diag(self._of_images[0]), 1e-300))
-        scale[np.diag(self._of_images[0]) == 0] = 1
+        scale = 1 / np.sqrt(np.maximum(np.diag(self._image_equations[0]), 1e-300))
+        scale[np.diag(self._image_equations[0]) == 0] = 1
         basis = np.eye(size)
         if len(gauge):
             basis = np.linalg.qr((gauge * scale).T, mode="complete")[0][:, len(gauge) :]
@@ -289,7 +319,7 @@ class NormalEquations:
 
 @kernel
 def _add_images(values, images, by_images, by_shared, U, g):  # type: ignore[no-untyped-def]
-    """U += J^T J and g += J^T r of shared and image parameters."""
+    """Add J^T J to U and J^T r to g, for the shared and the image parameters."""
     m, d, e, c = by_images.shape
     s = by_shared.shape[2]
     for i in range(m):
@@ -315,7 +345,7 @@ def _add_images(values, images, by_images, by_shared, U, g):  # type: ignore[no-
 
 @kernel
 def _add_points(start, stop, starts, values, by_point, V, h):  # type: ignore[no-untyped-def]
-    """V += J^T J and h += J^T r of each point."""
+    """Add J^T J to V and J^T r to h, for each point from start to stop."""
     d, p = by_point.shape[1], by_point.shape[2]
     for j in range(start, stop):
         for i in range(starts[j], starts[j + 1]):
@@ -328,7 +358,7 @@ def _add_points(start, stop, starts, values, by_point, V, h):  # type: ignore[no
 
 @kernel
 def _scaled(start, stop, point, by_point, inverse, result):  # type: ignore[no-untyped-def]
-    """result[i] = by_point[i] L^-T, with L^-1 of its point lower triangular."""
+    """Set result[i] = by_point[i] L^-T, where `inverse` holds the lower triangular L^-1 of each point."""
     d, p = by_point.shape[1], by_point.shape[2]
     for i in range(start, stop):
         j = point[i]
@@ -342,7 +372,7 @@ def _scaled(start, stop, point, by_point, inverse, result):  # type: ignore[no-u
 
 @kernel
 def _fill(start, stop, first, starts, place, images, by_images, by_shared, by_point, Y):  # type: ignore[no-untyped-def]
-    """Y[j] += by_point^T by_images of all residuals of point first + j, in the columns of their images."""
+    """Add by_point^T by_images of all residuals of point first + j to Y[j], in the columns of their images."""
     d, e, c = by_images.shape[1], by_images.shape[2], by_images.shape[3]
     s, p = by_shared.shape[2], by_point.shape[2]
     for j in range(start, stop):
@@ -359,8 +389,8 @@ def _fill(start, stop, first, starts, place, images, by_images, by_shared, by_po
 
 
 @kernel
-def _substitute(start, stop, starts, images, by_images, by_shared, by_point, shared, steps, result):  # type: ignore[no-untyped-def]
-    """result[j] += Y (shared, steps), the steps of the images."""
+def _back_substitute(start, stop, starts, images, by_images, by_shared, by_point, shared, steps, result):  # type: ignore[no-untyped-def]
+    """Add Y (shared, steps) to result[j], where `steps` are the steps of the images."""
     d, e, c = by_images.shape[1], by_images.shape[2], by_images.shape[3]
     s, p = by_shared.shape[2], by_point.shape[2]
     for j in range(start, stop):

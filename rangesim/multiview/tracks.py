@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tracks: which point is seen where in which image. What every chapter of `rangesim.multiview` takes."""
+"""Tracks: which point is seen in which image, and at which pixel. Every method of `rangesim.multiview` takes them.
+
+Used by: all modules of `rangesim.multiview` except `schur_complement`; no other module of rangesim.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,18 @@ from rangesim.settings.config import shown
 
 
 class CommonPoints(NamedTuple):
-    """point : (k,) int64, numbers of points that two images share. first, second : (k, 2) their pixels in either."""
+    """The points that two images share, with their pixels in both images.
+
+    point : (k,) int64, numbers of the points, ascending. first, second : (k, 2) float64, pixels (x, y) in the first and
+    in the second image.
+
+    Examples
+    --------
+    >>> tracks = Tracks(image=[0, 1, 1], point=[4, 4, 7], pixels=[[10.5, 20.5], [12.5, 20.5], [30.5, 8.5]])
+    >>> common = tracks.common(0, 1)
+    >>> common.point, common.second - common.first
+    (array([4]), array([[2., 0.]]))
+    """
 
     point: np.ndarray
     first: Array
@@ -25,16 +39,30 @@ class CommonPoints(NamedTuple):
 class Tracks:
     """Observations of points in images, as parallel arrays sorted by point, then by image.
 
-    image : (m,) int64, 0 to n_images - 1. point : (m,) int64, 0 to n_points - 1. pixels : (m, 2) float64, (x, y), pixel
-    centres at integer + 0.5. n_images, n_points : how many there are; -1: as many as the largest numbers say.
+    image : (m,) int64, number of the image of each observation, 0 to n_images - 1.
+    point : (m,) int64, number of the point of each observation, 0 to n_points - 1.
+    pixels : (m, 2) float64, (x, y) of each observation, with pixel centres at integer + 0.5.
+    n_images, n_points : numbers of images and points; -1 takes the largest number in `image` or `point`, plus one.
 
-    The dense form is (n_images, n_points, 2) with NaN where a point is not seen: `from_dense` and `dense`.
+    The dense form is an array (n_images, n_points, 2) with NaN where a point is not seen. `from_dense` reads it, and
+    `dense` returns it.
 
     Raises
     ------
     ValueError
-        Arrays of other shapes; numbers that are no integers or out of range; pixels that are not finite; a point that
-        is seen twice in one image.
+        The arrays have other shapes, the numbers are not integers or are out of range, a pixel is not finite, or a
+        point is seen twice in one image.
+
+    Examples
+    --------
+    >>> tracks = Tracks(image=[0, 0, 1], point=[0, 1, 1], pixels=[[10.5, 20.5], [30.5, 8.5], [31.5, 8.5]])
+    >>> tracks
+    Tracks(3 observations of 2 points in 2 images, 75% of all)
+    >>> tracks.images_per_point
+    array([1, 2])
+    >>> tracks.dense()[1]
+    array([[ nan,  nan],
+           [31.5,  8.5]])
     """
 
     image: np.ndarray
@@ -80,15 +108,28 @@ class Tracks:
 
     @classmethod
     def from_dense(cls, pixels: ArrayLike) -> Tracks:
-        """Tracks of pixels (n_images, n_points, 2), NaN, or masked, in both coordinates where a point is not seen.
+        """The tracks of a dense array of pixels.
+
+        Parameters
+        ----------
+        pixels : (n_images, n_points, 2), (x, y) with pixel centres at integer + 0.5. Where a point is not seen, both
+            coordinates are NaN or masked.
 
         Raises
         ------
         ValueError
-            Another shape; infinite pixels; pixels of which one coordinate alone is NaN.
+            The array has another shape, a pixel is infinite, or only one coordinate of a pixel is NaN.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> pixels = np.full((3, 10, 2), 100.5)
+        >>> pixels[1, 4] = np.nan
+        >>> Tracks.from_dense(pixels)
+        Tracks(29 observations of 10 points in 3 images, 97% of all)
         """
         try:
-            if isinstance(pixels, np.ma.MaskedArray):  # what is masked is not seen
+            if isinstance(pixels, np.ma.MaskedArray):  # a masked point is not seen
                 pixels = np.where(np.ma.getmaskarray(pixels), np.nan, pixels.data.astype(np.float64))
             dense = np.asarray(pixels, dtype=np.float64)
         except (TypeError, ValueError):
@@ -109,13 +150,13 @@ class Tracks:
         return cls(image, point, dense[image, point], *dense.shape[:2])
 
     def dense(self) -> Array:
-        """(n_images, n_points, 2) pixels; NaN where a point is not seen."""
+        """(n_images, n_points, 2) float64, pixels; NaN where a point is not seen."""
         result = np.full((self.n_images, self.n_points, 2), np.nan)
         result[self.image, self.point] = self.pixels
         return result
 
     def seen(self) -> np.ndarray:
-        """(n_images, n_points) bool: which image sees which point."""
+        """(n_images, n_points) bool, whether an image sees a point."""
         result = np.zeros((self.n_images, self.n_points), dtype=bool)
         result[self.image, self.point] = True
         return result
@@ -133,27 +174,32 @@ class Tracks:
 
     @property
     def images_per_point(self) -> np.ndarray:
-        """(n_points,) in how many images each point is seen."""
+        """(n_points,) int64, number of images that see each point."""
         return np.bincount(self.point, minlength=self.n_points)
 
     @property
     def points_per_image(self) -> np.ndarray:
-        """(n_images,) how many points each image sees."""
+        """(n_images,) int64, number of points that each image sees."""
         return np.bincount(self.image, minlength=self.n_images)
 
     def keep(self, observations: np.ndarray) -> Tracks:
-        """The tracks with these observations alone, (m,) bool or indices; images and points keep their numbers."""
+        """The tracks with some of the observations; images and points keep their numbers.
+
+        observations : (m,) bool, or int64 indices of the observations to keep.
+        """
         return Tracks(
             self.image[observations], self.point[observations], self.pixels[observations], self.n_images, self.n_points
         )
 
     def of_images(self, images: ArrayLike) -> Tracks:
-        """The tracks in some images, (k,) different numbers, which become 0 to k - 1; points keep their numbers.
+        """The tracks in some of the images, which get the numbers 0 to k - 1; points keep their numbers.
+
+        images : (k,) integers, each at most once, in the order of the new numbers.
 
         Raises
         ------
         ValueError
-            Numbers that are no integers, out of range, or not different: copy the pixels to see an image twice.
+            A number is not an integer, is out of range, or stands twice. To use an image twice, copy its pixels.
         """
         given = np.asarray(images)
         if given.ndim != 1 or (given.size and not np.issubdtype(given.dtype, np.integer)):
@@ -168,7 +214,7 @@ class Tracks:
         return Tracks(place[self.image[some]], self.point[some], self.pixels[some], len(chosen), self.n_points)
 
     def common(self, first: int, second: int) -> CommonPoints:
-        """The points that two images share, with their pixels in either; ValueError for images that are none."""
+        """The points that two images share, with their pixels in both; ValueError for an image that does not exist."""
         self._check_images(np.array([first, second]))
         one, two = (np.flatnonzero(self.image == k) for k in (first, second))
         point, a, b = np.intersect1d(self.point[one], self.point[two], assume_unique=True, return_indices=True)

@@ -8,8 +8,8 @@ from rangesim.point_cloud.point_cloud import (
     NORMAL_RADIUS,
     STEP_FLOOR,
     PointCloud,
-    from_range_image,
     lattice_normals,
+    organised_cloud,
 )
 
 __all__ = [
@@ -19,6 +19,6 @@ __all__ = [
     "NORMAL_RADIUS",
     "STEP_FLOOR",
     "PointCloud",
-    "from_range_image",
     "lattice_normals",
+    "organised_cloud",
 ]

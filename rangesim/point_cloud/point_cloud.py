@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Range images to point clouds with normals."""
+"""Points with normals, organised as the image they come from."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from pcgraph.kernel_cache import cached_njit
 from pcgraph.parallel import MIN_ROWS, in_blocks
-from rangesim.decoding.range_image import RangeImage
+from rangesim.rig import Intrinsics
 from rangesim.settings.config import ShortRepr
 
 COORDINATES = ("camera", "world")
@@ -98,37 +98,45 @@ class PointCloud(ShortRepr):
         return cloud
 
 
-def from_range_image(image: RangeImage, coordinates: str = "camera") -> PointCloud:
-    """Organised point cloud of a range image, with normals.
+def organised_cloud(
+    z: np.ndarray,
+    camera: Intrinsics,
+    T_world_camera: np.ndarray,
+    intensity: np.ndarray,
+    confidence: np.ndarray,
+    coordinates: str = "camera",
+) -> PointCloud:
+    """Organised point cloud of a depth image, with normals.
 
     Parameters
     ----------
+    z : (h, w) float32, metres, along the optical axis; NaN where there is no reading.
+    camera : Intrinsics of the image. T_world_camera : (4, 4) float64, its pose.
+    intensity : (h, w) float32, also made into grey colours. confidence : (h, w) float32 in 0..1.
     coordinates : "camera" or "world".
 
     Raises
     ------
     ValueError
-        The range image has no camera (uncalibrated capture), or these coordinates are unknown.
+        These coordinates are unknown.
     """
     if coordinates not in COORDINATES:
         raise ValueError(f"expected coordinates to be one of {', '.join(COORDINATES)}, got {coordinates!r}.")
-    if image.camera is None or image.T_world_camera is None:
-        raise ValueError("expected a calibrated range image: without a rig there are no points.")
-    rays = image.camera.directions(image.camera.pixel_centres())
-    z = image.z.astype(np.float64)
-    points, normals = rays * z[..., None], lattice_normals(z, rays)
+    rays = camera.directions(camera.pixel_centres())
+    depth = z.astype(np.float64)
+    points, normals = rays * depth[..., None], lattice_normals(depth, rays)
     kind: type[np.floating] = np.float32
     if coordinates == "world":
-        rotation, origin = image.T_world_camera[:3, :3], image.T_world_camera[:3, 3]
+        rotation, origin = T_world_camera[:3, :3], T_world_camera[:3, 3]
         points, normals = points @ rotation.T + origin, normals @ rotation.T
         kind = np.float64 if np.abs(origin).max() > FAR_M else kind
     return PointCloud(
         points=points.astype(kind),
         coordinates=coordinates,
         normals=normals.astype(np.float32),
-        intensity=image.intensity,
-        colors=_grey_colors(image.intensity, image.valid),
-        confidence=image.confidence,
+        intensity=intensity,
+        colors=_grey_colors(intensity, np.isfinite(z)),
+        confidence=confidence,
     )
 
 

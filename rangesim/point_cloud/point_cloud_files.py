@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pcgraph.plain_files import write_file
+from pcgraph.plumbing.plain_files import write_file
 from rangesim.errors import FileFormatError
 from rangesim.point_cloud import PointCloud
 

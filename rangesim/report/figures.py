@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.experiment.result_files import Measurement
+from rangesim.decoding.range_image import RangeImage
 from rangesim.files.image_files import PNG_STRATEGY
 from rangesim.report import palette
+from rangesim.results.run_files import Measurement
 from rangesim.signals import EnergySplit, GroundTruth
 
 GAMMA = 2.2
@@ -42,7 +43,12 @@ class LegendEntry:
 
 
 def png(image: np.ndarray, table: np.ndarray | None = None) -> str:
-    """Data URI of a grey (h, w) uint8 image, or of (h, w) uint8 indices into a colour table (n, 3) uint8."""
+    """Data URI of a PNG; parameters as of `png_bytes`."""
+    return "data:image/png;base64," + base64.b64encode(png_bytes(image, table)).decode("ascii")
+
+
+def png_bytes(image: np.ndarray, table: np.ndarray | None = None) -> bytes:
+    """PNG of a grey (h, w) uint8 image, or of (h, w) uint8 indices into a colour table (n, 3) uint8."""
     from PIL import Image
 
     picture = Image.fromarray(np.ascontiguousarray(image))
@@ -50,7 +56,7 @@ def png(image: np.ndarray, table: np.ndarray | None = None) -> str:
         picture.putpalette(np.ascontiguousarray(table, dtype=np.uint8).tobytes())
     buffer = io.BytesIO()
     picture.save(buffer, format="PNG", compress_level=1, compress_type=PNG_STRATEGY)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return buffer.getvalue()
 
 
 def grey(image: np.ndarray, white: float, black: float = 0.0) -> str:
@@ -60,12 +66,36 @@ def grey(image: np.ndarray, white: float, black: float = 0.0) -> str:
 
 
 def color_map(fraction: np.ndarray, table: np.ndarray) -> str:
-    """PNG of values 0..1 through a colour table of 256 entries; NaN becomes light grey."""
+    """Data URI of a PNG of values 0..1; parameters as of `_indexed`."""
+    return png(*_indexed(fraction, table))
+
+
+def map_pictures(image: RangeImage) -> dict[str, bytes]:
+    """PNG files of the maps that a range image has: columns, rows, depth and status."""
+    maps = {"columns": image.projector_column, "rows": image.projector_row, "depth": image.z}
+    table = palette.color_table("viridis")
+    pictures = {
+        name: png_bytes(*_indexed(_stretched(values), table))
+        for name, values in maps.items()
+        if values is not None and np.isfinite(values).any()
+    }
+    pictures["status"] = png_bytes(image.status, palette.STATUS_COLORS)
+    return pictures
+
+
+def _stretched(values: np.ndarray) -> np.ndarray:
+    """Values as 0..1 between their 1st and 99th percentile."""
+    low, high = np.nanpercentile(values, [1, 99])
+    return np.asarray((values - low) / max(high - low, 1e-12))
+
+
+def _indexed(fraction: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values 0..1 as (h, w) uint8 indices into a colour table (256, 3), and that table; NaN becomes light grey."""
     index = np.rint(np.clip(np.nan_to_num(fraction), 0, 1) * 254).astype(np.uint8)
     index[~np.isfinite(fraction)] = 255
     colors = table[np.rint(np.arange(256) / 254 * 255).clip(0, 255).astype(int)].copy()
     colors[255] = palette.NO_DATA
-    return png(index, colors)
+    return index, colors
 
 
 def color_bar(table: np.ndarray) -> str:

@@ -1,29 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables in Markdown, written and read."""
+"""A table of text, and the same in Markdown."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from rangesim.errors import visible
 
 _SPECIAL = re.compile(r"([\\`|\[]|<(?! ))")
-"""What Markdown reads as more than text; "< 0.1" is none of it."""
-_ESCAPED = re.compile(r"\\([\\`|\[<])")
-_BORDER = re.compile(r"(?<!\\)\|")
+"""Characters that Markdown reads as more than text; the "<" of "< 0.1" is text."""
 _BREAKS = re.compile(r"[\t\r\n]+")
 
 
-def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown; what Markdown or a terminal would take for more than text is escaped or spelt out."""
-    return "\n".join([_line(heads), "|" + " --- |" * len(heads), *map(_line, rows)]) + "\n"
+class Table(NamedTuple):
+    """Heads of the columns, and rows with a text for each column."""
+
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    def markdown(self) -> str:
+        """The table in Markdown; characters that Markdown or a terminal would interpret are escaped or spelt out."""
+        return "\n".join([_line(self.heads), "|" + " --- |" * len(self.heads), *map(_line, self.rows)]) + "\n"
 
 
-def cells(line: str) -> list[str]:
-    """Cells of a line of such a table, as they were before they became Markdown."""
-    return [_ESCAPED.sub(r"\1", cell.strip()) for cell in _BORDER.split(line)[1:-1]]
+def on_one_line(text: str) -> str:
+    """The text without line breaks and control characters."""
+    return visible(_BREAKS.sub(" ", text))
 
 
 def _line(texts: Sequence[str]) -> str:
-    return "| " + " | ".join(_SPECIAL.sub(r"\\\1", visible(_BREAKS.sub(" ", text))) for text in texts) + " |"
+    return "| " + " | ".join(_SPECIAL.sub(r"\\\1", on_one_line(text)) for text in texts) + " |"

@@ -9,7 +9,7 @@ import numpy as np
 
 from rangesim.causes.cause import TITLES, Cause
 from rangesim.decoding.status import Status
-from rangesim.experiment.result_files import Measurement
+from rangesim.results.run_files import Measurement
 
 NOTHING = len(Cause)
 """Class beyond `Cause`: the scene has no surface there."""

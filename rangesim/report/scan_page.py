@@ -6,21 +6,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 
 from rangesim.fusion.mesh_error import distances_to, nearest_on
 from rangesim.fusion.sdf import signed_distance
-from rangesim.fusion.seen_volume import SLANTED, VoxelState
+from rangesim.fusion.seen_volume import MAX_SLANT_TOLERANCES, VoxelState
 from rangesim.report import figures, palette
-from rangesim.report.build import _asset
 from rangesim.report.mesh_pictures import mesh_picture
-from rangesim.report.policy import StyleRules, content_policy, visible_text
+from rangesim.report.template import render_page
 from rangesim.rig import Intrinsics
 from rangesim.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
-    from rangesim.fusion.scan_run import ScanResult
+    from rangesim.results.scan_files import ScanResult
 
 PICTURES = 3
 """Places along the path that the pictures are taken from."""
@@ -40,10 +37,7 @@ SOLID = (196, 160, 96)
 
 def render_scan_page(result: ScanResult) -> str:
     """The page of a scan as HTML."""
-    environment = Environment(
-        autoescape=True, finalize=visible_text, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.from_string(_asset("scan.html.j2")).render(context(result))
+    return render_page("scan.html.j2", context(result))
 
 
 def context(result: ScanResult) -> dict[str, Any]:
@@ -57,10 +51,6 @@ def context(result: ScanResult) -> dict[str, Any]:
     places = _places(result)
     fused = result.fused
     return {
-        "css": Markup(_asset("style.css")),  # our own files
-        "script": Markup(_asset("scroll.js")),
-        "rules": StyleRules(),
-        "content_policy": content_policy,
         "scene": result.settings.scene,
         "line": _line(result),
         "verdict": _verdict(result),
@@ -69,17 +59,15 @@ def context(result: ScanResult) -> dict[str, Any]:
         "slices": _slices(result),
         "states": [(STATE_NAMES[s], palette.hexadecimal(np.array(STATE_COLORS[s]))) for s in STATE_NAMES]
         + [("solid", palette.hexadecimal(np.array(SOLID)))],
-        "shapes": [_shape_cells(result, name) for name in result.errors],
+        "shapes": [_shape_cells(result, name) for name in result.shapes],
         "views": [_view_cells(result, k) for k in range(number)],
         "poses_found": result.poses is not None,
         "truncation_mm": f"{1e3 * fused.truncation_m:.3g}",
         "min_weight": f"{fused.min_weight:.2g}",
         "voxel_mm": f"{1e3 * fused.voxel_m:.3g}",
-        "grid_mm": "-" if result.seen is None else f"{1e3 * result.seen.grid.voxel_m:.3g}",
+        "grid_mm": f"{1e3 * result.seen.grid.voxel_m:.3g}",
         "open_shapes": _open_shapes(result),
-        "fractions": []
-        if result.seen is None
-        else [(STATE_NAMES[s], _percent(result.seen.fraction(s))) for s in STATE_NAMES],
+        "fractions": [(STATE_NAMES[s], _percent(result.seen.fraction(s))) for s in STATE_NAMES],
         "times": [(name, f"{seconds:.1f} s") for name, seconds in result.times_s.items()],
         "seen_color": palette.hexadecimal(np.array(SEEN)),
         "unseen_color": palette.hexadecimal(np.array(UNSEEN)),
@@ -116,13 +104,12 @@ def _verdict(result: ScanResult) -> list[str]:
             f"Half of the fused surface{of} lies within {1e3 * float(np.median(off)):.2g} mm of the true one, "
             f"{_percent(within)} within a voxel."
         ]
-    if result.seen is not None:
-        areas = {n: s.area_m2 for n, s in result.seen.shapes.items()}
-        seen = sum(areas[n] * s.surface for n, s in result.seen.shapes.items()) / sum(areas.values())
-        said.append(f"The views measured {_percent(seen)} of the true surface of {_count(len(areas), 'thing')}.")
-        lost = [n for n, s in result.seen.shapes.items() if s.volume_m3 > 0 and s.volume_free > 0.5]
-        if lost:
-            said.append(f"Taken for empty space by more than half: {', '.join(lost)}.")
+    areas = {n: s.area_m2 for n, s in result.seen.shapes.items()}
+    seen = sum(areas[n] * s.surface for n, s in result.seen.shapes.items()) / sum(areas.values())
+    said.append(f"The views measured {_percent(seen)} of the true surface of {_count(len(areas), 'thing')}.")
+    lost = [n for n, s in result.seen.shapes.items() if s.volume_m3 > 0 and s.volume_free > 0.5]
+    if lost:
+        said.append(f"Taken for empty space by more than half: {', '.join(lost)}.")
     blind = [str(k + 1) for k, image in enumerate(result.scan.images) if not image.valid.any()]
     if blind:
         said.append(f"No reading in view {', '.join(blind)}: something stands before the camera, or nothing does.")
@@ -172,21 +159,19 @@ def _signed_error(points: np.ndarray, truth: TriangleMesh, normals: np.ndarray) 
 
 def _seen(result: ScanResult, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(n,) bool, whether some view measured the true surface there."""
-    tolerance = result.fused.voxel_m if result.seen is None else result.seen.tolerance_m
+    tolerance = result.seen.tolerance_m
     seen = np.zeros(len(points), bool)
     for image in result.scan.images:
         assert image.T_world_camera is not None
         to_camera = image.T_world_camera[:3, 3] - points
         cosine = np.abs((to_camera * np.nan_to_num(normals)).sum(axis=-1)) / np.linalg.norm(to_camera, axis=-1)
         off = np.abs(signed_distance(points, image, lookup="bilinear"))
-        seen |= (off * cosine <= tolerance) & (off <= SLANTED * tolerance)
+        seen |= (off * cosine <= tolerance) & (off <= MAX_SLANT_TOLERANCES * tolerance)
     return seen
 
 
 def _slices(result: ScanResult) -> list[dict[str, str]]:
     """What is there and what the views know of it, in the level and the upright middle plane of the things."""
-    if result.seen is None:
-        return []
     states, truth = result.seen.states, result.seen.truth
     solid = truth >= 0
     if solid.any():
@@ -210,20 +195,15 @@ def _slices(result: ScanResult) -> list[dict[str, str]]:
 
 def _open_shapes(result: ScanResult) -> list[str]:
     """Names of the things whose surface encloses no voxel: it is not closed, or they are thin."""
-    if result.seen is None:
-        return []
     return [name for name, seen in result.seen.shapes.items() if np.isnan(seen.volume_surface)]
 
 
 def _shape_cells(result: ScanResult, name: str) -> list[str]:
-    error = result.errors[name]
-    cells = [name, result.materials[name]]
-    if error is None:
-        cells += ["-"] * 5
-    else:
-        cells += [f"{1e3 * v:.3f}" for v in (error.accuracy_m, error.accuracy_rms_m, error.accuracy_p95_m)]
-        cells += [f"{1e3 * error.chamfer_m:.2f}", f"{error.f_score:.3f}"]
-    seen = None if result.seen is None else result.seen.shapes.get(name)
+    shape = result.shapes[name]
+    cells = [name, shape.material]
+    cells += [_number(v, 1e3, 3) for v in (shape.accuracy_m, shape.accuracy_rms_m, shape.accuracy_p95_m)]
+    cells += [_number(shape.chamfer_m, 1e3, 2), _number(shape.f_score, 1, 3)]
+    seen = result.seen.shapes.get(name)
     if seen is None:
         return [*cells, *["background"] * 4] if name not in result.things else [*cells, *["-"] * 4]
     return [*cells, *(_percent(v) for v in (seen.surface, seen.volume_surface, seen.volume_never, seen.volume_free))]
@@ -235,6 +215,11 @@ def _view_cells(result: ScanResult, number: int) -> list[str]:
     if result.poses is not None:
         cells += [f"{result.poses.angle_deg[number]:.4f}", f"{1e3 * result.poses.centre_m[number]:.3f}"]
     return cells
+
+
+def _number(value: float | None, factor: float, digits: int) -> str:
+    """A value times a factor; a dash where there is none."""
+    return "-" if value is None else f"{factor * value:.{digits}f}"
 
 
 def _count(n: int, what: str) -> str:

@@ -3,18 +3,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
-from rangesim.evaluation.comparison import OUTLIER_M
+from rangesim.evaluation.comparison import OUTLIER_M, Comparison, ErrorStatistics
 from rangesim.evaluation.range_noise import SMALL, noise_ratio
 from rangesim.experiment import Experiment
-from rangesim.experiment.result_files import Measurement, PhotonsRecord
 from rangesim.report import palette
 from rangesim.report.figures import LegendEntry
-from rangesim.report.markdown_table import markdown_table
+from rangesim.report.markdown_table import Table
+from rangesim.results.run_files import Measurement, PhotonsRecord
 
 Rows = list[dict[str, Any]]
 
@@ -147,31 +148,65 @@ def materials(measurements: Sequence[Measurement]) -> list[str]:
     return sorted(names, key=lambda n: n != "all")
 
 
-def markdown(tables: Sequence[tuple[str, Rows]]) -> str:
-    """The same comparison in Markdown, one row per instrument and material: tables of errors, failures and noise."""
-    heads = [f"{c.title} ({c.unit})" for c in COLUMNS]
-    return "\n".join(
-        [
-            _markdown(tables, heads, lambda row: [_text(c, row) for c in COLUMNS]),
-            _markdown(tables, FAILURE_HEADS, _failures),
-            _markdown(tables, ["detector noise (mm)", "sampling noise (mm)"], _noise),
-        ]
-    )
+def comparison_tables(tables: Sequence[tuple[str, Rows]]) -> list[Table]:
+    """Tables of errors, of failures and of noise, one row per material and instrument.
+
+    Parameters
+    ----------
+    tables : name of each instrument, and its rows: statistics per material class.
+    """
+    return [
+        _table(tables, [f"{c.title} ({c.unit})" for c in COLUMNS], lambda row: [_text(c, row) for c in COLUMNS]),
+        _table(tables, FAILURE_HEADS, _failures),
+        _table(tables, ["detector noise (mm)", "sampling noise (mm)"], _noise),
+    ]
+
+
+def comparison_markdown(tables: Sequence[tuple[str, Rows]]) -> str:
+    """The tables of `comparison_tables` in Markdown."""
+    return "\n".join(table.markdown() for table in comparison_tables(tables))
+
+
+def errors_markdown(comparison: Comparison) -> str:
+    """Table in Markdown of the errors of one range image, one row per material class; lengths in mm, fractions in %.
+
+    Parameters
+    ----------
+    comparison : Comparison, as `rangesim.compare` returns.
+    """
+    heads = [f.name.replace("_m", "_mm") if f.name.endswith("_m") else f.name for f in fields(ErrorStatistics)]
+    rows = [[_plain(name, value) for name, value in asdict(row).items()] for row in comparison.table]
+    return Table([head.replace("_", " ") for head in heads], rows).markdown()
+
+
+def _plain(name: str, value: Any) -> str:
+    """A value of `ErrorStatistics` as text."""
+    if isinstance(value, float) and math.isnan(value):
+        return "-"
+    if name.endswith("_m"):
+        return f"{1000 * value:.2f}"
+    if isinstance(value, float):
+        return f"{100 * value:.1f} %"
+    return str(value)
 
 
 def failures_markdown(rows: Rows) -> str:
-    """Table in Markdown of what failed and why, one row per material."""
-    return markdown_table(["material", *FAILURE_HEADS], [[row["material"], *_failures(row)] for row in rows])
+    """Table in Markdown of the failed pixels and their causes, one row per material class; fractions in %.
+
+    Parameters
+    ----------
+    rows : as `rangesim.causes.CauseMap.fractions` returns.
+    """
+    return Table(["material", *FAILURE_HEADS], [[row["material"], *_failures(row)] for row in rows]).markdown()
 
 
-def _markdown(
-    tables: Sequence[tuple[str, Rows]], heads: list[str], texts: Callable[[dict[str, Any]], list[str]]
-) -> str:
+def _table(tables: Sequence[tuple[str, Rows]], heads: list[str], texts: Callable[[dict[str, Any]], list[str]]) -> Table:
+    """One row per material class and instrument, with the cells that `texts` makes of the statistics."""
     lines = []
     for material in dict.fromkeys(row["material"] for _, rows in tables for row in rows):
         for name, rows in tables:
             lines += [[material, name, *texts(row)] for row in rows if row["material"] == material]
-    return markdown_table(["material", "sensor", *heads], lines)
+    return Table(["material", "sensor", *heads], lines)
 
 
 def _failures(row: dict[str, Any]) -> list[str]:
@@ -244,11 +279,22 @@ def cost_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[str]
     return table
 
 
-def settings_line(experiment: Experiment, width: int, height: int) -> str:
-    """The settings of the light transport in one line."""
+def size_text(shape: tuple[int, ...]) -> str:
+    """Width and height of an image of a shape (h, w)."""
+    return f"{shape[1]} × {shape[0]}"
+
+
+def settings_line(experiment: Experiment, shapes: Sequence[tuple[int, ...]]) -> str:
+    """The settings of the light transport in one line.
+
+    Parameters
+    ----------
+    shapes : height and width of the images of each instrument, pixels.
+    """
+    sizes = " and ".join(dict.fromkeys(map(size_text, shapes)))
     paths = f"up to {experiment.max_spp}" if experiment.spp is None else experiment.spp
     return (
-        f"{width} × {height} pixels, {paths} light paths per pixel of up to {experiment.max_depth} segments, "
+        f"{sizes} pixels, {paths} light paths per pixel of up to {experiment.max_depth} segments, "
         f"seed {experiment.seed}"
     )
 

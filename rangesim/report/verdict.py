@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from rangesim.evaluation.comparison import OUTLIER_M
-from rangesim.experiment.result_files import Measurement
 from rangesim.report.tables import (
     Rows,
     is_reference,
@@ -19,6 +18,7 @@ from rangesim.report.tables import (
     seconds,
     titles,
 )
+from rangesim.results.run_files import Measurement
 
 MAIN_CAUSE = 0.1
 """Fraction of the failures from which a cause is named."""

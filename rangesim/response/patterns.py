@@ -1,35 +1,57 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Responses to where light left the projector: Gray code, fringes, images."""
+"""Responses to the projector pixel that light left: Gray code, fringes, images."""
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from rangesim import limits
 from rangesim.response.base import DenseResponse, LightPath, Math
 from rangesim.response.defocus import BlurredImage, blurred_stripes, fringe_contrast
+from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, check_fields
 from rangesim.settings.config import shown
 
 Axis = Annotated[int, Bounds("0 (columns) or 1 (rows)", 0, 1)]
+"""Axis along which a pattern varies: 0 for columns (u), 1 for rows (v). It is the index of u or v in `LightPath`."""
 
 
 @dataclass(frozen=True)
 class GrayBits(DenseResponse):
-    """Bits of the Gray code of the projector column or row, most significant first; pixels are squares.
+    """Bits of the Gray code of the projector column or row, one channel per bit, the most significant first.
 
-    Out of focus, the edges of the stripes become error functions.
+    In focus, a pixel is a uniform square. Out of focus, the edges of the stripes are error functions.
+
+    Parameters
+    ----------
+    axis : 0 for columns (u), 1 for rows (v).
+    bits : number of bits of the code.
+    shift : number of the finest bits to leave out.
+
+    Raises
+    ------
+    ValueError
+        A value out of its bounds, or no bit left.
+
+    Examples
+    --------
+    Column 5 has the Gray code 5 ^ (5 >> 1) = 0b111:
+
+    >>> from rangesim.response import LightPath, NumpyMath
+    >>> path = LightPath(u=np.array([5.5]), v=np.array([0.5]), path_length_m=1.0, is_first=True)
+    >>> [int(bit[0]) for bit in GrayBits(axis=0, bits=4).weights(path, NumpyMath())]
+    [0, 1, 1, 1]
     """
 
     axis: Axis
-    """0: columns (u), 1: rows (v)."""
     bits: Annotated[int, Bounds("a number of bits", 1, 32)]
     shift: Annotated[int, Bounds("a number of bits", 0, 31)] = 0
-    """Finest bits left out."""
+
+    type_name: ClassVar[str] = "GrayBits"
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -51,14 +73,27 @@ class GrayBits(DenseResponse):
 
 @dataclass(frozen=True)
 class Fringes(DenseResponse):
-    """cos and sin of the phase 2 pi x / period along the projector columns or rows, x continuous.
+    """Sinusoidal fringes: cos and sin of the phase 2 pi x / period along the projector's columns or rows.
 
-    Out of focus, and where the projector's pixels are finite, they lose contrast.
+    The coordinate x is continuous. Out of focus, the blur and the width of the projector's pixels lower the contrast.
+
+    Parameters
+    ----------
+    axis : 0 for columns (u), 1 for rows (v).
+    period_px : period of the fringes, projector pixels.
+
+    Examples
+    --------
+    >>> from rangesim.response import LightPath, NumpyMath
+    >>> path = LightPath(u=4.0, v=0.0, path_length_m=1.0, is_first=True)
+    >>> [round(float(weight), 9) for weight in Fringes(axis=0, period_px=16.0).weights(path, NumpyMath())]
+    [0.0, 1.0]
     """
 
     axis: Axis
     period_px: Annotated[float, Bounds("positive and finite", 1e-3, 1e6)]
     channels: ClassVar[int] = 2  # type: ignore[misc]
+    type_name: ClassVar[str] = "Fringes"
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -73,27 +108,70 @@ class Fringes(DenseResponse):
 
 @dataclass(frozen=True, eq=False)
 class Images(DenseResponse):
-    """Arbitrary patterns, (k, height, width) float32 in 0..1, each projector pixel a uniform square.
+    """Arbitrary patterns, read at the projector pixel that the light left.
 
-    Out of focus, they are read from blurred copies.
+    Two stacks with the same pixels are equal, also after pickling, so sensors that show them share their channels. Out
+    of focus, the patterns are read from blurred copies.
+
+    Parameters
+    ----------
+    patterns : (k, height, width) float32, fraction of full power per projector pixel, each a uniform square. The array
+        is copied, and the copy is read-only.
+
+    Raises
+    ------
+    ValueError
+        `patterns` is no such array, has no pixels, or has some that are not finite.
+
+    Examples
+    --------
+    >>> stripes = np.tile([[0.0, 1.0]], (2, 4, 4)).astype(np.float32)
+    >>> images = Images(stripes)
+    >>> images.channels
+    2
+    >>> images == Images(stripes.copy())
+    True
     """
 
     patterns: np.ndarray
+
+    type_name: ClassVar[str] = "Images"
 
     def __post_init__(self) -> None:
         values = self.patterns
         if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiub" or values.ndim != 3 or not values.size:
             raise ValueError(f"expected patterns to be an array (k, height, width) of numbers, got {shown(values)}.")
         limits.check("frames", len(values), "patterns")
-        if not np.isfinite(values).all():
+        with np.errstate(over="ignore"):
+            kept = np.array(values, dtype=np.float32, order="C")
+        if not np.isfinite(kept).all():
             raise ValueError("expected patterns to be finite, got NaN or infinite pixels.")
+        kept.setflags(write=False)
+        object.__setattr__(self, "patterns", kept)
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and self._digest == other._digest  # type: ignore[attr-defined]
+
+    def __hash__(self) -> int:
+        return hash(self._digest)
+
+    def __reduce__(self) -> tuple[type[Images], tuple[np.ndarray]]:
+        """The class and its patterns, for pickle: the blurred copies are made anew instead of stored."""
+        return type(self), (self.patterns,)
+
+    @cached_property
+    def _digest(self) -> str:
+        """SHA-256 of the shape and the pixels: the same in every process, unlike `hash` of bytes."""
+        digest = hashlib.sha256(repr(self.patterns.shape).encode())
+        digest.update(self.patterns.data)
+        return digest.hexdigest()
 
     @property
     def channels(self) -> int:  # type: ignore[override]
         return len(self.patterns)
 
     def check(self, width: int, height: int) -> None:
-        if self.patterns.ndim != 3 or self.patterns.shape[1:] != (height, width):
+        if self.patterns.shape[1:] != (height, width):
             raise ValueError(
                 f"expected patterns of shape (k, {height}, {width}) for a projector of {width} x {height} pixels, "
                 f"got {self.patterns.shape}."
@@ -106,7 +184,7 @@ class Images(DenseResponse):
         column = m.unsigned(m.select(path.u < width, path.u, width - 1.0))
         row = m.unsigned(m.select(path.v < height, path.v, height - 1.0))
         index = row * width + column
-        return [m.lookup(np.ascontiguousarray(p, dtype=np.float32).ravel(), index) for p in self.patterns]
+        return [m.lookup(pattern.ravel(), index) for pattern in self.patterns]
 
     @cached_property
     def _blurred(self) -> list[BlurredImage]:

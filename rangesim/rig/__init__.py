@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera and emitter: intrinsics, poses, lenses, calibration files."""
+"""Rigs of a camera and an emitter: intrinsics, the camera model, lenses, poses, and calibration files."""
 
 from rangesim.rig.rig import (
     CAMERA_LENS,
@@ -12,6 +12,7 @@ from rangesim.rig.rig import (
     Lens,
     PrincipalPoint,
     Rig,
+    check_rigid,
     is_same_pose,
     look_at,
     pose,
@@ -29,6 +30,7 @@ __all__ = [
     "Lens",
     "PrincipalPoint",
     "Rig",
+    "check_rigid",
     "is_same_pose",
     "look_at",
     "pose",

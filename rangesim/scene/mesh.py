@@ -10,10 +10,10 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from pcgraph.plain_files import check_file
-from rangesim import limits
+from pcgraph.plumbing.plain_files import check_file
 from rangesim.errors import FileFormatError
 from rangesim.scene.origin import Rounding, rounding_of, warn_of_coarse_mesh
+from rangesim.settings import limits
 from rangesim.settings.bounds import MAX_COORDINATE_M
 from rangesim.settings.config import brief, nearest
 

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pcgraph.plain_files import read_file
-from rangesim import limits
+from pcgraph.plumbing.plain_files import read_file
 from rangesim.errors import FileFormatError
+from rangesim.settings import limits
 from rangesim.settings.config import brief, shown
 
 _TYPES = (

@@ -12,10 +12,10 @@ from typing import Any
 
 import mitsuba as mi
 
-from pcgraph.plain_files import check_file
-from rangesim import limits
+from pcgraph.plumbing.plain_files import check_file
 from rangesim.errors import FileFormatError
 from rangesim.scene.materials import MATERIAL_CLASSES
+from rangesim.settings import limits
 from rangesim.settings.config import nearest, shown
 
 CLASS_KEY = "material_class"

@@ -16,13 +16,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import check_pixels
 from rangesim.files.text_files import is_nested_deeper
 from rangesim.files.utf8_names import is_utf8
 from rangesim.scene.mesh_files import check_ply, check_serialized
 from rangesim.scene.nodes import check_type, named_file
+from rangesim.settings import limits
 from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds
 from rangesim.settings.config import shown
 

@@ -9,7 +9,6 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
-from rangesim import limits
 from rangesim.capture import Capture
 from rangesim.decoding.path_length import range_image_from_path_length
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds, modulation_is_weak, phase_sigma, tap_phase
@@ -20,6 +19,7 @@ from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.response import SPEED_OF_LIGHT, Phasor, Response
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, of_type
+from rangesim.settings import limits
 from rangesim.settings.bounds import HERTZ, Bounds, Hertz, check_fields, check_number
 
 MAX_RANGE_M = 100.0

@@ -9,7 +9,6 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
-from rangesim import limits
 from rangesim.capture import Capture, bright_level
 from rangesim.decoding.gray import Threshold
 from rangesim.decoding.histogram import coates, find_peak, runs_out, window_reach
@@ -20,6 +19,7 @@ from rangesim.electronics.detector import Gate
 from rangesim.electronics.spad import SpadDetector
 from rangesim.response import SPEED_OF_LIGHT, Response, TransientHistogram
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, of_type
+from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 OVERSAMPLING = (1, 2, 4)

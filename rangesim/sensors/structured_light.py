@@ -10,7 +10,6 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from rangesim import limits
 from rangesim.capture import Capture
 from rangesim.decoding.contradictions import (
     binary_contradiction,
@@ -27,6 +26,7 @@ from rangesim.decoding.triangulate import TriangulationLimits, range_image_from_
 from rangesim.errors import warn
 from rangesim.response import DenseResponse, Fringes, GrayBits, LightPath, NumpyMath
 from rangesim.sensor import Background, Decoder, Emitter, FrameContent, Sensor, least_signal_for, of_type
+from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 AXES = ("columns", "rows")

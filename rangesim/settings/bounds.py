@@ -1,9 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What values a setting may have: types and bounds are stated on the fields of its dataclass, and checked here.
+"""Types and bounds of the numbers in settings, stated on the fields of a dataclass and checked when it is made.
 
-A field says what it is, `spp: Annotated[int, whole(1, "spp")]` or `baseline_m: Metres`, and `check_fields(self)` in
-`__post_init__` holds every field to it. No number may be NaN or infinite, or a bool. The ranges are wide: they exclude
-what single precision, or physics, has no place for.
+A field states what it may hold, as in `spp: Annotated[int, whole(1, "spp")]` or `baseline_m: Metres`, and the class
+calls `check_fields(self)` in `__post_init__`. No number may be NaN or infinite, and a bool is not a number. The bounds
+are wide: they exclude only values that single precision cannot represent or that make no physical sense.
+
+Examples
+--------
+>>> from dataclasses import dataclass
+>>> @dataclass(frozen=True)
+... class Shutter:
+...     exposure_s: Seconds
+...     def __post_init__(self):
+...         check_fields(self)
+>>> Shutter(0.01)
+Shutter(exposure_s=0.01)
+>>> Shutter(-1)
+Traceback (most recent call last):
+ValueError: expected exposure_s to be positive and finite, 1e-15 to 1e+06, got -1.
 """
 
 from __future__ import annotations
@@ -18,16 +32,30 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from rangesim import limits
+from rangesim.settings import limits
 from rangesim.settings.config import nearest, shown
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """The closed interval in which a number has to lie.
+    """A closed interval of numbers.
 
-    words : what the number has to be, for messages: "positive".
-    or_zero : whether 0 is accepted too. limit : name of the entry of `rangesim.limits` that is the upper bound.
+    Parameters
+    ----------
+    words : description of the allowed numbers, for messages: "positive and finite".
+    low, high : the smallest and the largest allowed number.
+    or_zero : whether 0 is allowed too, although it lies outside the interval.
+    limit : name of the entry of `rangesim.settings.limits` that is the upper bound; "": none.
+    kind : `int` if only whole numbers are allowed. `check_number` reads it; on the field of a dataclass, the type in
+        its annotation decides instead.
+
+    Examples
+    --------
+    >>> duty = Bounds("a fraction", 0, 1)
+    >>> 0.5 in duty, 2 in duty
+    (True, False)
+    >>> str(duty)
+    'a fraction, 0 to 1'
     """
 
     words: str
@@ -35,9 +63,10 @@ class Bounds:
     high: float = math.inf
     or_zero: bool = False
     limit: str = ""
+    kind: type[int] | type[float] = float
 
     def __contains__(self, value: float) -> bool:
-        finite = isinstance(value, int) or math.isfinite(value)  # the longest whole numbers are beyond a float
+        finite = isinstance(value, int) or math.isfinite(value)  # an int may be too large for a float
         return finite and (self.low <= value <= self.high or (self.or_zero and value == 0))
 
     def __str__(self) -> str:
@@ -47,31 +76,52 @@ class Bounds:
 
 
 def whole(low: int, limit: str = "") -> Bounds:
-    """Bounds of a whole number: at least `low`, at most the entry `limit` of `rangesim.limits`."""
-    return Bounds(f"a whole number of at least {low}", low, limit=limit)
+    """Bounds of a whole number: at least `low`, and at most the entry `limit` of `rangesim.settings.limits`.
+
+    Examples
+    --------
+    >>> check_number("spp", 16, whole(1, "spp"))
+    >>> check_number("spp", 0.5, whole(1, "spp"))
+    Traceback (most recent call last):
+    ValueError: expected spp to be a whole number of at least 1, got 0.5.
+    """
+    return Bounds(f"a whole number of at least {low}", low, limit=limit, kind=int)
 
 
 MAX_COORDINATE_M = 1e7
-"""Metres: room for coordinates of maps, and of the globe; beyond, double precision has no nanometres."""
+"""Largest coordinate of the world, in metres: the Earth's radius is 6.4e6 m, so coordinates of maps and of the globe
+fit. Double precision still resolves 2 nm there; a larger value would lose that."""
 Metres = Annotated[float, Bounds("positive and finite", 1e-9, MAX_COORDINATE_M)]
+"""A length in metres, from 1 nm."""
 Watts = Annotated[float, Bounds("positive and finite", 1e-12, 1e9)]
+"""A radiant power in watts."""
 HERTZ = Bounds("positive and finite", 1.0, 1e12)
+"""Bounds of a frequency in hertz: from 1 Hz to 1 THz, which is a wavelength of 0.3 mm."""
 Hertz = Annotated[float, HERTZ]
+"""A frequency in hertz."""
 SECONDS = Bounds("positive and finite", 1e-15, 1e6)
+"""Bounds of a duration in seconds: from 1 fs, in which light travels 0.3 um, to eleven days."""
 Seconds = Annotated[float, SECONDS]
+"""A duration in seconds."""
 Pause = Annotated[float, Bounds("0 or positive", 1e-15, 1e6, or_zero=True)]
+"""A duration in seconds that may be 0."""
 Wavelength = Annotated[float, Bounds("positive and finite", 1e-8, 1e-2)]
+"""A wavelength of light in metres, from extreme ultraviolet (10 nm) to microwaves (10 mm)."""
 Exponent = Annotated[float, Bounds("an exponent of at least 0", 0, 100)]
+"""An exponent of a fall-off with the angle, dimensionless: at 100, light falls to half within 7 degrees."""
 Coordinate = Annotated[float, Bounds("a coordinate", -MAX_COORDINATE_M, MAX_COORDINATE_M)]
+"""A coordinate of the world in metres."""
 Fraction = Annotated[float, Bounds("a fraction", 0, 1)]
+"""A fraction from 0 to 1."""
 PositiveFraction = Annotated[float, Bounds("a positive fraction", 1e-9, 1)]
+"""A fraction that something is divided by, so it may not be 0."""
 
 
 def check_fields(setting: Any) -> None:
-    """Raise ValueError on the first field of a dataclass whose value is not of its type, or out of its bounds.
+    """Raise ValueError on the first field of a dataclass whose value does not match its type or its bounds.
 
-    NumPy scalars become Python's, and lists in place of tuples become tuples; the dataclass may be frozen. Fields that
-    hold arrays or mappings are left to the class itself.
+    NumPy scalars are replaced by Python numbers, and lists by tuples where the field holds a tuple; this works for
+    frozen dataclasses too. Fields that hold arrays or mappings are not checked: the class does that itself.
     """
     for field in dataclasses.fields(setting):
         if field.init:
@@ -82,9 +132,11 @@ def check_fields(setting: Any) -> None:
 
 
 def check_number(name: str, value: Any, bounds: Bounds) -> None:
-    """Raise ValueError unless `value` is a number, and within its bounds."""
-    kind = int if bounds.words.startswith("a whole number") else float
-    _number(kind, value.item() if isinstance(value, np.generic) else value, name, bounds)
+    """Raise ValueError unless `value` is a number of the kind and within the bounds that `bounds` states.
+
+    name : the name of the argument, for the message.
+    """
+    _number(bounds.kind, value.item() if isinstance(value, np.generic) else value, name, bounds)
 
 
 @lru_cache(maxsize=256)
@@ -93,14 +145,14 @@ def _hints(cls: type) -> dict[str, Any]:
 
 
 def _checked(hint: Any, value: Any, name: str) -> Any:
-    """`value`, as a plain Python value if it is a NumPy scalar or a list; ValueError if it does not fit `hint`."""
+    """The value, with NumPy scalars and lists made plain Python; raises ValueError if it does not match `hint`."""
     if get_origin(hint) in (Union, types.UnionType):
         if value is None and type(None) in get_args(hint):
             return None
         hint, *others = (arg for arg in get_args(hint) if arg is not type(None))
         for other in others:
             is_literal = get_origin(other) is typing.Literal
-            if (isinstance(value, str) and value in get_args(other)) if is_literal else type(value) is other:
+            if (isinstance(value, str) and value in get_args(other)) if is_literal else _is_member(value, other):
                 return value
     bounds = None
     if get_origin(hint) is Annotated:
@@ -121,6 +173,11 @@ def _checked(hint: Any, value: Any, name: str) -> Any:
         words = {bool: "true or false", str: "a text"}.get(hint, f"a {hint.__name__}")
         raise ValueError(f"expected {name} to be {words}, got {shown(value)}.")
     return value
+
+
+def _is_member(value: Any, kind: Any) -> bool:
+    """Whether a value is of a class or of a subclass; a bool is no number."""
+    return isinstance(kind, type) and isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
 
 
 def _number(kind: type, value: Any, name: str, bounds: Bounds | None) -> Any:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one transport pass returns, and its files."""
+"""Results of a transport pass: the light that sensors expose, the energy split, and the ground truth."""
 
 from rangesim.signals.signals import (
     ALL,

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one transport pass returns: signals, energy split and ground truth, as NumPy arrays."""
+"""Results of a transport pass: signals, energy split and ground truth, as NumPy arrays."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -15,20 +14,23 @@ from rangesim.sensor import Sensor
 from rangesim.settings.config import ShortRepr
 
 ALL = "all"
-"""Stands for all material classes."""
+"""Name of the row for all material classes together, in tables and mappings by class."""
 NO_SAMPLING_ERROR = "expected signals whose sampling error is known: those of a pass of at least 3 samples per pixel."
+"""Message of the ValueError where a sampling error is asked for and not known."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EnergySplit(ShortRepr):
-    """Radiance per pixel by the kind of light path, each (h, w) float32, W/m2/sr; the parts add up to all light.
+    """Radiance of each pixel by the kind of light path; the parts add up to all light.
 
-    direct : projector -> surface -> camera.
-    multipath : two or more non-delta surfaces.
-    specular : the camera sees the lit surface off a mirror or through glass, and nothing else between.
-    caustic : the projector lights the surface off a mirror or through glass.
-    glint : the camera sees the projector's lens off a mirror, through glass or directly.
-    ambient : every light but the projector, before any filter.
+    Each part is (h, w) float32, W/m2/sr.
+
+    direct : emitter -> surface -> camera.
+    multipath : paths with two or more scattering (non-delta) surfaces.
+    specular : the camera sees one lit surface in a mirror or through glass.
+    caustic : the emitter lights the surface over a mirror or through glass.
+    glint : the camera sees the emitter itself, in a mirror, through glass or directly.
+    ambient : light of everything but the emitter, before any filter.
     """
 
     direct: np.ndarray
@@ -40,20 +42,20 @@ class EnergySplit(ShortRepr):
 
     @property
     def projector(self) -> np.ndarray:
-        """(h, w) float32, all light of the projector at full power, without ambient."""
+        """All light of the emitter at full power, without ambient light: (h, w) float32, W/m2/sr."""
         return self.direct + self.multipath + self.specular + self.caustic + self.glint
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GroundTruth(ShortRepr):
-    """First surface behind each pixel centre; NaN (ids: -1) where there is none.
+    """First surface behind each pixel centre. Where there is none, numbers are NaN and indices are -1.
 
-    z, range_m : (h, w) float32, metres, depth along the axis and Euclidean distance from the camera centre.
-    normal : (h, w, 3) float32, unit, world, towards the camera.
+    z, range_m : (h, w) float32, metres, depth along the camera's axis and Euclidean distance from the camera centre.
+    normal : (h, w, 3) float32, unit vectors, world, on the camera's side of the surface.
     instance : (h, w) int32, index into `instance_names`.
     material : (h, w) int32, index into `material_names`.
-    projector_uv : (h, w, 2) float32, projector pixel coordinates of the point (also outside the projector's image).
-    projector_visible : (h, w) bool, the straight segment to the projector is free and inside its image.
+    projector_uv : (h, w, 2) float32, pixel coordinates of the point in the projector, also outside its image.
+    projector_visible : (h, w) bool, whether the straight line to the projector is free and the point is in its image.
     """
 
     z: np.ndarray
@@ -67,7 +69,7 @@ class GroundTruth(ShortRepr):
     material_names: tuple[str, ...] = ()
 
     def classes(self) -> dict[str, np.ndarray]:
-        """(h, w) bool, pixels of each material class that occurs; of "all" last, which may have none."""
+        """Pixels of each material class that occurs, as (h, w) bool by name; "all" comes last, and may be empty."""
         seen = np.isfinite(self.z)
         of_class = {name: seen & (self.material == i) for i, name in enumerate(self.material_names)}
         return {name: mask for name, mask in of_class.items() if mask.any()} | {ALL: seen}
@@ -75,12 +77,21 @@ class GroundTruth(ShortRepr):
 
 @dataclass(frozen=True)
 class Truncation:
-    """Estimate of the projector's light that a pass left out, by what ended it; fractions of all its light in the
-    image, glint excepted and what is left out included. See `rangesim.light_transport.truncation`.
+    """Estimate of the emitter's light that a pass left out, by the limit that ended the light paths.
 
-    depth : of paths with more scattering surfaces than `max_depth` allows; NaN where that is 2 or less, which asks for
-        direct light alone. chains : of camera paths with too many delta interactions in a row. photons : of photons
-        with too many.
+    Each field is a fraction of all the emitter's light in the image, including what is left out and excluding glint.
+    See `rangesim.light_transport.truncation`.
+
+    depth : light of paths with more scattering surfaces than `max_depth` allows. NaN where `max_depth` is 2 or less,
+        which asks for direct light alone.
+    chains : light of camera paths with more delta interactions in a row than allowed.
+    photons : light of photons with more delta interactions in a row than allowed.
+
+    Examples
+    --------
+    >>> from rangesim.signals import Truncation
+    >>> Truncation(depth=float("nan"), chains=0.01, photons=0.005).total
+    0.015
     """
 
     depth: float
@@ -89,17 +100,19 @@ class Truncation:
 
     @property
     def total(self) -> float:
-        """All that is known to be left out, a fraction of the projector's light."""
+        """Sum of all parts that are known, as a fraction of the emitter's light."""
         return float(np.nansum([self.depth, self.chains, self.photons]))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SamplingError(ShortRepr):
-    """One draw of the error that the sampling of light paths leaves in signals: half the difference of what two halves
-    of the samples say, scaled where these are not equal. It has the variance of the error, and its covariance between
-    channels, at each pixel; it is not the error itself.
+    """A random draw with the statistics of the error that the sampling of light paths leaves in signals.
 
-    channels : response -> (c, h, w) float32, W/m2/sr. projector : (h, w) float32, W/m2/sr, of `EnergySplit.projector`.
+    It is half the difference between the results of two halves of the samples, scaled where the halves differ in size.
+    At each pixel it has the variance of the error, and its covariance between channels. It is not the error itself.
+
+    channels : response -> (c, h, w) float32, W/m2/sr, error of `StillSignals.channels`.
+    projector : (h, w) float32, W/m2/sr, error of `EnergySplit.projector`.
     """
 
     channels: dict[Response, np.ndarray]
@@ -108,14 +121,27 @@ class SamplingError(ShortRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Signals(ShortRepr, ABC):
-    """The light that sensors expose, of one time (`StillSignals`) or of several (`rangesim.motion.MovingSignals`).
+    """Light that sensors expose, at one time (`StillSignals`) or at several times (`rangesim.motion.MovingSignals`).
 
-    rig : Rig
-    energy : EnergySplit
-    truth : GroundTruth
-    motion_m : (h, w) float32, metres, how far what a pixel sees moves while its frames are taken, see
+    `rangesim.transport` returns it, `rangesim.load_signals` reads it from a file, and `rangesim.expose` takes it.
+
+    rig : Rig, camera and emitter of the pass.
+    energy : EnergySplit, radiance by the kind of light path.
+    truth : GroundTruth, the first surface behind each pixel.
+    motion_m : (h, w) float32, metres, distance that the surface behind a pixel moves while its frames are taken, see
         `rangesim.motion`; None: nothing moves.
-    truncation : what the light transport left out, an estimate; None: not known.
+    truncation : Truncation, estimate of the light that is left out; None: not known.
+
+    Examples
+    --------
+    The light of one pass is exposed by any sensor of that pass, with any detector and exposure:
+
+    >>> import rangesim
+    >>> sensor = rangesim.StructuredLight()
+    >>> scene = rangesim.load_scene("matte")  # doctest: +SKIP
+    >>> signals = rangesim.transport(scene, scene.rig(width=160), sensor)  # doctest: +SKIP
+    >>> bright = rangesim.expose(signals, sensor, exposure_s=1e-2)  # doctest: +SKIP
+    >>> noisy = rangesim.expose(signals, sensor, rangesim.Detector(read_noise_e=20.0))  # doctest: +SKIP
     """
 
     rig: Rig
@@ -127,29 +153,36 @@ class Signals(ShortRepr, ABC):
     @property
     @abstractmethod
     def knows_sampling_error(self) -> bool:
-        """Whether `frames` can have its sampling error added."""
+        """Whether the sampling error is known, so that `frames` can add it."""
 
     @abstractmethod
     def frames(self, sensor: Sensor, ambient_transmission: float = 1.0, sampling_errors: float = 0.0) -> np.ndarray:
-        """(k, h, w) float32, W/m2/sr: the noise-free frames of `sensor`, which must have been part of the pass.
+        """Frames of a sensor without the detector's noise: (k, h, w) float32, W/m2/sr.
 
-        sampling_errors : so many times a draw of the error that the sampling of light paths leaves is added.
+        sensor : a sensor that was part of the pass.
+        ambient_transmission : factor (0..1) on the ambient light.
+        sampling_errors : factor on the draw of the sampling error that is added; 0: none is added.
+
+        Raises
+        ------
+        ValueError
+            The pass has no signals of this sensor, or its sampling error is asked for and not known.
         """
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StillSignals(Signals):
-    """Everything one transport pass accumulated for the sensors that share a rig.
+    """Everything that one transport pass accumulated, for all sensors that share its rig.
 
-    channels : response -> (c, h, w) float32, W/m2/sr.
-    sampling : SamplingError; None: not known.
+    channels : response -> (c, h, w) float32, W/m2/sr, light weighted by each channel of the response.
+    sampling : SamplingError of `channels`; None: not known.
     """
 
     channels: dict[Response, np.ndarray] = field(kw_only=True)
     sampling: SamplingError | None = field(kw_only=True, default=None)
 
     def only(self, sensor: Sensor) -> StillSignals:
-        """These signals without what other sensors need."""
+        """The same signals without the channels that other sensors need."""
         kept = sensor.responses()
         sampling = self.sampling
         if sampling is not None:
@@ -164,7 +197,8 @@ class StillSignals(Signals):
         missing = [r for r in sensor.responses() if r not in self.channels]
         if missing:
             raise ValueError(
-                f"expected signals of {sensor.type_name}, but the pass has no {missing[0]}; trace it with this sensor."
+                f"expected signals of {sensor.type_name}, but the pass has no {missing[0]}; "
+                "run transport with this sensor, too."
             )
         channels, projector = [self.channels[r] for r in sensor.responses()], self.energy.projector
         if sampling_errors:
@@ -179,17 +213,3 @@ class StillSignals(Signals):
             got = f"{frames.shape} and {frames.dtype}" if isinstance(frames, np.ndarray) else type(frames).__name__
             raise ValueError(f"expected frames of {sensor.type_name} of shape {expected} and type float32, got {got}.")
         return frames
-
-    def save(self, path: str | Path) -> None:
-        """Write everything to a compressed .npz file, which `rangesim.load_signals` reads back equal.
-
-        Raises
-        ------
-        ValueError
-            A response holds arrays (`Images`).
-        FileFormatError
-            The place cannot be written.
-        """
-        from rangesim.signals.signals_files import save_signals
-
-        save_signals(self, path)

@@ -17,7 +17,7 @@ from fuzz.cloud_files import lies
 from fuzz.hostile import Made
 from fuzz.inputs import Input
 from fuzz.mutation import MAX_BYTES, mutate, mutate_arguments
-from rangesim import limits
+from rangesim.settings import limits
 
 Arguments = tuple[str, ...]
 
@@ -202,7 +202,7 @@ def _tof_calibration(path: Path, _: Arguments) -> Any:
 
 
 def _result(path: Path, _: Arguments) -> Any:
-    from rangesim.experiment.result_files import load_result
+    from rangesim.results.run_files import load_result
 
     return load_result(path)
 

@@ -23,7 +23,7 @@ FIRST = (
     *("test_warmup", "test_real", "test_surface", "test_learning_classifier", "test_learning_transfer"),
     *("test_linkage_learned", "test_plain_files", "test_metrics_peers", "test_docs", "test_short_repr"),
     *("test_detection_objects", "test_detection_planes", "test_plausibility", "test_benchmarks", "test_files"),
-    *("test_properties", "test_output"),
+    *("test_properties",),
 )
 HERE = Path(__file__).parent
 REAL_CLOUDS = Path(__file__).resolve().parents[3] / "shared" / "data" / "mosd"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Single files are written whole or not at all, and none is lost: the laws of `pcgraph.plain_files`."""
+"""Single files are written whole or not at all, and none is lost: the laws of `pcgraph.plumbing.plain_files`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 import pcgraph
-from pcgraph import plain_files
-from pcgraph.plain_files import write_file, write_files
+from pcgraph.plumbing import plain_files
+from pcgraph.plumbing.plain_files import write_file, write_files
 from pcgraph.tree.learned import EdgeModel
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from pcgraph.python_files import run_python_file
+import pcgraph.own_files  # noqa: F401  (the package around the modules of files)
+from pcgraph.plumbing.python_files import run_python_file
 
 
 @pytest.fixture(autouse=True)

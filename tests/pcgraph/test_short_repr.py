@@ -10,7 +10,7 @@ import pytest
 
 import pcgraph
 from pcgraph import detection, learning, metrics
-from pcgraph.short_repr import ShortRepr
+from pcgraph.plumbing.short_repr import ShortRepr
 
 
 def of_arrays(kind: object) -> bool:

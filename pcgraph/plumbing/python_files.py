@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A Python file of a user, run as a module; it finds the files beside it, as with `python FILE.py`.
+
+A file that PACKAGE asks for becomes the module PACKAGE.own_files.NAME, where NAME spells out the path of the file. So
+what the file defines can be pickled: another process imports that module, which runs the file.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from importlib.util import module_from_spec, spec_from_file_location, spec_from_loader
+from pathlib import Path
+from types import ModuleType
+
+_NEIGHBOURS: dict[Path, dict[str, ModuleType]] = {}
+"""Modules that files of a folder imported from there, by their names."""
+_CHANGED: dict[Path, int] = {}
+"""When files of neighbours were last changed, as they were imported."""
+
+
+_RUN: dict[str, tuple[ModuleType, int]] = {}
+"""Modules of files that ran, by name, and when the file was last changed then."""
+
+
+def module_of_file(path: Path, package: str) -> ModuleType:
+    """The module of a Python file, which runs once, and again when it has changed. Raises as `run_python_file`."""
+    name, changed = _name_of(path, package), path.stat().st_mtime_ns
+    module, ran = _RUN.get(name, (None, None))
+    return module if module is not None and ran == changed else run_python_file(path, package)
+
+
+def run_python_file(path: Path, package: str) -> ModuleType:
+    """The module of a Python file, which runs, for the package that asks for it.
+
+    Imports find the folder of the file first; later ones, inside its functions, last. A name that files of two folders
+    use for a neighbour is for each that of its own folder, as long as it runs.
+
+    Raises
+    ------
+    BaseException
+        What the file raises; it is no module then, nor is what it imported from its folder.
+    """
+    importlib.import_module(f"{package}.own_files")  # the package around the module
+    name, changed = _name_of(path, package), path.stat().st_mtime_ns
+    spec = spec_from_file_location(name, path)
+    assert spec is not None, path  # a .py file has one
+    assert spec.loader is not None, path
+    module = module_from_spec(spec)
+    folder = path.parent.absolute()
+    _take_out_neighbours(folder)
+    before = set(sys.modules)
+    sys.modules[name] = module  # dataclasses look their own module up
+    sys.path.insert(0, str(folder))
+    importlib.invalidate_caches()  # for files written since
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        for new in {name, *_imported_from(folder, before)}:
+            sys.modules.pop(new, None)
+        raise
+    finally:
+        sys.path.remove(str(folder))
+        if str(folder) not in sys.path:
+            sys.path.append(str(folder))
+    for new, neighbour in _imported_from(folder, before - set(_NEIGHBOURS.get(folder, ()))).items():
+        _NEIGHBOURS.setdefault(folder, {})[new] = neighbour
+        if neighbour.__file__:
+            _CHANGED[Path(neighbour.__file__)] = Path(neighbour.__file__).stat().st_mtime_ns
+    _RUN[name] = module, changed
+    return module
+
+
+def _name_of(path: Path, package: str) -> str:
+    return f"{package}.own_files.x{bytes(path.absolute()).hex()}"
+
+
+class FileImporter(MetaPathFinder, Loader):
+    """Imports PACKAGE.own_files.NAME, by running the file that NAME spells out."""
+
+    def __init__(self, package: str) -> None:
+        self.package = package
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        return spec_from_loader(fullname, self) if fullname.startswith(f"{self.package}.own_files.x") else None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        path = Path(bytes.fromhex(spec.name.rpartition(".x")[2]).decode(errors="surrogateescape"))
+        if not path.is_file():
+            raise ImportError(f"expected the Python file {path}, which defines what was pickled; it is not there.")
+        return module_of_file(path, self.package)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Do nothing: the file has run."""
+
+
+def _take_out_neighbours(folder: Path) -> None:
+    """Leave those modules that files imported from `folder`, unless one changed, and none from other folders."""
+    own = _NEIGHBOURS.get(folder, {})
+    if any(_is_stale(Path(m.__file__)) for m in own.values() if m.__file__):
+        _NEIGHBOURS.pop(folder)
+    kept = _NEIGHBOURS.get(folder, {})
+    for modules in (own, *_NEIGHBOURS.values()):
+        for name, module in modules.items():
+            if sys.modules.get(name) is module:
+                del sys.modules[name]
+    sys.modules.update(kept)
+
+
+def _is_stale(file: Path) -> bool:
+    return not file.is_file() or file.stat().st_mtime_ns != _CHANGED.get(file)
+
+
+def _imported_from(folder: Path, before: set[str]) -> dict[str, ModuleType]:
+    """Modules and packages beside each other in `folder`, and theirs, unless they or their package were there before.
+
+    What is installed below the folder, such as in an environment there, is not beside the file.
+    """
+    found = {}
+    for name, module in list(sys.modules.items()):
+        top = name.partition(".")[0]
+        if top not in before and name not in before and _is_beside(folder, top, module):
+            found[name] = module
+    return found
+
+
+def _is_beside(folder: Path, top: str, module: ModuleType) -> bool:
+    """Whether a module is of the file or package `top` in the folder itself."""
+    places = [file] if (file := getattr(module, "__file__", None)) else list(getattr(module, "__path__", ()))
+    for place in places:
+        path = Path(place).absolute()
+        if folder in path.parents:
+            first = path.relative_to(folder).parts[0]
+            return first == top or first.partition(".")[0] == top
+    return False

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A `repr` of one to five lines for dataclasses of arrays."""
+
+from __future__ import annotations
+
+import dataclasses
+import reprlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+MAX_LINES = 5
+"""Lines of one `repr`. What does not fit is counted: "and 4 more"."""
+MAX_COLUMNS = 100
+"""Characters of a line; a longer `repr` is broken into several lines."""
+MAX_ENTRIES = 3
+"""Entries of a dictionary of arrays that are shown; the others are counted."""
+SHORT = reprlib.Repr()
+"""`repr` of plain values, cut to a readable length: 100 characters, 8 entries, 3 levels."""
+SHORT.maxstring = SHORT.maxother = 100
+SHORT.maxlist = SHORT.maxtuple = SHORT.maxarray = 8
+SHORT.maxlevel = 3
+
+
+class ShortRepr:
+    """A mixin for dataclasses of arrays: its `repr` names shapes and types instead of a thousand numbers.
+
+    Examples
+    --------
+    >>> @dataclasses.dataclass
+    ... class Planes(ShortRepr):
+    ...     normals: np.ndarray
+    >>> Planes(np.zeros((500, 3)))
+    Planes(normals=float64[500, 3])
+    """
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if cls.__repr__ is ShortRepr.__repr__:
+            cls.__repr__ = ShortRepr.__repr__  # type: ignore[method-assign]  # a class's own one is left by @dataclass
+
+    def _counts(self) -> str:
+        """A few words that stand first, such as "3 regions"; empty unless a subclass says more."""
+        return ""
+
+    def __repr__(self) -> str:
+        name, counts = type(self).__name__, self._counts()
+        parts = [counts] if counts else []
+        parts += [f"{f.name}={in_short(getattr(self, f.name))}" for f in dataclasses.fields(self)]  # type: ignore[arg-type]
+        line = f"{name}({', '.join(parts)})"
+        return line if len(line) <= MAX_COLUMNS else f"{name}(\n" + "\n".join(_filled(parts)) + ")"
+
+
+def in_short(value: Any) -> str:
+    """A short `repr`: type and shape of an array, length of a long list and the type of its first entry."""
+    if isinstance(value, np.ndarray) and value.size > 1:
+        if value.ndim == 1 and value.size <= 4 and value.dtype.kind in "iufb":
+            return np.array2string(value, precision=4, separator=", ")
+        return f"{value.dtype}{list(value.shape)}"
+    if isinstance(value, ShortRepr):
+        return f"{type(value).__name__}(...)"
+    if isinstance(value, Mapping) and any(isinstance(v, np.ndarray) for v in value.values()):
+        shown = [f"{str(k)[:20]}: {in_short(v)}" for k, v in list(value.items())[:MAX_ENTRIES]]
+        return (
+            "{" + ", ".join(shown) + (f" and {len(value) - len(shown)} more" if len(value) > len(shown) else "") + "}"
+        )
+    many = isinstance(value, (tuple, list)) and (len(value) > 3 or any(isinstance(v, np.ndarray) for v in value))
+    if many and value:
+        return f"{len(value)} of {type(value[0]).__name__}"
+    return SHORT.repr(value) if not dataclasses.is_dataclass(value) else f"{type(value).__name__}(...)"
+
+
+def _filled(parts: list[str]) -> list[str]:
+    """The parts on indented lines, at most `MAX_LINES` of them; parts that do not fit are counted."""
+    lines = ["   "]
+    for number, part in enumerate(parts):
+        if lines[-1].strip() and len(lines[-1]) + len(part) + 2 > MAX_COLUMNS:
+            if len(lines) == MAX_LINES - 1:
+                lines[-1] += f" and {len(parts) - number} more"
+                return lines
+            lines.append("   ")
+        lines[-1] += f" {part}" + ("," if number < len(parts) - 1 else "")
+    return lines

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `rangesim scan` does: a scene, an instrument, a path, and how its views become a surface."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from rangesim.electronics.ambient import Ambient
+from rangesim.experiment.camera_paths import CameraPath, Turntable
+from rangesim.files.settings_files import load_settings
+from rangesim.instrument.instrument import Instrument, instrument, instrument_from_dict
+from rangesim.settings import limits
+from rangesim.settings.bounds import Bounds, Metres, check_fields, whole
+from rangesim.settings.config import check_keys, from_dict, shown, to_dict
+from rangesim.settings.seeds import check_seed
+
+if TYPE_CHECKING:
+    from rangesim.light_transport.transport_settings import TransportSettings
+
+SENSOR = "gray-phase"
+
+
+@dataclass(frozen=True)
+class ScanSettings:
+    """A scan: many views of a scene, fused.
+
+    Parameters
+    ----------
+    scene, material, unit_m, width, height, spp, max_depth, photons, glint, seed, ambient : as of
+        `rangesim.experiment.Experiment`; spp None: the default of `transport`.
+    instrument : one, whose camera and emitter move together.
+    path : where its views are taken from; what it does not say comes from the scene's camera.
+    registration : "known": poses are those of the path; "unknown": they are found from the readings (`align`).
+    voxel_m : metres; None: 1.5 times the distance between readings.
+    truncation_m, weights, min_weight : as of `fuse`.
+    """
+
+    scene: str
+    material: str | None = None
+    unit_m: Metres | None = None
+    width: Annotated[int, whole(1, "pixels")] | None = None
+    height: Annotated[int, whole(1, "pixels")] | None = None
+    spp: Annotated[int, whole(1, "spp")] | None = None
+    max_depth: Annotated[int, whole(1, "depth")] = 5
+    photons: Annotated[int, whole(0, "photons")] | None = None
+    glint: bool = True
+    seed: int = 0
+    ambient: Ambient | None = None
+    instrument: Instrument = field(default_factory=lambda: instrument(SENSOR))
+    path: CameraPath = field(default_factory=Turntable)
+    registration: Literal["known", "unknown"] = "known"
+    voxel_m: Metres | None = None
+    truncation_m: Metres | None = None
+    weights: Literal["confidence", "uniform"] = "confidence"
+    min_weight: Annotated[float, Bounds("0 or positive", 0, 1e6)] | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if not self.scene or "\0" in self.scene:
+            raise ValueError(f"expected scene to be the path of a scene or a mesh, got {shown(self.scene)}.")
+        limits.check("pixels", (self.width or 1) * (self.height or 1), f"pixels, not {self.width} x {self.height}")
+        object.__setattr__(self, "seed", check_seed(self.seed))
+
+    def transport_settings(self) -> TransportSettings:
+        """How the light of a view is sampled."""
+        from rangesim.light_transport.transport_settings import PHOTONS, TransportSettings
+
+        photons = PHOTONS if self.photons is None else self.photons
+        return TransportSettings(
+            "auto" if self.spp is None else self.spp, self.max_depth, photons=photons, glint=self.glint
+        )
+
+
+def load_scan_settings(file: str | Path) -> ScanSettings:
+    """The scan of a TOML file: the fields of `ScanSettings`, tables `[instrument]` and `[path]` with their `type`.
+
+    A relative scene path counts from the file's directory.
+
+    Raises
+    ------
+    FileFormatError
+        The file is missing or no valid TOML, or holds an unknown key or a bad value; the message names the place.
+    """
+    return load_settings(file, "the settings of a scan", scan_settings_from_dict)
+
+
+def scan_settings_from_dict(data: Mapping[str, Any], files_in: Path | None = None) -> ScanSettings:
+    """The settings of plain data; ValueError as `from_dict`. files_in : as of `instrument_from_dict`."""
+    check_keys(data, [f.name for f in fields(ScanSettings)], "scan")
+    settings = from_dict(ScanSettings, {k: v for k, v in data.items() if k not in ("instrument", "path")})
+    if data.get("instrument") is not None:
+        settings = replace(settings, instrument=instrument_from_dict(data["instrument"], "instrument", files_in))
+    if data.get("path") is not None:
+        settings = replace(settings, path=from_dict(CameraPath, data["path"], "path"))  # type: ignore[type-abstract]
+    return settings
+
+
+def scan_settings_to_dict(settings: ScanSettings) -> dict[str, Any]:
+    """Plain data that `scan_settings_from_dict` reads back equal."""
+    return dict(to_dict(settings))

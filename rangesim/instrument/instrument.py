@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Instruments: a sensor with its camera, emitter, electronics, decoder and place."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+
+from rangesim.electronics.detector import PhotoDetector
+from rangesim.motion import Timing
+from rangesim.rig import CAMERA_LENS, PROJECTOR_LENS, Intrinsics, Lens, pose
+from rangesim.sensors import Decoder, Sensor, check_sensor, is_file_name, sensor_from_dict, sensor_of
+from rangesim.settings.bounds import Metres, Seconds, Watts, Wavelength, check_fields, whole
+from rangesim.settings.config import check_keys, from_dict, on_top_of, shown, to_dict
+
+if TYPE_CHECKING:
+    from rangesim.rig import Rig
+    from rangesim.scene import Scene
+
+MAX_NAME = 100
+"""Characters; the name becomes that of a directory."""
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+
+
+@dataclass(frozen=True, eq=False)
+class Instrument:
+    """A sensor with its camera, its emitter, its electronics, its decoder and its place in the scene.
+
+    What is None comes from the sensor (emitter, detector, decoder) or from the scene (camera and its pose).
+
+    Parameters
+    ----------
+    name : names its directory in the results: letters, digits, hyphens and underscores.
+    sensor : Sensor, the measuring principle.
+    detector : PhotoDetector; None: `Sensor.default_detector`.
+    noise : bool; False: the detector is not used, and frames are noise-free float32.
+    decoder : Decoder, with its thresholds; None: `Sensor.default_decoder`.
+    camera : Intrinsics; None: the scene's camera.
+    width, height : pixels of the scene's camera, whose field of view is kept; None: as the experiment says.
+    T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres; None: the scene's camera.
+    projector : Intrinsics of the emitter; None: as the sensor comes, with a field that covers the camera's view.
+    T_camera_projector : (4, 4) float64, maps projector coordinates to camera coordinates, metres; None: to the right
+        of the camera by `baseline_m`, turned towards the point that the camera looks at.
+    baseline_m : metres between camera and emitter; None: as the sensor comes, a fifth of the working distance for
+        structured light, 0.03 m for time of flight.
+    wavelength_m : metres, of the emitter's light; None: that of the detector. Instruments of different wavelengths
+        share no light-transport pass.
+    power_w : watts, mean radiant power of the emitter when it is fully on.
+    exposure_s : seconds per frame; None: automatic.
+    camera_lens, projector_lens : Lens, aperture, focus and vignetting.
+    timing : when its frames are taken, in an experiment in which something moves.
+
+    Raises
+    ------
+    ValueError
+        A name or a number out of range, a decoder or detector that does not fit the sensor, or two statements about
+        one thing: `camera` and `width`, `T_camera_projector` and `baseline_m`.
+
+    Examples
+    --------
+    >>> from rangesim.sensors import AmcwToF
+    >>> one = Instrument("tof", AmcwToF(), width=320, height=240, exposure_s=1e-3)
+    >>> one.detector.wavelength_m == one.emitter_wavelength_m
+    True
+    """
+
+    name: str
+    sensor: Sensor
+    detector: PhotoDetector | None = None
+    noise: bool = True
+    decoder: Decoder | None = None
+    baseline_m: Metres | None = None
+    power_w: Watts = 1.0
+    exposure_s: Seconds | None = None
+    camera_lens: Lens = CAMERA_LENS
+    projector_lens: Lens = PROJECTOR_LENS
+    timing: Timing = field(default_factory=Timing)
+    camera: Intrinsics | None = None
+    width: Annotated[int, whole(1, "pixels")] | None = None
+    height: Annotated[int, whole(1, "pixels")] | None = None
+    T_world_camera: np.ndarray | None = None
+    projector: Intrinsics | None = None
+    T_camera_projector: np.ndarray | None = None
+    wavelength_m: Wavelength | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if not _NAME.fullmatch(self.name) or len(self.name) > MAX_NAME:
+            raise ValueError(
+                f"expected a name of letters, digits, - and _, at most {MAX_NAME}, got {shown(self.name)}."
+            )
+        check_sensor(self.sensor)
+        if self.decoder is not None:
+            self.decoder.check(self.sensor)
+        if self.detector is None:
+            object.__setattr__(self, "detector", self.sensor.default_detector)
+        if self.detector is not None and not self.sensor.is_ideal:
+            self.detector.check(self.sensor.gate)
+        for one, others in (("camera", ("width", "height")), ("T_camera_projector", ("baseline_m",))):
+            if getattr(self, one) is not None and (twice := [n for n in others if getattr(self, n) is not None]):
+                raise ValueError(f"expected either {one} or {twice[0]} of instrument {self.name!r}, got both.")
+        for pose_name in ("T_world_camera", "T_camera_projector"):
+            if getattr(self, pose_name) is not None:
+                object.__setattr__(self, pose_name, pose(getattr(self, pose_name), pose_name))
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, Instrument) and to_dict(self) == to_dict(other)
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.sensor))
+
+    @property
+    def detector_in_use(self) -> PhotoDetector | None:
+        """The detector that frames are taken with, as for `rangesim.expose`; None: they are noise-free."""
+        return self.detector if self.noise else None
+
+    @property
+    def emitter_wavelength_m(self) -> float | None:
+        """Wavelength of the emitter's light, metres; None: an ideal instrument, to which any wavelength is the same."""
+        return self.wavelength_m or getattr(self.detector, "wavelength_m", None)
+
+    def rig(self, scene: Scene, width: int | None = None, height: int | None = None) -> Rig:
+        """Its camera and emitter in a scene.
+
+        Parameters
+        ----------
+        width, height : pixels of the scene's camera, where the instrument does not say how many.
+        """
+        size, baseline_m = self.sensor.emitter
+        if (self.width, self.height) != (None, None):
+            width, height = self.width, self.height
+        rig = scene.rig(
+            baseline_m if self.baseline_m is None else self.baseline_m, size, self.power_w, width, height,
+            camera=self.camera, T_world_camera=self.T_world_camera,
+        )  # fmt: skip
+        return replace(
+            rig,
+            camera_lens=self.camera_lens,
+            projector_lens=self.projector_lens,
+            projector=self.projector or rig.projector,
+            T_camera_projector=rig.T_camera_projector if self.T_camera_projector is None else self.T_camera_projector,
+            wavelength_m=self.emitter_wavelength_m,
+        )
+
+
+DEFAULT_SENSORS = ("gray-phase", "amcw", "ideal-tof")
+"""Structured light against time of flight, and the reference that says what no time-of-flight camera can better."""
+
+
+def instrument(name: str, **settings: Any) -> Instrument:
+    """The instrument with the sensor of a name, see `rangesim.sensors.sensor_of`; errors as there."""
+    sensor = sensor_of(name)
+    return Instrument(_name_of(name, sensor), sensor, **settings)
+
+
+def _name_of(given: str, sensor: Sensor) -> str:
+    """The name of an instrument given by its sensor alone: of the preset, or the type of a sensor from a file."""
+    return sensor.type_name if is_file_name(given) else given
+
+
+def instrument_from_dict(table: Any, place: str, files_in: Path | None = None) -> Instrument:
+    """An instrument; its sensor is the name of a preset, or a table with a `type`.
+
+    Parameters
+    ----------
+    files_in : folder from which a sensor named as FILE.py:NAME is loaded, see `rangesim.sensors.sensor_of`; None:
+        no file is, as in what is read back of results.
+    """
+    if not isinstance(table, Mapping):
+        raise ValueError(f"{place}: expected a table of settings, got {shown(table)}.")
+    values = dict(table)
+    if "optics" in values:
+        raise ValueError(
+            f"{place}: expected tables camera_lens and projector_lens in place of optics, see docs/optics.md."
+        )
+    check_keys(values, [f.name for f in fields(Instrument)], place)
+    given, sensor = values.get("sensor"), None
+    if given is not None:
+        values["sensor"] = sensor = sensor_from_dict(given, f"{place}.sensor", files_in)
+        if isinstance(given, str):
+            values.setdefault("name", _name_of(given, sensor))
+    for key, kind, default in (
+        ("detector", PhotoDetector, getattr(sensor, "default_detector", None)),
+        ("decoder", Decoder, getattr(sensor, "default_decoder", None)),
+    ):
+        if values.get(key) is not None:
+            values[key] = from_dict(kind, on_top_of(default, values[key]), f"{place}.{key}")
+    return from_dict(Instrument, values, place)

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One pass of light paths: scene + rigs + responses -> signals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from rangesim.light_transport.caustics import caustic_maps, caustic_photons
+from rangesim.light_transport.device import Device
+from rangesim.light_transport.glint import Glint, trace_glint
+from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
+from rangesim.light_transport.indirect_filter import LightFilter
+from rangesim.light_transport.kernel_launches import Launches, Progress, Report, raised_as_it_is, report_part
+from rangesim.light_transport.loop import PathSettings, Radiance, View
+from rangesim.light_transport.narrow_lobes import warn_of_narrow_lobes
+from rangesim.light_transport.photons import Photons
+from rangesim.light_transport.sampler import Sampler
+from rangesim.light_transport.sampling_error import MIN_FOR_HALVES, Estimate
+from rangesim.light_transport.traced_scene import TracedScene
+from rangesim.light_transport.transport_settings import TransportSettings
+from rangesim.light_transport.truncation import estimate_truncation
+from rangesim.response import Response
+from rangesim.rig import Rig
+from rangesim.scene import Scene
+from rangesim.scene.media import body_around, inside_out
+from rangesim.sensor import Sensor
+from rangesim.settings.config import shown
+from rangesim.settings.seeds import derived_seed
+from rangesim.signals import EnergySplit, StillSignals
+
+MATTE_SPP, OTHER_SPP = 16, 64
+"""Samples of a pixel that shares its indirect light, and of others, where no sensor says how many it needs."""
+PATHS_FRACTION = 0.95
+"""Fraction of the progress that is reported when all samples are taken; the filter and the sums take the rest."""
+RAYS_TO_MEDIA = 16
+"""Columns and rows of rays that look for media on the wrong side."""
+TEXTURE_SAMPLES = 64
+"""Samples of a pixel, at most, over which the reflectance of a texture is averaged."""
+
+
+@raised_as_it_is()
+def trace_light(
+    scene: Scene,
+    rigs: Sequence[Rig],
+    sensors: Sequence[Sensor | Response],
+    settings: TransportSettings,
+    progress: Callable[[float], None] | None = None,
+) -> list[StillSignals]:
+    """Signals of each camera from one pass of light paths, with the channels of all sensors.
+
+    Parameters
+    ----------
+    rigs : rigs that differ in their cameras alone. Photons are traced once for all.
+    sensors : sensors, or bare responses. Equal responses share their channels.
+    settings : of the pass. spp "auto": 16 samples where pixels share their indirect light, 64 elsewhere.
+    progress : as of `rangesim.transport`.
+
+    Raises
+    ------
+    ValueError
+        As `rangesim.transport`.
+    """
+    _check(scene, rigs, sensors, progress)
+    report, launches = Progress(progress), Launches(is_watched=progress is not None)
+    responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
+    if isinstance(settings.spp, Sampler):
+        settings.spp.check(responses)
+    traced = TracedScene.of(scene.mitsuba, scene.in_renderer(rigs[0]))
+    warn_of_narrow_lobes(traced, [instance.name for instance in scene.instances])
+    views = [_CameraPass(scene, traced, one, settings, number) for number, one in enumerate(rigs)]
+    fewest = min(int(view.samples.min()) for view in views)
+    at_work = partial(report, 0.0)
+    photons = caustic_photons(traced, rigs[0], settings, fewest, at_work)
+    signals = []
+    for number, view in enumerate(views):
+        part = partial(report_part, report, number / len(views), 1 / len(views))
+        signals.append(view.trace(responses, photons, launches, part))
+    return signals
+
+
+class _CameraPass:
+    """What one camera sees, before and after its light is traced.
+
+    Parameters
+    ----------
+    scene, rig, settings : of the pass.
+    traced : TracedScene, of some camera with the same emitter.
+    number : int, of the camera; each has random numbers of its own.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        traced: TracedScene,
+        rig: Rig,
+        settings: TransportSettings,
+        number: int,
+    ) -> None:
+        self.scene, self.rig, self.here = scene, rig, scene.in_renderer(rig)
+        self.settings = replace(settings, seed=derived_seed(settings.seed, number)) if number else settings
+        self.traced = traced._replace(camera=Device.camera(self.here))
+        self.truth, self.guides = ground_truth(scene, self.traced, rig)
+        spp, pixels = settings.spp, rig.camera.height * rig.camera.width
+        if isinstance(spp, Sampler):
+            self.samples = np.full(pixels, spp.first_spp)
+        elif isinstance(spp, int):
+            self.samples = np.full(pixels, spp)
+        else:
+            is_shared = (settings.indirect == "filtered") & (self.guides.instance.ravel() >= 0)
+            self.samples = np.where(is_shared, MATTE_SPP, OTHER_SPP)
+
+    def trace(
+        self,
+        responses: Sequence[Response],
+        photons: Photons | None,
+        launches: Launches,
+        report: Report,
+    ) -> StillSignals:
+        """Signals of this camera; photons are those of its emitter."""
+        settings, rig, guides = self.settings, self.rig, self.guides
+        sampler = settings.spp if isinstance(settings.spp, Sampler) else None
+        fewest = int(self.samples.min())
+        maps = caustic_maps(photons, self.here, settings.caustic_radius_m)
+        view, of_paths = View(self.traced, maps), PathSettings.of(self.scene, settings)
+        keeps_apart = settings.indirect == "filtered"
+        if keeps_apart and self.scene.has_matte_textures:
+            few = min(fewest, TEXTURE_SAMPLES)
+            guides = guides._replace(reflectance=mean_reflectance(view, of_paths, rig, self.scene.has_cutouts, few))
+        shared = LightFilter(guides) if keeps_apart else None
+        at_work = partial(report, 0.0)
+        glints = trace_glint(self.traced, self.here, responses, settings.seed, at_work) if settings.glint else None
+        has_halves = settings.sampling_error and fewest >= MIN_FOR_HALVES
+        estimate = Estimate(view, of_paths, rig, responses, keeps_apart, has_halves, settings.memory_bytes, launches)
+
+        def signals_of(some: Sequence[Response] | None) -> StillSignals:
+            channels, radiance, error = estimate.means(shared, some)
+            if glints and error:
+                glints.add_to(error.projector[None], glints.radiance_error[None])
+                for response, values in error.channels.items():
+                    glints.add_to(values, glints.channels_error[response])
+            energy = _energy(channels, radiance, glints)
+            return StillSignals(rig, energy, self.truth, channels=channels, sampling=error)
+
+        left = 0.5 * PATHS_FRACTION if sampler else 0.0  # how much follows is not known
+        pixels = np.arange(len(self.samples))
+        estimate.sample(pixels, self.samples, partial(report_part, report, 0.0, PATHS_FRACTION - left))
+        if sampler and sampler.most_spp > fewest:
+            more = sampler.samples(self.truth, signals_of).ravel() - self.samples
+            pixels = np.flatnonzero(more)
+            if len(pixels):
+                estimate.sample(pixels, more[pixels], partial(report_part, report, PATHS_FRACTION - left, left))
+        signals = signals_of(None)
+        report(1.0)
+        cut = photons.energy.cut if photons else 0.0
+        truncation = estimate_truncation(estimate.mean_tally(), signals.energy, settings.max_depth, cut)
+        return replace(signals, truncation=truncation)
+
+
+def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Glint | None) -> EnergySplit:
+    """The energy split; glint is added to it and to the channels."""
+    highlights = np.zeros((1, *radiance.direct.shape), np.float32)
+    if glints:
+        glints.add_to(highlights, glints.radiance[None])
+        for response, values in channels.items():
+            glints.add_to(values, glints.channels[response])
+    return EnergySplit(
+        direct=radiance.direct,
+        multipath=radiance.multipath,
+        specular=radiance.specular,
+        caustic=radiance.caustic + radiance.smooth_caustic,
+        glint=highlights[0],
+        ambient=radiance.ambient,
+    )
+
+
+def _check(scene: Scene, rigs: Sequence[Rig], sensors: Sequence[Sensor | Response], progress: Any) -> None:
+    if not isinstance(scene, Scene):
+        raise ValueError(f"expected a Scene, as load_scene returns, got {type(scene).__name__}.")
+    if not isinstance(rigs, Sequence):
+        raise ValueError(f"expected a Rig, as scene.rig() returns, or a list of them, got {type(rigs).__name__}.")
+    if not rigs or not all(isinstance(rig, Rig) for rig in rigs):
+        raise ValueError(f"expected one Rig or more, got {shown(list(rigs))}.")
+    for rig in rigs:
+        _check_in_air(scene, rig)
+    for number, rig in enumerate(rigs):
+        if differ := rigs[0].differences_of_emitter(rig):
+            raise ValueError(
+                f"expected rigs that share their emitter, as of `Rig.with_camera`; rig {number} has another "
+                f"{', another '.join(differ)} than rig 0."
+            )
+    if progress is not None and not callable(progress):
+        raise ValueError(f"expected progress as a function, got {shown(progress)}.")
+    if not isinstance(sensors, Sequence) or not all(isinstance(s, (Sensor, Response)) for s in sensors):
+        raise ValueError(f"expected a list of sensors, for example [StructuredLight()], got {sensors!r}.")
+    for sensor in sensors:
+        sensor.check(rigs[0].projector.width, rigs[0].projector.height)
+
+
+def _check_in_air(scene: Scene, rig: Rig) -> None:
+    """Raise ValueError if the camera or the projector is inside a body of a medium: its light would start outside.
+
+    Or if one sees a medium on the wrong side of its boundary.
+    """
+    T_camera = scene.in_renderer(rig).T_world_camera
+    devices = ("camera", rig.camera, T_camera), ("projector", rig.projector, T_camera @ rig.T_camera_projector)
+    for name, intrinsics, T in devices:
+        body = body_around(scene.mitsuba, T[:3, 3])
+        if body is not None:
+            raise ValueError(
+                f"expected the {name} to stand in air, but it is inside the medium of shape {body!r}; move it out, or "
+                "let the body begin in front of it."
+            )
+        steps = (np.arange(RAYS_TO_MEDIA) + 0.5) / RAYS_TO_MEDIA
+        pixels = np.stack(np.meshgrid(steps * intrinsics.width, steps * intrinsics.height), axis=-1)
+        directions = intrinsics.directions(pixels).reshape(-1, 3) @ T[:3, :3].T
+        match inside_out(scene.mitsuba, T[:3, 3], directions[np.isfinite(directions).all(axis=1)]):
+            case (shape, "interior"):
+                raise ValueError(
+                    f"expected the normals of shape {shape!r} to point out of the medium inside, but the {name} sees "
+                    "them from behind, as if the medium lay around the shape; turn them (flip_normals)."
+                )
+            case (shape, _):
+                raise ValueError(
+                    f"expected a body that holds the exterior medium of shape {shape!r}, but none is around it, so "
+                    f"the {name} would stand in that medium; put one in front of it, or leave the medium out."
+                )

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What made a result: resolved settings, the scene's fingerprint, versions."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rangesim.experiment import Experiment, experiment_to_dict
+from rangesim.instrument.instrument import Instrument
+from rangesim.results.run_files import InstrumentRecord, ResultRecord, SceneRecord, ShapeRecord
+from rangesim.settings.config import to_dict
+
+if TYPE_CHECKING:
+    from rangesim.rig import Rig
+    from rangesim.scene import Scene
+
+PACKAGES = ("rangesim", "mitsuba", "drjit", "numpy", "scipy", "numba", "open3d")
+
+
+def provenance(
+    experiment: Experiment,
+    scene: Scene,
+    passes: Sequence[tuple[Rig, Sequence[Instrument]]],
+    variant: str,
+    times_s: dict[str, float],
+) -> ResultRecord:
+    """Contents of `experiment.json`."""
+    placed = {i.name: (number, rig) for number, (rig, ones) in enumerate(passes, 1) for i in ones}
+    return ResultRecord(
+        experiment=experiment_to_dict(experiment),
+        scene=SceneRecord(
+            name=scene.name,
+            sha256=_checksum(scene.source),
+            working_distance_m=scene.working_distance_m,
+            shapes=[ShapeRecord(name=i.name, material=i.material) for i in scene.instances],
+        ),
+        passes=len(passes),
+        instruments=[
+            InstrumentRecord(name=i.name, light_pass=placed[i.name][0], rig=to_dict(placed[i.name][1]))
+            for i in experiment.instruments
+        ],
+        versions={"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
+        variant=variant,
+        times_s=times_s,
+    )
+
+
+def _checksum(path: Path | None) -> str | None:
+    """SHA-256 of the scene's file; None if there is none, or none any more."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path is not None and path.is_file() else None
+
+
+def _version(package: str) -> str:
+    """Version of a package, or of its build for the CPU alone."""
+    for name in (package, f"{package}-cpu"):
+        try:
+            return version(name)
+        except PackageNotFoundError:
+            continue
+    return "not installed"

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `rangesim decode` writes, and back.
+
+DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
+    decoded.json         sensor, rig, fractions of the pixels by status, likely cause where little was measured
+    range.npz            range image
+    cloud.ply            points, metres, camera coordinates, where there are any
+    depth.png ...        pictures of the maps
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from rangesim import __version__
+from rangesim.decoding.range_image import RangeImage
+from rangesim.errors import FileFormatError
+from rangesim.files.result_directories import DirectoryKind, new_directory, recover
+from rangesim.files.schema import Fraction, Record, read_record, write_record
+from rangesim.results.range_image_files import load_range_image, save_range_image
+from rangesim.rig import Rig
+from rangesim.sensors import Sensor, sensor_from_dict
+from rangesim.settings.config import ShortRepr, to_dict
+
+SIDECAR = "decoded.json"
+FORMAT = "rangesim-decoded"
+DECODED = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
+"""Directories that hold what a capture decodes to."""
+
+
+class DecodedRecord(Record, frozen=True, kw_only=True):
+    """`decoded.json`. status : fraction of the pixels by the name of their status."""
+
+    format: Literal["rangesim-decoded"] = "rangesim-decoded"
+    format_version: Literal[1] = 1
+    sensor: Any
+    rig: Any
+    rangesim: str
+    status: dict[str, Fraction]
+    likely_cause: str | None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Decoded(ShortRepr):
+    """A range image and what it was decoded from.
+
+    image : RangeImage. sensor : Sensor that took the capture. rig : Rig, None: not calibrated.
+    status : fraction of the pixels by the name of their status.
+    likely_cause : clause that says why little was measured; None if nothing points to a cause.
+    """
+
+    image: RangeImage
+    sensor: Sensor
+    rig: Rig | None
+    status: dict[str, float]
+    likely_cause: str | None
+
+
+def save_decoded(decoded: Decoded, directory: str | Path, pictures: Mapping[str, bytes]) -> None:
+    """Write the files of a decoded capture; they appear when all are complete.
+
+    Parameters
+    ----------
+    pictures : PNG files of the maps by name, as `rangesim.report.figures.map_pictures` makes them.
+
+    Raises
+    ------
+    FileFormatError
+        The directory exists and holds something else.
+    """
+    record = DecodedRecord(
+        sensor=to_dict(decoded.sensor),
+        rig=to_dict(decoded.rig),
+        rangesim=__version__,
+        status=decoded.status,
+        likely_cause=decoded.likely_cause,
+    )
+    image = decoded.image
+    with new_directory(directory, DECODED) as folder:
+        write_record(folder / SIDECAR, record)
+        save_range_image(image, folder / "range.npz")
+        for name, content in pictures.items():
+            (folder / f"{name}.png").write_bytes(content)
+        if image.camera is not None and image.valid.any():
+            image.to_point_cloud().save(folder / "cloud.ply")
+
+
+def load_decoded(directory: str | Path) -> Decoded:
+    """The decoded capture that `save_decoded` wrote.
+
+    Raises
+    ------
+    FileFormatError
+        The directory holds none, or a part of it is missing or broken; the message names the file.
+    """
+    folder = Path(directory)
+    recover(folder, FileFormatError)
+    if not (folder / SIDECAR).is_file():
+        raise FileFormatError(f"{folder} is no {FORMAT} directory: it has no {SIDECAR}.")
+    record = read_record(folder / SIDECAR, DecodedRecord)
+    try:
+        sensor = sensor_from_dict(record.sensor, "sensor")
+        rig = None if record.rig is None else Rig.from_dict(record.rig)
+    except (ValueError, TypeError) as error:
+        raise FileFormatError(f"{folder / SIDECAR}: {error}") from error
+    return Decoded(load_range_image(folder / "range.npz"), sensor, rig, record.status, record.likely_cause)

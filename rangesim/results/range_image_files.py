@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Range images as files."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.status import Status
+from rangesim.errors import FileFormatError
+from rangesim.files.array_files import write_arrays
+from rangesim.files.schema import MAX_METRES, SETTINGS, ArraySpec, read_checked_arrays, settings_array, settings_of
+from rangesim.rig import Intrinsics
+from rangesim.sensors import Decoder  # with those of the package, which are known from then on
+from rangesim.settings.config import check_keys, from_dict, to_dict
+
+_DEPTH = ArraySpec("float32", low=-MAX_METRES, high=MAX_METRES, nan=True)
+_RANGE = {
+    "z": _DEPTH,
+    "range_m": _DEPTH,
+    "confidence": ArraySpec("float32", low=0, high=1.001, nan=True),
+    "status": ArraySpec("uint8", high=max(Status)),
+    "intensity": ArraySpec("float32", nan=True),
+    "T_world_camera": ArraySpec("float64", (4, 4), required=False),
+    "projector_column": ArraySpec("float32", nan=True, required=False),
+    "projector_row": ArraySpec("float32", nan=True, required=False),
+    "sampling_sigma_m": ArraySpec("float32", low=0, nan=True, inf=True, required=False),
+    "settings": replace(SETTINGS, required=False),
+}
+
+
+def save_range_image(image: RangeImage, path: str | Path) -> None:
+    """Write the arrays of a range image, its camera and its decoder to a compressed .npz file.
+
+    `load_range_image` reads it back equal.
+    """
+    arrays = {f.name: getattr(image, f.name) for f in fields(image) if isinstance(getattr(image, f.name), np.ndarray)}
+    settings = {"camera": to_dict(image.camera), "decoder": to_dict(image.decoder)}
+    write_arrays(path, {**arrays, "settings": settings_array(settings)})
+
+
+def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> RangeImage:
+    """The range image that `save_range_image` wrote.
+
+    sizes : its height h and width w, where they are known.
+
+    Raises
+    ------
+    FileFormatError
+        The file is missing or broken, or its decoder is of a class that is not loaded.
+    """
+    path = Path(path)
+    arrays: dict[str, Any] = read_checked_arrays(path, _RANGE, dict(sizes or {}))
+    settings = settings_of(arrays.pop("settings"), path) if "settings" in arrays else {}
+    try:
+        check_keys(settings, ("camera", "decoder"), "settings")
+        camera, decoder = settings.get("camera"), settings.get("decoder")
+        image = RangeImage(
+            **arrays,
+            camera=None if camera is None else from_dict(Intrinsics, camera, "camera"),
+            decoder=None if decoder is None else from_dict(Decoder, decoder, "decoder"),  # type: ignore[type-abstract]
+        )
+    except (ValueError, TypeError) as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    if not image.is_consistent:
+        raise FileFormatError(f"{path}: expected z to be finite where status is {Status.OK.value}.")
+    if image.camera is not None and image.z.shape != (image.camera.height, image.camera.width):
+        raise FileFormatError(f"{path}: expected arrays of the size of the camera.")
+    return image
