@@ -56,9 +56,9 @@ DEPTH_ROUNDS = 100
 """Number of rounds that find the projective depths, before the descent. Measured with 12 scenes of 8 images and 40
 points, 30 % missing: 1 to 300 rounds end at the same minimum, and 30 to 100 take the least time."""
 RANDOM_STARTS = 4
-"""Number of random starts after the first one. They only run if the first descent ends without a finite sum of squares,
-because the first start counts as agreeing with the infinite cost before it. Measured with 25 scenes each, 30 % missing:
-with 8 images of 40 points no random start found a lower minimum; with 4 images of 20 points one did in 4 scenes."""
+"""Largest number of random starts after the first one. They end as soon as one agrees with the best minimum so far.
+Measured with 25 scenes each, 30 % missing: with 8 images of 40 points no random start found a lower minimum; with 4
+images of 20 points one did in 4 scenes."""
 SAME_AFFINE_COST = 1e-6
 """Relative difference of the sums of squares of two starts, a ratio, below which they found the same minimum. It must
 exceed the 1e-12 that a descent leaves when it ends. Measured in the scenes of `RANDOM_STARTS`: different minima have a
@@ -303,7 +303,7 @@ def low_rank(tracks: Tracks, rank: int, seed: int) -> AffineCameras:
             cameras = AffineCameras(M, np.nanmean(dense, axis=1), np.zeros_like(cameras.X))
         found, cost = _affine_descent(tracks, cameras)
         floor = (ROUNDING * spread) ** 2 * len(tracks)
-        is_same = abs(cost - least) <= SAME_AFFINE_COST * least + floor
+        is_same = attempt > 0 and abs(cost - least) <= SAME_AFFINE_COST * least + floor
         if cost < least:
             best, least = found, cost
         if is_same or least <= floor:
