@@ -9,7 +9,20 @@ import pkgutil
 
 import pytest
 
-ROOMS = ["rangesim.geometry", "rangesim.multiview", "rangesim.response", "rangesim.rig", "rangesim.settings"]
+ROOMS = [
+    "pcgraph.plumbing",
+    "rangesim.calibration",
+    "rangesim.electronics",
+    "rangesim.environment",
+    "rangesim.fusion",
+    "rangesim.geometry",
+    "rangesim.motion",
+    "rangesim.multiview",
+    "rangesim.response",
+    "rangesim.rig",
+    "rangesim.settings",
+    "rangesim.signals",
+]
 """Packages whose docstrings are run, all of their modules."""
 MODULES = ["rangesim.errors", "rangesim.triangle_mesh"]
 """Modules outside these packages whose docstrings are run."""

@@ -44,27 +44,27 @@ TILE = 8
 """Pixels along the edge of a tile. The farthest reading of each tile tells quickly which blocks are hidden. The value
 changes time alone."""
 MAX_BLOCKS = 1 << 21
-"""Largest number of blocks along an axis. Three such indices of 21 bits fit into one integer of 63 bits."""
+"""Largest count of blocks along an axis, so that three indices of 21 bits fit into one integer of 63 bits."""
 TRUNCATION_VOXELS = 3.0
 """Default truncation distance in voxels. Smaller ones cut off the noise of readings, which makes the surface rougher;
 larger ones spoil thin walls that are seen from both sides."""
 SPACING_STEP = 7
-"""Only every seventh reading is used for the median depth, from which the distance between readings follows; a check of
-`voxel_m` needs no more."""
+"""Step in pixels between the readings whose median depth gives the distance between readings. More readings would cost
+time alone, because the check of `voxel_m` is a coarse one."""
 WIDE_TRUNCATION_VOXELS = 8.0
 """Truncation distance in voxels beyond which blocks are searched around fewer points, so that the search stays short;
 the search radius is then larger by their distance, so no block is missed."""
 MAX_VOXEL_FRACTION = 0.5
-"""Largest edge of a voxel, as a fraction of the largest extent of the readings: less than two voxels are no shape."""
+"""Largest edge of a voxel, as a fraction of the extent of the readings, because less than two voxels show no shape."""
 MIN_VOXEL_SPACINGS = 0.1
-"""Smallest edge of a voxel, as a fraction of the distance between neighbouring readings. In smaller voxels each reading
-becomes a speck of its own."""
+"""Smallest edge of a voxel, as a fraction of the distance between neighbouring readings, because in smaller voxels each
+reading becomes a speck of its own."""
 MIN_VIEW_FRACTION = 0.05
 """Default of `min_weight`, in typical readings, as a fraction of the number of views, see `MAX_MIN_WEIGHT`."""
 MAX_MIN_WEIGHT = 1.0
-"""Largest default of `min_weight`, in typical readings; 20 and more views reach it. Measured among glass and mirrors
-(docs/fusion.md, "Weights"): without a least weight, there are 741 cm2 of ghosts and 75 % of the matte surface; with 1,
-1.7 cm2 and 69 %; with 2, none and 61 %."""
+"""Largest default of `min_weight`, as a count of typical readings; 20 and more views reach it. Measured among glass and
+mirrors (docs/fusion.md, "Weights"): without a least weight, there are 741 cm2 of ghosts and 75 % of the matte surface;
+with 1, 1.7 cm2 and 69 %; with 2, none and 61 %."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -366,10 +366,10 @@ class _Blocks:
 
 
 def _points_for_blocks(points: np.ndarray, voxel_m: float, truncation_m: float) -> tuple[np.ndarray, float]:
-    """Fewer points that need about the same blocks: one in each cube of two voxels; and 0.0 metres.
+    """One of the points in each small cube, which need about the same blocks, and an addition to the search radius.
 
-    Where the truncation distance is many voxels, cubes are larger. Blocks must then be searched farther around each
-    point, by the metres that are returned.
+    A cube is two voxels wide, or a quarter of the truncation distance if that is many voxels. In the second case alone,
+    the addition (metres) is above 0.
     """
     is_wide = truncation_m > WIDE_TRUNCATION_VOXELS * voxel_m
     if len(points) < 10_000 and not is_wide:

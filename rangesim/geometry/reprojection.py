@@ -22,11 +22,11 @@ from rangesim.rig import Intrinsics
 from rangesim.rig.camera_model import appears, distort, to_pixel
 
 LENS = 9
-"""Number of parameters of a device, a count: fx, fy, cx, cy, k1, k2, p1, p2 and k3, as in OpenCV's camera model."""
+"""Number of parameters of a device, as in OpenCV's camera model: fx, fy, cx, cy, k1, k2, p1, p2 and k3."""
 
 POSE = 6
-"""Number of parameters of a step of a pose, a count: a rotation vector applied after the rotation, and a translation,
-as in any rigid motion."""
+"""Number of parameters of a step of a pose: three of a rotation vector, applied after the rotation, and three of a
+translation."""
 
 MIN_FOCAL_PX = 1.0
 """Least focal length in pixels that a step of an adjustment can leave, so that no step turns the image over. Real

@@ -23,6 +23,7 @@ from rangesim.settings.bounds import (
     Exponent,
     Metres,
     Watts,
+    Wavelength,
     check_fields,
     check_number,
     whole,
@@ -325,6 +326,7 @@ class Rig:
     T_camera_projector : (4, 4) float64, rigid, maps projector coordinates to camera coordinates, metres.
     camera_lens, projector_lens : Lens
     projector_power_w : float, radiant power in watts that leaves the projector when it shows white.
+    wavelength_m : wavelength of the emitter's light, metres; None: not stated.
 
     Raises
     ------
@@ -347,6 +349,7 @@ class Rig:
     camera_lens: Lens = CAMERA_LENS
     projector_lens: Lens = PROJECTOR_LENS
     projector_power_w: Watts = 1.0
+    wavelength_m: Wavelength | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_world_camera", pose(self.T_world_camera, "T_world_camera"))
@@ -413,9 +416,8 @@ class Rig:
 
     def differences_of_emitter(self, other: Rig) -> list[str]:
         """Names of the attributes in which the emitters of two rigs differ; places may differ by `SAME_PLACE`."""
-        found = [
-            k for k in ("projector", "projector_lens", "projector_power_w") if getattr(self, k) != getattr(other, k)
-        ]
+        of_emitter = ("projector", "projector_lens", "projector_power_w", "wavelength_m")
+        found = [name for name in of_emitter if getattr(self, name) != getattr(other, name)]
         same = is_same_pose(self.T_world_projector, other.T_world_projector)
         return found if same else [*found, "T_world_projector"]
 
