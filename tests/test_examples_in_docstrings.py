@@ -14,6 +14,7 @@ ROOMS = [
     "rangesim.calibration",
     "rangesim.electronics",
     "rangesim.environment",
+    "rangesim.files",
     "rangesim.fusion",
     "rangesim.geometry",
     "rangesim.motion",
