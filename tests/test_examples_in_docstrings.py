@@ -13,6 +13,8 @@ ROOMS = [
     "pcgraph.plumbing",
     "rangesim.calibration",
     "rangesim.electronics",
+    "rangesim.environment",
+    "rangesim.files",
     "rangesim.fusion",
     "rangesim.geometry",
     "rangesim.motion",

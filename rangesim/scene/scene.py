@@ -105,8 +105,8 @@ class Scene:
         power_w : radiant power in watts that leaves the projector when it shows white.
         width, height : size of the camera's image, pixels; default as in the scene file. One alone keeps the aspect
             ratio. The horizontal field of view stays the same.
-        camera : Intrinsics in place of the scene's camera; `width` and `height` are then ignored.
-        T_world_camera : (4, 4) float64, pose of the camera in place of the scene's, metres.
+        camera : Intrinsics to use instead of the scene's camera; `width` and `height` are then ignored.
+        T_world_camera : (4, 4) float64, rigid, metres; pose of the camera to use instead of the scene's.
 
         Raises
         ------
