@@ -25,7 +25,7 @@ ROOMS = [
     "rangesim.signals",
 ]
 """Packages whose docstrings are run, all of their modules."""
-MODULES = ["rangesim.errors", "rangesim.triangle_mesh"]
+MODULES = ["rangesim", "rangesim.errors", "rangesim.triangle_mesh"]
 """Modules outside these packages whose docstrings are run."""
 
 
