@@ -20,7 +20,6 @@ from PIL import Image
 from small_result import ROOT, SCENES, SENSORS, small_result
 
 import rangesim
-from rangesim import save_capture
 from rangesim.cli import main
 from rangesim.cli.progress import progress_bar
 from rangesim.rig.calibration_files import save_calibration
@@ -198,7 +197,7 @@ def _write_bad_files(folder: Path) -> None:
     white = next((folder / "crop").glob("*white.png"))
     with Image.open(white) as image:
         smaller = image.crop((0, 0, 60, 60))
-    save_capture(smaller, white)
+    smaller.save(white)
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import re
 import subprocess
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,14 +19,15 @@ import pytest
 from browser import OPTIONS, WITHOUT_WEBGL, browser
 from PIL import Image
 from scroll_hints import check_scroll_hints
-from small_result import SENSORS, small_result
+from small_result import SENSORS, result_of_two_cameras, small_result
 
 from rangesim.causes import Cause
 from rangesim.decoding.status import Status
 from rangesim.environment.doctor import find_browser
-from rangesim.report import cloud, palette, tables
+from rangesim.report import cloud, palette, render_report, tables, write_report
+from rangesim.report.build import by_camera
 from rangesim.report.verdict import verdict
-from rangesim.results.run_files import PhotonsRecord, load_result
+from rangesim.results.run_files import PhotonsRecord, load_result, write_result
 
 BROWSER = find_browser()
 CANVAS = (16, 21, 29)
@@ -62,8 +66,6 @@ def test_text_from_outside_is_escaped(tmp_path: Path) -> None:
     result = load_result(small_result())
     scene = msgspec.structs.replace(result.info.scene, name="<script>alert(1)</script>")
     result = replace(result, info=msgspec.structs.replace(result.info, scene=scene))
-    from rangesim.report import write_report
-
     write_report(result, tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "<script>alert" not in text
@@ -334,6 +336,66 @@ def test_photons_per_pulse_have_two_digits() -> None:
 def test_tables_wider_than_the_page_say_that_they_scroll(tmp_path: Path) -> None:
     with browser(tmp_path) as page:
         check_scroll_hints(page, small_result() / "report.html")
+
+
+def _unpacked(text: str, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+    return np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype).reshape(shape)
+
+
+def test_each_instrument_has_the_size_camera_and_truth_of_its_own(tmp_path: Path) -> None:
+    result = result_of_two_cameras()
+    write_result(result, tmp_path, {})
+    html = render_report(load_result(tmp_path))
+    assert "96 × 72 and 64 × 36 pixels" in html
+    assert [int(n) for n in re.findall(r"<h3>Camera (\d), \d+ × \d+ pixels<", html)] == [1, 2]
+    (text,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', html)
+    data = json.loads(text)
+    assert [one["view"] for one in data["instruments"]] == [0, 1]
+    for one, m in zip(data["instruments"], result.measurements, strict=True):
+        height, width = m.truth.z.shape
+        assert (one["width"], one["height"]) == (width, height)
+        z, step = _unpacked(one["z"], "<u2", (height, width)), one["stepM"]
+        drawn = z > 0
+        assert drawn.any()
+        np.testing.assert_allclose(one["nearM"] + (z[drawn] - 1.0) * step, m.image.z[drawn], atol=step)
+        seen = data["passes"][one["lightPass"]]
+        assert seen["materials"] == list(m.truth.material_names)
+        assert (_unpacked(seen["material"], "i1", (height, width)) == m.truth.material).all()
+
+
+def test_instruments_share_a_camera_where_it_stands_in_one_place() -> None:
+    measurements = load_result(small_result()).measurements
+    assert by_camera(measurements) == [list(measurements)]
+    first, *others = measurements
+    rig = first.capture.rig
+    assert rig is not None
+    T = rig.T_world_camera.copy()
+    T[:3, 3] += 0.01
+    moved = replace(first, capture=replace(first.capture, rig=replace(rig, T_world_camera=T)))
+    assert by_camera([*others, moved]) == [others, [moved]]
+
+
+@needs_browser
+def test_two_cameras_are_drawn_side_by_side(tmp_path: Path) -> None:
+    """Each cloud fills its canvas, and a map marks a pixel in the maps of its own camera alone."""
+    write_report(result_of_two_cameras(), tmp_path / "report.html")
+    marked = """[...document.querySelectorAll(".map")].filter((m) => m.querySelector("i").style.display === "block")
+        .map((m) => +m.dataset.instrument)"""
+    with browser(tmp_path) as page:
+        page.open(tmp_path / "report.html", "color=material")
+        assert page.said == []
+        for i in range(2):
+            height, width, *pixels = page.evaluate(CLOUD % i)
+            cloud_drawn = np.array(pixels, float).reshape(height, width, 4)[..., :3]
+            drawn = (np.abs(cloud_drawn - CANVAS) > 12).any(axis=2)
+            assert 0.3 < drawn.mean() < 0.99
+            assert drawn[:, [0, -1]].mean() < 0.5  # no side is cut off
+        for instrument, title in enumerate(("Ideal time of flight", "Time of flight (AMCW)")):
+            page.mouse("mouseMoved", page.place(f'.map[data-instrument="{instrument}"]', 0.5, 0.9))
+            assert page.evaluate(marked) == [instrument] * 3
+            said = page.evaluate("document.querySelector('#probe').innerHTML")
+            assert re.search(r"^<b>\(\d\d, \d\d\)</b> matte: <b>", said)
+            assert re.findall(r": <b>([^<]*)</b>", said) == [title]
 
 
 def _browse(folder: Path, state: str, *options: str, console: bool = True, path: Path | None = None) -> str:

@@ -3,19 +3,18 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-
-from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 
 from pcgraph.plumbing.plain_files import write_file
 from rangesim.errors import FileFormatError
 from rangesim.report import cloud, figures, palette, tables
-from rangesim.report.policy import StyleRules, content_policy, visible_text
+from rangesim.report.policy import visible_text
+from rangesim.report.template import render_page
 from rangesim.report.verdict import verdict
 from rangesim.results.run_files import Measurement, Result
+from rangesim.signals import GroundTruth
 
 SCRIPTS = ("scroll.js", "viewer.js", "report.js")
 
@@ -33,34 +32,23 @@ def write_report(result: Result, path: Path) -> None:
 
 def render_report(result: Result) -> str:
     """The report of a result as HTML."""
-    environment = Environment(
-        autoescape=True, finalize=visible_text, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template = environment.from_string(_asset("report.html.j2"))
-    return template.render(context(result))
+    return render_page("report.html.j2", context(result), SCRIPTS)
 
 
 def context(result: Result) -> dict[str, Any]:
-    """Everything the template shows."""
+    """Values of the variables of the template, by name."""
     measurements = result.measurements
     names = tables.titles(measurements)
-    camera = measurements[0].capture.frames.shape
-    materials, legend = figures.material_picture(measurements[0].truth)
+    cameras = by_camera(measurements)
     depth, error = palette.color_table("viridis"), palette.color_table("RdBu_r")
     limits = palette.depth_limits(measurements)
     return {
-        "css": Markup(_asset("style.css")),  # our own files
-        "script": Markup("\n".join(_asset(name) for name in SCRIPTS)),
-        "rules": StyleRules(),
-        "content_policy": content_policy,
         "scene": result.info.scene,
         "titles": names,
         "references": [m.name for m in measurements if tables.is_reference(m)],
-        "settings_line": tables.settings_line(result.experiment, camera[2], camera[1]),
+        "settings_line": tables.settings_line(result.experiment, [m.truth.z.shape for m in measurements]),
         "verdict": verdict(measurements),
-        "scene_picture": figures.scene_picture(result.passes[0].energy),
-        "materials": materials,
-        "material_legend": legend,
+        "cameras": [_camera(result, group) for group in cameras],
         "columns": tables.COLUMNS,
         "comparison": tables.comparison_table(measurements),
         "failures": tables.failure_table(measurements),
@@ -74,9 +62,45 @@ def context(result: Result) -> dict[str, Any]:
         "light": [_light(result, number) for number in range(len(result.passes))],
         "costs": tables.cost_table(measurements),
         "transport": _transport(result, names),
-        "viewer": _viewer_data(result, names, error),
+        "viewer": _viewer_data(result, cameras, names, error),
         "settings": _flat(result.info.experiment),
         "versions": {**result.info.versions, "Mitsuba variant": result.info.variant},
+    }
+
+
+def by_camera(measurements: Sequence[Measurement]) -> list[list[Measurement]]:
+    """Measurements in groups that share the camera and its place, so that a pixel is the same ray in all of a group.
+
+    The groups are in the order of their first measurements.
+    """
+    groups: list[list[Measurement]] = []
+    for m in measurements:
+        shared = (group for group in groups if _shares_camera(group[0], m))
+        group = next(shared, None)
+        if group is None:
+            groups.append([m])
+        else:
+            group.append(m)
+    return groups
+
+
+def _shares_camera(one: Measurement, other: Measurement) -> bool:
+    """Whether two instruments look through the same camera from the same place."""
+    rig, other_rig = one.capture.rig, other.capture.rig
+    assert rig is not None
+    assert other_rig is not None
+    return rig.camera == other_rig.camera and rig.shares_camera_pose(other_rig)
+
+
+def _camera(result: Result, group: Sequence[Measurement]) -> dict[str, Any]:
+    """Pictures of the scene from the camera that a group of measurements shares."""
+    materials, legend = figures.material_picture(group[0].truth)
+    return {
+        "names": [m.name for m in group],
+        "size": tables.size_text(group[0].truth.z.shape),
+        "scene": figures.scene_picture(result.passes[group[0].light_pass - 1].energy),
+        "materials": materials,
+        "legend": legend,
     }
 
 
@@ -133,11 +157,18 @@ def _transport(result: Result, names: dict[str, str]) -> list[dict[str, str]]:
     ]
 
 
-def _viewer_data(result: Result, names: dict[str, str], error: Any) -> dict[str, Any]:
-    far = cloud.far_limit(result.measurements)
-    truth = result.measurements[0].truth
+def _viewer_data(
+    result: Result, cameras: Sequence[Sequence[Measurement]], names: dict[str, str], error: Any
+) -> dict[str, Any]:
+    """Data of the page's script: every instrument, by its camera and its light pass, and the colours of all."""
+    camera_of = {m.name: number for number, group in enumerate(cameras) for m in group}
+    far = [cloud.far_limit(group) for group in cameras]
     return {
-        "instruments": [cloud.packed_measurement(m, visible_text(names[m.name]), far) for m in result.measurements],
+        "instruments": [
+            cloud.packed_measurement(m, visible_text(names[m.name]), camera_of[m.name], far[camera_of[m.name]])
+            for m in result.measurements
+        ],
+        "passes": [_pass_materials(light_pass.truth) for light_pass in result.passes],
         "errorColors": error.ravel().tolist(),
         "errorKneeM": palette.ERROR_KNEE_M,
         "errorLimitM": palette.ERROR_LIMIT_M,
@@ -145,6 +176,12 @@ def _viewer_data(result: Result, names: dict[str, str], error: Any) -> dict[str,
         "status": list(palette.STATUS_NAMES.values()),
         "causes": palette.OUTCOME_NAMES,
         "causeColors": palette.OUTCOME_COLORS.ravel().tolist(),
+    }
+
+
+def _pass_materials(truth: GroundTruth) -> dict[str, Any]:
+    """Material of each pixel of a light pass, as an index into the names and colours of the materials; -1 for none."""
+    return {
         "materials": [visible_text(n) for n in truth.material_names],
         "materialColors": [palette.MATERIAL_COLORS.get(n, palette.NO_DATA) for n in truth.material_names],
         "material": cloud.pack(truth.material.astype("int8")),
@@ -158,7 +195,3 @@ def _flat(data: Any, prefix: str = "") -> list[tuple[str, str]]:
     if isinstance(data, list) and data and isinstance(data[0], dict):
         return [pair for i, value in enumerate(data) for pair in _flat(value, f"{prefix}[{i}]")]
     return [(prefix, "default" if data is None else str(data))]
-
-
-def _asset(name: str) -> str:
-    return (files("rangesim.report") / name).read_text(encoding="utf-8")

@@ -4,17 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
 from pcgraph.plumbing.plain_files import sealed, unsealed
 from rangesim.report.figures import grey
-from rangesim.report.policy import StyleRules, content_policy, visible_text
+from rangesim.report.template import render_page
 from rangesim.rig.calibration_files import SEAL
 
 if TYPE_CHECKING:
@@ -43,11 +40,7 @@ def render_calibration(found: RigCalibration, names: Sequence[str], images: Sequ
     """
     if len(names) != len(found.camera_views) or (images is not None and len(images) != len(names)):
         raise ValueError(f"expected a name and an image of each of the {len(found.camera_views)} captures.")
-    environment = Environment(
-        autoescape=True, finalize=visible_text, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template = environment.from_string(_asset("calibration.html.j2"))
-    page = template.render(context(found, [str(name) for name in names], images))
+    page = render_page("calibration.html.j2", context(found, [str(name) for name in names], images))
     return sealed(f"{page}<!-- {unsealed(SEAL)} -->\n".encode(), SEAL, at_end=True).decode()
 
 
@@ -62,10 +55,6 @@ def context(found: RigCalibration, names: list[str], images: Sequence[np.ndarray
     by_name = {"camera": found.camera_rms_px, "projector": found.projector_rms_px}
     T = found.rig.T_camera_projector
     return {
-        "css": Markup(_asset("style.css")),  # our own files
-        "script": Markup(_asset("scroll.js")),
-        "rules": StyleRules(),
-        "content_policy": content_policy,
         "verdict": _verdict(found, names, devices, boards),
         "rms": {name: f"{value:.3f}" for name, value in by_name.items()},
         "devices": devices,
@@ -236,7 +225,3 @@ def _verdict(
             )
         )
     return lines
-
-
-def _asset(name: str) -> str:
-    return (files("rangesim.report") / name).read_text(encoding="utf-8")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 import zlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -26,9 +27,16 @@ def pack(array: np.ndarray) -> str:
     return base64.b64encode(zlib.compress(little.tobytes(), DEFLATE_LEVEL)).decode("ascii")
 
 
-def packed_measurement(m: Measurement, title: str, far_m: float) -> dict[str, Any]:
-    """What the viewer needs of one instrument.
+def packed_measurement(m: Measurement, title: str, view: int, far_m: float) -> dict[str, Any]:
+    """Data of one instrument for the viewer.
 
+    Parameters
+    ----------
+    view : number of the camera, from 0; instruments of the same number share their pixels.
+    far_m : metres, z from which points are not drawn.
+
+    Returns
+    -------
     z : uint16, 0 for none, else near_m + (value - 1) step_m. error : int16, in 10 µm, clipped.
     intensity, status, cause : uint8. supervoxel : uint16 or uint32, 0 for none, else index + 1.
     """
@@ -45,6 +53,7 @@ def packed_measurement(m: Measurement, title: str, far_m: float) -> dict[str, An
         "camera": [camera.fx, camera.fy, camera.cx, camera.cy],
         "nearM": near,
         "stepM": step,
+        "view": view,
         "hidden": int((m.image.valid & ~drawn).sum()),
         "lightPass": m.light_pass - 1,
         "z": pack(z),
@@ -56,8 +65,8 @@ def packed_measurement(m: Measurement, title: str, far_m: float) -> dict[str, An
     }
 
 
-def far_limit(measurements: tuple[Measurement, ...]) -> float:
-    """Metres, z from which points are not drawn."""
+def far_limit(measurements: Sequence[Measurement]) -> float:
+    """Metres, z from which no points of these measurements, which share a camera, are drawn."""
     depths = [float(np.nanmax(m.truth.z)) for m in measurements if np.isfinite(m.truth.z).any()]
     return FAR * max(depths, default=1.0)
 

@@ -73,7 +73,10 @@ const PAINT = {
     else put(rgb, i, DATA.errorColors, 3 * errorIndex(one.error[i] * DATA.errorStepM), 1);
   },
   cause: (one, i, rgb) => put(rgb, i, DATA.causeColors, 3 * one.cause[i], 1),
-  material: (one, i, rgb) => put(rgb, i, DATA.materialColors[DATA.material[i]] || NOTHING, 0, 0.35 + 0.65 * one.intensity[i] / 255),
+  material: (one, i, rgb) => {
+    const { material, materialColors } = DATA.passes[one.lightPass];
+    put(rgb, i, materialColors[material[i]] || NOTHING, 0, 0.35 + 0.65 * one.intensity[i] / 255);
+  },
   segments: (one, i, rgb) => {
     const s = one.segmentation, node = s && s.supervoxel[i] ? one.owner[s.supervoxel[i] - 1] : -1;
     if (node < 0) put(rgb, i, NOTHING, 0, 1);
@@ -124,7 +127,8 @@ class Page {
   constructor() {
     this.mode = "intensity";
     this.levels = new Levels(DATA.instruments.map((one) => one.segmentation).filter(Boolean));
-    this.view = { ...START, depth: this.middle(), changed: () => this.redraw() };
+    this.view = { ...START, changed: () => this.redraw() };
+    for (const one of DATA.instruments) one.middleM = this.middle(one.view);
     this.clouds = all("canvas.cloud").map((c) => cloudView(c, this.of(c), this.of(c).z, this.view));
     if (this.clouds.some((cloud) => cloud instanceof StillView)) this.sayStill();
     $("level").addEventListener("input", () => { this.setMode("segments"); this.setAltitude(this.levels.altitude(+$("level").value)); });
@@ -144,8 +148,8 @@ class Page {
 
   of(element) { return DATA.instruments[+element.dataset.instrument]; }
 
-  middle() {  // metres, median depth of the first sensor that sees anything
-    const one = DATA.instruments.find((o) => o.z.some((v) => v > 0));
+  middle(view) {  // metres, median depth of the first sensor of a camera that sees anything
+    const one = DATA.instruments.find((o) => o.view === view && o.z.some((v) => v > 0));
     if (!one) return 1;
     const seen = one.z.filter((v) => v > 0).sort();
     return one.nearM + seen[seen.length >> 1] * one.stepM;
@@ -189,11 +193,13 @@ class Page {
     const x = Math.floor((event.clientX - box.left) / box.width * here.width);
     const y = Math.floor((event.clientY - box.top) / box.height * here.height), i = y * here.width + x;
     if (!(i >= 0 && i < here.z.length)) return;
-    all(".map i").forEach((dot) => {
-      Object.assign(dot.style, { display: "block", left: `${100 * (x + 0.5) / here.width}%`, top: `${100 * (y + 0.5) / here.height}%` });
+    all(".map").forEach((other) => {  // a pixel of another camera is another ray
+      const display = this.of(other).view === here.view ? "block" : "none";
+      Object.assign(other.querySelector("i").style, { display, left: `${100 * (x + 0.5) / here.width}%`, top: `${100 * (y + 0.5) / here.height}%` });
     });
-    const material = DATA.materials[DATA.material[i]] || "nothing";
-    const said = DATA.instruments.flatMap((one, k) => [k ? " · " : "", bold(one.title), ` ${reading(one, i)}`]);
+    const truth = DATA.passes[here.lightPass], material = truth.materials[truth.material[i]] || "nothing";
+    const shared = DATA.instruments.filter((one) => one.view === here.view);
+    const said = shared.flatMap((one, k) => [k ? " · " : "", bold(one.title), ` ${reading(one, i)}`]);
     $("probe").replaceChildren(bold(`(${x}, ${y})`), ` ${material}: `, ...said);
   }
 }
@@ -215,7 +221,7 @@ function reading(one, i) {
 }
 
 async function start() {
-  DATA.material = await unpack(DATA.material, Int8Array);
+  await Promise.all(DATA.passes.map(async (one) => { one.material = await unpack(one.material, Int8Array); }));
   await Promise.all(DATA.instruments.map(unpackInstrument));
   const wanted = new URLSearchParams(location.hash.slice(1));
   const page = window.page = new Page();

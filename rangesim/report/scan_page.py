@@ -6,16 +6,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 
 from rangesim.fusion.mesh_error import distances_to, nearest_on
 from rangesim.fusion.sdf import signed_distance
 from rangesim.fusion.seen_volume import MAX_SLANT_TOLERANCES, VoxelState
 from rangesim.report import figures, palette
-from rangesim.report.build import _asset
 from rangesim.report.mesh_pictures import mesh_picture
-from rangesim.report.policy import StyleRules, content_policy, visible_text
+from rangesim.report.template import render_page
 from rangesim.rig import Intrinsics
 from rangesim.triangle_mesh import TriangleMesh
 
@@ -40,10 +37,7 @@ SOLID = (196, 160, 96)
 
 def render_scan_page(result: ScanResult) -> str:
     """The page of a scan as HTML."""
-    environment = Environment(
-        autoescape=True, finalize=visible_text, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.from_string(_asset("scan.html.j2")).render(context(result))
+    return render_page("scan.html.j2", context(result))
 
 
 def context(result: ScanResult) -> dict[str, Any]:
@@ -57,10 +51,6 @@ def context(result: ScanResult) -> dict[str, Any]:
     places = _places(result)
     fused = result.fused
     return {
-        "css": Markup(_asset("style.css")),  # our own files
-        "script": Markup(_asset("scroll.js")),
-        "rules": StyleRules(),
-        "content_policy": content_policy,
         "scene": result.settings.scene,
         "line": _line(result),
         "verdict": _verdict(result),

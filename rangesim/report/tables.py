@@ -279,11 +279,22 @@ def cost_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[str]
     return table
 
 
-def settings_line(experiment: Experiment, width: int, height: int) -> str:
-    """The settings of the light transport in one line."""
+def size_text(shape: tuple[int, ...]) -> str:
+    """Width and height of an image of a shape (h, w)."""
+    return f"{shape[1]} × {shape[0]}"
+
+
+def settings_line(experiment: Experiment, shapes: Sequence[tuple[int, ...]]) -> str:
+    """The settings of the light transport in one line.
+
+    Parameters
+    ----------
+    shapes : height and width of the images of each instrument, pixels.
+    """
+    sizes = " and ".join(dict.fromkeys(map(size_text, shapes)))
     paths = f"up to {experiment.max_spp}" if experiment.spp is None else experiment.spp
     return (
-        f"{width} × {height} pixels, {paths} light paths per pixel of up to {experiment.max_depth} segments, "
+        f"{sizes} pixels, {paths} light paths per pixel of up to {experiment.max_depth} segments, "
         f"seed {experiment.seed}"
     )
 

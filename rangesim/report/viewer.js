@@ -38,15 +38,18 @@ function unproject(instrument, z) {
   return { positions, pixels };
 }
 
-// Focal length over half the height, of the camera's own field of view.
-function focalOf(camera, height) { return 2 * camera[1] / height; }
+// Focal length over half the canvas's height, with which a canvas of an aspect shows the camera's whole field of view.
+function focalOf(instrument, aspect) {
+  const [fx, fy] = instrument.camera;
+  return Math.min(2 * fy / instrument.height, aspect * 2 * fx / instrument.width);
+}
 
 // Pixels that a point at its own distance covers, on a canvas of a height.
 function pointSize(camera, focal, height) { return 1.35 * focal * height / 2 / camera[1]; }
 
-// Turn about the centre at depth d, step back, project; column-major.
-function projection(view, focal, aspect) {
-  const { yaw, pitch, zoom, shift, depth } = view;
+// Turn about the centre at a depth, step back, project; column-major.
+function projection(view, depth, focal, aspect) {
+  const { yaw, pitch, zoom, shift } = view;
   const [sy, cy, sp, cp] = [Math.sin(yaw), Math.cos(yaw), Math.sin(pitch), Math.cos(pitch)];
   const r = [[cy, 0, sy], [sp * sy, cp, -sp * cy], [-cp * sy, sp, cp * cy]];
   const back = depth * 1.12 / zoom, near = 0.02 * back, far = back + 20 * depth;
@@ -99,7 +102,7 @@ function cloudView(canvas, instrument, z, view) {
 // A cloud from where the view starts, drawn without WebGL.
 class StillView {
   constructor(canvas, instrument, z, view) {
-    Object.assign(this, { canvas, view, camera: instrument.camera, height: instrument.height }, unproject(instrument, z));
+    Object.assign(this, { canvas, view, instrument }, unproject(instrument, z));
     canvas.classList.add("still");
   }
 
@@ -109,8 +112,8 @@ class StillView {
   draw() {
     const [width, height] = fit(this.canvas);
     if (!(width && height)) return;
-    const focal = focalOf(this.camera, this.height), size = pointSize(this.camera, focal, height);
-    const m = projection(this.view, focal, width / height), positions = this.positions;
+    const one = this.instrument, focal = focalOf(one, width / height), size = pointSize(one.camera, focal, height);
+    const m = projection(this.view, one.middleM, focal, width / height), positions = this.positions;
     const context = this.canvas.getContext("2d"), image = context.createImageData(width, height);
     const nearest = new Float32Array(width * height).fill(Infinity), shown = new Uint32Array(image.data.buffer);
     const color = (r, g, b) => new Uint32Array(new Uint8Array([r, g, b, 255]).buffer)[0];
@@ -136,7 +139,7 @@ class StillView {
 
 class CloudView {
   constructor(canvas, instrument, z, view, opened) {
-    Object.assign(this, { canvas, view, camera: instrument.camera, height: instrument.height }, opened, unproject(instrument, z));
+    Object.assign(this, { canvas, view, instrument }, opened, unproject(instrument, z));
     this.fill("position", this.positions, this.gl.FLOAT, false);
     this.follow();
   }
@@ -167,9 +170,10 @@ class CloudView {
     const gl = this.gl, [width, height] = fit(this.canvas);
     gl.viewport(0, 0, width, height);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const focal = focalOf(this.camera, this.height);
-    gl.uniformMatrix4fv(gl.getUniformLocation(this.program, "matrix"), false, projection(this.view, focal, width / height));
-    gl.uniform1f(gl.getUniformLocation(this.program, "size"), pointSize(this.camera, focal, height));
+    const one = this.instrument, focal = focalOf(one, width / height);
+    const matrix = projection(this.view, one.middleM, focal, width / height);
+    gl.uniformMatrix4fv(gl.getUniformLocation(this.program, "matrix"), false, matrix);
+    gl.uniform1f(gl.getUniformLocation(this.program, "size"), pointSize(one.camera, focal, height));
     gl.drawArrays(gl.POINTS, 0, this.pixels.length);
   }
 

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pages rendered from the templates of this package: each is one HTML file with its style sheet and scripts inside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from rangesim.report.policy import StyleRules, content_policy, visible_text
+
+
+def render_page(template: str, values: Mapping[str, Any], scripts: Sequence[str] = ("scroll.js",)) -> str:
+    """HTML page that a template of this package makes of values.
+
+    Every page also gets the style sheet (`css`), the scripts (`script`), the rules that the template adds to the style
+    sheet (`rules`) and the function that writes the page's security policy (`content_policy`).
+
+    Parameters
+    ----------
+    template : name of the template's file. values : the other variables of the template, by name.
+    scripts : names of the files whose JavaScript the page runs, in this order.
+
+    Raises
+    ------
+    jinja2.UndefinedError
+        The template uses a variable that is not there.
+    """
+    environment = Environment(
+        autoescape=True, finalize=visible_text, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    own = {  # `Markup` is not escaped: these files are part of the package
+        "css": Markup(_file("style.css")),
+        "script": Markup("\n".join(map(_file, scripts))),
+        "rules": StyleRules(),
+        "content_policy": content_policy,
+    }
+    return environment.from_string(_file(template)).render(own, **values)
+
+
+def _file(name: str) -> str:
+    """Text of a file of this package."""
+    return (files("rangesim.report") / name).read_text(encoding="utf-8")
