@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +14,7 @@ from rangesim.errors import warn
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
 from rangesim.settings.bounds import SECONDS, check_number
+from rangesim.settings.config import ShortRepr
 from rangesim.settings.seeds import check_seed
 
 if TYPE_CHECKING:
@@ -54,6 +55,64 @@ def expose(
         The pass lacks the sensor's signals, the exposure is not positive, the seed is out of its range, detector and
         sensor do not go together, or ambient light is stated for a scene that has none.
     """
+    return exposed(signals, sensor, detector, exposure_s, seed, ambient).capture
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Exposure(ShortRepr):
+    """A capture together with the light that it was exposed from.
+
+    capture : Capture.
+    signals : Signals.
+    radiance : (k, h, w) float32, W/m2/sr, mean of the light that the detector turns into each frame; None: the capture
+        is noise-free, and its frames are the radiance.
+    """
+
+    capture: Capture
+    signals: Signals
+    radiance: np.ndarray | None = None
+
+    def photons_per_pulse(self) -> np.ndarray | None:
+        """(h, w) float64, mean number of photons that each pixel detects per laser pulse, counted by the detector or
+        not; None where the detector integrates, or the capture is noise-free."""
+        capture = self.capture
+        if capture.detector is None or self.radiance is None or capture.sensor.gate is None:
+            return None
+        return capture.detector.photons_per_pulse(self.radiance, capture.sensor.gate, self.signals.rig)
+
+    def warn_of_overexposure(self, name: str) -> None:
+        """Warn if the detector's shortest exposure, which was chosen automatically, saturates the bright pixels.
+
+        name : of the instrument.
+
+        Warns
+        -----
+        RangesimWarning
+        """
+        capture, rig = self.capture, self.signals.rig
+        detector = capture.detector
+        if detector is None or self.radiance is None or capture.exposure_s > detector.min_exposure_s:
+            return
+        level = bright_level(self.radiance.max(axis=0)) * detector.electron_rate_per_radiance(rig)
+        if level * capture.exposure_s > detector.capacity_e:
+            lit = self.signals.energy.projector > 0
+            fraction = np.mean(capture.saturated(capture.frames), where=lit) if lit.any() else 0.0
+            warn(
+                f"{name}: the detector's shortest exposure, {capture.exposure_s:g} s, saturates {100 * fraction:.0f} % "
+                "of the pixels that get light of the projector; take less light "
+                f"(its power_w is {rig.projector_power_w:g}), or a shorter min_exposure_s."
+            )
+
+
+def exposed(
+    signals: Signals,
+    sensor: Sensor,
+    detector: PhotoDetector | None = None,
+    exposure_s: float | None = None,
+    seed: int = 0,
+    ambient: Ambient | None = None,
+) -> Exposure:
+    """Capture of `sensor` with the light that it was exposed from; parameters and errors as of `expose`."""
     if detector is not None and not isinstance(detector, PhotoDetector):
         raise ValueError(f"expected a Detector, a SpadDetector or None, got {detector!r}.")
     seed = check_seed(seed)
@@ -62,25 +121,12 @@ def expose(
     if ambient is not None:
         ambient.check_emitters(bool(signals.energy.ambient.any()))
     if detector is None or sensor.is_ideal:
-        return noise_free_capture(signals, sensor, ambient)
+        return Exposure(noise_free_capture(signals, sensor, ambient), signals)
     radiance = _mean_radiance(signals, sensor, detector, ambient)
     if exposure_s is None:
         exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
     frames = detector.read_out(radiance, sensor.gate, signals.rig, exposure_s, seed)
-    return Capture(frames, sensor, signals.rig, detector, exposure_s, ambient)
-
-
-def photons_per_pulse(signals: Signals, capture: Capture) -> np.ndarray | None:
-    """(h, w) float64, photons that each pixel of the capture detected per laser pulse, on average, whether or not the
-    detector could count them; None if it integrates, or the capture is noise-free.
-
-    signals : those that the capture was exposed from.
-    """
-    sensor, detector = capture.sensor, capture.detector
-    if detector is None or sensor.gate is None:
-        return None
-    radiance = _mean_radiance(signals, sensor, detector, capture.ambient)
-    return detector.photons_per_pulse(radiance, sensor.gate, signals.rig)
+    return Exposure(Capture(frames, sensor, signals.rig, detector, exposure_s, ambient), signals, radiance)
 
 
 def noise_free_capture(
@@ -134,27 +180,3 @@ def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetecto
         return detector.max_exposure_s
     wanted = TARGET_FRACTION * detector.capacity_e / level
     return float(np.clip(wanted, detector.min_exposure_s, detector.max_exposure_s))
-
-
-def warn_of_overexposure(name: str, capture: Capture, signals: Signals) -> None:
-    """Warn of a capture whose automatic exposure is as short as can be, and yet too long for its bright pixels.
-
-    name : of the instrument. signals : those that the capture was exposed from.
-
-    Warns
-    -----
-    RangesimWarning
-    """
-    detector, rig = capture.detector, signals.rig
-    if detector is None or capture.exposure_s > detector.min_exposure_s:
-        return
-    radiance = _mean_radiance(signals, capture.sensor, detector, capture.ambient)
-    level = bright_level(radiance.max(axis=0)) * detector.electron_rate_per_radiance(rig)
-    if level * capture.exposure_s > detector.capacity_e:
-        lit = signals.energy.projector > 0
-        fraction = np.mean(capture.saturated(capture.frames), where=lit) if lit.any() else 0.0
-        warn(
-            f"{name}: the detector's shortest exposure, {capture.exposure_s:g} s, saturates {100 * fraction:.0f} % of "
-            "the pixels that get light of the projector; take less light "
-            f"(its power_w is {rig.projector_power_w:g}), or a shorter min_exposure_s."
-        )
