@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that are about files and the environment, and warnings; bad arguments are a plain ValueError.
+"""Errors about files and about the machine, and warnings. Bad arguments raise a plain ValueError instead.
 
-The message of each is one clear sentence that names what was found, what is needed and the fix: the
-command line prints it as it stands.
+Every message is one clear sentence that names what was found, what is needed, and how to fix it. The command line
+prints it unchanged.
 """
 
 from __future__ import annotations
@@ -29,30 +29,40 @@ __all__ = [
 ]
 
 MAX_SENTENCE = 480
-"""Characters of a message. Files may hold names of a megabyte."""
+"""Number of characters of a message, about six lines of a terminal; a longer message loses its middle. Files may hold
+names of a megabyte."""
 
 
 class RangesimError(Exception):
-    """Base of every error that rangesim raises itself, except ValueError for bad arguments."""
+    """Base of all errors that rangesim raises, except ValueError for bad arguments.
+
+    Examples
+    --------
+    >>> str(FileFormatError("scene.xml is\\nno scene"))  # always one line
+    'scene.xml is no scene'
+    """
 
     def __init__(self, message: str = "") -> None:
         super().__init__(sentence(message))
 
 
 class FileFormatError(RangesimError):
-    """A file is missing, broken, or does not hold what its place asks for."""
+    """A file is missing, is broken, or holds something other than expected."""
 
 
 class EnvironmentProblem(RangesimError):
-    """This machine lacks something that rangesim needs, such as a new enough LLVM."""
+    """The machine lacks something that rangesim needs, such as a recent LLVM."""
 
 
 class RangesimWarning(UserWarning):
-    """Something is left out of a result, or read as what it may not be."""
+    """A result leaves something out, or rests on an assumption that may be wrong."""
 
 
 class TruncationWarning(RangesimWarning):
-    """Light paths were ended so early that a noticeable part of the projector's light, `fraction`, is missing."""
+    """Light paths ended so early that a noticeable part of the projector's light is missing.
+
+    fraction : the missing part, 0 to 1.
+    """
 
     def __init__(self, message: str, fraction: float) -> None:
         super().__init__(message)
@@ -60,28 +70,28 @@ class TruncationWarning(RangesimWarning):
 
 
 class AlignmentWarning(RangesimWarning):
-    """Poses of views that nothing confirms."""
+    """The poses of some views are not confirmed by the data."""
 
 
 class SamplingWarning(RangesimWarning):
-    """The noise that the sampling of light paths makes is not small against the detector's."""
+    """The sampling error of the light transport is not small compared with the detector's noise."""
 
 
 def warn(message: str) -> None:
-    """Warn with one sentence; the command line prints it on a line of its own."""
+    """Issue a `RangesimWarning` of one sentence; the command line prints it on a line of its own."""
     warnings.warn(sentence(message), RangesimWarning, stacklevel=3)
 
 
 @contextmanager
 def without_warnings() -> Iterator[None]:
-    """Suppress `RangesimWarning`: what is decoded again for comparison has warned already."""
+    """Suppress `RangesimWarning` while the block runs, where a computation is repeated that has warned already."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RangesimWarning)
         yield
 
 
 def sentence(message: str) -> str:
-    """A message on one printable line, without its middle if it is too long to read."""
+    """A message as one printable line; one longer than `MAX_SENTENCE` loses its middle."""
     line = visible(without_long_words(message))
     if len(line) <= MAX_SENTENCE:
         return line

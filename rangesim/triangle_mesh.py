@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Triangle meshes: the true surface of a scene, and what views are fused to."""
+"""Triangle meshes, for the true surface of a scene and for the surface fused from several views."""
 
 from __future__ import annotations
 
@@ -24,17 +24,29 @@ _HEAD = (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TriangleMesh(ShortRepr):
-    """Triangles over shared vertices.
+    """A triangle mesh: vertices, and triangles as indices of them.
 
     Parameters
     ----------
     vertices : (n, 3) float64, metres, world.
-    faces : (m, 3) int32, indices of vertices, counter-clockwise as seen from outside.
+    faces : (m, 3) int32, indices of vertices, counter-clockwise seen from outside.
 
     Raises
     ------
     ValueError
-        Shapes that do not fit, vertices that are not finite, or indices of vertices that are not there.
+        An array of another shape, a vertex that is not finite, or an index out of range.
+
+    Examples
+    --------
+    >>> corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    >>> tetrahedron = TriangleMesh(corners, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    >>> tetrahedron.is_closed
+    True
+    >>> round(tetrahedron.volume_m3, 6)
+    0.166667
+    >>> points, faces = tetrahedron.sample(100)
+    >>> points.shape
+    (100, 3)
     """
 
     vertices: np.ndarray
@@ -53,7 +65,7 @@ class TriangleMesh(ShortRepr):
 
     @classmethod
     def joined(cls, meshes: list[TriangleMesh]) -> TriangleMesh:
-        """All triangles of several meshes; no vertices are merged."""
+        """One mesh with the triangles of several; vertices at the same place stay separate."""
         starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
         vertices = [np.zeros((0, 3)), *(m.vertices for m in meshes)]
         faces = [np.zeros((0, 3), np.int32), *(m.faces + s for m, s in zip(meshes, starts, strict=False))]
@@ -61,18 +73,18 @@ class TriangleMesh(ShortRepr):
 
     @property
     def corners(self) -> np.ndarray:
-        """(m, 3, 3) float64, metres, the corners of each triangle."""
+        """(m, 3, 3) float64, the three corners of each triangle, metres, world."""
         return np.asarray(self.vertices[self.faces])
 
     @property
     def face_areas_m2(self) -> np.ndarray:
-        """(m,) float64."""
+        """(m,) float64, areas of the triangles, square metres."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
         return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1))
 
     @property
     def face_normals(self) -> np.ndarray:
-        """(m, 3) float64, unit, outward; NaN of triangles without an area."""
+        """(m, 3) float64, outward unit normals of the triangles, world; NaN for triangles without area."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
         n = np.cross(b - a, c - a)
         with np.errstate(invalid="ignore"):
@@ -80,19 +92,24 @@ class TriangleMesh(ShortRepr):
 
     @property
     def area_m2(self) -> float:
-        """Of all triangles together."""
+        """Total area of the triangles, square metres."""
         return float(self.face_areas_m2.sum())
 
     @property
     def volume_m3(self) -> float:
-        """Enclosed volume of a closed mesh, by the divergence theorem: the sum of a . (b x c) / 6 over its
-        triangles."""
+        """Volume that a closed mesh encloses, cubic metres.
+
+        By the divergence theorem it is the sum of a . (b x c) / 6 over the triangles with corners a, b and c.
+        """
         a, b, c = np.moveaxis(self.corners - self.vertices.mean(axis=0), 1, 0)
         return float((a * np.cross(b, c)).sum() / 6)
 
     @property
     def is_closed(self) -> bool:
-        """Whether each edge has as many triangles on one side as on the other; vertices at one place are one."""
+        """Whether the mesh is closed: every edge has as many triangles on one side as on the other.
+
+        Vertices at the same place count as one.
+        """
         if not len(self.faces):
             return False
         scale = max(float(np.ptp(self.vertices, axis=0).max()), 1e-30)
@@ -104,9 +121,15 @@ class TriangleMesh(ShortRepr):
         return bool(np.array_equal(np.sort(a * count + b), np.sort(b * count + a)))
 
     def sample(self, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Points that are spread evenly over the area (n, 3) float64, metres, and the face each lies on (n,).
+        """Random points on the surface, uniform by area.
 
-        Stratified in area: the k-th point lies in the k-th n-th of it.
+        The points are stratified: the area is cut into n equal parts, in the order of the faces, and each part gets one
+        point.
+
+        Returns
+        -------
+        points : (n, 3) float64, metres, world.
+        faces : (n,) int64, index of the triangle on which each point lies.
 
         Raises
         ------
@@ -124,19 +147,19 @@ class TriangleMesh(ShortRepr):
         return (1 - s) * a + s * (1 - t) * b + s * t * c, face
 
     def moved(self, T: ArrayLike) -> TriangleMesh:
-        """The mesh under a rigid transform (4, 4)."""
+        """The mesh moved by a rigid transform T, (4, 4), metres."""
         matrix = np.asarray(T, dtype=np.float64)
         return TriangleMesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
 
     def save(self, path: str | Path) -> None:
-        """Write a binary `.ply` file, which appears when it is complete; vertices in double precision.
+        """Write a binary `.ply` file with vertices in double precision. The file appears only when it is complete.
 
         Raises
         ------
         ValueError
-            The file name ends in something else.
+            The file name does not end in `.ply`.
         FileFormatError
-            The place cannot be written.
+            The file cannot be written.
         """
         from pcgraph.plumbing.plain_files import write_file
         from rangesim.errors import FileFormatError

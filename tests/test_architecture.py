@@ -166,6 +166,7 @@ def test_pcgraph_never_imports_rangesim_or_a_renderer() -> None:
 
 STOREYS = [
     "plumbing",
+    "own_files",
     "errors",
     "cloud",
     "columns",

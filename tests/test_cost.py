@@ -15,10 +15,12 @@ from small_result import ROOT
 
 from rangesim import load_scene
 from rangesim.cli import main
-from rangesim.experiment import Experiment, cost, pipeline
+from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import instrument
 from rangesim.motion import ConstantTwist, Motion, Timing
+from rangesim.pipeline import cost, experiment_run
 from rangesim.pipeline.cost import Cost, available_memory_bytes, estimate_cost
+from rangesim.pipeline.passes import group_by_rig
 from rangesim.sensors import DirectToF
 from rangesim.settings import limits
 
@@ -27,7 +29,7 @@ MATTE = str(ROOT / "scenes" / "matte.xml")
 
 def of(experiment: Experiment, trial: bool = False) -> Cost:
     scene = load_scene(experiment.scene)
-    return estimate_cost(experiment, scene, pipeline.group_by_rig(experiment, scene), trial)
+    return estimate_cost(experiment, scene, group_by_rig(experiment, scene), trial)
 
 
 def test_light_paths_are_pixels_times_samples_times_passes() -> None:
@@ -61,7 +63,7 @@ def test_what_exceeds_the_memory_is_refused_before_the_work(tmp_path: Path, monk
     large = Experiment(MATTE, width=8000, height=8000, spp=1)
     start = time.process_time()
     with pytest.raises(ValueError, match=r"expected a run within the .* GB .* this one takes about 128 M light paths"):
-        pipeline.run(large, tmp_path / "out")
+        experiment_run.run(large, tmp_path / "out")
     assert time.process_time() - start < 5
     assert not list(tmp_path.iterdir())
 
@@ -69,7 +71,7 @@ def test_what_exceeds_the_memory_is_refused_before_the_work(tmp_path: Path, monk
 def test_the_memory_that_a_run_may_take_can_be_set(tmp_path: Path) -> None:
     small = Experiment(MATTE, width=32, height=24, spp=1)
     with limits.raised(memory=10**6), pytest.raises(ValueError, match=r"within the 0\.0 GB"):
-        pipeline.run(small, tmp_path / "out")
+        experiment_run.run(small, tmp_path / "out")
     with limits.raised(memory=10**15):
         Cost(1, 1, 1, 1, 10**14, 1.0).check_memory()
 
@@ -179,7 +181,7 @@ def test_other_work_on_the_machine_does_not_lengthen_an_estimate(
 def test_a_long_run_is_estimated_by_a_trial_within_a_factor_of_two() -> None:
     experiment = Experiment(MATTE, width=320, height=240, spp=64, instruments=(instrument("ideal-tof"),))
     scene = load_scene(experiment.scene)
-    ((rig, instruments),) = pipeline.group_by_rig(experiment, scene)
+    ((rig, instruments),) = group_by_rig(experiment, scene)
     from rangesim import transport
 
     compile_s, fixed_s, path_s = cost._timed_trial(experiment, scene, (rig, instruments))

@@ -15,7 +15,7 @@ from synthetic import plane_signals, stereo_rig
 from rangesim import save_capture
 from rangesim.capture.exposure import expose
 from rangesim.response import Fringes, GrayBits, Images, LightPath, NumpyMath
-from rangesim.response.defocus import SWITCH, blurred_stripes
+from rangesim.response.defocus import MIN_HARMONIC_SIGMA, blurred_stripes
 from rangesim.results.capture_files import load_capture
 from rangesim.rig import Intrinsics, Lens, Rig
 from rangesim.sensors import IdealToF
@@ -34,7 +34,9 @@ def path(u: np.ndarray, v: np.ndarray, blur_px: float | None) -> LightPath:
 
 
 @pytest.mark.parametrize("bit", [0, 2, 5])
-@pytest.mark.parametrize("periods", [1e-3, 0.01, 0.05, 0.99 * SWITCH, 1.01 * SWITCH, 0.1, 0.3, 1.0])
+@pytest.mark.parametrize(
+    "periods", [1e-3, 0.01, 0.05, 0.99 * MIN_HARMONIC_SIGMA, 1.01 * MIN_HARMONIC_SIGMA, 0.1, 0.3, 1.0]
+)
 def test_gray_stripes_out_of_focus_are_the_convolved_stripes(bit: int, periods: float) -> None:
     """Brute force: the stripes' spectrum times that of the Gaussian, 65536 samples per period."""
     period = 4 * 2**bit

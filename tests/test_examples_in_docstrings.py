@@ -9,8 +9,22 @@ import pkgutil
 
 import pytest
 
-ROOMS = ["rangesim.geometry", "rangesim.multiview"]
+ROOMS = [
+    "pcgraph.plumbing",
+    "rangesim.calibration",
+    "rangesim.electronics",
+    "rangesim.fusion",
+    "rangesim.geometry",
+    "rangesim.motion",
+    "rangesim.multiview",
+    "rangesim.response",
+    "rangesim.rig",
+    "rangesim.settings",
+    "rangesim.signals",
+]
 """Packages whose docstrings are run, all of their modules."""
+MODULES = ["rangesim.errors", "rangesim.triangle_mesh"]
+"""Modules outside these packages whose docstrings are run."""
 
 
 def modules_of(room: str) -> list[str]:
@@ -30,3 +44,11 @@ def test_the_examples_of_a_room_print_what_they_say(room):
         if (failed := doctest.testmod(importlib.import_module(name), optionflags=options).failed)
     }
     assert not failures, f"failed examples per module: {failures}; doctest's report stands above."
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_the_examples_of_a_module_print_what_they_say(module):
+    options = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    tried = doctest.testmod(importlib.import_module(module), optionflags=options)
+    assert tried.attempted > 0
+    assert tried.failed == 0

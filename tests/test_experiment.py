@@ -24,7 +24,8 @@ from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_
 from rangesim.experiment.scan_settings import scan_settings_from_dict
 from rangesim.instrument.instrument import DEFAULT_SENSORS, Instrument, instrument
 from rangesim.motion import ConstantTwist, Motion, Timing
-from rangesim.pipeline.experiment_run import group_by_rig, noise_seed, run
+from rangesim.pipeline.experiment_run import noise_seed, run
+from rangesim.pipeline.passes import group_by_rig
 from rangesim.results.run_files import load_result
 from rangesim.rig import Lens
 from rangesim.sensors import DirectToF, IdealToF
@@ -96,7 +97,7 @@ def test_usual_detectors() -> None:
     assert instrument("amcw").detector == Detector.time_of_flight()
     assert Instrument("d", DirectToF()).detector == SpadDetector()
     assert Instrument("i", IdealToF()).detector is None
-    assert instrument("amcw", noise=False).detector is None
+    assert instrument("amcw", noise=False).detector_in_use is None
 
 
 def test_instruments_with_the_same_emitter_share_a_pass() -> None:
@@ -104,7 +105,7 @@ def test_instruments_with_the_same_emitter_share_a_pass() -> None:
     names = [*DEFAULT_SENSORS, "direct-tof", "gray"]
     experiment = Experiment("plane.xml", width=32, height=24, instruments=tuple(instrument(n) for n in names))
     groups = [[i.name for i in ones] for _, ones in group_by_rig(experiment, scene)]
-    assert groups == [["gray-phase", "gray"], ["amcw", "ideal-tof", "direct-tof"]]
+    assert groups == [["gray-phase", "gray"], ["amcw", "ideal-tof"], ["direct-tof"]]  # 850 nm, and 905 nm
     far = replace(experiment, instruments=(instrument("amcw"), instrument("ideal-tof", baseline_m=0.1)))
     assert len(group_by_rig(far, scene)) == 2
 

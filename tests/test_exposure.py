@@ -278,5 +278,5 @@ def test_impossible_exposures_are_refused() -> None:
         expose(signals, SENSOR, SpadDetector(), 1e-3)
     with pytest.raises(ValueError, match="SpadDetector"):
         expose(signals, DirectToF(bins=4, pulse_fwhm_s=0.0), Detector(), 1e-3)
-    with pytest.raises(ValueError, match="trace it with this sensor"):
+    with pytest.raises(ValueError, match="run transport with this sensor"):
         expose(signals, AmcwToF(), Detector(), 1e-3)

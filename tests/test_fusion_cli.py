@@ -16,6 +16,7 @@ from browser import BROWSER, browser
 from fusion_scenes import part
 from scroll_hints import check_scroll_hints
 from small_result import ROOT
+from tiers import to_validate
 from typer.testing import CliRunner
 
 from rangesim import load_range_image
@@ -162,7 +163,7 @@ def test_a_scan_beyond_the_memory_is_refused_before_the_work(tmp_path: Path) -> 
     assert "expected --out DIRECTORY" in CliRunner().invoke(app, ["scan", "matte"]).output
 
 
-@pytest.mark.parametrize(("width", "views"), [(80, 3), (128, 2)])
+@pytest.mark.parametrize(("width", "views"), [(80, 3), *to_validate((128, 2))])
 def test_the_cost_of_a_scan_is_as_counted(width: int, views: int, tmp_path: Path) -> None:
     options = ("matte", "--width", str(width), "--views", str(views), "--spp", "4")
     found = COST.fullmatch(run(*options, "--estimate").strip())

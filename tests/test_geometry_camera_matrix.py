@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera matrices: made, taken apart two ways, applied and inverted; against OpenCV, and the closed form."""
+"""Camera matrices: composition, both decompositions, projection and back-projection, compared with OpenCV."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CAMERA = Intrinsics(640, 480, 800, 790, 322, 236, (-0.2, 0.05, 1e-3, -2e-3))
 
 
 def random_camera(random: np.random.Generator, skew: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """K, pose and P at a random scale, of either sign."""
+    """A random K, a random pose and their P, with a random scale and sign."""
     K = np.array([[random.uniform(300, 2000), skew, 320], [0, random.uniform(300, 2000), 240], [0, 0, 1]])
     T = rigid(Rotation.random(rng=random).as_rotvec(), random.normal(0, 2, 3))
     return K, T, random.normal() * 3 * projection_matrix(K, T)
@@ -47,7 +47,7 @@ def test_decomposition_gives_back_the_parts(skew: float) -> None:
             assert parts.skew == pytest.approx(skew, abs=1e-8)
 
 
-def test_it_agrees_with_opencv() -> None:
+def test_decomposition_agrees_with_opencv() -> None:
     random = np.random.default_rng(1)
     for _ in range(20):
         _, _, P = random_camera(random, 3.0)
@@ -59,7 +59,7 @@ def test_it_agrees_with_opencv() -> None:
         np.testing.assert_allclose(parts.centre, (C[:3] / C[3]).ravel(), atol=1e-7)
 
 
-def test_the_closed_form_of_zero_skew_is_the_textbooks() -> None:
+def test_zero_skew_is_the_closed_form_of_the_textbook() -> None:
     """K from A = P3 P3^T normalised to A33 = 1: x0 = A13, y0 = A23, fx = sqrt(A11 - x0^2), fy = sqrt(A22 - y0^2)."""
     K, T, P = random_camera(np.random.default_rng(2))
     A = P[:, :3] @ P[:, :3].T
@@ -75,7 +75,7 @@ def test_the_closed_form_of_zero_skew_is_the_textbooks() -> None:
 
 
 def test_the_pose_has_six_parameters() -> None:
-    """P has eleven degrees of freedom; five are K, six the pose."""
+    """P has eleven degrees of freedom: five of K and six of the pose."""
 
     def camera(v: np.ndarray) -> np.ndarray:
         P = projection_matrix([[v[0], v[1], v[2]], [0, v[3], v[4]], [0, 0, 1]], rigid(v[5:8], v[8:]))
@@ -116,7 +116,7 @@ def test_points_behind_the_camera_have_no_image() -> None:
     assert np.isfinite(project(P, X)).all(axis=1).tolist() == [True, False, False]
 
 
-def test_projection_is_that_of_the_rig_and_of_opencv() -> None:
+def test_projection_agrees_with_the_rig_and_with_opencv() -> None:
     X = np.random.default_rng(5).uniform((-1, -1, 2), (1, 1, 5), (40, 3))
     T = rigid((0.1, 0.2, -0.1), (0.1, 0, 0.2))
     ideal = project(projection_matrix(CAMERA, T), X)
@@ -157,7 +157,7 @@ AFFINE = np.array([[1.0, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]])
         (lambda: projection_matrix(CAMERA, np.diag([2, 1, 1, 1])), "rigid"),
     ],
 )
-def test_what_is_no_camera_is_said(call, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_invalid_cameras_are_refused(call, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=message):
         call()
     # an affine camera has a centre, at infinity

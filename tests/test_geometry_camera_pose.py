@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose of a camera from known points: against OpenCV and the Cramer-Rao bound; planes with two poses; bad input."""
+"""The pose of a camera from known points: OpenCV, the Cramer-Rao bound, planes with two poses, invalid input."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def seen(X: np.ndarray, T: np.ndarray = TRUE) -> np.ndarray:
 
 
 def difference(T: np.ndarray, other: np.ndarray = TRUE) -> np.ndarray:
-    """(6,) rotation vector and translation between two poses."""
+    """(6,) rotation vector, rad, and translation, metres, between two poses."""
     return np.concatenate([Rotation.from_matrix(T[:3, :3] @ other[:3, :3].T).as_rotvec(), T[:3, 3] - other[:3, 3]])
 
 
@@ -46,8 +46,8 @@ def test_exact_pixels_give_the_pose_through_a_distorted_lens(n: int, plane: bool
 @pytest.mark.parametrize("metres", [30.0, 1000.0, 5e5])
 @pytest.mark.parametrize(("n", "plane"), [(6, False), (30, False), (12, True)])
 @pytest.mark.parametrize("fit", [fit_camera_pose, find_camera_pose])
-def test_far_from_the_origin_it_is_the_same(fit, metres: float, n: int, plane: bool) -> None:  # type: ignore[no-untyped-def]
-    """Points at an offset give the pose at the origin, moved, with the covariance carried along."""
+def test_the_pose_is_the_same_far_from_the_origin(fit, metres: float, n: int, plane: bool) -> None:  # type: ignore[no-untyped-def]
+    """Points at an offset give the pose at the origin, moved by the offset, with the covariance moved too."""
     random = np.random.default_rng(n)
     X = target(random, n, plane)
     x = seen(X) + random.normal(0, 0.1, (n, 2))
@@ -66,7 +66,7 @@ def test_far_from_the_origin_it_is_the_same(fit, metres: float, n: int, plane: b
     np.testing.assert_allclose(far.covariance[3:, 3:], np.cov(t.T), atol=0.04 * np.trace(np.cov(t.T)))
 
 
-def test_it_agrees_with_opencv() -> None:
+def test_the_pose_agrees_with_opencv() -> None:
     random = np.random.default_rng(1)
     for _ in range(10):
         X = target(random, 15)
@@ -81,7 +81,7 @@ def test_it_agrees_with_opencv() -> None:
 
 @pytest.mark.validation
 @pytest.mark.parametrize("plane", [False, True])
-def test_it_reaches_the_bound_and_knows_it(plane: bool) -> None:
+def test_the_pose_reaches_the_bound_and_states_its_covariance(plane: bool) -> None:
     random = np.random.default_rng(2)
     X = target(random, 20, plane)
 
@@ -136,10 +136,10 @@ LINE = np.linspace(-0.5, 0.5, 8)[:, None] * [1.0, 0.3, 0.2]
 WIDE = Intrinsics(640, 480, 300, 300, 320, 240, (-0.9,))
 
 
-def test_points_on_a_line_to_their_noise_leave_the_turn_open() -> None:
+def test_points_on_a_line_within_their_noise_are_refused() -> None:
     for _ in range(5):
         nearly = LINE + RANDOM.normal(0, 1e-4, LINE.shape)
-        with pytest.raises(ValueError, match="leave its rotation open"):
+        with pytest.raises(ValueError, match="do not determine its rotation"):
             fit_camera_pose(nearly, seen(LINE) + RANDOM.normal(0, NOISE, (8, 2)), CAMERA, noise_px=NOISE)
 
 
@@ -148,7 +148,7 @@ def test_points_on_a_line_to_their_noise_leave_the_turn_open() -> None:
     [
         (lambda: fit_camera_pose(X[:3], seen(X[:3]), CAMERA), "three leave up to four poses"),
         (lambda: fit_camera_pose(np.repeat(X[:3], 3, 0), np.repeat(seen(X[:3]), 3, 0), CAMERA), "3 different ones"),
-        (lambda: fit_camera_pose(LINE, seen(LINE), CAMERA), "turn about it is open"),
+        (lambda: fit_camera_pose(LINE, seen(LINE), CAMERA), "rotation about that line is not determined"),
         (lambda: fit_camera_pose(X, seen(X)[:5], CAMERA), "as many pixels"),
         (lambda: fit_camera_pose(X, np.full((12, 2), np.nan), CAMERA), "24 NaN"),
         (lambda: fit_camera_pose(X, seen(X), CAMERA, noise_px=0), "noise_px"),
@@ -157,18 +157,18 @@ def test_points_on_a_line_to_their_noise_leave_the_turn_open() -> None:
         (lambda: find_camera_pose(target(RANDOM, 40), RANDOM.uniform(0, 480, (40, 2)), CAMERA, NOISE), "than chance"),
     ],
 )
-def test_what_cannot_be_done_is_said(call, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_invalid_input_is_refused(call, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=message):
         call()
 
 
-def test_points_behind_the_camera_are_no_pose() -> None:
-    """Pixels of points behind a pinhole, as a projection without cheirality gives them, are mirrored: no pose fits."""
+def test_points_behind_the_camera_are_refused() -> None:
+    """A projection without the test for points behind the camera mirrors their pixels, so that no pose fits."""
     T = rigid((0.3, -0.4, 0.2), (0.1, 0.05, -2.5))
     Y = X @ T[:3, :3].T + T[:3, 3]
     pixels = Y[:, :2] / Y[:, 2:] * 800 + [320, 240]
     plain = Intrinsics(640, 480, 800, 800, 320, 240)
-    with pytest.raises(ValueError, match=r"to their noise of 0.3 px, got residuals"):
+    with pytest.raises(ValueError, match=r"within their noise of 0.3 px, got residuals"):
         fit_camera_pose(X, pixels, plain, noise_px=NOISE)
     with pytest.raises(ValueError, match="chance"):
         find_camera_pose(X, pixels, plain, NOISE)

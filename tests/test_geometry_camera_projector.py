@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera and projector: the depth of a known ray from a noisy projector coordinate, and what the second axis gains."""
+"""Camera and projector: depth of a known ray from a noisy projector coordinate, with one coded axis and with both."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TRIALS = 20000
 
 
 def rig(tilt_deg: float) -> Rig:
-    """A projector 0.2 m from the camera, in a direction that is tilted against its columns, turned inwards."""
+    """A rig whose projector stands 0.2 m from the camera in a direction tilted against its columns, turned inwards."""
     tilt = np.radians(tilt_deg)
     T = rigid((0.0, -0.15, 0.0), (0.2 * np.cos(tilt), 0.2 * np.sin(tilt), 0.03))
     return Rig(
@@ -23,7 +23,7 @@ def rig(tilt_deg: float) -> Rig:
 
 
 def readings(device: Rig, z: float, noise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rays (n, 3), all the same, and noisy projector coordinates (n, 2); and the exact ones (2,)."""
+    """n times the same ray (n, 3), noisy projector coordinates (n, 2), and the exact coordinates (2,)."""
     ray = device.camera.directions(np.array([250.0, 300.0]))
     T = np.linalg.inv(device.T_camera_projector)
     exact = device.projector.project(T[:3, :3] @ (ray * z) + T[:3, 3])
@@ -32,7 +32,7 @@ def readings(device: Rig, z: float, noise: float) -> tuple[np.ndarray, np.ndarra
 
 
 def bound(device: Rig, z: float, noise: float, axes: list[int]) -> float:
-    """Least standard deviation of z from these axes, by differences."""
+    """Least standard deviation of z that these axes allow, by numerical derivatives."""
     h = 1e-6
     ray = device.camera.directions(np.array([250.0, 300.0]))
     T = np.linalg.inv(device.T_camera_projector)
@@ -41,8 +41,8 @@ def bound(device: Rig, z: float, noise: float, axes: list[int]) -> float:
 
 
 @pytest.mark.parametrize("tilt_deg", [0, 30, 60, 85])
-def test_both_axes_reach_the_bound_and_gain_what_the_tilt_says(tilt_deg: float) -> None:
-    """The gain over columns alone is 1 / cos of the angle of the epipolar line: 1 with the devices side by side."""
+def test_both_axes_reach_the_bound_and_gain_with_the_tilt_of_the_baseline(tilt_deg: float) -> None:
+    """The gain over columns alone is 1 / cos of the angle of the epipolar line, or 1 with devices side by side."""
     device, noise = rig(tilt_deg), 0.3
     rays, uv, _ = readings(device, 0.9, noise)
     both = triangulate_coordinates(rays, device, uv[:, 0], uv[:, 1]).z
@@ -56,7 +56,7 @@ def test_both_axes_reach_the_bound_and_gain_what_the_tilt_says(tilt_deg: float) 
 
 
 def linear(rays: np.ndarray, device: Rig, uv: np.ndarray) -> np.ndarray:
-    """(n,) z by least squares of the two plane equations w (b_x - x b_z) = x a_z - a_x: what was here before."""
+    """(n,) z by linear least squares of the two plane equations w (b_x - x b_z) = x a_z - a_x."""
     R, t = device.T_camera_projector[:3, :3], device.T_camera_projector[:3, 3]
     a, b = rays @ R, -t @ R
     xy = device.projector.normalise(uv)
@@ -66,7 +66,7 @@ def linear(rays: np.ndarray, device: Rig, uv: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("noise", [0.1, 1.0, 4.0])
-def test_it_is_the_nearest_place_on_the_epipolar_line(noise: float) -> None:
+def test_the_coordinate_moves_to_the_nearest_place_on_the_epipolar_line(noise: float) -> None:
     device = rig(40)
     rays, uv, _ = readings(device, 0.9, noise)
     found = triangulate_coordinates(rays, device, uv[:, 0], uv[:, 1])
@@ -83,8 +83,8 @@ def test_it_is_the_nearest_place_on_the_epipolar_line(noise: float) -> None:
     assert 0 < np.abs(apart).max() < 1e-2 * np.std(found.z)
 
 
-def test_two_cameras_triangulation_gives_the_depth_of_another_ray() -> None:
-    """It shares the correction with the camera pixel, which has no error, and is no better along the known ray."""
+def test_triangulation_of_two_cameras_gives_the_depth_of_another_ray() -> None:
+    """It also corrects the camera pixel, which has no error, and is no better along the known ray."""
     device, noise = rig(40), 1.0
     rays, uv, _ = readings(device, 0.9, noise)
     P = projection_matrix(device.camera), projection_matrix(device.projector, np.linalg.inv(device.T_camera_projector))

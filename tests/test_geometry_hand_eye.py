@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hand-eye calibration of simulated robots: exact without noise, at its stated precision with; parallel axes."""
+"""Hand-eye calibration of simulated robots: exact without noise, as precise as stated with noise, parallel axes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ MOUNT, OTHER = rigid((0.1, 0.2, -0.3), (0.05, 0.02, 0.1)), rigid((1.0, 0.2, 0.5)
 
 
 def robot(random: np.random.Generator, n: int) -> np.ndarray:
-    """(n, 4, 4) T_base_gripper."""
+    """Random poses T_base_gripper (n, 4, 4)."""
     return np.stack([rigid(random.normal(0, 0.5, 3), random.normal(0, 0.3, 3)) for _ in range(n)])
 
 
 def sightings(chain: np.ndarray, random: np.random.Generator, turn: float = 0.0, move: float = 0.0) -> np.ndarray:
-    """(n, 4, 4) T_camera_target with chain T_mount_camera T_camera_target = T_other_target, and noise."""
+    """T_camera_target (n, 4, 4) with chain T_mount_camera T_camera_target = T_other_target, with noise."""
     exact = np.linalg.inv(chain @ MOUNT) @ OTHER
     return np.stack([T @ rigid(random.normal(0, 1, 3) * turn, random.normal(0, 1, 3) * move) for T in exact])
 
@@ -51,7 +51,7 @@ def test_errors_are_what_the_covariance_says() -> None:
     np.testing.assert_allclose(np.mean(rms, axis=0), np.sqrt(30 / 36) * np.array([turn, move]), rtol=0.1)
 
 
-def test_more_poses_know_better() -> None:
+def test_more_poses_give_a_smaller_covariance() -> None:
     random = np.random.default_rng(2)
     few, many = (robot(random, n) for n in (5, 80))
     deviations = [
@@ -86,6 +86,6 @@ SEEN = sightings(HAND, np.random.default_rng(5))
         (HAND, SEEN * np.nan, "finite"),
     ],
 )
-def test_what_cannot_be_done_is_said(hand: np.ndarray, seen: np.ndarray, message: str) -> None:
+def test_invalid_input_is_refused(hand: np.ndarray, seen: np.ndarray, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         eye_in_hand(hand, seen)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Homographies against OpenCV, scikit-image and the Cramer-Rao bound; sets of points that determine none."""
+"""Homographies: OpenCV, scikit-image, the Cramer-Rao bound, and sets of points that do not determine one."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_exact_pairs_give_the_exact_map(n: int) -> None:
 
 
 def test_two_equations_for_each_pair() -> None:
-    """Four pairs determine the 8 degrees of freedom, three leave two of them open."""
+    """Four pairs determine the 8 degrees of freedom; three pairs leave two of them undetermined."""
     a, b = pairs(np.random.default_rng(1), 4)
     rows = []
     for (x, y), (u, v) in zip(a, b, strict=True):
@@ -42,7 +42,7 @@ def test_two_equations_for_each_pair() -> None:
         homography_dlt(a[:3], b[:3])
 
 
-def test_batches_are_sets_of_their_own() -> None:
+def test_sets_of_a_batch_are_independent() -> None:
     sets = [pairs(np.random.default_rng(k), 6, NOISE) for k in range(5)]
     a, b = (np.stack([s[k] for s in sets]) for k in (0, 1))
     together = homography_dlt(a, b)
@@ -52,7 +52,7 @@ def test_batches_are_sets_of_their_own() -> None:
 
 
 def test_it_agrees_with_opencv_and_scikit_image() -> None:
-    """OpenCV refines the error in the second image; scikit-image has the normalised linear one."""
+    """OpenCV minimises the error in the second image; scikit-image has the normalised linear method."""
     random = np.random.default_rng(2)
     for _ in range(20):
         a, b = pairs(random, 15, NOISE)
@@ -68,7 +68,7 @@ def test_it_agrees_with_opencv_and_scikit_image() -> None:
 
 @pytest.mark.validation
 @pytest.mark.parametrize("noisy", ["second", "both"])
-def test_estimates_reach_the_bound_and_know_it(noisy) -> None:  # type: ignore[no-untyped-def]
+def test_estimates_reach_the_bound_and_state_their_covariance(noisy) -> None:  # type: ignore[no-untyped-def]
     random, n = np.random.default_rng(3), 20
     a = random.uniform(0, 640, (n, 2))
     b = map_points(TRUE, a)
@@ -98,7 +98,7 @@ def test_estimates_reach_the_bound_and_know_it(noisy) -> None:  # type: ignore[n
 
 
 @pytest.mark.validation
-def test_where_points_are_mapped_is_known_to_the_covariance() -> None:
+def test_transfer_covariance_is_the_scatter_of_mapped_points() -> None:
     random = np.random.default_rng(4)
     at, off, sigma = np.array([(100.0, 300.0)]), [], []
     for _ in range(200):
@@ -140,7 +140,7 @@ SQUARE = np.array([(0, 0), (1, 0), (1, 1), (0, 1.0)]) * 100
         (np.where(np.arange(8).reshape(4, 2) == 3, np.nan, SQUARE), "1 NaN"),
     ],
 )
-def test_sets_that_determine_none_are_refused(first: np.ndarray, message: str) -> None:
+def test_sets_that_do_not_determine_a_homography_are_refused(first: np.ndarray, message: str) -> None:
     second = np.where(np.isfinite(first), first, 0) @ TRUE[:2, :2].T + 5
     with pytest.raises(ValueError, match=message):
         fit_homography(first, second)
@@ -156,19 +156,19 @@ def test_the_second_image_may_be_degenerate_too() -> None:
 
 @pytest.mark.parametrize("beside", [0, 1])
 @pytest.mark.parametrize("known", [True, False])
-def test_collinear_to_their_noise_is_collinear(beside: int, known: bool) -> None:
-    """Also with one point beside the line; two make four in general position."""
+def test_points_on_a_line_within_their_noise_are_refused(beside: int, known: bool) -> None:
+    """They are refused with one point beside the line too; with two there are four in general position."""
     random = np.random.default_rng(7)
     for _ in range(20):
         exact = np.concatenate([LINE, np.array([(100, 400), (500, -300)])[:beside]])
         a, b = (x + random.normal(0, NOISE, x.shape) for x in (exact, map_points(TRUE, exact)))
-        with pytest.raises(ValueError, match=r"no three collinear.*on one line to their noise"):
+        with pytest.raises(ValueError, match=r"no three collinear.*on one line within their noise"):
             fit_homography(a, b, noise_px=NOISE if known else None)
     exact = np.concatenate([LINE, [(100, 400), (500, -300)]])
     fit_homography(exact + random.normal(0, NOISE, exact.shape), map_points(TRUE, exact))
 
 
-def test_chance_is_no_homography() -> None:
+def test_random_pairs_are_refused() -> None:
     random = np.random.default_rng(8)
     for n in (6, 40, 200):
         with pytest.raises(ValueError, match="no more than chance"):
@@ -191,8 +191,8 @@ def test_settings_are_checked(arguments: dict, message: str) -> None:  # type: i
 
 
 @pytest.mark.parametrize("freedom", [0, 1, 2, 7, 400])
-def test_limits_of_chance_are_those_of_scipy_s_distributions(freedom: int) -> None:
-    """Whose import takes longer than all of geometry."""
+def test_limits_of_chance_agree_with_scipy_stats(freedom: int) -> None:
+    """Geometry uses scipy.special instead, because the import of scipy.stats takes longer than all of geometry."""
     limits = consensus.chi2_limit(freedom), consensus._f_limit(freedom, 30)
     distributions = stats.chi2(freedom), stats.f(freedom, 30)
     np.testing.assert_allclose(limits, [one.isf(consensus.SIGNIFICANCE) for one in distributions], rtol=1e-9)

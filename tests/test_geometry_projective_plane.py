@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The projective plane: laws of points and lines, kinds of transforms, rectification; the worked cases."""
+"""The projective plane: laws of points and lines, kinds of transforms, rectification, examples from the textbook."""
 
 from __future__ import annotations
 
@@ -222,7 +222,7 @@ def test_mirrors_are_isometries_and_say_so() -> None:
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 def test_the_tolerance_has_no_unit(unit: float) -> None:
-    """The same map in metres, micrometres and megametres is of one kind, if the extent is given in that unit."""
+    """A map has the same kind in metres, micrometres and megametres if the extent is given in that unit."""
     scale = np.diag([unit, unit, 1.0])
     nearly = build(1, 0.3, (5, 2), 0, 1, (1e-6, 0))
     for tolerance, kind in ((1e-5, "isometry"), (1e-7, "projectivity")):
@@ -241,7 +241,7 @@ SQUARES = np.array([(x, y) for y in range(4) for x in range(4)], dtype=float) * 
 
 
 def image_lines(H: np.ndarray, directions: list[tuple[float, float]], random: np.random.Generator) -> np.ndarray:
-    """(n, 3) images under H of lines of these directions through random places."""
+    """(n, 3) images under H of lines with these directions through random points."""
     start = random.uniform(0, 300, (len(directions), 2))
     ends = map_points(H, start), map_points(H, start + 50 * np.array(directions))
     return join(homogeneous(ends[0]), homogeneous(ends[1]))
@@ -315,6 +315,6 @@ def orthogonal(angle: float) -> tuple[np.ndarray, np.ndarray]:
         (lambda: homogeneous("a line"), "array of numbers"),
     ],
 )
-def test_what_cannot_be_done_is_said(call, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_invalid_input_is_refused(call, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=message):
         call()

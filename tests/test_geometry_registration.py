@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Registration of clouds of a known part: from a first guess and without one; what slides, is symmetric or apart."""
+"""Registration of clouds of a known part with and without a first guess; sliding, symmetric and distant clouds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from rangesim.geometry import Registration, icp, register
 
 TRUE = rigid((0.3, -0.8, 1.2), (0.5, 0.1, 0.3))
-"""Maps the source's coordinates to the target's."""
+"""The true T_target_source, metres."""
 
 
 def box(
@@ -25,7 +25,7 @@ def box(
 
 
 def part(random: np.random.Generator, n: int) -> np.ndarray:
-    """A block with two bosses, that looks different from all sides."""
+    """A block with two bosses, which looks different from each side."""
     bosses = (
         box(random, n // 4, (0.08, 0.06, 0.15), (0.1, 0.05, 0.12)),
         box(random, n // 4, (0.05, 0.12, 0.06), (-0.1, -0.02, 0.08)),
@@ -48,7 +48,7 @@ def plane(random: np.random.Generator, n: int) -> np.ndarray:
 
 
 def pair(shape, noise: float = 0.0, n: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]
-    """Two independent samplings; the source as if seen from another place."""
+    """Two independent samplings of a shape, the source and the target; the source is moved by the inverse of `TRUE`."""
     random = np.random.default_rng(seed)
     source, target = shape(random, n), shape(random, n)
     source = (source - TRUE[:3, 3]) @ TRUE[:3, :3]
@@ -56,7 +56,7 @@ def pair(shape, noise: float = 0.0, n: int = 4000, seed: int = 0) -> tuple[np.nd
 
 
 def off(found: Registration) -> tuple[float, float]:
-    """Degrees and metres from the truth, the latter at the part's middle."""
+    """Difference from the truth in degrees and in metres, the latter at the middle of the part."""
     E = found.T_target_source @ np.linalg.inv(TRUE)
     return float(np.degrees(Rotation.from_matrix(E[:3, :3]).magnitude())), float(np.linalg.norm(E[:3, 3]))
 
@@ -74,7 +74,7 @@ def test_icp_finds_the_pose_from_a_near_one(noise: float) -> None:
 
 
 def test_icp_is_a_minimum_of_the_distances_to_the_surface() -> None:
-    """Of the truth and of poses beside it none has a smaller root mean square distance to the tangent planes."""
+    """Neither the truth nor a pose beside the result has a smaller root mean square distance to the tangent planes."""
     source, target = pair(part, 3e-4)
     best = icp(source, target, TRUE)
     assert best.rms_m < 1.3e-3
@@ -96,7 +96,7 @@ def test_register_needs_no_first_guess_and_repeats() -> None:
 @pytest.mark.parametrize("metres", [1.0, 3.0, 30.0, 1000.0, 5e5])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_far_from_the_origin_icp_finds_the_same(metres: float, seed: int) -> None:
-    """The target at an offset, and the source at another: the pose is that of the clouds at the origin, moved."""
+    """With an offset of the target and another of the source, the pose is that at the origin, moved by the offsets."""
     source, target = pair(part, 3e-4, n=2000, seed=seed)
     guess = rigid((0.05, 0.04, -0.06), (0.004, 0, 0.003)) @ TRUE
     near = icp(source, target, guess)
@@ -123,14 +123,14 @@ def test_far_from_the_origin_register_finds_the_same(metres: float) -> None:
 
 
 def corrugated(random: np.random.Generator, n: int) -> np.ndarray:
-    """A plate with waves of 30 mm along x, 12 mm from trough to crest, and of 60 mm along y, 4 mm, which hold it."""
+    """A plate with waves of 30 mm along x, 12 mm high, and of 60 mm along y, 4 mm high, so that it cannot slide."""
     xy = random.uniform(-0.15, 0.15, (n, 2))
     return np.column_stack([xy, np.sin(2 * np.pi * xy / [0.03, 0.06]) @ [0.006, 0.002]])
 
 
 @pytest.mark.parametrize(("turn", "seed"), [(0.3, 0), (1.57, 1), (1.0, 2)])
 def test_plates_with_their_waves_across_each_other_are_refused(turn: float, seed: int) -> None:
-    """They lie on each other by nearly all points, with waves through waves."""
+    """Nearly all points have a partner, although the waves of one plate cross those of the other."""
     source, target = pair(corrugated, 2e-4, n=6000, seed=seed)
     with pytest.raises(ValueError, match="expected surfaces that lie on each other"):
         icp(source, target, rigid((0, 0, turn), (0.004, 0, 0.003)) @ TRUE)
@@ -140,7 +140,7 @@ def test_plates_with_their_waves_across_each_other_are_refused(turn: float, seed
 @pytest.mark.parametrize(("pitch", "studs"), [(0.02, 12), (0.03, 8)])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_guess_off_by_one_stud_of_many_is_refused(pitch: float, studs: int, seed: int) -> None:
-    """A prism with studs in a row; from half a pitch the right pose is found, from one and more the next one fits."""
+    """A prism with studs in a row: a guess half a pitch off finds the pose; a full pitch off, another pose fits."""
 
     def prism(random: np.random.Generator, n: int) -> np.ndarray:
         row = (np.arange(studs) - (studs - 1) / 2) * pitch
@@ -166,7 +166,7 @@ def test_a_part_of_another_scale_is_refused(scale: float) -> None:
 
 @pytest.mark.parametrize(("noise", "n"), [(2e-3, 20000), (3e-3, 4000)])
 def test_a_noisy_scan_of_a_dense_model_is_not_refused(noise: float, n: int) -> None:
-    """Noise far above the model's spacing lowers the agreement of the right pose too."""
+    """Noise far above the spacing of the model lowers the agreement of the correct pose too."""
     random = np.random.default_rng(0)
     source, target = part(random, n), part(random, 30000)
     source = (source - TRUE[:3, 3]) @ TRUE[:3, :3] + random.normal(0, noise, source.shape)
@@ -177,12 +177,12 @@ def test_a_noisy_scan_of_a_dense_model_is_not_refused(noise: float, n: int) -> N
 
 
 def overlap(x: float) -> tuple[np.ndarray, np.ndarray]:
-    """The part from -0.15 to x, and from -x to 0.15."""
+    """The source from -0.15 to x, and the target from -x to 0.15, metres."""
     source, target = pair(part, 3e-4, n=6000)
     return source[(source @ TRUE[:3, :3].T + TRUE[:3, 3])[:, 0] < x], target[target[:, 0] > -x]
 
 
-def test_a_part_of_an_overlap_is_reported_as_that() -> None:
+def test_fitness_is_the_fraction_that_overlaps() -> None:
     found = icp(*overlap(0.1), TRUE)
     degrees, metres = off(found)
     assert degrees < 0.2
@@ -193,20 +193,20 @@ def test_a_part_of_an_overlap_is_reported_as_that() -> None:
 
 
 def test_too_small_an_overlap_that_fits_in_two_ways_is_refused() -> None:
-    """Of the bosses each cloud shows one then, and they fit on each other."""
+    """Each cloud then shows only one of the two bosses, and these fit on each other."""
     with pytest.raises(ValueError, match=r"fit in one way, got two poses 0 degrees and 0\.04"):
         icp(*overlap(0.08), TRUE)
 
 
 @pytest.mark.parametrize("shape", [sphere, cylinder, plane])
 @pytest.mark.parametrize("noise", [0.0, 3e-4])
-def test_what_slides_is_refused(shape, noise: float) -> None:  # type: ignore[no-untyped-def]
+def test_surfaces_that_slide_are_refused(shape, noise: float) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match="surfaces that hold each other"):
         icp(*pair(shape, noise, n=1500), TRUE)
 
 
 def gutter(random: np.random.Generator, n: int) -> np.ndarray:
-    """Waves of 30 mm along x alone: it slides along y."""
+    """A plate with waves of 30 mm along x alone, which slides along y."""
     xy = random.uniform(-0.15, 0.15, (n, 2))
     return np.column_stack([xy, 0.006 * np.sin(2 * np.pi * xy[:, 0] / 0.03)])
 
@@ -222,8 +222,8 @@ def roof(random: np.random.Generator, n: int) -> np.ndarray:
     [(sphere, 600, 0.0), (sphere, 600, 1.0), (cylinder, 600, 0.5), (cylinder, 2500, 1.0), (roof, 600, 1.0),
      (roof, 2500, 1.0), (plane, 600, 1.0), (gutter, 6000, 0.05)],
 )  # fmt: skip
-def test_few_points_and_noise_do_not_hold_what_slides(shape, n: int, noise: float, seed: int) -> None:  # type: ignore[no-untyped-def]
-    """Of noise (in spacings) in the normals, a constraint of 0.005 to 0.024 came; poses 2 to 4 spacings off passed."""
+def test_surfaces_that_slide_are_refused_with_few_noisy_points(shape, n: int, noise: float, seed: int) -> None:  # type: ignore[no-untyped-def]
+    """With one estimate of the normals, noise looked like a constraint of 0.005 to 0.024, and wrong poses passed."""
     points = shape(np.random.default_rng(0), n)
     spacing = float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
     with pytest.raises(ValueError, match="surfaces that hold each other"):
@@ -257,6 +257,6 @@ SOURCE, TARGET = pair(part, n=400)
         (lambda: register(SOURCE, TARGET, min_fitness=1.5), "min_fitness"),
     ],
 )
-def test_what_cannot_be_done_is_said(call, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_invalid_input_is_refused(call, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=message):
         call()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stereo: rectified rows, formulas of parallel cameras, and matching on a textured wall that is known exactly."""
+"""Stereo: rectified rows, formulas of parallel cameras, and matching on a textured wall of known geometry."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from rangesim.rig import Intrinsics
 LEFT = Intrinsics(320, 240, 300, 302, 161, 118, (-0.1, 0.02))
 RIGHT = Intrinsics(320, 240, 310, 308, 158, 122, (-0.08,))
 T = rigid((0.06, 0.12, -0.03), (-0.15, 0.01, 0.02))
-"""Maps coordinates of the left camera to the right one's, which stands to the right and is turned inwards."""
+"""T_right_left: maps coordinates of the left camera to those of the right one, which is turned inwards."""
 WALL = np.array([0.1, -0.2, 1.0]), 1.2
-"""n and d of the plane n X = d in the left camera's coordinates, metres."""
+"""Normal n and distance d of the plane n X = d in coordinates of the left camera, metres."""
 
 
 def texture(X: np.ndarray) -> np.ndarray:
-    """A pattern on the wall (n, 3) without a period, its finest wave some pixels long."""
+    """Brightness of points (n, 3) of the wall: a pattern without a period, whose finest wave is some pixels long."""
     random = np.random.default_rng(0)
     waves, phases = random.normal(0, 60, (60, 3)), random.uniform(0, 2 * np.pi, 60)
     return np.asarray(np.sin(X @ waves.T + phases).sum(axis=-1))
 
 
 def photograph(camera: Intrinsics, T_camera_left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(h, w) image of the wall and (h, w) its depth z for that camera."""
+    """Image (h, w) of the wall and its depth z (h, w) in metres for that camera."""
     back = np.linalg.inv(T_camera_left)
     rays = camera.directions(camera.pixel_centres()) @ back[:3, :3].T
     z = (WALL[1] - WALL[0] @ back[:3, 3]) / (rays @ WALL[0])
@@ -71,7 +71,7 @@ def test_rectified_epipolar_lines_are_rows_and_epipoles_lie_at_infinity() -> Non
     assert pair.baseline_m == pytest.approx(np.linalg.norm(T[:3, 3]))
 
 
-def test_rotations_are_opencvs_up_to_the_choice_of_the_turn_about_the_baseline() -> None:
+def test_rotations_are_those_of_opencv_but_for_the_turn_about_the_baseline() -> None:
     pair = rectify(LEFT, RIGHT, T)
     K = [projection_matrix(c)[:, :3] for c in (LEFT, RIGHT)]
     theirs = cv2.stereoRectify(K[0], np.zeros(5), K[1], np.zeros(5), (320, 240), T[:3, :3], T[:3, 3:])
@@ -81,8 +81,8 @@ def test_rotations_are_opencvs_up_to_the_choice_of_the_turn_about_the_baseline()
         np.testing.assert_allclose(turn[0], (1, 0, 0), atol=1e-9)
 
 
-def test_pixels_of_images_go_where_pixels_go() -> None:
-    """The homography of the pinhole, and the image that is warped, agree with the pixels that are mapped."""
+def test_warped_images_agree_with_mapped_pixels() -> None:
+    """The homography of the pinhole and the warped image agree with the mapped pixels."""
     pair = rectify(LEFT, RIGHT, T)
     from rangesim.geometry import ideal_pixels
 
@@ -157,7 +157,7 @@ def test_disparity_depth_and_error_are_the_fronto_parallel_formulas() -> None:
 @pytest.mark.parametrize(
     "move", [(-0.1, 0, 0), (0.1, 0, 0), (0, -0.1, 0), (0, 0.1, 0)], ids=["right", "left", "below", "above"]
 )
-def test_any_side_will_do(move: tuple[float, float, float]) -> None:
+def test_the_second_camera_may_stand_on_any_side(move: tuple[float, float, float]) -> None:
     there = rigid((0.02, 0.05, -0.03), move)
     pair = rectify(LEFT, LEFT, there)
     X = scene_points(np.random.default_rng(5), 20)
@@ -190,6 +190,6 @@ FLAT, GREY = np.zeros((40, 60)), np.random.default_rng(6).uniform(size=(40, 60))
         (lambda: ParallelCameras(800.0, 0.0), "positive"),
     ],
 )
-def test_what_cannot_be_done_is_said(call, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_invalid_input_is_refused(call, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=message):
         call()

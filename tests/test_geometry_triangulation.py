@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Triangulation of two views: the global minimum against OpenCV's polynomial, never worse than linear, at the bound."""
+"""Triangulation of two views: the global minimum compared with OpenCV's polynomial, and the Cramer-Rao bound."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def noisy_pixels(other: np.ndarray, n: int, noise: float, seed: int = 0) -> tupl
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("scale", [1.0, -3.0])
 def test_exact_pixels_give_the_point(method: str, scale: float) -> None:
-    """Whatever the scale and sign of the camera matrices."""
+    """This holds for any scale and sign of the camera matrices."""
     X, a, b = noisy_pixels(SECOND, 200, 0.0)
     found = METHODS[method](FIRST, scale * SECOND, a, b)
     np.testing.assert_allclose(found.points, X, atol=1e-8)
@@ -46,12 +46,12 @@ def test_exact_pixels_give_the_point(method: str, scale: float) -> None:
 @pytest.mark.parametrize("other", [SECOND, ASIDE, FORWARD], ids=["second", "aside", "forward"])
 @pytest.mark.parametrize("metres", [30.0, 1000.0, 5e5])
 def test_far_from_the_origin_the_points_are_the_same(method: str, other: np.ndarray, metres: float) -> None:
-    """Cameras at an offset give the points at the origin, moved, and the same errors."""
+    """Cameras at an offset give the points at the origin, moved by the offset, with the same errors."""
     _, a, b = noisy_pixels(other, 200, 0.3)
     offset = metres * np.array([1.0, -0.7, 0.1])
     moved = [np.hstack([P[:, :3], (P[:, 3] - P[:, :3] @ offset)[:, None]]) for P in (FIRST, other)]
     near, far = METHODS[method](FIRST, other, a, b), METHODS[method](*moved, a, b)
-    firm = ~(np.linalg.norm(near.points, axis=1) > 50)  # the place of points that are almost at infinity is open
+    firm = ~(np.linalg.norm(near.points, axis=1) > 50)  # points almost at infinity are not determined
     assert firm.mean() > 0.8
     np.testing.assert_allclose((far.points - offset)[firm], near.points[firm], atol=1e-8 + 1e-11 * metres)
     np.testing.assert_allclose(far.error_px[firm], near.error_px[firm], atol=1e-7 + 1e-11 * metres)
@@ -63,7 +63,7 @@ def test_far_from_the_origin_the_points_are_the_same(method: str, other: np.ndar
 
 @pytest.mark.parametrize("other", [SECOND, ASIDE, FORWARD], ids=["second", "aside", "forward"])
 @pytest.mark.parametrize("noise", [0.1, 2.0, 30.0])
-def test_it_is_the_global_minimum_and_never_worse_than_the_others(other: np.ndarray, noise: float) -> None:
+def test_optimal_is_the_global_minimum_and_never_worse_than_the_others(other: np.ndarray, noise: float) -> None:
     _, a, b = noisy_pixels(other, 4000, noise)
     F = fundamental_from_cameras(FIRST, other)
     corrected = correct_pixels(F, a, b)
@@ -90,7 +90,7 @@ def test_it_is_the_global_minimum_and_never_worse_than_the_others(other: np.ndar
 
 @pytest.mark.parametrize("seed", [4, 12, 19, 43, 50, 51])
 def test_points_near_an_epipole_get_the_best_of_several_minima(seed: int) -> None:
-    """Epipoles within the images, lines through them mapped by any A, far from alike: no line of many is nearer."""
+    """With epipoles within the images and a random map of the lines through them, no line of many gives less."""
     random = np.random.default_rng(seed)
     e, e_ = random.uniform(0, 600, (2, 2))
     A = random.normal(size=(2, 2)) * 10 ** random.uniform(-1, 1, (2, 1))
@@ -155,7 +155,7 @@ def test_rays_that_do_not_meet_in_front_give_nan(method: str) -> None:
 
 
 def test_two_million_points_a_second() -> None:
-    """On one core it is 5 million; this only guards against a return to loops in Python."""
+    """One core does 5 million; the limit only guards against a return to loops in Python."""
     import time
 
     _, a, b = noisy_pixels(SECOND, 200_000, 1.0)
@@ -166,7 +166,7 @@ def test_two_million_points_a_second() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_cannot_be_done_is_said(method: str) -> None:
+def test_invalid_input_is_refused(method: str) -> None:
     pixel = np.array([(320.0, 240.0)])
     turned = projection_matrix(K, rigid((0, 0.1, 0), (0, 0, 0)))
     for arguments, message in (

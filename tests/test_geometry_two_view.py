@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two views: laws of F and E, estimates against OpenCV, scikit-image and the Cramer-Rao bound, degenerate views."""
+"""Two views: laws of F and E, estimates compared with OpenCV, scikit-image and the bound, degenerate views."""
 
 from __future__ import annotations
 
@@ -66,14 +66,14 @@ def test_f_has_rank_two_and_its_lines_and_epipoles_hold() -> None:
 
 
 def at(P: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """The camera matrix for world points moved by an offset."""
+    """The camera matrix for world points that are moved by an offset."""
     return np.hstack([P[:, :3], (P[:, 3] - P[:, :3] @ offset)[:, None]])
 
 
 @pytest.mark.parametrize("metres", [30.0, 1000.0, 5e5])
 @pytest.mark.parametrize("baseline", [1.0, 0.01])
 def test_f_of_cameras_does_not_depend_on_where_they_stand(metres: float, baseline: float) -> None:
-    """Nor on which of them is first; two that stand together are refused there too."""
+    """It does not depend on which camera is first either, and cameras with one centre are refused there too."""
     offset = metres * np.array([1.0, -0.7, 0.1])
     other = projection_matrix(K, rigid((0.1, 0.2, 0.3), (0.3 * baseline, 0.1 * baseline, -0.05 * baseline)))
     for first, second in ((FIRST, other), (other, FIRST)):
@@ -112,7 +112,7 @@ def test_f_and_e_of_forward_motion_are_accepted_and_their_epipoles_are_right(
         assert np.isfinite(lines_in_second(matrix, seen)).all()
 
 
-def test_a_border_of_rounding_tells_no_unit_and_rank_three_is_still_refused() -> None:
+def test_f_with_a_border_of_rounding_is_accepted_and_rank_three_is_refused() -> None:
     for rounding in (0.0, 1e-17, 1e-12, 1e-8):
         for last in (0.0, 1e-17, 1e-12):
             e, e_ = epipoles([[0, -1, 0], [1, 0, rounding], [0, 0, last]])
@@ -158,7 +158,7 @@ def test_f_of_cameras_is_f_of_pose_and_e() -> None:
     np.testing.assert_allclose(right[:3, 3], T_SECOND_FIRST[:3, 3] / np.linalg.norm(T_SECOND_FIRST[:3, 3]), atol=1e-9)
 
 
-def test_lines_are_opencvs() -> None:
+def test_epipolar_lines_are_those_of_opencv() -> None:
     a, b = views(np.random.default_rng(2), 10)
     for ours, theirs in (
         (lines_in_second(F, a), cv2.computeCorrespondEpilines(a[:, None], 1, F)),
@@ -190,7 +190,7 @@ def test_seven_pairs_give_the_truth_among_at_most_three() -> None:
             assert min(np.abs(alike(ours, one) - one / np.linalg.norm(one)).max() for ours in found) < 1e-4
 
 
-def test_the_eight_point_algorithm_is_scikit_images() -> None:
+def test_the_eight_point_algorithm_is_that_of_scikit_image() -> None:
     a, b = views(np.random.default_rng(5), 20, NOISE)
     theirs = FundamentalMatrixTransform.from_estimate(a, b).params
     np.testing.assert_allclose(
@@ -200,7 +200,7 @@ def test_the_eight_point_algorithm_is_scikit_images() -> None:
 
 
 @pytest.mark.validation
-def test_f_reaches_the_bound_and_knows_it() -> None:
+def test_f_reaches_the_bound_and_states_its_covariance() -> None:
     random, n = np.random.default_rng(6), 25
     X = points(random, n)
     a, b = project(FIRST, X), project(SECOND, X)
@@ -294,8 +294,8 @@ def test_the_pose_agrees_with_opencv_on_exact_pairs() -> None:
 
 
 @pytest.mark.parametrize("seed", [478, 2917, 8796, 13017, 10711, 11617, 14164])
-def test_a_poor_candidate_of_the_five_points_stops_no_pose(seed: int) -> None:
-    """One of the solver's matrices has singular values that differ by more than 1e-3; the right one is among them."""
+def test_a_poor_solution_of_the_five_point_solver_does_not_prevent_a_pose(seed: int) -> None:
+    """One of the solver's matrices has singular values that differ by more than 1e-3; another one is correct."""
     random = np.random.default_rng(seed)
     focal = 10 ** random.uniform(2.2, 4.3)
     camera = np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1.0]])
@@ -355,8 +355,8 @@ def test_the_messages_name_what_is_wrong() -> None:
         seven_point(*views(random, 7, plane=True))
 
 
-def test_a_plane_with_wrong_pairs_is_no_scene() -> None:
-    """RANSAC finds some F there: the plane, and two of the wrong pairs."""
+def test_a_plane_with_wrong_pairs_is_refused() -> None:
+    """RANSAC finds some F there, from the plane and two of the wrong pairs."""
     random = np.random.default_rng(12)
     for T, plane in ((T_SECOND_FIRST, True), (ROTATED, False)):
         for _ in range(3):
@@ -368,7 +368,7 @@ def test_a_plane_with_wrong_pairs_is_no_scene() -> None:
                 find_relative_pose(a, b, K, K, NOISE)
 
 
-def test_chance_is_no_scene() -> None:
+def test_random_pairs_are_refused() -> None:
     random = np.random.default_rng(13)
     for n in (12, 60):
         a, b = random.uniform(0, 480, (2, n, 2))
@@ -379,7 +379,7 @@ def test_chance_is_no_scene() -> None:
 
 
 def plane_and_more(seed: int, n: int, off: int) -> tuple[np.ndarray, np.ndarray]:
-    """n noisy pairs, all but `off` of one plane."""
+    """n noisy pairs (n, 2), of which all but `off` lie on one plane."""
     random = np.random.default_rng(seed)
     X = points(random, n, plane=True)
     X[:off] = points(random, off)
@@ -390,7 +390,7 @@ def plane_and_more(seed: int, n: int, off: int) -> tuple[np.ndarray, np.ndarray]
 @pytest.mark.parametrize("known", [True, False], ids=["noise known", "noise unknown"])
 @pytest.mark.parametrize("n", [12, 30, 80, 400])
 def test_a_plane_and_one_point_off_it_leave_the_epipole_open(n: int, known: bool) -> None:
-    """Its line of epipoles is a family of F; a fifth of them passed, with epipoles 75 degrees off."""
+    """Any epipole on the line of that point fits. A fifth of such sets once passed, with epipoles 75 degrees off."""
     for seed in range(30):
         with pytest.raises(ValueError, match="expected"):
             fit_fundamental(*plane_and_more(seed, n, 1), noise_px=NOISE if known else None)
@@ -415,7 +415,7 @@ def test_a_plane_and_some_points_off_it_are_as_exact_as_their_covariance_or_refu
 
 
 def test_a_surface_through_both_centres_is_refused() -> None:
-    """A ruled quadric that contains the centres and the points leaves F open (HZ 22.2)."""
+    """A ruled quadric that contains the centres and the points does not determine F (HZ 22.2)."""
     random = np.random.default_rng(14)
     c = -T_SECOND_FIRST[:3, :3].T @ T_SECOND_FIRST[:3, 3]
     # alpha x^2 + beta y^2 + gamma z^2 - z = 0 holds at the first centre, 0, and by its alpha at the second
@@ -453,6 +453,6 @@ A, B = views(np.random.default_rng(15), 20)
         (lambda: epipoles(np.outer([1, 2, 3], [1, 1, 1])), "rank 2"),
     ],
 )
-def test_what_cannot_be_done_is_said(call: Callable[[], object], message: str) -> None:
+def test_invalid_input_is_refused(call: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rectification by F alone: the law of its rows, OpenCV's Hartley, images that it brings together, what it refuses."""
+"""Rectification by F alone: matching rows, OpenCV's implementation, matching of images, invalid input."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rangesim.rig import Intrinsics
 SIZE = (320, 240)
 PINHOLES = replace(LEFT, distortion=()), replace(RIGHT, distortion=())
 PARALLEL_ROWS = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0.0]])
-"""F of rectified cameras."""
+"""Fundamental matrix of rectified cameras."""
 
 
 def views(T, cameras=PINHOLES, n=200, seed=1, noise=0.0):
@@ -47,7 +47,7 @@ def views(T, cameras=PINHOLES, n=200, seed=1, noise=0.0):
         ((-0.08, -0.1, 0.1), (-0.15, -0.1, 0.03)),
     ],
 )
-def test_epipolar_lines_become_rows_of_one_number(turn, move):
+def test_epipolar_lines_become_rows_with_the_same_number(turn, move):
     F, a, b = views(rigid(turn, move))
     assert len(a) > 20
     pair = rectify_uncalibrated(F, a, b, SIZE)
@@ -67,7 +67,7 @@ def test_epipolar_lines_become_rows_of_one_number(turn, move):
 
 
 def test_rows_are_those_of_opencv():
-    """OpenCV's Hartley turns the second image alike; its rows are ours but for where they begin."""
+    """OpenCV's implementation gives the same rows up to their offset."""
     F, a, b = views(rigid((0.06, 0.12, -0.03), (-0.15, 0.01, 0.02)))
     ours = rectify_uncalibrated(F, a, b, SIZE)
     found, H_first, H_second = cv2.stereoRectifyUncalibrated(a - 0.5, b - 0.5, _opencv(F), SIZE)
@@ -82,7 +82,7 @@ def test_rows_are_those_of_opencv():
 
 
 def _opencv(F):
-    """F of pixels whose centres lie at integers."""
+    """F (3, 3) for pixels whose centres lie at integers, as in OpenCV."""
     shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
     return shift.T @ F @ shift
 
@@ -121,7 +121,7 @@ def test_cameras_that_look_along_their_baseline_are_refused(forward):
         rectify_uncalibrated(F, a, b, SIZE)
 
 
-def test_what_else_is_refused():
+def test_invalid_input_is_refused():
     F, a, b = views(rigid((0.06, 0.12, -0.03), (-0.15, 0.01, 0.02)))
     with pytest.raises(ValueError, match="at least 3"):
         rectify_uncalibrated(F, a[:2], b[:2], SIZE)

@@ -202,7 +202,7 @@ def test_launches_of_any_size_give_the_same_bytes(
     """Few pixels at a time, few turns of the loop at a time, and all at once."""
     expected, trace = uncut
     monkeypatch.setattr(kernel_launches, "LAUNCH_S", launch_s)
-    monkeypatch.setattr(kernel_launches, "LONGEST", 1.0)
+    monkeypatch.setattr(kernel_launches, "MAX_OVERRUN", 1.0)
     monkeypatch.setattr(kernel_launches, "FIRST_UNITS", units)
     for module in (rangesim.light_transport.loop, rangesim.light_transport.glint):
         monkeypatch.setattr(module, "min_lanes", lambda: lanes)
@@ -216,7 +216,7 @@ def test_launches_of_any_size_give_the_same_bytes(
 
     original = kernel_launches.evaluate
     monkeypatch.setattr(kernel_launches, "evaluate", evaluate)
-    monkeypatch.setattr(kernel_launches, "STEEPEST", 1.0)
+    monkeypatch.setattr(kernel_launches, "MAX_GROWTH", 1.0)
     assert trace() == expected
     assert (number > 20) == (units < 1 << 30)
 

@@ -194,7 +194,7 @@ def test_sensors_of_one_pass_do_not_disturb_each_other(corner: rangesim.Scene) -
     rig, light = corner.rig(**SIZE), StructuredLight()
     alone = transport(corner, rig, [light], spp=8).frames(light)
     together = transport(corner, rig, all_sensors(), spp=8)
-    with pytest.raises(ValueError, match="trace it with this sensor"):
+    with pytest.raises(ValueError, match="run transport with this sensor"):
         together.frames(AmcwToF((1e6,)))
     both = transport(corner, rig, [light, *all_sensors()], spp=8).frames(light)
     np.testing.assert_allclose(both, alone, rtol=1e-6)

@@ -391,7 +391,7 @@ def test_ambient_light_is_filtered_frame_by_frame() -> None:
     for transmission in (0.0, 0.4, 1.0):
         off = np.abs(signals.frames(sensor, transmission) - static.frames(sensor, transmission))
         assert np.quantile(off, 0.95) < 1e-5 * static.frames(sensor, transmission).mean()
-    with pytest.raises(ValueError, match="whose frames these are"):
+    with pytest.raises(ValueError, match="the frames of this sensor alone"):
         signals.frames(AmcwToF((30e6,)))
 
 

@@ -228,7 +228,7 @@ def test_paths_through_a_lens_meet_in_focus_and_are_equally_long_there() -> None
     origin, direction, path_offset = (np.array(x, dtype=float).T for x in (ray.origin, ray.direction, ray.path_offset))
     t = (0.8 - origin[:, 2]) / direction[:, 2]
     focus = origin + t[:, None] * direction
-    chief = np.array(device.ray_direction(pixel), dtype=float).T
+    chief = np.array(device.centre_ray(pixel).direction, dtype=float).T
     np.testing.assert_allclose(focus, chief / chief[:, 2:] * 0.8, atol=1e-6)
     np.testing.assert_allclose(path_offset + t, np.linalg.norm(focus, axis=-1), atol=1e-6)
     radius2 = np.sum(origin[:, :2] ** 2, axis=-1)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tiers import to_validate
 
 from rangesim import (
     AmcwToF,
@@ -175,7 +176,7 @@ def test_two_samples_know_nothing_of_their_error(matte: Scene) -> None:
     ("name", "sensor", "spp", "seed"),
     [
         ("tabletop", StructuredLight(), 16, 3),
-        ("glassware", StructuredLight(), 16, 4),
+        *to_validate(("glassware", StructuredLight(), 16, 4)),
         ("tabletop", AmcwToF(), 16, 5),
         ("tabletop", AmcwToF(), "auto", 6),
     ],
@@ -208,9 +209,11 @@ def test_the_detectors_sigma_is_that_between_captures_of_one_render(
     ("name", "sensor", "seed", "width", "least"),
     [
         ("tabletop", StructuredLight(), 0, 96, 0.03),
-        ("tabletop", StructuredLight(), 1, 96, 0.03),
-        ("glassware", StructuredLight(), 1, 64, 0.08),
-        ("tabletop", AmcwToF(), 1, 96, 0.02),
+        *to_validate(
+            ("tabletop", StructuredLight(), 1, 96, 0.03),
+            ("glassware", StructuredLight(), 1, 64, 0.08),
+            ("tabletop", AmcwToF(), 1, 96, 0.02),
+        ),
     ],
 )
 def test_the_error_bar_of_completeness_covers_what_many_samples_read(

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SIGINT, SIGTERM and SIGHUP end a command with one line, whatever it is doing.
+"""Ending a command with one line on SIGINT, SIGTERM or SIGHUP, whatever it is doing.
 
-Python runs its handlers between two bytecodes of the main thread, and handlers that raise can be swallowed: by an
-import half done, by a compiler that calls back, by a destructor. So the handlers here do nothing, and a thread that
-waits for the signal's number on a pipe (`signal.set_wakeup_fd`) ends the process: also while the main thread is busy in
-compiled code that has let go of the interpreter.
+Python runs signal handlers between two bytecodes of the main thread, and an exception that a handler raises can be
+swallowed: by an import half done, by a compiler that calls back, by a destructor. So the handlers here do nothing. A
+thread waits for the signal's number on a pipe (`signal.set_wakeup_fd`) and ends the process, also while the main thread
+is busy in compiled code that has released the interpreter lock.
 
-A process that has ended its work leaves at once: Python's own end, up to half a second for large libraries, gives the
-handlers up first, and a signal then would kill without a word.
+A process whose work is done exits at once. Python's own shutdown takes up to half a second with large libraries and
+removes the handlers first, so a signal during it would kill the process without a word.
 
 Only the standard library is imported, so that this can come before every other import.
 """
@@ -26,18 +26,21 @@ from collections.abc import Callable, Iterator
 handled = False
 """Whether a thread of this module ends the process on a signal, whatever the others do."""
 removers: list[Callable[[], bool]] = []
-"""Of work in progress, called before the process ends, the last one first: each says whether there was any."""
+"""Functions that remove work in progress, called before the process ends, the last one first. Each returns whether
+there was any."""
 LOST_OUTPUT = 120
-"""Status of a command whose last words nobody could read, as Python's own."""
+"""Exit status of a command whose last output could not be written; 120 is Python's own status for that."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
+"""Signals that end a command. Windows has no SIGHUP."""
 
 
 def end_on_signals(program: str, writes: bool) -> None:
-    """Let the signals remove work in progress, print one line, and end with status 130, 143 or 129.
+    """Make the signals remove work in progress, print one line, and end the process with status 130, 143 or 129.
 
     Parameters
     ----------
-    program : begins the line. writes : whether the command writes files, so that the line says what became of them.
+    program : name at the beginning of the line. writes : whether the command writes files; if so, the line says what
+    became of them.
     """
     _open_standard_streams()
     reader, writer = os.pipe()
@@ -53,7 +56,10 @@ def end_on_signals(program: str, writes: bool) -> None:
 
 
 def _open_standard_streams() -> None:
-    """Open those that the parent closed (`>&-`): a file would take their numbers, and what libraries print."""
+    """Open the standard streams that the parent closed (`>&-`).
+
+    Otherwise a file that is opened later takes the number of a stream, and what libraries print goes into the file.
+    """
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
@@ -66,7 +72,7 @@ def _open_standard_streams() -> None:
 
 
 def run(command: Callable[[], None]) -> None:
-    """Run a command, the last thing that a process does: how it ends is how the process ends."""
+    """Run a command as the last thing that the process does, and keep its exit status for the end of the process."""
     global _status
     try:
         command()
@@ -79,21 +85,22 @@ def run(command: Callable[[], None]) -> None:
 
 _ending = threading.Event()
 _end_lock = threading.Lock()
-"""Held by whoever ends the process: the thread that waits for signals, or the main thread."""
+"""The lock of whoever ends the process: the thread that waits for signals, or the main thread."""
 _status: int | None = None
-"""Of the process once its command has ended; None: not yet, or by an error that Python has to print."""
+"""Exit status of the process once its command has ended; None before, and after an error that Python has to print."""
 _written = 0
+"""Files and directories that this process has written."""
 
 
 def count() -> None:
-    """Say that a file or a directory has been written."""
+    """Count a file or a directory that has been written."""
     global _written
     _written += 1
 
 
 @contextlib.contextmanager
 def holding(lock: threading.RLock) -> Iterator[None]:
-    """Hold a lock; for ever if the process is about to end, so that nobody begins anything any more."""
+    """Hold a lock; keep it for ever if the process is about to end, so that no other thread begins new work."""
     lock.acquire()
     try:
         yield
@@ -103,10 +110,10 @@ def holding(lock: threading.RLock) -> Iterator[None]:
 
 
 def _leave() -> None:
-    """End the process, if its command has ended and no signal has come; wait if one has.
+    """End the process if its command has ended and no signal has come; wait if one has.
 
-    What else was registered with `atexit` has run by now. The main thread of a command that is interrupted fails, as
-    its work is taken away: it must not end the process with an error of its own.
+    Everything else that was registered with `atexit` has run by now. The main thread of an interrupted command fails,
+    because its work is removed: it must not end the process with an error of its own.
     """
     status = _status
     for stream in (sys.stdout, sys.stderr):
@@ -122,6 +129,7 @@ def _leave() -> None:
 
 
 def _wait(reader: int, screen: int, program: str, writes: bool) -> None:
+    """Wait for the numbers of signals on a pipe, and end the process on one of `SIGNALS`."""
     while True:
         number = os.read(reader, 1)[0]
         if number in SIGNALS:
@@ -129,7 +137,7 @@ def _wait(reader: int, screen: int, program: str, writes: bool) -> None:
 
 
 def _end(number: int, screen: int, program: str, writes: bool) -> None:
-    """End the process. `screen` is what stderr was at the start: another may stand there to keep libraries quiet."""
+    """End the process. `screen` is stderr as it was at the start: it may be redirected now to keep libraries quiet."""
     with _end_lock:
         _ending.set()
     try:
@@ -146,7 +154,7 @@ def _end(number: int, screen: int, program: str, writes: bool) -> None:
 
 
 def _silence_others() -> None:
-    """Let nobody else's words come through: the main thread may fail, as its work is taken away."""
+    """Discard all further output: the main thread may fail and print an error, because its work is removed."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Single files: read only if they are plain, written whole or not at all.
+"""Reading single files only if they are plain, and writing them whole or not at all.
 
 Only the standard library is imported, as the entry points of both packages need this before anything else.
 """
@@ -26,10 +26,13 @@ except ImportError:  # Windows has no flock: there, what killed processes left i
 DISK = {errno.ENOSPC: "no space left on the device", errno.EDQUOT: "the disk quota is used up",
         errno.EFBIG: "the file would be larger than allowed", errno.EROFS: "the file system is read-only",
         errno.EIO: "the device fails"}  # fmt: skip
-"""Why a disk takes no more, by error number."""
+"""Reasons why a disk takes no more data, by error number."""
 _LONGEST_NAME = 255
-_SEALED_WITHIN = 400  # bytes
+"""Bytes of a file's name that common file systems allow; a temporary file of a longer one is named by a digest."""
+_SEALED_WITHIN = 400
+"""Bytes at the beginning, or at the end, of a file in which its seal is searched: writers put it there."""
 _BLOCK = 1 << 20
+"""Bytes that are read and hashed at a time, so that a large file does not have to fit into memory."""
 _PART = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{16}\.part")
 
 
@@ -37,7 +40,7 @@ _PART = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{16}\.part")
 
 
 def check_file(path: str | Path, error: type[Exception]) -> None:
-    """Raise `error` unless `path` is a plain file or a link to one: pipes would be waited for, devices never end."""
+    """Raise `error` unless `path` is a plain file or a link to one: a pipe may never answer, a device may never end."""
     path = Path(path)
     try:
         if path.is_file():
@@ -49,7 +52,7 @@ def check_file(path: str | Path, error: type[Exception]) -> None:
 
 
 def read_file(path: str | Path, error: type[Exception]) -> bytes:
-    """Contents of a plain file; `error` if it is none, cannot be read, or does not fit into memory."""
+    """Return the content of a plain file; raise `error` if it is none, cannot be read, or does not fit into memory."""
     check_file(path, error)
     try:
         return Path(path).read_bytes()
@@ -60,7 +63,7 @@ def read_file(path: str | Path, error: type[Exception]) -> bytes:
 
 
 def is_plain_file(path: Path) -> bool:
-    """Whether `path` is a file and no link to one."""
+    """Whether `path` is a plain file, and not a link to one."""
     try:
         return stat.S_ISREG(path.lstat().st_mode)
     except OSError:
@@ -71,14 +74,21 @@ def is_plain_file(path: Path) -> bool:
 
 
 def unsealed(mark: str) -> str:
-    """The text, of letters that any format takes, by which `sealed` finds where the seal of a file goes."""
+    """The text that stands in a file where `sealed` will put its seal; it has only letters that any format takes."""
     return f"{mark} sha256 {'0' * 64}"
 
 
 def sealed(content: bytes, mark: str, at_end: bool = False) -> bytes:
-    """The bytes of a file with their SHA-256 in place of the zeros of the first `unsealed`, or the last.
+    """The bytes of a file with their SHA-256 in place of the zeros of its `unsealed` text.
 
-    The sum is that of the file with zeros in place of the sum.
+    The sum is taken while the zeros are in place. With `at_end`, the last such text in the file is the seal; otherwise
+    the first one is.
+
+    Examples
+    --------
+    >>> content = sealed(f"<!-- {unsealed('mine')} -->".encode(), "mine")
+    >>> content[:28]
+    b'<!-- mine sha256 5da3f0adb61'
     """
     empty = unsealed(mark).encode()
     start = (content.rindex(empty) if at_end else content.index(empty)) + len(empty) - 64
@@ -86,7 +96,7 @@ def sealed(content: bytes, mark: str, at_end: bool = False) -> bytes:
 
 
 def is_sealed(path: Path, mark: str, at_end: bool = False) -> bool:
-    """Whether a file has its seal within the first 400 bytes, or the last, and nobody changed it."""
+    """Whether a file has a seal in its first 400 bytes, or its last with `at_end`, and the content that was sealed."""
     with path.open("rb") as stream:
         start = max(0, stream.seek(0, os.SEEK_END) - _SEALED_WITHIN) if at_end else 0
         stream.seek(start)
@@ -109,16 +119,16 @@ def is_sealed(path: Path, mark: str, at_end: bool = False) -> bool:
 
 
 def write_file(path: Path, content: bytes, error: type[Exception], make_parents: bool = False) -> None:
-    """Write a file; as `write_files`."""
+    """Write one file, as `write_files` does."""
     write_files({path: content}, error, make_parents)
 
 
 def write_files(contents: Mapping[Path, bytes], error: type[Exception], make_parents: bool = False) -> None:
-    """Write files; a reader finds the old content of each or the new, never a part, also after a crash.
+    """Write files so that a reader finds the old content of each or the new one, never a part, also after a crash.
 
-    Older files are replaced: who calls this names the files, and who makes names up asks first whose a file is.
-    None is replaced before all are on the disk, and a signal leaves all or none. Links are written through. What
-    killed processes left beside them is cleared.
+    Older files are replaced. So a caller passes names that the user gave; a caller that makes up names first checks
+    whose a file is. No file is replaced before all are on the disk, and a signal leaves all or none. Links are written
+    through. Temporary files that killed processes left beside the files are removed.
 
     Raises
     ------
@@ -152,7 +162,7 @@ def write_files(contents: Mapping[Path, bytes], error: type[Exception], make_par
 
 
 def replace_file(target: Path, content: bytes) -> None:
-    """Put `content` in place of a plain file, or of nothing, whole or not at all; OSError if that fails."""
+    """Put `content` in the place of a plain file, or where none is, whole or not at all; OSError if that fails."""
     part = _Part(target)
     try:
         part.write(content)
@@ -162,12 +172,12 @@ def replace_file(target: Path, content: bytes) -> None:
 
 
 class _Part:
-    """The temporary file beside its place that holds what is to come there; known by its lock while it is written."""
+    """A temporary file beside the place of a file, with its new content. It is locked while it is written."""
 
     def __init__(self, named: Path) -> None:
         self.named, target = named, Path(os.path.realpath(named))
         digest = hashlib.sha256(os.fsencode(target.name)).hexdigest()
-        self.names = {target.name, digest}  # of parts that killed processes may have left
+        self.names = {target.name, digest}  # the names in the temporary files that killed processes may have left
         self.target = target
         self.path = target.with_name(f".{target.name}.{os.urandom(8).hex()}.part")
         if len(os.fsencode(self.path.name)) > _LONGEST_NAME:
@@ -194,12 +204,12 @@ class _Part:
             os.chmod(self.path, stat.S_IMODE(self.target.stat().st_mode))
 
     def place(self) -> None:
-        """Let the file take its place."""
+        """Move the temporary file to its place."""
         os.replace(self.path, self.target)
         flush(self.target.parent)
 
     def remove(self, and_directories: bool = False) -> None:
-        """Remove the file, if it is there still, and the directories made for it that are empty."""
+        """Remove the temporary file, if it still exists, and on demand the empty directories that were made for it."""
         with _lock:
             if self in _parts:
                 _parts.remove(self)
@@ -210,13 +220,13 @@ class _Part:
 
 
 _parts: list[_Part] = []
-"""Those of this process."""
+"""Temporary files of this process."""
 _lock = threading.RLock()
-"""Held while temporary files come, take their places and go: `_abandon` waits for it."""
+"""The lock that is held while temporary files are made, moved and removed; `_abandon` waits for it."""
 
 
 def _abandon() -> bool:
-    """Remove the temporary files of this process, which is about to end; whether there were any."""
+    """Remove the temporary files of this process, which is about to end; return whether there were any."""
     with interrupts.holding(_lock):
         begun = bool(_parts)
         for part in reversed(_parts.copy()):
@@ -225,7 +235,7 @@ def _abandon() -> bool:
 
 
 def _forget_parts() -> None:
-    """In a child of a process: what its parent has begun is none of its business."""
+    """Forget the temporary files in a forked child: they are its parent's."""
     global _lock
     _lock = threading.RLock()
     _parts.clear()
@@ -237,7 +247,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def clear_parts(folder: Path, names: Set[str]) -> None:
-    """Remove temporary files for those of the names whose writer is gone."""
+    """Remove the temporary files of these names in a folder whose writers have ended."""
     if fcntl is None:
         return
     for entry in folder.iterdir():
@@ -256,12 +266,12 @@ def clear_parts(folder: Path, names: Set[str]) -> None:
 
 
 def why(problem: OSError) -> str:
-    """What an operating system's error says, in words."""
+    """The reason of an error of the operating system, in words."""
     return DISK.get(problem.errno or 0) or problem.strerror or str(problem)
 
 
 def said(problem: OSError) -> str:
-    """What an operating system's error says, for people: of which file, and why."""
+    """A sentence about an error of the operating system: which file, and why."""
     if problem.errno is None:
         return str(problem)
     if problem.filename is not None:
@@ -283,7 +293,7 @@ def flush(path: Path) -> None:
 
 
 def remove_empty(directories: Iterable[Path]) -> None:
-    """Remove those of the directories, the innermost first, that are empty."""
+    """Remove those of the directories that are empty; the innermost comes first."""
     for directory in directories:
         with suppress(OSError):  # never made, or somebody else put something there meanwhile
             directory.rmdir()

@@ -1,14 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Python file of somebody's, run as a module; it finds the files beside it, as with `python FILE.py`."""
+"""A Python file of a user, run as a module; it finds the files beside it, as with `python FILE.py`.
+
+A file that PACKAGE asks for becomes the module PACKAGE.own_files.NAME, where NAME spells out the path of the file. So
+what the file defines can be pickled: another process imports that module, which runs the file.
+"""
 
 from __future__ import annotations
 
 import importlib
 import sys
-from importlib.util import module_from_spec, spec_from_file_location
+from collections.abc import Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from importlib.util import module_from_spec, spec_from_file_location, spec_from_loader
 from pathlib import Path
 from types import ModuleType
-from zlib import crc32
 
 _NEIGHBOURS: dict[Path, dict[str, ModuleType]] = {}
 """Modules that files of a folder imported from there, by their names."""
@@ -16,8 +22,19 @@ _CHANGED: dict[Path, int] = {}
 """When files of neighbours were last changed, as they were imported."""
 
 
+_RUN: dict[str, tuple[ModuleType, int]] = {}
+"""Modules of files that ran, by name, and when the file was last changed then."""
+
+
+def module_of_file(path: Path, package: str) -> ModuleType:
+    """The module of a Python file, which runs once, and again when it has changed. Raises as `run_python_file`."""
+    name, changed = _name_of(path, package), path.stat().st_mtime_ns
+    module, ran = _RUN.get(name, (None, None))
+    return module if module is not None and ran == changed else run_python_file(path, package)
+
+
 def run_python_file(path: Path, package: str) -> ModuleType:
-    """The module of a Python file, which runs, under a name of its own that tells the package that asked for it.
+    """The module of a Python file, which runs, for the package that asks for it.
 
     Imports find the folder of the file first; later ones, inside its functions, last. A name that files of two folders
     use for a neighbour is for each that of its own folder, as long as it runs.
@@ -27,7 +44,8 @@ def run_python_file(path: Path, package: str) -> ModuleType:
     BaseException
         What the file raises; it is no module then, nor is what it imported from its folder.
     """
-    name = f"_{package}_file_{path.stem}_{crc32(bytes(path)):x}"
+    importlib.import_module(f"{package}.own_files")  # the package around the module
+    name, changed = _name_of(path, package), path.stat().st_mtime_ns
     spec = spec_from_file_location(name, path)
     assert spec is not None, path  # a .py file has one
     assert spec.loader is not None, path
@@ -52,7 +70,33 @@ def run_python_file(path: Path, package: str) -> ModuleType:
         _NEIGHBOURS.setdefault(folder, {})[new] = neighbour
         if neighbour.__file__:
             _CHANGED[Path(neighbour.__file__)] = Path(neighbour.__file__).stat().st_mtime_ns
+    _RUN[name] = module, changed
     return module
+
+
+def _name_of(path: Path, package: str) -> str:
+    return f"{package}.own_files.x{bytes(path.absolute()).hex()}"
+
+
+class FileImporter(MetaPathFinder, Loader):
+    """Imports PACKAGE.own_files.NAME, by running the file that NAME spells out."""
+
+    def __init__(self, package: str) -> None:
+        self.package = package
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        return spec_from_loader(fullname, self) if fullname.startswith(f"{self.package}.own_files.x") else None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        path = Path(bytes.fromhex(spec.name.rpartition(".x")[2]).decode(errors="surrogateescape"))
+        if not path.is_file():
+            raise ImportError(f"expected the Python file {path}, which defines what was pickled; it is not there.")
+        return module_of_file(path, self.package)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Do nothing: the file has run."""
 
 
 def _take_out_neighbours(folder: Path) -> None:

@@ -11,17 +11,29 @@ from typing import Any
 import numpy as np
 
 MAX_LINES = 5
+"""Lines of one `repr`. What does not fit is counted: "and 4 more"."""
 MAX_COLUMNS = 100
+"""Characters of a line; a longer `repr` is broken into several lines."""
 MAX_ENTRIES = 3
+"""Entries of a dictionary of arrays that are shown; the others are counted."""
 SHORT = reprlib.Repr()
-"""`repr` of plain values, cut to a readable length."""
+"""`repr` of plain values, cut to a readable length: 100 characters, 8 entries, 3 levels."""
 SHORT.maxstring = SHORT.maxother = 100
 SHORT.maxlist = SHORT.maxtuple = SHORT.maxarray = 8
 SHORT.maxlevel = 3
 
 
 class ShortRepr:
-    """Mixin of dataclasses of arrays: a `repr` that names shapes and types instead of a thousand numbers."""
+    """A mixin for dataclasses of arrays: its `repr` names shapes and types instead of a thousand numbers.
+
+    Examples
+    --------
+    >>> @dataclasses.dataclass
+    ... class Planes(ShortRepr):
+    ...     normals: np.ndarray
+    >>> Planes(np.zeros((500, 3)))
+    Planes(normals=float64[500, 3])
+    """
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
@@ -29,7 +41,7 @@ class ShortRepr:
             cls.__repr__ = ShortRepr.__repr__  # type: ignore[method-assign]  # a class's own one is left by @dataclass
 
     def _counts(self) -> str:
-        """How many of what there are, in a few words, which come first; none by default."""
+        """A few words that stand first, such as "3 regions"; empty unless a subclass says more."""
         return ""
 
     def __repr__(self) -> str:
@@ -41,7 +53,7 @@ class ShortRepr:
 
 
 def in_short(value: Any) -> str:
-    """A few words in place of `repr`: type and shape of arrays, the number of what is many."""
+    """A short `repr`: type and shape of an array, length of a long list and the type of its first entry."""
     if isinstance(value, np.ndarray) and value.size > 1:
         if value.ndim == 1 and value.size <= 4 and value.dtype.kind in "iufb":
             return np.array2string(value, precision=4, separator=", ")
@@ -60,7 +72,7 @@ def in_short(value: Any) -> str:
 
 
 def _filled(parts: list[str]) -> list[str]:
-    """Lines of parts, indented; what does not fit on so many lines is counted."""
+    """The parts on indented lines, at most `MAX_LINES` of them; parts that do not fit are counted."""
     lines = ["   "]
     for number, part in enumerate(parts):
         if lines[-1].strip() and len(lines[-1]) + len(part) + 2 > MAX_COLUMNS:

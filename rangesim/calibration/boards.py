@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration boards: where their points are, what they look like, how a camera finds them, a scene that holds one.
+"""Calibration boards: the points of a board, its picture, the detection of its points, and a scene with the board.
 
-A board's frame has its origin at its first point, x along a row of points, y along a column and z into the board, so
-that a camera straight in front of it has the board's axes. Pixels have their centres at integer + 0.5; OpenCV, which
-finds the points, has them at integers, and the difference is added here and nowhere else.
+The frame of a board has its origin at the first point, x along a row of points, y along a column and z into the board.
+A camera straight in front of the board has the same axes. Pixel centres are at integer + 0.5. OpenCV, which finds the
+points, has them at integers; only this module adds the difference.
 """
 
 from __future__ import annotations
@@ -21,22 +21,39 @@ from rangesim.settings.bounds import Bounds, check_fields, whole
 Array = NDArray[np.float64]
 
 EDGE_POINTS = 64
-"""Of a disc: its polygon's centroid is the disc's to rounding, as far as a lens bends no edge within a side."""
-BLACK, WHITE = 0.05, 0.8
-"""Reflectances of ink and of the board."""
-MAX_MOVE, LEAST_MOVE_PX = 8.0, 0.15
-"""How far the place of a corner may depend on the window that is looked at: times the median of all corners, or pixels.
-Measured in 36 rendered views: at most 0.14 px, and 3.5 to 4.1 px where the edge of the light was near."""
+"""Number of points on the edge of a disc, whose polygon gives the centroid of the disc's image. The two centroids are
+equal to rounding, as long as the distortion of the lens hardly bends one side of the polygon."""
+INK_REFLECTANCE = 0.05
+"""Reflectance of the ink of a rendered board, a fraction, like black print. More leaves less contrast at the
+corners."""
+BOARD_REFLECTANCE = 0.8
+"""Reflectance of a rendered board beside the ink, a fraction, like white paper."""
+MIN_MOVE_PX = 0.15
+"""Smallest limit, in pixels, on how far a corner may move when the search window is half as wide. Measured in 36
+rendered views: good corners move by at most 0.14 px, and corners beside the edge of the light by 3.5 to 4.1 px."""
+MAX_MOVE_RATIO = 8.0
+"""Limit on the same move, as a multiple of the median move of all corners of the view, if that is larger than
+`MIN_MOVE_PX`. In a blurred or noisy view all corners move more."""
 Count = Annotated[int, whole(2)]
+"""A number of points along a side of a board, at least two: one row has no second direction."""
 Length = Annotated[float, Bounds("positive metres", 1e-6, 1e3)]
+"""A length on a board, metres, from a micrometre to a kilometre. A number beyond is in another unit by mistake."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """Points of a board as a camera saw them.
+    """The points of a board that were found in an image.
 
-    indices : (m,) int64, which of `Board.points`, ascending; not all, where some are hidden or beside the edge of a
-    shadow or of the light. pixels : (m, 2) float64.
+    indices : (m,) int64, rows of `Board.points`, ascending. Points that are hidden, or beside the edge of a shadow or
+        of the light, are missing.
+    pixels : (m, 2) float64, their pixels (x, y), with pixel centres at integer + 0.5.
+
+    Examples
+    --------
+    >>> board = Checkerboard(columns=5, rows=4, square_m=0.03)
+    >>> view = board.find(board.image(32))  # its own picture, with squares of 32 pixels
+    >>> view.indices.size, view.pixels[0].round(2)
+    (20, array([64., 64.]))
     """
 
     indices: NDArray[np.int64]
@@ -45,9 +62,13 @@ class BoardView:
 
 @dataclass(frozen=True)
 class Board(ABC):
-    """A plane with points that a camera can find.
+    """A plane with a grid of points that a camera can find.
 
-    columns, rows : points along x and y.
+    columns, rows : numbers of points along x and y.
+
+    Examples
+    --------
+    See `Checkerboard`, `CharucoBoard` and `CircleGrid`.
     """
 
     columns: Count
@@ -59,23 +80,27 @@ class Board(ABC):
     @property
     @abstractmethod
     def spacing_m(self) -> float:
-        """Metres between neighbouring points."""
+        """Distance between neighbouring points, metres."""
 
     @property
     def points(self) -> Array:
-        """(columns * rows, 3) float64, metres, board coordinates, row by row; z = 0."""
+        """(columns * rows, 3) float64, the points in board coordinates, metres, row by row; z = 0."""
         y, x = np.mgrid[: self.rows, : self.columns].reshape(2, -1) * self.spacing_m
         return np.stack([x, y, np.zeros(len(x))], axis=-1)
 
     def seen_points(self, camera: Intrinsics, T_camera_board: ArrayLike) -> Array:
-        """(columns * rows, 3) the places on the board that a camera takes for its points: `points`, where what is found
-        in an image has no size."""
+        """(columns * rows, 3) float64, the positions on the board that `find` detects as its points, metres.
+
+        They are `points` for corners, which have no size. A `CircleGrid` overrides this.
+
+        T_camera_board : (4, 4) maps board coordinates to those of the camera.
+        """
         return self.points
 
     @property
     @abstractmethod
     def margin(self) -> int:
-        """Spacings from the first point to the edges of the board, and from the last."""
+        """Distance from the first and the last point to the edges of the board, in spacings."""
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -84,23 +109,28 @@ class Board(ABC):
 
     @abstractmethod
     def image(self, pixels_per_spacing: int = 64) -> Array:
-        """(h, w) float64, 0 ink, 1 board; x to the right, y down."""
+        """(h, w) float64, the picture of the board, 0 for ink and 1 for board; x to the right, y down."""
 
     @abstractmethod
     def _find(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Array] | None:
-        """Indices and pixels as OpenCV has them; None if there is no board."""
+        """Indices (m,) and pixels (m, 2) of the points, with pixel centres at integers; None if there is no board."""
 
     def find(self, image: ArrayLike) -> BoardView:
         """The points of the board in an image.
 
         Parameters
         ----------
-        image : (h, w), brightness in any unit and of any type; the range that it uses is stretched.
+        image : (h, w), brightness in any unit and of any number type. Its range is scaled to 8 bits, with the 0.1 %
+            darkest and brightest pixels clipped.
 
         Raises
         ------
         ValueError
-            Not an image with finite values, or no board is found in it.
+            The image is not an array (h, w) of finite numbers, or no board is found in it.
+
+        Examples
+        --------
+        See `BoardView`.
         """
         values = np.asarray(image)
         if values.ndim != 2 or values.dtype.kind not in "uif" or not values.size:
@@ -114,29 +144,31 @@ class Board(ABC):
         if found is None:
             raise ValueError(
                 f"expected a {type(self).__name__} of {self.columns} x {self.rows} points in the image, found none; "
-                "it must be in the image as a whole, sharp and evenly lit (of a CharucoBoard parts are enough)."
+                "the whole board must be in the image, sharp and evenly lit (for a CharucoBoard, parts are enough)."
             )
         indices, pixels = found
         order = np.argsort(indices)
         return BoardView(indices[order].astype(np.int64), pixels[order].astype(np.float64) + 0.5)
 
     def scene(self, T_world_board: ArrayLike, width: int = 640, height: int = 480) -> dict[str, Any]:
-        """A Mitsuba scene dictionary for `rangesim.load_scene`: the board, matte, before a camera at the origin.
+        """A Mitsuba scene dictionary for `rangesim.load_scene`: the diffuse board and a camera at the origin.
 
         Parameters
         ----------
-        T_world_board : (4, 4) metres. The camera has the world's axes: x right, y down, z forward.
+        T_world_board : (4, 4) maps board coordinates to the world, metres. The axes of the world are those of the
+            camera: x right, y down, z forward.
+        width, height : size of the camera's image, pixels.
         """
         from rangesim.environment.backend import select_variant
 
         select_variant()
         import mitsuba as mi
 
-        drawn = BLACK + (WHITE - BLACK) * self.image()[::-1]  # Mitsuba's v points up
+        drawn = INK_REFLECTANCE + (BOARD_REFLECTANCE - INK_REFLECTANCE) * self.image()[::-1]  # Mitsuba's v points up
         half = np.diag([self.size_m[0] / 2, self.size_m[1] / 2, 1.0, 1.0])
         middle = np.eye(4)
         middle[:2, 3] = [(n - 1) * self.spacing_m / 2 for n in (self.columns, self.rows)]
-        facing = np.diag([1.0, -1.0, -1.0, 1.0])  # a rectangle's y is up and its normal towards the camera
+        facing = np.diag([1.0, -1.0, -1.0, 1.0])  # a rectangle has y up and its normal towards the camera
         to_world = pose(T_world_board, "T_world_board") @ middle @ facing @ half
         texture = {
             "type": "bitmap",
@@ -160,28 +192,35 @@ class Board(ABC):
 
 @dataclass(frozen=True)
 class Checkerboard(Board):
-    """A chessboard; its points are the inner corners.
+    """A chessboard, whose points are its inner corners.
 
-    With an odd number of both or an even number of both it looks the same turned by half: a view then has either end
-    for the first point, which matters only where views of several cameras belong together.
+    If `columns` and `rows` are both odd or both even, the board looks the same after half a turn. The first point of a
+    view may then be at either end, which only matters if several cameras see the same board.
 
-    columns, rows : inner corners. square_m : side of a square.
+    columns, rows : numbers of inner corners. square_m : side of a square, metres.
+
+    Examples
+    --------
+    >>> board = Checkerboard(columns=9, rows=6, square_m=0.025)
+    >>> board.points.shape, board.points[1]  # metres
+    ((54, 3), array([0.025, 0.   , 0.   ]))
     """
 
     square_m: Length
 
     @property
     def spacing_m(self) -> float:
-        """Metres between neighbouring corners."""
+        """Distance between neighbouring corners, metres."""
         return self.square_m
 
     @property
     def margin(self) -> int:
-        """A square and a white one around it."""
+        """Two spacings: the outer squares, and a white border as wide as a square."""
         return 2
 
     def image(self, pixels_per_spacing: int = 64) -> Array:
-        """(h, w) float64, 0 ink, 1 board; the square before the first corner is black."""
+        """(h, w) float64, the picture of the board, 0 for ink and 1 for board; the square before the first corner is
+        black."""
         squares = np.ones((self.rows + 3, self.columns + 3))
         squares[1:-1, 1:-1] = np.indices((self.rows + 1, self.columns + 1)).sum(axis=0) % 2
         return squares.repeat(pixels_per_spacing, axis=0).repeat(pixels_per_spacing, axis=1)
@@ -199,7 +238,7 @@ class Checkerboard(Board):
         return order[is_corner], pixels[is_corner]
 
     def _starts_black(self, image: NDArray[np.uint8], pixels: Array) -> bool:
-        """Whether the square between the first four corners is darker than its neighbours, as it is drawn."""
+        """Whether the square between the first four corners is darker than its neighbours, as in `image`."""
         grid = pixels.reshape(self.rows, self.columns, 2)
         centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4.0
         at = np.rint(centres).astype(int)
@@ -210,10 +249,24 @@ class Checkerboard(Board):
 
 @dataclass(frozen=True)
 class CharucoBoard(Board):
-    """A chessboard with ArUco markers in its white squares, which name the corners: parts of it are enough.
+    """A chessboard with ArUco markers in its white squares, of which a view of a part is enough.
 
-    columns, rows : inner corners. square_m, marker_m : sides of a square and of a marker. dictionary : OpenCV's name of
-    the markers.
+    The markers say which corner is which.
+
+    columns, rows : numbers of inner corners. square_m, marker_m : sides of a square and of a marker, metres.
+    dictionary : OpenCV's name of the dictionary of markers.
+
+    Raises
+    ------
+    ValueError
+        The markers do not fit into the squares, or the dictionary is unknown or has too few markers.
+
+    Examples
+    --------
+    >>> board = CharucoBoard(columns=4, rows=3, square_m=0.04, marker_m=0.03)
+    >>> whole = board.image(64)
+    >>> board.find(whole).indices.size, board.find(whole[:, :320]).indices.size  # the right part is cut off
+    (12, 9)
     """
 
     square_m: Length
@@ -224,19 +277,20 @@ class CharucoBoard(Board):
         check_fields(self)
         if not self.marker_m < self.square_m:
             raise ValueError(f"expected marker_m below square_m, got {self.marker_m} of {self.square_m}.")
-        self._board()
+        self._opencv_board()
 
     @property
     def spacing_m(self) -> float:
-        """Metres between neighbouring corners."""
+        """Distance between neighbouring corners, metres."""
         return self.square_m
 
     @property
     def margin(self) -> int:
-        """A square and a white one around it."""
+        """Two spacings: the outer squares, and a white border as wide as a square."""
         return 2
 
-    def _board(self) -> Any:
+    def _opencv_board(self) -> Any:
+        """The board as an object of OpenCV; ValueError if there is no such dictionary, or too few markers in it."""
         import cv2
 
         known = {name for name in dir(cv2.aruco) if name.startswith("DICT_")}
@@ -251,31 +305,43 @@ class CharucoBoard(Board):
         return cv2.aruco.CharucoBoard((self.columns + 1, self.rows + 1), self.square_m, self.marker_m, markers)
 
     def image(self, pixels_per_spacing: int = 64) -> Array:
-        """(h, w) float64, 0 ink, 1 board."""
+        """(h, w) float64, the picture of the board, 0 for ink and 1 for board."""
         size = ((self.columns + 1) * pixels_per_spacing, (self.rows + 1) * pixels_per_spacing)
-        drawn = self._board().generateImage(size, marginSize=0) / 255.0
+        drawn = self._opencv_board().generateImage(size, marginSize=0) / 255.0
         return np.pad(drawn, pixels_per_spacing, constant_values=1.0)
 
     def _find(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Array] | None:
         import cv2
 
-        corners, indices, _, _ = cv2.aruco.CharucoDetector(self._board()).detectBoard(image)
+        corners, indices, _, _ = cv2.aruco.CharucoDetector(self._opencv_board()).detectBoard(image)
         if indices is None or len(indices) < 4:
             return None
-        free = 0.5 * (1.0 - self.marker_m / self.square_m)  # of a square, from a corner to the next markers
+        free = 0.5 * (1.0 - self.marker_m / self.square_m)  # distance from a corner to the next marker, in squares
         pixels, is_corner = _refined(image, corners, 0.8 * free)
         return indices.ravel()[is_corner], pixels[is_corner]
 
 
 @dataclass(frozen=True)
 class CircleGrid(Board):
-    """A grid of discs; its points are their centres.
+    """A grid of discs, whose points are the centres of the discs.
 
-    The middle of a disc's image is not the image of its middle (Heikkilae: "Geometric camera calibration using circular
-    control points", PAMI 2000); `seen_points` says of which place it is, and calibration takes that. Corners have no
-    such error.
+    The centroid of the image of a disc is not the image of its centre (Heikkilae: "Geometric camera calibration using
+    circular control points", PAMI 2000). `seen_points` returns the position on the board that the centroid is the image
+    of, and calibration uses it. Corners have no such error.
 
-    columns, rows : discs. distance_m : between centres of neighbours. diameter_m : of a disc.
+    columns, rows : numbers of discs. distance_m : distance between the centres of neighbours, metres. diameter_m :
+    diameter of a disc, metres.
+
+    Raises
+    ------
+    ValueError
+        The discs touch each other.
+
+    Examples
+    --------
+    >>> board = CircleGrid(columns=5, rows=4, distance_m=0.04, diameter_m=0.02)
+    >>> board.find(board.image(32)).pixels[0].round(1)
+    array([32., 32.])
     """
 
     distance_m: Length
@@ -288,26 +354,27 @@ class CircleGrid(Board):
 
     @property
     def spacing_m(self) -> float:
-        """Metres between neighbouring centres."""
+        """Distance between the centres of neighbouring discs, metres."""
         return self.distance_m
 
     @property
     def margin(self) -> int:
-        """One spacing."""
+        """One spacing on each side."""
         return 1
 
     def seen_points(self, camera: Intrinsics, T_camera_board: ArrayLike) -> Array:
-        """(columns * rows, 3) where on the board the rays through the middles of the discs' images meet it.
+        """(columns * rows, 3) float64, the positions on the board of which the centroids of the discs are images,
+        metres.
 
-        The middle of an image is the centroid of its area, that of a polygon of `EDGE_POINTS` on the disc's edge as the
-        lens shows it. NaN where a disc is not seen as a whole.
+        The centroid is that of a polygon of `EDGE_POINTS` points on the edge of the disc, projected through the lens.
+        NaN for a disc that is not in front of the camera as a whole.
         """
         T = pose(T_camera_board, "T_camera_board")
         angle = np.arange(EDGE_POINTS) * (2 * np.pi / EDGE_POINTS)
         around = np.stack([np.cos(angle), np.sin(angle), np.zeros(EDGE_POINTS)], axis=-1)
         edge = self.points[:, None] + 0.5 * self.diameter_m * around
         image = camera.project(edge @ T[:3, :3].T + T[:3, 3])
-        about = image - image.mean(axis=1, keepdims=True)  # small numbers, for the sake of rounding
+        about = image - image.mean(axis=1, keepdims=True)  # small numbers lose less to rounding
         following = np.roll(about, -1, axis=1)
         area = about[..., 0] * following[..., 1] - about[..., 1] * following[..., 0]
         middle = ((about + following) * area[..., None]).sum(axis=1) / (3 * area.sum(axis=1))[:, None]
@@ -316,7 +383,7 @@ class CircleGrid(Board):
         return np.asarray((X - T[:3, 3]) @ T[:3, :3])
 
     def image(self, pixels_per_spacing: int = 64) -> Array:
-        """(h, w) float64, 0 ink, 1 board."""
+        """(h, w) float64, the picture of the board, 0 for ink and 1 for board."""
         n = pixels_per_spacing
         y, x = ((np.arange((k + 1) * n) + 0.5) / n for k in (self.rows, self.columns))  # in spacings
         off_y, off_x = y - np.clip(np.rint(y), 1, self.rows), x - np.clip(np.rint(x), 1, self.columns)
@@ -333,10 +400,13 @@ class CircleGrid(Board):
 
 
 def _refined(image: NDArray[np.uint8], corners: Any, reach: float) -> tuple[Array, NDArray[np.bool_]]:
-    """(n, 2) corners where all gradients around meet (Foerstner 1987), within a fraction of the way to the next one.
+    """(n, 2) float64, corners with subpixel accuracy, and (n,) bool, whether a window half as wide finds the same.
 
-    And (n,) bool, whether a window half as wide finds the same place. Where it does not, another edge lies in the wider
-    one: a shadow's, that of the projector's light, a finger's. It draws the corner away by pixels.
+    A corner is the point where the gradients around it meet (Foerstner 1987). If the narrow window finds another point,
+    the wide window has another edge in it, for example of a shadow, of the projected light, or of a finger, which draws
+    the corner away by pixels.
+
+    reach : half the width of the wide window, as a fraction of the smallest distance between two corners.
     """
     import cv2
 
@@ -350,4 +420,4 @@ def _refined(image: NDArray[np.uint8], corners: Any, reach: float) -> tuple[Arra
         for w in (window, max(2, window // 2))
     )
     moved = np.linalg.norm(wide - narrow, axis=-1)
-    return wide, moved <= max(MAX_MOVE * float(np.median(moved)), LEAST_MOVE_PX)
+    return wide, moved <= max(MAX_MOVE_RATIO * float(np.median(moved)), MIN_MOVE_PX)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bundle adjustment of one or two devices that see the same boards: lenses, poses of the boards, pose of the second.
+"""Bundle adjustment of one or two devices that see the same boards.
 
-Reprojection errors through the lens, distortion included, are minimised over everything at once, with Jacobians in
-closed form; the inverse of J^T J at the minimum is the covariance (Triggs et al. 2000: "Bundle adjustment - a modern
-synthesis"). A projector is a camera that is told what it sees.
+It minimises the reprojection errors through the lens, with its distortion, over the lenses, the poses of the boards and
+the pose of the second device at once. The Jacobians have closed forms, and the inverse of J^T J at the minimum is the
+covariance (Triggs et al. 2000: "Bundle adjustment - a modern synthesis"). A projector is a device like a camera: its
+pixels of a point come from the decoded coordinates.
 """
 
 from __future__ import annotations
@@ -27,14 +28,24 @@ from rangesim.geometry.reprojection import (
 from rangesim.rig import Intrinsics
 
 REWEIGHTINGS = 8
+"""Number of rounds of `reweighted`, each an adjustment. With more rounds the weights of the views change less from one
+round to the next, and each takes the time of an adjustment."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """Points of one board as one device sees them.
+    """The points of one board in one pose, as one device sees them.
 
-    device : 0 or 1. view : which pose of the board. points : (m, 3) metres, board coordinates. pixels : (m, 2).
-    noise_px : standard deviation of a coordinate, by which the errors are divided, where devices differ in it.
+    device : number of the device, 0 or 1.
+    view : number of the pose of the board.
+    points : (m, 3) float64, board coordinates, metres.
+    pixels : (m, 2) float64, (x, y) with pixel centres at integer + 0.5.
+    noise_px : standard deviation of a pixel's coordinate, by which the errors are divided. It only matters if the
+        devices or the views differ in it.
+
+    Examples
+    --------
+    See `adjust`.
     """
 
     device: int
@@ -46,10 +57,16 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Devices and boards.
+    """One or two devices, and the poses of the boards.
 
-    devices : one or two. T_second_first : (4, 4) maps coordinates of the first device to the second's; the identity if
-    there is but one. T_first_board : (k, 4, 4) maps each board's coordinates to the first device's.
+    devices : the lenses of the devices.
+    T_second_first : (4, 4) float64, maps coordinates of the first device to those of the second, metres; the identity
+        if there is only one device.
+    T_first_board : (k, 4, 4) float64, maps the coordinates of each board to those of the first device, metres.
+
+    Examples
+    --------
+    See `adjust`.
     """
 
     devices: tuple[Intrinsics, ...]
@@ -57,7 +74,7 @@ class Bundle:
     T_first_board: Array
 
     def project(self, seen: Observation) -> Array:
-        """(m, 2) pixels where the points should be seen; NaN behind the device."""
+        """(m, 2) float64, pixels to which the points of an observation project; NaN for points behind the device."""
         T = self.T_first_board[seen.view]
         if seen.device:
             T = self.T_second_first @ T
@@ -65,14 +82,35 @@ class Bundle:
 
 
 def adjust(start: Bundle, observations: Sequence[Observation], coefficients: int = 5) -> Minimum[Bundle]:
-    """The bundle of least squared reprojection error, from `start` downwards.
+    """The bundle with the least squared reprojection error, found by a descent from a start.
 
     Parameters
     ----------
-    coefficients : how many of k1, k2, p1, p2, k3 are free, in that order; the others stay as they are.
+    start : lenses and poses to start from.
+    observations : what the devices see.
+    coefficients : number of free coefficients of distortion, in the order k1, k2, p1, p2, k3; the others stay.
 
-    The step's parameters, in the order of the covariance: those of the lens of each device less the fixed ones,
-    then `POSE` of T_second_first if there are two devices, then `POSE` of each board.
+    Returns
+    -------
+    The minimum, with its residuals divided by `noise_px`. The parameters of its Jacobian and of its covariance are the
+    free ones of each lens, then the six of T_second_first if there are two devices, then the six of each board. The six
+    are a rotation vector, radians, and a translation, metres, both applied after the pose.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.calibration import Checkerboard
+    >>> from rangesim.rig import Intrinsics, look_at
+    >>> board = Checkerboard(columns=9, rows=6, square_m=0.025)
+    >>> true = Intrinsics(640, 480, 600.0, 600.0, 320.0, 240.0)
+    >>> places = [(0.3, 0.1, -0.5), (-0.3, 0, -0.5), (0, 0.3, -0.6)]  # three cameras, in board coordinates
+    >>> T = np.stack([np.linalg.inv(look_at(place, (0.1, 0.06, 0.0), (0, -1, 0))) for place in places])
+    >>> pixels = [true.project(board.points @ pose[:3, :3].T + pose[:3, 3]) for pose in T]
+    >>> seen = [Observation(0, view, board.points, x) for view, x in enumerate(pixels)]
+    >>> start = Bundle((Intrinsics(640, 480, 650.0, 650.0, 320.0, 240.0),), np.eye(4), T)
+    >>> found = adjust(start, seen, coefficients=0)
+    >>> round(found.state.devices[0].fx, 3), found.jacobian.shape  # 324 coordinates; 4 of the lens, 6 of each pose
+    (600.0, (324, 22))
     """
     start = replace(start, devices=tuple(with_all_coefficients(device) for device in start.devices))
     n_devices, n_views = len(start.devices), len(start.T_first_board)
@@ -116,10 +154,10 @@ def adjust(start: Bundle, observations: Sequence[Observation], coefficients: int
 
 
 def reweighted(start: Bundle, observations: Sequence[Observation], coefficients: int) -> Bundle:
-    """The bundle when each view of each device is weighed by its own scatter, again and again.
+    """The bundle from repeated adjustments that weigh each view of each device by the scatter of its own residuals.
 
-    One view that contradicts the others bends the solution of least squares until all have errors; here it is left
-    with them, so that it can be told which it is.
+    In plain least squares, one view that contradicts the others spreads its errors over all views. Here the errors stay
+    with this view, so that it can be found.
     """
     bundle = start
     for _ in range(REWEIGHTINGS):

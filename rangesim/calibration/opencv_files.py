@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A rig as OpenCV's stereo calibration has it, or a camera, in a YAML or XML file that `cv2.FileStorage` reads."""
+"""Writing and reading of a rig or a camera as YAML or XML files of OpenCV (`cv2.FileStorage`).
+
+The keys and conventions are those of OpenCV's stereo calibration.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +21,18 @@ from rangesim.settings.bounds import Bounds, check_number
 from rangesim.settings.config import brief
 
 SUFFIXES = (".yml", ".yaml", ".xml")
+"""Ends of the names of files that OpenCV writes as YAML or XML."""
 MAX_BYTES = 1_000_000
-"""Of a file that is read."""
+"""Largest size of a file that is read, bytes. A calibration needs about 2000; the limit keeps OpenCV's parser away from
+files that are something else."""
 
 
 def save_opencv(rig: Rig, path: str | Path) -> None:
-    """Write a rig for OpenCV: pixel centres at integers, X_projector = R X_camera + T, metres.
+    """Write a rig for OpenCV, with pixel centres at integers and X_projector = R X_camera + T in metres.
 
-    Keys: camera_width, camera_height, camera_matrix (3, 3), camera_distortion (1, 5) of k1, k2, p1, p2, k3; the same of
-    the projector; R (3, 3), T (3, 1); and E, F of camera and projector, x_p^T F x_c = 0.
+    The keys are camera_width, camera_height, camera_matrix (3, 3) and camera_distortion (1, 5) with k1, k2, p1, p2, k3;
+    the same for the projector; R (3, 3) and T (3, 1); and the essential matrix E (3, 3) and the fundamental matrix F
+    (3, 3) with x_projector^T F x_camera = 0.
 
     Raises
     ------
@@ -46,21 +52,26 @@ def save_opencv(rig: Rig, path: str | Path) -> None:
 
 
 def save_opencv_camera(camera: Intrinsics, path: str | Path) -> None:
-    """Write a camera for OpenCV, with the keys that it has in the file of a rig; see `save_opencv`."""
+    """Write a camera for OpenCV, with the same keys and errors as the camera of a rig; see `save_opencv`."""
     _write(path, _entries("camera", camera))
 
 
 def load_opencv(path: str | Path, unit_m: float = 1.0) -> Rig:
-    """The rig that `save_opencv` wrote, or whoever else with the same keys; E and F are not looked at.
+    """The rig in a file that `save_opencv` wrote, or in another file of OpenCV with the same keys.
 
-    `unit_m`, metres, is the unit of length of T: 0.001 where the board was measured in millimetres.
+    E and F are not read.
+
+    Parameters
+    ----------
+    path : the YAML or XML file.
+    unit_m : unit of length of T, metres; 0.001 if the board was measured in millimetres.
 
     Raises
     ------
     ValueError
         `unit_m` is not positive.
     FileFormatError
-        The file is missing or broken, or lacks a matrix: that of a camera alone is no rig.
+        The file is missing or broken, or lacks a matrix, as the file of a camera alone does.
     """
     import cv2
 
@@ -77,12 +88,13 @@ def load_opencv(path: str | Path, unit_m: float = 1.0) -> Rig:
         camera, projector = (_device(storage, name) for name in ("camera", "projector"))
         return Rig(camera, projector, T_camera_projector=np.linalg.inv(pose(T_projector_camera, "(R, T)")))
     except (cv2.error, UnicodeDecodeError, SystemError) as error:
-        raise FileFormatError(f"{path}: expected a file of OpenCV's: {brief(error)}.") from error
+        raise FileFormatError(f"{path}: expected a file of OpenCV: {brief(error)}.") from error
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
 
 
 def _device(storage: Any, name: str) -> Intrinsics:
+    """The lens of the device `name`, "camera" or "projector", in a file; ValueError if an entry is wrong."""
     sizes = [storage.getNode(f"{name}_{side}") for side in ("width", "height")]
     if not all(node.isInt() for node in sizes):
         raise ValueError(f"expected {name}_width and {name}_height as whole numbers.")
@@ -96,6 +108,7 @@ def _device(storage: Any, name: str) -> Intrinsics:
 
 
 def _matrix(storage: Any, name: str, shape: tuple[int, int]) -> np.ndarray:
+    """The matrix `name` of a file, float64; ValueError if it is missing, of another shape or not finite."""
     node = storage.getNode(name)
     value = node.mat() if _is_matrix(node, shape) else None
     if value is None or value.shape != shape or not np.isfinite(value).all():
@@ -104,9 +117,10 @@ def _matrix(storage: Any, name: str, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _is_matrix(node: Any, shape: tuple[int, int]) -> bool:
-    """Whether a node has rows, cols, dt and data of a matrix of this shape.
+    """Whether a node has the entries rows, cols, dt and data of a matrix of this shape.
 
-    OpenCV makes room for what they say and checks little: without cols, or with -1, it writes beyond its memory.
+    OpenCV itself allocates memory by these entries and checks little: without cols, or with cols -1, it writes beyond
+    its memory.
     """
     if not node.isMap():
         return False
@@ -121,6 +135,7 @@ def _is_matrix(node: Any, shape: tuple[int, int]) -> bool:
 
 
 def _entries(name: str, device: Intrinsics) -> dict[str, Any]:
+    """The entries of a file for the device `name`, "camera" or "projector"."""
     return {
         f"{name}_width": device.width,
         f"{name}_height": device.height,
@@ -130,6 +145,7 @@ def _entries(name: str, device: Intrinsics) -> dict[str, Any]:
 
 
 def _write(path: str | Path, entries: dict[str, Any]) -> None:
+    """Write numbers and matrices to a file of OpenCV, with a seal by which `rangesim calibrate` knows its own files."""
     import cv2
 
     path = Path(path)
@@ -144,7 +160,7 @@ def _write(path: str | Path, entries: dict[str, Any]) -> None:
 
 
 def _opencv_matrix(device: Intrinsics) -> np.ndarray:
-    """(3, 3) K with pixel centres at integers."""
+    """(3, 3) float64, the matrix K of a device with pixel centres at integers."""
     K = calibration_matrix(device)
     K[:2, 2] -= 0.5
     return K

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points of views that do not fit a calibration, and distortion that it leaves out, by more than noise can explain."""
+"""Points that do not fit a calibration by more than noise explains, and distortion that a calibration leaves out."""
 
 from __future__ import annotations
 
@@ -17,25 +17,39 @@ from rangesim.geometry.least_squares import Minimum
 from rangesim.rig import Intrinsics
 from rangesim.robust_scale import sigma_from_median
 
-LIMIT = 6.0
-"""Robust standard deviations of a coordinate: noise goes beyond once in 10^8 points."""
-LEAST_PX = 0.1
-"""Errors below harm nobody, however little noise there is."""
-MAX_NOISE = 1.5
-"""Noise of a bundle over that of its devices by themselves, above which views contradict each other."""
+MAX_SIGMAS = 6.0
+"""Largest error of a point, as a multiple of the robust standard deviation of a coordinate. Gaussian noise exceeds it
+once in 10^8 points."""
+MIN_ERROR_PX = 0.1
+"""Error below which no point is suspect, pixels, however little noise there is, because so small an error hardly moves
+a calibration."""
+MAX_NOISE_RATIO = 1.5
+"""Largest noise of a bundle of two devices over the noise of each device alone, a ratio. Above it, some views of the
+two devices contradict each other, even if no single point is suspect."""
 DEVICES = ("camera", "projector")
+"""Names of the devices of a rig, by their number in `Observation.device`."""
 
-COEFFICIENTS = 5
-"""Largest number of coefficients of distortion that a lens has."""
-MAX_SHIFT = 2.0
-"""Standard deviations by which the distortion that is left out may move a focal length or a principal point."""
+MAX_COEFFICIENTS = 5
+"""Largest number of coefficients of distortion of a lens: k1, k2, p1, p2, k3 in `Intrinsics`."""
+MAX_SHIFT_SIGMAS = 2.0
+"""Largest shift of a focal length or a principal point by distortion that is left out, in stated standard deviations.
+Beyond two, the stated deviations do not describe the errors."""
 ROUNDING_PX = 1e-6
-"""Residuals, in pixels, below which points fit exactly but for rounding."""
+"""Residual below which a point fits exactly, pixels: only rounding is left. It keeps exact points from being tested
+against a noise of 0."""
 
 
 class Suspect(NamedTuple):
-    """A point that does not fit. device : "camera" or "projector". view : its number. point : of `Board.points`.
-    error_px : of reprojection."""
+    """A point that does not fit the calibration.
+
+    device : "camera" or "projector". view : number of the view. point : row of `Board.points`. error_px : reprojection
+    error, pixels.
+
+    Examples
+    --------
+    >>> Suspect("camera", view=3, point=17, error_px=12.5)
+    Suspect(device='camera', view=3, point=17, error_px=12.5)
+    """
 
     device: str
     view: int
@@ -46,19 +60,21 @@ class Suspect(NamedTuple):
 def find_suspects(
     bundle: Bundle, observations: Sequence[Observation], views: Sequence[BoardView], noise: float, coefficients: int
 ) -> tuple[Suspect, ...]:
-    """Points whose error is beyond all noise, the worst first: a corner taken for another, or drawn away by an edge
-    beside it; a board that moved while it was taken; an image of another size.
+    """The points whose error is larger than noise explains, the worst first.
 
-    One bad view bends the solution until others have errors too. So where any point is suspect, the errors are those
-    of `reweighted`, which leaves them with the views that they come from.
+    Such a point may be a corner taken for another one, or drawn away by an edge beside it. Or the board moved while it
+    was captured, or an image has another size. One bad view spreads its errors over other views. So if any point is
+    suspect, all are judged by the errors of `reweighted`, where the errors stay with the bad view.
 
     Parameters
     ----------
-    bundle : of least squares. views : the points of each observation. noise : of a coordinate over what it should be,
-        from the residuals.
+    bundle : the result of least squares.
+    observations, views : what the devices see, and the view of each observation.
+    noise : noise of a coordinate from the residuals, over the stated noise, a ratio.
+    coefficients : number of free coefficients of distortion.
     """
     residuals = [bundle.project(seen) - seen.pixels for seen in observations]
-    if not (_beyond(observations, views, residuals) or noise > MAX_NOISE):
+    if not (_beyond(observations, views, residuals) or noise > MAX_NOISE_RATIO):
         return ()
     settled = reweighted(bundle, observations, coefficients)
     return _beyond(observations, views, [settled.project(seen) - seen.pixels for seen in observations])
@@ -67,11 +83,12 @@ def find_suspects(
 def _beyond(
     observations: Sequence[Observation], views: Sequence[BoardView], residuals: Sequence[Array]
 ) -> tuple[Suspect, ...]:
+    """The points of observations whose residuals (m, 2) are beyond `MAX_SIGMAS` and `MIN_ERROR_PX`, the worst first."""
     found = []
     for device in {seen.device for seen in observations}:
         of_device = [k for k, seen in enumerate(observations) if seen.device == device]
         robust = sigma_from_median(np.concatenate([residuals[k] for k in of_device]))
-        limit = max(LIMIT * robust, LEAST_PX)
+        limit = max(MAX_SIGMAS * robust, MIN_ERROR_PX)
         for k in of_device:
             errors = np.linalg.norm(residuals[k], axis=-1)
             found += [
@@ -88,13 +105,16 @@ def suspects_told(
     coefficients: int,
     names: Sequence[str],
 ) -> tuple[Suspect, ...]:
-    """`find_suspects`, with a warning that names the view of the worst one.
+    """The points of `find_suspects`, with a warning that names the view of the worst one.
 
-    Where all points fit a lens with all coefficients of distortion, there are none, and the warning is of these.
+    If all points fit a lens with all coefficients of distortion, no point is suspect, and the warning asks for more
+    free coefficients.
 
     Parameters
     ----------
-    found : of `adjust` with so many `coefficients`. views : the points of each observation. names : of the views.
+    found : the result of `adjust` with this number of free `coefficients`.
+    observations, views : what the devices see, and the view of each observation.
+    names : names of the views, for the warning.
     """
 
     def suspects_of(minimum: Minimum[Bundle], free: int) -> tuple[Suspect, ...]:
@@ -102,10 +122,10 @@ def suspects_told(
         noise = minimum.noise(minimum.jacobian.shape[1]) if is_rig else 1.0
         return find_suspects(minimum.state, observations, views, noise, free)
 
-    if coefficients < COEFFICIENTS:
-        full = adjust(found.state, observations, COEFFICIENTS)
+    if coefficients < MAX_COEFFICIENTS:
+        full = adjust(found.state, observations, MAX_COEFFICIENTS)
         says = _missing_distortion(found, full, coefficients)
-        if says is not None and not suspects_of(full, COEFFICIENTS):
+        if says is not None and not suspects_of(full, MAX_COEFFICIENTS):
             warn(says)
             return ()
     suspects = suspects_of(found, coefficients)
@@ -114,8 +134,11 @@ def suspects_told(
 
 
 def _missing_distortion(found: Minimum[Bundle], full: Minimum[Bundle], coefficients: int) -> str | None:
-    """A sentence if all coefficients of distortion explain residuals that `found` leaves, and move its cameras by more
-    than it states, None if not."""
+    """The text of a warning if `found` leaves out distortion that changes its cameras; None if it does not.
+
+    It does if all coefficients of distortion (`full`) explain its residuals significantly better, and move a focal
+    length or a principal point by more than `MAX_SHIFT_SIGMAS`.
+    """
     n = len(found.residuals)
     (simple, k), (fuller, more) = ((minimum.cost, minimum.jacobian.shape[1]) for minimum in (found, full))
     if n <= more or simpler_model_suffices((simple, n - k), (fuller, n - more), None, ROUNDING_PX):
@@ -129,21 +152,22 @@ def _missing_distortion(found: Minimum[Bundle], full: Minimum[Bundle], coefficie
         worst = int(np.argmax(relative))
         shifts.append((float(relative[worst]), float(moved[worst]), ("fx", "fy", "cx", "cy")[worst], DEVICES[device]))
     relative_shift, shift, parameter, name = max(shifts)
-    if not relative_shift > MAX_SHIFT:
+    if not relative_shift > MAX_SHIFT_SIGMAS:
         return None
     return (
-        f"the residuals show distortion that {coefficients} free coefficients leave out: all {COEFFICIENTS} lower the "
-        f"squared errors by {100 * (1 - fuller / simple):.0f} % and move {parameter} of the {name} by {shift:+.1f} px, "
-        f"{relative_shift:.0f} times the standard deviation stated; free more coefficients."
+        f"the residuals show distortion that {coefficients} free coefficients leave out: all {MAX_COEFFICIENTS} lower "
+        f"the squared errors by {100 * (1 - fuller / simple):.0f} % and move {parameter} of the {name} by {shift:+.1f} "
+        f"px, {relative_shift:.0f} times the standard deviation stated; free more coefficients."
     )
 
 
 def _pinhole(device: Intrinsics) -> Array:
+    """(4,) float64, fx, fy, cx, cy of a device, pixels."""
     return np.array([device.fx, device.fy, device.cx, device.cy])
 
 
 def _warn_of_suspects(suspects: Sequence[Suspect], names: Sequence[str]) -> None:
-    """A warning that names the view of the worst of them, if there are any."""
+    """Warn if there are suspect points, and name the view of the worst one."""
     if suspects:
         worst = suspects[0]
         views = sorted({suspect.view for suspect in suspects})

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A camera calibrated by views of a plane: homographies, the image of the absolute conic, then everything at once.
+"""Calibration of a camera by views of a plane: homographies, the image of the absolute conic, then bundle adjustment.
 
-Z. Zhang: "A flexible new technique for camera calibration", PAMI 2000. Each view of a plane maps the plane's circular
-points to two points of the image of the absolute conic, omega = K^-T K^-1: two linear equations for its 4 degrees of
-freedom without skew, so two views determine it; 5 with skew, so three do. Where they do not (boards that are parallel
-to each other, or all straight in front), that is an error.
+Z. Zhang: "A flexible new technique for camera calibration", PAMI 2000. A view of a plane maps the two circular points
+of the plane to points of the image of the absolute conic, omega = K^-T K^-1. This gives two linear equations. Without
+skew, omega has 4 degrees of freedom, so that two views determine it; with skew it has 5 and needs three views. Boards
+that are parallel to each other, or all straight in front, do not determine it and raise an error.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from rangesim.calibration.boards import Board, BoardView
 from rangesim.calibration.bundle import Bundle, Observation, adjust
-from rangesim.calibration.suspects import Suspect, suspects_told
+from rangesim.calibration.suspects import DEVICES, Suspect, suspects_told
 from rangesim.errors import warn
 from rangesim.geometry.camera_pose import fit_camera_pose
 from rangesim.geometry.correspondences import Array, checked_array, unit_norm
@@ -27,37 +27,49 @@ from rangesim.geometry.reprojection import LENS, POSE, by_lens
 from rangesim.rig import Intrinsics
 
 MIN_VIEWS = 2
-"""Least number of views for a camera without skew; with skew it is one more (Zhang 2000, section 3.1)."""
-DETERMINED = 1e-4
-"""The second smallest singular value of the equations of the conic, relative to the largest, below which their views
-are parallel to each other, to what noise allows to tell."""
+"""Smallest number of views for a camera without skew. With skew it is one more (Zhang 2000, section 3.1)."""
+MIN_CONIC_RATIO = 1e-4
+"""Smallest ratio of the second smallest singular value of the conic's equations to the largest. Below it, the views
+leave a second solution: within the noise, the boards are parallel to each other."""
 MIN_APART_DEG = 1.0
-"""Largest angle between two boards below which all count as parallel. Parallel ones are found within 0.1 degrees, ones
-turned at random by up to 5 degrees 4.8 degrees apart or more (measured, noise of 0.05 px)."""
-FEW_VIEWS = 5
-"""Number of views up to which more than one start is tried: with 3 views at 10 degrees, 1 of 40
-ended in a side minimum."""
-SAME_MINIMUM = 0.999
-"""Ratio of sums of squares of two minima from which on they are one."""
-MAX_DEVIATION = 0.1
-"""Standard deviation of a focal length, relative, above which the views do not determine it."""
+"""Smallest value of the largest angle between two boards, degrees; below it all boards count as parallel. Measured with
+a noise of 0.05 px: boards that are parallel are found within 0.1 degrees, boards turned at random by up to 5 degrees at
+4.8 degrees or more."""
+MAX_CENTRED_VIEWS = 5
+"""Largest number of views for which a second start, with the principal point in the middle of the image, is tried.
+Measured with 3 views tilted by 10 degrees: with one start, 1 of 40 sets ended in a wrong minimum."""
+SAME_COST_RATIO = 0.999
+"""Ratio of the sums of squares of two minima, above which they count as the same minimum and the first one is taken. It
+allows for what the two descents leave when they end."""
+MAX_FOCAL_DEVIATION = 0.1
+"""Largest relative standard deviation of a focal length. Above 10 % the views count as not determining it."""
 MAX_CORNER_PX = 5.0
-"""Standard deviation of where a ray meets a corner of the image, above which the lens counts as unknown there."""
-AGAIN = 2
-"""Adjustments after the first, for boards whose points look as if they were elsewhere."""
+"""Largest standard deviation, in pixels, of the pixel of a ray through a corner of the image. Above it, the lens counts
+as unknown there, and the result comes with a warning."""
+SEEN_POINT_ROUNDS = 2
+"""Number of adjustments after the first, for boards whose points are not detected where they are (`CircleGrid`).
+Each one uses the positions that the camera found last would detect. They change little after the first of them."""
 BORDER_POINTS = 9
-"""Along each side of an image, whose rays must exist."""
+"""Number of points along each side of an image, at which the ray through the lens must exist. More points find shorter
+gaps. The corners, which are farthest from the centre, are always among them."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """A camera, how well it is known, and where the boards were.
+    """A calibrated camera with its standard deviations, and the poses of the boards.
 
-    camera : Intrinsics, with five coefficients of distortion. deviations : (9,) standard deviations of fx, fy, cx, cy
-    in pixels and of k1, k2, p1, p2, k3; 0 for those held. T_camera_board : (k, 4, 4) maps the board's coordinates to
-    the camera's, metres. residuals : k arrays (m, 2), pixels, projected less seen. noise_px : standard deviation of a
-    coordinate, from the residuals. rms_px : root mean square of the reprojection errors, over points. suspects : points
-    whose error is beyond all noise, the worst first; they weigh on the result.
+    camera : Intrinsics, with five coefficients of distortion.
+    deviations : (9,) float64, standard deviations of fx, fy, cx, cy (pixels), k1, k2, p1, p2, k3; 0 for a coefficient
+        that is not free.
+    T_camera_board : (k, 4, 4) float64, maps the board coordinates of each view to those of the camera, metres.
+    residuals : k arrays (m, 2) float64, projected minus seen pixel.
+    noise_px : standard deviation of a pixel's coordinate, from the residuals.
+    rms_px : root mean square of the reprojection errors of all points, pixels.
+    suspects : points whose error is larger than noise explains, the worst first. They took part in the result.
+
+    Examples
+    --------
+    See `calibrate_camera`.
     """
 
     camera: Intrinsics
@@ -70,21 +82,34 @@ class CameraCalibration:
 
 
 def intrinsics_from_homographies(homographies: ArrayLike, *, has_skew: bool = False) -> Array:
-    """(3, 3) K of a camera from homographies (k, 3, 3) that map a plane's coordinates to pixels (Zhang 2000, 3.1).
+    """(3, 3) float64, the matrix K of a camera, from homographies of views of a plane (Zhang 2000, 3.1).
 
-    With columns h1, h2 of each: h1^T omega h2 = 0 and h1^T omega h1 = h2^T omega h2, linear in the six entries of the
-    symmetric omega, up to scale; then omega = K^-T K^-1 by Cholesky. K33 = 1.
+    The columns h1 and h2 of each homography give h1^T omega h2 = 0 and h1^T omega h1 = h2^T omega h2. These equations
+    are linear in the six entries of the symmetric omega, which is known up to scale. Cholesky's decomposition of
+    omega = K^-T K^-1 then gives K, with K33 = 1.
 
     Parameters
     ----------
-    has_skew : whether K12 is free, which takes a third view. False: it is 0, and so is omega12; of a camera that has
-        skew all the rest is then wrong.
+    homographies : (k, 3, 3), map coordinates on the plane to pixels.
+    has_skew : whether K12 is free, which needs a third view. If not, K12 and omega12 are 0; for a camera with skew, all
+        other entries are then wrong, too.
 
     Raises
     ------
     ValueError
-        Fewer than two homographies, three with skew; views that are parallel to each other; or homographies
-        of no camera (omega is not positive definite).
+        There are fewer than two homographies, or three with skew, or the views are parallel to each other, or omega is
+        not positive definite, so that no camera has these homographies.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.rig import look_at
+    >>> K = np.array([[600, 0, 320], [0, 610, 240], [0, 0, 1.0]])
+    >>> places = [(0.3, 0.1, -0.5), (-0.3, 0, -0.5)]  # two cameras, in coordinates of the plane
+    >>> T = [np.linalg.inv(look_at(place, (0, 0, 0), (0, -1, 0))) for place in places]
+    >>> found = intrinsics_from_homographies([K @ pose[:3, [0, 1, 3]] for pose in T])
+    >>> np.allclose(found, K)
+    True
     """
     H = checked_array("homographies", homographies, 3, 3)
     freedom, least = (5, MIN_VIEWS + 1) if has_skew else (4, MIN_VIEWS)
@@ -94,7 +119,7 @@ def intrinsics_from_homographies(homographies: ArrayLike, *, has_skew: bool = Fa
             f"expected at least {least} views of the plane, got {n}: each gives two equations for the {freedom} "
             "degrees of freedom of the absolute conic's image."
         )
-    # pixels about their middle and of size 1, planes of size 1: the equations are then of one size
+    # Move the pixels to mean 0 and scale pixels and planes to size 1, so that all equations have the same size.
     corners = H[:, :2, 2] / H[:, 2:, 2]
     middle = corners.mean(axis=0)
     size = max(float(np.abs(corners - middle).max()), 1e-3 * float(np.abs(middle).max()), 1.0)
@@ -106,9 +131,9 @@ def intrinsics_from_homographies(homographies: ArrayLike, *, has_skew: bool = Fa
     if not has_skew:
         rows = np.delete(rows, 1, axis=1)
     _, values, axes = np.linalg.svd(rows)
-    if not values[freedom - 1] > DETERMINED * values[0]:
+    if not values[freedom - 1] > MIN_CONIC_RATIO * values[0]:
         raise ValueError(
-            f"expected views of the plane under different tilts, got {len(H)} that are nearly parallel to each other: "
+            f"expected views of the plane at different tilts, got {len(H)} that are nearly parallel to each other: "
             "they do not determine the camera; tilt the board."
         )
     a, b, c, d, e, f = axes[5] if has_skew else np.insert(axes[4], 1, 0.0)
@@ -116,8 +141,8 @@ def intrinsics_from_homographies(homographies: ArrayLike, *, has_skew: bool = Fa
     omega = omega if omega[0, 0] > 0 else -omega
     if np.linalg.eigvalsh(omega)[0] <= 0:
         raise _NoCamera(
-            "expected homographies of one camera, got some whose absolute conic is not one (not positive definite): "
-            "wrong points, much distortion, or views that differ too little."
+            "expected homographies of one camera, got homographies of none (the image of the absolute conic is not "
+            "positive definite): points are wrong, the distortion is large, or the views differ too little."
         )
     K = np.linalg.inv(np.linalg.cholesky(omega).T)
     K = np.linalg.inv(to_unit) @ (K / K[2, 2])
@@ -125,14 +150,15 @@ def intrinsics_from_homographies(homographies: ArrayLike, *, has_skew: bool = Fa
 
 
 class _NoCamera(ValueError):
-    """The equations of the conic have a solution, which no camera has."""
+    """Error for equations of the conic whose solution belongs to no camera."""
 
 
 def _starting_intrinsics(homographies: ArrayLike, width: int, height: int) -> list[Intrinsics]:
-    """Cameras that the bundle adjustment starts from: that of the homographies, unless noise or distortion leaves none.
+    """The cameras from which the bundle adjustment starts.
 
-    With few views also the one with the principal point in the middle of the image, as noise moves that of the
-    homographies far away.
+    The first is the camera of the homographies, unless noise or distortion leaves none. If there is none, or there are
+    few views, another one has its principal point in the middle of the image, because with few views noise moves the
+    principal point of the homographies far away.
     """
     H = np.asarray(homographies, dtype=np.float64)
     matrices, none = [], None
@@ -140,7 +166,7 @@ def _starting_intrinsics(homographies: ArrayLike, width: int, height: int) -> li
         matrices.append(intrinsics_from_homographies(H))
     except _NoCamera as error:
         none = error
-    if none is not None or len(H) <= FEW_VIEWS:
+    if none is not None or len(H) <= MAX_CENTRED_VIEWS:
         to_middle = np.array([[1.0, 0, -width / 2], [0, 1.0, -height / 2], [0, 0, 1.0]])
         centred = to_middle @ H
         centred = centred / np.linalg.norm(centred[:, :, :2], axis=(1, 2), keepdims=True)
@@ -165,22 +191,46 @@ def calibrate_camera(
     coefficients: int = 5,
     names: Sequence[str] | None = None,
 ) -> CameraCalibration:
-    """A camera from views of a board: `intrinsics_from_homographies`, then all parameters by `bundle.adjust`.
+    """The camera that took views of a board.
+
+    `intrinsics_from_homographies` gives a start, and `bundle.adjust` then adjusts all parameters.
 
     Parameters
     ----------
-    views : of `board.find`, two or more, under different tilts, ten to twenty all over the image for a good one.
-    width, height : of the images, pixels.
-    coefficients : of distortion that are free, of k1, k2, p1, p2, k3 in this order; 0 for a pinhole.
-    names : of the views, for messages; None: their numbers.
-
-    Warns of points that do not fit (`suspects`), of distortion that too few coefficients leave out, and of a lens that
-    is unknown in a corner of the image, or folds there.
+    board : the board in all views.
+    views : results of `board.find`, two or more at different tilts; for good accuracy ten to twenty, with boards in all
+        parts of the image.
+    width, height : size of the images, pixels.
+    coefficients : number of free coefficients of distortion, in the order k1, k2, p1, p2, k3; 0 for a pinhole.
+    names : names of the views, for messages; None takes their numbers.
 
     Raises
     ------
     ValueError
-        Fewer than two views, one view twice, points outside the image, or views that do not determine the camera.
+        There are fewer than two views, a view is given twice, points are outside the image, or the views do not
+        determine the camera.
+
+    Warns
+    -----
+    RangesimWarning
+        Points do not fit (`suspects`), too few free coefficients leave out distortion, or the lens is unknown in a
+        corner of the image or folds there.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.calibration import BoardView, Checkerboard
+    >>> from rangesim.rig import Intrinsics, look_at
+    >>> board = Checkerboard(columns=9, rows=6, square_m=0.025)
+    >>> true = Intrinsics(640, 480, 600.0, 610.0, 320.0, 240.0)
+    >>> places = [(0.3, 0.1, -0.5), (-0.3, 0, -0.5), (0, 0.3, -0.6)]  # three cameras, in board coordinates
+    >>> T = [np.linalg.inv(look_at(place, (0.1, 0.06, 0.0), (0, -1, 0))) for place in places]
+    >>> noise = np.random.default_rng(0).normal(0, 0.05, (3, 54, 2))
+    >>> pixels = [true.project(board.points @ pose[:3, :3].T + pose[:3, 3]) for pose in T] + noise
+    >>> found = calibrate_camera(board, [BoardView(np.arange(54), x) for x in pixels], 640, 480, coefficients=0)
+    >>> error = np.abs([found.camera.fx - 600, found.camera.fy - 610])
+    >>> bool((error < 4 * found.deviations[:2]).all())
+    True
     """
     names = [f"view {k}" for k in range(len(views))] if names is None else [str(name) for name in names]
     if len(names) != len(views):
@@ -205,8 +255,8 @@ def calibrate_camera(
 def first_camera(
     board: Board, views: Sequence[BoardView], width: int, height: int, coefficients: int, names: Sequence[str]
 ) -> tuple[Intrinsics, Array, float]:
-    """Camera, poses (k, 4, 4) of the boards and noise of a coordinate, to start a bundle of several devices from."""
-    found, _, noise, _ = _calibrated(board, views, width, height, coefficients, names, says=False)
+    """Camera, poses (k, 4, 4) of the boards, and noise in pixels, as the start for a bundle of two devices."""
+    found, _, noise, _ = _calibrated(board, views, width, height, coefficients, names, may_warn=False)
     return found.state.devices[0], found.state.T_first_board, noise
 
 
@@ -217,9 +267,12 @@ def _calibrated(
     height: int,
     coefficients: int,
     names: Sequence[str],
-    says: bool = True,
+    may_warn: bool = True,
 ) -> tuple[Minimum[Bundle], list[Observation], float, Array]:
-    """The bundle of one camera, what it rests on, its noise and deviations."""
+    """The adjusted bundle of one camera, its observations, its noise in pixels, and deviations of its parameters.
+
+    may_warn : whether to warn of a lens that is unknown in a corner of the image.
+    """
     check_views(board, views, coefficients, names)
     homographies = []
     for k, view in enumerate(views):
@@ -229,8 +282,8 @@ def _calibrated(
             raise ValueError(f"{names[k]}: {error}") from error
         if not ((view.pixels >= 0) & (view.pixels <= [width, height])).all():
             raise ValueError(
-                f"{names[k]}: expected points in an image of {width} x {height} pixels, got some outside; is it of "
-                "another size?"
+                f"{names[k]}: expected points in an image of {width} x {height} pixels, got some outside; does the "
+                "image have another size?"
             )
         homographies.append(plane.matrix)
     starts = _starting_intrinsics(homographies, width, height)
@@ -241,20 +294,20 @@ def _calibrated(
         adjusted.append(adjust_as_seen(board, bundle, observations, views, coefficients))
     found, observations = adjusted[0]
     for other in adjusted[1:]:
-        if other[0].cost < SAME_MINIMUM * found.cost:
+        if other[0].cost < SAME_COST_RATIO * found.cost:
             found, observations = other
     _refuse_parallel(found.state.T_first_board)
-    noise, deviations = judged(found, observations, says)
+    noise, deviations = judged(found, observations, may_warn)
     return found, observations, noise, deviations
 
 
 def _refuse_parallel(T_camera_board: Array) -> None:
-    """Raise ValueError if all boards are parallel, whose views give the same two equations, up to distortion."""
+    """Raise ValueError if all boards are parallel, because their views then give the same two equations."""
     normals = T_camera_board[:, :3, 2]
     apart = np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0)))
     if apart < MIN_APART_DEG:
         raise ValueError(
-            f"expected views of the plane under different tilts, got {len(normals)} whose boards are within "
+            f"expected views of the plane at different tilts, got {len(normals)} whose boards are within "
             f"{apart:.2g} degrees of parallel: they do not determine the camera; tilt the board."
         )
 
@@ -262,16 +315,17 @@ def _refuse_parallel(T_camera_board: Array) -> None:
 def adjust_as_seen(
     board: Board, start: Bundle, observations: Sequence[Observation], views: Sequence[BoardView], coefficients: int
 ) -> tuple[Minimum[Bundle], list[Observation]]:
-    """`bundle.adjust`; and again with the places that the camera takes for the board's points, once it is known.
+    """The result of `bundle.adjust`, repeated with the positions that the camera detects as the points of the board.
 
-    A second device is told what the first one sees, so it sees the same places.
+    These positions (`Board.seen_points`) depend on the camera, so that they are known after a first adjustment. The
+    pixels of a second device come from what the first one detects, so it has the same positions.
 
     Parameters
     ----------
-    views : the points of each observation.
+    views : the view of each observation.
     """
     found, taken = adjust(start, observations, coefficients), list(observations)
-    for _ in range(AGAIN):
+    for _ in range(SEEN_POINT_ROUNDS):
         camera = found.state.devices[0]
         seen = [board.seen_points(camera, T) for T in found.state.T_first_board]
         if all(np.array_equal(points, board.points) for points in seen):
@@ -286,7 +340,7 @@ def adjust_as_seen(
 
 
 def check_views(board: Board, views: Sequence[BoardView], coefficients: int, names: Sequence[str]) -> None:
-    """Raise ValueError unless there are enough views of this board, and a number of coefficients from 0 to 5."""
+    """Raise ValueError unless there are enough different views of this board, and 0 to 5 coefficients."""
     if len(views) < MIN_VIEWS:
         raise ValueError(
             f"expected at least {MIN_VIEWS} views of the board, got {len(views)}: each gives two equations for the 4 "
@@ -307,19 +361,21 @@ def check_views(board: Board, views: Sequence[BoardView], coefficients: int, nam
 
 
 def board_poses(camera: Intrinsics, observations: Sequence[Observation]) -> Array:
-    """(k, 4, 4) poses of the boards of a camera that is roughly known."""
+    """(k, 4, 4) float64, poses of the boards in coordinates of a camera that is roughly known, metres."""
     return np.stack([fit_camera_pose(seen.points, seen.pixels, camera).T_camera_object for seen in observations])
 
 
-def judged(found: Minimum[Bundle], observations: Sequence[Observation], says: bool = True) -> tuple[float, Array]:
-    """Noise of a coordinate, pixels, and standard deviations of the parameters.
+def judged(found: Minimum[Bundle], observations: Sequence[Observation], may_warn: bool = True) -> tuple[float, Array]:
+    """The noise of a bundle, and standard deviations of its parameters.
 
-    says : warns of lenses that are unknown in a corner of their image.
+    The noise is the standard deviation of a coordinate, in the unit of the residuals: pixels over `noise_px`.
+
+    may_warn : whether to warn of a lens that is unknown in a corner of its image.
 
     Raises
     ------
     ValueError
-        There are fewer observations than parameters, or they leave a focal length open.
+        There are not more coordinates than parameters, or they leave a focal length open.
     """
     parameters = found.jacobian.shape[1]
     if len(found.residuals) <= parameters:
@@ -334,36 +390,37 @@ def judged(found: Minimum[Bundle], observations: Sequence[Observation], says: bo
     lens = (parameters - POSE * (n_views + n_devices - 1)) // n_devices
     for k, device in enumerate(found.state.devices):
         relative = float((deviations[k * lens : k * lens + 2] / [device.fx, device.fy]).max())
-        if not relative <= MAX_DEVIATION:
+        if not relative <= MAX_FOCAL_DEVIATION:
             raise ValueError(
                 "expected views that determine the focal length, got some that leave it open (standard deviation "
                 f"{100 * relative:.3g} %): tilt the board more, in different directions."
             )
         part = slice(k * lens, (k + 1) * lens)
-        _check_corners(device, covariance[part, part], NAMES[k] if n_devices > 1 else "lens", says)
+        _check_corners(device, covariance[part, part], DEVICES[k] if n_devices > 1 else "lens", may_warn)
     return noise, deviations
 
 
-NAMES = ("camera", "projector")
+def _check_corners(device: Intrinsics, covariance: Array, name: str, may_warn: bool) -> None:
+    """Warn if a lens folds within its image, or is unknown in a corner of it.
 
-
-def _check_corners(device: Intrinsics, covariance: Array, name: str, says: bool) -> None:
-    """Warn if a lens folds within its image, or is unknown in a corner of it."""
+    covariance : of the parameters of the lens. name : of the device. may_warn : whether to warn at all.
+    """
     s = np.linspace(0, 1, BORDER_POINTS)
     zero, one = np.zeros_like(s), np.ones_like(s)
     sides = [np.stack(side, axis=-1) for side in ((s, zero), (s, one), (zero, s), (one, s))]
     rays = device.directions(np.concatenate(sides) * [device.width, device.height])
     if not np.isfinite(rays).all():
-        if says:
+        if may_warn:
             warn(
-                f"the distortion found of the {name} folds within its image, which has no rays there: it is unknown "
-                "where no board was; show boards up to the corners of the image, or free fewer coefficients."
+                f"the distortion found for the {name} folds within its image, so that some pixels have no ray: the "
+                "lens is unknown where no board was; show boards up to the corners of the image, or free fewer "
+                "coefficients."
             )
         return
     corners = device.directions(np.array([[0, 0], [1, 0], [0, 1], [1, 1.0]]) * [device.width, device.height])
     J = by_lens(device, corners)[:, :, : len(covariance)]
     off = float(np.sqrt(np.linalg.eigvalsh(J @ covariance @ np.swapaxes(J, 1, 2))[:, -1].max()))
-    if says and off > MAX_CORNER_PX:
+    if may_warn and off > MAX_CORNER_PX:
         warn(
             f"the {name} is known to {off:.3g} px only in a corner of its image: show boards there, or free fewer "
             "coefficients."
@@ -371,7 +428,7 @@ def _check_corners(device: Intrinsics, covariance: Array, name: str, says: bool)
 
 
 def _conic_row(a: Array, b: Array) -> Array:
-    """(k, 6) coefficients of a^T omega b in the entries 11, 12, 22, 13, 23, 33 of omega."""
+    """(k, 6) float64, coefficients of the entries 11, 12, 22, 13, 23, 33 of omega in a^T omega b, for a, b (k, 3)."""
     return np.stack(
         [
             a[:, 0] * b[:, 0],

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 PLANCK_TIMES_C = 6.626_070_15e-34 * 299_792_458.0
 """h c in joule metres, exact by the definition of the SI (2019)."""
 Bits = Annotated[int, Bounds("a number of bits", 1, 16)]
-"""Resolution of an analogue-to-digital converter or a counter; at most 16, as digital numbers are uint8 or uint16."""
+"""Resolution of an analogue-to-digital converter or a counter, 1 to 16 bits, because digital numbers are stored as
+uint8 or uint16."""
 BandWidth = Annotated[float, Bounds("0 or positive", 1e-12, 2e-2, or_zero=True)]
 """Full width of a band-pass filter in metres; at most twice the longest wavelength, as the band ends above 0 m."""
 
@@ -139,7 +140,10 @@ class PhotoDetector(Named, ABC):
     def _check(self) -> None:
         check_fields(self)
         if self.band_width_m >= 2 * self.wavelength_m:
-            raise ValueError(f"expected a band_width_m whose filter ends above 0 m, got {self.band_width_m}.")
+            raise ValueError(
+                f"expected a band_width_m below {2 * self.wavelength_m:g}, twice the wavelength_m, "
+                f"got {self.band_width_m}."
+            )
         if self.min_exposure_s > self.max_exposure_s:
             raise ValueError(
                 f"expected min_exposure_s <= max_exposure_s, got {self.min_exposure_s} > {self.max_exposure_s}."

@@ -28,16 +28,16 @@ MAX_DEVIATE = 4.0
 """Standard deviations: largest |w| for which the bound of the expansion's error holds (tests/test_shot_noise.py). One
 draw in 16 000 is beyond, and is then decided by the cumulative probability."""
 SUMMED = 8
-"""Number of terms of the cumulative probability that are always added, without a branch. At the largest mean that they
-serve (4 photons), 2 % of the draws need more terms."""
+"""Count of terms of the cumulative probability that are always added, because a loop without a branch is faster. At the
+largest mean that they serve (4 photons), 2 % of the draws need more terms."""
 _RECIPROCAL = 1 / np.arange(1.0, SUMMED + 1)
 """1, 1/2, 1/3 ... for the terms of `SUMMED`, as multiplying is faster than dividing."""
 NEGLIGIBLE = 1e-17
 """Fraction of a sum of probabilities, so small that adding it no longer changes the sum in double precision."""
 SPARSE = 5.0
-"""Limit in photons for n^2 / m, with n the expected photons and m the pulses; n^2 / (2 m) photons share a pulse with an
-earlier one. Up to the limit `pulses_hit` draws photons one by one, above it NumPy's binomial. Both are exact, so the
-value decides speed alone."""
+"""Limit in photons for n^2 / m, with n the expected photons and m the pulses; half of n^2 / m is the number of photons
+that share a pulse with an earlier one. Up to the limit `pulses_hit` draws photons, above it NumPy's binomial. Both are
+exact, so the value changes the speed alone."""
 
 
 @cached_njit(nogil=True, error_model="numpy")

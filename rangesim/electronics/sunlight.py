@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 TOTAL_W_M2 = 1000.37
-"""Irradiance in W/m2 over the whole ASTM table, 280 to 4000 nm."""
+"""Irradiance in W/m2 over the whole table of the standard, 280 to 4000 nm."""
 BELOW_W_M2 = 0.0015
-"""Irradiance in W/m2 from 280 to 300 nm, below the first bin, from the same table."""
+"""Irradiance in W/m2 from 280 to 300 nm, which is below the first bin; source: the same table."""
 
 EDGES_NM = np.concatenate([np.arange(300.0, 700.0, 10.0), np.arange(700.0, 1100.1, 5.0)])
 """Edges of the bins in nm: 10 nm apart up to 700 nm, and 5 nm apart from there to 1100 nm, where most sensors work."""

@@ -43,19 +43,29 @@ except ImportError:  # Windows has no flock: there, two runs with the same outpu
 STAGING = ".rangesim-staging"
 """Name of the hidden directory, inside the output, in which work in progress lies."""
 MANIFEST = "manifest.json"
+"""Name of the file that lists all other files of a finished directory."""
 MANIFEST_FORMAT = "rangesim-manifest"
 MANIFEST_VERSION = 1
+"""Version of the manifest's format; a manifest of another version is refused."""
 MAX_MANIFEST_BYTES = 64 << 20
+"""Bytes of the largest manifest that is read. A file takes some 150 of them, so these are over 400 000 files."""
 _JOURNAL, _LOCK, _WORK, _NEW, _OLD, _DOOMED = "journal.json", "lock", "work", "new", "old", "doomed"
-_ATTEMPTS = 1000  # at a directory whose owner removes it just then
+_ATTEMPTS = 1000
+"""Attempts, about a millisecond apart, to claim a directory that another process removes at the same moment. If all
+fail, the directory counts as one that cannot be made."""
 
 
 @dataclass(frozen=True)
 class DirectoryKind:
     """A kind of directory that this project writes.
 
-    format : states the kind in the manifest and in the sidecar. sidecar : name of the JSON file with the settings.
-    error : raised, with one sentence, where a directory of this kind cannot be written.
+    format : name of the kind in the manifest and in the sidecar. sidecar : name of the JSON file with the settings.
+    error : exception, with one sentence, that says why a directory of this kind cannot be written.
+
+    Examples
+    --------
+    >>> DirectoryKind("rangesim-result", "experiment.json", ValueError).format
+    'rangesim-result'
     """
 
     format: str
@@ -72,10 +82,10 @@ class Digest(NamedTuple):
 
 @dataclass(frozen=True)
 class Verification:
-    """How a directory differs from its manifest; paths are relative to it, sorted.
+    """The differences between a directory and its manifest; paths are relative to the directory and sorted.
 
-    missing, changed : listed files that are gone, or hold something else. foreign : files and empty directories that
-    are not listed. files : number of files that are listed.
+    missing : listed files that do not exist. changed : listed files with another content. foreign : files and empty
+    directories that are not listed. files : number of listed files.
     """
 
     missing: tuple[str, ...]
@@ -88,16 +98,16 @@ class Verification:
 
 
 def check_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence[str | Path] = ()) -> Path:
-    """The directory that output to `directory` goes to, links followed; nothing is written.
+    """Return the directory that output to `directory` goes to, with links followed; nothing is written.
 
-    A directory may be new, or empty, or hold an older result of the same kind as it was written, beside which the user
-    may keep files. `inputs` are what the work reads.
+    A directory may be new, or empty, or hold an unchanged older result of the same kind, beside which the user may keep
+    files. `inputs` are the files and directories that the work reads.
 
     Raises
     ------
     kind.error
-        The place holds something else, a file of the older result was changed, `directory` is a link to nothing, is or
-        holds an input or lies in one, or another process is writing to it.
+        The place holds something else, or a file of the older result was changed; `directory` is a link to nothing; it
+        is an input, holds one or lies in one; or another process is writing to it.
     """
     named = Path(directory)
     if named.parts[:1] == ("~",) or named.name.startswith("--"):
@@ -124,16 +134,16 @@ def check_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence
 
 @contextmanager
 def new_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence[str | Path] = ()) -> Iterator[Path]:
-    """A directory to fill; its files take their places in `directory` when the block ends well, and vanish if it fails.
+    """Yield a directory to fill; its files move to `directory` when the block ends well, and are removed if it fails.
 
-    An older result of the same kind is replaced then, and stays until then. Files that are not in its manifest stay.
-    Should a file of the user's stand in the way by the time the block ends, the new result is kept in a directory
-    inside, and the error says in which.
+    An older result of the same kind stays until then, and is replaced then. Files that are not in its manifest stay. If
+    a file of the user stands in the way when the block ends, the new result is kept in a directory inside, which the
+    error names.
 
     Raises
     ------
     kind.error
-        As `check_directory`; or the directory cannot be made, or the disk is full.
+        As for `check_directory`; or the directory cannot be made, or the disk is full.
     """
     named = Path(directory)
     target = check_directory(named, kind, inputs)
@@ -152,15 +162,15 @@ def new_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence[s
 
 
 def write_manifest(folder: Path, kind: DirectoryKind) -> None:
-    """List all files of a complete directory in its manifest; `new_directory` does so itself."""
+    """Write the manifest of a complete directory, with all its files; `new_directory` does this itself."""
     files = {name: [_digest(folder / name)] for name in _walk(folder) if name != MANIFEST}
     (folder / MANIFEST).write_bytes(_manifest(kind, files))
 
 
 def replace_listed_file(directory: str | Path, name: str, make: Callable[[], bytes], kind: DirectoryKind) -> None:
-    """Write the file `name` of a complete directory anew, and its manifest.
+    """Write the file `name` of a complete directory again, and its manifest.
 
-    `make` returns the content; nobody else replaces the directory from when it is called to the end.
+    `make` returns the new content. No other process replaces the directory from the call of `make` until the end.
 
     Raises
     ------
@@ -189,7 +199,7 @@ def replace_listed_file(directory: str | Path, name: str, make: Callable[[], byt
 
 
 def read_manifest(directory: Path, kind: DirectoryKind) -> dict[str, list[Digest]]:
-    """The contents that each file of a directory may have, by its path relative to the directory, with `/`.
+    """Return the contents that each file of a directory may have, by its path relative to the directory, with `/`.
 
     Raises
     ------
@@ -211,7 +221,7 @@ def read_manifest(directory: Path, kind: DirectoryKind) -> dict[str, list[Digest
 
 
 def verify_directory(directory: str | Path, kind: DirectoryKind) -> Verification:
-    """How the files of a directory differ from what was written; reads every byte.
+    """Return how the files of a directory differ from what was written; this reads every byte.
 
     Raises
     ------
@@ -233,12 +243,12 @@ def verify_directory(directory: str | Path, kind: DirectoryKind) -> Verification
 
 
 def recover(directory: str | Path, error: type[Exception]) -> None:
-    """Complete a replacement that a killed process had begun; called before a directory of ours is read.
+    """Complete a replacement that a killed process began. Call this before reading a directory that rangesim wrote.
 
     Raises
     ------
     error
-        It cannot be completed: a file is in the way, or the place cannot be written.
+        The replacement cannot be completed: a file is in the way, or the place cannot be written.
     """
     target = Path(os.path.realpath(directory))
     staging = target / STAGING
@@ -266,14 +276,15 @@ def recover(directory: str | Path, error: type[Exception]) -> None:
 
 
 _claims: dict[Path, _Staging] = {}
+"""Staging directories that this process works in, by their paths."""
 _claims_lock = threading.RLock()
-"""Held while claims change and while files take their places: `abandon` waits for it."""
+"""The lock that is held while claims change and while files move to their places; `abandon` waits for it."""
 
 
 def abandon() -> bool:
-    """Remove all work in progress of this process, which is about to end; whether there was any.
+    """Remove all work in progress of this process, which is about to end; return whether there was any.
 
-    A replacement under way is completed first. For handlers of signals, in a thread of their own.
+    A replacement under way is completed first. The thread that handles signals calls this.
     """
     with interrupts.holding(_claims_lock):
         begun = bool(_claims)
@@ -283,7 +294,7 @@ def abandon() -> bool:
 
 
 class _Staging:
-    """The staging directory inside an output, claimed by this process for as long as its lock is open."""
+    """The staging directory inside an output, which this process claims as long as it keeps the lock file open."""
 
     def __init__(self, target: Path) -> None:
         self.target, self.path = target, target / STAGING
@@ -295,7 +306,7 @@ class _Staging:
 
     @classmethod
     def claim(cls, named: Path, target: Path, kind: DirectoryKind) -> _Staging:
-        """Make the staging directory, or take over what a killed process left there."""
+        """Make the staging directory, or take over the one that a killed process left."""
         with _claims_lock:
             claim = cls(target)
             try:
@@ -319,7 +330,7 @@ class _Staging:
         return claim
 
     def take(self, kind: DirectoryKind) -> bool:
-        """Try to lock the staging directory, made if need be; whether it was still there."""
+        """Try to lock the staging directory, which is made if need be; return whether it still existed."""
         try:
             self.target.mkdir(parents=True, exist_ok=True)
             self.path.mkdir(exist_ok=True)
@@ -339,7 +350,7 @@ class _Staging:
         return True
 
     def make_new(self) -> Path:
-        """The directory to fill."""
+        """Make the directory to fill, and return it."""
         with _claims_lock:
             self.work.mkdir()
         return self.work
@@ -347,8 +358,8 @@ class _Staging:
     def is_ours(self) -> bool:
         """Whether this process made the claim, and the directory is still where it was.
 
-        A user may move or remove it meanwhile, and another process may work in a new one of that name; and a child of
-        this process shares the claim.
+        A user may move or remove it meanwhile, another process may work in a new one of that name, and a child of this
+        process shares the claim.
         """
         with _claims_lock:  # a thread that ends the process may give up the claim meanwhile
             if self.handle is None or self.process != os.getpid():
@@ -359,12 +370,12 @@ class _Staging:
                 return False
 
     def was_moved(self) -> bool:
-        """Whether the directory is no longer where this process made it."""
+        """Whether the directory is no longer where this process made it, because somebody moved or removed it."""
         with _claims_lock:
             return self.handle is not None and self.process == os.getpid() and not self.is_ours()
 
     def commit(self, named: Path, kind: DirectoryKind) -> None:
-        """List the new files in a manifest, flush them, and let them take their places."""
+        """List the new files in a manifest, flush them, and move them to their places."""
         if self.process != os.getpid():
             return
         write_manifest(self.work, kind)
@@ -394,9 +405,9 @@ class _Staging:
         interrupts.count()
 
     def listed(self, kind: DirectoryKind) -> dict[str, list[Digest]]:
-        """Files of the older result that are still as they were written, its manifest among them.
+        """Return the files of the older result that are still as they were written, including its manifest.
 
-        A manifest that came while the work went on is the user's, and so is what it lists.
+        A manifest that somebody put there while the work went on belongs to the user, with the files that it lists.
         """
         try:
             if self.manifest is None or _digest(self.target / MANIFEST) != self.manifest:
@@ -408,6 +419,7 @@ class _Staging:
         return {**kept, MANIFEST: [_digest(self.target / MANIFEST)]}
 
     def _set_aside(self, kind: DirectoryKind) -> Path:
+        """Move the new result to a directory inside the target that does not exist yet, and return that directory."""
         for number in range(2, 10_000):
             place = self.target / f"{kind.format}-{number}"
             if not os.path.lexists(place):
@@ -417,7 +429,7 @@ class _Staging:
         raise kind.error(f"{self.target} holds too many results that were set aside; move them away.")
 
     def release(self) -> None:
-        """Remove the staging directory, but for a replacement that is still to be completed; give up the lock."""
+        """Remove the staging directory, unless it holds a replacement to complete, and give up the lock."""
         with _claims_lock:
             _claims.pop(self.path, None)
             handle = self.handle
@@ -437,7 +449,7 @@ def _moved(named: Path) -> str:
 
 
 def _clear(staging: Path) -> None:
-    """Remove all but the lock from a staging directory."""
+    """Remove everything but the lock from a staging directory."""
     for entry in staging.iterdir():
         if entry.name == _LOCK:
             continue
@@ -450,7 +462,7 @@ def _clear(staging: Path) -> None:
 
 
 def _dissolve(staging: Path) -> None:
-    """Remove a staging directory whose lock is held; the lock last, so that nobody takes it for a foreign one."""
+    """Remove a staging directory whose lock is held. The lock goes last, so that nobody takes the rest for foreign."""
     with suppress(OSError):  # the next one clears it
         _clear(staging)
         if os.listdir(staging) == [_LOCK]:
@@ -459,7 +471,7 @@ def _dissolve(staging: Path) -> None:
 
 
 def _forget_claims() -> None:
-    """In a child of a process: what its parent has begun is none of its business."""
+    """Forget the claims in a forked child: they are its parent's."""
     global _claims_lock
     _claims_lock = threading.RLock()
     for claim in _claims.values():
@@ -475,9 +487,10 @@ if hasattr(os, "register_at_fork"):
 
 
 def _carry_out(target: Path) -> None:
-    """Do what the journal says, if there is one, and is not yet done: retire the old files, place the new ones.
+    """Complete the replacement that a journal describes, if there is one: retire the old files, place the new ones.
 
-    A crafted directory may hold a crafted journal: nothing is reached through links, nothing outside is touched.
+    Steps that are done already are left out. A crafted directory may hold a crafted journal, so no link is followed,
+    and nothing outside the directory is touched.
     """
     staging = target / STAGING
     if not is_plain_file(staging / _JOURNAL):
@@ -511,7 +524,7 @@ def _carry_out(target: Path) -> None:
 
 
 def _read_journal(path: Path) -> tuple[dict[str, list[Digest]], list[str]]:
-    """The files to retire, with what they hold, and those to place; OSError if the journal is damaged."""
+    """Return the files to retire, with their contents, and the files to place; OSError if the journal is damaged."""
     try:
         journal = json.loads(path.read_bytes()[:MAX_MANIFEST_BYTES])
         place = [_checked_name(name) for name in journal["place"]]
@@ -521,7 +534,7 @@ def _read_journal(path: Path) -> tuple[dict[str, list[Digest]], list[str]]:
 
 
 def _check_contents(named: Path, target: Path, kind: DirectoryKind, inputs: Sequence[str | Path]) -> None:
-    """Refuse what is neither empty nor an older result of the same kind as it was written, and what holds an input."""
+    """Refuse a directory that is neither empty nor an unchanged result of the same kind, or that holds an input."""
     entries = [entry.name for entry in target.iterdir() if entry.name != STAGING]
     if not entries:
         return
@@ -562,7 +575,7 @@ def _check_apart(named: Path, target: Path, source: Path, kind: DirectoryKind) -
 
 
 def _is_in_the_way(target: Path, name: str, listed: Mapping[str, Any]) -> bool:
-    """Whether something that is not ours stands where the new file `name` is to go."""
+    """Whether a file or directory that rangesim did not write stands where the new file `name` is to go."""
     for parent in _parents(target, name):
         is_directory = parent.is_dir() and not parent.is_symlink()
         if os.path.lexists(parent) and not is_directory and parent.relative_to(target).as_posix() not in listed:
@@ -571,7 +584,7 @@ def _is_in_the_way(target: Path, name: str, listed: Mapping[str, Any]) -> bool:
 
 
 def _may_move(path: Path) -> bool:
-    """Whether this process may rename a file: that is up to its directory."""
+    """Whether this process may rename a file, which the permissions of its directory decide."""
     if not os.access(path.parent, os.W_OK | os.X_OK):
         return False
     folder = path.parent.stat()
@@ -581,6 +594,7 @@ def _may_move(path: Path) -> bool:
 
 
 def _listed_names(target: Path, kind: DirectoryKind) -> set[str]:
+    """Names of the files in the manifest of a directory; none if there is no valid manifest."""
     try:
         return set(read_manifest(target, kind))
     except kind.error:
@@ -588,6 +602,7 @@ def _listed_names(target: Path, kind: DirectoryKind) -> set[str]:
 
 
 def _states_kind(sidecar: Path, kind: str) -> bool:
+    """Whether a sidecar is a JSON file whose format is `kind`."""
     try:
         info = json.loads(sidecar.read_text(encoding="utf-8")) if is_plain_file(sidecar) else None
     except (OSError, ValueError, RecursionError):
@@ -595,12 +610,12 @@ def _states_kind(sidecar: Path, kind: str) -> bool:
     return isinstance(info, dict) and info.get("format") == kind
 
 
-# ---- What they rest on ----------------------------------------------------------------------------------------------
+# ---- Files and locks beneath ---------------------------------------------------------------------------------------
 
 
 @contextmanager
 def _one_sentence(named: Path, target: Path, kind: DirectoryKind) -> Iterator[None]:
-    """Turn an OSError of the directory that is written to, or of those around it, into a sentence that names it."""
+    """Turn an OSError about the output directory, or about one around it, into an error whose sentence names it."""
     try:
         yield
     except (OSError, kind.error) as error:
@@ -621,7 +636,7 @@ def _one_sentence(named: Path, target: Path, kind: DirectoryKind) -> Iterator[No
 
 
 def _walk(folder: Path, empty_directories: bool = False) -> list[str]:
-    """Relative paths of all files and links in a directory but for the staging; on demand, of empty directories too."""
+    """Relative paths of all files and links in a directory except the staging; on demand, empty directories too."""
     found: list[str] = []
     pending = [""]
     while pending:
@@ -650,20 +665,22 @@ def _parents(folder: Path, name: str) -> list[Path]:
 
 
 def _is_reached_plainly(folder: Path, name: str) -> bool:
-    """Whether there is no link on the way."""
+    """Whether the directories between `folder` and its file `name` exist and none of them is a link."""
     return all(parent.is_dir() and not parent.is_symlink() for parent in _parents(folder, name))
 
 
 def _make_plain_parents(folder: Path, name: str) -> None:
+    """Make the directories between `folder` and its file `name`; FileExistsError if a link or a file is there."""
     for parent in _parents(folder, name):
         if not parent.is_dir() or parent.is_symlink():
             parent.mkdir()  # FileExistsError if something else is there
 
 
 def _is_staging(path: Path) -> bool:
-    """Whether a directory of the staging's name is one: it holds its lock, or nothing.
+    """Whether a directory with the name of a staging directory is one: it holds a lock, or nothing.
 
-    Its owner may make or remove it meanwhile, and the next one come: it takes several looks to find a foreign one.
+    Its owner may make or remove it meanwhile, and another process may make the next one. So it counts as foreign only
+    if several looks in a row say so.
     """
     lock = path / _LOCK
     for _ in range(5):
@@ -680,7 +697,7 @@ def _is_staging(path: Path) -> bool:
 
 
 def _digest(path: Path) -> Digest:
-    """Size and SHA-256 of a file; of one that was hashed before and has the same change time since, from memory."""
+    """Size and SHA-256 of a file; a file that was hashed before and has the same change time is not read again."""
     with path.open("rb") as stream:
         state = os.fstat(stream.fileno())
         key = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
@@ -698,12 +715,16 @@ def _digest(path: Path) -> Digest:
 
 
 _hashed: dict[tuple[int, ...], Digest] = {}
+"""Digests of files that this process has read, by device, inode, size, and times of modification and change."""
 SETTLED_NS = 2_000_000_000
-"""A file that changed so long ago gets another change time when it changes again: clocks of file systems are coarse."""
+"""Nanoseconds since the last change of a file after which its digest is kept. A later change surely gets another time:
+the coarsest clocks of file systems tick every two seconds."""
 MAX_HASHED = 10_000
+"""Digests that are kept; when there are more, all are forgotten."""
 
 
 def _manifest(kind: DirectoryKind, files: Mapping[str, Sequence[Digest]]) -> bytes:
+    """The content of a manifest."""
     info = {"format": MANIFEST_FORMAT, "format_version": MANIFEST_VERSION, "of": kind.format, "files": files}
     return _json(info)
 
@@ -713,6 +734,7 @@ def _json(content: Mapping[str, Any]) -> bytes:
 
 
 def _parse_manifest(info: Any, kind: str) -> dict[str, list[Digest]]:
+    """Return the files of a manifest of this kind; ValueError, TypeError, KeyError or AttributeError if it is none."""
     if not isinstance(info, dict) or info.get("format") != MANIFEST_FORMAT or info.get("of") != kind:
         raise ValueError(f"it does not state the format {MANIFEST_FORMAT!r} of a {kind!r}")
     if info.get("format_version") != MANIFEST_VERSION:
@@ -731,7 +753,7 @@ def _parse_files(files: Any) -> dict[str, list[Digest]]:
 
 
 def _checked_name(name: str) -> str:
-    """`name`, a relative path that stays inside its directory; ValueError otherwise."""
+    """Return `name` if it is a relative path that stays inside its directory; ValueError otherwise."""
     parts = PurePosixPath(name).parts
     plain = parts and not name.startswith("/") and ".." not in parts and PurePosixPath(name).as_posix() == name
     if not plain or "\0" in name or parts[0] == STAGING or name == ".":
@@ -740,7 +762,7 @@ def _checked_name(name: str) -> str:
 
 
 def _move_to_free_place(source: Path, place: Path) -> None:
-    """Move a file to where nothing is; FileExistsError if something is there after all."""
+    """Move a file to a place where nothing is; FileExistsError if something is there after all."""
     try:
         os.link(source, place, follow_symlinks=False)
     except FileExistsError:
@@ -761,6 +783,7 @@ def _move_to_free_place(source: Path, place: Path) -> None:
 
 
 def _flush_tree(folder: Path) -> None:
+    """Flush all files and directories of a directory to the disk."""
     for directory, _, names in os.walk(folder, topdown=False):
         for name in names:
             flush(Path(directory) / name)
@@ -768,9 +791,9 @@ def _flush_tree(folder: Path) -> None:
 
 
 def _lock(staging: Path, seconds: float = 0.0) -> int | None:
-    """An open handle that holds the lock of a staging directory; None if a living process has it for so long.
+    """Return an open handle that holds the lock of a staging directory; None if a living process holds it that long.
 
-    FileNotFoundError if the directory goes meanwhile.
+    Raise FileNotFoundError if the directory is removed meanwhile.
     """
     until = time.monotonic() + seconds
     while True:
@@ -792,7 +815,7 @@ def _lock(staging: Path, seconds: float = 0.0) -> int | None:
 
 
 def _is_claimed(target: Path) -> bool:
-    """Whether a living process writes to a directory; this looks without making anything."""
+    """Whether a living process writes to a directory; nothing is made to find out."""
     path = target / STAGING / _LOCK
     if fcntl is None or not is_plain_file(path):
         return False

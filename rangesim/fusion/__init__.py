@@ -1,5 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many views to one surface, and what a range sensor never sees; names load on first use. See docs/fusion.md."""
+"""Fusion of many views to one surface, its error, and the volume that the views never see (docs/fusion.md).
+
+Names are loaded when they are first used.
+
+Examples
+--------
+Views of a ball from six sides, computed in closed form, become a mesh that is right to a fraction of a voxel:
+
+>>> import numpy as np
+>>> import trimesh
+>>> from rangesim import Intrinsics, RangeImage, look_at
+>>> from rangesim.fusion import fuse, surface_error
+>>> from rangesim.triangle_mesh import TriangleMesh
+>>> camera, radius_m = Intrinsics.from_fov(96, 72, 20.0), 0.05
+>>> rays = camera.directions(camera.pixel_centres())
+>>> def view(x, y, z):
+...     T = look_at((x, y, z), (0, 0, 0))
+...     centre = T[:3, :3].T @ -T[:3, 3]
+...     a, b = (rays**2).sum(axis=-1), rays @ centre
+...     inside = b * b - a * (centre @ centre - radius_m**2)
+...     z = np.where(inside > 0, (b - np.sqrt(np.maximum(inside, 0))) / a, np.nan).astype(np.float32)
+...     one, status = np.ones_like(z), np.where(np.isfinite(z), 0, 1).astype(np.uint8)
+...     return RangeImage(z, z * np.linalg.norm(rays, axis=-1), one, status, one, camera, T)
+>>> sides = [(0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0, -0.5, 0), (0.01, 0, 0.5), (0.01, 0, -0.5)]
+>>> fused = fuse([view(*side) for side in sides], voxel_m=0.004)
+>>> true = trimesh.creation.icosphere(subdivisions=4, radius=radius_m)
+>>> error = surface_error(fused.mesh, TriangleMesh(true.vertices, true.faces), threshold_m=0.002)
+>>> error.accuracy_m < 0.0005, error.f_score > 0.99
+(True, True)
+"""
 
 from __future__ import annotations
 

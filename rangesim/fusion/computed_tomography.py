@@ -35,12 +35,12 @@ from rangesim.triangle_mesh import TriangleMesh
 FILTERS = ("ramp", "shepp-logan", "cosine", "hamming", "hann")
 """Names of the filters of scikit-image's `iradon`. The ramp is exact; the others have less noise and resolution."""
 RAYS_AT_ONCE = 1 << 19
-"""Number of rays that are cast in one call, so that a call needs about a hundred megabytes."""
+"""Count of rays that are cast in one call, so that a call needs about a hundred megabytes."""
 MAX_SHIFTS = 8
-"""Largest number of times that a ray which meets an edge of the mesh is shifted. A shifted
-ray rarely meets another edge, so one that needs more shifts has most likely met a hole in the mesh."""
+"""Largest number of times that a ray which meets an edge of the mesh is shifted. A shifted ray rarely meets another
+edge; the number is limited because rays through a hole in the mesh would be shifted forever."""
 SHIFT_VOXELS = 1e-3
-"""Length of such a shift in voxels: far above the rounding of single precision, and far below the resolution."""
+"""Length of such a shift in voxels, chosen far above the rounding of single precision and far below the resolution."""
 MIN_COUNT = 0.5
 """Photons that replace a count of 0, as the logarithm of 0 is infinite: half-way between none and one photon."""
 
@@ -193,7 +193,7 @@ def filtered_back_projection(sinogram: Sinogram, filter_name: str = "ramp") -> n
             f"expected a filter out of {', '.join(FILTERS)}, got {filter_name!r}{nearest(filter_name, FILTERS)}."
         )
     if len(sinogram.angles) < 2:
-        raise ValueError(f"expected at least two angles to see depth by, got {len(sinogram.angles)}.")
+        raise ValueError(f"expected at least two angles, got {len(sinogram.angles)}.")
     grid, degrees = sinogram.grid, np.degrees(sinogram.angles)
     n, (nx, ny, nz) = sinogram.values.shape[1], grid.shape
     left, top = n // 2 - nx // 2, n // 2 - ny // 2
@@ -273,7 +273,7 @@ class _Caster:
         if not closed.all():
             raise ValueError(
                 f"expected a closed mesh that rays leave as often as they enter, but {np.count_nonzero(~closed)} of "
-                f"{len(closed)} do not through {self.name}; mend its holes and turned faces."
+                f"{len(closed)} rays through {self.name} do not; close its holes, and turn faces that point inward."
             )
         return found
 

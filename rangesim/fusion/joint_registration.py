@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of many views refined together, from all their readings at once.
+"""Joint registration: the poses of many views are refined together, from all their readings at once.
 
-Pairs of clouds that overlap in part pull each other's borders together: a point beside the other cloud's border has its
-partner on it. Here a point p of view i finds its partner by projection to view j instead (Blais, Levine 1995), where
-the border is known, and all pairs are fitted in one system (Neugebauer 1997), point to plane:
+In the registration of two clouds that overlap in part, a point outside the overlap finds its partner on the border of
+the other cloud, and pulls the borders together. Here a point p of view i finds its partner by projection to view j
+instead (Blais, Levine 1995), where the border of the readings is known. All pairs of views are fitted in one system
+(Neugebauer 1997), point to plane:
 
-    minimise  sum over i, j, p  rho( n_j . (T_j^-1 T_i p - q_j) ),     q_j the reading of view j where T_j^-1 T_i p
-    falls
+    minimise  sum over i, j, p  rho( n_j . (T_j^-1 T_i p - q_j) )
 
-over T_2 .. T_n, by Gauss-Newton with Tukey's weights.
+over T_2 .. T_n, with q_j the reading of view j in the pixel of T_j^-1 T_i p, and n_j its normal. The method is
+Gauss-Newton with Tukey's weights.
 """
 
 from __future__ import annotations
@@ -25,22 +26,34 @@ from rangesim.point_cloud import lattice_normals
 from rangesim.rig import Array, Intrinsics
 from rangesim.robust_scale import sigma_from_median
 
-POINTS = 4000
-"""Of each view."""
+POINTS_PER_VIEW = 4000
+"""Number of random readings of each view that are fitted: twice as many take twice the time, and make the error of a
+pose smaller by the root of two."""
 BORDER_PX = 3
-"""Pixels from a border or a failed pixel within which readings are no partners."""
-LEAST_COSINE = 0.3
-"""Between the normals of partners, and of the angle of incidence."""
+"""Distance in pixels from a border or a failed pixel within which readings are not used, because normals and
+interpolated depths are wrong there."""
+MIN_COSINE = 0.3
+"""Smallest cosine (a ratio) of the angle between the normals of two partners, and of the angle of incidence. It is that
+of 73 degrees, because readings beyond are inaccurate, and partners beyond lie on different surfaces."""
 TUKEY = 4.685
-"""Standard deviations beyond which a residual counts nothing."""
-ROUNDS = 30
+"""Standard deviations beyond which a residual has the weight 0: the standard value, which gives 95 % efficiency for
+normally distributed errors (Holland, Welsch 1977)."""
+MAX_ROUNDS = 30
+"""Largest number of Gauss-Newton steps. The fit normally ends earlier, see `CONVERGED`; the count is limited so that
+poses which go to and fro end, too."""
 CONVERGED = 1e-7
-"""Radians, and metres over the size of the scene."""
+"""Largest entry of a step at which the fit ends: radians, and metres as a fraction of the size of the scene. It is
+chosen far below the errors of the poses, so a larger value would save a step or two."""
 
 
 class _View(NamedTuple):
-    """camera : Intrinsics. z, normals : (h, w), (h, w, 3), NaN at borders. points, point_normals : (n, 3), some of its
-    readings, camera coordinates."""
+    """One view, prepared for the fit.
+
+    camera : Intrinsics.
+    z : (h, w) float64, metres, depth; NaN without a reading.
+    normals : (h, w, 3) float64, camera coordinates; NaN near borders and on slanted surfaces.
+    points, point_normals : (n, 3) float64, metres and unit vectors, camera coordinates, a random part of the readings.
+    """
 
     camera: Intrinsics
     z: Array
@@ -50,6 +63,7 @@ class _View(NamedTuple):
 
     @classmethod
     def of(cls, image: RangeImage, random: np.random.Generator) -> _View:
+        """The view of a range image."""
         from scipy.ndimage import binary_erosion
 
         camera, _ = camera_and_pose(image)
@@ -58,37 +72,48 @@ class _View(NamedTuple):
         normals = lattice_normals(z, rays)
         cosine = -(normals * rays).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
         size = 2 * BORDER_PX + 1
-        inner = binary_erosion(np.isfinite(z) & (cosine > LEAST_COSINE), np.ones((size, size)))  # False with NaN
+        inner = binary_erosion(np.isfinite(z) & (cosine > MIN_COSINE), np.ones((size, size)))  # False with NaN
         normals[~inner] = np.nan
         rows, columns = np.nonzero(inner)
-        few = random.permutation(len(rows))[:POINTS]
+        few = random.permutation(len(rows))[:POINTS_PER_VIEW]
         y, x = rows[few], columns[few]
         return cls(camera, z, normals, rays[y, x] * z[y, x, None], normals[y, x])
 
 
 def refine_jointly(images: Sequence[RangeImage], poses: Array, reach_m: float, seed: int = 0) -> Array:
-    """(n, 4, 4) poses, T_world_camera, that fit all readings; the first is kept.
+    """Poses that fit all readings of all views best: (n, 4, 4) float64, T_world_camera; the first one is kept.
 
     Parameters
     ----------
-    poses : (n, 4, 4) first guess. reach_m : metres, how far surfaces may be apart at first.
+    images : the views; their own poses are not used.
+    poses : (n, 4, 4), metres, T_world_camera, first guess.
+    reach_m : metres, largest distance between the surfaces of two views under the first guess.
+    seed : of the random readings that are fitted; the same seed gives the same poses.
 
     Raises
     ------
     ValueError
-        The readings do not hold the poses: surfaces that slide on each other, or views without partners.
+        The readings do not fix the poses: surfaces slide on each other, or a view has no partners in the others.
+
+    Examples
+    --------
+    `align` calls it as its last step. To improve poses that are known to some millimetres:
+
+    >>> from rangesim.fusion import refine_jointly
+    >>> better = refine_jointly(scan.images, scan.poses, reach_m=0.005)  # doctest: +SKIP
     """
     random = np.random.default_rng(seed)
     views = [_View.of(image, random) for image in images]
     T = np.array(poses, dtype=np.float64)
     size = float(np.median([np.median(np.linalg.norm(v.points, axis=1)) for v in views if len(v.points)]))
     scale = reach_m / 3
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         normal, right, residuals = _equations(views, T, reach_m, scale, size)
         values = np.linalg.eigvalsh(normal[6:, 6:])
         if not values[0] > 1e-8 * values[-1]:
             raise ValueError(
-                "expected views whose readings hold each other, got some that slide or have no partners in the others."
+                "expected readings that fix the poses of all views, but some views slide on the others, or do not "
+                "overlap them."
             )
         step = np.concatenate([np.zeros(6), -np.linalg.solve(normal[6:, 6:], right[6:])]).reshape(-1, 6)
         for k, twist in enumerate(step):
@@ -103,7 +128,10 @@ def refine_jointly(images: Sequence[RangeImage], poses: Array, reach_m: float, s
 
 
 def _equations(views: list[_View], T: Array, reach_m: float, scale: float, size: float) -> tuple[Array, Array, Array]:
-    """Normal equations of all pairs, (6n, 6n) and (6n,), translations in units of `size`; residuals in metres."""
+    """Normal equations of all pairs of views: matrix (6n, 6n), right side (6n,), and residuals in metres.
+
+    Translations are in units of `size` metres, so that the matrix is well conditioned.
+    """
     n = len(views)
     normal, right, residuals = np.zeros((n, 6, n, 6)), np.zeros((n, 6)), [np.zeros(0)]
     for i, source in enumerate(views):
@@ -117,10 +145,10 @@ def _equations(views: list[_View], T: Array, reach_m: float, scale: float, size:
             z = depth_at(pixels, target.z, "bilinear")
             x, y = (np.nan_to_num(pixels[:, k]).astype(int).clip(0, m - 1) for k, m in enumerate(target.z.shape[::-1]))
             n_j = target.normals[y, x] @ T[j, :3, :3].T
-            # The reading's point lies on the point's own ray, so both differ along it alone
+            # The reading is on the ray of the point, so the two differ along the ray only
             along = local / local[:, 2:] * (local[:, 2] - z)[:, None] @ T[j, :3, :3].T
             r = (along * n_j).sum(axis=-1)
-            fits = (np.abs(r) < min(reach_m, TUKEY * scale)) & ((n_j * facing).sum(axis=-1) > LEAST_COSINE)
+            fits = (np.abs(r) < min(reach_m, TUKEY * scale)) & ((n_j * facing).sum(axis=-1) > MIN_COSINE)
             if not fits.any():
                 continue
             rows = np.hstack([np.cross(world[fits], n_j[fits]), size * n_j[fits]])

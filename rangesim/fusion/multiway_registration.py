@@ -1,22 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the views of a scan were taken from, when nobody knows: pairs of views, and a pose graph over all of them.
+"""Multiway registration: unknown poses of the views of a scan, from pairs of views and a pose graph over all of them.
 
-0. Planes that hold more than half of a view's readings (a table, a wall) are set aside: they slide on themselves.
-1. Each view is registered to the one before without a first guess (`rangesim.geometry.register`), or, where that fails,
-   to one of the three before: a chain.
-2. Every other pair that overlaps by the chain is refined by `rangesim.geometry.icp`: loops.
-   A pair that moves off far from the chain has found another surface, and is left out.
-3. The pose graph takes the poses that fit all pairs best (Choi, Zhou, Koltun: "Robust reconstruction of indoor scenes",
-   CVPR 2015; Open3D's `global_optimization`), each pair with its information matrix:
+1. Planes that contain more than half of a view's readings (a table, a wall) are removed, because a plane slides on
+   itself.
+2. Chain: each view is registered to the view before it, without a first guess (`rangesim.geometry.register`). If that
+   fails, the two views before that one are tried.
+3. Loops: every other pair of views that overlaps according to the chain is refined by `rangesim.geometry.icp`. A pair
+   that ends far from the chain has found another surface, and is left out.
+4. Pose graph: the poses that fit all pairs best, each weighted with its information matrix (Choi, Zhou, Koltun: "Robust
+   reconstruction of indoor scenes", CVPR 2015; Open3D's `global_optimization`):
 
        minimise  sum over pairs (i, j)  r_ij^T Lambda_ij r_ij,     r_ij = log(T_ij^-1 T_j^-1 T_i)
 
-4. All readings are fitted at once (`joint_registration`).
-5. The result is checked: no pair of the chain may disagree with the graph, loops that do are left out, and no view may
-have surface where another sees through.
+   Loops that disagree with the graph are left out. A pair of the chain that disagrees is an error.
+5. Joint fit of all readings (`rangesim.fusion.joint_registration`).
+6. Check: a view that looks through a surface which another view measured is an error.
 
-Degenerate cases, each a ValueError that names the views: what slides on itself (a vase, a ball, a plane), what fits in
-two ways (symmetric things), too little overlap. A constant scale error of the sensor cannot be seen.
+Degenerate cases raise a ValueError that names the views: surfaces that slide on themselves (a vase, a ball, a plane),
+objects that fit in two ways (symmetric ones), and too little overlap. A constant scale error of the sensor cannot be
+detected.
 """
 
 from __future__ import annotations
@@ -41,40 +43,58 @@ from rangesim.settings.bounds import check_number
 from rangesim.settings.bounds import whole as whole_number
 from rangesim.settings.config import ShortRepr, shown
 
-POINTS = 4000
-"""Of each view, about, that are registered, if no spacing is given."""
-LEAST_POINTS = 200
-"""Of a view."""
-DOMINANT = 0.5
-"""Fraction of a view's readings from which a plane is set aside."""
+POINTS_PER_VIEW = 4000
+"""Number of points of each view that are registered, about, if no spacing is given. More take longer, and fewer lose
+the small features from which a pose can be told."""
+MIN_POINTS = 200
+"""Smallest number of points of a view, because fewer rarely show enough of a shape to find its pose."""
+DOMINANT_FRACTION = 0.5
+"""Fraction of a view's points from which on a plane is removed. It has to be the majority: a smaller plane does not
+keep the rest from being registered."""
 MAX_PLANES = 3
-BACK = 3
-"""Views before, that a view is registered to."""
+"""Largest number of planes that are removed from a view: a corner of a room has three. A view with more dominant planes
+than that has no object left."""
+MAX_STEPS_BACK = 3
+"""Number of views before a view that it may be registered to. More could bridge a longer gap, but each failed
+registration takes seconds (docs/fusion.md)."""
 MIN_OVERLAP = 0.3
-"""Fraction of the smaller view's points that the other shows, for a pair to be registered."""
-NEAR = 6.0
-"""Spacings within which points of two views, placed by the chain, are of one surface."""
-LOOP_OVERLAP = 0.5
-"""The same for a loop: pairs with less pull each other's borders together, and add little."""
-CONSISTENT = 2.0
-"""Spacings by which a pair may disagree with the graph, root mean square over its points."""
-THROUGH = 4.0
-"""Spacings in front of another view's surface from which a point contradicts it, besides 1 % of the depth."""
+"""Smallest fraction of the smaller view's points that lie on the other view, for a pair in the chain. It is a little
+below the third that `align` asks for, so that views taken as asked are not refused."""
+NEAR_SPACINGS = 6.0
+"""Distance within which points of two views belong to one surface, when the chain places the views, in spacings of the
+points. It is large because errors add up along the chain."""
+MIN_LOOP_OVERLAP = 0.5
+"""Smallest overlap of a loop, as a fraction like `MIN_OVERLAP`. Pairs with less overlap pull each other's borders
+together, and add little, because the chain holds the views already."""
+MAX_DISAGREEMENT_SPACINGS = 2.0
+"""Largest disagreement of a pair with the pose graph, in spacings of the points, root mean square over the pair's
+points. A larger limit keeps wrong loops; a smaller one leaves out good ones, because ICP is exact to a fraction of the
+spacing only."""
+THROUGH_SPACINGS = 4.0
+"""Distance by which a point has to be in front of another view's surface to contradict it, in spacings of the points,
+besides 1 % of the depth. It is large because readings are noisy and poses have errors."""
 MAX_CONTRADICTION = 0.15
-"""Fraction of the points of a view that another may see through: edges and ghosts, not a wrong pose."""
+"""Largest fraction of a view's points that another view may look through. It is not zero because edges and ghosts are
+looked through, too; a wrong pose makes it large."""
 EARLY_SPACINGS = (1.0, 0.8, 1.25)
-"""Spacings at which the first two views of a scan are tried, over their own: those of a whole scan differ by less."""
+"""Spacings at which `check_first_pair` tries the first two views, as multiples of the spacing of these two. The spacing
+of a whole scan differs from it by less."""
 
 ORDER = "Views are expected in the order of a walk, each overlapping the one before by a third or more."
+"""Advice about the order of views, in error messages."""
 REMEDY = f"add views between, or scan something that looks different from all sides. {ORDER}"
+"""Advice for views that do not fit, in error messages."""
 
 
 class PairFit(NamedTuple):
-    """Two views that were registered.
+    """Pair of views that was registered.
 
-    source, target : numbers of the views. T_target_source : (4, 4). overlap : fraction of the source's points on the
-    target. disagreement_m : root mean square distance of the source's points under the pair's pose and the graph's.
-    is_loop : whether it closes a loop, beside the chain.
+    source, target : numbers of the views.
+    T_target_source : (4, 4) float64, metres, pose of the source in the target's camera coordinates.
+    overlap : fraction of the source's points that lie on the target.
+    disagreement_m : metres, root mean square distance between the source's points placed by this pair and placed by the
+        pose graph.
+    is_loop : True for a loop, False for a pair of the chain.
     """
 
     source: int
@@ -87,11 +107,12 @@ class PairFit(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Alignment(ShortRepr):
-    """Poses that were found.
+    """Result of `align`: the views of a scan with their poses.
 
-    scan : the views with them; the first keeps the pose it had, which is the world. pairs : what they were found from.
-    spacing_m : between the points that were registered. unchecked : numbers of views that no loop holds, so that
-    nothing confirms their pose but the registration of one pair.
+    scan : the views with the poses that were found. The first view keeps its pose, which defines the world.
+    pairs : the pairs of views that the poses follow from.
+    spacing_m : metres, distance between the points that were registered.
+    unchecked : numbers of the views that are in no loop: their pose follows from a single pair, which nothing confirms.
     """
 
     scan: Scan
@@ -101,37 +122,44 @@ class Alignment(ShortRepr):
 
     @property
     def poses(self) -> Array:
-        """(n, 4, 4) float64, T_world_camera."""
+        """Poses of all views, T_world_camera: (n, 4, 4) float64, metres."""
         return self.scan.poses
 
 
 def align(scan: Scan, spacing_m: float | None = None, *, seed: int = 0) -> Alignment:
-    """Finds the poses of a scan's views from their readings alone; the head of this module says how.
+    """Alignment of a scan: the poses of its views, found from their readings alone.
 
-    The poses that the images have are not looked at, but for the first one's. Views come in the order of a walk:
-    neighbours overlap by a third or more. What is beside the thing (a table that does not turn with it) must not be in
-    the images.
+    The head of this module lists the steps. The poses of the images are not used, except the first one. Views must come
+    in the order of a walk, each overlapping the view before by a third or more. If the object turns, everything that
+    does not turn with it (a table) must be removed from the images.
 
     Parameters
     ----------
-    spacing_m : metres between the points that are registered; None: so that a view has about 4000.
-    seed : of the random samples; the same seed gives the same poses, to the rounding of Open3D's parallel sums.
+    scan : the views in order.
+    spacing_m : metres, distance between the points that are registered; None: a view has about 4000 points.
+    seed : of the random samples; the same seed gives the same poses, up to the rounding of Open3D's parallel sums.
 
     Raises
     ------
     ValueError
-        Fewer than two views, a view with fewer than 200 points, one that fits none of the three before, pairs that
-        contradict each other, or poses in which a view has surface where another looks through.
+        Fewer than two views, a view with fewer than 200 points, a view that fits none of the three before, pairs that
+        contradict each other, or poses in which a view looks through a surface that another measured.
 
     Warns
     -----
     AlignmentWarning
-        Views that no loop holds; of two views always one.
+        A view is in no loop. With two views this is always so.
+
+    Examples
+    --------
+    >>> from rangesim.fusion import align, fuse
+    >>> aligned = align(scan)  # doctest: +SKIP
+    >>> fused = fuse(aligned.scan.images, voxel_m=0.002)  # doctest: +SKIP
     """
     if len(scan) < 2:
         raise ValueError(f"expected two views or more to align, got {len(scan)}.")
     check_number("seed", seed, whole_number(0))
-    clouds, spacing = _thinned(scan, spacing_m, seed)
+    clouds, spacing = _registered_points(scan, spacing_m, seed)
     chain = _chain(clouds, seed)
     placed = _placed(chain, len(clouds))
     edges = chain + _loops(clouds, placed, spacing, {(e.source, e.target) for e in chain})
@@ -139,7 +167,7 @@ def align(scan: Scan, spacing_m: float | None = None, *, seed: int = 0) -> Align
         placed = _optimised(clouds, placed, edges, spacing)
         pairs = tuple(e._replace(disagreement_m=_disagreement(e, placed, clouds)) for e in edges)
         wrong = max((e for e in pairs if e.is_loop), key=lambda e: e.disagreement_m, default=None)
-        if wrong is None or wrong.disagreement_m <= CONSISTENT * spacing:
+        if wrong is None or wrong.disagreement_m <= MAX_DISAGREEMENT_SPACINGS * spacing:
             break
         edges = [e for e in edges if (e.source, e.target) != (wrong.source, wrong.target)]
     _refuse_disagreement(pairs, spacing)
@@ -147,26 +175,29 @@ def align(scan: Scan, spacing_m: float | None = None, *, seed: int = 0) -> Align
     first = scan.poses[0]
     aligned = scan.with_poses(np.stack([first, *(_rigid(world @ T) for T in placed[1:])]))
     aligned = scan.with_poses(
-        np.stack([_rigid(T) for T in refine_jointly(scan.images, aligned.poses, CONSISTENT * spacing, seed)])
+        np.stack(
+            [_rigid(T) for T in refine_jointly(scan.images, aligned.poses, MAX_DISAGREEMENT_SPACINGS * spacing, seed)]
+        )
     )
     _refuse_contradiction(aligned, clouds, spacing)
     unchecked = _unchecked(pairs, len(clouds))
-    if unchecked:  # of two views always: their one pair may fit wrongly, and nobody would know
+    if unchecked:  # always with two views: nothing confirms their only pair
         views = ", ".join(map(str, unchecked))
         warnings.warn(AlignmentWarning(f"no loop confirms the pose of view {views}; add views between."), stacklevel=2)
     return Alignment(aligned, pairs, spacing, unchecked)
 
 
 def check_first_pair(first_two: Scan, *, seed: int = 0) -> None:
-    """Raise ValueError if the second view of a scan fits nowhere on the first, as `align` of the whole scan would.
+    """Raise the ValueError that `align` of the whole scan would raise, if the second view does not fit on the first.
 
-    The spacing of the whole scan is not known yet, so that of two views is tried, then others near it.
+    The spacing of the whole scan is not known yet. So the spacing of the two views is tried, and then two others near
+    it.
     """
-    clouds, spacing = _thinned(first_two, None, seed)
+    clouds, spacing = _registered_points(first_two, None, seed)
     problems = []
     for scale in EARLY_SPACINGS:
         try:
-            _chain(clouds if scale == 1 else _thinned(first_two, scale * spacing, seed)[0], seed)
+            _chain(clouds if scale == 1 else _registered_points(first_two, scale * spacing, seed)[0], seed)
             return
         except ValueError as error:
             problems.append(error)
@@ -174,9 +205,10 @@ def check_first_pair(first_two: Scan, *, seed: int = 0) -> None:
 
 
 class PoseErrors(NamedTuple):
-    """How far poses are from the truth, once the frames of both are laid over each other: (n,) float64 each.
+    """Errors of poses after the frames of found and true poses were aligned.
 
-    angle_deg : degrees. centre_m : metres, of the camera centres.
+    angle_deg : (n,) float64, degrees, angle of the remaining rotation.
+    centre_m : (n,) float64, metres, distance between the camera centres.
     """
 
     angle_deg: Array
@@ -184,15 +216,31 @@ class PoseErrors(NamedTuple):
 
 
 def pose_errors(poses: ArrayLike, true_poses: ArrayLike) -> PoseErrors:
-    """Differences of poses (n, 4, 4) T_world_camera from the true ones, but for where the world has its axes.
+    """Errors of poses against the true poses, whatever the axes of the two worlds are.
 
-    The frames are laid over each other by the mean rotation (Moakher 2002: the polar factor of the sum) and the mean
-    translation of T_true T^-1, taken at the middle of the cameras.
+    The two frames are aligned by the mean rotation of T_true T^-1 (Moakher 2002: the polar factor of the sum), and by
+    the mean difference of the camera centres.
+
+    Parameters
+    ----------
+    poses, true_poses : (n, 4, 4), T_world_camera, metres.
 
     Raises
     ------
     ValueError
         Shapes other than (n, 4, 4), or different numbers of poses.
+
+    Examples
+    --------
+    A shift of the whole world is no error, but one camera of two that is 2 mm off is:
+
+    >>> import numpy as np
+    >>> from rangesim.fusion import pose_errors
+    >>> true = np.stack([np.eye(4), np.eye(4)])
+    >>> found = true.copy()
+    >>> found[:, 0, 3] = 5.0, 5.002
+    >>> pose_errors(found, true).centre_m.round(6).tolist()
+    [0.001, 0.001]
     """
     found, true = np.asarray(poses, dtype=np.float64), np.asarray(true_poses, dtype=np.float64)
     if found.shape != true.shape or found.shape[1:] != (4, 4) or not len(found):
@@ -210,58 +258,63 @@ def pose_errors(poses: ArrayLike, true_poses: ArrayLike) -> PoseErrors:
 # ---- Steps ---------------------------------------------------------------------------------------------------------
 
 
-def _thinned(scan: Scan, spacing_m: float | None, seed: int) -> tuple[list[Array], float]:
-    """Points of each view without dominant planes, one in each cube of the spacing, in its camera's coordinates."""
+def _registered_points(scan: Scan, spacing_m: float | None, seed: int) -> tuple[list[Array], float]:
+    """Points of each view that are registered, and their spacing in metres.
+
+    Dominant planes are removed, and one point is left in each cube of the spacing. Points are in camera coordinates.
+    """
     if spacing_m is not None and not 0 < spacing_m < np.inf:
         raise ValueError(f"expected a positive spacing_m in metres, got {shown(spacing_m)}.")
     every = scan.points()
     for number, cloud in enumerate(every):
-        if len(cloud) < LEAST_POINTS:
+        if len(cloud) < MIN_POINTS:
             raise ValueError(
-                f"expected {LEAST_POINTS} readings or more in each view to align, got {len(cloud)} in view {number}."
+                f"expected {MIN_POINTS} readings or more in each view to align, got {len(cloud)} in view {number}."
             )
-    # The area that readings stand for is their number times that of a pixel's footprint
+    # The area of a surface is the number of its readings times the footprint of a pixel
     pixels = [
         float(np.median(i.z[i.valid])) ** 2 / (i.camera.fx * i.camera.fy) for i in scan.images if i.camera is not None
     ]
-    coarse = float(np.sqrt(np.median([a * len(c) for a, c in zip(pixels, every, strict=True)]) / POINTS))
+    coarse = float(np.sqrt(np.median([a * len(c) for a, c in zip(pixels, every, strict=True)]) / POINTS_PER_VIEW))
     clouds = [_without_planes(cloud, spacing_m or coarse, seed) for cloud in every]
     if spacing_m is None:
-        spacing_m = float(np.sqrt(np.median([a * len(c) for a, c in zip(pixels, clouds, strict=True)]) / POINTS))
+        spacing_m = float(
+            np.sqrt(np.median([a * len(c) for a, c in zip(pixels, clouds, strict=True)]) / POINTS_PER_VIEW)
+        )
     thinned = []
     for number, cloud in enumerate(clouds):
         thinned.append(_one_in_each(cloud, spacing_m))
-        if len(thinned[-1]) < LEAST_POINTS:
+        if len(thinned[-1]) < MIN_POINTS:
             raise ValueError(
-                f"expected a spacing_m that leaves {LEAST_POINTS} points or more of each view, got {spacing_m:g} m, "
+                f"expected a spacing_m that leaves {MIN_POINTS} points or more of each view, got {spacing_m:g} m, "
                 f"which leaves {len(thinned[-1])} of view {number}."
             )
     return thinned, spacing_m
 
 
 def _without_planes(cloud: Array, spacing_m: float, seed: int) -> Array:
-    """The points (n, 3) that lie on no plane that holds most of them; all, if too few would be left."""
+    """Points (n, 3) that are on no dominant plane; all points, if too few would be left."""
     import open3d as o3d
 
     left = cloud
     for _ in range(MAX_PLANES):
         few = _one_in_each(left, spacing_m)
-        if len(few) < LEAST_POINTS:
+        if len(few) < MIN_POINTS:
             return cloud
         o3d.utility.random.seed(seed)
         packed = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(few))
         (*normal, offset), on_it = packed.segment_plane(0.5 * spacing_m, 3, 500)
-        if len(on_it) < DOMINANT * len(few):
+        if len(on_it) < DOMINANT_FRACTION * len(few):
             return left
         beside = left[np.abs(left @ np.array(normal) + offset) > 1.5 * spacing_m]
-        if len(beside) < LEAST_POINTS:
+        if len(beside) < MIN_POINTS:
             return cloud
         left = beside
     return left
 
 
 def _one_in_each(cloud: Array, spacing_m: float) -> Array:
-    """(m, 3) the middle of the points in each cube of the spacing."""
+    """Mean of the points in each cube of the spacing: (m, 3) float64, metres."""
     import open3d as o3d
 
     packed = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud))
@@ -269,11 +322,11 @@ def _one_in_each(cloud: Array, spacing_m: float) -> Array:
 
 
 def _chain(clouds: list[Array], seed: int) -> list[PairFit]:
-    """Each view registered to one before."""
+    """Pairs of the chain: each view registered to one of the views before it."""
     found = []
     for source in range(1, len(clouds)):
         reasons: dict[int, str] = {}
-        for target in range(source - 1, max(-1, source - 1 - BACK), -1):
+        for target in range(source - 1, max(-1, source - 1 - MAX_STEPS_BACK), -1):
             try:
                 fit = register(clouds[source], clouds[target], min_fitness=MIN_OVERLAP, seed=seed)
             except ValueError as error:
@@ -287,9 +340,10 @@ def _chain(clouds: list[Array], seed: int) -> list[PairFit]:
 
 
 def _why(reasons: dict[int, str]) -> str:
-    """Why a view fits none of those before, by the nearest one: reasons of all, the nearest one's first.
+    """Message that a view fits none of the views before it, with the reason for the nearest of them.
 
-    What a reason advises, after its semicolon, is for two clouds alone; of three, a message would be too long to read.
+    reasons : message of the failed registration by number of the view, the nearest view first. The advice after a
+    message's semicolon is left out, as it holds for two clouds alone.
     """
     (nearest, reason), *others = reasons.items()
     what = reason.partition("; ")[0].rstrip(".")
@@ -297,7 +351,7 @@ def _why(reasons: dict[int, str]) -> str:
 
 
 def _placed(chain: list[PairFit], n: int) -> list[Array]:
-    """(4, 4) pose of each view in the first one's frame, along the chain."""
+    """Pose (4, 4) of each view in the coordinates of the first, from the pairs of the chain."""
     poses = [np.eye(4)] * n
     for edge in chain:
         poses[edge.source] = poses[edge.target] @ edge.T_target_source
@@ -305,7 +359,7 @@ def _placed(chain: list[PairFit], n: int) -> list[Array]:
 
 
 def _loops(clouds: list[Array], poses: list[Array], spacing: float, known: set[tuple[int, int]]) -> list[PairFit]:
-    """Pairs beside the chain that overlap by it, refined."""
+    """Loops: pairs outside the chain that overlap when the chain places them, refined by ICP."""
     found = []
     trees = [cKDTree(c) for c in clouds]
     for target, source in combinations(range(len(clouds)), 2):
@@ -313,24 +367,26 @@ def _loops(clouds: list[Array], poses: list[Array], spacing: float, known: set[t
             continue
         T = np.linalg.inv(poses[target]) @ poses[source]
         moved = clouds[source] @ T[:3, :3].T + T[:3, 3]
-        near = np.isfinite(trees[target].query(moved, distance_upper_bound=NEAR * spacing)[0]).sum()
-        if near < LOOP_OVERLAP * min(len(clouds[source]), len(clouds[target])):
+        near = np.isfinite(trees[target].query(moved, distance_upper_bound=NEAR_SPACINGS * spacing)[0]).sum()
+        if near < MIN_LOOP_OVERLAP * min(len(clouds[source]), len(clouds[target])):
             continue
         try:
-            fit = icp(clouds[source], clouds[target], T, max_distance_m=NEAR * spacing, min_fitness=MIN_OVERLAP)
+            fit = icp(
+                clouds[source], clouds[target], T, max_distance_m=NEAR_SPACINGS * spacing, min_fitness=MIN_OVERLAP
+            )
         except ValueError:
-            continue  # a pair that overlaps in too little; views that no pair holds are told
+            continue  # the pair overlaps too little; `align` warns of views that are in no loop
         pair = PairFit(source, target, np.asarray(fit.T_target_source), fit.fitness, np.nan, True)
-        if _disagreement(pair, poses, clouds) <= 2 * NEAR * spacing:
+        if _disagreement(pair, poses, clouds) <= 2 * NEAR_SPACINGS * spacing:
             found.append(pair)
     return found
 
 
 def _optimised(clouds: list[Array], poses: list[Array], edges: list[PairFit], spacing: float) -> list[Array]:
-    """Poses that fit all pairs best."""
+    """Poses (4, 4) of all views that fit all pairs best: the optimum of the pose graph."""
     import open3d as o3d
 
-    r, reach = o3d.pipelines.registration, CONSISTENT * spacing
+    r, reach = o3d.pipelines.registration, MAX_DISAGREEMENT_SPACINGS * spacing
     packed: list[Any] = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(c)) for c in clouds]
     graph = r.PoseGraph()
     for T in poses:
@@ -350,22 +406,25 @@ def _optimised(clouds: list[Array], poses: list[Array], edges: list[PairFit], sp
 
 
 def _disagreement(edge: PairFit, poses: list[Array], clouds: list[Array]) -> float:
+    """Root mean square distance in metres between the source's points placed by a pair and placed by poses."""
     by_graph = np.linalg.inv(poses[edge.target]) @ poses[edge.source]
     off = by_graph - edge.T_target_source
     return float(np.sqrt(((clouds[edge.source] @ off[:3, :3].T + off[:3, 3]) ** 2).sum(axis=-1).mean()))
 
 
 def _refuse_disagreement(pairs: tuple[PairFit, ...], spacing: float) -> None:
+    """Raise ValueError if a pair disagrees with the pose graph."""
     worst = max(pairs, key=lambda e: e.disagreement_m)
-    if not worst.disagreement_m <= CONSISTENT * spacing:
+    if not worst.disagreement_m <= MAX_DISAGREEMENT_SPACINGS * spacing:
         raise ValueError(
-            f"expected pairs of views that agree, but views {worst.target} and {worst.source} are "
-            f"{1e3 * worst.disagreement_m:.2g} mm off what the others say (spacing {1e3 * spacing:.2g} mm): some pair "
-            f"fits wrongly; {REMEDY}"
+            f"expected pairs of views that agree, but the pair {worst.target}, {worst.source} differs by "
+            f"{1e3 * worst.disagreement_m:.2g} mm from the poses of all pairs (spacing {1e3 * spacing:.2g} mm): "
+            f"one pair fits wrongly; {REMEDY}"
         )
 
 
 def _refuse_contradiction(scan: Scan, clouds: list[Array], spacing: float) -> None:
+    """Raise ValueError if a view looks through a surface that another view measured."""
     worst, views = 0.0, (0, 0)
     for i, T in enumerate(scan.poses):
         world = clouds[i] @ T[:3, :3].T + T[:3, 3]
@@ -373,7 +432,7 @@ def _refuse_contradiction(scan: Scan, clouds: list[Array], spacing: float) -> No
             if i == j:
                 continue
             distance = signed_distance(world, image)
-            tolerance = THROUGH * spacing + 0.01 * float(np.nanmedian(image.z))
+            tolerance = THROUGH_SPACINGS * spacing + 0.01 * float(np.nanmedian(image.z))
             through = float((distance < -tolerance).mean())  # False with NaN
             if through > worst:
                 worst, views = through, (i, j)
@@ -385,7 +444,7 @@ def _refuse_contradiction(scan: Scan, clouds: list[Array], spacing: float) -> No
 
 
 def _unchecked(pairs: tuple[PairFit, ...], n: int) -> tuple[int, ...]:
-    """Views that hang on the rest by a single pair."""
+    """Numbers of the views that a single pair connects to the rest."""
     import networkx as nx
 
     graph = nx.Graph((e.source, e.target) for e in pairs)
@@ -398,7 +457,7 @@ def _unchecked(pairs: tuple[PairFit, ...], n: int) -> tuple[int, ...]:
 
 
 def _rigid(T: Array) -> Array:
-    """The nearest rigid transform: products leave rounding."""
+    """Rigid transform nearest to a matrix (4, 4), which removes the rounding of products."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     result = np.array(T)
     result[:3, :3], result[3] = U @ Vt, (0, 0, 0, 1)

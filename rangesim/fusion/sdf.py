@@ -46,7 +46,8 @@ Lookup = Literal["bilinear", "nearest"]
 """Name of a rule for the depth between pixels, see `depth_at`."""
 MAX_DEPTH_STEP = 0.02
 """Largest difference of depth, as a fraction of the depth, between four neighbouring pixels of one surface. Depth is
-interpolated only between such pixels. Larger values interpolate across edges, smaller ones less on slanted surfaces."""
+interpolated only between such pixels, because values between the two sides of an edge lie on neither surface. A smaller
+step interpolates less on slanted surfaces."""
 MEDIAN_READINGS = 20_000
 """Number of readings of a view from which the median weight is taken, about. More would cost time alone: the median of
 20 000 readings is known to a percent of their spread."""

@@ -25,8 +25,8 @@ SAMPLES = 20_000
 """Number of points on the true surface of each shape; the seen fraction then has a standard error of 0.4 % at most."""
 MAX_SLANT_TOLERANCES = 4.0
 """Largest difference of depth between a reading and a slanted face that it still belongs to, in multiples of
-`tolerance_m`. On a face at 75 degrees, the distance to the face's plane reaches the tolerance there. A larger value
-would count readings of other surfaces, a smaller one fewer slanted faces."""
+`tolerance_m`. At 75 degrees of incidence, it is a distance of one tolerance to the face's plane. A larger value would
+count readings of other surfaces, a smaller one fewer slanted faces."""
 MIN_VIEW_COSINE = 0.05
 """Smallest cosine of the angle of incidence, no unit, at which a view may see a surface: up to 87 degrees. Beyond, a
 pixel covers so much of a face that its reading says nothing of a single place."""

@@ -14,14 +14,14 @@ from rangesim.settings.config import ShortRepr, shown
 from rangesim.triangle_mesh import TriangleMesh
 
 TOUCHING = 1e-5
-"""Distance below which a point lies on a solid's surface, as a fraction of the solid's extent. It has to exceed the
-rounding of Open3D, which computes in single precision (1e-7 of the extent)."""
+"""Distance below which a point lies on a solid's surface, as a fraction of the solid's extent. It is above
+the rounding of Open3D (1e-7), because points on the surface must not count as inside or outside."""
 SAMPLES = 2000
-"""Number of points on a surface, besides its vertices, by which crossings with another solid are found. A crossing that
-none of them falls into is not found; more points cost time in proportion."""
+"""Count of points on a surface, besides its vertices, by which crossings with another solid are found. A crossing that
+contains none of them is not found; twice as many points take twice the time."""
 VOTES = 3
-"""Number of rays by whose majority Open3D decides whether a point is inside. A single ray that hits an edge could be
-wrong; an odd number always has a majority."""
+"""Count of rays by whose majority Open3D decides whether a point is inside, because a single ray that hits an edge may
+be wrong. The count is odd so that there is always a majority."""
 POINTS_AT_ONCE = 1 << 20
 """Number of points that are tested in one call, so that they take about 12 MB."""
 

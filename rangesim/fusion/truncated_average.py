@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numba.extending import register_jitable
 
 from pcgraph.parallel import in_blocks, kernel, routine
 from rangesim.decoding.range_image import RangeImage
@@ -28,6 +29,7 @@ from rangesim.fusion.sdf import (
     check_lookup,
     relative_weights,
 )
+from rangesim.rig.camera_model import appears, distort, project, to_pixel
 from rangesim.settings import limits
 from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds, check_number
 from rangesim.settings.config import ShortRepr, shown
@@ -42,27 +44,27 @@ TILE = 8
 """Pixels along the edge of a tile. The farthest reading of each tile tells quickly which blocks are hidden. The value
 changes time alone."""
 MAX_BLOCKS = 1 << 21
-"""Largest number of blocks along an axis. Three such indices of 21 bits fit into one integer of 63 bits."""
+"""Largest count of blocks along an axis, so that three indices of 21 bits fit into one integer of 63 bits."""
 TRUNCATION_VOXELS = 3.0
 """Default truncation distance in voxels. Smaller ones cut off the noise of readings, which makes the surface rougher;
 larger ones spoil thin walls that are seen from both sides."""
 SPACING_STEP = 7
-"""Only every seventh reading is used for the median depth, from which the distance between readings follows; a check of
-`voxel_m` needs no more."""
+"""Step in pixels between the readings whose median depth gives the distance between readings. More readings would cost
+time alone, because the check of `voxel_m` is a coarse one."""
 WIDE_TRUNCATION_VOXELS = 8.0
 """Truncation distance in voxels beyond which blocks are searched around fewer points, so that the search stays short;
 the search radius is then larger by their distance, so no block is missed."""
 MAX_VOXEL_FRACTION = 0.5
-"""Largest edge of a voxel, as a fraction of the largest extent of the readings: less than two voxels are no shape."""
+"""Largest edge of a voxel, as a fraction of the extent of the readings, because less than two voxels show no shape."""
 MIN_VOXEL_SPACINGS = 0.1
-"""Smallest edge of a voxel, as a fraction of the distance between neighbouring readings. In smaller voxels each reading
-becomes a speck of its own."""
+"""Smallest edge of a voxel, as a fraction of the distance between neighbouring readings, because in smaller voxels each
+reading becomes a speck of its own."""
 MIN_VIEW_FRACTION = 0.05
 """Default of `min_weight`, in typical readings, as a fraction of the number of views, see `MAX_MIN_WEIGHT`."""
 MAX_MIN_WEIGHT = 1.0
-"""Largest default of `min_weight`, in typical readings; 20 and more views reach it. Measured among glass and mirrors
-(docs/fusion.md, "Weights"): without a least weight, there are 741 cm2 of ghosts and 75 % of the matte surface; with 1,
-1.7 cm2 and 69 %; with 2, none and 61 %."""
+"""Largest default of `min_weight`, as a count of typical readings; 20 and more views reach it. Measured among glass and
+mirrors (docs/fusion.md, "Weights"): without a least weight, there are 741 cm2 of ghosts and 75 % of the matte surface;
+with 1, 1.7 cm2 and 69 %; with 2, none and 61 %."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -309,10 +311,9 @@ class _Blocks:
         camera, T = camera_and_pose(image)
         # From the grid's coordinates to those of the camera
         R, t = T[:3, :3].T, T[:3, :3].T @ (self.origin - T[:3, 3])
-        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.coefficients, camera.fold_radius2])
         in_blocks(
             _add_view, len(self.keys), self.keys, self.rows, self.total, self.weight, self.voxel_m, truncation_m,
-            np.ascontiguousarray(R), t, lens, np.ascontiguousarray(image.z), np.ascontiguousarray(weight),
+            np.ascontiguousarray(R), t, camera.model, np.ascontiguousarray(image.z), np.ascontiguousarray(weight),
             lookup == "bilinear", _farthest(image.z, weight), smallest=64,
         )  # fmt: skip
 
@@ -365,10 +366,10 @@ class _Blocks:
 
 
 def _points_for_blocks(points: np.ndarray, voxel_m: float, truncation_m: float) -> tuple[np.ndarray, float]:
-    """Fewer points that need about the same blocks: one in each cube of two voxels; and 0.0 metres.
+    """One of the points in each small cube, which need about the same blocks, and an addition to the search radius.
 
-    Where the truncation distance is many voxels, cubes are larger. Blocks must then be searched farther around each
-    point, by the metres that are returned.
+    A cube is two voxels wide, or a quarter of the truncation distance if that is many voxels. In the second case alone,
+    the addition (metres) is above 0.
     """
     is_wide = truncation_m > WIDE_TRUNCATION_VOXELS * voxel_m
     if len(points) < 10_000 and not is_wide:
@@ -399,17 +400,23 @@ def _farthest(z: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 # ---- One view over all blocks --------------------------------------------------------------------------------------
 
+for _function in (distort, appears, to_pixel, project):
+    register_jitable(_function)  # so that the loops below may call them
+NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
+"""Coefficients of a pinhole without distortion."""
+
 
 @kernel
 def _add_view(  # type: ignore[no-untyped-def]
-    start, stop, keys, rows, total, weight, voxel_m, truncation_m, R, t, lens, z, weights, interpolate, farthest
+    start, stop, keys, rows, total, weight, voxel_m, truncation_m, R, t, camera, z, weights, interpolate, farthest
 ):
     """Add w r max(-t, sdf) and w r of one view to the voxels of the blocks `start` to `stop` - 1.
 
     The formula and its symbols are those of `rangesim.fusion.sdf`.
     """
+    has_distortion = camera.coefficients != NO_DISTORTION
     for block in range(start, stop):
-        if _is_hidden(keys[block], voxel_m, truncation_m, R, t, lens, farthest, z.shape):
+        if _is_hidden(keys[block], voxel_m, truncation_m, R, t, camera, farthest, z.shape):
             continue
         row = rows[block]
         for k in range(BLOCK):
@@ -426,8 +433,11 @@ def _add_view(  # type: ignore[no-untyped-def]
                         continue
                     a = (x0 + R[0, 0] * i * voxel_m) / zc
                     b = (y0 + R[1, 0] * i * voxel_m) / zc
-                    u, v = _pixel(a, b, lens)
-                    if not (u >= 0 and u < z.shape[1] and v >= 0 and v < z.shape[0]):
+                    u, v = to_pixel(camera, a, b)
+                    is_shown = True
+                    if has_distortion:
+                        u, v, is_shown = project(camera, a, b)
+                    if not (is_shown and u >= 0 and u < z.shape[1] and v >= 0 and v < z.shape[0]):
                         continue
                     w = weights[int(v), int(u)]
                     if not w > 0:
@@ -441,7 +451,7 @@ def _add_view(  # type: ignore[no-untyped-def]
 
 
 @routine
-def _is_hidden(key, voxel_m, truncation_m, R, t, lens, farthest, shape):  # type: ignore[no-untyped-def]
+def _is_hidden(key, voxel_m, truncation_m, R, t, camera, farthest, shape):  # type: ignore[no-untyped-def]
     """Whether no reading of a view concerns a block; False in doubtful cases.
 
     The block is then more than the truncation distance behind all readings near it, or outside the image. The test uses
@@ -455,13 +465,13 @@ def _is_hidden(key, voxel_m, truncation_m, R, t, lens, farthest, shape):  # type
     z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + t[2]
     if z + radius <= 0:
         return True
-    if z <= 4 * radius or lens[4] != 0 or lens[5] != 0 or lens[6] != 0 or lens[7] != 0 or lens[8] != 0:
+    if z <= 4 * radius or camera.coefficients != NO_DISTORTION:
         return False
     a, b = x / z, y / z
     # In the image plane, a point of the sphere is off the centre by dx / z - x dz / z^2; its z is z - radius or more
     reach = radius / (z - radius)
-    wide, high = lens[0] * reach * (1 + abs(a)) + 1, lens[1] * reach * (1 + abs(b)) + 1
-    u, v = lens[0] * a + lens[2], lens[1] * b + lens[3]
+    wide, high = camera.fx * reach * (1 + abs(a)) + 1, camera.fy * reach * (1 + abs(b)) + 1
+    u, v = to_pixel(camera, a, b)
     left, right = max(u - wide, 0.0), min(u + wide, shape[1] - 1.0)
     top, bottom = max(v - high, 0.0), min(v + high, shape[0] - 1.0)
     if left > right or top > bottom:
@@ -471,22 +481,6 @@ def _is_hidden(key, voxel_m, truncation_m, R, t, lens, farthest, shape):  # type
             if z - radius - farthest[i, j] <= truncation_m:
                 return False
     return True
-
-
-@routine
-def _pixel(a, b, lens):  # type: ignore[no-untyped-def]
-    """Pixel (u, v) of a point (a, b) = (x / z, y / z); NaN beyond the fold of the lens distortion.
-
-    The formula is that of `rangesim.rig.distortion`.
-    """
-    fx, fy, cx, cy, k1, k2, p1, p2, k3, fold = lens
-    r2 = a * a + b * b
-    if not r2 < fold:
-        return np.nan, np.nan
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    x = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
-    y = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
-    return fx * x + cx, fy * y + cy
 
 
 @routine

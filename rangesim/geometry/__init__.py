@@ -1,5 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mathematics of 3D vision around a range sensor; names load on first use. See docs/geometry.md."""
+"""The mathematics of 3D vision around a range sensor: planes, cameras, two views, triangulation, poses, registration.
+
+Functions take and return NumPy arrays; names load on first use. docs/geometry.md describes the modules.
+
+Used by: rangesim.calibration, decoding, fusion and multiview.
+
+Examples
+--------
+>>> from rangesim.geometry import project, projection_matrix
+>>> project(projection_matrix([[800, 0, 320], [0, 800, 240], [0, 0, 1]]), [[0.1, 0, 2]])
+array([[360., 240.]])
+"""
 
 from __future__ import annotations
 

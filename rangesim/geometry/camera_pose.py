@@ -34,7 +34,7 @@ from rangesim.geometry.reprojection import reproject
 from rangesim.rig import Intrinsics
 
 POSE_PARAMETERS = 6
-"""Number of parameters of a pose, a count: three for its rotation and three for its translation, as in any motion."""
+"""Number of parameters of a pose: three of the rotation and three of the translation."""
 
 MAX_PLANAR_FRACTION = 1e-3
 """Ratio of the third principal extent of the points to the first up to which they are also treated as a plane. The
@@ -46,16 +46,16 @@ MAX_ROTATION_DEVIATION = 0.3
 linear covariance no longer holds; nobody measured a closer limit."""
 
 TRIPLES = 20
-"""Number of triples of points, a count, that P3P solves to find starts. More triples cost time and help only where the
-other solvers fail and noise spoils the first triples."""
+"""Number of triples of points that P3P solves to find starts. More triples cost time and help only where the other
+solvers fail and noise spoils the first triples."""
 
 STARTS = 6
-"""Number of different starts, a count, from which the reprojection error is minimised: the best by that error. P3P has
-up to four solutions and a plane two, so that six leave room for both."""
+"""Number of different starts from which the reprojection error is minimised: the best by that error. P3P has up to four
+solutions and a plane two, so that six leave room for both."""
 
 SAME_POSE = 1e-3
-"""Difference in radians, and as a ratio to the distance, up to which two minima are one and the same pose. Descents end
-far nearer to each other than this if their minimum is the same."""
+"""Difference in radians, and as a ratio to the distance, up to which two minima are one and the same pose, because
+descents to one minimum end far nearer to each other."""
 
 SAME_START = 0.03
 """Difference in radians, and as a ratio to the distance, up to which two starts count as one, because the descents from
@@ -206,8 +206,8 @@ def _fitted(X: Array, x: Array, camera: Intrinsics, noise_px: float | None) -> C
     extents = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
     if extents[1] <= ROUNDING * extents[0]:
         raise ValueError(
-            f"expected points that are not on one line, got {len(X)} that are: the turn about it is open; add points "
-            "beside it."
+            f"expected points that are not on one line, got {len(X)} that are: the rotation about that line is not "
+            "determined; add points beside it."
         )
     minima: list[Minimum[Array]] = []
     for start in _starting_poses(X, x, camera, is_planar=extents[2] <= MAX_PLANAR_FRACTION * extents[0]):
@@ -216,7 +216,7 @@ def _fitted(X: Array, x: Array, camera: Intrinsics, noise_px: float | None) -> C
             minima.append(found)
     if not minima:
         raise ValueError(
-            "expected points in front of the camera, got pairs that no pose puts there; check them and the camera."
+            "expected points in front of the camera, got pairs that no pose puts there; check the pairs and the camera."
         )
     minima.sort(key=lambda minimum: minimum.cost)
     best, freedom = minima[0], 2 * len(X) - POSE_PARAMETERS
@@ -225,9 +225,9 @@ def _fitted(X: Array, x: Array, camera: Intrinsics, noise_px: float | None) -> C
     covariance = best.covariance(max(noise, 1e-300))
     if not np.sqrt(np.trace(covariance[:3, :3])) <= MAX_ROTATION_DEVIATION:
         raise ValueError(
-            f"expected points that determine a pose, got some that leave its rotation open at a noise of {noise:.3g} "
-            "px: nearly on one line, too near to each other, or pairs that do not belong together; add points, or "
-            "look at the pairs."
+            "expected points that determine a pose, got some that do not determine its rotation at a noise of "
+            f"{noise:.3g} px: they are nearly on one line, too near to each other, or paired wrongly; add points, or "
+            "check the pairs."
         )
     rounding = consensus.rounding_of(x)
     others = tuple(

@@ -18,12 +18,12 @@ import numpy as np
 from rangesim.rig import Intrinsics, Rig
 
 MAX_ITERATIONS = 20
-"""Largest number of iterations, a count, for the projector coordinate that was not decoded. It matters only through the
-lens distortion, so that a few iterations usually converge; the limit ends those of pixels that never do."""
+"""Largest number of iterations for the projector coordinate that was not decoded. It matters only through the lens
+distortion, so that a few iterations usually converge; the limit ends those of pixels that never do."""
 
 CONVERGED_PX = 1e-4
-"""Largest change of that coordinate, in projector pixels, at which the iterations end. A tenth of a thousandth of a
-pixel is far below the noise of a decoded coordinate, and distortion passes on only a part of it."""
+"""Largest change of that coordinate, in projector pixels, at which the iterations end. A smaller change does not
+matter, because the noise of a decoded coordinate is far larger."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,8 @@ from rangesim.geometry.correspondences import ROUNDING, Array
 Model = TypeVar("Model")
 
 INLIER_PROBABILITY = 0.99
-"""Probability that a correct correspondence counts as an inlier, as a fraction. It sets the threshold of the error; a
-smaller value loses correct pairs, a larger one lets more wrong pairs in."""
+"""Probability that a correct correspondence counts as an inlier, as a fraction. It sets the threshold of the error and
+was chosen as a compromise: a smaller value loses correct pairs, a larger one lets more wrong pairs in."""
 
 SIGNIFICANCE = 1e-5
 """Probability, as a fraction, with which a test may take degenerate data for sound data, or chance for a model. For
@@ -32,8 +32,8 @@ planes and rotations it is only nominal, because a fundamental matrix fits their
 parameters says: at a level of 1e-3, up to five times as many passed (measured)."""
 
 MAX_ROUNDS = 20
-"""Largest number of times, a count, that a model is fitted and its inliers are chosen again. Sets that stay or return
-end sooner, so this is only a bound for sets that keep changing."""
+"""Largest number of times that a model is fitted and its inliers are chosen again. Sets that stay or return end sooner,
+so this is only a bound for sets that keep changing."""
 
 MAX_EXCESS = 3.0
 """Largest ratio of the residuals to the stated noise. Nobody measured it: three times leaves room for a noise that is
@@ -206,7 +206,7 @@ def refuse_misfit(cost: float, freedom: int, noise_px: float | None, model: str)
     excess = cost / noise_px**2
     if excess > MAX_EXCESS**2 * freedom and excess > chi2_limit(freedom):
         raise ValueError(
-            f"expected pairs that {model} explains to their noise of {noise_px:.3g} px, got residuals of "
+            f"expected pairs that {model} explains within their noise of {noise_px:.3g} px, got residuals of "
             f"{np.sqrt(cost / freedom):.3g} px; some pairs are wrong (the robust function finds them), or noise_px "
             "is too small."
         )

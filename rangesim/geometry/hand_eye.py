@@ -36,15 +36,15 @@ MIN_TURN_OVER_NOISE = 5.0
 standard deviations are hardly noise alone; a smaller ratio lets the place along the axis be guessed from noise."""
 
 DERIVATIVE_STEP = 1e-6
-"""Step of the numerical derivatives, in radians or metres. With central differences of numbers about 1, rounding then
-leaves a relative error of about 1e-10 and the third derivative one of 1e-12."""
+"""Step of the numerical derivatives, in radians or metres. Chosen so that, with central differences of numbers about 1,
+rounding leaves a relative error of only 1e-10 and the third derivative one of 1e-12."""
 
 MIN_NOISE = 1e-12
 """Least noise, in radians or metres, that residuals are weighted by, so that exact poses do not divide by 0."""
 
 REWEIGHTINGS = 3
-"""Number of minimisations, a count, between which rotations and translations are weighted anew by their own noise. The
-first starts with equal weights; more change little, as the noise hardly depends on the weights."""
+"""Number of times that the residuals are minimised; before each but the first, rotations and translations are weighted
+anew by their own noise. More change little, because the noise hardly depends on the weights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,8 +202,8 @@ def _start(hand: Array, seen: Array) -> Array:
 
 
 _PARALLEL = (
-    "expected robot poses that turn about two different axes, got {what}: the camera's place along the axis is open; "
-    "turn the gripper by 30 degrees or more about a second axis."
+    "expected robot poses that turn about two different axes, got {what}: the camera's position along the axis is not "
+    "determined; turn the gripper by 30 degrees or more about a second axis."
 )
 
 

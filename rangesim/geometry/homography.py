@@ -34,7 +34,7 @@ from rangesim.geometry.correspondences import (
 from rangesim.geometry.least_squares import Minimum, minimise
 
 HOMOGRAPHY_PARAMETERS = 8
-"""Number of degrees of freedom, a count: the 9 entries of H less its scale, as in HZ table 2.4."""
+"""Number of degrees of freedom of a homography: 9 entries of H less its scale; source: HZ table 2.4."""
 
 COLLINEAR_FRACTION = 1e-7
 """Distance from a line, as a fraction of the spread of the points, up to which a point without noise lies on it. It is
@@ -343,8 +343,8 @@ def _refuse_collinear(name: str, points: Array, noise_px: float) -> None:
         others = np.delete(np.arange(n), odd).tolist()
         which = f"points {others} of {name}" if n == 4 else f"{n - 1} of the {n} points of {name}, or all,"
         raise ValueError(
-            f"expected four points with no three collinear, got {which} on one line to their noise of {noise_px:.3g} "
-            "px; add points away from it."
+            f"expected four points with no three collinear, got {which} on one line within their noise of "
+            f"{noise_px:.3g} px; add points away from it."
         )
 
 

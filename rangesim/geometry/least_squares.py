@@ -23,12 +23,13 @@ State = TypeVar("State")
 Look = TypeVar("Look", bound="Descent")
 
 MAX_STEPS = 100
-"""Largest number of steps of a descent, a count. A descent from a good start converges in far fewer; the limit ends
-those from a bad start, which are then judged by their cost."""
+"""Largest number of steps of a descent. A descent from a good start converges in far fewer; the limit ends those from a
+bad start, which are then judged by their cost."""
 
 CONVERGED = 1e-12
-"""Relative decrease of the cost, as a ratio, at which a descent has converged. It is as small as double precision
-allows with a margin, so that an estimate reaches its minimum; a larger value ends sooner, beside the minimum."""
+"""Relative decrease of the cost, as a ratio, at which a descent has converged. It lies a little above what double
+precision resolves, so that an estimate reaches its minimum; with a larger value the descent ends sooner, beside the
+minimum."""
 
 START_DAMPING = 1e-6
 """Damping of the first step, as a ratio to the diagonal of J^T J. It is small because starts are good (Madsen, Nielsen,
@@ -43,9 +44,9 @@ LEAST_DAMPING = 1e-15
 `Minimum.damped_step` solves singular equations in the least-squares sense; sparse solvers state a larger one."""
 
 MIN_DETERMINED = 1e-10
-"""Ratio of the smallest to the largest singular value of a jacobian below which the residuals leave a direction open.
-It lies above the rounding of the singular values, 1e-16 times some thousand residuals; a larger value calls weakly
-determined parameters open."""
+"""Ratio of the smallest to the largest singular value of a jacobian below which the residuals do not determine all
+parameters. It lies above the rounding of the singular values, 1e-16 times some thousand residuals, so that exact
+degeneracy is found; a larger value also refuses weakly determined parameters."""
 
 
 @dataclass(frozen=True, eq=False)

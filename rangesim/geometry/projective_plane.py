@@ -27,10 +27,10 @@ LINE_AT_INFINITY: tuple[float, float, float] = (0.0, 0.0, 1.0)
 only if the map is an affinity."""
 
 LAST_DIGITS = 1e-15
-"""Relative error, without unit, that a few operations in double precision leave; double precision has 16 digits. A
-homogeneous coordinate below this fraction of the largest counts as 0, and lines that differ by less than this angle in
-radians count as parallel. A larger value takes lines that meet far away for parallel ones; a smaller one lets rounding
-decide where parallel lines meet."""
+"""Ratio up to which a number is the rounding of a few operations, because double precision has 16 digits. A homogeneous
+coordinate below this fraction of the largest counts as 0, and lines that differ by less than this angle in radians
+count as parallel. A larger value takes lines that meet far away for parallel ones; a smaller one lets rounding decide
+where parallel lines meet."""
 
 MIN_SINGULAR_RATIO = 1e-14
 """Ratio of the smallest to the largest singular value of a 3 x 3 matrix, its rows and columns at one size, up to which

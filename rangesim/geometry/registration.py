@@ -25,27 +25,27 @@ from rangesim.rig import pose
 from rangesim.robust_scale import sigma_from_median
 
 MIN_POINTS = 20
-"""Least number of different points of a cloud, a count: as many as `NORMAL_NEIGHBOURS`, so that every normal has all
-its neighbours."""
+"""Least number of different points of a cloud: as many as `NORMAL_NEIGHBOURS`, so that every normal has all its
+neighbours."""
 
 PARTNER_SPACINGS = 3.0
-"""Distance, in spacings as a ratio, within which a point has a partner when a pose is judged. On a randomly sampled
-surface the fraction without a partner is 0.5^(d^2) at d spacings: 0.2 % at 3. A larger value finds partners on other
-surfaces."""
+"""Distance, in spacings, within which a point has a partner when a pose is judged. Chosen so that few points have no
+partner by chance: on a randomly sampled surface their fraction is 0.5^(d^2) at d spacings, 0.2 % at 3. A larger value
+finds partners on other surfaces."""
 
 FINAL_SPACINGS = 1.5
-"""Distance of partners, in spacings as a ratio, in the last steps of ICP. The smaller it is, the less points beyond the
-border of the other cloud pull. On a randomly sampled surface 21 % of the points have no partner at 1.5 spacings, and
-half of them at 1."""
+"""Distance of partners, in spacings, in the last steps of ICP. The smaller it is, the less points beyond the border of
+the other cloud pull. On a randomly sampled surface 21 % of the points have no partner at 1.5 spacings, and half of them
+at 1."""
 
 START_SPACINGS = 12.0
-"""Distance of partners, in spacings as a ratio, in the first steps of `icp` by default: about how far the first guess
-may be off. It is halved three times down to `FINAL_SPACINGS`; a larger value reaches farther, but pulls clouds that
-overlap only in part over each other."""
+"""Distance of partners, in spacings, in the first steps of `icp` by default: about how far the first guess may be off.
+Chosen as three halvings above `FINAL_SPACINGS`; a larger value reaches farther, but pulls clouds that overlap only in
+part over each other."""
 
 NORMAL_NEIGHBOURS = 20
-"""Number of neighbours, a count, from which the normal of a point is estimated. More average more noise, but round off
-edges, as in any estimate of normals; either half of a cloud uses half as many, which reach as far."""
+"""Number of neighbours from which the normal of a point is estimated. More average more noise, but round off edges, as
+in any estimate of normals; either half of a cloud uses half as many, which reach as far."""
 
 MIN_CONSTRAINT = 3e-3
 """Ratio of the smallest eigenvalue of the normal equations to the largest below which the surfaces can slide. Measured:
@@ -53,19 +53,20 @@ at most 0.0019 for planes, spheres, cylinders, cones and roofs of 600 and 2500 p
 0.0008 to 0.012 for tables with things on them, 0.2 for a box."""
 
 FEATURE_SPACINGS = 5.0
-"""Edge of the voxels for features and for the samples of RANSAC, in spacings as a ratio. A voxel then holds about 25
-points of a regularly sampled surface, 5 of a random one, so that noise averages; larger voxels lose small shapes."""
+"""Edge of the voxels for features and for the samples of RANSAC, in spacings. A voxel then holds about 25 points of a
+regularly sampled surface, 5 of a random one, so that noise averages; larger voxels lose small shapes."""
 
 MIN_FEATURE_FRACTION = 0.02
 """Least edge of these voxels, as a fraction of the extent of the target. So there are a few thousand voxels at most,
 which suffice and take little time."""
 
 ATTEMPTS = 4
-"""Number of runs of RANSAC, a count, each with its own seed, because one run can miss the pose. Time grows with it."""
+"""Number of times that RANSAC runs, each time with its own seed, because one run can miss the pose. The time grows with
+it."""
 
 COMPARED_POINTS = 3000
-"""Largest number of points of the source, a count, with which poses are compared in `register`. With more, `icp` from
-each of the starts takes longer; the chosen pose is refined with all points in any case."""
+"""Largest number of points of the source with which poses are compared in `register`. With more, `icp` from each of the
+starts takes longer; the chosen pose is refined with all points in any case."""
 
 MIN_AGREEMENT = 0.45
 """Least mean of 1 - (d / s)^2, a ratio, over the points with a partner; d is their distance along the normal, s the
@@ -79,16 +80,16 @@ solved. At 5 extents a turn of 0.2 rad about the origin moves a cloud by its who
 neither small nor exact. Nearer clouds stay where they are, so that their results stay the same to the last digit."""
 
 SLIDE_SPACINGS = 6.0
-"""Step, in spacings as a ratio, by which a result of `icp` is slid along the surface to look for other poses. ICP then
-starts there with the same reach, so that steps twice as long would leave gaps."""
+"""Step, in spacings, by which a result of `icp` is slid along the surface to look for other poses. ICP then starts
+there with the same reach, so that steps twice as long would leave gaps."""
 
 MAX_SLIDES = 6
-"""Largest number of such steps to either side, a count; each costs one run of ICP. If the reach needs more, the steps
+"""Largest number of such steps to either side, because each takes one run of ICP. If the reach needs more, the steps
 become longer."""
 
 SLID_POINTS = 800
-"""Number of points of the source that are slid, a count. With 800 instead of 3000 points `icp` takes 1.5 times the time
-that it takes without this test, and the same poses are found (measured)."""
+"""Number of points of the source that are slid. With 800 instead of 3000 points `icp` takes 1.5 times the time that it
+takes without this test, and the same poses are found (measured)."""
 
 NEARLY_BEST = 0.95
 """Ratio of an agreement to the best one from which on another pose fits as well. Nobody measured it: a larger ratio
@@ -453,8 +454,8 @@ def _refuse_slid(found: Registration, guess: Array, source: Array, surface: _Sur
 def _roughness(points: Array, spacing: float) -> float:
     """Typical distance in metres of neighbours from each other along their normals, from noise or curvature.
 
-    The cloud (n, 3) is thinned to a spacing in metres first. The distance is 1.4826 times the median absolute one,
-    which is the standard deviation for Gaussian noise.
+    The cloud (n, 3) is thinned to a spacing in metres first. The distance is the standard deviation of Gaussian noise
+    with the same median absolute distance.
     """
     import open3d as o3d
 

@@ -19,14 +19,14 @@ from scipy.spatial.transform import Rotation
 
 from rangesim.geometry.correspondences import Array
 from rangesim.rig import Intrinsics
-from rangesim.rig.distortion import distort
+from rangesim.rig.camera_model import appears, distort, to_pixel
 
 LENS = 9
-"""Number of parameters of a device, a count: fx, fy, cx, cy, k1, k2, p1, p2 and k3, as in OpenCV's camera model."""
+"""Number of parameters of a device, as in OpenCV's camera model: fx, fy, cx, cy, k1, k2, p1, p2 and k3."""
 
 POSE = 6
-"""Number of parameters of a step of a pose, a count: a rotation vector applied after the rotation, and a translation,
-as in any rigid motion."""
+"""Number of parameters of a step of a pose: three of a rotation vector, applied after the rotation, and three of a
+translation."""
 
 MIN_FOCAL_PX = 1.0
 """Least focal length in pixels that a step of an adjustment can leave, so that no step turns the image over. Real
@@ -54,13 +54,13 @@ def reproject(device: Intrinsics, X: Array) -> Reprojection:
     z = X[:, 2]
     x, y, one = X[:, 0] / z, X[:, 1] / z, 1.0 / z
     image = distort(device.coefficients, x, y)
-    appears = (z > 0) & (x * x + y * y < device.fold_radius2) & (image.jacobian > 0)
+    is_seen = (z > 0) & appears(device.model, x, y, image)
     by_point = np.empty((len(X), 2, 3))
     for k, (focal, by_x, by_y) in enumerate(((device.fx, image.xx, image.xy), (device.fy, image.xy, image.yy))):
         by_point[:, k, 0], by_point[:, k, 1] = focal * by_x * one, focal * by_y * one
         by_point[:, k, 2] = -(by_point[:, k, 0] * x + by_point[:, k, 1] * y)
-    pixels = np.stack([device.fx * image.x + device.cx, device.fy * image.y + device.cy], axis=-1)
-    return Reprojection(pixels, by_point, appears)
+    pixels = np.stack(to_pixel(device.model, image.x, image.y), axis=-1)
+    return Reprojection(pixels, by_point, is_seen)
 
 
 def by_lens(device: Intrinsics, X: Array) -> Array:

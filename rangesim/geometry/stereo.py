@@ -33,8 +33,8 @@ MIN_ACROSS = 1e-3
 no direction for the common axis. The value hardly matters, because such cameras exceed `MAX_GROWTH` long before."""
 
 BORDER_POINTS = 33
-"""Number of points per side of an image, a count, whose rays say how far the rectified image reaches. Between two of
-them a border that distortion bends can be cut off by a fraction of a pixel; more points cut off less."""
+"""Number of points per side of an image whose rays say how far the rectified image reaches. There are enough so that a
+border that distortion bends between two of them is cut off by no more than a fraction of a pixel."""
 
 STEPS_PER_PIXEL = 16
 """Number of steps per pixel in OpenCV's disparities, which are integers with four fractional bits (source:

@@ -58,54 +58,55 @@ from rangesim.geometry.projective_plane import homogeneous
 from rangesim.rig import pose
 
 FUNDAMENTAL_PARAMETERS = 7
-"""Number of degrees of freedom of F, a count: 9 entries less the scale and the rank condition, as in HZ 9.2.4."""
+"""Number of degrees of freedom of F: 9 entries less the scale and the rank condition; source: HZ 9.2.4."""
 
 RELATIVE_POSE_PARAMETERS = 5
-"""Number of degrees of freedom of a relative pose, a count: 3 of the rotation and 2 of the direction of t (HZ 9.6)."""
+"""Number of degrees of freedom of a relative pose: 3 of the rotation and 2 of the direction of t; source: HZ 9.6."""
 
 ROTATION_PARAMETERS = 3
-"""Number of degrees of freedom of a rotation, a count, as in any rotation in space."""
+"""Number of degrees of freedom of a rotation in space."""
 
 MIN_IMAGE_EXTENT = 0.05
-"""Least size of image coordinates that `_checked_F` scales F by: about a lens of 6 degrees in units of its focal
-length. Pixels and normalised coordinates both occur, so that the unit is guessed from F, between this and
-`MAX_IMAGE_EXTENT`."""
+"""Least size of image coordinates by which `_checked_F` scales F. F may be given for pixels or for coordinates in units
+of the focal length, so that the size is guessed from F itself, between this value (a lens of about 6 degrees in units
+of its focal length) and `MAX_IMAGE_EXTENT`."""
 
 MAX_IMAGE_EXTENT = 1e5
-"""Largest size of image coordinates, in pixels, that `_checked_F` scales F by; no image is larger, see
+"""Largest size of image coordinates, in pixels, by which `_checked_F` scales F, because no image is larger; see
 `MIN_IMAGE_EXTENT`."""
 
 SINGLE_ROUNDING = 1e-6
-"""Ratio up to which an entry of F counts as rounding. It is the relative error of a few operations in single precision,
-because matrices of other programs may come in it."""
+"""Ratio of the border of F to its upper left block up to which the border is rounding. It is the relative error of a
+few operations in single precision, because other programs may have computed F in it."""
 
 MIN_SECOND_SINGULAR = 1e-12
 """Ratio of the second singular value of F to the first below which F has rank 1, so that it is refused. It lies well
 above the rounding of double precision, 2e-16."""
 
 MAX_THIRD_SINGULAR = 1e-6
-"""Ratio of the third singular value of F to the first up to which F has rank 2; as `SINGLE_ROUNDING`, see there."""
+"""Ratio of the third singular value of F to the first up to which F has rank 2. It is the rounding of single precision,
+because other programs may have computed F in it."""
 
 MAX_ESSENTIAL_ERROR = 1e-3
-"""Largest difference of the two singular values of an essential matrix from each other, and of the third from 0, as a
-ratio to the first. It accepts matrices that other programs estimated without the constraint, and whose entries are
-printed with four digits; the nearest essential matrix is used."""
+"""Largest ratio, to the first singular value of an essential matrix, of the difference of the first two and of the
+third. It is so large because other programs may have estimated the matrix without this constraint or written it with
+four digits; the nearest essential matrix is then used."""
 
 MAX_OFF_PLANE_LINES = 5
-"""Number of pairs off a plane, a count, along whose lines other epipoles are tried: those with the largest parallax,
-because their lines are known best. Each costs 90 evaluations of all pairs."""
+"""Number of points off a plane along whose lines other epipoles are tried: those with the largest parallax, because
+their lines are known best. Each costs 90 evaluations of all pairs."""
 
 EPIPOLES_PER_LINE = 90
-"""Number of epipoles tried along such a line, a count: one every 2 degrees of its directions in normalised coordinates.
-Fewer could step over a whole family of F; more take time in proportion."""
+"""Number of epipoles tried along such a line: one every 2 degrees of its directions in normalised coordinates, so that
+none of the families of F falls between two of them. The time grows with the number."""
 
 DIFFERENT_F = 0.02
-"""Difference of an entry of F, as a ratio to its norm in normalised coordinates, from which on two minima are different
-matrices. Descents that end in the same minimum differ far less."""
+"""Difference of an entry of F, as a ratio to the norm of F in normalised coordinates, from which on two minima are
+different matrices. Descents that end in the same minimum differ far less."""
 
 MAX_STANDARD_DEVIATION = 0.3
-"""Largest standard deviation of F, as a ratio to its norm in normalised coordinates. The norm is 1, so that a deviation
-of 1 knows nothing; beyond a third the noise determines F rather than the points. Nobody measured a closer limit."""
+"""Largest standard deviation of F, as a ratio to its norm in normalised coordinates. At a ratio of 1, F is unknown;
+beyond a third, the noise determines F rather than the points. Nobody measured a closer limit."""
 
 
 # ------------------------------------------------------------------------------------------- from cameras
@@ -474,7 +475,7 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
     normal = tangent @ in_tangent @ tangent.T
     if not np.sqrt(np.trace(normal)) <= MAX_STANDARD_DEVIATION:
         raise ValueError(
-            "expected points that determine the fundamental matrix, got some that leave it open at a noise of "
+            "expected points that determine the fundamental matrix, got some that do not at a noise of "
             f"{noise:.3g} px: near a plane, near a surface that contains both centres, or with too small a baseline; "
             "add points at other depths."
         )
@@ -815,7 +816,7 @@ def _refuse_homography(a: Array, b: Array, cost: float, parameters: int, noise_p
         hint = "" if noise_px is not None or n > 12 else " With so few pairs, state noise_px if you know it."
         raise ValueError(
             f"expected two views with parallax, got {n} pairs that a homography maps to each other within {apart:.3g} "
-            f"px: {what}; the epipoles are then open, or two poses fit. Add points at other depths or move the "
+            f"px: {what}; the epipoles are not determined, or two poses fit. Add points at other depths or move the "
             f"camera.{hint}"
         )
 
@@ -863,8 +864,8 @@ def _refuse_open_epipole(
             if distances @ distances <= allowed:
                 raise ValueError(
                     f"expected points that determine the fundamental matrix, got {len(a)} pairs of which all but "
-                    f"{len(off)} lie on one plane: these leave the epipole open at a noise of {noise_px:.3g} px, and a "
-                    "family of matrices explains all pairs; add points off the plane."
+                    f"{len(off)} lie on one plane: these do not determine the epipole at a noise of {noise_px:.3g} px; "
+                    "a family of matrices explains all pairs; add points off the plane."
                 )
 
 
@@ -1100,12 +1101,12 @@ def _starting_poses(a: Array, b: Array, K_first: Array, K_second: Array) -> list
 
 
 SAMPLES = 20
-"""Number of minimal samples, a count, that the five-point algorithm solves to find starts. All pairs are correct here,
-so that noise alone spoils a sample; more samples take more time and make the best one better."""
+"""Number of minimal samples that the five-point algorithm solves to find starts. All pairs are correct here, so that
+noise alone spoils a sample; more samples take more time and make the best one better."""
 
 STARTS = 4
-"""Number of different starts, a count, from which the Sampson distances are minimised. Two poses can explain the points
-nearly as well and both must be found; more starts take time in proportion."""
+"""Number of different starts from which the Sampson distances are minimised. Two poses can explain the points nearly as
+well and both must be found; more starts take time in proportion."""
 
 DIFFERENT_E = 0.02
 """Difference of an entry of E, as a ratio to its norm, up to which two solutions count as one start, because descents

@@ -24,8 +24,8 @@ from rangesim.geometry.projective_plane import homogeneous, map_points
 from rangesim.geometry.two_view import epipoles
 
 MIN_PAIRS = 3
-"""Least number of pairs, a count: as many as there are parameters of the position along a row, so that they determine
-them."""
+"""Least number of pairs of points: as many as there are parameters of the position along a row, so that the pairs
+determine them."""
 
 MIN_CORNER_SCALE = 0.2
 """Least scale of the projective part at a corner of the image, as a ratio to its scale in the middle; its inverse is

@@ -86,7 +86,9 @@ class AdaptiveSampling(Sampler):
         negligible = NEGLIGIBLE * float(np.median(z)) if z.size else 0.0
         for instrument in self.instruments:
             signals = signals_of(instrument.sensor.responses())
-            capture = expose(signals, instrument.sensor, instrument.detector, instrument.exposure_s, 0, self.ambient)
+            capture = expose(
+                signals, instrument.sensor, instrument.detector_in_use, instrument.exposure_s, 0, self.ambient
+            )
             image = decode(capture, instrument.decoder)
             middle, sampling = sampling_draw(image, capture, signals)
             from_middle = (image.z - middle).astype(np.float32)  # at little cost, the detector's error, or more

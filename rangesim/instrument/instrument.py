@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Instruments: a sensor with its electronics, its optics and its place."""
+"""Instruments: a sensor with its camera, emitter, electronics, decoder and place."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
 
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.motion import Timing
-from rangesim.rig import CAMERA_LENS, PROJECTOR_LENS, Lens
+from rangesim.rig import CAMERA_LENS, PROJECTOR_LENS, Intrinsics, Lens, pose
 from rangesim.sensors import Decoder, Sensor, check_sensor, is_file_name, sensor_from_dict, sensor_of
-from rangesim.settings.bounds import Metres, Seconds, Watts, check_fields
-from rangesim.settings.config import check_keys, from_dict, on_top_of, shown
+from rangesim.settings.bounds import Metres, Seconds, Watts, Wavelength, check_fields, whole
+from rangesim.settings.config import check_keys, from_dict, on_top_of, shown, to_dict
 
 if TYPE_CHECKING:
     from rangesim.rig import Rig
@@ -25,23 +27,46 @@ MAX_NAME = 100
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Instrument:
-    """A sensor with its electronics and its place in the scene.
+    """A sensor with its camera, its emitter, its electronics, its decoder and its place in the scene.
+
+    What is None comes from the sensor (emitter, detector, decoder) or from the scene (camera and its pose).
 
     Parameters
     ----------
     name : names its directory in the results: letters, digits, hyphens and underscores.
     sensor : Sensor, the measuring principle.
     detector : PhotoDetector; None: `Sensor.default_detector`.
-    noise : bool; False: noise-free float frames, no detector at all.
+    noise : bool; False: the detector is not used, and frames are noise-free float32.
     decoder : Decoder, with its thresholds; None: `Sensor.default_decoder`.
+    camera : Intrinsics; None: the scene's camera.
+    width, height : pixels of the scene's camera, whose field of view is kept; None: as the experiment says.
+    T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres; None: the scene's camera.
+    projector : Intrinsics of the emitter; None: as the sensor comes, with a field that covers the camera's view.
+    T_camera_projector : (4, 4) float64, maps projector coordinates to camera coordinates, metres; None: to the right
+        of the camera by `baseline_m`, turned towards the point that the camera looks at.
     baseline_m : metres between camera and emitter; None: as the sensor comes, a fifth of the working distance for
         structured light, 0.03 m for time of flight.
+    wavelength_m : metres, of the emitter's light; None: that of the detector. Instruments of different wavelengths
+        share no light-transport pass.
     power_w : watts, mean radiant power of the emitter when it is fully on.
     exposure_s : seconds per frame; None: automatic.
     camera_lens, projector_lens : Lens, aperture, focus and vignetting.
     timing : when its frames are taken, in an experiment in which something moves.
+
+    Raises
+    ------
+    ValueError
+        A name or a number out of range, a decoder or detector that does not fit the sensor, or two statements about
+        one thing: `camera` and `width`, `T_camera_projector` and `baseline_m`.
+
+    Examples
+    --------
+    >>> from rangesim.sensors import AmcwToF
+    >>> one = Instrument("tof", AmcwToF(), width=320, height=240, exposure_s=1e-3)
+    >>> one.detector.wavelength_m == one.emitter_wavelength_m
+    True
     """
 
     name: str
@@ -55,6 +80,13 @@ class Instrument:
     camera_lens: Lens = CAMERA_LENS
     projector_lens: Lens = PROJECTOR_LENS
     timing: Timing = field(default_factory=Timing)
+    camera: Intrinsics | None = None
+    width: Annotated[int, whole(1, "pixels")] | None = None
+    height: Annotated[int, whole(1, "pixels")] | None = None
+    T_world_camera: np.ndarray | None = None
+    projector: Intrinsics | None = None
+    T_camera_projector: np.ndarray | None = None
+    wavelength_m: Wavelength | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -65,18 +97,55 @@ class Instrument:
         check_sensor(self.sensor)
         if self.decoder is not None:
             self.decoder.check(self.sensor)
-        detector = self.detector or self.sensor.default_detector
-        if detector is not None and not self.sensor.is_ideal:
-            detector.check(self.sensor.gate)
-        object.__setattr__(self, "detector", detector if self.noise else None)
+        if self.detector is None:
+            object.__setattr__(self, "detector", self.sensor.default_detector)
+        if self.detector is not None and not self.sensor.is_ideal:
+            self.detector.check(self.sensor.gate)
+        for one, others in (("camera", ("width", "height")), ("T_camera_projector", ("baseline_m",))):
+            if getattr(self, one) is not None and (twice := [n for n in others if getattr(self, n) is not None]):
+                raise ValueError(f"expected either {one} or {twice[0]} of instrument {self.name!r}, got both.")
+        for pose_name in ("T_world_camera", "T_camera_projector"):
+            if getattr(self, pose_name) is not None:
+                object.__setattr__(self, pose_name, pose(getattr(self, pose_name), pose_name))
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, Instrument) and to_dict(self) == to_dict(other)
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.sensor))
+
+    @property
+    def detector_in_use(self) -> PhotoDetector | None:
+        """The detector that frames are taken with, as for `rangesim.expose`; None: they are noise-free."""
+        return self.detector if self.noise else None
+
+    @property
+    def emitter_wavelength_m(self) -> float | None:
+        """Wavelength of the emitter's light, metres; None: an ideal instrument, to which any wavelength is the same."""
+        return self.wavelength_m or getattr(self.detector, "wavelength_m", None)
 
     def rig(self, scene: Scene, width: int | None = None, height: int | None = None) -> Rig:
-        """The scene's camera, `width` x `height` pixels, and this instrument's emitter, which covers its view."""
+        """Its camera and emitter in a scene.
+
+        Parameters
+        ----------
+        width, height : pixels of the scene's camera, where the instrument does not say how many.
+        """
         size, baseline_m = self.sensor.emitter
-        if self.baseline_m is not None:
-            baseline_m = self.baseline_m
-        rig = scene.rig(baseline_m, size, self.power_w, width, height)
-        return replace(rig, camera_lens=self.camera_lens, projector_lens=self.projector_lens)
+        if (self.width, self.height) != (None, None):
+            width, height = self.width, self.height
+        rig = scene.rig(
+            baseline_m if self.baseline_m is None else self.baseline_m, size, self.power_w, width, height,
+            camera=self.camera, T_world_camera=self.T_world_camera,
+        )  # fmt: skip
+        return replace(
+            rig,
+            camera_lens=self.camera_lens,
+            projector_lens=self.projector_lens,
+            projector=self.projector or rig.projector,
+            T_camera_projector=rig.T_camera_projector if self.T_camera_projector is None else self.T_camera_projector,
+            wavelength_m=self.emitter_wavelength_m,
+        )
 
 
 DEFAULT_SENSORS = ("gray-phase", "amcw", "ideal-tof")

@@ -2,15 +2,14 @@
 """Absorption inside glass, water and clear plastics, by Beer and Lambert's law.
 
 A body that refracts light (`dielectric`, `roughdielectric`) may be filled with a medium that absorbs and does not
-scatter. Light that runs a distance d inside keeps exp(-sigma_a d) of itself. The ray stays straight there, so a path
-needs one number more: the absorption coefficient along its ray. At the surface of such a body, the side to which light
-leaves decides on the next one, as in Mitsuba's `volpath`: against the normal it is that of the interior medium, along
-the normal that of the exterior one. All other surfaces leave it as it is.
+scatter. Light that runs a distance d inside keeps the fraction exp(-sigma_a d). The ray stays straight there, so a path
+needs one more number: the absorption coefficient along its ray. At the surface of such a body, the side to which light
+leaves decides on the next coefficient, as in Mitsuba's `volpath`. Light that leaves against the normal gets the
+coefficient of the interior medium; light that leaves along the normal gets that of the exterior medium. All other
+surfaces do not change the coefficient.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -21,10 +20,12 @@ from rangesim.light_transport.scattering import Medium
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.scene.media import is_boundary, medium_numbers
 
-ENDLESS = 1e30
-"""Metres to where a ray that meets no surface ends."""
+ENDLESS_M = 1e30
+"""Length in metres of a ray that meets no surface. Stands for infinity in single precision: infinity times a
+coefficient of 0 would be NaN."""
 UNCHANGED = -1.0
-"""Stands in the table for surfaces that bound no absorbing medium."""
+"""Coefficient in the table that stands for surfaces which bound no absorbing medium. Real coefficients are not
+negative."""
 
 
 class Absorbers:
@@ -36,34 +37,42 @@ class Absorbers:
     sides : (shapes, 2) float, inside and outside; `UNCHANGED` for surfaces that bound no absorbing medium.
     """
 
-    def __init__(self, scene: Any, sides: np.ndarray) -> None:
+    def __init__(self, scene: mi.Scene, sides: np.ndarray) -> None:
         self.table = mi.Float(aligned(table_of(scene, sides), np.float32))
 
-    def transmittance(self, sigma_a: Any, distance: Any, inside: Medium | None = None) -> Any:
-        """Fraction of the light left after a distance in metres; 1 in a scattering medium `inside` the absorbing body,
-        which has its own extinction."""
+    def transmittance(self, sigma_a: mi.Float, distance: mi.Float, inside: Medium | None = None) -> mi.Float:
+        """Fraction of the light that is left after a distance in metres.
+
+        It is 1 in a medium `inside` the absorbing body that scatters, because such a medium has its own extinction.
+        """
         if inside is not None:
             sigma_a = dr.select(inside.sigma_t > 0, 0, sigma_a)
         return dr.exp(-sigma_a * distance)
 
-    def beyond(self, si: Any, direction: Any, sigma_a: Any, active: Any) -> Any:
-        """Absorption coefficient of what light enters that leaves the surface `si` in a direction; `sigma_a` is that
-        of what it came through."""
+    def beyond(
+        self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, sigma_a: mi.Float, active: mi.Bool
+    ) -> mi.Float:
+        """Absorption coefficient (1/m) along a ray that leaves the surface `si` in a direction.
+
+        `sigma_a` is the coefficient along the ray that met the surface.
+        """
         outside = dr.select(dr.dot(direction, si.n) > 0, mi.UInt32(1), mi.UInt32(0))
         found = dr.gather(mi.Float, self.table, 2 * number_of(si.shape) + outside, active)
         return dr.select(active & (found >= 0), found, sigma_a)
 
 
-def absorbers_of(scene: Any) -> Absorbers | None:
-    """The absorbing bodies of a mitsuba.Scene; None where there are none, and nothing of this module is in the
-    kernels."""
+def absorbers_of(scene: mi.Scene) -> Absorbers | None:
+    """The absorbing bodies of a mitsuba.Scene. None if it has none: no kernel then has code of this module."""
     sides = np.array([_sides(shape) for shape in scene.shapes()])
     return Absorbers(scene, sides) if (sides > 0).any() else None
 
 
-def _sides(shape: Any) -> tuple[float, float]:
-    """Inside and outside of a shape, 1/m. A scattering medium inside is not this module's; if nothing is said of what
-    lies around it, that is what light came through."""
+def _sides(shape: mi.Shape) -> tuple[float, float]:
+    """Absorption coefficients inside and outside of a shape, 1/m.
+
+    A medium inside that scatters is left to `rangesim.light_transport.scattering`. If the scene says nothing about what
+    lies around such a medium, the coefficient along the ray stays as it is.
+    """
     if not shape.is_medium_transition():
         return UNCHANGED, UNCHANGED
     untold = UNCHANGED if is_boundary(shape) else 0.0
@@ -71,5 +80,6 @@ def _sides(shape: Any) -> tuple[float, float]:
     return inside, _sigma_a(shape.exterior_medium(), untold)
 
 
-def _sigma_a(medium: Any, untold: float) -> float:
+def _sigma_a(medium: mi.Medium | None, untold: float) -> float:
+    """Absorption coefficient of a medium, 1/m; `untold` if there is none."""
     return untold if medium is None else medium_numbers(medium)[0]

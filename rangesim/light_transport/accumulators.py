@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensor responses on Dr.Jit arrays: the accumulators of the path loop."""
+"""Sums of sensor responses over the paths of the loop, on Dr.Jit arrays."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain, product
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,32 +14,36 @@ from rangesim.response import DenseResponse, LightPath, Response, SparseResponse
 
 
 class DrjitMath:
-    """`rangesim.response.Math` on Dr.Jit arrays."""
+    """The functions of `rangesim.response.Math` on Dr.Jit arrays."""
 
     cos, sin, floor, abs, exp, erf = dr.cos, dr.sin, dr.floor, dr.abs, dr.exp, dr.erf
     select = staticmethod(dr.select)
 
     @staticmethod
-    def unsigned(x: Any) -> Any:
+    def unsigned(x: mi.Float) -> mi.UInt32:
         return mi.UInt32(x)
 
     @staticmethod
-    def array(table: np.ndarray) -> Any:
+    def array(table: np.ndarray) -> mi.Float:
         return mi.Float(table)
 
     @staticmethod
-    def lookup(table: Any, index: Any) -> Any:
+    def lookup(table: mi.Float | np.ndarray, index: mi.UInt32) -> mi.Float:
         return dr.gather(mi.Float, mi.Float(table), index)
 
 
 class Accumulators:
-    """Where the responses of a number of pixels add up, one lane of a kernel for each pixel at work.
+    """Sums of the responses of a number of pixels. One lane of a kernel works on each pixel.
 
-    A dense channel is a loop variable of the lane, so it lives in registers and costs one multiply-add per
-    vertex. A sparse response is a buffer in memory: each lane adds to its own column, hence no two threads ever
-    write to the same place, no atomics are needed, and sums are made in the same order on any machine.
+    A dense channel is a loop variable of the lane, so it lives in registers and costs one multiply-add per vertex. A
+    sparse response is a buffer in memory. Each lane adds to its own column: no two threads write to the same place, no
+    atomics are needed, and sums are made in the same order on any machine.
 
-    keeps_apart : whether smooth light has sums of its own. `parts` then are two: all other light, and that.
+    Parameters
+    ----------
+    responses : what is summed up.
+    pixels : number of pixels.
+    keeps_apart : whether smooth light has sums of its own. There are two `parts` then: all other light, and that.
     """
 
     def __init__(self, responses: Sequence[Response], pixels: int, keeps_apart: bool = False) -> None:
@@ -48,23 +51,36 @@ class Accumulators:
         self.pixels = pixels
         self.parts = 2 if keeps_apart else 1
         self.stride = dr.opaque(mi.UInt32, pixels)
-        self.bins: dict[Response, Any] = {
+        self.bins: dict[Response, mi.Float] = {
             r: dr.zeros(mi.Float, pixels * r.channels * self.parts) for r in responses if isinstance(r, SparseResponse)
         }
         dense = [r for r in responses if isinstance(r, DenseResponse)]
         self.dense = {r: [np.empty((r.channels, pixels), np.float32) for _ in range(self.parts)] for r in dense}
 
-    def zeros(self, lanes: int) -> list[list[Any]]:
-        """Fresh dense channels, the loop variable that `add` updates."""
+    def zeros(self, lanes: int) -> list[list[mi.Float]]:
+        """Dense channels of lanes before their first path, one list per response; `add` updates them."""
         return [
             [dr.zeros(mi.Float, lanes) for _ in range(self.parts * r.channels)] if isinstance(r, DenseResponse) else []
             for r in self.responses
         ]
 
     def add(
-        self, channels: list[list[Any]], path: LightPath, radiance: Any, place: Any, active: Any, is_smooth: Any = False
-    ) -> list[list[Any]]:
-        """Channels after a path of this radiance (0 where not `active`); `place` is the number of the lane's pixel."""
+        self,
+        channels: list[list[mi.Float]],
+        path: LightPath,
+        radiance: mi.Float,
+        place: mi.UInt32,
+        active: mi.Bool,
+        is_smooth: mi.Bool | bool = False,
+    ) -> list[list[mi.Float]]:
+        """Dense channels after a light path was added; sparse responses are added to their buffers.
+
+        Parameters
+        ----------
+        radiance : Float, W/m2/sr, of the path; 0 where not `active`.
+        place : UInt32, index of the lane's pixel among those of the accumulators.
+        is_smooth : Bool, whether the light belongs to the part that is kept apart.
+        """
         math = DrjitMath()
         result = []
         for response, values in zip(self.responses, channels, strict=True):
@@ -85,19 +101,20 @@ class Accumulators:
             result.append(values)
         return result
 
-    def pending(self) -> list[Any]:
-        """The buffers that a launch has added to: to be evaluated with its loop, or that runs a second time."""
+    def pending(self) -> list[mi.Float]:
+        """The buffers that a launch has added to. They must be evaluated together with its loop: else the loop runs a
+        second time for them."""
         return list(self.bins.values())
 
-    def store(self, channels: list[list[Any]], places: Any) -> None:
-        """Keep the evaluated dense channels of the pixels with these numbers (a slice or (lanes,) int)."""
+    def store(self, channels: list[list[mi.Float]], places: slice | np.ndarray) -> None:
+        """Keep the evaluated dense channels of the pixels with these indices, a slice or (lanes,) int."""
         for response, values in zip(self.responses, channels, strict=True):
             if isinstance(response, DenseResponse):
                 for image, value in zip(chain.from_iterable(self.dense[response]), values, strict=True):
                     image[places] = value.numpy()
 
     def images(self) -> list[list[np.ndarray]]:
-        """Of each response, its parts: (c, pixels) float32 each."""
+        """The sums of all pixels: for each response a list of its parts, (c, pixels) float32 each."""
         return [
             self.dense[r]
             if isinstance(r, DenseResponse)

@@ -81,6 +81,8 @@ def sampled_ambient_through_media(
     scatters : Bool, whether `si` is a scattering event instead of a surface.
     """
     scene, media, absorbers, inside = traced.scene, traced.media, traced.absorbers, ray_state.inside
+    assert media is not None
+    assert inside is not None
     ds, radiance = scene.sample_emitter_direction(si, xi, False, active)
     active &= ds.pdf != 0
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active & ~scatters)

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The projector's light beyond glass and mirrors: how many photons are traced, how far they are gathered, and the light
-that they bring to a vertex of a camera path."""
+"""The projector's light beyond glass and mirrors, as camera paths gather it.
+
+This module chooses the number of photons and the radius within which they are gathered, and computes the light that
+they bring to a vertex of a camera path.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -22,21 +25,30 @@ from rangesim.response import CAUSTIC, LightPath
 from rangesim.rig import Rig
 
 PHOTONS_PER_DISC = 400
-"""Photons of all maps within the largest radius, where light is neither spread nor focused."""
-RADIUS_IN_PROJECTOR_PIXELS = 3.0
-RADIUS_IN_CAMERA_PIXELS = (0.3, 3.0)
-"""Bounds of the largest photon radius, where it is: finer than the stripes, about as fine as the image."""
-MAX_BENT = 4.0
-"""Cosine of a photon to the surface at a vertex, at most, over that where it landed."""
+"""Number of photons of all maps within the radius of the first map, where light is neither spread nor focused. It sets
+the radius. An estimate from n photons has a relative noise of about 1 / sqrt(n); a larger number blurs more."""
+MAX_RADIUS_PROJECTOR_PX = 3.0
+"""Largest radius of the first map, in projector pixels as large as at the point itself. The bound keeps the
+blur finer than the stripes of structured light."""
+MIN_RADIUS_CAMERA_PX = 0.3
+"""Smallest radius of the first map, in camera pixels as large as at the point itself. The image shows nothing finer."""
+MAX_RADIUS_CAMERA_PX = 3.0
+"""Largest radius of the first map, in camera pixels as large as at the point itself. A larger one would blur the image
+of a caustic."""
+MAX_COSINE_RATIO = 4.0
+"""Largest ratio of a photon's cosine to the facet at the vertex to its cosine to the facet on which it landed. The
+radiance is divided by the latter, which may be near 0 where the facet turns away; the bound keeps the light finite."""
 
 
 def caustic_photons(
     traced: TracedScene, rig: Rig, settings: TransportSettings, spp: int, report: Callable[[], None] = lambda: None
 ) -> Photons | None:
-    """Photons for a pass of `spp` samples, of any camera; None if there are none, nothing to send them through, or none
-    landed.
+    """Photons for a pass of any camera; None if none are asked for, no surface has a delta interaction, or none landed.
 
-    `report` is called after each kernel launch.
+    Parameters
+    ----------
+    spp : int, number of samples of a pixel, which is the number of photon maps up to `MAX_MAPS`.
+    report : called after each kernel launch.
     """
     if not settings.photons or not has_delta(traced.scene):
         return None
@@ -46,7 +58,10 @@ def caustic_photons(
 
 
 def caustic_maps(photons: Photons | None, rig: Rig, radius_m: float | None) -> PhotonMaps | None:
-    """Photons sorted for the camera of the rig to gather; None if there are none."""
+    """The photons sorted into maps, from which the camera of the rig gathers them; None if there are none.
+
+    `radius_m` is the radius of the first map in metres; None chooses it.
+    """
     if photons is None:
         return None
     radius = gathering_radius(rig, photons.per_pixel, radius_m)
@@ -54,38 +69,58 @@ def caustic_maps(photons: Photons | None, rig: Rig, radius_m: float | None) -> P
 
 
 def gathering_radius(rig: Rig, photons_per_pixel: float, fixed_m: float | None = None) -> GatheringRadius:
-    """Largest photon radius: wide enough for `PHOTONS_PER_DISC`, within bounds; or the same everywhere."""
-    of_projector = min(np.sqrt(PHOTONS_PER_DISC / (np.pi * photons_per_pixel)), RADIUS_IN_PROJECTOR_PIXELS)
-    low, high = (pixels / rig.camera.fx for pixels in RADIUS_IN_CAMERA_PIXELS)
+    """Radius within which photons of the first map are gathered, wide enough for `PHOTONS_PER_DISC` within the bounds.
+
+    With `fixed_m` it is this number of metres everywhere.
+    """
+    of_projector = min(np.sqrt(PHOTONS_PER_DISC / (np.pi * photons_per_pixel)), MAX_RADIUS_PROJECTOR_PX)
+    low, high = (pixels / rig.camera.fx for pixels in (MIN_RADIUS_CAMERA_PX, MAX_RADIUS_CAMERA_PX))
     places = (rig.T_world_projector[:3, 3], rig.T_world_camera[:3, 3])
     return GatheringRadius(float(of_projector / rig.projector.fx), (low, high), *places, fixed_m)
 
 
 class CausticLight(NamedTuple):
-    """Light of the photons around a vertex: the photon that stands for all, their irradiance in W/m2, and whether it
-    was found in a wide circle, and is smooth therefore."""
+    """Light of the photons around a vertex.
 
-    photon: Any
-    irradiance: Any
-    is_wide: Any
+    photon : UInt32, index of the photon that stands for all.
+    irradiance : Float, W/m2, of all photons together.
+    is_wide : Bool, whether the photon was found within a wide circle, so that the light is smooth.
+    """
+
+    photon: mi.UInt32
+    irradiance: mi.Float
+    is_wide: mi.Bool
 
 
 class Vertex(NamedTuple):
-    """A vertex of a camera path: surface, throughput, optical length from the camera, and whether light that reaches it
-    is the first to do so."""
+    """A vertex of a camera path.
 
-    si: Any
-    bsdf: Any
-    throughput: Any
-    length: Any
-    is_first: Any
+    si, bsdf : SurfaceInteraction3f and BSDFPtr, the surface.
+    throughput : Float, radiance at the camera per radiance that leaves the vertex towards it.
+    length : Float, metres, optical length from the camera.
+    is_first : Bool, whether photons there are the first return: the vertex is the first of the path, and the projector
+        does not light it straight.
+    """
+
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    throughput: mi.Float
+    length: mi.Float
+    is_first: mi.Bool
 
 
 @dr.syntax
-def gather(maps: PhotonMaps, vertex: Vertex, sample: Any, xi: list[Any], chance: Any, active: Any) -> CausticLight:
+def gather(
+    maps: PhotonMaps, vertex: Vertex, sample: mi.UInt32, xi: list[mi.Float], chance: mi.Float, active: mi.Bool
+) -> CausticLight:
     """The light of the photons around a vertex.
 
-    `chance` decides which levels are gathered. Neighbouring lanes share it, so that they skip a level together.
+    Parameters
+    ----------
+    sample : UInt32, number of the sample in its pixel, which chooses the map.
+    xi : three Floats, uniform in 0..1.
+    chance : Float, uniform in 0..1; a level is gathered if this is below its `chance`. Neighbouring lanes share the
+        number, so that they skip a level together.
     """
     photon, irradiance = dr.zeros(mi.UInt32, dr.width(sample)), dr.zeros(mi.Float, dr.width(sample))
     pick, is_wide = mi.Float(xi[2]), dr.full(mi.Bool, False, dr.width(sample))
@@ -107,12 +142,15 @@ def gather(maps: PhotonMaps, vertex: Vertex, sample: Any, xi: list[Any], chance:
 def caustic_light(
     maps: PhotonMaps,
     accumulators: Accumulators,
-    channels: list[list[Any]],
+    channels: list[list[mi.Float]],
     vertex: Vertex,
     brought: CausticLight,
-    place: Any,
-) -> tuple[list[list[Any]], Any]:
-    """Channels with the light of the photons at a vertex added, and the radiance they bring to the camera."""
+    place: mi.UInt32,
+) -> tuple[list[list[mi.Float]], mi.Float]:
+    """Channels with the light of the photons around a vertex added, and the radiance (W/m2/sr) that the camera gets.
+
+    `place` is the index of the lane's pixel among those of the accumulators.
+    """
     radiance = dr.zeros(mi.Float, dr.width(place))
     found = brought.irradiance > 0
     if found:
@@ -122,7 +160,7 @@ def caustic_light(
         # Photons count flux per area, so the geometric cosine is in them already; the BSDF counts that to the shading
         # normal (Veach 1997, 5.3). Where a photon landed beside an edge, its own facet is the one that counts
         seen, lit = dr.dot(vertex.si.to_world(wi), vertex.si.n), -dr.dot(flight.direction, vertex.si.n)
-        cosine = dr.maximum(flight.cosine, dr.abs(lit) / MAX_BENT)
+        cosine = dr.maximum(flight.cosine, dr.abs(lit) / MAX_COSINE_RATIO)
         on_one_side = seen * lit * wi.z * wo.z > 0  # for both normals, or for neither
         radiance = vertex.throughput * brought.irradiance * mono(value) / cosine
         radiance = dr.select(found & on_one_side, radiance, 0)

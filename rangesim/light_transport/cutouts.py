@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Holes in surfaces: where light passes as if nothing were there (`mask`, `null`)."""
+"""Holes in surfaces (`mask`, `null`), through which light passes as if nothing were there."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.spectrum import mono
-from rangesim.light_transport.surfaces import number_of, table_of
+from rangesim.light_transport.surfaces import Surfaces, number_of, table_of
 from rangesim.scene.materials import holes
 
 MAX_CUTOUTS = 8
-"""Holes behind each other that a camera ray is followed through."""
+"""Number of holes in a row through which a camera ray is followed to find the first surface. A larger number costs one
+intersection each, in scenes with holes alone; with a smaller one, the ground truth may name the sheet of a hole."""
 
 
 class Cutouts:
@@ -23,26 +22,30 @@ class Cutouts:
     Parameters
     ----------
     scene : mitsuba.Scene
-    components : per shape, bits of the components of its BSDF that are holes (`rangesim.scene.materials.holes`).
+    components : (shapes,) int. Bit i of a number says that component i of the shape's BSDF is a hole
+        (`rangesim.scene.materials.holes`).
     """
 
-    def __init__(self, scene: Any, components: list[int]) -> None:
+    def __init__(self, scene: mi.Scene, components: list[int]) -> None:
         self.table = mi.UInt32(table_of(scene, np.array(components, np.uint32)))
 
-    def passed(self, si: Any, bs: Any, active: Any) -> Any:
+    def passed(self, si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f, active: mi.Bool) -> mi.Bool:
         """Whether the BSDF sample `bs` at the surface `si` went through a hole."""
         components = dr.gather(mi.UInt32, self.table, number_of(si.shape), active)
         return mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null) & ((components >> bs.sampled_component) & 1 == 1)
 
 
-def cutouts_of(scene: Any) -> Cutouts | None:
-    """The holes of a mitsuba.Scene; None where there are none, and nothing of this module is in the kernels."""
+def cutouts_of(scene: mi.Scene) -> Cutouts | None:
+    """The holes of a mitsuba.Scene. None if it has none: no kernel then has code of this module."""
     components = [holes(shape.bsdf()) for shape in scene.shapes()]
     return Cutouts(scene, components) if any(components) else None
 
 
-def first_surface(surfaces: Any, ray: Any, has_cutouts: bool) -> Any:
-    """Where the ray meets the first surface that is less than half a hole."""
+def first_surface(surfaces: mi.Scene | Surfaces, ray: mi.Ray3f, has_cutouts: bool) -> mi.SurfaceInteraction3f:
+    """The first surface on the ray that stops at least half of the light.
+
+    `has_cutouts` says whether any surface of the scene has holes.
+    """
     si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     for _ in range(MAX_CUTOUTS if has_cutouts else 0):
         passes = si.is_valid() & (_openness(si) > 0.5)
@@ -52,10 +55,11 @@ def first_surface(surfaces: Any, ray: Any, has_cutouts: bool) -> Any:
     return si
 
 
-def _openness(si: Any) -> Any:
+def _openness(si: mi.SurfaceInteraction3f) -> mi.Float:
     """Fraction of the light that passes the surface through holes.
 
-    It is that which passes unchanged at grazing incidence, where thin glass reflects everything.
+    It is the fraction that passes unchanged at grazing incidence. Thin glass also passes light unchanged, but reflects
+    all of it at grazing incidence.
     """
     grazing = mi.SurfaceInteraction3f(si)
     grazing.wi = mi.Vector3f(1, 0, 0)

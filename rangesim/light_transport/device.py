@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera and projector on the renderer's side, and the straight connection of a surface point to the projector."""
+"""Camera and projector as kernels see them, and the straight connection of a surface point to the projector."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -12,40 +12,47 @@ import numpy as np
 
 from rangesim.light_transport.scattering import Media, Medium
 from rangesim.rig import Intrinsics, Lens, Rig
-from rangesim.rig.distortion import distort, undistort
+from rangesim.rig.camera_model import Distorted, distort, undistort
 
-NO_RAY_PX = 1e-2
-"""Where the inverse of a lens model reprojects worse than this in single precision, there is none."""
-FAR = 1e30
-"""Stands for an infinite squared radius in single precision."""
+MAX_REPROJECTION_PX = 1e-2
+"""Largest error, in pixels, with which the ray found for a pixel may project back onto it. Where it is larger, the
+distortion has no inverse in single precision, and the pixel has no ray. A larger bound lets rays through beside the
+fold of a lens model; a smaller one comes near the rounding of single precision."""
+MAX_RADIUS2 = 1e30
+"""Stands for an infinite squared radius in single precision, whose largest number is 3e38."""
 
 
 class PrimaryRay(NamedTuple):
-    """A ray that leaves a device.
+    """Rays that leave a device.
 
-    origin, direction : world, metres and unit.
-    path_offset : Float, metres, by which the path length from the device's centre exceeds that from `origin`: all
-        paths through a lens to a point in focus are optically as long as the one through its centre.
-    exists : Bool, false where the distortion has no inverse and the lens sends no ray (the direction is then that of
-        the axis); None: everywhere.
+    origin, direction : Point3f and Vector3f, world, metres and unit.
+    path_offset : Float, metres, to be added to path lengths that count from `origin`. All paths through a lens to a
+        point in focus are optically as long as the one through its centre.
+    exists : Bool, false where the distortion has no inverse, so that the lens sends no ray; the direction is then that
+        of the axis. None: true everywhere.
     """
 
-    origin: Any
-    direction: Any
-    path_offset: Any
-    exists: Any = None
+    origin: mi.Point3f
+    direction: mi.Vector3f
+    path_offset: mi.Float
+    exists: mi.Bool = None
 
 
 class Device:
-    """A lens of the rig on the renderer's side: intrinsics, centre, axes; all numbers opaque to the kernel cache.
+    """A camera or a projector of the rig as kernels see it: intrinsics, centre and axes.
 
-    Distortion, a finite lens and vignetting shape the kernel: without them it is that of a pinhole.
+    All numbers are opaque to the kernel cache. Distortion, a finite lens and vignetting add code to the kernel; without
+    them it is the kernel of a pinhole.
 
     Parameters
     ----------
     intrinsics : Intrinsics
     T_world_device : (4, 4) float, maps device coordinates to world coordinates, metres.
-    lens : Lens; its aperture counts where it has a focus.
+    lens : Lens. Its aperture is used if it has a focus; else the lens is a point.
+
+    Attributes
+    ----------
+    has_lens : bool, whether rays start on a lens of finite size, so that `sample_ray` needs a sample of it.
     """
 
     def __init__(self, intrinsics: Intrinsics, T_world_device: np.ndarray, lens: Lens) -> None:
@@ -59,16 +66,15 @@ class Device:
         self.distortion = None
         if any(intrinsics.distortion):
             self.distortion = [opaque(k) for k in intrinsics.coefficients]
-            self.fold_radius2 = opaque(min(intrinsics.fold_radius2, FAR))
+            self.fold_radius2 = opaque(min(intrinsics.fold_radius2, MAX_RADIUS2))
         self.has_lens = lens.focus_m is not None
-        """Whether rays start on a lens of finite size, and `sample_ray` needs a sample."""
         if lens.focus_m is not None:
             self.aperture, self.focus = opaque(lens.aperture_radius_m), opaque(lens.focus_m)
         self.vignetting = opaque(lens.vignetting) if lens.vignetting else None
 
     @classmethod
     def camera(cls, rig: Rig) -> Device:
-        """The rig's camera. Its vignetting is left to the exposure: signals are radiance."""
+        """The rig's camera. The exposure applies its vignetting, because signals are radiance."""
         return cls(rig.camera, rig.T_world_camera, replace(rig.camera_lens, vignetting=0.0))
 
     @classmethod
@@ -78,29 +84,30 @@ class Device:
 
     # ---- From pixels to rays -----------------------------------------------------------------------------
 
-    def ray_direction(self, pixel: Any) -> Any:
-        """Unit world direction through pixel coordinates from the centre of the lens."""
-        return self._direction(self._undistorted(pixel)[0])
-
-    def centre_ray(self, pixel: Any) -> PrimaryRay:
-        """The ray through pixel coordinates and the centre of the lens."""
+    def centre_ray(self, pixel: mi.Point2f) -> PrimaryRay:
+        """The ray through the centre of the lens at pixel coordinates."""
         p, exists = self._undistorted(pixel)
         return PrimaryRay(mi.Point3f(self.centre), self._direction(p), mi.Float(0), exists)
 
     @property
     def pixels(self) -> int:
-        """Pixels of the image."""
+        """Number of pixels of the image."""
         return int(self.size.x[0]) * int(self.size.y[0])
 
     def centre_rays(self, begin: int, end: int) -> PrimaryRay:
-        """The rays through the centres of a range of pixels, row by row, and the centre of the lens."""
+        """Rays from the centre of the lens through the centres of the pixels `begin` to `end` - 1, row by row."""
         index, row = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin), mi.UInt32(self.size.x)
         return self.centre_ray(mi.Point2f(mi.Float(index % row) + 0.5, mi.Float(index // row) + 0.5))
 
-    def sample_ray(self, pixel: Any, lens: Any) -> PrimaryRay:
-        """The ray through pixel coordinates; `lens` Point2f in the unit square, None where `has_lens` is not set.
+    def sample_ray(self, pixel: mi.Point2f, lens: mi.Point2f | None) -> PrimaryRay:
+        """The ray through pixel coordinates from a point of the lens.
 
-        A thin lens: rays of one pixel start anywhere on the aperture and meet in the plane z = `focus_m`.
+        The lens is thin: rays of one pixel start anywhere on the aperture and meet in the plane z = `focus_m`.
+
+        Parameters
+        ----------
+        pixel : Point2f, pixel coordinates.
+        lens : Point2f, uniform in the unit square; None where `has_lens` is not set.
         """
         if not self.has_lens:
             return self.centre_ray(pixel)
@@ -113,27 +120,27 @@ class Device:
         origin = mi.Point3f(self.centre + self.x * start.x + self.y * start.y)
         return PrimaryRay(origin, direction, dr.norm(to_focus) - length, exists)
 
-    def _direction(self, p: Any) -> Any:
+    def _direction(self, p: mi.Point2f) -> mi.Vector3f:
         return dr.normalize(self.x * p.x + self.y * p.y + self.z)
 
-    def _world(self, v: Any) -> Any:
+    def _world(self, v: mi.Vector3f) -> mi.Vector3f:
         return self.x * v.x + self.y * v.y + self.z * v.z
 
-    def _undistorted(self, pixel: Any) -> tuple[Any, Any]:
-        """Image-plane coordinates x/z, y/z of pixel coordinates, and whether there are any (None: always)."""
+    def _undistorted(self, pixel: mi.Point2f) -> tuple[mi.Point2f, mi.Bool | None]:
+        """Image-plane coordinates x/z and y/z of pixel coordinates, and whether they exist (None: everywhere)."""
         p = (pixel - self.c) / self.f
         if self.distortion is None:
             return p, None
         x, y = undistort(self.distortion, p.x, p.y)
         image, exists = self._distorted(x, y)
         off = dr.norm(mi.Vector2f(image.x - p.x, image.y - p.y) * self.f)
-        exists &= off <= NO_RAY_PX
+        exists &= off <= MAX_REPROJECTION_PX
         return dr.select(exists, mi.Point2f(x, y), 0), exists
 
     # ---- From points to pixels ---------------------------------------------------------------------------
 
-    def project(self, point: Any) -> tuple[Any, Any]:
-        """Pixel coordinates of a world point, and its depth z in metres; NaN where the distortion folds the image."""
+    def project(self, point: mi.Point3f) -> tuple[mi.Point2f, mi.Float]:
+        """Pixel coordinates of a world point, NaN where the distortion folds the image, and its depth z in metres."""
         d = mi.Vector3f(point) - self.centre
         z = dr.dot(d, self.z)
         p = mi.Point2f(dr.dot(d, self.x), dr.dot(d, self.y)) / z
@@ -142,28 +149,28 @@ class Device:
             p = dr.select(appears, mi.Point2f(image.x, image.y), dr.nan)
         return p * self.f + self.c, z
 
-    def _distorted(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """The image of a ray, and whether it lies where the image is not folded."""
+    def _distorted(self, x: mi.Float, y: mi.Float) -> tuple[Distorted, mi.Bool]:
+        """The image of the ray (x, y, 1), and whether it lies where the image is not folded."""
         assert self.distortion is not None
         image = distort(self.distortion, x, y)
         return image, (x * x + y * y < self.fold_radius2) & (image.jacobian > 0)
 
     # ---- How bright, how sharp ---------------------------------------------------------------------------
 
-    def relative_illumination(self, direction: Any) -> Any:
+    def relative_illumination(self, direction: mi.Vector3f) -> mi.Float | float:
         """Fraction of a pixel's light that vignetting leaves along a unit world direction away from the device.
 
-        The Python number 1 where there is no vignetting.
+        It is the Python number 1 if the lens has no vignetting.
         """
         if self.vignetting is None:
             return 1.0
         return dr.power(dr.maximum(dr.dot(direction, self.z), 0), self.vignetting)
 
-    def pixel_density(self, direction: Any) -> Any:
+    def pixel_density(self, direction: mi.Vector3f) -> mi.Float | float:
         """Pixels per area of the plane z = 1 along a unit world direction, relative to an undistorted lens.
 
-        Every pixel of a projector sends out the same power, so its irradiance there has this factor. The Python number
-        1 without distortion; 0 where the lens sends no light.
+        Every pixel of a projector sends out the same power, so its irradiance there is multiplied by this factor. It is
+        the Python number 1 without distortion, and 0 where the lens sends no light.
         """
         if self.distortion is None:
             return 1.0
@@ -172,10 +179,11 @@ class Device:
         )
         return dr.select(appears, image.jacobian, 0)
 
-    def blur_px(self, z: Any) -> Any:
-        """Standard deviation in pixels of the disc through which a point at depth z meets the image; None: sharp.
+    def blur_px(self, z: mi.Float) -> mi.Float | None:
+        """Standard deviation, in pixels, of the disc over which the image spreads a point at depth z; None: sharp.
 
-        The disc's diameter is 2 a f |1/z - 1/z_focus|; a uniform disc has the standard deviation diameter / 4 per axis.
+        The diameter of the disc is 2 a f |1/z - 1/z_focus|, with the aperture's radius a. A uniform disc has the
+        standard deviation diameter / 4 along each axis.
         """
         if not self.has_lens:
             return None
@@ -188,26 +196,37 @@ class Connection(NamedTuple):
     uv : Point2f, projector pixel coordinates.
     direction : Vector3f, unit, world, towards the projector.
     distance : Float, metres.
-    geometry : Float, times the irradiance at z = 1 m: the irradiance on a surface that faces the projector.
-    lit : Bool, inside the projector's image and unobstructed.
+    geometry : Float, ratio of the irradiance on a surface at the point that faces the projector to the irradiance at
+        z = 1 m.
+    lit : Bool, whether the point is inside the projector's image and nothing stands in between.
     blur_px : Float, see `rangesim.response.LightPath`; None: sharp.
     """
 
-    uv: Any
-    direction: Any
-    distance: Any
-    geometry: Any
-    lit: Any
-    blur_px: Any = None
+    uv: mi.Point2f
+    direction: mi.Vector3f
+    distance: mi.Float
+    geometry: mi.Float
+    lit: mi.Bool
+    blur_px: mi.Float | None = None
 
 
 def connect(
-    scene: Any, projector: Device, si: Any, active: Any, media: Media | None = None, inside: Medium | None = None
+    scene: mi.Scene,
+    projector: Device,
+    si: mi.SurfaceInteraction3f,
+    active: mi.Bool,
+    media: Media | None = None,
+    inside: Medium | None = None,
 ) -> Connection:
-    """Straight connection of the point `si` to the projector; with `media` through them, from the one that is `inside`.
+    """Straight connection of the point `si` to the projector, through `media` if there are any.
 
-    The pattern is uniform per projector pixel, so the radiant intensity is E / cos^3 and falls as
-    cos^2 / z^2, which leaves E / (z^2 cos), with E of the lens: its pixels' density and relative illumination.
+    All projector pixels have the same power. With E the irradiance at z = 1 m on the axis, the radiant intensity is
+    E / cos^3. Irradiance falls as cos^2 / z^2, which leaves E / (z^2 cos). The lens multiplies E by the density of its
+    pixels and by its relative illumination.
+
+    Parameters
+    ----------
+    inside : Medium, in which the point lies; None without media.
     """
     uv, z = projector.project(si.p)
     to_projector = projector.centre - mi.Vector3f(si.p)

@@ -2,10 +2,14 @@
 """Glint: the camera sees the projector's lens itself, in a mirror, through glass or directly.
 
 The lens is a disc as large as its aperture. A camera path of delta interactions alone that meets it brings its full
-radiance. Where all of a pixel sees the lens, that is 10^4 times the radiance of a lit wall, so a highlight much finer
-than a pixel counts. Random paths of the pass would mostly miss it, hence three steps: pixels behind whose centre there
-is a delta surface; of those, pixels of which a few probing paths come near the lens; and these get thousands of paths.
-The lens is not seen through a medium that scatters: its boundary ends a path. Through glass that absorbs it is seen.
+radiance. Where the whole of a pixel sees the lens, that is 10^4 times the radiance of a lit wall, so a highlight much
+finer than a pixel matters. Random paths of the pass would mostly miss it. Three steps find it:
+
+1. Pixels are chosen behind whose centre, or a neighbour's centre, there is a delta surface.
+2. A few probing paths of each tell how near to the lens its paths come, and how far they spread.
+3. Pixels whose paths come near the lens get thousands of paths.
+
+The lens is not seen through a medium that scatters: its boundary ends a path. It is seen through glass that absorbs.
 """
 
 from __future__ import annotations
@@ -13,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -34,33 +38,41 @@ from rangesim.response import GLINT, LightPath, Response
 from rangesim.rig import Rig
 
 PROBES = 32
-"""Probing paths per pixel."""
-NEAR = 1.5
-"""Times the spread of a pixel's probes, within which the lens counts as near."""
+"""Number of probing paths of a pixel. Fewer probes miss more lenses; the time of the search grows with the number."""
+NEAR_SPREADS = 1.5
+"""A pixel is near the lens if a probe passes the edge of the lens at less than this distance, in spreads. The spread is
+the least distance between the places at which successive probes cross the plane of the lens. A larger value sends paths
+to pixels that do not see the lens."""
 UNKNOWN_SPREAD = 8.0
-"""Radii of the lens; stands for the spread where but one probe crossed its plane."""
-FINEST = 0.2
-"""Times the spread, the radius of the smallest disc that a pixel's paths hit well: about a tenth of the pixel."""
+"""Spread, in radii of the lens, that is assumed where only one probe crossed the plane of the lens."""
+MIN_RADIUS_SPREADS = 0.2
+"""Radius, in spreads, of the smallest disc that a pixel's paths hit well: it covers about a tenth of the pixel."""
 MAX_ENLARGEMENT = 16.0
-"""Times the radius of the lens, of the disc that stands for it."""
+"""Largest radius, in radii of the lens, of the disc that stands for it. A larger disc is hit by more paths, but may
+reach into pixels that do not see the lens."""
 MAX_PATHS = 1 << 22
-"""Of all pixels together."""
-PATHS_PER_PIXEL = (64, 4096)
-"""Least and largest number."""
-SCREENING, CLOSE = 8, 8.0
-"""Fraction of the paths that look first, as its inverse; the others are sent where one of them came so close to the
-centre of the lens, in radii. A lens that one path in 4000 hits has eight of 512 come as close; it is missed by chance
-once in 3000 times."""
+"""Largest number of paths of all pixels together, which bounds the time."""
+MIN_PATHS_PER_PIXEL = 64
+"""Smallest number of paths of a pixel, however many pixels there are: fewer would make glint noisy."""
+MAX_PATHS_PER_PIXEL = 4096
+"""Largest number of paths of a pixel, however few pixels there are."""
+SCREENING = 8
+"""One path in this many is sent first. The other paths are sent only to pixels where one of the first came close."""
+CLOSE_RADII = 8.0
+"""Distance from the centre of the lens, in its radii, at which a path counts as close. If one path in 4000 hits the
+lens, 64 in 4000 come that close, so 8 of the first 512 do; all of them miss by chance once in 3000 times."""
 SEGMENTS = 4
-"""Segments of a path, about, on which the size of launches rests."""
+"""Segments that a path is taken to have when the size of the first launch is chosen. Later launches go by the time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Glint:
-    """Glint of the n pixels that have any.
+    """Glint of the n pixels that may see the projector's lens.
 
-    pixel : (n,) int, flat index. radiance : (n,) float32, W/m2/sr. channels : response -> (c, n) float32.
-    radiance_error, channels_error : a draw of the sampling error of each, see `rangesim.signals.SamplingError`.
+    pixel : (n,) int, flat indices in the image.
+    radiance : (n,) float32, W/m2/sr.
+    channels : response -> (c, n) float32, contributions to its channels.
+    radiance_error, channels_error : one draw of the sampling error of each, see `rangesim.signals.SamplingError`.
     """
 
     pixel: np.ndarray
@@ -81,17 +93,25 @@ def trace_glint(
     seed: int,
     report: Callable[[], None] = lambda: None,
 ) -> Glint:
-    """What the camera of the rig sees of the projector's lens; `report` is called after each kernel launch."""
+    """The glint that the camera of the rig sees.
+
+    Parameters
+    ----------
+    traced, rig : TracedScene and Rig, in coordinates of the renderer.
+    responses : whose channels are returned.
+    seed : int, 0 to 2^64 - 1.
+    report : called after each kernel launch.
+    """
     view = GlintView(traced, Seed.of(seed))
     worth_probing = _worth_probing(traced, rig.camera.height, rig.camera.width)
     pixel, radius_m = _near_the_lens(view, rig, worth_probing, report)
     if len(pixel) == 0:
         nothing, none = np.zeros(0, np.float32), {r: np.zeros((r.channels, 0), np.float32) for r in responses}
         return Glint(pixel, nothing, none, nothing, none)
-    paths = int(np.clip(MAX_PATHS // len(pixel), *PATHS_PER_PIXEL)) // 2  # of each half
+    paths = int(np.clip(MAX_PATHS // len(pixel), MIN_PATHS_PER_PIXEL, MAX_PATHS_PER_PIXEL)) // 2  # of each half
     few = paths // SCREENING
     halves = [_sums(view, rig, responses, pixel, radius_m, half * paths, few, half, report) for half in (0, 1)]
-    close = np.flatnonzero(np.minimum(*(half.nearest for half in halves)) < CLOSE)
+    close = np.flatnonzero(np.minimum(*(half.nearest for half in halves)) < CLOSE_RADII)
     counts = np.full(len(pixel), np.float32(few))
     if len(close):
         for number, half in enumerate(halves):
@@ -112,8 +132,13 @@ def trace_glint(
 
 
 class GlintSums(NamedTuple):
-    """Sums over paths of n pixels: how near one came to the centre of the lens, in radii of the disc that stands for
-    it; radiance; response -> (c, n) channels."""
+    """Sums over the paths of n pixels.
+
+    nearest : (n,) float32, least distance of a path from the centre of the lens, in radii of the disc that stands for
+        the lens.
+    radiance : (n,) float32, W/m2/sr.
+    channels : response -> (c, n) float32.
+    """
 
     nearest: np.ndarray
     radiance: np.ndarray
@@ -131,62 +156,65 @@ def _sums(
     part: int,
     report: Callable[[], None],
 ) -> GlintSums:
-    """Sums over the paths of each pixel from number `first` on; each part has random numbers of its own."""
+    """Sums over `paths` paths of each pixel, from number `first` on; each `part` has random numbers of its own."""
     nearest, total = (np.zeros(len(pixel), np.float32) for _ in range(2))
     radiance = rig.projector_irradiance / (np.pi * radius_m**2)
     accumulators, launches, projector = Accumulators(responses, len(pixel)), Launches(), view.traced.projector
     for begin, end in launches.ranges(len(pixel), SEGMENTS * paths, at_least=min_lanes()):
         some, n = slice(begin, end), end - begin
-        lens = LensDisc(rig, projector, radius_m[some], radiance[some])
+        lens = LensDisc(projector, radius_m[some], radiance[some])
         lanes = GlintLanes(view, pixel[some], paths, begin, first, part)
-        state = PathState(
+        state = GlintState(
             chain=lanes.start(),
             throughput=dr.ones(mi.Float, n),
             ray_state=RayState.start(view.traced._replace(media=None), n),  # boundaries of media end its paths
             channels=accumulators.zeros(n),
-            total=dr.zeros(mi.Float, n),
+            radiance=dr.zeros(mi.Float, n),
             nearest=dr.full(mi.Float, dr.inf, n),
         )
         loop = partial(_paths_to_the_lens, lanes, lens, accumulators)
         state, _ = launches.run(loop, state, n, accumulators.pending, lambda state: report())
         accumulators.store(state.channels, some)
-        total[some], nearest[some] = state.total.numpy(), state.nearest.numpy()
+        total[some], nearest[some] = state.radiance.numpy(), state.nearest.numpy()
     channels = {r: parts[0] for r, parts in zip(responses, accumulators.images(), strict=True)}
     return GlintSums(nearest / radius_m.astype(np.float32), total, channels)
 
 
 class GlintView(NamedTuple):
-    """What the camera looks into, and the seed of its random numbers."""
+    """The scene that the camera looks into, and the seed of its random numbers."""
 
     traced: TracedScene
     seed: Seed
 
 
 @dataclass
-class Chain:
-    """Where a lane is in the delta chains of its pixel.
+class ChainState:
+    """How far a lane has come in the delta chains of its pixel.
 
-    random : UInt64, state of the random numbers. k : UInt32, chains finished. length : UInt32, surfaces of this one so
-    far. origin, direction : the ray.
+    random : UInt64, state of the random numbers.
+    number : UInt32, number of chains that are finished.
+    length : UInt32, surfaces that the present chain has met.
+    origin, direction : Point3f and Vector3f, its ray; world, metres and unit.
     """
 
-    random: Any
-    k: Any
-    length: Any
-    origin: Any
-    direction: Any
+    random: mi.UInt64
+    number: mi.UInt32
+    length: mi.UInt32
+    origin: mi.Point3f
+    direction: mi.Vector3f
 
 
 class GlintLanes:
-    """Pixels at work, a lane for each, and how many paths each of them sends.
+    """The pixels that a launch works on, one for each lane, and the number of paths that each of them sends.
 
     Parameters
     ----------
     view : GlintView
     pixel : (lanes,) int, flat indices.
-    paths : int, for each pixel.
-    first_place : int, the number of the first pixel in the accumulators.
-    first, part : number of the first path, which gives them their place in the pixel; and of their random numbers.
+    paths : int, number of paths of each pixel.
+    first_place : int, index of the first pixel in the accumulators.
+    first : int, number of the first path, which decides on the places of the paths within the pixel.
+    part : int, number of the part of the paths; parts have independent random numbers.
     """
 
     def __init__(
@@ -195,56 +223,81 @@ class GlintLanes:
         self.traced, seed = view
         self.pixel, self.paths = mi.UInt32(aligned(pixel, np.uint32)), dr.opaque(mi.UInt32, paths)
         self.place = dr.arange(mi.UInt32, len(pixel)) + dr.opaque(mi.UInt32, first_place)
-        rng = random_stream(seed, self.pixel ^ 0x85EBCA6B)
+        rng = random_stream(seed, self.pixel ^ 0x85EBCA6B)  # other numbers than those of the path loop
         self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())
         self.first = dr.opaque(mi.UInt32, first)
         self.random = Continued(of_part(rng, dr.opaque(mi.UInt32, part)))
         width = mi.UInt32(self.traced.camera.size.x)
         self.corner = mi.Point2f(mi.Float(self.pixel % width), mi.Float(self.pixel // width))
 
-    def start(self) -> Chain:
-        """The lanes before their first path."""
+    def start(self) -> ChainState:
+        """The state of the lanes before their first path."""
         zero = dr.zeros(mi.UInt32, dr.width(self.pixel))
         nowhere = dr.zeros(mi.Vector3f, dr.width(self.pixel))
-        return Chain(mi.UInt64(self.random.rng.state), zero, mi.UInt32(zero), mi.Point3f(nowhere), nowhere)
+        return ChainState(mi.UInt64(self.random.rng.state), zero, mi.UInt32(zero), mi.Point3f(nowhere), nowhere)
 
 
 @dataclass
 class ProbeState:
-    """What a lane carries from one probing segment to the next; see `_probe`."""
+    """Everything that a segment of a probing path changes in a lane; `_probe` changes it.
 
-    chain: Chain
-    nearest: Any
-    spread: Any
-    before: Any
+    nearest : Float, metres, least distance at which a probe passed the centre of the lens.
+    spread : Float, metres, least distance between the places at which successive probes crossed the plane of the lens.
+    before : Point2f, metres from the centre of the lens, the place at which the last probe crossed it.
+    """
+
+    chain: ChainState
+    nearest: mi.Float
+    spread: mi.Float
+    before: mi.Point2f
 
 
 @dataclass
-class PathState:
-    """What a lane carries from one segment of its paths to the lens to the next; see `_paths_to_the_lens`."""
+class GlintState:
+    """Everything that a segment of a path to the lens changes in a lane; `_paths_to_the_lens` changes it.
 
-    chain: Chain
-    throughput: Any
+    throughput : Float, radiance at the camera per radiance along the ray.
+    ray_state : RayState
+    channels : per response its dense channels, Float each.
+    radiance : Float, W/m2/sr, sum over the paths.
+    nearest : Float, metres, least distance at which a path passed the centre of the lens.
+    """
+
+    chain: ChainState
+    throughput: mi.Float
     ray_state: RayState
-    channels: list[list[Any]]
-    total: Any
-    nearest: Any
+    channels: list[list[mi.Float]]
+    radiance: mi.Float
+    nearest: mi.Float
 
 
 class LensDisc:
     """The projector's lens as the camera may see it: a disc that faces along the projector's axis.
 
-    Where a curved mirror makes its image too small for a pixel's paths to hit, a larger and dimmer disc stands for it:
-    `radius_m` and `radiance`, for each pixel. What the pixel receives is the same.
+    Where a curved mirror makes the image of the lens too small for a pixel's paths to hit, a larger and dimmer disc
+    stands for it. The pixel receives the same light.
+
+    Parameters
+    ----------
+    projector : Device
+    radius_m : (lanes,) float, metres, radius of the disc of each pixel.
+    radiance : (lanes,) float, W/m2/sr, its radiance along the axis.
     """
 
-    def __init__(self, rig: Rig, projector: Device, radius_m: np.ndarray, radiance: np.ndarray) -> None:
+    def __init__(self, projector: Device, radius_m: np.ndarray, radiance: np.ndarray) -> None:
         self.projector = projector
         self.radius = mi.Float(aligned(radius_m, np.float32))
         self.radiance = mi.Float(aligned(radiance, np.float32))
 
-    def offset(self, ray: Any, si: Any) -> tuple[Any, Any, Any]:
-        """Where the ray crosses the plane of the lens, metres from its centre; the way there; and whether it does."""
+    def crossing(self, ray: mi.Ray3f, si: mi.SurfaceInteraction3f) -> tuple[mi.Point2f, mi.Float, mi.Bool]:
+        """Where the ray crosses the plane of the lens from the front, before it meets the surface `si`.
+
+        Returns
+        -------
+        across : Point2f, metres, the place along the projector's x and y axes, from the centre of the lens.
+        t : Float, metres, the distance from the start of the ray.
+        crosses : Bool, whether the ray does so at all.
+        """
         z, centre = self.projector.z, self.projector.centre
         slope = -dr.dot(ray.d, z)
         t = dr.dot(mi.Vector3f(ray.o) - centre, z) / slope
@@ -254,7 +307,7 @@ class LensDisc:
 
 
 def _worth_probing(traced: TracedScene, h: int, w: int) -> np.ndarray:
-    """Flat indices of the pixels around whose centre there is a delta surface, or the lens in plain view."""
+    """Flat indices of the pixels to be probed: beside a delta surface, or beside the lens in plain view."""
     meets, exists = meets_delta(traced.scene, traced.camera)
     mask = meets.reshape(h, w)
     uv, z = traced.camera.project(mi.Point3f(traced.projector.centre))
@@ -267,10 +320,15 @@ def _worth_probing(traced: TracedScene, h: int, w: int) -> np.ndarray:
 def _near_the_lens(
     view: GlintView, rig: Rig, pixel: np.ndarray, report: Callable[[], None]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Those of the pixels whose probes come near the lens, as measured by how far they spread; and for each of them
-    the radius in metres of the disc to hit."""
+    """The pixels out of `pixel` whose probes come near the lens, measured by how far they spread.
+
+    Returns
+    -------
+    pixel : (n,) int, flat indices.
+    radius_m : (n,) float, metres, radius of the disc that stands for the lens in each pixel.
+    """
     aperture = np.full(len(pixel), rig.projector_lens.aperture_radius_m)
-    lens = LensDisc(rig, view.traced.projector, aperture[:1], aperture[:1])
+    lens = LensDisc(view.traced.projector, aperture[:1], aperture[:1])
     nearest, spread = np.empty(len(pixel), np.float32), np.empty(len(pixel), np.float32)
     launches = Launches()
     for begin, end in launches.ranges(len(pixel), SEGMENTS * PROBES, at_least=min_lanes()):
@@ -280,126 +338,116 @@ def _near_the_lens(
         state, _ = launches.run(partial(_probe, lanes, lens), state, n, report=lambda state: report())
         nearest[some], spread[some] = state.nearest.numpy(), state.spread.numpy()
     spread = np.where(np.isfinite(spread), spread, np.float32(UNKNOWN_SPREAD * rig.projector_lens.aperture_radius_m))
-    near = nearest < aperture + NEAR * spread
-    return pixel[near], np.clip(FINEST * spread, aperture, MAX_ENLARGEMENT * aperture)[near]
+    near = nearest < aperture + NEAR_SPREADS * spread
+    return pixel[near], np.clip(MIN_RADIUS_SPREADS * spread, aperture, MAX_ENLARGEMENT * aperture)[near]
 
 
 @dr.syntax
-def _probe(lanes: GlintLanes, lens: LensDisc, state: ProbeState, most: Any) -> tuple[ProbeState, Any]:
-    """The state after at most so many iterations, and those taken: the least distance at which each pixel's delta paths
-    pass the lens's centre, and how far apart they cross its plane (infinite where fewer than two do).
+def _probe(
+    lanes: GlintLanes, lens: LensDisc, state: ProbeState, max_iterations: mi.UInt32
+) -> tuple[ProbeState, mi.UInt32]:
+    """The state of the probes after at most that many segments, and the number of segments that each lane took.
 
-    Where light splits into reflection and refraction, probes take both alike, however faint one is.
+    Where light splits into reflection and refraction, probes take both equally often, however faint one is.
     """
     traced = lanes.traced
-    random, k, chain = state.chain.random, state.chain.k, state.chain.length
-    origin, direction = state.chain.origin, state.chain.direction
-    nearest, spread, before = state.nearest, state.spread, state.before  # where the last one crossed
     context = delta_only(mi.TransportMode.Radiance)
-    left = most + dr.zeros(mi.UInt32, dr.width(k))  # iterations
-    while (k < lanes.paths) & (left > 0):
-        rng = lanes.random.at(random)
-        primary = traced.camera.centre_ray(lanes.corner + stratified(lanes.shift, k))
+    left = max_iterations + dr.zeros(mi.UInt32, dr.width(state.nearest))  # iterations
+    while (state.chain.number < lanes.paths) & (left > 0):
+        chain = state.chain  # a part of the state, changed in place
+        rng = lanes.random.at(chain.random)
+        primary = traced.camera.centre_ray(lanes.corner + stratified(lanes.shift, chain.number))
+        starts = chain.length == 0
         ray = mi.Ray3f(
-            dr.select(chain == 0, primary.origin, origin), dr.select(chain == 0, primary.direction, direction)
+            dr.select(starts, primary.origin, chain.origin), dr.select(starts, primary.direction, chain.direction)
         )
         si = traced.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False)
-        across, _, crosses = lens.offset(ray, si)
-        nearest = dr.select(crosses, dr.minimum(nearest, dr.norm(across)), nearest)
+        across, _, crosses = lens.crossing(ray, si)
+        state.nearest = dr.select(crosses, dr.minimum(state.nearest, dr.norm(across)), state.nearest)
         # The least step, because probes that went another way are far off and say nothing
-        spread = dr.select(crosses, dr.minimum(spread, dr.norm(across - before)), spread)
-        before = dr.select(crosses, across, before)
+        step = dr.norm(across - state.before)
+        state.spread = dr.select(crosses, dr.minimum(state.spread, step), state.spread)
+        state.before = dr.select(crosses, across, state.before)
         hit = si.is_valid() & ~bounded(traced.media, si)
-        way = dr.select(rng.next_float32() < 0.5, mi.Float(0), mi.Float(0.9999))
-        bs, weight = si.bsdf(ray).sample(context, si, way, mi.Point2f(0.5), hit)
+        component = dr.select(rng.next_float32() < 0.5, mi.Float(0), mi.Float(0.9999))  # the first, or the last
+        bs, weight = si.bsdf(ray).sample(context, si, component, mi.Point2f(0.5), hit)
         ray = spawn_specular_ray(si, si.p, si.to_world(bs.wo))
-        chain += 1
-        ends = (
-            ~hit
-            | ~owner(has_vertex=~is_delta(bs), delta_interactions=chain).glint
-            | (mono(weight) <= 0)
-            | (chain >= MAX_CHAIN)
-        )
-        chain = dr.select(ends, 0, chain)
-        k = dr.select(ends, k + 1, k)
-        random, origin, direction = rng.state, ray.o, ray.d
+        chain.length += 1
+        ends = ~hit | ~owner(has_vertex=~is_delta(bs), delta_interactions=chain.length).glint
+        ends |= (mono(weight) <= 0) | (chain.length >= MAX_CHAIN)
+        chain.length = dr.select(ends, 0, chain.length)
+        chain.number = dr.select(ends, chain.number + 1, chain.number)
+        chain.random, chain.origin, chain.direction = rng.state, ray.o, ray.d
         left -= 1
-    return ProbeState(Chain(random, k, chain, origin, direction), nearest, spread, before), most - left
+    return state, max_iterations - left
 
 
 @dr.syntax
 def _paths_to_the_lens(
-    lanes: GlintLanes, lens: LensDisc, accumulators: Accumulators, state: PathState, most: Any
-) -> tuple[PathState, Any]:
-    """The state after at most so many iterations, and those taken: dense channels and radiance of the delta paths
-    from each pixel to the lens; bins go to the accumulators."""
+    lanes: GlintLanes, lens: LensDisc, accumulators: Accumulators, state: GlintState, max_iterations: mi.UInt32
+) -> tuple[GlintState, mi.UInt32]:
+    """The state of the paths after at most that many segments, and the number of segments that each lane took.
+
+    Sparse responses are added to the accumulators.
+    """
     traced, camera = lanes.traced, lanes.traced.camera
-    random, k, chain = state.chain.random, state.chain.k, state.chain.length
-    origin, direction = state.chain.origin, state.chain.direction
-    throughput, ray_state, channels, total, nearest = (
-        state.throughput,
-        state.ray_state,
-        state.channels,
-        state.total,
-        state.nearest,
-    )
     context = delta_only(mi.TransportMode.Radiance)
-    left = most + dr.zeros(mi.UInt32, dr.width(k))  # iterations
-    while (k < lanes.paths) & (left > 0):
-        rng = lanes.random.at(random)
+    n = dr.width(state.nearest)
+    left = max_iterations + dr.zeros(mi.UInt32, n)  # iterations
+    while (state.chain.number < lanes.paths) & (left > 0):
+        chain = state.chain  # a part of the state, changed in place
+        rng = lanes.random.at(chain.random)
         # ---- The next path starts at the camera ------------------------------------------------------
-        starts = chain == 0
+        starts = chain.length == 0
         on_lens = (
             mi.Point2f(rng.next_float32(), rng.next_float32()) if dr.hint(camera.has_lens, mode="scalar") else None
         )
-        primary = camera.sample_ray(lanes.corner + stratified(lanes.shift, lanes.first + k), on_lens)
-        ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, direction))
-        ray_state = ray_state.restarted(starts, primary.origin, primary.path_offset)
+        primary = camera.sample_ray(lanes.corner + stratified(lanes.shift, lanes.first + chain.number), on_lens)
+        ray = mi.Ray3f(
+            dr.select(starts, primary.origin, chain.origin), dr.select(starts, primary.direction, chain.direction)
+        )
+        state.ray_state = state.ray_state.restarted(starts, primary.origin, primary.path_offset)
         si = traced.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False)
 
         # ---- Does this segment meet the lens? --------------------------------------------------------
-        across, way, crosses = lens.offset(ray, si)
-        uv, z = lens.projector.project(ray_state.previous)
+        across, t, crosses = lens.crossing(ray, si)
+        uv, z = lens.projector.project(state.ray_state.previous)
         size = lens.projector.size
-        nearest = dr.select(crosses, dr.minimum(nearest, dr.norm(across)), nearest)
+        state.nearest = dr.select(crosses, dr.minimum(state.nearest, dr.norm(across)), state.nearest)
         meets = crosses & (dr.norm(across) < lens.radius) & (z > 0)
         meets &= (uv.x >= 0) & (uv.x < size.x) & (uv.y >= 0) & (uv.y < size.y)
         # Intensity E / cos^3 of the pinhole, from a disc that looks smaller by cos
         cosine = -dr.dot(ray.d, lens.projector.z)
-        radiance = (
-            throughput * lens.radiance * lens.projector.relative_illumination(-ray.d) / dr.square(dr.square(cosine))
-        )
+        illumination = lens.projector.relative_illumination(-ray.d)
+        radiance = state.throughput * lens.radiance * illumination / dr.square(dr.square(cosine))
         radiance = dr.select(meets, radiance * lens.projector.pixel_density(-ray.d), 0)
-        u, v, path_length = (dr.select(meets, x, 0) for x in (uv.x, uv.y, dr.fma(ray_state.ior, way, ray_state.length)))
-        path = LightPath(u, v, path_length, dr.full(mi.Bool, False, dr.width(k)), mi.UInt32(GLINT))
-        channels = accumulators.add(channels, path, radiance, lanes.place, meets)
-        total += radiance
+        length = dr.fma(state.ray_state.ior, t, state.ray_state.length)
+        u, v, path_length = (dr.select(meets, x, 0) for x in (uv.x, uv.y, length))
+        path = LightPath(u, v, path_length, dr.full(mi.Bool, False, n), mi.UInt32(GLINT))
+        state.channels = accumulators.add(state.channels, path, radiance, lanes.place, meets)
+        state.radiance += radiance
 
         # ---- On through delta interactions, or the next path -----------------------------------------
         hit = si.is_valid() & ~meets & ~bounded(traced.media, si)
-        ray_state.length = ray_state.length_to(si.p, hit)
+        state.ray_state.length = state.ray_state.length_to(si.p, hit)
         if dr.hint(traced.absorbers is not None, mode="scalar"):
-            throughput *= ray_state.unabsorbed(traced, si.p, hit)
+            state.throughput *= state.ray_state.unabsorbed(traced, si.p, hit)
         bs, weight = si.bsdf(ray).sample(
             context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), hit
         )
-        throughput *= mono(weight)
-        ray_state = ray_state.refracted(bs, hit).restarted(True, si.p, ray_state.length)
+        state.throughput *= mono(weight)
+        state.ray_state = state.ray_state.refracted(bs, hit).restarted(True, si.p, state.ray_state.length)
         ray = spawn_specular_ray(si, si.p, si.to_world(bs.wo))
-        chain += 1
-        chance = survival(chain, throughput * dr.square(ray_state.ior))
-        ends = (
-            ~hit
-            | ~owner(has_vertex=~is_delta(bs), delta_interactions=chain).glint
-            | (throughput <= 0)
-            | (chain >= MAX_CHAIN)
-        )
+        chain.length += 1
+        chance = survival(chain.length, state.throughput * dr.square(state.ray_state.ior))
+        ends = ~hit | ~owner(has_vertex=~is_delta(bs), delta_interactions=chain.length).glint
+        ends |= (state.throughput <= 0) | (chain.length >= MAX_CHAIN)
         ends |= rng.next_float32() >= chance
-        throughput /= chance
-        ray_state = ray_state.entering(traced, si, ray.d, hit, mi.Bool(False)).reset(traced, ends)
-        chain, k = dr.select(ends, 0, chain), dr.select(ends, k + 1, k)
-        throughput = dr.select(ends, 1, throughput)
-        random, origin, direction = rng.state, ray.o, ray.d
+        state.throughput /= chance
+        state.ray_state = state.ray_state.entering(traced, si, ray.d, hit, mi.Bool(False)).reset(traced, ends)
+        chain.length = dr.select(ends, 0, chain.length)
+        chain.number = dr.select(ends, chain.number + 1, chain.number)
+        state.throughput = dr.select(ends, 1, state.throughput)
+        chain.random, chain.origin, chain.direction = rng.state, ray.o, ray.d
         left -= 1
-    at = Chain(random, k, chain, origin, direction)
-    return PathState(at, throughput, ray_state, channels, total, nearest), most - left
+    return state, max_iterations - left

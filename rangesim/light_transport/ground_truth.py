@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ground truth: what lies behind each pixel centre, found with one camera ray and one shadow ray."""
+"""Ground truth of each pixel, found with one camera ray through its centre and one shadow ray to the projector."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -26,7 +26,10 @@ from rangesim.signals import GroundTruth
 
 
 def ground_truth(scene: Scene, traced: TracedScene, rig: Rig) -> tuple[GroundTruth, Guides]:
-    """First surface along the ray through each pixel centre; see `rangesim.signals.GroundTruth`."""
+    """The ground truth of the camera's image, and the guides of the filter of indirect light.
+
+    Both describe the first surface on the ray through each pixel's centre; see `rangesim.signals.GroundTruth`.
+    """
     h, w = rig.camera.height, rig.camera.width
     launches, shapes = Launches(), scene.mitsuba.shapes()
     index_of = mi.Int32(table_of(scene.mitsuba, np.arange(len(shapes), dtype=np.int32)))
@@ -34,36 +37,50 @@ def ground_truth(scene: Scene, traced: TracedScene, rig: Rig) -> tuple[GroundTru
     matte = np.array([is_matte(s) for s in shapes])
     parts = []
     for begin, end in launches.ranges(h * w):
-        part = _truth(traced, scene.has_cutouts, index_of, transmits_of, begin, end)
+        part = _first_surfaces(traced, scene.has_cutouts, index_of, transmits_of, begin, end)
         launches.evaluate(part, end - begin)
-        parts.append([np.asarray(x.numpy()) for x in part])
-    columns = (np.concatenate(column) for column in zip(*parts, strict=True))
-    hit, index, z, distance, visible, u, v, *vectors = (column.reshape(h, w) for column in columns)
-    normal, position, shading_normal, (reflectance,) = vectors[:3], vectors[3:6], vectors[6:9], vectors[9:]
-    masked = lambda x: np.where(hit, x, np.float32(np.nan))  # noqa: E731
-    instance = np.where(hit, index, -1).astype(np.int32)
+        parts.append(part)
+
+    def image(name: str) -> np.ndarray:
+        """A field of the surfaces as an image, (h, w) or (h, w, components)."""
+        column = np.concatenate([np.asarray(getattr(part, name).numpy()) for part in parts], axis=-1)
+        if column.ndim == 1:
+            return column.reshape(h, w)
+        return np.ascontiguousarray(np.moveaxis(column.reshape(-1, h, w), 0, -1))
+
+    hit, reflectance = image("hit"), image("reflectance")
+
+    def where_hit(name: str) -> np.ndarray:
+        """The same, NaN in pixels that see no surface."""
+        values = image(name)
+        return np.where(hit if values.ndim == 2 else hit[..., None], values, np.float32(np.nan))
+
+    instance = np.where(hit, image("index"), -1).astype(np.int32)
     materials = np.array([MATERIAL_CLASSES.index(i.material) for i in scene.instances], dtype=np.int32)
     truth = GroundTruth(
-        z=masked(z),
-        range_m=masked(distance),
-        normal=np.stack([masked(x) for x in normal], axis=-1),
+        z=where_hit("z"),
+        range_m=where_hit("range_m"),
+        normal=where_hit("normal"),
         instance=instance,
         material=np.where(instance >= 0, materials[instance], -1).astype(np.int32),
-        projector_uv=np.stack([masked(u), masked(v)], axis=-1),
-        projector_visible=visible,
+        projector_uv=where_hit("uv"),
+        projector_visible=image("visible"),
         instance_names=tuple(i.name for i in scene.instances),
         material_names=MATERIAL_CLASSES,
     )
     is_shared = (instance >= 0) & matte[instance] & (reflectance > 0)
     guides = Guides(
-        np.where(is_shared, instance, np.int32(-1)), np.stack(position, -1), np.stack(shading_normal, -1), reflectance
+        instance=np.where(is_shared, instance, np.int32(-1)),
+        position=image("position"),
+        normal=image("shading_normal"),
+        reflectance=reflectance,
     )
     return truth, guides
 
 
 @dr.syntax
 def mean_reflectance(view: View, settings: PathSettings, rig: Rig, has_cutouts: bool, samples: int) -> np.ndarray:
-    """(h, w) float32, mean diffuse reflectance of the first surfaces behind a pixel's first samples."""
+    """(h, w) float32, diffuse reflectance of the first surface, averaged over the first samples of each pixel."""
     launches, parts = Launches(), []
     surfaces, camera, shape = view.traced.surfaces, view.traced.camera, (rig.camera.height, rig.camera.width)
     count = np.full(shape[0] * shape[1], samples, np.uint32)
@@ -83,9 +100,40 @@ def mean_reflectance(view: View, settings: PathSettings, rig: Rig, has_cutouts: 
     return np.concatenate(parts).reshape(shape)
 
 
-def _truth(traced: TracedScene, has_cutouts: bool, index_of: Any, transmits_of: Any, begin: int, end: int) -> list[Any]:
-    """Of a range of pixels: hit, index of the shape, z, range, visibility, u, v, and three of each of the normal,
-    the place from the camera, and the shading normal, and the diffuse reflectance."""
+@dataclass
+class FirstSurfaces:
+    """The first surface behind the centre of each of n pixels. A dataclass, because Dr.Jit evaluates no named tuple.
+
+    hit : Bool, whether there is one. The other fields mean something only where there is.
+    index : Int32, index of its shape in the scene.
+    z, range_m : Float, metres, depth, and distance from the camera.
+    visible : Bool, whether the projector lights the side that the camera sees.
+    uv : Point2f, projector pixel coordinates.
+    normal : Vector3f, unit, world, geometric normal on the side of the camera.
+    position : Vector3f, metres, from the camera's centre, along the axes of the world.
+    shading_normal : Vector3f, unit, world.
+    reflectance : Float, diffuse reflectance.
+    """
+
+    hit: mi.Bool
+    index: mi.Int32
+    z: mi.Float
+    range_m: mi.Float
+    visible: mi.Bool
+    uv: mi.Point2f
+    normal: mi.Vector3f
+    position: mi.Vector3f
+    shading_normal: mi.Vector3f
+    reflectance: mi.Float
+
+
+def _first_surfaces(
+    traced: TracedScene, has_cutouts: bool, index_of: mi.Int32, transmits_of: mi.Bool, begin: int, end: int
+) -> FirstSurfaces:
+    """The first surfaces behind the centres of the pixels `begin` to `end` - 1, row by row.
+
+    `index_of` and `transmits_of` are tables (`table_of`): index of a shape, and whether light goes through it.
+    """
     camera = traced.camera
     ray = camera.centre_rays(begin, end)
     si = first_surface(traced.surfaces, mi.Ray3f(ray.origin, ray.direction), has_cutouts)
@@ -93,12 +141,17 @@ def _truth(traced: TracedScene, has_cutouts: bool, index_of: Any, transmits_of: 
     to_camera = camera.centre - mi.Vector3f(si.p)
     normal = dr.select(dr.dot(si.n, to_camera) < 0, -si.n, si.n)
     link = connect(traced.scene, traced.projector, si, hit)
-    uv = link.uv
     shape = number_of(si.shape)
     through = dr.gather(mi.Bool, transmits_of, shape, hit)
-    visible = link.lit & (through | (dr.dot(normal, link.direction) > 0))
-    z, distance = -dr.dot(to_camera, camera.z), dr.norm(to_camera)
-    index = dr.gather(mi.Int32, index_of, shape, hit)
-    seen = dr.normalize(si.sh_frame.n)
-    reflectance = mono(si.bsdf().eval_diffuse_reflectance(si, hit))
-    return [hit, index, z, distance, visible, uv.x, uv.y, *normal, *(-to_camera), *seen, reflectance]
+    return FirstSurfaces(
+        hit=hit,
+        index=dr.gather(mi.Int32, index_of, shape, hit),
+        z=-dr.dot(to_camera, camera.z),
+        range_m=dr.norm(to_camera),
+        visible=link.lit & (through | (dr.dot(normal, link.direction) > 0)),
+        uv=link.uv,
+        normal=mi.Vector3f(normal),
+        position=-to_camera,
+        shading_normal=mi.Vector3f(dr.normalize(si.sh_frame.n)),
+        reflectance=mono(si.bsdf().eval_diffuse_reflectance(si, hit)),
+    )

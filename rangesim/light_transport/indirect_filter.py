@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Indirect light with less noise: multipath on matte surfaces is smooth, so neighbouring pixels share their samples.
+"""A filter that takes noise out of indirect light: neighbouring pixels of matte surfaces share their samples.
 
-Light that has been diffusely reflected twice comes to a matte point from a whole hemisphere, and changes little from
-one pixel to the next; but a pixel's few paths sample it badly. The mean over neighbours has the noise of many more
-paths, and a bias where the light bends within the window. All that is filtered is radiance over the reflectance of the
-matte surface, so that textures stay; only pixels of the same instance count, with like normals and in one plane with
-each other; and the weights reproduce what is linear in place, so that the bias begins with the second derivative, in
-corners and at contacts too (local linear regression: Fan, Ann. Statist. 21, 1993; for rendered images: Bitterli et al.,
-Computer Graphics Forum 35, 2016). The same weights act on every channel: a filtered pass is what a slightly blurred
-light would have given, with sensors, histograms and energy split in agreement.
+Light that has been diffusely reflected twice comes to a matte point from a whole hemisphere. It changes little from one
+pixel to the next, but a pixel's few paths sample it badly. The mean over neighbours has the noise of many more paths,
+and a bias where the light bends within the window. Only radiance over the reflectance of the matte surface is filtered,
+so that textures stay. Only pixels of the same instance count, with similar normals and in one plane with each other.
+The weights reproduce light that is linear in place, so that the bias begins with the second derivative, in corners and
+at contacts too (local linear regression: Fan, Ann. Statist. 21, 1993; for rendered images: Bitterli et al., Computer
+Graphics Forum 35, 2016). The same weights act on every channel: a filtered pass is what a slightly blurred light would
+have given, and sensors, histograms and energy split agree.
 
 The window is built from levels of 3 x 3 pixels that are 1, 3, 9 ... pixels apart, so that 9 taps for each level cover a
 square of 3^levels pixels (the "a trous" scheme: Dammertz et al., High Performance Graphics 2010).
 
-Light seen in mirrors, through glass and on glossy surfaces is not smooth, and left as it is.
+Light seen in mirrors, through glass and on glossy surfaces is not smooth, and is left as it is.
 """
 
 from __future__ import annotations
@@ -28,29 +28,37 @@ from pcgraph.kernel_cache import cached_njit
 from pcgraph.parallel import MIN_ROWS, in_blocks
 
 LEVELS = 2
-"""The window is 3^LEVELS pixels wide."""
+"""Number of levels of the window, which is 3^LEVELS pixels wide. One more level would make it three times as wide, with
+less noise and more bias."""
 REACH_PX = 3**LEVELS // 2
-"""How far from a pixel the light that it gets comes."""
-SAME_NORMAL = 0.9
-"""Least cosine between the normals of two pixels that share light."""
-OFF_PLANE = 0.3
-"""Sine, at most, between the line to a neighbour and the surface."""
-JUMP = 0.02
-"""Distance of a neighbour off the surface, over that from the camera, from which on a pixel sees an edge with something
-behind: it sees both, and does not lend its light to others."""
+"""Largest distance, in pixels along an axis, over which pixels share light."""
+MIN_NORMAL_COSINE = 0.9
+"""Smallest cosine between the normals of two pixels that share light (26 degrees). A smaller one would share light
+around edges; a larger one would stop the filter on curved surfaces."""
+MAX_PLANE_SINE = 0.3
+"""Largest sine of the angle between a pixel's surface and the line to a neighbour that shares light with it (17
+degrees). A larger one would share light between surfaces that lie behind each other."""
+MIN_JUMP = 0.02
+"""Distance of a neighbour from a pixel's tangent plane, as a fraction of the distance from the camera, above which the
+pixel counts as mixed: it sees an edge and something behind, and lends no light to others. A smaller value would stop
+the filter on curved surfaces; a larger one would spread light across edges."""
 RIDGE = 0.05
-"""Of the regression, as a fraction of the weight times the squared step: how soon a one-sided window is a plain
-mean."""
-
-CHANNELS_AT_ONCE, ROWS_AT_ONCE = 32, 16
-"""Of the filter: what fits into the caches."""
+"""Number added to the second moments of the regression, as a fraction of the weight times the squared step. The larger
+it is, the sooner a one-sided window takes the plain mean. At 0, a window of a single row or column would divide by
+zero."""
+CHANNELS_AT_ONCE = 32
+"""Number of channels that are filtered together, so that they fit into the caches."""
+ROWS_AT_ONCE = 16
+"""Number of rows that are filtered together, so that their weights stay in the cache for all channels."""
 
 
 class Guides(NamedTuple):
-    """What decides which pixels share light.
+    """Properties of the pixels that decide which of them share light.
 
-    instance : (h, w) int32; -1: a pixel of its own, such as one that sees no matte surface.
-    position : (h, w, 3) float32, metres. normal : (h, w, 3) float32, unit.
+    instance : (h, w) int32, index of the instance; -1 for pixels that share no light, such as those that see no matte
+        surface.
+    position : (h, w, 3) float32, metres, from the camera's centre.
+    normal : (h, w, 3) float32, unit.
     reflectance : (h, w) float32, of the matte surface.
     """
 
@@ -61,14 +69,28 @@ class Guides(NamedTuple):
 
 
 class LightFilter:
-    """Lets neighbouring pixels share indirect light, as the guides say."""
+    """The filter of indirect light for an image with these guides.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> plane = np.zeros((9, 9, 3), np.float32)
+    >>> plane[..., :2], plane[..., 2] = np.moveaxis(np.indices((9, 9)), 0, -1), 100
+    >>> normal = np.broadcast_to(np.float32([0, 0, -1]), plane.shape)
+    >>> guides = Guides(np.zeros((9, 9), np.int32), plane, normal, np.ones((9, 9), np.float32))
+    >>> light = np.zeros((1, 9, 9), np.float32)
+    >>> light[0, 4, 4] = 81
+    >>> LightFilter(guides).apply(light)
+    >>> float(light[0, 4, 4].round(3))
+    1.0
+    """
 
     def __init__(self, guides: Guides) -> None:
         self.guides = guides
 
     @cached_property
     def weights(self) -> list[NDArray[np.float32]]:
-        """Of the neighbours of each level, made when there is light to be shared."""
+        """(h, 9, w) float32 for each level, weights of the neighbours; computed when there is light to be shared."""
         guides, mixed = self.guides, mixed_pixels(self.guides)
         weights = [level_weights(guides, mixed, 3**level) for level in range(LEVELS)]
         reflectance = np.where(guides.instance >= 0, guides.reflectance, np.float32(1)).astype(np.float32)
@@ -77,11 +99,11 @@ class LightFilter:
 
     @cached_property
     def scratch(self) -> NDArray[np.float32]:
-        """(CHANNELS_AT_ONCE, h, w) float32, for every other level."""
+        """(CHANNELS_AT_ONCE, h, w) float32, memory for the result of every other level."""
         return np.empty((CHANNELS_AT_ONCE, *self.guides.instance.shape), np.float32)
 
     def apply(self, image: NDArray[np.float32]) -> None:
-        """Filter an image (c, h, w) in place; without light, as after a pass of direct light alone, it stays."""
+        """Filter an image (c, h, w) float32 in place. Channels without any light are left as they are."""
         for begin in range(0, len(image), CHANNELS_AT_ONCE):
             some = image[begin : begin + CHANNELS_AT_ONCE]
             if not some.any():
@@ -95,7 +117,7 @@ class LightFilter:
 
 
 def mixed_pixels(guides: Guides) -> NDArray[np.bool_]:
-    """(h, w) whether a pixel sees an edge with something behind it."""
+    """(h, w) bool, whether a pixel sees an edge and something behind it."""
     mixed = np.zeros(guides.instance.shape, np.bool_)
     in_blocks(_find_mixed, len(mixed), guides.instance, guides.position, guides.normal, mixed, smallest=MIN_ROWS)
     return mixed
@@ -124,7 +146,7 @@ def _find_mixed(start, stop, instance, position, normal, mixed):  # type: ignore
                 for i in range(3):
                     off += (position[yk, xk, i] - position[y, x, i]) * normal[y, x, i]
                     distance += position[y, x, i] * position[y, x, i]
-                if not off * off < JUMP * JUMP * distance:
+                if not off * off < MIN_JUMP * MIN_JUMP * distance:
                     mixed[y, x] = True
 
 
@@ -152,7 +174,7 @@ def _weigh(start, stop, step, instance, position, normal, mixed, weights):  # ty
                         cosine += normal[yk, xk, i] * normal[y, x, i]
                         off += d * normal[y, x, i]
                         distance += d * d
-                    if cosine < SAME_NORMAL or off * off > OFF_PLANE * OFF_PLANE * distance:
+                    if cosine < MIN_NORMAL_COSINE or off * off > MAX_PLANE_SINE * MAX_PLANE_SINE * distance:
                         continue
                 is_shared[k] = True
                 n += 1
@@ -175,8 +197,11 @@ def _weigh(start, stop, step, instance, position, normal, mixed, weights):  # ty
 
 
 def _of_radiance(first: NDArray[np.float32], last: NDArray[np.float32], reflectance: NDArray[np.float32]) -> None:
-    """Make weights of radiance over reflectance those of radiance: divided by that of the neighbour at the first level,
-    times that of the pixel at the last."""
+    """Change weights for radiance over reflectance into weights for radiance, in place.
+
+    At the first level they are divided by the reflectance of the neighbour, at the last multiplied by that of the
+    pixel.
+    """
     h, w = reflectance.shape
     for k in range(9):
         dy, dx = k // 3 - 1, k % 3 - 1
@@ -189,7 +214,7 @@ def _of_radiance(first: NDArray[np.float32], last: NDArray[np.float32], reflecta
 @cached_njit(nogil=True)
 def _apply(start, stop, weights, step, image, out):  # type: ignore[no-untyped-def]
     channels, h, _ = image.shape
-    for first in range(start, stop, ROWS_AT_ONCE):  # whose weights stay in the cache
+    for first in range(start, stop, ROWS_AT_ONCE):  # the weights of these rows stay in the cache
         for c in range(channels):
             for y in range(first, min(first + ROWS_AT_ONCE, stop)):
                 # Beyond the borders weights are 0, so any pixel will do

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernel launches of bounded time.
 
-A running kernel cannot be stopped, and Python handles a signal (Ctrl-C) only after it: so work is cut into launches of
-less than a second, and each is waited for. The time they take says where the work is cut and nothing else; all that
-is cut here has the same bytes however it is cut.
+A running kernel cannot be stopped, and Python handles a signal (Ctrl-C) only after it. So work is cut into launches of
+less than a second, and each launch is waited for. The time that launches take decides where the work is cut, and
+nothing else: the results are the same bytes, however it is cut.
 
 Compiling a kernel is one more stretch without signals: a tenth of a second to a few seconds, once per machine.
 """
@@ -22,23 +22,32 @@ import numpy as np
 from pcgraph.plumbing import interrupts
 
 LAUNCH_S = 1.0
-"""What a launch should take, seconds."""
+"""Duration of a launch, in seconds, at which the size of launches aims. It is the time that Ctrl-C waits; shorter
+launches spend more of their time on the start of kernels."""
 UNWATCHED_LAUNCH_S = 20.0
-"""The same where nobody waits: no report of progress, and signals that end the process from a thread of their own."""
-LONGEST = 1.5
-"""Times the duration of a launch, after which it ends even if lanes have not finished."""
+"""The same where nobody waits for a launch: no progress is reported, and a thread of its own handles signals by ending
+the process."""
+MAX_OVERRUN = 1.5
+"""Largest number of iterations of a launch, as a multiple of those that fit into its duration. After them the launch
+ends, even if some lanes have not finished; those go on in the next launch."""
 FIRST_UNITS = 1 << 21
-"""Work of a first launch: as many iterations of a loop, rays or photons."""
-LONGER_WHERE_PREPARED_LONG = 2.0
-"""Times as long, at most, where it takes long to make the kernel (thousands of shapes)."""
+"""Work of a first launch, before any time was measured, in units: iterations of a loop, rays or photons. A first launch
+that is too large delays Ctrl-C once."""
+MAX_STRETCH = 2.0
+"""Largest factor by which launches become longer where the kernel takes long to be made (thousands of shapes), because
+each launch makes it again."""
 LANES_TOGETHER = 16
+"""Number of lanes that a vector of the processor holds (AVX-512). They take as long as the slowest of them."""
 MIN_AT_WORK = 256
-STEEPEST = 8.0
-"""Growth of the work from one launch to the next, at most."""
+"""Smallest number of lanes that is assumed when a launch's iterations are chosen: fewer lanes take as long as this
+many."""
+MAX_GROWTH = 8.0
+"""Largest ratio of the work of a launch to that of the launch before, so that one launch that was short by chance does
+not make the next one very long."""
 MAX_ITERATIONS = 1 << 31
-"""Of a launch, so that they can be counted."""
+"""Largest number of iterations of a launch, so that 32 bits can count them."""
 REPORT_S = 0.1
-"""Between two reports of progress, seconds, at least."""
+"""Smallest time between two reports of progress, in seconds."""
 
 State = TypeVar("State")
 Report = Callable[[float], None]
@@ -46,11 +55,23 @@ Report = Callable[[float], None]
 
 
 class Launches:
-    """Launches of one kind of work, each as large as the time of the earlier ones suggests.
+    """Launches of one kind of work. The time of earlier launches decides on the size of later ones.
 
-    is_watched : whether somebody waits for reports between launches. If not, and if signals end the process from a
-        thread of their own, launches may be long.
+    Parameters
+    ----------
+    is_watched : whether somebody waits for reports between launches. If nobody does, and if a thread of its own handles
+        signals by ending the process, launches may be long.
+
+    Attributes
+    ----------
     units : int, the work that the next launch should do.
+
+    Examples
+    --------
+    >>> launches = Launches(is_watched=True)
+    >>> launches.units = 1000
+    >>> list(launches.ranges(2500))
+    [(0, 834), (834, 1667), (1667, 2500)]
     """
 
     def __init__(self, is_watched: bool = False) -> None:
@@ -58,15 +79,15 @@ class Launches:
         self.units = int(FIRST_UNITS * self.launch_s / LAUNCH_S)
 
     def evaluate(self, arrays: Any, units: int) -> None:
-        """Compute Dr.Jit arrays that are so many units of work, and wait for them."""
+        """Compute Dr.Jit arrays, wait for them, and learn from the time that these units of work took."""
         self.learn(units, evaluate(arrays))
 
     def learn(self, units: int, seconds: float, prepared_s: float = 0.0) -> None:
-        """Fit the next launch to the time that this one took, and took to be prepared."""
-        launch_s = self.launch_s * min(max(2 * prepared_s / self.launch_s, 1), LONGER_WHERE_PREPARED_LONG)
+        """Fit the size of the next launch to the time that these units took, and to the time to make the kernel."""
+        launch_s = self.launch_s * min(max(2 * prepared_s / self.launch_s, 1), MAX_STRETCH)
         fits = units * launch_s / max(seconds, 1e-6)
         if fits > self.units:
-            self.units = int(min(fits, STEEPEST * self.units))
+            self.units = int(min(fits, MAX_GROWTH * self.units))
         elif seconds > launch_s / 2:  # a shorter launch says how long its overhead takes
             self.units = max(1, int(fits))
 
@@ -78,26 +99,28 @@ class Launches:
         pending: Callable[[], Any] = list,
         report: Callable[[State], None] = lambda state: None,
     ) -> tuple[State, int]:
-        """The state of the lanes when all of them are finished, and the iterations of the loop that they took together.
+        """Run a loop until all lanes are finished; returns their state, and the iterations that they took together.
 
         Parameters
         ----------
-        loop : makes of a state and the most iterations allowed (UInt32) the next state and (lanes,) the iterations that
-            were taken: fewer than allowed by a lane that is finished.
-        pending : the buffers that it scatters to.
+        loop : function of a state and the largest number of iterations (UInt32), which returns the next state and the
+            number of iterations that each lane took (UInt32). A lane that takes fewer than allowed is finished.
+        state : the state of the lanes before the first launch.
+        lanes : int, number of lanes.
+        pending : returns the buffers to which the loop scatters.
         report : called with the state after each launch.
         """
         dr.make_opaque(state)  # like the state of later launches, so that they share a kernel
         total, at_work = 0, lanes
         while at_work:
-            most = min(max(1, int(self.units * LONGEST) // at_work), MAX_ITERATIONS)
+            most = min(max(1, int(self.units * MAX_OVERRUN) // at_work), MAX_ITERATIONS)
             start = time.perf_counter()
             state, taken = loop(state, dr.opaque(mi.UInt32, most))
             seconds = evaluate([state, taken, pending()])
             iterations = taken.numpy()
             self.learn(int(iterations.sum()), seconds, time.perf_counter() - start - seconds)
             total += int(iterations.sum())
-            # Neighbours are at work together, and a few lanes take as long as many
+            # The lanes of a vector are at work as long as one of them is, and few lanes take as long as many
             groups = np.logical_or.reduceat(iterations == most, np.arange(0, lanes, LANES_TOGETHER))
             at_work = max(MIN_AT_WORK, LANES_TOGETHER * int(groups.sum())) if groups.any() else 0
             report(state)
@@ -106,7 +129,15 @@ class Launches:
     def ranges(
         self, count: int, per_item: float = 1, multiple_of: int = 1, *, at_least: int = 1, at_most: int = 1 << 32
     ) -> Iterator[tuple[int, int]]:
-        """Ranges that cut 0..count, one for each launch, where an item is so many units of work."""
+        """Ranges that cut 0..count into launches of even size, each a pair of its begin and its end.
+
+        Parameters
+        ----------
+        count : int, number of items.
+        per_item : units of work of an item.
+        multiple_of : int; every range but the last holds a multiple of this number of items.
+        at_least, at_most : int, bounds of the number of items of a range.
+        """
         begin = 0
         while begin < count:
             left = -(-(count - begin) // multiple_of)
@@ -118,8 +149,10 @@ class Launches:
 
 @contextmanager
 def raised_as_it_is() -> Iterator[None]:
-    """Let through what was raised while Dr.Jit traced a loop, by the handler of a signal for example: Dr.Jit makes a
-    RuntimeError of it."""
+    """Raise the exception itself that was raised while Dr.Jit traced a loop, for example by the handler of a signal.
+
+    Dr.Jit turns it into a RuntimeError.
+    """
     try:
         yield
     except RuntimeError as error:
@@ -132,8 +165,10 @@ def raised_as_it_is() -> Iterator[None]:
 
 
 def evaluate(arrays: Any) -> float:
-    """Compute Dr.Jit arrays and wait for them; the seconds that the kernels took, once they were compiled. A single
-    thread runs them before it comes back, so that there the time in which they were compiled is among them."""
+    """Compute Dr.Jit arrays and wait for them; returns the seconds that the kernels took after they were compiled.
+
+    If Dr.Jit has a single thread, it runs the kernels before it returns, so that the time of compilation is included.
+    """
     begin = time.perf_counter()
     try:
         dr.eval(arrays)  # where there are more, returns when the last kernel is compiled and under way
@@ -145,17 +180,24 @@ def evaluate(arrays: Any) -> float:
 
 
 def min_lanes() -> int:
-    """Lanes that keep all of the device busy."""
+    """Number of lanes that keep the whole device busy."""
     return 1 << 18 if mi.variant().startswith("cuda") else max(4096, 512 * dr.thread_count())
 
 
 def report_part(report: Report, before: float, part: float, fraction: float) -> None:
-    """Report the fraction done of a part of the work, which begins where `before` of it is done."""
+    """Report progress from within a part of the work.
+
+    `before` is the fraction of the whole that was done before the part, `part` the size of the part as a fraction of
+    the whole, and `fraction` the fraction of the part that is done.
+    """
     report(before + part * fraction)
 
 
 class Progress:
-    """Reports to a caller who may not want any, at most ten times a second; the last report is always made."""
+    """Passes reports of progress to a function, at most ten times a second; the last report is always passed on.
+
+    `call` is None if nobody wants reports.
+    """
 
     def __init__(self, call: Report | None) -> None:
         self.call = call

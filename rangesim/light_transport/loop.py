@@ -411,7 +411,7 @@ def walk(
             dr.select(starts, primary.origin, path.origin), dr.select(starts, primary.direction, path.direction)
         )
         path.ray_state = path.ray_state.restarted(starts, primary.origin, primary.path_offset)
-        if dr.hint(camera.distortion is not None, mode="scalar"):
+        if dr.hint(primary.exists is not None, mode="scalar"):
             path.throughput = dr.select(starts & ~primary.exists, 0, path.throughput)  # no ray, no light
 
         # ---- Next surface ----------------------------------------------------------------------------
@@ -420,6 +420,8 @@ def walk(
         met = mi.Point3f(si.p)
         si.p = dr.select(path.left_delta, corrected_point(si, path.ray_state.previous, ray.d), met)
         if dr.hint(media is not None, mode="scalar"):
+            assert media is not None
+            assert path.ray_state.inside is not None
             scatters, crosses = media.event(
                 path.ray_state.inside, path.ray_state.previous, ray.d, si, hit, rng.next_float32()
             )
@@ -460,6 +462,7 @@ def walk(
         wo = si.to_world(bs.wo)
         if dr.hint(media is not None, mode="scalar"):
             medium = path.ray_state.inside
+            assert medium is not None
             value = dr.select(scatters, medium.albedo * medium.phase(dr.dot(ray.d, link.direction)), value)
             bs_weight = dr.select(scatters, medium.albedo, bs_weight)
             xi = mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -526,6 +529,7 @@ def walk(
         path.throughput /= chance
         passes = mi.Bool(False)  # through a hole, as if nothing were there
         if dr.hint(cutouts is not None, mode="scalar"):
+            assert cutouts is not None
             passes = cutouts.passed(si, bs, at_surface)
         path.is_first &= ~scatters & (passes | ~can_be_vertex(bsdf))
         path.via_delta |= goes_delta & ~passes

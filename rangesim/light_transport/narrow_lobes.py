@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Light that narrow lobes throw onto other surfaces, which light paths hardly find: how much, and onto what.
+"""A warning of light that narrow lobes throw onto other surfaces, where light paths hardly find it.
 
-A mirror is a delta interaction, and photons carry its light. A rough metal with an alpha of 0.01, or a polished
-`principled`, which has no delta interaction at any roughness, is none; and a path from the lit wall meets its lobe by
-chance once in ten thousand times. What no sample found, the sampling error does not know of. So rays of the projector
-are followed here, through lobes and delta interactions, to the surfaces that scatter them.
+A mirror is a delta interaction, and photons carry its light. A rough metal with an alpha of 0.01 is no delta
+interaction, nor is a polished `principled`, at any roughness. A path from the lit wall meets such a lobe by chance once
+in ten thousand times, and the sampling error knows nothing of light that no sample found. So rays of the projector are
+followed here, over lobes and delta interactions, to the surfaces that scatter them.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -22,21 +22,24 @@ from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.scene.materials import MAX_NARROW_ALPHA, has_narrow_lobe
 
 RAYS = (128, 128)
-"""Columns and rows of the grid of rays over the projector's image."""
+"""Columns and rows of the grid of rays over the projector's image. More rays find smaller surfaces and take more
+time."""
 MAX_SURFACES = 8
-"""Number of surfaces that a ray is followed over; a hollow glass has four."""
+"""Number of surfaces over which a ray is followed; a hollow glass has four."""
 MIN_THROWN = 0.005
-"""Fraction of the projector's light that narrow lobes throw onto other surfaces, from which on it is warned of."""
+"""Fraction of the projector's light, thrown onto other surfaces by narrow lobes, above which a pass warns. A smaller
+value would warn of light that changes few readings."""
 MIN_NAMED = 0.1
-"""Fraction of the thrown light that a shape throws or receives, from which on the warning names it."""
+"""Fraction of the thrown light that a shape throws or receives, above which the warning names it."""
 MAX_NAMED = 3
-"""Number of shapes that the warning names."""
+"""Largest number of shapes that the warning names, so that it stays one sentence."""
 
 
 class ThrownLight(NamedTuple):
-    """Light that reached a surface over a narrow lobe, over all light of the projector, by shape.
+    """Fraction of the projector's light that reached a surface over a narrow lobe, by shape.
 
-    by, onto : (shapes,) float64, in the order of the scene's shapes.
+    by : (shapes,) float64, by the shape that has the lobe, in the order of the scene's shapes.
+    onto : (shapes,) float64, by the shape that the light reached.
     """
 
     by: np.ndarray
@@ -44,7 +47,7 @@ class ThrownLight(NamedTuple):
 
 
 def thrown_light(traced: TracedScene) -> ThrownLight | None:
-    """Light that narrow lobes throw onto other surfaces; None where no surface has such a lobe."""
+    """The light that narrow lobes throw onto other surfaces; None if no surface has such a lobe."""
     scene, projector = traced.scene, traced.projector
     shapes = scene.shapes()
     is_narrow = [has_narrow_lobe(shape.bsdf()) for shape in shapes]
@@ -85,7 +88,7 @@ def thrown_light(traced: TracedScene) -> ThrownLight | None:
 
 
 def warn_of_narrow_lobes(traced: TracedScene, names: list[str]) -> None:
-    """Warn if narrow lobes throw noticeable light onto other surfaces; `names` of all shapes."""
+    """Warn if narrow lobes throw noticeable light onto other surfaces. `names` are those of all shapes."""
     thrown = thrown_light(traced)
     if thrown is None or thrown.onto.sum() <= MIN_THROWN:
         return
@@ -98,7 +101,7 @@ def warn_of_narrow_lobes(traced: TracedScene, names: list[str]) -> None:
 
 
 def _named(names: list[str], light: np.ndarray) -> str:
-    """The shapes with the most light, in words."""
-    order: Any = [int(i) for i in np.argsort(-light, kind="stable") if light[i] > MIN_NAMED * light.sum()]
+    """The names of the shapes with the most light, as words of a sentence."""
+    order = [int(i) for i in np.argsort(-light, kind="stable") if light[i] > MIN_NAMED * light.sum()]
     listed = ", ".join(repr(names[i]) for i in order[:MAX_NAMED])
     return listed + (" and others" if len(order) > MAX_NAMED else "")

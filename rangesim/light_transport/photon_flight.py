@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -16,26 +16,52 @@ from rangesim.light_transport.strategies import can_be_vertex, delta_only, is_de
 from rangesim.light_transport.traced_scene import TracedScene
 
 LANDING_FRACTION = 0.75
-"""Of the photons on a surface that both scatters and mirrors (polished plastic), those that land there."""
+"""Fraction of the photons that land on a surface which both scatters and mirrors (polished plastic); the others go on
+as delta interactions. Both kinds get the inverse weight, so the fraction changes noise and no mean."""
 
 
 class PhotonDeposit(NamedTuple):
-    """Where a photon landed; flux 0 where it did not."""
+    """Photons that landed on a surface that scatters.
 
-    position: Any
-    direction: Any
-    flux: Any
-    u: Any
-    v: Any
-    length: Any
-    cosine: Any
-    """Of its direction to the geometric normal of the surface on which it landed."""
+    position : Point3f, world, metres.
+    direction : Vector3f, unit, world, direction of flight.
+    flux : Float, watts; 0 for photons that did not land.
+    u, v : Float, projector pixel coordinates.
+    length : Float, metres, optical length from the projector.
+    cosine : Float, absolute cosine between the direction and the geometric normal of the surface.
+    """
+
+    position: mi.Point3f
+    direction: mi.Vector3f
+    flux: mi.Float
+    u: mi.Float
+    v: mi.Float
+    length: mi.Float
+    cosine: mi.Float
+
+
+class PhotonEnergy(NamedTuple):
+    """Power of each photon by where it went, watts; the fields of `rangesim.light_transport.photons.EnergyBudget`."""
+
+    emitted: mi.Float
+    direct: mi.Float
+    stored: mi.Float
+    absorbed: mi.Float
+    escaped: mi.Float
+    truncated: mi.Float
 
 
 def trace_photon_paths(
     traced: TracedScene, pixel: np.ndarray, flux: np.ndarray, number: np.ndarray, seed: int
-) -> tuple[PhotonDeposit, tuple[Any, ...]]:
-    """Landings of photons sent through projector pixels, and the parts of each that `EnergyBudget` sums up."""
+) -> tuple[PhotonDeposit, PhotonEnergy]:
+    """Send photons through projector pixels; returns where they landed, and where their power went.
+
+    Parameters
+    ----------
+    pixel : (n,) int, flat indices of projector pixels.
+    flux : (n,) float, watts.
+    number : (n,) int, numbers of the photons, on which their random numbers depend.
+    """
     pixel, width = mi.UInt32(aligned(pixel, np.uint32)), mi.UInt32(traced.projector.size.x)
     photon = mi.UInt32(aligned(number, np.uint32))
     rng = random_stream(Seed.of(seed), photon ^ 0x9E3779B9)
@@ -46,7 +72,9 @@ def trace_photon_paths(
 
 
 @dr.syntax
-def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -> tuple[PhotonDeposit, tuple[Any, ...]]:
+def _chain(
+    traced: TracedScene, uv: mi.Point2f, power: mi.Float, rng: mi.PCG32, max_chain: mi.UInt32
+) -> tuple[PhotonDeposit, PhotonEnergy]:
     """Follow photons through delta interactions until they land, leave, are absorbed, or the chain is too long."""
     lanes, projector, media, absorbers = dr.width(power), traced.projector, traced.media, traced.absorbers
     lens = mi.Point2f(rng.next_float32(), rng.next_float32()) if dr.hint(projector.has_lens, mode="scalar") else None
@@ -80,6 +108,8 @@ def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -
             absorbed += lost
         escaped += dr.select(active & ~hit, flux, 0)
         if dr.hint(media is not None, mode="scalar"):
+            assert media is not None
+            assert ray_state.inside is not None
             crosses = hit & media.bounded_by(si, hit)
             through = dr.exp(-ray_state.inside.sigma_t * dr.norm(point - ray_state.previous))
             lost = dr.select(hit, flux * (1 - through), 0)
@@ -91,7 +121,7 @@ def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -
         scatters = hit & can_be_vertex(bsdf)
         mirrors = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
 
-        # ---- It lands: beyond a delta surface for the map, else for next-event estimation ------------
+        # ---- It lands: the photon map owns it beyond a delta surface, else next-event estimation does -
         direct += dr.select(hit & ~mirrors & (chain == 0), flux, 0)
         mixed = scatters & mirrors & (chain > 0)
         lands = owner(scatters, chain).photons & (~mixed | (rng.next_float32() < LANDING_FRACTION))
@@ -123,4 +153,4 @@ def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -
         random, origin, towards = rng.state, ray.o, ray.d
 
     landing = PhotonDeposit(position, direction, stored, uv.x, uv.y, ray_state.length, cosine)
-    return landing, (emitted, direct, stored, absorbed, escaped, truncated)
+    return landing, PhotonEnergy(emitted, direct, stored, absorbed, escaped, truncated)

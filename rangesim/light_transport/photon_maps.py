@@ -1,26 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photon maps on hash grids, and the light they bring to a surface point.
+"""Photon maps on hash grids, and the light that their photons bring to a surface point.
 
-Density estimation after Jensen ("Realistic Image Synthesis Using Photon Mapping", 2001), with many small maps instead
-of one large one: sample s of a pixel looks into map s mod n, and the maps' radii shrink as in probabilistic progressive
-photon mapping (Knaus, Zwicker 2011, eq. 15; their alpha is our `ALPHA`). A sample so pays for a few photons only, and
-the pixel as a whole sees all of them.
+Density estimation follows Jensen ("Realistic Image Synthesis Using Photon Mapping", 2001), with many small maps instead
+of one large one. Sample s of a pixel looks into map s mod n, and the radii of the maps shrink as in probabilistic
+progressive photon mapping (Knaus and Zwicker 2011, eq. 15; their alpha is our `ALPHA`). So a sample pays for a few
+photons only, and the pixel as a whole sees all of them.
 
-How far a gather reaches follows from where it is (`GatheringRadius`). A grid has cells of one size, so photons are
-sorted by the radius there into classes, `CLASSES_PER_OCTAVE` for each factor of two, and a point looks into the cells
-of its own class. Photons near a border between two classes are in the cells of both.
+The radius of a gather depends on the place (`GatheringRadius`). A grid has cells of one size, so photons are sorted by
+the radius at their place into classes, `CLASSES_PER_OCTAVE` for each factor of two, and a point looks into the cells of
+its own class. Photons near a border between two classes are in the cells of both.
 
-Photons are sorted into `LEVELS` by the light they bring, compared with the projector's direct light. Fainter light is
-gathered over larger radii, because few photons carry it, and by fewer vertices, because little depends on it.
+Photons are sorted into `LEVELS` by the light that they bring, compared with the projector's direct light. Few photons
+carry faint light, so it is gathered over larger radii; and little depends on it, so fewer vertices gather it.
 
-At a vertex, one photon within the radius is chosen with a chance proportional to its weight (reservoir sampling); it
-stands for them all. So BSDF and sensor responses are evaluated once per vertex, however many photons are near.
+At a vertex, one photon within the radius is chosen with a chance in proportion to its weight (reservoir sampling). It
+stands for all of them. So BSDF and sensor responses are evaluated once per vertex, however many photons are near.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -30,40 +30,55 @@ from rangesim.light_transport.photons import Photons
 from rangesim.light_transport.sampling import aligned
 
 ALPHA = 2 / 3
+"""Says how fast the radii of successive maps shrink (Knaus and Zwicker 2011). The noise of n maps falls as
+n^(-alpha / 2) and their bias as n^(alpha - 1); at 2/3 both fall alike. At 1 radii do not shrink, and the blur stays."""
 MAX_MAPS = 64
-"""Photon maps; with more samples per pixel than this, several samples share a map."""
+"""Largest number of photon maps. With more samples per pixel than this, several samples share a map. The number of maps
+is a multiple of 32, because `_occupancy` keeps a bit for each in words of 32."""
 CLASSES_PER_OCTAVE = 4
+"""Number of classes of radii for each factor of two. More classes fit cells more tightly to the radii, but put more
+photons into the cells of two classes."""
 STEEPEST = 1 / 12
-"""Radius of the brightest level over the distance, at most; that of the faintest is half the distance then."""
+"""Largest ratio of the radius of the brightest level to the distance from a device. The radius of the faintest level is
+six times as large, so it is half the distance at most."""
 FLATNESS = 0.3
-"""Photons farther than this fraction of the radius above or below the tangent plane lie on another surface."""
+"""Largest distance of a photon from the tangent plane, as a fraction of the radius. Photons farther off lie on another
+surface. A smaller value loses photons on curved surfaces; a larger one takes light from beyond edges."""
 MAX_LOOKED_AT = 16
-"""Photons that a gather looks at, where there are more."""
+"""Number of photons that a gather looks at. Where n times as many are near, it looks at every n-th, and counts each n
+times. A larger number makes less noise in bright caustics and takes more time."""
 OCCUPANCY_CELLS = 1 << 18
+"""Number of places in the table that says where photons may be, a power of two. A larger table has fewer false hits and
+needs more of the cache: it takes 2 MiB for each level."""
 PRIMES = (73856093, 19349663, 83492791)
-"""Spatial hash (Teschner et al. 2003), but added: combined by exclusive or, opposite cells would share a place."""
+"""Factors of the spatial hash of a cell's coordinates (Teschner et al. 2003). They are added up here: combined by
+exclusive or, as in the paper, opposite cells would share a place."""
 CLASS_PRIME = 50331653
-"""The same for the number of a class."""
-BESIDE = 1e-4
-"""Relative error of a radius that does not put a photon into the wrong class."""
-TYPICAL = 0.05
-"""Quantile of the radii, over the distance from the camera, that stands for them all."""
-FOLD = 1024
-"""Cells along x after which a row turns back on itself, so that the table stays small in a large scene."""
+"""Factor of the class in the same hash."""
 ROW_FACTORS = (0x9E3779B3, 0x85EBCA75)
+"""Factors of a row's y and z in the hash of rows. Modulo 16 they keep neighbouring rows apart, see `_row`."""
 CLASS_FACTOR = 0xC2B2AE3D
-UNBOUNDED = 1e30
-"""Stands for infinity in single precision."""
+"""Factor of the class in the hash of rows."""
+ROUNDING = 1e-4
+"""Relative error of a radius for which classes allow, far above the unit of rounding in single precision (6e-8)."""
+TYPICAL_QUANTILE = 0.05
+"""Quantile of the ratios of radius to distance from the camera that decides whether a level is wide. It is low, so that
+a level counts as wide only if nearly all of its photons are gathered over wide circles."""
+FOLD = 1024
+"""Number of cells along x after which a row turns back on itself, so that the table stays small in a large scene. Cells
+far apart then share a place, which costs time."""
+UNBOUNDED_M = 1e30
+"""Stands for an infinite radius in single precision, in metres."""
 MIN_M = 1e-9
-"""Least radius: at a device itself."""
+"""Smallest radius and distance in metres, at a device itself, where the radius would be 0."""
 
 
 class Level(NamedTuple):
-    """How photons of one brightness are gathered.
+    """How the photons of one range of brightness are gathered.
 
-    brightest : of the photons of this level, irradiance as a fraction of the direct light.
-    radius : times the radius of the brightest level.
-    chance : that a vertex gathers them.
+    brightest : upper end of the range: irradiance as a fraction of the projector's direct light.
+    radius : ratio of the radius to that of the brightest level.
+    chance : probability that a vertex gathers the level.
     """
 
     brightest: float
@@ -72,15 +87,27 @@ class Level(NamedTuple):
 
 
 LEVELS = (Level(np.inf, 1.0, 1.0), Level(0.1, 2.5, 0.25), Level(0.01, 6.0, 0.1))
+"""Levels of photons, brightest first. Light that brings less than a tenth of the direct light is gathered over 2.5
+times the radius, at every fourth vertex; light below a hundredth over 6 times the radius, at every tenth vertex. More
+vertices would cost time for light that adds little to a reading."""
+
+
+Whole = TypeVar("Whole", np.ndarray, "mi.UInt32", "mi.Int32")
+"""Whole numbers, of NumPy or of Dr.Jit."""
 
 
 @dataclass(frozen=True)
 class GatheringRadius:
-    """How far photons of the brightest level are gathered around a point, in the first map: `projector` times the
-    distance from the projector, within `camera` (least, most) times the distance from the camera; or `fixed_m`.
+    """Radius within which photons of the brightest level are gathered around a point, in the first map.
 
-    Distances are straight ones: light that came a long way round, off a mirror, has spread and is fainter than direct
-    light would be, so a wider level has it. Angles are radians, capped at `STEEPEST`; centres metres, world.
+    It is the distance from the projector times an angle, within two bounds that are the distance from the camera times
+    an angle. Distances are straight ones. Light that came a long way round, off a mirror, has spread and is fainter
+    than direct light would be, so a level with a larger radius holds it.
+
+    projector : radians. A value above `STEEPEST` counts as `STEEPEST`.
+    camera : smallest and largest angle, radians, likewise capped.
+    projector_at, camera_at : (3,) float, metres, world, centres of the two.
+    fixed_m : metres, the radius everywhere, in place of all this; None: not used.
     """
 
     projector: float
@@ -90,73 +117,88 @@ class GatheringRadius:
     fixed_m: float | None = None
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """a, b, c, d: the radius is a + b x distance from the projector, within c and d x distance from the camera."""
+        """Numbers a, b, c, d: the radius is a + b times the distance from the projector, not below c and not above d
+        times the distance from the camera."""
         if self.fixed_m is not None:
-            return self.fixed_m, 0.0, 0.0, UNBOUNDED
+            return self.fixed_m, 0.0, 0.0, UNBOUNDED_M
         of_projector, least, most = (min(angle, STEEPEST) for angle in (self.projector, *self.camera))
         return 0.0, of_projector, least, most
 
     def at(self, position: np.ndarray) -> np.ndarray:
-        """(n,) metres at positions (n, 3)."""
+        """(n,) float, metres, the radius at positions (n, 3)."""
         a, b, c, d = self.bounds()
         from_camera = np.linalg.norm(position - self.camera_at, axis=1)
         return np.clip(a + b * np.linalg.norm(position - self.projector_at, axis=1), c * from_camera, d * from_camera)
 
     @property
     def steepness(self) -> float:
-        """How fast the radius grows, at most, in metres per metre."""
+        """Largest growth of the radius along a way, in metres per metre."""
         return 0.0 if self.fixed_m is not None else max(self.bounds()[1:])
 
 
 class Gathered(NamedTuple):
-    """The photons near a point: index of the one that stands for all, and their irradiance in W/m2; 0: none."""
+    """The photons near a point.
 
-    photon: Any
-    irradiance: Any
+    photon : UInt32, index of the photon that stands for all.
+    irradiance : Float, W/m2, of all of them; 0 if there are none.
+    """
+
+    photon: mi.UInt32
+    irradiance: mi.Float
 
 
-class GatherRadius(NamedTuple):
-    """How far a gather reaches at a point: radius of the brightest level in the first map, metres; number of the class
-    of that radius; and edge of the cells of this class, metres."""
+class Reach(NamedTuple):
+    """The distance within which photons are gathered at a point, for the brightest level in the first map.
 
-    radius: Any
-    kind: Any
-    edge: Any
+    radius : Float, metres.
+    kind : UInt32, number of the class of that radius.
+    edge : Float, metres, edge of the cells of this class.
+    """
+
+    radius: mi.Float
+    kind: mi.UInt32
+    edge: mi.Float
 
 
 class Flight(NamedTuple):
-    """How a photon came: unit direction of flight (world), projector pixel coordinates, optical length in metres, and
-    the cosine of its direction to the geometric normal of the surface."""
+    """The way of a photon to where it landed.
 
-    direction: Any
-    u: Any
-    v: Any
-    length: Any
-    cosine: Any
+    direction : Vector3f, unit, world, direction of flight.
+    u, v : Float, projector pixel coordinates.
+    length : Float, metres, optical length from the projector.
+    cosine : Float, absolute cosine between the direction and the geometric normal of the surface.
+    """
+
+    direction: mi.Vector3f
+    u: mi.Float
+    v: mi.Float
+    length: mi.Float
+    cosine: mi.Float
 
 
 class PhotonMaps:
-    """Photons sorted into grid cells of twice the radius of their map, level and class, on the renderer's side.
+    """Photons sorted into grid cells, as kernels see them. A cell's edge is twice the radius of its map, level and
+    class.
 
-    A point looks at 2 x 2 x 2 cells. The two along x are neighbours in memory, so that makes four ranges of photons.
+    A point looks into 2 x 2 x 2 cells. The two along x are neighbours in memory, so they make four ranges of photons.
 
     Parameters
     ----------
-    photons : Photons, one or more.
+    photons : Photons, at least one.
     radius : GatheringRadius, of the first map and the brightest level.
-    irradiance : W/m2, direct light of the projector at 1 m.
-    wide : radians, radius over the distance from the camera from which on gathered light counts as smooth.
+    irradiance : W/m2, irradiance of the projector's direct light at 1 m.
+    wide : radians, ratio of radius to distance from the camera above which gathered light counts as smooth.
     """
 
     def __init__(self, photons: Photons, radius: GatheringRadius, irradiance: float, wide: float = np.inf) -> None:
         maps = photons.maps
         at_photons = np.maximum(radius.at(photons.position), MIN_M)
-        # Of a whole level, lest light be smooth on one side of a line and not on the other
+        # Decided for a whole level: else light would be smooth on one side of a line and not on the other
         from_camera = np.linalg.norm(photons.position - radius.camera_at, axis=1)
-        typical = float(np.quantile(at_photons / np.maximum(from_camera, MIN_M), TYPICAL))
+        typical = float(np.quantile(at_photons / np.maximum(from_camera, MIN_M), TYPICAL_QUANTILE))
         self.is_wide = [typical * one.radius >= wide for one in LEVELS]
         self.maps = dr.opaque(mi.UInt32, maps)
-        unit = float(at_photons.min()) * (1 + BESIDE)
+        unit = float(at_photons.min()) * (1 + ROUNDING)
         level = levels_of(photons, maps, at_photons, radius, irradiance)
         factors = np.array([one.radius for one in LEVELS])
         shrinkage = radii_of_maps(1.0, maps)
@@ -189,18 +231,18 @@ class PhotonMaps:
         self.occupied = [mi.UInt32(_occupancy(*(x[level == i] for x in occupancy_of))) for i in range(len(LEVELS))]
         dr.eval([self.starts, self.points, self.flights, self.shrinkage, *self.occupied])
 
-    def reach(self, point: Any) -> GatherRadius:
-        """How far photons of the brightest level are gathered around a point."""
+    def reach(self, point: mi.Point3f) -> Reach:
+        """The distance within which photons of the brightest level are gathered around a point."""
         point = mi.Vector3f(point)
         a, b, c, d = self.bounds
         from_camera = dr.norm(point - self.camera_at)
         radius = dr.fma(b, dr.norm(point - self.projector_at), a)
         radius = dr.maximum(dr.clip(radius, c * from_camera, d * from_camera), MIN_M)
         kind = dr.ceil(dr.log2(radius / self.unit) * CLASSES_PER_OCTAVE)
-        return GatherRadius(radius, mi.UInt32(mi.Int32(kind)), 2 * self.unit * dr.exp2(kind / CLASSES_PER_OCTAVE))
+        return Reach(radius, mi.UInt32(mi.Int32(kind)), 2 * self.unit * dr.exp2(kind / CLASSES_PER_OCTAVE))
 
-    def near(self, level: int, point: Any, reach: GatherRadius, sample: Any, active: Any) -> Any:
-        """Whether there may be photons of a level within its radius, in the map of `sample`."""
+    def near(self, level: int, point: mi.Point3f, reach: Reach, sample: mi.UInt32, active: mi.Bool) -> mi.Bool:
+        """Whether photons of a level may lie within its radius of a point, in the map of `sample`."""
         cell = dr.floor((mi.Vector3f(point) - self.origin) / (reach.edge * LEVELS[level].radius))
         index = _hash(*(mi.UInt32(mi.Int32(x)) for x in cell)) + reach.kind * CLASS_PRIME
         index &= OCCUPANCY_CELLS - 1
@@ -210,9 +252,24 @@ class PhotonMaps:
 
     @dr.syntax
     def gather(
-        self, level: int, point: Any, normal: Any, reach: GatherRadius, sample: Any, pick: Any, offset: Any, active: Any
+        self,
+        level: int,
+        point: mi.Point3f,
+        normal: mi.Normal3f,
+        reach: Reach,
+        sample: mi.UInt32,
+        pick: mi.Float,
+        offset: mi.Float,
+        active: mi.Bool,
     ) -> Gathered:
-        """Photons of a level around a surface point, in the map of `sample`; `pick`, `offset` are uniform in 0..1."""
+        """The photons of a level around a surface point, in the map of `sample`.
+
+        Parameters
+        ----------
+        normal : Normal3f, unit, geometric normal of the surface.
+        pick : Float, uniform in 0..1, chooses the photon that stands for all.
+        offset : Float, uniform in 0..1, chooses the first photon where not all are looked at.
+        """
         of_map = sample % self.maps
         shrunk = dr.gather(mi.Float, self.shrinkage, of_map, active) * LEVELS[level].radius
         radius = reach.radius * shrunk
@@ -241,13 +298,15 @@ class PhotonMaps:
             k += every
         return Gathered(chosen, total * mi.Float(every) * (2 / dr.pi) * inverse_square)
 
-    def flight(self, photon: Any, active: Any) -> Flight:
-        """How a photon came."""
+    def flight(self, photon: mi.UInt32, active: mi.Bool) -> Flight:
+        """The way of the photon with this index."""
         a, b = (dr.gather(mi.Vector4f, self.flights, photon * 2 + half, active) for half in (0, 1))
         return Flight(mi.Vector3f(a.x, a.y, a.z), a.w, b.x, b.y, b.z)
 
-    def _ranges(self, point: Any, of_map: Any, edge: Any, kind: Any, active: Any) -> tuple[list[Any], list[Any]]:
-        """Start and length of the four ranges of photons that lie in the 2 x 2 x 2 cells around a point."""
+    def _ranges(
+        self, point: mi.Point3f, of_map: mi.UInt32, edge: mi.Float, kind: mi.UInt32, active: mi.Bool
+    ) -> tuple[list[mi.UInt32], list[mi.UInt32]]:
+        """Starts and lengths of the four ranges of photons in the 2 x 2 x 2 cells around a point."""
         base = dr.floor((mi.Vector3f(point) - self.origin) / edge - 0.5)
         x, y, z = mi.Int32(base.x), mi.UInt32(mi.Int32(base.y)), mi.UInt32(mi.Int32(base.z))
         first = mi.UInt32(dr.minimum(_column(x), _column(x + 1)))  # the other one follows
@@ -262,7 +321,7 @@ class PhotonMaps:
 
 
 def radii_of_maps(radius_m: float, maps: int) -> np.ndarray:
-    """(maps,) float64, metres: r_1 = radius_m, r_(i+1)^2 = r_i^2 (i + alpha) / (i + 1)."""
+    """(maps,) float64, metres, radii of the maps: r_1 = radius_m, r_(i+1)^2 = r_i^2 (i + alpha) / (i + 1)."""
     i = np.arange(1, maps)
     return np.asarray(radius_m * np.sqrt(np.cumprod(np.concatenate([[1.0], (i + ALPHA) / (i + 1)]))))
 
@@ -270,10 +329,18 @@ def radii_of_maps(radius_m: float, maps: int) -> np.ndarray:
 def levels_of(
     photons: Photons, maps: int, radius_m: np.ndarray, radius: GatheringRadius, irradiance: float
 ) -> np.ndarray:
-    """(n,) int, index into `LEVELS`, from the irradiance that the photons of all maps bring to a cell of about four
-    times the radius (n,) there, compared with the direct light of the projector at that distance."""
-    octave = np.ceil(np.log2(radius_m / (radius_m.min() * (1 + BESIDE)))).astype(np.int64)
-    cell_m = 4 * radius_m.min() * (1 + BESIDE) * 2.0**octave
+    """(n,) int, the level of each photon, an index into `LEVELS`.
+
+    The photons of all maps bring an irradiance to a cell around the photon, whose edge is about four times the radius
+    there. The level follows from its ratio to the projector's direct light at that distance.
+
+    Parameters
+    ----------
+    radius_m : (n,) float, metres, `radius` at the photons.
+    irradiance : W/m2, irradiance of the projector's direct light at 1 m.
+    """
+    octave = np.ceil(np.log2(radius_m / (radius_m.min() * (1 + ROUNDING)))).astype(np.int64)
+    cell_m = 4 * radius_m.min() * (1 + ROUNDING) * 2.0**octave
     key = _hash(*_cells(photons.position, cell_m).T) + octave * CLASS_PRIME & (OCCUPANCY_CELLS - 1)
     power = np.bincount(key, photons.flux, OCCUPANCY_CELLS)[key] / maps
     direct = irradiance / np.maximum(np.sum((photons.position - radius.projector_at) ** 2, axis=1), MIN_M)
@@ -282,14 +349,19 @@ def levels_of(
 
 
 def _in_classes(radius: np.ndarray, steepness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (m,) of photons, and a class of each: all classes from which a point may gather it.
+    """Pairs of a photon and a class from which a point may gather it: index of the photon (m,), and class (m,).
 
-    A point at distance d of a photon has a radius r' that differs from the photon's r by steepness x d, at most, and
-    reaches that far: r' <= r / (1 - steepness), r' >= r / (1 + steepness). `radius` (n,) in units of that of class 0.
+    A point at the distance d from a photon has a radius r' that differs from the photon's r by steepness times d at
+    most. The point reaches the photon if d <= r', so r / (1 + steepness) <= r' <= r / (1 - steepness).
+
+    Parameters
+    ----------
+    radius : (n,) float, the radii at the photons, in units of that of class 0.
+    steepness : (n,) float, largest growth of these radii, in metres per metre.
     """
     low, high = (
         np.ceil(CLASSES_PER_OCTAVE * np.log2(radius * bound)).astype(np.int64)
-        for bound in ((1 - BESIDE) / (1 + steepness), (1 + BESIDE) / (1 - steepness))
+        for bound in ((1 - ROUNDING) / (1 + steepness), (1 + ROUNDING) / (1 - steepness))
     )
     count = high - low + 1
     photon = np.repeat(np.arange(len(radius)), count)
@@ -297,32 +369,34 @@ def _in_classes(radius: np.ndarray, steepness: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _cells(position: np.ndarray, edge: np.ndarray) -> np.ndarray:
-    """(n, 3) int coordinates of grid cells."""
+    """(n, 3) int, coordinates of the grid cells at these positions (n, 3), for cells of an edge (n,) in metres."""
     return np.floor(position / np.asarray(edge, np.float32)[:, None]).astype(np.int64)
 
 
-def _hash(x: Any, y: Any, z: Any) -> Any:
-    """Hash of integer cell coordinates; NumPy integers and Dr.Jit UInt32 alike give the same low 32 bits."""
+def _hash(x: Whole, y: Whole, z: Whole) -> Whole:
+    """Hash of integer cell coordinates. Integers of NumPy and UInt32 of Dr.Jit give the same low 32 bits."""
     return x * PRIMES[0] + y * PRIMES[1] + z * PRIMES[2]
 
 
-def _column(x: Any) -> Any:
-    """Place of a cell within its row, in 0..FOLD; neighbours stay neighbours. NumPy integers and Dr.Jit Int32."""
+def _column(x: Whole) -> Whole:
+    """Place of a cell within its row, 0 to `FOLD`. Neighbours stay neighbours. Takes NumPy integers or Int32."""
     return FOLD - abs(FOLD - (x & (2 * FOLD - 1)))
 
 
-def _row(y: Any, z: Any, kind: Any, mask: Any) -> Any:
-    """Where the cells of a row along x begin, in 0..mask; mask + 1 is a power of two of at least 16.
+def _row(y: Whole, z: Whole, kind: Whole, mask: int | mi.UInt32) -> Whole:
+    """Start of the cells of a row along x, 0 to `mask`; mask + 1 is a power of two, at least 16.
 
-    A point looks at two cells in each of four neighbouring rows and must count no photon twice, so these begin two
-    cells or more apart: their differences are 3, 5, 8 or 2 modulo 16.
+    A point looks into two cells in each of four neighbouring rows, and must count no photon twice. So the starts of
+    these rows are two cells or more apart: they differ by 3, 5, 8 or 2 modulo 16.
     """
     return (y * ROW_FACTORS[0] + z * ROW_FACTORS[1] + kind * CLASS_FACTOR) & mask
 
 
 def _occupancy(position: np.ndarray, of_map: np.ndarray, kind: np.ndarray, edge: np.ndarray) -> np.ndarray:
-    """(cells * MAX_MAPS / 32,) uint32: one bit per map and hash of a cell within the radius, half an edge, of some
-    photon of that class."""
+    """(cells * MAX_MAPS / 32,) uint32, a bit for each hash of a cell and each map.
+
+    It is set if a photon of that map lies within the radius, which is half an edge, of a point in such a cell.
+    """
     occupied = np.zeros(OCCUPANCY_CELLS * MAX_MAPS, dtype=bool)
     low, high = (_cells(position + offset * edge[:, None], edge) for offset in (-0.5, 0.5))
     for corner in range(8):

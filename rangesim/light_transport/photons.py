@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Caustic photons: projector light on its way through glass and off mirrors, up to the first surface that scatters it.
+"""Caustic photons: the projector's light that goes through glass and off mirrors, up to the first surface that
+scatters.
 
 A photon leaves the projector through a pixel, follows delta interactions alone (dielectric, conductor, thin
-dielectric, hole), and lands on the first non-delta surface. Light that lands without any delta interaction is
-next-event estimation's (`rangesim.light_transport.loop`) and ends at once. A translucent object's medium weakens
-photons by what it scatters out of their way; that scattered light is not followed further. Glass that absorbs weakens
-them on their way inside (`rangesim.light_transport.absorption`).
+dielectric, hole), and lands on the first surface that scatters. Next-event estimation owns the light that lands without
+any delta interaction, so such a photon ends at once (`rangesim.light_transport.strategies`). The medium of a
+translucent object weakens photons by the light that it scatters out of their way; that scattered light is not followed.
+Glass that absorbs weakens them on their way inside (`rangesim.light_transport.absorption`).
 
-Only pixels whose light meets a delta surface first are worth photons. A pre-pass with one ray per pixel finds them and
-their neighbours; a small fraction of the photons goes to all other pixels, so that the estimate stays unbiased where
-something is finer than a pixel.
+Most photons are sent through projector pixels whose light meets a delta surface first. A pre-pass with one ray per
+pixel finds these pixels; their neighbours count as well. A small fraction of the photons goes through all other pixels,
+so that the estimate has no bias where something is finer than a pixel.
 """
 
 from __future__ import annotations
@@ -32,25 +33,31 @@ from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.scene.media import is_boundary
 
 DEFENSIVE_FRACTION = 0.05
-"""Of the photons, for the pixels where the pre-pass found no delta surface."""
+"""Fraction of the photons that go through pixels where the pre-pass found no delta surface. Any fraction above 0 leaves
+the mean as it is; a larger one spends more photons where most meet no delta surface."""
 SURFACES_PER_PHOTON = 2
-"""Surfaces that a photon meets on average, about, on which the size of launches rests."""
+"""Surfaces that a photon is taken to meet when the size of the first launch is chosen. Later launches go by the
+time."""
 SUMMED_TOGETHER = 1 << 16
-"""Photons whose parts are added up first, so that the sum does not depend on launches."""
+"""Number of successive photons whose power is added up first. Launches hold whole blocks of this size, so the sum does
+not depend on how the photons are cut into launches."""
 MAX_AT_ONCE = 1 << 20
-"""Photons of a launch, so that what NumPy does with them is short as well."""
+"""Largest number of photons of a launch, so that NumPy's work on them between launches is short as well."""
 BYTES_PER_PHOTON = 128
-"""While it flies, an upper bound."""
+"""Memory of a photon during its flight, in bytes, an upper bound."""
 
 
 @dataclass(frozen=True, eq=False)
 class EnergyBudget:
-    """Where the projector's power went, watts; emitted = direct + stored + absorbed + escaped + truncated.
+    """Power of the projector by where it went, watts; emitted = direct + stored + absorbed + escaped + truncated.
 
-    emitted : of the pixels that photons were sent through. direct : landed without a delta surface, left to next-event
-    estimation. stored : landed beyond delta surfaces. absorbed : by delta surfaces and by the parts of mixed ones that
-    scatter, by media, and inside glass; by Russian roulette on average nothing. escaped : met no surface.
-    truncated : still under way after `MAX_CHAIN` surfaces.
+    emitted : power that photons were sent out with.
+    direct : power that landed without a delta interaction, and is left to next-event estimation.
+    stored : power that landed beyond delta interactions, and is kept as photons.
+    absorbed : power lost in delta surfaces, in media, inside glass, and to the parts that scatter of surfaces that do
+        both. Russian roulette absorbs nothing on average.
+    escaped : power that met no surface.
+    truncated : power still under way after `MAX_CHAIN` surfaces.
     """
 
     emitted: float
@@ -62,23 +69,25 @@ class EnergyBudget:
 
     @property
     def cut(self) -> float:
-        """Flux that was cut off, over that which landed."""
+        """Ratio of the power that was truncated to the power that was stored."""
         return self.truncated / self.stored if self.stored else 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Photons:
-    """Photons that landed, n of them, in the order of their numbers.
+    """The n photons that landed beyond delta interactions, in the order of their numbers.
 
-    position, direction : (n, 3) float32, metres and unit, world; the direction is that of flight.
-    flux : (n,) float32, watts, of white.
+    position : (n, 3) float32, metres, world.
+    direction : (n, 3) float32, unit, world, direction of flight.
+    flux : (n,) float32, watts, while the projector shows white.
     u, v : (n,) float32, projector pixel coordinates.
     length_m : (n,) float32, metres, optical length from the projector.
-    cosine : (n,) float32, of the direction to the geometric normal where it landed.
-    map : (n,) int in 0..maps - 1, which of the independent maps a photon belongs to; each alone carries all the power.
-    maps : int >= 1, how many there are.
-    energy : EnergyBudget, the mean over the maps.
-    per_pixel : float, photons of all maps sent through each projector pixel that is worth it.
+    cosine : (n,) float32, absolute cosine between the direction and the geometric normal of the surface.
+    map : (n,) int, 0 to maps - 1, the independent map to which a photon belongs; each map alone carries all the power.
+    maps : int >= 1, number of maps.
+    energy : EnergyBudget, mean over the maps.
+    per_pixel : float, number of photons of all maps that are sent through a projector pixel whose light meets a delta
+        surface first.
     """
 
     position: np.ndarray
@@ -94,19 +103,24 @@ class Photons:
     per_pixel: float
 
 
-def has_delta(scene: Any) -> bool:
-    """Whether some surface of a mitsuba.Scene has a delta interaction: without one there is nothing to trace."""
+def has_delta(scene: mi.Scene) -> bool:
+    """Whether some surface of a mitsuba.Scene has a delta interaction. Without one there are no photons to trace."""
     return any(map(_is_delta, scene.shapes()))
 
 
-def _is_delta(shape: Any) -> bool:
+def _is_delta(shape: mi.Shape) -> bool:
     """Whether the surface of a shape has a delta interaction, and is not the boundary of a medium."""
     return bool(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta)) and not is_boundary(shape)
 
 
-def meets_delta(scene: Any, device: Device) -> tuple[np.ndarray, np.ndarray]:
-    """(pixels,) bool: whether the first surface behind each pixel's centre has a delta interaction; and whether the
-    lens sends a ray through it at all."""
+def meets_delta(scene: mi.Scene, device: Device) -> tuple[np.ndarray, np.ndarray]:
+    """Whether the first surface behind each pixel's centre has a delta interaction.
+
+    Returns
+    -------
+    meets : (pixels,) bool, whether it has one.
+    exists : (pixels,) bool, whether the lens sends a ray through the pixel's centre at all.
+    """
     launches, meets, exists = Launches(), np.zeros(device.pixels, dtype=bool), np.ones(device.pixels, dtype=bool)
     table = mi.Bool(table_of(scene, list(map(_is_delta, scene.shapes()))))
     for begin, end in launches.ranges(device.pixels):
@@ -129,11 +143,17 @@ def trace_photons(
     memory_bytes: int,
     report: Callable[[], None] = lambda: None,
 ) -> Photons:
-    """`photons` photons of a projector of that power, dealt out evenly to `maps` independent maps.
+    """Trace caustic photons, and return those that landed beyond delta interactions.
 
-    `report` is called after each kernel launch.
+    Parameters
+    ----------
+    power_w : watts, power of the projector.
+    photons : int, number of photons to send out; they are dealt out evenly to `maps` independent maps.
+    seed : int, 0 to 2^64 - 1.
+    memory_bytes : largest size of the renderer's arrays during a launch.
+    report : called after each kernel launch.
     """
-    pixels, fraction = _worthwhile_pixels(traced.scene, traced.projector)
+    pixels, fraction = _chances(traced.scene, traced.projector)
     per_map = -(-photons // maps)
     cumulative, shift = np.cumsum(fraction), shift_of(seed)
     total = per_map * maps
@@ -158,8 +178,14 @@ def trace_photons(
     return Photons(position, direction, flux, u, v, length, cosine, of_map, maps, mean_budget, total / cumulative[-1])
 
 
-def _worthwhile_pixels(scene: Any, projector: Device) -> tuple[np.ndarray, np.ndarray]:
-    """Flat indices of all projector pixels along a Morton curve, and the relative chance of a photon for each."""
+def _chances(scene: mi.Scene, projector: Device) -> tuple[np.ndarray, np.ndarray]:
+    """The projector pixels, and the relative chance that a photon is sent through each of them.
+
+    Returns
+    -------
+    pixels : (n,) int, flat indices of all pixels, in the order of a Morton curve.
+    chance : (n,) float, 1 for pixels whose light meets a delta surface first and for their neighbours.
+    """
     meets, _ = meets_delta(scene, projector)
     w, h = (int(n[0]) for n in projector.size)
     mask = binary_dilation(meets.reshape(h, w), np.ones((3, 3))).ravel()
@@ -173,7 +199,7 @@ def _worthwhile_pixels(scene: Any, projector: Device) -> tuple[np.ndarray, np.nd
 
 
 def _morton(w: int, h: int) -> np.ndarray:
-    """(h, w) uint32, place along the Morton curve: even steps along it are spread evenly over the image."""
+    """(h, w) uint32, places of the pixels along the Morton curve. Even steps along it spread evenly over the image."""
 
     def spread(a: np.ndarray) -> np.ndarray:
         for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
@@ -185,17 +211,24 @@ def _morton(w: int, h: int) -> np.ndarray:
 
 
 def shift_of(seed: int) -> float:
-    """Uniform in 0..1, of the seed's own random numbers."""
+    """A number that is uniform in 0..1 over the seeds."""
     rng = random_stream(Seed.of(seed), mi.UInt32(0xC2B2AE35), Stream.THIRD)
     return float(rng.next_float64()[0])
 
 
 def stratified_choice(cumulative: np.ndarray, number: np.ndarray, per_map: int, shift: float) -> np.ndarray:
-    """Which of the pixels with these cumulative chances each photon is sent through.
+    """(n,) int, index of the pixel through which each photon is sent.
 
-    The photons of a map are evenly spaced in 0..1 (systematic sampling), each map shifted against the others (golden
-    ratio) and all by `shift`, in spacings. If that is uniform, so is every photon's place in its stratum: the chance of
-    a pixel is its fraction, and the mean over seeds has no bias.
+    The photons of a map are evenly spaced in 0..1 (systematic sampling). Each map is shifted against the others by the
+    golden ratio, and all of them by `shift`, in spacings. If `shift` is uniform, so is the place of every photon in its
+    stratum. Then the chance of a pixel is its fraction, and the mean over seeds has no bias.
+
+    Parameters
+    ----------
+    cumulative : (pixels,) float, cumulative sum of the relative chances of the pixels.
+    number : (n,) int, numbers of the photons.
+    per_map : int, number of photons of each map.
+    shift : float, 0..1.
     """
     shifts = (number // per_map * 0.6180339887498949 + shift) % 1.0
     place = (number % per_map + shifts) / per_map
@@ -203,5 +236,5 @@ def stratified_choice(cumulative: np.ndarray, number: np.ndarray, per_map: int, 
 
 
 def _columns(array: Any) -> np.ndarray:
-    """(n,) or (n, 3) of a Dr.Jit array."""
+    """A Dr.Jit array as an array (n,) or (n, 3) of NumPy."""
     return np.ascontiguousarray(np.array(array).T)

@@ -1,21 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random numbers and the places of samples within a pixel."""
+"""Random numbers, and the places of samples within a pixel and on the lens."""
 
 from __future__ import annotations
 
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+R2 = (0.7548776662466927, 0.5698402909980532)
+"""Steps of the R2 sequence: 1 / phi and 1 / phi^2 with phi^3 = phi + 1 (Roberts 2018)."""
+R4 = (0.8566748838545029, 0.733891856627126, 0.6287067210378087, 0.5385972572236101)
+"""Steps of the R4 sequence: the first four powers of 1 / phi with phi^5 = phi + 1 (Roberts 2018)."""
+
 
 class Seed(NamedTuple):
-    """The halves of a seed of 64 bits, UInt32 and opaque, so that no kernel is compiled for a seed."""
+    """The two halves of a seed of 64 bits. They are opaque, so that all seeds share a kernel.
 
-    low: Any
-    high: Any
+    low, high : UInt32.
+    """
+
+    low: mi.UInt32
+    high: mi.UInt32
 
     @classmethod
     def of(cls, seed: int) -> Seed:
@@ -24,19 +32,19 @@ class Seed(NamedTuple):
 
 
 class Stream(Enum):
-    """Independent streams of random numbers for one seed and number."""
+    """Names of independent streams of random numbers that share a seed and a number."""
 
     FIRST = "first"
     SECOND = "second"
     THIRD = "third"
 
 
-def random_stream(seed: Seed, number: Any, stream: Stream = Stream.FIRST) -> Any:
-    """PCG32 that depends on the seed and the UInt32 `number` alone, not on the lane.
+def random_stream(seed: Seed, number: mi.UInt32, stream: Stream = Stream.FIRST) -> mi.PCG32:
+    """Random numbers that depend on the seed, the number and the stream alone, and not on the lane.
 
-    Both are mixed by the block cipher TEA (Zafar, Olano, Curtis: GPU random numbers via the tiny encryption
-    algorithm, HPG 2010), which is one to one. A seed of more than 32 bits goes through it twice, its upper half
-    added in between: so no seed is another one in disguise.
+    The block cipher TEA mixes seed and number (Zafar, Olano, Curtis: GPU random numbers via the tiny encryption
+    algorithm, HPG 2010). It is one to one. A seed of more than 32 bits goes through it twice, and its upper half is
+    added in between, so that no two seeds give the same numbers.
     """
     pair = (number, seed.low) if stream is Stream.THIRD else (seed.low, number)
     once = [mi.UInt32(x) for x in mi.sample_tea_32(*pair)]
@@ -45,63 +53,75 @@ def random_stream(seed: Seed, number: Any, stream: Stream = Stream.FIRST) -> Any
     return mi.PCG32(1, *(reversed(states) if stream is Stream.SECOND else states))  # 1: no lane number mixed in
 
 
-def of_part(rng: Any, part: Any) -> Any:
-    """The numbers of a PCG32 for one of several parts (UInt32) that share its seed, 2^40 numbers apart."""
+def of_part(rng: mi.PCG32, part: mi.UInt32) -> mi.PCG32:
+    """The random numbers of one of several parts that share a seed. Parts are 2^40 numbers apart in the stream."""
     return rng + mi.Int64(mi.UInt64(part) << 40)
 
 
 class Continued:
-    """A stream of which a loop carries the state alone.
+    """A stream of random numbers for a loop that carries its state alone.
 
-    What a loop carries and never changes, like the increment, makes Dr.Jit trace it twice: that takes seconds where
-    there are thousands of shapes. This class hides it, and whatever else is held by an object that is no array.
+    Dr.Jit traces a loop twice if the loop carries something that it never changes, such as the increment of a PCG32.
+    That takes seconds where there are thousands of shapes. Dr.Jit does not look into this class, so the loop does not
+    carry the increment.
     """
 
-    def __init__(self, rng: Any) -> None:
+    def __init__(self, rng: mi.PCG32) -> None:
         self.rng = rng
 
-    def at(self, state: Any) -> Any:
-        """The PCG32 in that state (UInt64)."""
+    def at(self, state: mi.UInt64) -> mi.PCG32:
+        """The generator in that state."""
         rng = mi.PCG32(self.rng)
         rng.state = state
         return rng
 
 
-def stratified(shift: Any, sample: Any) -> Any:
-    """Place of a sample within its pixel: the R2 sequence (Roberts 2018), shifted per pixel; fills the pixel evenly."""
-    return _sequence(shift, sample, (0.7548776662466927, 0.5698402909980532))
+def stratified(shift: mi.Point2f, sample: mi.UInt32) -> mi.Point2f:
+    """Place of a sample within its pixel, in the unit square.
+
+    The places follow the R2 sequence (Roberts 2018), which fills the pixel evenly; `shift` differs from pixel to pixel.
+    """
+    return _sequence(shift, sample, R2)
 
 
-def in_pairs(shift: Any, lens_shift: Any, sample: Any, samples: Any) -> tuple[Any, Any]:
-    """Places of a sample in its pixel and on the lens (None without a `lens_shift`), each in the unit square.
+def in_pairs(
+    shift: mi.Point2f, lens_shift: mi.Point2f | None, sample: mi.UInt32, samples: mi.UInt32
+) -> tuple[mi.Point2f, mi.Point2f | None]:
+    """Places of a sample in its pixel and on the lens, each in the unit square; on the lens None without `lens_shift`.
 
-    Every second sample is the one before it mirrored about the centres; of an odd number of samples, the last one is at
-    the centres. What is linear in the place, as phase and depth are on a plane, then has no sampling error at all: its
-    mean is its value at the centre (antithetic variates; Hammersley and Morton, Proc. Camb. Phil. Soc. 52, 1956).
-    The pairs follow the R2 sequence, with a lens the R4 sequence.
+    Every second sample is the one before it mirrored about the centres. If the number of samples is odd, the last one
+    is at the centres. A quantity that is linear in the place, as phase and depth are on a plane, then has no sampling
+    error: its mean is its value at the centre (antithetic variates; Hammersley and Morton, Proc. Camb. Phil. Soc. 52,
+    1956). The pairs follow the R2 sequence, with a lens the R4 sequence.
+
+    Parameters
+    ----------
+    shift, lens_shift : Point2f, uniform in the unit square, of the pixel.
+    sample, samples : UInt32, number of the sample, and number of samples of the pixel.
     """
     pair, mirrors = sample >> 1, (sample & 1) == 1
     alone = ~mirrors & (sample + 1 == samples)
 
-    def place(p: Any) -> Any:
+    def place(p: mi.Point2f) -> mi.Point2f:
         return dr.select(alone, 0.5, dr.select(mirrors, 1 - p, p))
 
     if lens_shift is None:
         return place(stratified(shift, pair)), None
-    in_pixel = _sequence(shift, pair, (0.8566748838545029, 0.733891856627126))
-    return place(in_pixel), place(_sequence(lens_shift, pair, (0.6287067210378087, 0.5385972572236101)))
+    in_pixel = _sequence(shift, pair, R4[:2])
+    return place(in_pixel), place(_sequence(lens_shift, pair, R4[2:]))
 
 
-def _sequence(shift: Any, number: Any, steps: tuple[float, float]) -> Any:
+def _sequence(shift: mi.Point2f, number: mi.UInt32, steps: tuple[float, ...]) -> mi.Point2f:
+    """Points of an additive recurrence in the unit square: shift + number * steps, modulo 1."""
     p = shift + mi.Point2f(*(mi.Float(number) * step for step in steps))
     return p - dr.floor(p)
 
 
 def aligned(values: np.ndarray, dtype: type[np.generic]) -> np.ndarray:
-    """A flat copy whose memory starts at a multiple of 64 bytes, as Dr.Jit's own arrays do.
+    """A flat copy of the values whose memory starts at a multiple of 64 bytes, as Dr.Jit's own arrays do.
 
-    Dr.Jit reads arrays of NumPy where they lie, and compiles a kernel anew where one of its inputs begins at another
-    alignment; NumPy's begin at multiples of 16, as it happens.
+    Dr.Jit reads arrays of NumPy in place, and compiles a kernel again if one of its inputs has another alignment.
+    Arrays of NumPy start at any multiple of 16 bytes.
     """
     flat = np.ravel(np.asarray(values, dtype))
     memory = np.empty(flat.nbytes + 64, np.uint8)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Means over samples, taken in rounds and in two halves, whose difference tells the error of the mean."""
+"""Means over samples, and the error of these means.
+
+Samples are taken in two halves. Half the difference of their means has the variance of the error of the mean of all.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +22,19 @@ from rangesim.rig import Rig
 from rangesim.signals import SamplingError
 
 BYTES_PER_LANE = 512
-"""State of one lane besides its channels, an upper bound."""
+"""Memory of the state of a lane besides its channels, in bytes, an upper bound."""
 MIN_FOR_HALVES = 3
-"""Samples of a pixel: two and one."""
+"""Smallest number of samples of a pixel that can be dealt into halves: two and one."""
 SMOOTH = [i for i, field in enumerate(fields(Radiance)) if field.name in ("multipath", "smooth_caustic")]
-"""Light that neighbouring pixels may share."""
+"""Indices of the kinds of light that neighbouring pixels may share, in the order of the fields of `Radiance`."""
 
 
 class Sums:
-    """Sums over samples of each pixel.
+    """Sums over the samples of each pixel of an image.
 
-    channels : response -> (c, h, w) float32. smooth : the same of light that is kept apart; empty if none is.
-    radiance : (6, h, w) float32, in the order of `Radiance`.
+    channels : response -> (c, h, w) float32.
+    smooth : the same for smooth light, if it is kept apart; else empty.
+    radiance : (6, h, w) float32, W/m2/sr, in the order of the fields of `Radiance`.
     """
 
     def __init__(self, h: int, w: int) -> None:
@@ -40,7 +44,7 @@ class Sums:
         self.radiance = np.zeros((len(fields(Radiance)), h, w), np.float32)
 
     def add(self, pixels: np.ndarray, traced: PathSums, accumulators: Accumulators) -> None:
-        """Add the sums of pixels with these flat indices, in ascending order."""
+        """Add sums of the pixels with these flat indices (n,), which are in ascending order."""
         some: slice | np.ndarray = pixels
         if pixels[-1] - pixels[0] + 1 == len(pixels):
             some = slice(pixels[0], pixels[-1] + 1)
@@ -59,11 +63,22 @@ class Sums:
 
 
 class Halves:
-    """Makes means and errors of sums over samples in two halves; of sums over all of them in one, means.
+    """Computes means, and draws of their error, from sums over samples in two halves; from one sum, means alone.
 
     With means a and b over p and q samples, (a - b) sqrt(p q) / (p + q) has the variance of the mean of all.
 
-    samples : p and q, (h, w) each, or the one.
+    Parameters
+    ----------
+    samples : p and q, (h, w) int each; or one such array.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> halves = Halves([np.array([[1]]), np.array([[1]])])
+    >>> sums = np.array([[[4.0]]], np.float32), np.array([[[2.0]]], np.float32)
+    >>> halves.mean_and_error(sums, sums)
+    >>> float(sums[0].item()), float(sums[1].item())
+    (3.0, 1.0)
     """
 
     def __init__(self, samples: Sequence[np.ndarray]) -> None:
@@ -75,8 +90,10 @@ class Halves:
             self.of_a, self.of_b = np.sqrt(q / p) / self.total, np.sqrt(p / q) / self.total
 
     def mean_and_error(self, sums: Sequence[np.ndarray], out: Sequence[np.ndarray]) -> None:
-        """Write the mean over all samples, and a draw of its error, of the sums of the halves, each (c, h, w), to
-        `out`, which may be the sums themselves."""
+        """Write the mean over all samples to `out[0]`, and a draw of its error to `out[1]`.
+
+        `sums` are those of the halves, (c, h, w) each; `out` may be the same arrays.
+        """
         if len(sums) == 1:
             np.divide(sums[0], self.total, out=out[0])
             return
@@ -88,15 +105,17 @@ class Halves:
 
 
 class Estimate:
-    """What the samples taken so far say.
+    """The image of a camera as estimated from the samples taken so far.
 
     Parameters
     ----------
-    view, settings : View and PathSettings, what is sampled.
-    rig, responses : whose image, and what is summed up.
-    keeps_apart : whether smooth light is kept apart, to be shared by neighbours.
-    has_halves : whether samples are dealt into halves; every pixel then needs `MIN_FOR_HALVES` at once.
-    memory_bytes : of the arrays of the renderer.
+    view, settings : View and PathSettings, for the path loop.
+    rig : Rig, whose camera takes the image.
+    responses : the responses whose channels are summed up.
+    keeps_apart : whether smooth light has sums of its own, so that neighbours can share it.
+    has_halves : whether samples are dealt into halves. Every pixel then needs `MIN_FOR_HALVES` samples at once.
+    memory_bytes : largest size of the renderer's arrays.
+    launches : Launches, which remember how much work fits into a launch.
     """
 
     def __init__(
@@ -119,9 +138,13 @@ class Estimate:
         self.rounds = 0
 
     def sample(self, pixels: np.ndarray, samples: np.ndarray, report: Report) -> None:
-        """Take so many samples (n,) more of pixels (n,), given by ascending flat indices; all have had equally many.
+        """Take more samples of some pixels, of which all have had equally many.
 
-        `report` gets the fraction done.
+        Parameters
+        ----------
+        pixels : (n,) int, flat indices in ascending order.
+        samples : (n,) int, number of samples to be taken of each.
+        report : called with the fraction done after each launch.
         """
         first = int(sum(taken.ravel()[pixels[0]] for taken in self.samples))
         samples = samples.astype(np.uint32)
@@ -142,16 +165,19 @@ class Estimate:
         self.rounds += 1
 
     def mean_tally(self) -> np.ndarray:
-        """(6, h, w) float32, means over samples in the order of `Tally`."""
+        """(6, h, w) float32, means over samples, in the order of the fields of `Tally`."""
         return np.asarray(self.tally / np.asarray(sum(self.samples)).astype(np.float32))
 
     def means(
         self, shared: LightFilter | None, responses: Sequence[Response] | None = None
     ) -> tuple[dict[Response, np.ndarray], Radiance, SamplingError | None]:
-        """Means over all samples of channels and radiance, and a draw of their error.
+        """Means of channels and radiance over all samples, and a draw of their error (None without halves).
 
-        `shared` filters the light that is kept apart; None if none is. With `responses` the channels of these alone,
-        and more samples may be taken; without, the sums are used up.
+        Parameters
+        ----------
+        shared : LightFilter of the smooth light that is kept apart; None if none is.
+        responses : the responses whose channels are returned; more samples may be taken afterwards. None returns all
+            channels and uses up the sums.
         """
         channels, errors, halves = {}, {}, Halves(self.samples)
         for r in self.responses if responses is None else responses:
@@ -184,7 +210,7 @@ class Estimate:
         return channels, Radiance(*out[0]), error
 
     def _tiles(self, pixels: int) -> Iterator[tuple[int, int]]:
-        """Ranges of pixels that fit the memory, of about equal size."""
+        """Ranges of pixels, of about equal size, whose arrays fit into the memory."""
         bytes_per_pixel = BYTES_PER_LANE + 4 * (1 + self.keeps_apart) * sum(r.channels for r in self.responses)
         if self.memory_bytes < bytes_per_pixel:
             raise ValueError(f"expected a memory budget of at least {bytes_per_pixel} bytes, got {self.memory_bytes}.")
@@ -195,7 +221,7 @@ class Estimate:
 
 
 def projector_light(radiance: Radiance) -> np.ndarray:
-    """All light of the projector, without glint, (h, w)."""
+    """(h, w) float32, W/m2/sr, all light of the projector but glint."""
     return np.asarray(
         radiance.direct + radiance.multipath + radiance.specular + radiance.caustic + radiance.smooth_caustic
     )

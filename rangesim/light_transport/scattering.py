@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Translucent objects: light that walks through a homogeneous participating medium behind an index-matched boundary.
 
-Inside, light travels exponentially distributed ways between scattering events (mean 1 / sigma_t), keeps the fraction
-`albedo` of itself at each, and turns by an angle of the phase function of Henyey and Greenstein (1941); g = 0 is
-isotropic. The boundary neither reflects nor refracts, so the way to the projector is straight, and what is left of the
-light along it is exp(-sigma_t times the way inside) (Beer-Lambert). See docs/subsurface.md. Media that absorb alone
-inside bodies that refract are another matter: `rangesim.light_transport.absorption`.
+Inside, light travels exponentially distributed distances between scattering events, 1 / sigma_t on average. At each
+event it keeps the fraction `albedo`, and turns by an angle that follows the phase function of Henyey and Greenstein
+(1941); g = 0 is isotropic. The boundary neither reflects nor refracts, so the way to the projector is straight. Along
+it, the fraction exp(-sigma_t times the distance inside) of the light is left (Beer-Lambert). See docs/subsurface.md.
+Media that only absorb, inside bodies that refract, are in `rangesim.light_transport.absorption`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,44 +21,53 @@ from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.scene.media import is_boundary, medium_numbers
 
 MAX_EVENTS = 1 << 14
-"""Scattering events and crossed boundaries of a path, after which it is cut off; apart from `max_depth`."""
+"""Number of scattering events and crossed boundaries after which a path is cut off, apart from `max_depth`. In whole
+milk a walk takes some 4000 events to a throughput of `ROULETTE_BELOW`."""
 ROULETTE_BELOW = 0.2
-"""Throughput below which Russian roulette may end a walk inside a medium."""
+"""Throughput below which Russian roulette may end a walk inside a medium. A smaller value makes less noise, and walks
+last longer."""
 OPAQUE = 30.0
-"""Optical thickness that counts as a wall: exp(-30) = 1e-13."""
+"""Optical thickness that counts as a wall, no unit: exp(-30) = 1e-13 is below the rounding of single precision."""
 
 
 @dataclass
 class Medium:
-    """The medium at a place; `sigma_t` 0: none. Not frozen, so that it can be the state of a loop of Dr.Jit.
+    """The medium along a ray. Loops of Dr.Jit carry it, so it is not frozen.
 
-    sigma_t : Float, 1/m, extinction, the inverse of the mean free path. albedo : Float, sigma_s / sigma_t.
+    sigma_t : Float, 1/m, extinction coefficient, the inverse of the mean free path; 0 where there is no medium.
+    albedo : Float, sigma_s / sigma_t.
     g : Float, mean cosine of the angle by which light turns.
     """
 
-    sigma_t: Any = None
-    albedo: Any = None
-    g: Any = None
+    sigma_t: mi.Float
+    albedo: mi.Float
+    g: mi.Float
 
-    def replaced(self, where: Any, other: Medium) -> Medium:
-        """This medium, and another one `where` it says so."""
+    def replaced(self, where: mi.Bool, other: Medium) -> Medium:
+        """This medium, or the other one on the lanes of the mask `where`."""
         return Medium(
             dr.select(where, other.sigma_t, self.sigma_t),
             dr.select(where, other.albedo, self.albedo),
             dr.select(where, other.g, self.g),
         )
 
-    def free_flight(self, xi: Any) -> Any:
-        """Metres to the next scattering event, for xi uniform in [0, 1); infinite where there is no medium."""
+    def free_flight(self, xi: mi.Float) -> mi.Float:
+        """Distance to the next scattering event in metres; infinite where there is no medium.
+
+        `xi` is uniform in [0, 1).
+        """
         return dr.select(self.sigma_t > 0, -dr.log(1 - xi) / self.sigma_t, dr.inf)
 
-    def phase(self, cosine: Any) -> Any:
-        """Density per steradian of scattering into a direction at that cosine to the one before."""
+    def phase(self, cosine: mi.Float) -> mi.Float:
+        """Density (1/sr) with which light scatters by an angle of that cosine."""
         base = 1 + dr.square(self.g) - 2 * self.g * cosine
         return dr.inv_four_pi * (1 - dr.square(self.g)) / (base * dr.sqrt(base))
 
-    def scattered(self, direction: Any, xi: Any) -> Any:
-        """Unit direction after a scattering event, by the phase function; xi Point2f uniform in the unit square."""
+    def scattered(self, direction: mi.Vector3f, xi: mi.Point2f) -> mi.Vector3f:
+        """Unit direction after a scattering event, drawn from the phase function.
+
+        `direction` is the one before; `xi` is uniform in the unit square.
+        """
         g = dr.select(dr.abs(self.g) < 1e-3, 1e-3, self.g)  # the inverse has no value at g = 0
         way = (1 - dr.square(g)) / (1 - g + 2 * g * xi.x)
         cosine = dr.clip((1 + dr.square(g) - dr.square(way)) / (2 * g), -1, 1)
@@ -69,14 +77,14 @@ class Medium:
 
 
 class Media:
-    """The media of a scene, by the shape that each fills.
+    """The media that scatter in a scene, by the shape that each of them fills.
 
     Parameters
     ----------
     scene : mitsuba.Scene, whose boundaries `rangesim.scene.load_scene` has checked.
     """
 
-    def __init__(self, scene: Any) -> None:
+    def __init__(self, scene: mi.Scene) -> None:
         none = (0.0,) * len(fields(Medium))
         media = [medium_numbers(s.interior_medium()) if is_boundary(s) else none for s in scene.shapes()]
         table = table_of(scene, np.array(media, np.float32))
@@ -86,20 +94,36 @@ class Media:
         """No medium, on every lane."""
         return Medium(*(dr.zeros(mi.Float, lanes) for _ in fields(Medium)))
 
-    def bounded_by(self, si: Any, active: Any) -> Any:
+    def bounded_by(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
         """Whether the surface is the boundary of a medium."""
         return dr.gather(mi.Float, self.table[0], number_of(si.shape), active) > 0
 
-    def beyond(self, si: Any, direction: Any, active: Any) -> Medium:
-        """The medium that light enters in a direction across the boundary `si`."""
+    def beyond(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> Medium:
+        """The medium that light enters when it crosses the boundary `si` in a direction."""
         enters = active & (dr.dot(direction, si.n) < 0)
         shape = number_of(si.shape)
         return Medium(*(dr.gather(mi.Float, column, shape, enters) for column in self.table))
 
-    def event(self, inside: Medium, previous: Any, direction: Any, si: Any, hit: Any, xi: Any) -> tuple[Any, Any]:
-        """Whether light scatters on its way from `previous` to the surface `si`, or crosses a boundary there.
+    def event(
+        self,
+        inside: Medium,
+        previous: mi.Point3f,
+        direction: mi.Vector3f,
+        si: mi.SurfaceInteraction3f,
+        hit: mi.Bool,
+        xi: mi.Float,
+    ) -> tuple[mi.Bool, mi.Bool]:
+        """Whether light scatters on its way to a surface, and whether it crosses the boundary of a medium there.
 
-        Where it scatters, position and normal of `si` become those of the event: rays then start there itself.
+        Where it scatters, the position of `si` becomes that of the event, and its normal 0, so that rays start exactly
+        there.
+
+        Parameters
+        ----------
+        inside : Medium, along the way.
+        previous, direction : start and direction of the way.
+        si : SurfaceInteraction3f, where the way ends; changed in place.
+        xi : Float, uniform in [0, 1).
         """
         flight = inside.free_flight(xi)
         scatters = hit & (flight < dr.norm(si.p - previous))
@@ -110,11 +134,23 @@ class Media:
 
     @dr.syntax
     def transmittance(
-        self, scene: Any, si: Any, target: Any, inside: Medium, active: Any, around: Any = None
-    ) -> tuple[Any, Any]:
-        """Fraction of the light that reaches `target` straight from `si`, which lies in the medium `inside`; 0 behind
-        any other surface. And whether the way crosses a boundary. `around`: absorption coefficient outside the
-        media."""
+        self,
+        scene: mi.Scene,
+        si: mi.SurfaceInteraction3f,
+        target: mi.Point3f,
+        inside: Medium,
+        active: mi.Bool,
+        around: mi.Float = None,
+    ) -> tuple[mi.Float, mi.Bool]:
+        """Transmittance of the straight way from `si` to `target`, and whether the way crosses a boundary.
+
+        The transmittance is 0 where any surface other than the boundary of a medium stands in between.
+
+        Parameters
+        ----------
+        inside : Medium, in which the way starts.
+        around : Float, 1/m, absorption coefficient outside the media that scatter; None: 0.
+        """
         start = mi.Point3f(si.p)
         ray = mi.Ray3f(si.spawn_ray_to(target))
         sigma_t, thickness = mi.Float(inside.sigma_t), dr.zeros(mi.Float, dr.width(active))
@@ -138,11 +174,11 @@ class Media:
         return dr.select(free & (thickness < OPAQUE), dr.exp(-thickness), 0), crossed
 
 
-def media_of(scene: Any) -> Media | None:
-    """The media of a mitsuba.Scene; None where there are none, and nothing of this module is in the kernels."""
+def media_of(scene: mi.Scene) -> Media | None:
+    """The media of a mitsuba.Scene that scatter. None if it has none: no kernel then has code of this module."""
     return Media(scene) if any(map(is_boundary, scene.shapes())) else None
 
 
-def bounded(media: Media | None, si: Any) -> Any:
-    """Whether the surface is the boundary of a medium; False where there are none."""
+def bounded(media: Media | None, si: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Whether the surface `si` is the boundary of a medium; false in scenes without media."""
     return mi.Bool(False) if media is None else media.bounded_by(si, si.is_valid())

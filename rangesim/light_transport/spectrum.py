@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Spectra of the renderer in kernels: one channel, unpolarised (`rangesim.environment.backend.VARIANTS`)."""
+"""Spectra in kernels. Mitsuba's variants here are monochrome (`rangesim.environment.backend.VARIANTS`)."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import mitsuba as mi
 
 
-def mono(spectrum: Any) -> Any:
-    """The single channel of a monochrome spectrum."""
+def mono(spectrum: mi.Spectrum) -> mi.Float:
+    """The single channel of an unpolarised, monochrome spectrum."""
     return mi.unpolarized_spectrum(spectrum)[0]

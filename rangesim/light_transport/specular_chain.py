@@ -1,55 +1,61 @@
 # SPDX-License-Identifier: Apache-2.0
 """Specular chains: light on its way through glass, off mirrors, through thin panes, coats and holes.
 
-Delta interactions scatter nothing, so they do not count towards `max_depth`; they have a limit of their own, of
-surfaces in a row. Photons, camera paths and glint share it, and walk with the same `RayState`.
+Delta interactions scatter nothing, so they do not count towards `max_depth`. They have a limit of their own, a number
+of surfaces in a row. Photons, camera paths and glint share the limit, and walk with the same `RayState`.
 
 Mitsuba's `spawn_ray` starts rays a little off a surface, along its normal: about 0.1 mm at 1 m. So an oblique ray runs
-beside its true line, by a twentieth of a projector pixel or more, and mirrors and glass pass the error on. Starting
-the ray on its line instead would have it miss faces beside edges. So the ray is left where it is, and the point where
-it ends is corrected (`corrected_point`).
+beside its true line, by a twentieth of a projector pixel or more, and mirrors and glass pass the error on. A ray that
+started on its true line would miss faces beside edges. So the ray is left where it is, and the point where it ends is
+corrected (`corrected_point`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from rangesim.light_transport.absorption import ENDLESS
+from rangesim.light_transport.absorption import ENDLESS_M
+from rangesim.light_transport.scattering import Medium
 from rangesim.light_transport.traced_scene import TracedScene
 
 MAX_CHAIN = 128
-"""Delta interactions in a row, after which light is cut off. A pane has two faces, a hollow glass four."""
+"""Number of delta interactions in a row after which light is cut off. A pane has two faces, a hollow glass four; light
+in a brilliant is reflected dozens of times. Of photons into one of n = 2.4, 0.2 % are cut off (5.8 % at a limit of 16).
+"""
 ROULETTE_AFTER = 8
-"""Delta interactions in a row, after which Russian roulette may end the light."""
+"""Number of delta interactions in a row after which Russian roulette may end the light: the faces of two hollow
+glasses. A smaller number makes more noise behind glass; a larger one takes more time among metals."""
 CLEARANCE = 0.1
-"""Fraction of Mitsuba's own offset with which rays leave a delta surface, so that thin glass keeps its far face."""
+"""Distance at which rays start from a delta surface, as a fraction of Mitsuba's own: 0.009 mm at 1 m. Glass thinner
+than this distance loses its far face; a smaller fraction comes near the rounding of single precision."""
 MIN_COSINE = 0.05
-"""At more grazing incidence the correction of a point would be worse than the error."""
+"""Smallest cosine of the angle of incidence at which a point is corrected. At more grazing incidence, the point where
+the line meets the tangent plane may be far off, and the correction would be worse than the error."""
 
 
 @dataclass
 class RayState:
-    """What light carries along its ray. Not frozen, so that it can be the state of a loop of Dr.Jit.
+    """Start, optical length and surroundings of a ray of light. Loops of Dr.Jit carry it, so it is not frozen.
 
-    previous : Point3f, the vertex that the ray left. length : Float, metres, optical length up to there.
+    previous : Point3f, world, metres, the point that the ray left.
+    length : Float, metres, optical length up to there.
     ior : Float, refractive index along the ray.
-    inside : Medium that scatters along the ray; None in scenes without any.
+    inside : Medium, along the ray, that scatters; None in scenes without such media.
     sigma_a : Float, 1/m, absorption coefficient along the ray; None in scenes without absorbing bodies.
     """
 
-    previous: Any
-    length: Any
-    ior: Any
-    inside: Any = None
-    sigma_a: Any = None
+    previous: mi.Point3f
+    length: mi.Float
+    ior: mi.Float
+    inside: Medium | None = None
+    sigma_a: mi.Float = None
 
     @classmethod
     def start(cls, traced: TracedScene, lanes: int) -> RayState:
-        """Light in air that has gone no way yet."""
+        """The state of light in air whose optical length is 0."""
         return cls(
             dr.zeros(mi.Point3f, lanes),
             dr.zeros(mi.Float, lanes),
@@ -58,62 +64,84 @@ class RayState:
             None if traced.absorbers is None else dr.zeros(mi.Float, lanes),
         )
 
-    def restarted(self, where: Any, origin: Any, length: Any) -> RayState:
-        """With a new start of the ray `where` it says so; what lies around it is kept."""
+    def restarted(self, where: mi.Bool, origin: mi.Point3f, length: mi.Float) -> RayState:
+        """The state after the ray starts anew at `origin`, on the lanes of the mask `where`; surroundings are kept."""
         return replace(
             self, previous=dr.select(where, origin, self.previous), length=dr.select(where, length, self.length)
         )
 
-    def length_to(self, point: Any, hit: Any) -> Any:
-        """Optical length up to the point that the ray meets, where it does. Not `si.t`: rays start off the surface."""
+    def length_to(self, point: mi.Point3f, hit: mi.Bool) -> mi.Float:
+        """Optical length up to the point that the ray meets, in metres; on lanes without a `hit` up to its start.
+
+        `si.t` would be wrong, because rays start off the surface.
+        """
         return dr.select(hit, dr.fma(self.ior, dr.norm(point - self.previous), self.length), self.length)
 
-    def unabsorbed(self, traced: TracedScene, point: Any, hit: Any) -> Any:
-        """Fraction of the light that absorption leaves on the way to the point; without one the ray is endless."""
-        distance = dr.select(hit, dr.norm(point - self.previous), ENDLESS)
+    def unabsorbed(self, traced: TracedScene, point: mi.Point3f, hit: mi.Bool) -> mi.Float:
+        """Fraction of the light that absorption leaves on the way to the point; without a `hit` the ray is endless."""
+        assert traced.absorbers is not None
+        distance = dr.select(hit, dr.norm(point - self.previous), ENDLESS_M)
         return traced.absorbers.transmittance(self.sigma_a, distance, self.inside)
 
-    def refracted(self, bs: Any, where: Any) -> RayState:
-        """With the refractive index beyond the surface at which `bs` was sampled."""
+    def refracted(self, bs: mi.BSDFSample3f, where: mi.Bool) -> RayState:
+        """The state with the refractive index beyond the surface at which `bs` was sampled."""
         is_transmitted = where & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
         return replace(self, ior=dr.select(is_transmitted, self.ior * bs.eta, self.ior))
 
-    def entering(self, traced: TracedScene, si: Any, direction: Any, where: Any, crosses: Any) -> RayState:
-        """With the media that light enters which leaves the surface in a direction; `crosses` : boundaries of media
-        that scatter."""
+    def entering(
+        self,
+        traced: TracedScene,
+        si: mi.SurfaceInteraction3f,
+        direction: mi.Vector3f,
+        where: mi.Bool,
+        crosses: mi.Bool,
+    ) -> RayState:
+        """The state with the media along a ray that leaves the surface `si` in a direction.
+
+        Parameters
+        ----------
+        where : Bool, whether the ray leaves a surface at all.
+        crosses : Bool, whether the surface is the boundary of a medium that scatters.
+        """
         inside, sigma_a = self.inside, self.sigma_a
-        if inside is not None:
+        if inside is not None and traced.media is not None:
             inside = inside.replaced(crosses, traced.media.beyond(si, direction, crosses))
-        if sigma_a is not None:
+        if sigma_a is not None and traced.absorbers is not None:
             sigma_a = traced.absorbers.beyond(si, direction, sigma_a, where)
         return replace(self, inside=inside, sigma_a=sigma_a)
 
-    def reset(self, traced: TracedScene, where: Any) -> RayState:
-        """In air again, without a length, `where` a path ends."""
-        inside = None if self.inside is None else self.inside.replaced(where, traced.media.none(dr.width(where)))
+    def reset(self, traced: TracedScene, where: mi.Bool) -> RayState:
+        """The state of light in air whose optical length is 0, on the lanes of the mask `where` a path ends."""
+        inside = self.inside
+        if inside is not None and traced.media is not None:
+            inside = inside.replaced(where, traced.media.none(dr.width(where)))
         sigma_a = None if self.sigma_a is None else dr.select(where, 0, self.sigma_a)
         length, ior = dr.select(where, 0, self.length), dr.select(where, 1, self.ior)
         return RayState(self.previous, length, ior, inside, sigma_a)
 
 
-def survival(chain: Any, fraction: Any) -> Any:
-    """Probability of light to go on after `chain` delta interactions that left `fraction` of it; survivors are divided
-    by it.
+def survival(chain: mi.UInt32, fraction: mi.Float) -> mi.Float:
+    """Probability with which light goes on after `chain` delta interactions that left `fraction` of it.
 
-    Lossless glass keeps all: its paths go on to the limit. Light that fades off metals ends in time.
+    Callers divide the light that goes on by this probability. Lossless glass keeps all light, so its paths go on to
+    the limit. Light that metals absorb ends in time.
     """
     return dr.select(chain > ROULETTE_AFTER, dr.minimum(fraction, 1), 1)
 
 
-def corrected_point(si: Any, origin: Any, direction: Any) -> Any:
-    """The point where the line from `origin` meets the tangent plane of the surface met beside it, `si`."""
+def corrected_point(si: mi.SurfaceInteraction3f, origin: mi.Point3f, direction: mi.Vector3f) -> mi.Point3f:
+    """The point where the true line of a ray, from `origin`, meets the tangent plane of the surface `si` that the ray
+    met."""
     slope = dr.dot(direction, si.n)
     along = dr.dot(si.p - origin, si.n) / slope
     return dr.select(dr.abs(slope) > MIN_COSINE, mi.Point3f(origin + direction * along), si.p)
 
 
-def spawn_specular_ray(si: Any, met: Any, direction: Any) -> Any:
-    """The ray that leaves a delta surface close by; `met` is where the ray before met it, on the safe side of edges."""
+def spawn_specular_ray(si: mi.SurfaceInteraction3f, met: mi.Point3f, direction: mi.Vector3f) -> mi.Ray3f:
+    """The ray that leaves a delta surface in a direction, closer to it than Mitsuba's.
+
+    `met` is the point where the ray before met the surface, not corrected, so that it lies on the safe side of edges.
+    """
     ray = si.spawn_ray(direction)
     ray.o = met + CLEARANCE * (ray.o - si.p)
     return ray

@@ -1,41 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where rays meet a scene of many shapes: computed once for all spheres, and once for all meshes of one kind.
+"""Surface interactions in scenes of many shapes, and tables of what is known about each shape.
 
-Mitsuba asks the shape that a ray met for position, normal and frame: a virtual call. Dr.Jit traces the code of every
-shape wherever a kernel makes one, and the kernel runs it once for each of the shapes that neighbouring lanes met. Here
-shapes of one family share one branch, of the same operations in the same order: the results are the same bytes.
+Mitsuba asks the shape that a ray met for position, normal and frame, by a virtual call. Dr.Jit traces the code of every
+shape wherever a kernel makes such a call, and the kernel runs it once for each of the shapes that neighbouring lanes
+met. Here all spheres share one branch, and all meshes of one kind another. A branch has the same operations in the same
+order as Mitsuba's code, so the results are the same bytes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from functools import partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rangesim.light_transport.sampling import aligned
 
 MANY = 100
-"""Shapes from which on tables of them are worth making."""
+"""Number of shapes from which on branches are shared. In smaller scenes virtual calls take little time, and the tables
+of a branch would not pay."""
 MAX_FACES = 4096
-"""Of a mesh that is copied into a joint one."""
+"""Largest number of faces of a mesh that is copied into a joint mesh. Copies of larger meshes would take much memory,
+and a scene has few of them."""
 
 
-def surfaces_of(scene: Any) -> Any:
-    """What to intersect rays with: the mitsuba.Scene itself, or its `Surfaces` where they have much in common."""
+def surfaces_of(scene: mi.Scene) -> mi.Scene | Surfaces:
+    """The object to intersect rays with: the mitsuba.Scene itself, or its `Surfaces` if many shapes share branches."""
     shapes = scene.shapes()
     if len(shapes) < MANY:
         return scene
-    families: dict[Any, list[int]] = {}
+    families: dict[Hashable, list[int]] = {}
     for i, shape in enumerate(shapes):
         families.setdefault(_family(shape), []).append(i)
     return Surfaces(scene, list(families.values())) if 2 * len(families) <= len(shapes) else scene
 
 
-def _family(shape: Any) -> Any:
-    """Equal for shapes that can share a branch; else the shape itself."""
+def _family(shape: mi.Shape) -> Hashable:
+    """A key that is equal for shapes which can share a branch; else the shape itself."""
     if _is_sphere(shape):
         return "sphere"
     if shape.shape_type() == mi.ShapeType.Mesh.value and shape.face_count() <= MAX_FACES:
@@ -44,12 +48,15 @@ def _family(shape: Any) -> Any:
 
 
 class Surfaces:
-    """Stands for a mitsuba.Scene where rays are intersected with it, as long as its shapes stay as they are.
+    """A stand-in for a mitsuba.Scene to intersect rays with, as long as its shapes do not change.
 
-    families : places of the scene's shapes, those together that share a branch.
+    Parameters
+    ----------
+    scene : mitsuba.Scene
+    families : indices of the scene's shapes, one list for each branch.
     """
 
-    def __init__(self, scene: Any, families: list[list[int]]) -> None:
+    def __init__(self, scene: mi.Scene, families: list[list[int]]) -> None:
         shapes = scene.shapes()
         self.scene = scene
         branch = np.zeros(len(shapes), np.uint32)
@@ -61,8 +68,10 @@ class Surfaces:
             self.branches.append(family.compute_surface_interaction)
         self.branch = mi.UInt32(table_of(scene, branch))
 
-    def ray_intersect(self, ray: Any, flags: Any, coherent: bool, active: Any = True) -> Any:
-        """The surface interaction that `mitsuba.Scene.ray_intersect` returns; more than `flags` ask for may be set."""
+    def ray_intersect(
+        self, ray: mi.Ray3f, flags: int, coherent: bool, active: mi.Bool | bool = True
+    ) -> mi.SurfaceInteraction3f:
+        """The surface interaction that `mitsuba.Scene.ray_intersect` returns; it may set more than `flags` asks for."""
         found = self.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
         met = found.is_valid() & active
         branch = dr.gather(mi.UInt32, self.branch, number_of(found.shape), met)
@@ -78,9 +87,9 @@ class Surfaces:
 
 
 class Spheres:
-    """Spheres of a scene."""
+    """The spheres of a scene, which share a branch."""
 
-    def __init__(self, scene: Any, members: list[int]) -> None:
+    def __init__(self, scene: mi.Scene, members: list[int]) -> None:
         shapes = scene.shapes()
         to_world = [mi.traverse(shapes[i])["to_world"] for i in members]
         table = partial(_table, scene, members)
@@ -91,8 +100,10 @@ class Spheres:
             for matrices in ([t.matrix for t in to_world], [t.inverse_transpose for t in to_world])
         )
 
-    def compute_surface_interaction(self, ray: Any, found: Any, flags: Any, met: Any) -> Any:
-        """What `Sphere` of Mitsuba 3.9 computes for `mitsuba.RayFlags.All`."""
+    def compute_surface_interaction(
+        self, ray: mi.Ray3f, found: mi.PreliminaryIntersection3f, flags: int, met: mi.Bool
+    ) -> mi.SurfaceInteraction3f:
+        """The surface interaction as `Sphere` of Mitsuba 3.9 computes it for `mitsuba.RayFlags.All`."""
         number = number_of(found.shape)
         to_world = dr.gather(mi.AffineTransform4f, self.to_world, number, met)
         si = dr.zeros(mi.SurfaceInteraction3f)
@@ -114,9 +125,9 @@ class Spheres:
 
 
 class Meshes:
-    """Meshes of a scene that are of one kind, joined to one mesh."""
+    """Meshes of a scene that are of one kind, joined to one mesh, which share a branch."""
 
-    def __init__(self, scene: Any, members: list[int]) -> None:
+    def __init__(self, scene: mi.Scene, members: list[int]) -> None:
         shapes = scene.shapes()
         meshes = [shapes[i] for i in members]
         vertices = np.cumsum([0, *(mesh.vertex_count() for mesh in meshes)])
@@ -139,19 +150,21 @@ class Meshes:
             parameters["vertex_texcoords"] = _joined([m.vertex_texcoords_buffer() for m in meshes])
         parameters.update()
 
-    def compute_surface_interaction(self, ray: Any, found: Any, flags: Any, met: Any) -> Any:
-        """What the joint mesh computes, in which the faces have other numbers."""
+    def compute_surface_interaction(
+        self, ray: mi.Ray3f, found: mi.PreliminaryIntersection3f, flags: int, met: mi.Bool
+    ) -> mi.SurfaceInteraction3f:
+        """The surface interaction as the joint mesh computes it, in which the faces have other numbers."""
         of_joint = mi.PreliminaryIntersection3f(found)
         of_joint.prim_index += dr.gather(mi.UInt32, self.first_face, number_of(found.shape), met)
         return self.joint.compute_surface_interaction(ray, of_joint, flags, met)
 
 
-def _is_sphere(shape: Any) -> bool:
+def _is_sphere(shape: mi.Shape) -> bool:
     return bool(shape.shape_type() == mi.ShapeType.Sphere.value)
 
 
-def _kind(mesh: Any) -> tuple[str, bool, bool, bool, bool]:
-    """What of a mesh decides how its normals and texture coordinates are computed."""
+def _kind(mesh: mi.Mesh) -> tuple[str, bool, bool, bool, bool]:
+    """The properties of a mesh that decide how its normals and texture coordinates are computed."""
     return (
         "mesh",
         mesh.has_flipped_normals(),
@@ -161,32 +174,33 @@ def _kind(mesh: Any) -> tuple[str, bool, bool, bool, bool]:
     )
 
 
-def _joined(buffers: list[Any]) -> Any:
+def _joined(buffers: list[mi.Float]) -> mi.Float:
+    """The buffers of several meshes, one after the other."""
     return mi.Float(aligned(np.concatenate([buffer.numpy() for buffer in buffers]), np.float32))
 
 
-def _table(scene: Any, members: list[int], values: Any) -> np.ndarray:
-    """Table of `values` (members, ...) by the numbers of the shapes; 0 for all others."""
-    values = np.asarray(values)
-    of_shapes = np.zeros((len(scene.shapes()), *values.shape[1:]), values.dtype)
-    of_shapes[members] = values
+def _table(scene: mi.Scene, members: list[int], values: ArrayLike) -> np.ndarray:
+    """Table of `values` (members, ...), one for each of these shapes; 0 for all other shapes. See `table_of`."""
+    rows = np.asarray(values)
+    of_shapes = np.zeros((len(scene.shapes()), *rows.shape[1:]), rows.dtype)
+    of_shapes[members] = rows
     return table_of(scene, of_shapes)
 
 
 # ---- Tables of what is known of each shape ---------------------------------------------------------------
 #
-# Asking the shapes themselves is a virtual call, for which Dr.Jit traces the code of each and every shape of the
-# process, about 0.1 ms for each: nothing among ten shapes, but a second among ten thousand.
+# A kernel that asks the shapes themselves makes a virtual call. Dr.Jit then traces the code of every shape of the
+# process, which takes about 0.1 ms for each shape: a second for ten thousand shapes. Tables avoid the call.
 
 
-def number_of(shape: Any) -> Any:
-    """(lanes,) UInt32, the place in a table of each shape of a mitsuba.ShapePtr; 0 for none."""
+def number_of(shape: mi.ShapePtr) -> mi.UInt32:
+    """(lanes,) UInt32, index of each shape in the tables of `table_of`; 0 where there is no shape."""
     return dr.reinterpret_array(mi.UInt32, shape)
 
 
-def table_of(scene: Any, values: Any) -> np.ndarray:
-    """`values` (n, ...), one for each of the scene's shapes in their order, at the places that `number_of` gives."""
-    numbers, values = number_of(scene.shapes_dr()).numpy(), np.asarray(values)
-    table = np.zeros((int(numbers.max()) + 1, *values.shape[1:]), values.dtype)
-    table[numbers] = values
+def table_of(scene: mi.Scene, values: ArrayLike) -> np.ndarray:
+    """Table of `values` (shapes, ...), one for each shape of the scene in its order, indexed by `number_of`."""
+    numbers, rows = number_of(scene.shapes_dr()).numpy(), np.asarray(values)
+    table = np.zeros((int(numbers.max()) + 1, *rows.shape[1:]), rows.dtype)
+    table[numbers] = rows
     return table

@@ -1,37 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What light meets: scene, devices, media; the same for camera paths, photons, glint and the ground truth."""
+"""The scene and the rig as all kernels see them: camera paths, photons, glint and the ground truth."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from rangesim.light_transport.absorption import absorbers_of
-from rangesim.light_transport.cutouts import cutouts_of
+import mitsuba as mi
+
+from rangesim.light_transport.absorption import Absorbers, absorbers_of
+from rangesim.light_transport.cutouts import Cutouts, cutouts_of
 from rangesim.light_transport.device import Device
-from rangesim.light_transport.scattering import media_of
-from rangesim.light_transport.surfaces import surfaces_of
+from rangesim.light_transport.scattering import Media, media_of
+from rangesim.light_transport.surfaces import Surfaces, surfaces_of
 from rangesim.rig import Rig
 
 
 class TracedScene(NamedTuple):
     """A scene and a rig, ready for kernels.
 
-    scene : mitsuba.Scene. surfaces : what rays are intersected with, see `surfaces_of`.
-    camera, projector : Device.
-    media, cutouts, absorbers : Media, Cutouts and Absorbers; None where there are none, and their code is in no kernel.
+    scene : mitsuba.Scene
+    surfaces : the scene itself, or its `Surfaces`; rays are intersected with this, see `surfaces_of`.
+    camera, projector : Device
+    media, cutouts, absorbers : Media, Cutouts and Absorbers. None if the scene has none: no kernel then has code for
+        them.
     """
 
-    scene: Any
-    surfaces: Any
+    scene: mi.Scene
+    surfaces: mi.Scene | Surfaces
     camera: Device
     projector: Device
-    media: Any = None
-    cutouts: Any = None
-    absorbers: Any = None
+    media: Media | None = None
+    cutouts: Cutouts | None = None
+    absorbers: Absorbers | None = None
 
     @classmethod
-    def of(cls, scene: Any, rig: Rig) -> TracedScene:
-        """A mitsuba.Scene that `rangesim.scene.load_scene` has checked, seen by a rig in its coordinates."""
+    def of(cls, scene: mi.Scene, rig: Rig) -> TracedScene:
+        """A traced scene of a mitsuba.Scene that `rangesim.scene.load_scene` has checked, and a rig in its
+        coordinates."""
         camera, projector = Device.camera(rig), Device.projector(rig)
         parts = surfaces_of(scene), camera, projector, media_of(scene), cutouts_of(scene), absorbers_of(scene)
         return cls(scene, *parts)

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An estimate of the projector's light that a pass leaves out, because it ends paths, chains and photons somewhere.
+"""An estimate of the projector's light that a pass leaves out because it ends paths, chains and photons somewhere.
 
-A camera path brings light at each vertex that scatters. The throughput with which paths arrive at their k-th such
-vertex, T_k, falls off geometrically after a few of them: t = T_n / T_(n-1) at the last one that a pass looks at is the
-mean albedo times the chance to meet another surface. (Its ratio is used and not that of the light itself, which swings:
-what a lamp lights and what this lights in turn are most often opposite each other.) What all later vertices would
-receive is T_n t / (1 - t), and they are taken to be lit, per throughput, as vertices after the first are on average:
+A camera path brings light at each of its vertices. Let T_k be the throughput with which paths arrive at their k-th
+vertex. It falls off geometrically after a few vertices: the ratio t = T_n / T_(n-1) at the last vertex that a pass
+looks at is the mean albedo times the chance to meet another surface. (The ratio of throughputs is used because the
+ratio of the light itself swings: surfaces that the projector lights and surfaces that these light in turn most often
+face each other.) The throughput of all later vertices is T_n t / (1 - t). They are taken to be lit, per throughput, as
+vertices after the first are on average:
 
     left out = T_n t / (1 - t) * (light at vertices 2..n) / (T_2 + ... + T_n)
 
-Light in chains of delta interactions that are cut off is taken to be as bright as all other, and photons cut off to
-land where the others do.
+Chains of delta interactions that are cut off are taken to carry light as bright as all other paths, and photons that
+are cut off are taken to land where the other photons do.
 """
 
 from __future__ import annotations
@@ -26,11 +27,13 @@ from rangesim.light_transport.specular_chain import MAX_CHAIN
 from rangesim.signals import EnergySplit, Truncation
 
 DIRECT_ALONE = 2
-"""The `max_depth` that asks for direct light alone; how much else there would be is not known then."""
-WORTH_A_WARNING = 0.02
-"""Fraction of the projector's light."""
-MIN_DECAY, MAX_DECAY = 0.0, 0.99
-"""Bounds of t: nothing is known about a closed room that absorbs next to nothing."""
+"""The `max_depth` that asks for direct light alone. The light at later vertices is not known then."""
+MAX_LEFT_OUT = 0.02
+"""Fraction of the projector's light that a pass may leave out without a warning. A smaller value would warn more often,
+of light that changes few readings."""
+MAX_DECAY = 0.99
+"""Largest ratio t of the throughputs at successive vertices. In a closed room that absorbs next to nothing t comes near
+1, and the estimate t / (1 - t) grows without a bound."""
 
 
 Array = TypeVar("Array")
@@ -58,18 +61,20 @@ class Tally(Generic[Array]):
 
 
 def estimate_truncation(tally: np.ndarray, energy: EnergySplit, max_depth: int, photons_cut: float) -> Truncation:
-    """What a pass left out.
+    """Fractions of the projector's light that a pass left out.
 
     Parameters
     ----------
-    tally : (6, h, w) float32, in the order of `Tally`.
-    photons_cut : flux of photons that were cut off, over that of those that landed.
+    tally : (6, h, w) float32, in the order of the fields of `Tally`.
+    energy : EnergySplit, of the pass.
+    max_depth : int, of the pass.
+    photons_cut : ratio of the power of photons that were cut off to the power of photons that landed.
     """
     first, further, before_last, last, indirect, cut = (float(x.sum(dtype=float)) for x in tally)
     seen = sum(float(x.sum(dtype=float)) for x in (energy.direct, energy.multipath, energy.specular, energy.caustic))
     by_depth = np.nan
     if max_depth > DIRECT_ALONE:
-        t = min(max(last / before_last, MIN_DECAY), MAX_DECAY) if before_last else 0.0
+        t = min(max(last / before_last, 0.0), MAX_DECAY) if before_last else 0.0
         by_depth = indirect / further * last * t / (1 - t) if further else 0.0
     by_chains = seen * cut / (first + further) if first + further else 0.0
     by_photons = float(energy.caustic.sum(dtype=float)) * photons_cut
@@ -79,8 +84,8 @@ def estimate_truncation(tally: np.ndarray, energy: EnergySplit, max_depth: int, 
 
 
 def warn_of_truncation(truncation: Truncation | None, max_depth: int, of: str, stacklevel: int) -> None:
-    """Warn if a pass left out more than `WORTH_A_WARNING`; `of` says of which camera, if there are several."""
-    if truncation is None or truncation.total <= WORTH_A_WARNING:
+    """Warn if a pass left out more than `MAX_LEFT_OUT`; `of` names the camera, if there are several."""
+    if truncation is None or truncation.total <= MAX_LEFT_OUT:
         return
     why = f"a max_depth of {max_depth} ends light paths early; a larger one brings it"
     if not truncation.depth > truncation.chains + truncation.photons:

@@ -43,7 +43,9 @@ class MovingSignals(Signals):
 
     def frames(self, sensor: Sensor, ambient_transmission: float = 1.0, sampling_errors: float = 0.0) -> np.ndarray:
         if sensor != self.sensor:
-            raise ValueError(f"expected {self.sensor}, whose frames these are, got {sensor}.")
+            raise ValueError(
+                f"expected {self.sensor}, as the signals are the frames of this sensor alone, got {sensor}."
+            )
         lit = self.lit
         if sampling_errors:
             if self.lit_error is None:

@@ -17,8 +17,8 @@ perspective, that the shape stays open. These inputs raise an error. The covaria
 all, because depths can be fitted to noise, and at such depths the covariance looks good. So an F test also compares the
 cameras found with cameras that only rotate.
 
-Used by: `multi_view_triangulation`, `incremental_reconstruction` and `sliding_window` of `rangesim.multiview`; no other
-module of rangesim.
+Used by: `multi_view_triangulation`, `incremental_reconstruction`, `sliding_window` and `factorisation` (its checks) of
+`rangesim.multiview`; no other module of rangesim.
 """
 
 from __future__ import annotations

@@ -130,7 +130,7 @@ def estimate_cost(
 
     Parameters
     ----------
-    passes : as `rangesim.pipeline.experiment_run.group_by_rig` returns.
+    passes : as `rangesim.pipeline.passes.group_by_rig` returns.
     trial : whether small passes may be timed where the run is long.
     places : that each pass is traced from. rest : what is done with the signals; None: what a run does.
     """

@@ -26,6 +26,7 @@ from rangesim.files.result_directories import new_directory
 from rangesim.instrument.instrument import Instrument
 from rangesim.motion import transport_moving
 from rangesim.pipeline.cost import Cost, estimate_cost
+from rangesim.pipeline.passes import group_by_rig
 from rangesim.pipeline.provenance import provenance
 from rangesim.results.run_files import (
     RESULT,
@@ -205,7 +206,7 @@ def measure(
     times: dict[str, float] = {}
     moves = signals.motion_m is not None
     with timed(times, "exposure"):
-        detector = _in_time(instrument) if moves else instrument.detector
+        detector = _in_time(instrument) if moves else instrument.detector_in_use
         exposure = exposed(signals, instrument.sensor, detector, instrument.exposure_s, seed, ambient)
     capture, photons = exposure.capture, exposure.photons_per_pulse()
     if instrument.exposure_s is None:
@@ -246,10 +247,11 @@ def measure(
 def _in_time(instrument: Instrument) -> PhotoDetector | None:
     """The instrument's detector, whose automatic exposure ends before the next one begins."""
     period_s = instrument.timing.frame_period_s
-    if instrument.detector is None or not period_s:
-        return instrument.detector
-    longest_s = max(instrument.detector.min_exposure_s, min(instrument.detector.max_exposure_s, period_s))
-    return replace(instrument.detector, max_exposure_s=longest_s)  # type: ignore[type-var]
+    detector = instrument.detector_in_use
+    if detector is None or not period_s:
+        return detector
+    longest_s = max(detector.min_exposure_s, min(detector.max_exposure_s, period_s))
+    return replace(detector, max_exposure_s=longest_s)  # type: ignore[type-var]
 
 
 def segmented(cloud: PointCloud) -> Segmentation:
@@ -258,20 +260,6 @@ def segmented(cloud: PointCloud) -> Segmentation:
 
     result = pcgraph.segment(cloud.points, colors=cloud.colors, viewpoint=(0.0, 0.0, 0.0))
     return Segmentation(result.supervoxels, result.labels, result.tree.parents, result.tree.altitudes)
-
-
-def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[Instrument]]]:
-    """Instruments that share camera, emitter and power, and so one transport pass; in order of first appearance.
-
-    Where something moves, each is on its own: it has its own time, and so its own truth.
-    """
-    if experiment.motion is not None:
-        return [(i.rig(scene, experiment.width, experiment.height), [i]) for i in experiment.instruments]
-    groups: dict[Rig, list[Instrument]] = {}
-    for instrument in experiment.instruments:
-        rig = instrument.rig(scene, experiment.width, experiment.height)
-        groups.setdefault(rig, []).append(instrument)
-    return list(groups.items())
 
 
 def noise_seed(experiment: Experiment, instrument: Instrument) -> int:

@@ -95,7 +95,9 @@ def taken(
         here = replace(settings, seed=derived_seed(seed, number, 0))
         signals = transport(scene, placed, [instrument.sensor], here)
         noise_seed = derived_seed(seed, number, 1)
-        capture = expose(signals, instrument.sensor, instrument.detector, instrument.exposure_s, noise_seed, ambient)
+        capture = expose(
+            signals, instrument.sensor, instrument.detector_in_use, instrument.exposure_s, noise_seed, ambient
+        )
         yield decode(capture, instrument.decoder), signals.truth
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a sensor reads of one light path; see `rangesim.response.base`."""
+"""Responses: the weights with which sensors count light paths. `rangesim.response.base` has the interface."""
 
 from rangesim.response.base import (
     CAUSTIC,

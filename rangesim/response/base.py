@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a sensor reads of one light path: a weight that depends on (u, v) and the path length.
+"""The interface of a response: the weight with which a sensor counts one light path.
 
-A range sensor is a linear functional of light paths. A path leaves the projector at (u, v), has the
-optical length l, and brings the radiance w to a pixel. A `DenseResponse` adds w * r_c(u, v, l) to
-each of its channels c; a `SparseResponse` adds w to one of many bins. Frames that a sensor can
-compute from other frames (an inverse pattern is white minus the pattern; four taps are two phasor
-components and the mean) are no channels: sensors declare the smallest basis, and build their frames
-from it.
+A range sensor is a linear functional of light paths. A path leaves the projector at (u, v), has the optical length l,
+and brings the radiance w to a pixel. A `DenseResponse` adds w * r_c(u, v, l) to each of its channels c; a
+`SparseResponse` adds w to one of many bins. A frame that a sensor can compute from other frames needs no channel of its
+own: an inverse pattern is the white image minus the pattern, and four taps are made of two phasor components and the
+mean. A sensor therefore declares the smallest basis, and builds its frames from that.
 
-The formulas are written once, over `Math`: NumPy evaluates them for tests and pattern images,
-the renderer evaluates them per light path.
+Each formula is written once, with the functions of `Math`. NumPy evaluates it for tests and pattern images, the
+renderer for every light path.
 """
 
 from __future__ import annotations
@@ -22,19 +21,19 @@ import numpy as np
 from rangesim.settings.config import Named
 
 KINDS = ("direct", "multipath", "specular", "caustic", "glint")
-"""Kinds of projector light, in the order of `rangesim.signals.EnergySplit`; a path's `kind` is an index."""
+"""Names of the kinds of projector light, in the order of `rangesim.signals.EnergySplit`, which explains them."""
 DIRECT, MULTIPATH, SPECULAR, CAUSTIC, GLINT = range(len(KINDS))
+"""Indices of these kinds, as `LightPath.kind` holds them."""
 
 
 class LightPath(NamedTuple):
-    """One light path, or arrays of them.
+    """One light path, or many of them as arrays.
 
-    u, v : projector pixel coordinates, 0 <= u <= width, 0 <= v <= height.
-    path_length_m : optical length from projector to camera, metres (refractive index included).
-    is_first : whether the camera sees the lit point directly or through delta surfaces only.
-    kind : unsigned, index into `KINDS`.
-    blur_px : standard deviation of the light's spread over the projector's image plane (defocus), projector pixels;
-        None: sharp.
+    u, v : projector pixel coordinates where the light leaves, 0 <= u <= width, 0 <= v <= height.
+    path_length_m : optical length from projector to camera, metres: each part is multiplied by its refractive index.
+    is_first : whether the camera sees the lit point directly or through mirrors and clear glass only.
+    kind : unsigned integer, index into `KINDS`.
+    blur_px : standard deviation of the projector's defocus blur at the lit point, projector pixels; None: in focus.
     """
 
     u: Any
@@ -46,7 +45,7 @@ class LightPath(NamedTuple):
 
 
 class Math(Protocol):
-    """The array functions a response may use."""
+    """The functions of arrays that a response may use."""
 
     def cos(self, x: Any) -> Any: ...
     def sin(self, x: Any) -> Any: ...
@@ -56,17 +55,17 @@ class Math(Protocol):
     def erf(self, x: Any) -> Any: ...
     def select(self, condition: Any, a: Any, b: Any) -> Any: ...
     def unsigned(self, x: Any) -> Any:
-        """`x` (>= 0) truncated to a 32-bit unsigned integer."""
+        """`x`, which is at least 0, truncated to a 32-bit unsigned integer."""
 
     def array(self, table: np.ndarray) -> Any:
-        """A flat float32 table that is read more than once."""
+        """A flat float32 table, made ready for several calls of `lookup`."""
 
     def lookup(self, table: Any, index: Any) -> Any:
-        """table[index] for a flat float32 table, from `array` or not."""
+        """table[index] of a flat float32 table: a NumPy array, or what `array` returned."""
 
 
 class NumpyMath:
-    """`Math` on NumPy arrays."""
+    """`Math` for NumPy arrays."""
 
     cos, sin, floor, abs, exp = np.cos, np.sin, np.floor, np.abs, np.exp
     select = staticmethod(np.where)
@@ -89,9 +88,10 @@ class NumpyMath:
 
 
 class Response(Named, ABC):
-    """A linear functional of light paths. Subclasses are frozen dataclasses.
+    """A linear functional of light paths: `DenseResponse` or `SparseResponse`.
 
-    A response with a `type_name` can be written to files of signals and read back, also one from outside the package.
+    Concrete subclasses are frozen dataclasses. One that has a `type_name` can be saved with signals and loaded again,
+    also if it comes from outside the package.
     """
 
     known: ClassVar[dict[str, type[Any]]] = {}
@@ -99,27 +99,45 @@ class Response(Named, ABC):
     """Name in files of signals; a response without one can be used, but not saved."""
 
     channels: int
-    """Number of channels (dense) or bins (sparse)."""
+    """Number of channels of a dense response, of bins of a sparse one."""
 
     def check(self, width: int, height: int) -> None:
-        """Raise ValueError if a projector of that many pixels cannot show this response."""
+        """Raise ValueError if a projector of width x height pixels cannot show this response. Most fit any."""
 
 
 class DenseResponse(Response):
-    """Every path counts in every channel, with a weight."""
+    """A response in which every path counts in every channel, with a weight.
+
+    Examples
+    --------
+    A channel that counts only light that travelled less than 3 m:
+
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True)
+    ... class Near(DenseResponse):
+    ...     channels = 1
+    ...     def weights(self, path, m):
+    ...         return [m.select(path.path_length_m < 3.0, 1.0, 0.0)]
+    >>> paths = LightPath(u=0.0, v=0.0, path_length_m=np.array([2.0, 4.0]), is_first=True)
+    >>> Near().weights(paths, NumpyMath())
+    [array([1., 0.])]
+    """
 
     @abstractmethod
     def weights(self, path: LightPath, m: Math) -> list[Any]:
-        """One real weight per channel."""
+        """Real weights of the path, one per channel."""
 
 
 class SparseResponse(Response):
-    """A path counts in one bin, with weight one, or in none; or in the few that `bin_weights` names."""
+    """A response in which a path counts in one bin with weight 1, or in none.
+
+    A subclass that overrides `bin_weights` spreads the path over a few bins instead.
+    """
 
     @abstractmethod
     def bin(self, path: LightPath, m: Math) -> Any:
-        """Unsigned bin index; an index >= `channels` means none."""
+        """Unsigned index of the path's bin; an index of `channels` or more means that the path counts nowhere."""
 
     def bin_weights(self, path: LightPath, m: Math) -> list[tuple[Any, Any]]:
-        """Unsigned bin indices, each with the weight that the path has there."""
+        """Pairs of an unsigned bin index and the weight of the path in that bin."""
         return [(self.bin(path, m), 1.0)]

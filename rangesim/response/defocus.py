@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Patterns of a projector out of focus, in closed form.
 
-A surface point out of focus sees the pattern through a disc of the projector's image plane. The disc is approximated by
-a Gaussian of its standard deviation sigma (a quarter of its diameter), in projector pixels; the pattern is then
-filtered before it is read, instead of sampled over the lens. The functions work over `rangesim.response.Math`.
+A surface point that is out of focus receives light from a disc of the projector's image plane (the circle of
+confusion). Here the disc is replaced by a Gaussian with the same standard deviation sigma, a quarter of the disc's
+diameter, in projector pixels. The pattern is filtered with this Gaussian before it is read, so nothing has to be
+sampled over the lens. The functions are written with `rangesim.response.Math`.
 """
 
 from __future__ import annotations
@@ -16,77 +17,90 @@ if TYPE_CHECKING:
     from rangesim.response.base import Math
 
 ROOT_HALF = 0.5**0.5
-SHARPEST = 1e-5
-"""Smallest sigma, in periods or pixels: keeps an edge that is read at its place from 0 / 0."""
-SWITCH = 0.075
-"""Sigma in periods from which on harmonics stand for the stripes; both forms are then within 5e-4."""
+"""1 / sqrt(2), dimensionless: the Gaussian's integral up to x is 0.5 + 0.5 erf(x ROOT_HALF / sigma)."""
+MIN_SIGMA = 1e-5
+"""Smallest sigma, in periods or pixels, so that a point exactly on an edge does not divide 0 by 0. It is far below what
+shows: an edge is then a step."""
+MIN_HARMONIC_SIGMA = 0.075
+"""Sigma in periods from which on `blurred_stripes` sums harmonics instead of taking the nearest edge. Here both forms
+are within 5e-4 of the exact stripes; a larger value is worse for the edge, a smaller one for the harmonics."""
 
 
 def blurred_stripes(x: Any, period: float, sigma: Any, m: Math) -> Any:
-    """Stripes 0 1 1 0 of the given period, dark first, blurred by a Gaussian of standard deviation `sigma`.
+    """Value at x of stripes (a quarter dark, half bright, a quarter dark) blurred by a Gaussian.
 
-    Little blur: the nearest edge, an error function; the next one is left out, less than Q(0.25 / SWITCH), the
-    Gaussian's tail. Much blur: mean and harmonics k = 1, 3, 5 of the square wave, each times
-    exp(-2 (pi k sigma / P)^2); the seventh is below 2 / (7 pi) exp(-98 (pi SWITCH)^2).
+    Below `MIN_HARMONIC_SIGMA` the value is that of the nearest edge, an error function; neglected is the next edge,
+    less than the Gaussian's tail Q(0.25 / MIN_HARMONIC_SIGMA). Above, it is the mean and the harmonics k = 1, 3, 5 of
+    the square wave, each times exp(-2 (pi k sigma / P)^2); neglected is the seventh, less than
+    2 / (7 pi) exp(-98 (pi MIN_HARMONIC_SIGMA)^2).
+
+    Parameters
+    ----------
+    x, period, sigma : position, period P of the stripes and standard deviation of the blur, in one unit (pixels).
     """
     phase = x * (1 / period)
     phase = phase - m.floor(phase)
-    into = 0.25 - m.abs(phase - 0.5)  # periods from the nearest edge, > 0 inside the bright stripe
+    into = 0.25 - m.abs(phase - 0.5)  # distance in periods to the nearest edge, positive inside the bright stripe
     spread = sigma * (1 / period)
-    edge = 0.5 + 0.5 * m.erf(into * (ROOT_HALF / m.select(spread > SHARPEST, spread, SHARPEST)))
+    edge = 0.5 + 0.5 * m.erf(into * (ROOT_HALF / m.select(spread > MIN_SIGMA, spread, MIN_SIGMA)))
     h, c = m.exp(-2 * np.pi**2 * spread * spread), m.cos(2 * np.pi * phase)
     h4, cc = h * h * h * h, c * c
     h9, h16 = h4 * h4 * h, h4 * h4 * h4 * h4
-    third, fifth = 4 * cc - 3, (16 * cc - 20) * cc + 5  # cos 3x and cos 5x, over cos x
+    third, fifth = 4 * cc - 3, (16 * cc - 20) * cc + 5  # cos(3a) / cos(a) and cos(5a) / cos(a), a = 2 pi phase
     harmonics = c * (h - h9 * third * (1 / 3) + h9 * h16 * fifth * (1 / 5))
-    return m.select(spread < SWITCH, edge, 0.5 - 2 / np.pi * harmonics)
+    return m.select(spread < MIN_HARMONIC_SIGMA, edge, 0.5 - 2 / np.pi * harmonics)
 
 
 def fringe_contrast(period: float, sigma: Any, m: Math) -> Any:
-    """Factor on the modulation of a sinusoid: exp(-2 pi^2 sigma^2 / P^2) of the blur, sinc(1 / P) of the pixels.
+    """Factor by which blur and pixels lower the contrast of sinusoidal fringes with the period P.
 
-    Pixels hold the value at their centre over their width (zero-order hold). The steps' own harmonics, near one per
-    pixel, are neglected.
+    The blur contributes exp(-2 pi^2 sigma^2 / P^2). The pixels contribute sinc(1 / P), because each shows the value at
+    its centre over its whole width (zero-order hold); the harmonics of these steps, about one period per pixel, are
+    neglected.
     """
     spread = sigma * (1 / period)
     return m.exp(-2 * np.pi**2 * spread * spread) * float(np.sinc(1 / period))
 
 
-FINEST = 0.5
-"""Sigma in pixels up to which the nine nearest pixels are read, each with the Gaussian's weight."""
-STEP = 2.0
-"""Ratio of variances between blurred copies."""
+MAX_READ_SIGMA_PX = 0.5
+"""Blur, as a sigma in pixels, that reading the nine nearest pixels adds; stronger blur is in the copies. At 0.5, less
+than 2.3 % (Q(2)) of the Gaussian lies beyond the neighbouring pixels; a larger value would need more than nine."""
+VARIANCE_RATIO = 2.0
+"""Ratio of the variances of two successive copies. A smaller one interpolates more closely and needs more copies."""
 COPIES = 9
+"""Number of copies of a pattern: with the ratio 2 they reach a sigma of 8 pixels, and take 36 bytes per pixel."""
 
 
 class BlurredImage:
-    """A pattern and Gaussian-blurred copies of it, dark outside.
+    """A pattern with Gaussian-blurred copies of it; outside the pattern it is dark.
 
-    A blur of up to `FINEST` is read exactly, but for the Gaussian's tails beyond the neighbouring pixels. A stronger
-    one is split: the reading blurs by `FINEST`, and the copies hold the rest, so that their variances are FINEST^2
-    times 1, 2, 4 ... 256 (sigma 0.5 ... 8 pixels; a stronger blur reads the last copy). Between copies the value is
-    linear in the variance, as the heat equation has it for small steps. 36 bytes per pixel.
+    A blur of at most `MAX_READ_SIGMA_PX` is computed while reading, exactly but for the Gaussian's tails beyond the
+    neighbouring pixels. A stronger blur is split in two: reading adds MAX_READ_SIGMA_PX, and the copies hold the rest,
+    so that the variances of both together are MAX_READ_SIGMA_PX^2 times 1, 2, 4 ... 256 (sigma 0.5 to 8 pixels). A
+    still stronger blur reads the last copy. Between two copies the value is interpolated linearly in the variance: by
+    the heat equation it is linear there for small steps.
 
     Parameters
     ----------
-    pattern : (height, width) float32; each pixel a uniform square.
+    pattern : (height, width) float32; each pixel is a uniform square.
     """
 
     def __init__(self, pattern: np.ndarray) -> None:
-        sharp = np.pad(np.asarray(pattern, dtype=np.float32), 1)  # what is blurred reaches beyond the pattern's edge
+        sharp = np.pad(np.asarray(pattern, dtype=np.float32), 1)  # blurred light also falls just outside the pattern
         self.height, self.width = sharp.shape
-        self.copies = np.stack([_smooth(sharp, FINEST**2 * (STEP**k - 1)) for k in range(COPIES)]).ravel()
+        variances = [MAX_READ_SIGMA_PX**2 * (VARIANCE_RATIO**k - 1) for k in range(COPIES)]
+        self.copies = np.stack([_smooth(sharp, variance) for variance in variances]).ravel()
 
     def at(self, u: Any, v: Any, sigma: Any, m: Math) -> Any:
-        """Value at pixel coordinates (u, v) with a blur of standard deviation `sigma` pixels."""
-        variance = sigma * sigma * (1 / FINEST**2)
-        copy, base = 0.0 * variance, 1.0 + 0.0 * variance  # the copy below, and its variance
+        """Value of the pattern at pixel coordinates (u, v), blurred with the standard deviation `sigma`, pixels."""
+        variance = sigma * sigma * (1 / MAX_READ_SIGMA_PX**2)
+        copy, base = 0.0 * variance, 1.0 + 0.0 * variance  # index and relative variance of the copy with less blur
         for k in range(1, COPIES - 1):
-            beyond = variance >= STEP**k
-            copy, base = m.select(beyond, float(k), copy), m.select(beyond, STEP**k, base)
-        fraction = m.select(variance < STEP ** (COPIES - 1), variance / base, STEP) - 1
-        fraction = m.select(fraction > 0, fraction * (1 / (STEP - 1)), 0.0)
-        sigma = m.select(sigma < FINEST, sigma, FINEST)
+            beyond = variance >= VARIANCE_RATIO**k
+            copy, base = m.select(beyond, float(k), copy), m.select(beyond, VARIANCE_RATIO**k, base)
+        fraction = m.select(variance < VARIANCE_RATIO ** (COPIES - 1), variance / base, VARIANCE_RATIO) - 1
+        fraction = m.select(fraction > 0, fraction * (1 / (VARIANCE_RATIO - 1)), 0.0)
+        sigma = m.select(sigma < MAX_READ_SIGMA_PX, sigma, MAX_READ_SIGMA_PX)
         columns, rows = _taps(u + 1, self.width, sigma, m), _taps(v + 1, self.height, sigma, m)
         copies, offset = m.array(self.copies), m.unsigned(copy) * (self.height * self.width)
         total = 0.0 * u
@@ -99,9 +113,13 @@ class BlurredImage:
 
 
 def _taps(x: Any, size: int, sigma: Any, m: Math) -> list[tuple[Any, Any]]:
-    """Indices and weights of the three pixels about `x`: the fractions of a Gaussian on each, 0 outside the image."""
+    """Pairs of index and weight for the three pixels around `x` along one axis of the image.
+
+    A weight is the part of the Gaussian that falls on the pixel and, for the two outer ones, beyond; it is 0 outside
+    the image.
+    """
     pixel = m.floor(x)
-    scale = ROOT_HALF / m.select(sigma > SHARPEST, sigma, SHARPEST)
+    scale = ROOT_HALF / m.select(sigma > MIN_SIGMA, sigma, MIN_SIGMA)
     before, after = (0.5 + 0.5 * m.erf((pixel + edge - x) * scale) for edge in (0.0, 1.0))
     taps = []
     for place, weight in ((pixel - 1, before), (pixel, after - before), (pixel + 1, 1 - after)):
@@ -111,9 +129,10 @@ def _taps(x: Any, size: int, sigma: Any, m: Math) -> list[tuple[Any, Any]]:
 
 
 def _smooth(image: np.ndarray, variance: float) -> np.ndarray:
-    """`image` convolved with the taps whose frequency response is the Gaussian's up to half a cycle per pixel.
+    """The image blurred by a Gaussian of the given variance, pixels^2.
 
-    Sampled Gaussians narrower than a pixel have neither its variance nor its response.
+    The taps of the filter have the Gaussian's frequency response up to half a cycle per pixel. Taps that sample the
+    Gaussian itself would have neither its variance nor its response where it is narrower than a pixel.
     """
     from scipy.ndimage import correlate1d
 

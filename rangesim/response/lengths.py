@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Responses to how far light went: modulation, first return, time bins."""
+"""Responses to the length of light paths: modulated light, first return, histograms."""
 
 from __future__ import annotations
 
@@ -12,20 +12,34 @@ from rangesim.response.base import KINDS, DenseResponse, LightPath, Math, Sparse
 from rangesim.settings.bounds import Bounds, Hertz, check_fields, whole
 
 SPEED_OF_LIGHT = 299_792_458.0
-"""Metres per second in vacuum, exact."""
-
-
+"""Speed of light in vacuum, metres per second, exact by the definition of the metre."""
 StartLength = Annotated[float, Bounds("a length in metres", -1e6, 1e6)]
+"""Path length at which the first bin begins, metres; negative where bins begin before the pulse."""
 BinLength = Annotated[float, Bounds("positive and finite", 1e-8, 1e6)]
+"""Width of a bin, metres of path length: 1e-8 m is light's way in 0.03 fs, shorter than one period of the light."""
 Period = Annotated[float, Bounds("positive and finite", 1e-8, 1e9)]
+"""Path length between two pulses, metres; 1e9 m is 3 s."""
 
 
 @dataclass(frozen=True)
 class Phasor(DenseResponse):
-    """Correlation of the returned modulation with a reference in phase and in quadrature, over 2 pi f l / c.
+    """Correlation of modulated light with a reference in phase and one in quadrature (AMCW).
 
-    A sine source gives cos and sin; a square source and a square reference give triangle waves of the same
-    period, which hold odd harmonics (the "wiggling" error of AMCW cameras).
+    The weights of a path of length l are cos and sin of the phase 2 pi f l / c. With a square source and a square
+    reference they are triangle waves of the same period instead; their odd harmonics cause the "wiggling" error of AMCW
+    cameras.
+
+    Parameters
+    ----------
+    modulation_hz : frequency f of the modulation, hertz.
+    square : whether source and reference are square waves instead of sines.
+
+    Examples
+    --------
+    >>> from rangesim.response import LightPath, NumpyMath
+    >>> path = LightPath(u=0.0, v=0.0, path_length_m=SPEED_OF_LIGHT / 20e6 / 8, is_first=True)  # an eighth of a period
+    >>> [round(float(weight), 3) for weight in Phasor(20e6).weights(path, NumpyMath())]
+    [0.707, 0.707]
     """
 
     modulation_hz: Hertz
@@ -44,13 +58,23 @@ class Phasor(DenseResponse):
 
 
 def _triangle(phase: Any, m: Math) -> Any:
-    """Triangle wave of period 1 with value 1 at 0 and -1 at 1/2."""
+    """Triangle wave of period 1 whose value is 1 at 0 and -1 at 1/2."""
     return 4 * m.abs(phase - m.floor(phase) - 0.5) - 1
 
 
 @dataclass(frozen=True)
 class FirstReturn(DenseResponse):
-    """Radiance, and radiance times path length, of the paths that are lit where the camera looks."""
+    """Radiance, and radiance times path length, of the first return: light from the point that the camera sees.
+
+    The quotient of the two channels is the mean path length of that light, in metres.
+
+    Examples
+    --------
+    >>> from rangesim.response import LightPath, NumpyMath
+    >>> paths = LightPath(0.0, 0.0, np.array([1.5, 2.0]), is_first=np.array([True, False]))
+    >>> FirstReturn().weights(paths, NumpyMath())
+    [array([1., 0.]), array([1.5, 0. ])]
+    """
 
     channels: ClassVar[int] = 2  # type: ignore[misc]
     type_name: ClassVar[str] = "FirstReturn"
@@ -62,11 +86,30 @@ class FirstReturn(DenseResponse):
 
 @dataclass(frozen=True)
 class TransientHistogram(SparseResponse):
-    """Histogram over the path length (round trip), `channels` bins from `start_m`, `width_m` each.
+    """Histogram of the path length from projector to camera (the round trip).
 
-    With a `period_m`, lengths that differ by a multiple of it are one: those of light that is sent out again and again.
-    `is_shared`: a path counts in the two bins whose centres are next to it, in proportion to how near they are (linear
-    binning), so that the mean length is kept, whatever the width.
+    Parameters
+    ----------
+    start_m : path length at which the first bin begins, metres.
+    width_m : width of a bin, metres of path length.
+    channels : number of bins.
+    period_m : path length between two pulses, metres, at least that of all bins. Lengths that differ by a multiple of
+        it fall into the same bin, as light of successive pulses does. None: one single pulse.
+    is_shared : whether a path is shared between the two bins whose centres are nearest, in proportion to how near they
+        are (linear binning). This keeps the mean length, whatever the width of the bins.
+
+    Raises
+    ------
+    ValueError
+        A value out of its bounds, or a period shorter than all bins together.
+
+    Examples
+    --------
+    >>> from rangesim.response import LightPath, NumpyMath
+    >>> histogram = TransientHistogram(start_m=1.0, width_m=0.5, channels=4)
+    >>> paths = LightPath(0.0, 0.0, np.array([1.1, 2.7, 9.0]), is_first=True)
+    >>> histogram.bin(paths, NumpyMath())  # 4: the last path counts in none of the bins 0 to 3
+    array([0, 3, 4], dtype=uint32)
     """
 
     start_m: StartLength
@@ -88,7 +131,7 @@ class TransientHistogram(SparseResponse):
     def bin_weights(self, path: LightPath, m: Math) -> list[tuple[Any, Any]]:
         if not self.is_shared:
             return super().bin_weights(path, m)
-        start_m = self.start_m - self.width_m / 2  # so that whole numbers are the centres, of the bin before
+        start_m = self.start_m - self.width_m / 2  # whole numbers then are bin centres: n is that of bin n - 1
         place = _place(path, m, start_m, self.width_m, self.channels, self.period_m)
         upper = m.floor(place)
         lower, weight = upper - 1, place - upper
@@ -102,10 +145,20 @@ class TransientHistogram(SparseResponse):
 
 @dataclass(frozen=True)
 class LengthSplit(SparseResponse):
-    """The energy split per path length: `bins` bins from `start_m`, `width_m` each, for every one of `KINDS`.
+    """A `TransientHistogram` for each kind of light: the energy split by path length.
 
-    Channels are kind-major: channel kind * bins + bin. Their sum over the kinds is that of `TransientHistogram`,
-    their sum over the bins the `rangesim.signals.EnergySplit` of what lies within them. `period_m` as there.
+    Channel kind * bins + bin holds the light of `KINDS[kind]` in a bin. The sum over kinds is the `TransientHistogram`
+    with the same bins; the sum over bins is the `rangesim.signals.EnergySplit` of the light within them.
+
+    Parameters
+    ----------
+    start_m, width_m, period_m : see `TransientHistogram`.
+    bins : number of bins for each kind.
+
+    Examples
+    --------
+    >>> LengthSplit(start_m=0.0, width_m=0.1, bins=100).channels
+    500
     """
 
     start_m: StartLength
@@ -137,21 +190,24 @@ def _check_period(period_m: float | None, width_m: float, bins: int) -> None:
 def _length_bin(
     path: LightPath, m: Math, start_m: float, width_m: float, bins: int, period_m: float | None
 ) -> tuple[Any, Any]:
-    """Place of a path length in bins, and whether it is in any of them."""
+    """Position of the path length on the axis of the bins, in bin widths, and whether it lies in one of them."""
     place = _place(path, m, start_m, width_m, bins, period_m)
     return place, (place >= 0) & (place < bins)
 
 
 def _place(path: LightPath, m: Math, start_m: float, width_m: float, bins: int, period_m: float | None) -> Any:
-    """Place of a path length in bins; in 0 .. period, if there is one."""
+    """Position of the path length on the axis of the bins, in bin widths from the start of the first.
+
+    With a period the position is reduced to 0 <= position < period.
+    """
     place = (path.path_length_m - start_m) * (1 / width_m)
     if period_m is None:
         return place
     period = float(bins) if _fills(period_m, width_m, bins) else period_m / width_m
     place = place - period * m.floor(place * (1 / period))
-    return m.select((place < 0) | (place >= period), 0.0, place)  # rounded there
+    return m.select((place < 0) | (place >= period), 0.0, place)  # rounding can leave it just outside
 
 
 def _fills(period_m: float, width_m: float, bins: int) -> bool:
-    """Whether the bins leave no gap in the period but for rounding."""
+    """Whether the bins fill the period, up to rounding."""
     return abs(period_m / width_m - bins) < 1e-6 * bins

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Responses to where light left the projector: Gray code, fringes, images."""
+"""Responses to the projector pixel that light left: Gray code, fringes, images."""
 
 from __future__ import annotations
 
@@ -17,20 +17,39 @@ from rangesim.settings.bounds import Bounds, check_fields
 from rangesim.settings.config import shown
 
 Axis = Annotated[int, Bounds("0 (columns) or 1 (rows)", 0, 1)]
+"""Axis along which a pattern varies: 0 for columns (u), 1 for rows (v). It is the index of u or v in `LightPath`."""
 
 
 @dataclass(frozen=True)
 class GrayBits(DenseResponse):
-    """Bits of the Gray code of the projector column or row, most significant first; pixels are squares.
+    """Bits of the Gray code of the projector column or row, one channel per bit, the most significant first.
 
-    Out of focus, the edges of the stripes become error functions.
+    In focus, a pixel is a uniform square. Out of focus, the edges of the stripes are error functions.
+
+    Parameters
+    ----------
+    axis : 0 for columns (u), 1 for rows (v).
+    bits : number of bits of the code.
+    shift : number of the finest bits to leave out.
+
+    Raises
+    ------
+    ValueError
+        A value out of its bounds, or no bit left.
+
+    Examples
+    --------
+    Column 5 has the Gray code 5 ^ (5 >> 1) = 0b111:
+
+    >>> from rangesim.response import LightPath, NumpyMath
+    >>> path = LightPath(u=np.array([5.5]), v=np.array([0.5]), path_length_m=1.0, is_first=True)
+    >>> [int(bit[0]) for bit in GrayBits(axis=0, bits=4).weights(path, NumpyMath())]
+    [0, 1, 1, 1]
     """
 
     axis: Axis
-    """0: columns (u), 1: rows (v)."""
     bits: Annotated[int, Bounds("a number of bits", 1, 32)]
     shift: Annotated[int, Bounds("a number of bits", 0, 31)] = 0
-    """Finest bits left out."""
 
     type_name: ClassVar[str] = "GrayBits"
 
@@ -54,9 +73,21 @@ class GrayBits(DenseResponse):
 
 @dataclass(frozen=True)
 class Fringes(DenseResponse):
-    """cos and sin of the phase 2 pi x / period along the projector columns or rows, x continuous.
+    """Sinusoidal fringes: cos and sin of the phase 2 pi x / period along the projector's columns or rows.
 
-    Out of focus, and where the projector's pixels are finite, they lose contrast.
+    The coordinate x is continuous. Out of focus, the blur and the width of the projector's pixels lower the contrast.
+
+    Parameters
+    ----------
+    axis : 0 for columns (u), 1 for rows (v).
+    period_px : period of the fringes, projector pixels.
+
+    Examples
+    --------
+    >>> from rangesim.response import LightPath, NumpyMath
+    >>> path = LightPath(u=4.0, v=0.0, path_length_m=1.0, is_first=True)
+    >>> [round(float(weight), 9) for weight in Fringes(axis=0, period_px=16.0).weights(path, NumpyMath())]
+    [0.0, 1.0]
     """
 
     axis: Axis

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera and emitter: intrinsics, poses, lenses, calibration files."""
+"""Rigs of a camera and an emitter: intrinsics, the camera model, lenses, poses, and calibration files."""
 
 from rangesim.rig.rig import (
     CAMERA_LENS,

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigs from calibration files: procam-calibration's OpenCV XML, and our own JSON.
+"""Rigs in calibration files: the OpenCV XML of procam-calibration, and a JSON format of our own.
 
-OpenCV has pixel centres at integer coordinates, we have them at integer + 0.5: principal points move by 0.5.
-OpenCV's stereo calibration maps the first device's coordinates to the second's, X_projector = R X_camera + T,
-here in millimetres; our `T_camera_projector` is the inverse, in metres.
+The two conventions differ. OpenCV has pixel centres at integer coordinates; here they lie at integer + 0.5, so
+principal points move by 0.5 pixels. The stereo calibration of OpenCV maps camera coordinates to projector coordinates,
+X_projector = R X_camera + T, usually in millimetres; `T_camera_projector` is the inverse, in metres.
 """
 
 from __future__ import annotations
@@ -23,18 +23,20 @@ from rangesim.settings.bounds import Bounds, check_number, whole
 from rangesim.settings.config import shown, to_dict
 
 SEAL = "rangesim-calibration"
-"""By which `rangesim calibrate` knows the files that it may replace; see `pcgraph.plumbing.plain_files.sealed`."""
+"""Mark of a file that `rangesim calibrate` wrote and may replace; see `pcgraph.plumbing.plain_files.sealed`."""
 MAX_NUMBER = 1e9
-"""Of a number in a calibration file: pixels, millimetres, coefficients."""
-_SHAPES = {
+"""Largest absolute value of a number in an XML file, whatever its unit (pixels, millimetres, coefficients): far above
+any real one, so that only broken files are refused."""
+_MATRIX_SIZES = {
     "img_shape": 2,
     "cam_int": 9,
     "cam_dist": 5,
     "proj_int": 9,
     "proj_dist": 5,
-    "roration": 9,  # spelt so in the files
+    "roration": 9,  # procam-calibration spells it so
     "translation": 3,
 }
+"""Number of values in each matrix of the XML file, by its name there."""
 
 
 def load_calibration(
@@ -43,17 +45,18 @@ def load_calibration(
     code_step: int = 1,
     unit_m: float = 1e-3,
 ) -> Rig:
-    """Rig of a calibration file.
+    """The rig that a calibration file holds.
 
     Parameters
     ----------
-    path : `.xml`, OpenCV FileStorage as kamino410/procam-calibration writes it; or `.json`, as
-        `save_calibration`.
-    projector_size : (width, height) of the coded area in cells of `code_step` pixels; XML files do not hold
-        it, so it is required for them.
-    code_step : int, projector pixels per cell of the Gray code at calibration (procam-calibration's
-        graycode_step). The rig's projector then has the cells for pixels.
-    unit_m : float, metres per unit of length of an XML file (there, of its chessboard's square); millimetres.
+    path : a `.json` file that `save_calibration` wrote, or an `.xml` file (OpenCV FileStorage) of
+        kamino410/procam-calibration.
+    projector_size : (width, height) of the coded area, in cells of `code_step` pixels. Required for XML files, which do
+        not hold it.
+    code_step : int, projector pixels per cell of the Gray code during the calibration (`graycode_step` of
+        procam-calibration). The projector of the rig has these cells as its pixels.
+    unit_m : float, metres per unit of length in an XML file, which is the unit of its chessboard squares; default
+        millimetres.
 
     Raises
     ------
@@ -85,7 +88,8 @@ def load_calibration(
 def save_calibration(rig: Rig, path: str | Path) -> None:
     """Write a rig as JSON; `load_calibration` reads it back equal.
 
-    The key "seal" holds the SHA-256 of the file: who corrects the file by hand makes it their own.
+    The key "seal" holds the SHA-256 of the file. After a correction by hand it no longer matches, and no command
+    overwrites the file any more.
     """
     text = json.dumps({**to_dict(rig), "seal": unsealed(SEAL)}, indent=1) + "\n"
     write_file(Path(path), sealed(text.encode(), SEAL, at_end=True), FileFormatError, make_parents=True)
@@ -105,7 +109,7 @@ def _read_opencv(path: Path) -> dict[str, np.ndarray]:
     check_xml(path)
     root = ET.parse(path).getroot()
     values = {}
-    for name, size in _SHAPES.items():
+    for name, size in _MATRIX_SIZES.items():
         text = root.findtext(f"{name}/data")
         if text is None:
             raise FileFormatError(f"{path}: expected a matrix {name!r} as procam-calibration writes it, found none.")

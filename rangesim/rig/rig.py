@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the camera and the emitter are, and how their pixels map to rays."""
+"""A rig: a camera and an emitter, their lenses, and their poses.
+
+Coordinates of a device follow OpenCV: x right, y down, z forward, metres. `T_a_b` maps coordinates of b to coordinates
+of a.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,8 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangesim.rig.distortion import distort, fold_radius2, undistort
+from rangesim.rig import camera_model
+from rangesim.rig.camera_model import CameraModel, fold_radius2
 from rangesim.settings import limits
 from rangesim.settings.bounds import (
     MAX_COORDINATE_M,
@@ -18,6 +23,7 @@ from rangesim.settings.bounds import (
     Exponent,
     Metres,
     Watts,
+    Wavelength,
     check_fields,
     check_number,
     whole,
@@ -25,31 +31,51 @@ from rangesim.settings.bounds import (
 from rangesim.settings.config import from_dict, shown, to_dict
 
 Array = NDArray[np.float64]
+"""An array of float64."""
 
 SAME_PLACE = 1e-5
-"""Metres and radians; emitters no farther apart are in one place."""
+"""Largest difference of two poses, in metres and radians, that count as the same place. Poses that were computed along
+different ways differ by rounding, about 1e-16; 10 um is less than anybody can adjust a device."""
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R R^T - I|, dimensionless, of a matrix that counts as a rotation. A matrix written with five
 decimals is off by at most 2e-5 and passes; a scale of 1.0001 does not."""
 RESIDUAL_PX = 1e-3
-"""Where the inverse of a lens model reprojects worse than this, there is none."""
-
-
+"""Pixels by which a ray may miss its pixel when it is projected again; if it misses by more, the pixel has no ray.
+Newton's method ends far below this where the lens model has an inverse, and far above where it has none."""
 FocalLength = Annotated[float, Bounds("positive and finite", 1e-3, 1e9)]
-"""Pixels."""
+"""A focal length in pixels."""
 PrincipalPoint = Annotated[float, Bounds("a pixel coordinate", -1e9, 1e9)]
+"""A coordinate of the principal point in pixels; it may lie outside the image."""
 Coefficient = Annotated[float, Bounds("a coefficient", -1e6, 1e6)]
+"""A coefficient of distortion, dimensionless."""
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Pinhole with Brown-Conrady distortion, OpenCV's model and axes: x right, y down, z forward.
+    """Intrinsics of a camera or projector: a pinhole with Brown-Conrady distortion, the model of OpenCV.
+
+    Pixel coordinates (x, y) begin at the upper left corner of the image. Pixel centres lie at integer + 0.5 (OpenCV has
+    them at integers), so the middle of the image is (width / 2, height / 2).
 
     Parameters
     ----------
-    width, height : int, pixels
-    fx, fy, cx, cy : float, pixels; pixel centres lie at integer + 0.5: the middle of an image is (width/2, height/2).
-    distortion : tuple of 0 to 5 floats, OpenCV's order k1, k2, p1, p2, k3.
+    width, height : int, size of the image, pixels.
+    fx, fy : float, focal lengths, pixels.
+    cx, cy : float, principal point, pixels.
+    distortion : tuple of 0 to 5 floats, the coefficients k1, k2, p1, p2, k3 in OpenCV's order; missing ones are 0.
+
+    Raises
+    ------
+    ValueError
+        A value out of its bounds, more than five coefficients, or more pixels than `rangesim.settings.limits` allows.
+
+    Examples
+    --------
+    >>> camera = Intrinsics(640, 480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+    >>> camera.project([0.1, 0.0, 1.0])
+    array([370., 240.])
+    >>> camera.directions([370.0, 240.0])
+    array([0.1, 0. , 1. ])
     """
 
     width: Annotated[int, whole(1)]
@@ -68,7 +94,15 @@ class Intrinsics:
 
     @classmethod
     def from_fov(cls, width: int, height: int, fov_x_deg: float) -> Intrinsics:
-        """Square pixels, principal point in the centre, horizontal field of view in degrees."""
+        """Intrinsics with square pixels, the principal point in the middle, and no distortion.
+
+        fov_x_deg : horizontal field of view, degrees.
+
+        Examples
+        --------
+        >>> round(Intrinsics.from_fov(640, 480, fov_x_deg=90.0).fx, 6)
+        320.0
+        """
         check_number("fov_x_deg", fov_x_deg, Bounds("degrees between 0 and 180", 1e-6, 180 - 1e-6))
         for name, value in (("width", width), ("height", height)):
             check_number(name, value, whole(1))
@@ -76,7 +110,10 @@ class Intrinsics:
         return cls(width, height, float(f), float(f), width / 2, height / 2)
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """The same lens with another pixel count; the horizontal field of view and the shape of pixels are kept."""
+        """Intrinsics of the same lens with another number of pixels.
+
+        The horizontal field of view and the shape of the pixels stay the same.
+        """
         for name, value in (("width", width), ("height", height)):
             check_number(name, value, whole(1, "pixels"))
         scale = width / self.width
@@ -84,42 +121,48 @@ class Intrinsics:
         return Intrinsics(width, height, self.fx * scale, self.fy * scale, cx, cy, self.distortion)
 
     def pixel_centres(self, rows: slice = slice(None)) -> Array:
-        """(height, width, 2) pixel coordinates (x, y) of the pixel centres, of all rows or some."""
+        """(height, width, 2) float64, pixel coordinates (x, y) of the pixel centres.
+
+        rows : the rows to return; default all.
+        """
         x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height)[rows] + 0.5)
         return np.stack([x, y], axis=-1)
 
     def normalise(self, pixels: ArrayLike) -> Array:
-        """(..., 2) undistorted image-plane coordinates x/z, y/z of pixel coordinates (..., 2).
+        """(..., 2) float64, undistorted coordinates x/z, y/z on the image plane of pixel coordinates (..., 2).
 
-        NaN where the distortion has no inverse: beyond the radius at which its polynomial turns round.
+        NaN where the distortion has no inverse, that is beyond the radius at which its polynomial turns round.
         """
         pixels = np.asarray(pixels, dtype=np.float64)
-        target_x, target_y = (pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy
+        u, v = pixels[..., 0], pixels[..., 1]
         if not any(self.distortion):
-            return np.stack([target_x, target_y], axis=-1)
+            return np.stack(camera_model.from_pixel(self.model, u, v), axis=-1)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            x, y = undistort(self.coefficients, target_x, target_y)
-            image = distort(self.coefficients, x, y)
-            off = np.hypot((image.x - target_x) * self.fx, (image.y - target_y) * self.fy)
-            inverse = (off <= RESIDUAL_PX) & (x * x + y * y < self.fold_radius2) & (image.jacobian > 0)
-        return np.where(inverse[..., None], np.stack([x, y], axis=-1), np.nan)
+            x, y, exists = camera_model.unproject(self.model, u, v, RESIDUAL_PX)
+        result = np.stack([x, y], axis=-1)
+        result[~exists] = np.nan
+        return result
 
     def project(self, points: ArrayLike) -> Array:
-        """(..., 2) pixel coordinates of points (..., 3) in coordinates of this device; NaN behind it and beyond the
-        radius at which the distortion turns round."""
+        """(..., 2) float64, pixel coordinates of points (..., 3) in coordinates of this device, metres.
+
+        NaN behind the device, and beyond the radius at which the distortion turns round.
+        """
         points = np.asarray(points, dtype=np.float64)
-        z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
-        xy = points[..., :2] / z
-        if any(self.distortion):
-            x, y = xy[..., 0], xy[..., 1]
-            image = distort(self.coefficients, x, y)
-            appears = (x * x + y * y < self.fold_radius2) & (image.jacobian > 0)
-            xy = np.where(appears[..., None], np.stack([image.x, image.y], axis=-1), np.nan)
-        return xy * [self.fx, self.fy] + [self.cx, self.cy]
+        z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
+        x, y = points[..., 0] / z, points[..., 1] / z
+        if not any(self.distortion):
+            return np.stack(camera_model.to_pixel(self.model, x, y), axis=-1)
+        u, v, appears = camera_model.project(self.model, x, y)
+        result = np.stack([u, v], axis=-1)
+        result[~appears] = np.nan
+        return result
 
     def directions(self, pixels: ArrayLike) -> Array:
-        """(..., 3) ray directions with z = 1 (not unit length) through pixel coordinates (..., 2); NaN where
-        `normalise` is."""
+        """(..., 3) float64, directions of the rays through pixel coordinates (..., 2), scaled to z = 1.
+
+        NaN where `normalise` has NaN.
+        """
         xy = self.normalise(pixels)
         result = np.ones((*xy.shape[:-1], 3))
         result[..., :2] = xy
@@ -127,17 +170,31 @@ class Intrinsics:
 
     @property
     def coefficients(self) -> tuple[float, float, float, float, float]:
-        """k1, k2, p1, p2, k3, the missing ones 0."""
+        """All five coefficients k1, k2, p1, p2, k3; missing ones are 0."""
         return (*self.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]  # type: ignore[return-value]
 
     @property
     def fold_radius2(self) -> float:
-        """See `rangesim.rig.distortion.fold_radius2`."""
+        """Squared radius on the image plane at which the distortion folds the image; infinity if it does not."""
         return fold_radius2(self.coefficients)
+
+    @property
+    def model(self) -> CameraModel:
+        """The parameters as `rangesim.rig.camera_model` and kernels take them."""
+        fx, fy, cx, cy, *coefficients = map(float, (self.fx, self.fy, self.cx, self.cy, *self.coefficients))
+        return CameraModel(fx, fy, cx, cy, tuple(coefficients), self.fold_radius2)
 
 
 def pose(matrix: ArrayLike, name: str) -> Array:
-    """A read-only (4, 4) float64 copy of a rigid transform; ValueError if it is not one."""
+    """A rigid transform as a read-only (4, 4) float64 copy.
+
+    name : what the transform is, for the message.
+
+    Raises
+    ------
+    ValueError
+        The matrix is not a rotation and a translation of at most `MAX_COORDINATE_M`.
+    """
     try:
         result: Array = np.array(matrix, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -169,12 +226,31 @@ def check_rigid(T: NDArray[np.floating[Any]], name: str) -> None:
 
 
 def is_same_pose(first: np.ndarray, second: np.ndarray) -> bool:
-    """Whether two poses (4, 4) differ by no more than `SAME_PLACE`."""
+    """Whether two poses (4, 4) are equal within `SAME_PLACE`."""
     return bool(np.abs(np.linalg.inv(first) @ second - np.eye(4)).max() <= SAME_PLACE)
 
 
 def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """(4, 4) T_world_device of a device at `origin` that looks at `target`, metres, OpenCV axes."""
+    """(4, 4) float64, T_world_device of a device at `origin` that looks at `target`.
+
+    Parameters
+    ----------
+    origin, target : (3,) metres, world.
+    up : (3,) direction in the world that is upwards in the image.
+
+    Raises
+    ------
+    ValueError
+        A coordinate that is not finite, `target` at `origin`, or `up` along the direction of view.
+
+    Examples
+    --------
+    A camera 2 m above the ground that looks straight down; the last two columns are its direction of view and place:
+
+    >>> T = look_at((0, 0, 2), (0, 0, 0), up=(0, 1, 0))
+    >>> T[:3, 2], T[:3, 3]
+    (array([ 0.,  0., -1.]), array([0., 0., 2.]))
+    """
     o, t, u = (np.asarray(a, dtype=np.float64) for a in (origin, target, up))
     for name, value in (("origin", o), ("target", t), ("up", u)):
         if value.shape != (3,) or not (np.abs(value) <= MAX_COORDINATE_M).all():
@@ -191,15 +267,20 @@ def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0
 
 @dataclass(frozen=True)
 class Lens:
-    """The lens of a camera or a projector: thin, or a pinhole.
+    """The lens of a camera or a projector.
 
     Parameters
     ----------
-    aperture_radius_m : metres, radius of the entrance (exit) pupil.
-    focus_m : metres, depth z of the plane in focus of a thin lens with this aperture; None: sharp everywhere. See
-        docs/optics.md for what a projector out of focus does to its patterns.
-    vignetting : exponent n >= 0 of the relative illumination cos^n of the angle to the optical axis: 4 is the natural
-        law, 0 an even image. It takes from a projector's power what it darkens.
+    aperture_radius_m : radius of the entrance pupil (of a projector: the exit pupil), metres.
+    focus_m : depth z of the plane in focus, metres. None: everything is in focus, as through a pinhole. docs/optics.md
+        says what a projector out of focus does to its patterns.
+    vignetting : exponent n >= 0 of the relative illumination cos^n, where the angle is that to the optical axis: 4 is
+        the natural law, 0 an even image. The light that a projector loses by vignetting is missing from its power.
+
+    Examples
+    --------
+    >>> Lens(aperture_radius_m=2e-3, focus_m=0.8, vignetting=4)
+    Lens(aperture_radius_m=0.002, focus_m=0.8, vignetting=4)
     """
 
     aperture_radius_m: Metres
@@ -210,36 +291,55 @@ class Lens:
         check_fields(self)
 
 
-CAMERA_LENS, PROJECTOR_LENS = Lens(0.75e-3), Lens(2e-3)
-"""The defaults: sharp and even."""
+CAMERA_LENS = Lens(0.75e-3)
+"""Default lens of a camera: everything in focus, an even image, a pupil of 1.5 mm (f = 6 mm at f/4)."""
+PROJECTOR_LENS = Lens(2e-3)
+"""Default lens of a projector: everything in focus, an even image, a pupil of 4 mm."""
 
 
 def translation(x: float, y: float, z: float) -> Array:
-    """(4, 4) pure translation in metres."""
+    """(4, 4) float64, the translation by (x, y, z), metres."""
     result = np.eye(4)
     result[:3, 3] = x, y, z
     return result
 
 
-_FLAT = {
+_OLD_LENS_KEYS = {
     f"{device}_{setting}": (f"{device}_lens", setting)
     for device in ("camera", "projector")
     for setting in ("aperture_radius_m", "focus_m", "vignetting")
 }
+"""Lens and setting of each key that older files of rigs have at the top level; see `Rig.from_dict`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """A camera and the emitter (projector or modulated lamp) fixed to it.
+    """A camera and its emitter: their intrinsics, lenses and poses.
+
+    The emitter is called projector here, also where it shows no image: the emitter of a time-of-flight camera has
+    intrinsics too, for its field of illumination, and its pixels only serve as coordinates.
 
     Parameters
     ----------
-    camera : Intrinsics
-    projector : Intrinsics; of a ToF lamp, its field of illumination (the pixel count only names coordinates).
-    T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres.
-    T_camera_projector : (4, 4) float64, maps projector coordinates to camera coordinates, metres.
+    camera, projector : Intrinsics
+    T_world_camera : (4, 4) float64, rigid, maps camera coordinates to world coordinates, metres.
+    T_camera_projector : (4, 4) float64, rigid, maps projector coordinates to camera coordinates, metres.
     camera_lens, projector_lens : Lens
-    projector_power_w : float, mean radiant power that leaves the projector when it shows white.
+    projector_power_w : float, radiant power in watts that leaves the projector when it shows white.
+    wavelength_m : wavelength of the emitter's light, metres; None: not stated.
+
+    Raises
+    ------
+    ValueError
+        A pose that is not rigid, or a value out of its bounds.
+
+    Examples
+    --------
+    >>> camera = Intrinsics.from_fov(640, 480, fov_x_deg=50.0)
+    >>> projector = Intrinsics.from_fov(1280, 800, fov_x_deg=60.0)
+    >>> beside = look_at((0.2, 0, 0), (0, 0, 1), up=(0, -1, 0))  # 0.2 m to the right of the camera, turned inwards
+    >>> Rig(camera, projector, T_camera_projector=beside).baseline_m
+    0.2
     """
 
     camera: Intrinsics
@@ -249,6 +349,7 @@ class Rig:
     camera_lens: Lens = CAMERA_LENS
     projector_lens: Lens = PROJECTOR_LENS
     projector_power_w: Watts = 1.0
+    wavelength_m: Wavelength | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_world_camera", pose(self.T_world_camera, "T_world_camera"))
@@ -263,14 +364,15 @@ class Rig:
 
     @classmethod
     def from_dict(cls, data: Any, where: str = "rig") -> Rig:
-        """The rig of plain data, see `rangesim.settings.config.from_dict`.
+        """The rig of plain data; see `rangesim.settings.config.from_dict`.
 
-        In captures and calibrations of before lenses were structures, each had its settings beside the others'.
+        Captures and calibrations written before `Lens` existed have its settings at the top level, such as
+        `camera_focus_m`. They are read too.
         """
         if isinstance(data, Mapping):
-            values = {key: value for key, value in data.items() if key not in _FLAT}
-            for key in data.keys() & _FLAT.keys():
-                lens, setting = _FLAT[key]
+            values = {key: value for key, value in data.items() if key not in _OLD_LENS_KEYS}
+            for key in data.keys() & _OLD_LENS_KEYS.keys():
+                lens, setting = _OLD_LENS_KEYS[key]
                 if not isinstance(values.setdefault(lens, {}), Mapping):
                     raise ValueError(f"{where}.{lens}: expected a table of settings, got {shown(values[lens])}.")
                 values[lens] = {**values[lens], setting: data[key]}
@@ -280,18 +382,21 @@ class Rig:
     def with_camera(
         self, T_camera_other: ArrayLike, intrinsics: Intrinsics | None = None, lens: Lens | None = None
     ) -> Rig:
-        """The rig of another camera beside the same emitter, as for active stereo: `transport` takes several at once.
+        """The rig of a further camera with the same emitter, for example for active stereo.
+
+        `rangesim.transport` takes the rigs of several cameras at once.
 
         Parameters
         ----------
-        T_camera_other : (4, 4) float64, maps the other camera's coordinates to those of this one, metres. One 0.1 m
-            to the right that looks at the same point 0.8 m away: ``look_at((0.1, 0, 0), (0, 0, 0.8), (0, -1, 0))``.
-        intrinsics, lens : of the other camera; None: as this one's.
+        T_camera_other : (4, 4) float64, rigid, maps coordinates of the further camera to those of this one, metres. For
+            a camera 0.1 m to the right that looks at the same point at a depth of 0.8 m, it is
+            ``look_at((0.1, 0, 0), (0, 0, 0.8), (0, -1, 0))``.
+        intrinsics, lens : those of the further camera; None: the same as of this one.
 
         Raises
         ------
         ValueError
-            The matrix is not rigid, or intrinsics or lens are something else.
+            The matrix is not rigid, `intrinsics` is no Intrinsics, or `lens` is no Lens.
         """
         T = pose(T_camera_other, "T_camera_other")
         for name, value, kind in (("intrinsics", intrinsics, Intrinsics), ("lens", lens, Lens)):
@@ -306,19 +411,18 @@ class Rig:
         )
 
     def shares_emitter(self, other: Rig) -> bool:
-        """Whether the emitters of two rigs are one and the same: in one place, with one lens and power."""
+        """Whether two rigs have the same emitter: the same intrinsics, lens, power and place."""
         return not self.differences_of_emitter(other)
 
     def differences_of_emitter(self, other: Rig) -> list[str]:
-        """What is not the same of the emitters of two rigs, by name; places may differ by `SAME_PLACE`."""
-        found = [
-            k for k in ("projector", "projector_lens", "projector_power_w") if getattr(self, k) != getattr(other, k)
-        ]
+        """Names of the attributes in which the emitters of two rigs differ; places may differ by `SAME_PLACE`."""
+        of_emitter = ("projector", "projector_lens", "projector_power_w", "wavelength_m")
+        found = [name for name in of_emitter if getattr(self, name) != getattr(other, name)]
         same = is_same_pose(self.T_world_projector, other.T_world_projector)
         return found if same else [*found, "T_world_projector"]
 
     def shares_camera_pose(self, other: Rig) -> bool:
-        """Whether the cameras of two rigs stand in one place and look the same way."""
+        """Whether the cameras of two rigs have the same pose, within `SAME_PLACE`."""
         return is_same_pose(self.T_world_camera, other.T_world_camera)
 
     @property
@@ -328,19 +432,22 @@ class Rig:
 
     @property
     def baseline_m(self) -> float:
-        """Distance between camera centre and projector centre, metres."""
+        """Distance in metres between the centres of camera and projector."""
         return float(np.linalg.norm(self.T_camera_projector[:3, 3]))
 
     @property
     def projector_irradiance(self) -> float:
-        """Irradiance in W/m2 that white casts on a fronto-parallel plane at z = 1 m."""
+        """Irradiance in W/m2 of a fronto-parallel plane at z = 1 m when the projector shows white."""
         p = self.projector
         return self.projector_power_w * p.fx * p.fy / (p.width * p.height)
 
     @property
     def camera_illumination(self) -> NDArray[np.float32]:
-        """(h, w) float32 in 0..1, fraction of the light that vignetting leaves a pixel: cos^n of its ray to the
-        axis."""
+        """(h, w) float32, relative illumination of the camera's pixels, from 0 to 1.
+
+        It is cos^n of the angle between a pixel's ray and the optical axis; see `Lens.vignetting`. Pixels without a ray
+        have 0.
+        """
         rays = self.camera.directions(self.camera.pixel_centres())
         fraction = np.linalg.norm(rays, axis=-1) ** -self.camera_lens.vignetting
-        return np.nan_to_num(fraction, nan=0.0).astype(np.float32)  # no ray, no light
+        return np.nan_to_num(fraction, nan=0.0).astype(np.float32)

@@ -83,6 +83,9 @@ class Scene:
         power_w: float = 1.0,
         width: int | None = None,
         height: int | None = None,
+        *,
+        camera: Intrinsics | None = None,
+        T_world_camera: np.ndarray | None = None,
     ) -> Rig:
         """Rig of the scene's camera and a projector to its right that covers the camera's view.
 
@@ -94,6 +97,8 @@ class Scene:
         power_w : radiant power of white.
         width, height : camera pixels; default as in the scene file; one alone keeps the aspect ratio. The
             horizontal field of view is kept.
+        camera : Intrinsics in place of the scene's camera; `width` and `height` then do not count.
+        T_world_camera : (4, 4) float64, pose of the camera in place of the scene's, metres.
         """
         for name, value in (("width", width), ("height", height)):
             if value is not None:
@@ -102,7 +107,10 @@ class Scene:
             width = self.camera.width if height is None else round(height * self.camera.width / self.camera.height)
         if height is None:
             height = max(1, round(width * self.camera.height / self.camera.width))
-        camera = self.camera.resized(width, height)
+        if camera is None:
+            camera = self.camera.resized(width, height)
+        if T_world_camera is None:
+            T_world_camera = self.T_world_camera
         if baseline_m is None:
             baseline_m = float(f"{0.2 * self.working_distance_m:.1g}")
         check_number("baseline_m", baseline_m, BASELINE)
@@ -110,7 +118,7 @@ class Scene:
         return Rig(
             camera=camera,
             projector=covering(camera, *(projector_size or PROJECTOR_PIXELS)),
-            T_world_camera=pose(self.T_world_camera, "T_world_camera"),
+            T_world_camera=pose(T_world_camera, "T_world_camera"),
             T_camera_projector=look_at((baseline_m, 0.0, 0.0), target, up=(0.0, -1.0, 0.0)),
             projector_power_w=power_w,
         )

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pcgraph.plumbing.python_files import run_python_file
+from pcgraph.plumbing.python_files import module_of_file
 from rangesim.errors import FileFormatError
 from rangesim.sensor import Decoder, Sensor
 from rangesim.settings.config import brief, from_dict, nearest, shown, to_dict
@@ -134,24 +134,15 @@ def _sensor_in(path: Path, attribute: str) -> Sensor:
     raise FileFormatError(f"{path}: expected {attribute} to be a sensor or a class of sensors, got {shown(found)}.")
 
 
-_MODULES: dict[Path, tuple[int, ModuleType]] = {}
-"""Files that ran, and when they were last changed then."""
-
-
 def _module(path: Path) -> ModuleType:
     """The module of a file, which runs once, and again when it has changed."""
     if not path.is_file():
         raise FileFormatError(f"{path} does not exist; expected a Python file with a sensor.")
-    changed = path.stat().st_mtime_ns
-    if path in _MODULES and _MODULES[path][0] == changed:
-        return _MODULES[path][1]
     before = [(family, dict(family.known)) for family in (Sensor, Decoder)]
     try:
-        module = run_python_file(path, "rangesim")
+        return module_of_file(path, "rangesim")
     except (Exception, SystemExit) as error:
         for family, known in before:
             family.known.clear()
             family.known.update(known)
         raise FileFormatError(f"{path} fails: {type(error).__name__}: {brief(error)}") from error
-    _MODULES[path] = changed, module
-    return module

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings as frozen dataclasses: bounds of their fields, and their way to and from plain data."""
+"""Settings as frozen dataclasses: bounds of their fields, limits of sizes, seeds, and conversion to plain data."""

@@ -1,9 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Strict conversion between frozen dataclasses and plain data (TOML, JSON).
 
-Every setting of the package is a frozen dataclass. This module is the only place where such a
-setting meets a file: unknown keys are refused with the nearest valid name, values are type-checked,
-and what is written reads back equal.
+Every setting of the package is a frozen dataclass, and files of settings are read and written through this module only.
+It refuses unknown keys and names the nearest valid one, checks the types of values, and reads back equal what it wrote.
+
+Examples
+--------
+>>> from rangesim.rig import Lens
+>>> table = to_dict(Lens(aperture_radius_m=2e-3))
+>>> table
+{'aperture_radius_m': 0.002, 'focus_m': None, 'vignetting': 0.0}
+>>> from_dict(Lens, table) == Lens(aperture_radius_m=2e-3)
+True
+>>> from_dict(Lens, {"aperture_radius_m": 2e-3, "focus": 1.0})
+Traceback (most recent call last):
+ValueError: Lens: unknown key 'focus' (did you mean 'focus_m'?); valid are aperture_radius_m, focus_m, vignetting.
 """
 
 from __future__ import annotations
@@ -27,7 +38,10 @@ T = TypeVar("T")
 
 
 def to_dict(setting: Any) -> Any:
-    """Plain data (dict, list, str, number, bool, None) of a dataclass, `type` first where it is tagged."""
+    """Plain data (dict, list, str, number, bool, None) of a dataclass.
+
+    For a class with a `type_name`, the table begins with the key `type`, so that `from_dict` finds the class again.
+    """
     if dataclasses.is_dataclass(setting) and not isinstance(setting, type):
         fields = {f.name: to_dict(getattr(setting, f.name)) for f in dataclasses.fields(setting) if f.init}
         tag = getattr(setting, "type_name", None)
@@ -42,19 +56,20 @@ def to_dict(setting: Any) -> Any:
 
 
 def from_dict(cls: type[T], data: Any, where: str = "") -> T:
-    """An instance of the dataclass `cls` from plain data.
+    """An instance of the dataclass `cls` made from plain data.
 
     Parameters
     ----------
-    cls : dataclass type; if it is abstract, `data["type"]` names one of its subclasses' `type_name`.
-    data : mapping of field names to plain values; where the default of a field has settings itself, a table changes
-        some of them.
+    cls : dataclass type. If it is the abstract base of a family (`Named`), `data["type"]` is the `type_name` of the
+        subclass to make.
+    data : mapping of field names to plain values. If the default value of a field is a dataclass, a table for it need
+        only hold the fields that differ from that default.
     where : name of the place in the file, for messages, for example "sensors[0].rig".
 
     Raises
     ------
     ValueError
-        Unknown or missing key, wrong type or a value the dataclass refuses; the message names the place.
+        Unknown or missing key, wrong type, or a value that the dataclass refuses; the message names the place.
     """
     place = where or cls.__name__
     if not isinstance(data, Mapping):
@@ -75,13 +90,17 @@ def from_dict(cls: type[T], data: Any, where: str = "") -> T:
         raise ValueError(f"{place}: {error}") from error
 
 
-@lru_cache(maxsize=256)  # each evaluates the annotations anew, which takes longer than all else of a table
+@lru_cache(maxsize=256)  # evaluating the annotations takes longer than everything else that is done for a table
 def _hints(cls: type) -> dict[str, Any]:
     return get_type_hints(cls)
 
 
 def on_top_of(default: Any, table: Any) -> Any:
-    """The settings of a default, but for what a table says; what is given if it is of another type, or no table."""
+    """A default value as plain data, updated with the entries of a table.
+
+    The table is returned unchanged if the default is no dataclass or has another `type`, and so is anything that is no
+    table.
+    """
     if not isinstance(table, Mapping) or not dataclasses.is_dataclass(default) or isinstance(default, type):
         return table
     settings = to_dict(default)
@@ -89,25 +108,27 @@ def on_top_of(default: Any, table: Any) -> Any:
 
 
 def shown(value: Any) -> str:
-    """`repr` of a value for a message, cut to a readable length."""
+    """Text of a value for a message: its `repr`, shortened to a readable length."""
     if isinstance(value, int) and abs(value) >= 10**30:
-        return f"{'-' if value < 0 else ''}2^{value.bit_length() - 1} or more"  # Python refuses to print the longest
+        # Python refuses to print integers of more than 4300 digits
+        return f"{'-' if value < 0 else ''}2^{value.bit_length() - 1} or more"
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape} and type {value.dtype}"
     return SHORT.repr(value)
 
 
 def brief(error: BaseException) -> str:
-    """What an error of a library says, in one line of readable length."""
+    """Message of a library's error on one line, cut after `MAX_REASON` characters."""
     return " ".join(str(error).split())[:MAX_REASON]
 
 
 MAX_REASON = 200
-"""Characters."""
+"""Number of characters of a library's message that are repeated: two lines of a terminal. Some libraries quote whole
+files."""
 
 
 def check_keys(given: Mapping[str, Any], valid: typing.Iterable[str], place: str) -> None:
-    """Raise ValueError on the first key that is not valid, naming the nearest valid one."""
+    """Raise ValueError on the first key that is not valid; the message names the nearest valid one."""
     valid = list(valid)
     for key in given:
         if key not in valid:
@@ -115,7 +136,7 @@ def check_keys(given: Mapping[str, Any], valid: typing.Iterable[str], place: str
 
 
 def nearest(name: str, valid: typing.Iterable[str]) -> str:
-    """' (did you mean ...?)' if some valid name is close to `name`, else ''."""
+    """The text " (did you mean ...?)" with the valid name closest to `name`; empty if none is close."""
     close = difflib.get_close_matches(str(name)[:100], list(valid), n=1, cutoff=0.5)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
@@ -125,7 +146,7 @@ def _required(field: dataclasses.Field[Any]) -> bool:
 
 
 def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
-    """`cls` itself, or the subclass that the key `type` names; removes that key from `values`."""
+    """The class to make: `cls`, or the member of its family that the key `type` names. The key is removed."""
     if not issubclass(cls, Named):
         return cls
     own = getattr(cls, "type_name", None)
@@ -139,14 +160,30 @@ def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
 
 
 class Named:
-    """A family of classes, each of which has a `type_name` of its own, by which files name it.
+    """Base of a family of classes that files name by their `type_name`, such as sensors, detectors or responses.
 
-    A class takes the place of an older one that the same lines defined, as where a notebook runs a cell again.
+    The base of a family derives from `Named` and sets ``known = {}``. Every subclass with a `type_name` then joins the
+    family when it is defined, also one from outside the package. If the same lines are run again, as in a notebook, the
+    new class replaces the older one.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> class Shape(Named):
+    ...     known = {}
+    >>> @dataclass(frozen=True)
+    ... class Ball(Shape):
+    ...     radius_m: float = 1.0
+    ...     type_name = "ball"
+    >>> Shape.known["ball"] is Ball
+    True
+    >>> from_dict(Shape, {"type": "ball", "radius_m": 2.0})
+    Ball(radius_m=2.0)
     """
 
     type_name: typing.ClassVar[str]
     known: typing.ClassVar[dict[str, type[Any]]]
-    """Classes of the family by `type_name`, in the order of their definition; the base of a family has its own."""
+    """Classes of the family by `type_name`, in the order of their definition; every family has its own."""
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -162,13 +199,13 @@ class Named:
 
 
 def _source(kind: type[Any]) -> str:
-    """File of a class, or its module where there is none."""
+    """File in which a class is defined, or the name of its module if there is no file."""
     module = sys.modules.get(kind.__module__)
     return getattr(module, "__file__", None) or kind.__module__
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:
-    """`value` converted to the annotated type."""
+    """A plain value converted to the annotated type; ValueError if it does not match."""
     if get_origin(hint) in (Union, types.UnionType):
         if value is None and type(None) in get_args(hint):
             return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of a transport pass: the light that sensors expose, the energy split, the ground truth, and their files."""
+"""Results of a transport pass: the light that sensors expose, the energy split, and the ground truth."""
 
 from rangesim.signals.signals import (
     ALL,

@@ -197,7 +197,8 @@ class StillSignals(Signals):
         missing = [r for r in sensor.responses() if r not in self.channels]
         if missing:
             raise ValueError(
-                f"expected signals of {sensor.type_name}, but the pass has no {missing[0]}; trace it with this sensor."
+                f"expected signals of {sensor.type_name}, but the pass has no {missing[0]}; "
+                "run transport with this sensor, too."
             )
         channels, projector = [self.channels[r] for r in sensor.responses()], self.energy.projector
         if sampling_errors:

@@ -7,7 +7,7 @@ import io
 import itertools
 import tempfile
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from unittest import mock
 
@@ -92,23 +92,28 @@ def signals_files() -> Seeds:
     """Signals of two sensors."""
     from synthetic import plane_signals, stereo_rig
 
-    from rangesim import AmcwToF, StructuredLight
+    from rangesim import AmcwToF, StructuredLight, save_signals
 
     rig = stereo_rig(12, 8)
     sensors = {"codes": StructuredLight(), "amcw": AmcwToF((20e6, 50e6))}
-    return {k: of_file("signals.npz", written("s.npz", plane_signals(rig, s).save)) for k, s in sensors.items()}
+    return {
+        k: of_file("signals.npz", written("s.npz", partial(save_signals, plane_signals(rig, s))))
+        for k, s in sensors.items()
+    }
 
 
 def range_image_files() -> Seeds:
     """Range images with camera and decoder."""
     from synthetic import plane_signals, stereo_rig
 
-    from rangesim import IdealToF, StructuredLight, decode, expose
+    from rangesim import IdealToF, StructuredLight, decode, expose, save_range_image
 
     images = {
         s.type_name: decode(expose(plane_signals(stereo_rig(12, 8), s), s)) for s in (IdealToF(), StructuredLight())
     }
-    return {name: of_file("range.npz", written("r.npz", image.save)) for name, image in images.items()}
+    return {
+        name: of_file("range.npz", written("r.npz", partial(save_range_image, image))) for name, image in images.items()
+    }
 
 
 def experiments() -> Seeds:

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from tiers import to_validate
 
 import pcgraph
 from pcgraph import warmup
@@ -215,8 +216,8 @@ def damage_of(kind, content):
     return {"empty": b"", "a pickle that ends the process": b"cos\n_exit\n(I7\ntR."}[kind]
 
 
-DAMAGES = ["one bit", "cut short", "blocks of zeros", "other machine code", "numba's own", "empty"]
-DAMAGES += ["a pickle that ends the process"]
+DAMAGES = ["one bit", "other machine code", "numba's own", "a pickle that ends the process"]
+DAMAGES += to_validate("cut short", "blocks of zeros", "empty")  # unsound as one bit is: see the test below
 
 
 @pytest.fixture(scope="module")
@@ -265,6 +266,6 @@ def test_an_index_that_is_damaged_counts_as_missing(tmp_path):
     here = SimpleNamespace(py_func=kernel.py_func, stats=SimpleNamespace(cache_path=tmp_path))
     assert warmup._is_cached(here)
     content = index.read_bytes()
-    for damaged in (content[:-1] + bytes([content[-1] ^ 1]), content[:9], b""):
+    for damaged in (content[:-1] + bytes([content[-1] ^ 1]), content[:9], bytes(len(content)), b""):
         copy.write_bytes(damaged)
         assert not warmup._is_cached(here)

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which instruments share a light-transport pass: those whose emitter, wavelength and camera agree."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from rangesim.experiment import Experiment
+from rangesim.instrument.instrument import Instrument
+from rangesim.rig import Rig
+
+if TYPE_CHECKING:
+    from rangesim.scene import Scene
+
+
+def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[Instrument]]]:
+    """The passes of an experiment: a rig each, and the instruments that share it; in order of first appearance.
+
+    An ideal instrument has no wavelength and joins the first group with its camera and emitter. Where something moves,
+    each instrument has a pass of its own, because its frames are taken at times of its own.
+    """
+    groups: list[tuple[Rig, list[Instrument]]] = []
+    for instrument in experiment.instruments:
+        rig = instrument.rig(scene, experiment.width, experiment.height)
+        shared = None if experiment.motion is not None else _first_that_agrees(groups, rig)
+        if shared is None:
+            groups.append((rig, [instrument]))
+        else:
+            of_group, members = groups[shared]
+            groups[shared] = (of_group if rig.wavelength_m is None else rig, [*members, instrument])
+    return groups
+
+
+def _first_that_agrees(groups: list[tuple[Rig, list[Instrument]]], rig: Rig) -> int | None:
+    """Index of the first group whose light and camera are those of a rig; None: there is none."""
+    for index, (other, _) in enumerate(groups):
+        is_same_light = None in (rig.wavelength_m, other.wavelength_m) or rig.wavelength_m == other.wavelength_m
+        if is_same_light and replace(rig, wavelength_m=other.wavelength_m) == other:
+            return index
+    return None
