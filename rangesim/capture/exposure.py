@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals to a capture, as a camera would deliver it."""
+"""Exposure of signals: the capture that a camera would deliver of them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,11 @@ if TYPE_CHECKING:
     from rangesim.signals import Signals
 
 TARGET_FRACTION = 0.7
-"""Fraction of the saturation capacity where automatic exposure puts the bright pixels (`bright_level`)."""
+"""Fraction of the saturation capacity to which automatic exposure brings the bright pixels (`bright_level`).
+
+A larger value saturates more of the brightest 1 % of the pixels; a smaller one uses less of the dynamic range. The
+value is a choice and was not optimised.
+"""
 
 
 def expose(
@@ -33,27 +37,38 @@ def expose(
     seed: int = 0,
     ambient: Ambient | None = None,
 ) -> Capture:
-    """Capture of `sensor`: its frames with the noise and limits of `detector`.
+    """The capture that a sensor takes of signals, with the noise and the limits of a detector.
 
     Parameters
     ----------
     signals : Signals of a transport pass that this sensor was part of.
     sensor : Sensor.
-    detector : Detector (EMVA 1288) or, for direct time of flight, SpadDetector. None: a noise-free capture,
-        float32 radiance in W/m2/sr, unfiltered ambient light included. The frames of an ideal sensor
-        (`Sensor.is_ideal`) are always noise-free.
+    detector : Detector (EMVA 1288) or, for direct time of flight, SpadDetector. None: the capture is noise-free; its
+        frames are float32 radiance in W/m2/sr and contain the ambient light without a filter. The frames of an ideal
+        sensor (`Sensor.is_ideal`) are always noise-free.
     exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`.
-    seed : int, 0 to 2^64 - 1, of the noise. Every frame, of a SpadDetector every image row, has its own stream; the
-        same seed gives the same bytes on any number of threads.
-    ambient : Ambient, what kind of light the scene's own emitters give, and how strong: the detector's
-        band (`band_width_m`) then decides what counts of it. None: unknown, and the detector's
-        `ambient_transmission` does. Other light needs no new pass.
+    seed : int from 0 to 2^64 - 1, seed of the noise. Every frame has a random stream of its own, with a SpadDetector
+        every image row; the same seed gives the same bytes on any number of threads.
+    ambient : Ambient, kind and strength of the light of the scene's own emitters; the detector's band
+        (`band_width_m`) then decides how much of it counts. None: unknown; the detector's `ambient_transmission`
+        decides. Another ambient light needs no new transport pass.
 
     Raises
     ------
     ValueError
         The pass lacks the sensor's signals, the exposure is not positive, the seed is out of its range, detector and
         sensor do not go together, or ambient light is stated for a scene that has none.
+
+    Examples
+    --------
+    `signals` is what `rangesim.transport(scene, rig, sensor)` returns, here of a wall at 1 m:
+
+    >>> from rangesim import Detector, expose
+    >>> capture = expose(signals, sensor, Detector(read_noise_e=5.0), exposure_s=1e-3, seed=1)
+    >>> capture.frames.dtype.name, capture.frames.shape == (sensor.n_frames, 48, 64)
+    ('uint16', True)
+    >>> expose(signals, sensor).is_digital  # noise-free: radiance
+    False
     """
     return exposed(signals, sensor, detector, exposure_s, seed, ambient).capture
 
@@ -73,8 +88,8 @@ class Exposure(ShortRepr):
     radiance: np.ndarray | None = None
 
     def photons_per_pulse(self) -> np.ndarray | None:
-        """(h, w) float64, mean number of photons that each pixel detects per laser pulse, counted by the detector or
-        not; None where the detector integrates, or the capture is noise-free."""
+        """(h, w) float64, mean number of photons that each pixel detects per laser pulse; with pile-up, it counts only
+        the first of them. None if the detector integrates, or the capture is noise-free."""
         capture = self.capture
         if capture.detector is None or self.radiance is None or capture.sensor.gate is None:
             return None
@@ -99,7 +114,7 @@ class Exposure(ShortRepr):
             fraction = np.mean(capture.saturated(capture.frames), where=lit) if lit.any() else 0.0
             warn(
                 f"{name}: the detector's shortest exposure, {capture.exposure_s:g} s, saturates {100 * fraction:.0f} % "
-                "of the pixels that get light of the projector; take less light "
+                "of the pixels that get light of the emitter; take less light "
                 f"(its power_w is {rig.projector_power_w:g}), or a shorter min_exposure_s."
             )
 
@@ -132,15 +147,25 @@ def exposed(
 def noise_free_capture(
     signals: Signals, sensor: Sensor, ambient: Ambient | None = None, sampling_errors: float = 0.0
 ) -> Capture:
-    """Capture of radiance, without a detector; so many times the sampling error of the signals is added to them."""
+    """Capture of the radiance of signals, without a detector.
+
+    sampling_errors : factor on the draw of the sampling error that is added to the signals; 0: none is added.
+    """
     unfiltered = 1.0 if ambient is None else ambient.scale
     frames = signals.frames(sensor, unfiltered, sampling_errors)
     return Capture(_through_lens(frames, signals.rig), sensor, signals.rig, ambient=ambient)
 
 
 def exposed_again(capture: Capture, signals: Signals, seed: int, sampling_errors: float = 0.0) -> Capture:
-    """Capture of the same signals with the same settings and other noise of the detector, which must be known; so many
-    times the sampling error of the signals is added to them."""
+    """Capture of the same signals with the same settings, and with the noise of another seed.
+
+    sampling_errors : factor on the draw of the sampling error that is added to the signals; 0: none is added.
+
+    Raises
+    ------
+    ValueError
+        The detector of the capture is not known.
+    """
     if capture.detector is None:
         raise ValueError("expected a capture whose detector is known, got one without.")
     radiance = _mean_radiance(signals, capture.sensor, capture.detector, capture.ambient, sampling_errors)
@@ -155,21 +180,24 @@ def _mean_radiance(
     ambient: Ambient | None,
     sampling_errors: float = 0.0,
 ) -> np.ndarray:
-    """(k, h, w) W/m2/sr, of the frames that a detector takes, on average; so many times the sampling error is added."""
+    """(k, h, w) float32, W/m2/sr, mean radiance of the frames that a detector takes.
+
+    sampling_errors : factor on the draw of the sampling error that is added to the signals; 0: none is added.
+    """
     lit = signals.frames(sensor, detector.ambient_fraction(sensor.gate, ambient), sampling_errors)
     return _through_lens(lit, signals.rig)
 
 
 def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:
-    """Frames (k, h, w) as the camera's vignetting leaves them."""
+    """Frames (k, h, w) behind the camera's lens, which darkens the corners if it vignettes."""
     return frames * rig.camera_illumination if rig.camera_lens.vignetting else frames
 
 
 def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetector, rig: Rig) -> float:
-    """Exposure in seconds, one for all frames, that puts the bright pixels at 70 % of saturation.
+    """Exposure in seconds, one for all frames, that brings the bright pixels to 70 % of saturation.
 
-    Of the pixels that receive light, 99 % are at or below that level in their brightest frame: the highlights
-    of mirrors and gloss may saturate. Limited by the detector's shortest and longest exposure.
+    Of the pixels that receive light, 99 % are at or below that level in their brightest frame: highlights of mirrors
+    and glossy surfaces may saturate. The exposure stays between the detector's shortest and longest one.
 
     Parameters
     ----------
