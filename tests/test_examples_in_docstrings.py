@@ -13,6 +13,7 @@ ROOMS = [
     "pcgraph.plumbing",
     "rangesim.calibration",
     "rangesim.electronics",
+    "rangesim.experiment",
     "rangesim.fusion",
     "rangesim.geometry",
     "rangesim.motion",
