@@ -21,9 +21,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rangesim import Capture, Decoder, RangeImage, Sensor, Status, compare, decode, expose, load_scene, transport
+from rangesim import Capture, Decoder, Sensor, Status, compare, decode, expose, load_scene, transport
 from rangesim.capture import bright_level
-from rangesim.decoding.path_length import range_image_from_path_length
+from rangesim.decoding.path_length import PathLengths
 from rangesim.electronics.detector import Detector
 from rangesim.response import SPEED_OF_LIGHT, DenseResponse, LightPath, Math
 from rangesim.sensor import Background, Emitter, FrameContent, least_signal_for, of_type
@@ -124,7 +124,7 @@ class GateRatio(Decoder):
     type_name: ClassVar[str] = "gate-ratio"
     reads: ClassVar[type[Sensor]] = GatedCamera
 
-    def decode(self, capture: Capture) -> RangeImage:
+    def coordinates(self, capture: Capture) -> PathLengths:
         sensor = of_type(capture.sensor, GatedCamera)
         *gates, off = capture.frames.astype(np.float64)
         light = np.stack(gates) - off
@@ -142,9 +142,7 @@ class GateRatio(Decoder):
         length_m = SPEED_OF_LIGHT * (sensor.delays_s[first[0]] + ratio * sensor.width_s)
         status = np.where(is_enough, Status.OK, Status.LOW_SIGNAL)
         status[capture.saturated(capture.frames)] = Status.SATURATED
-        return range_image_from_path_length(
-            capture, length_m, status=status, confidence=both / capture.full_scale, intensity=both
-        )
+        return PathLengths(length_m=length_m, status=status, confidence=both / capture.full_scale, intensity=both)
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         if background.noise_variance is None:

@@ -25,7 +25,7 @@ from rangesim.experiment.scan_settings import scan_settings_from_dict
 from rangesim.instrument.instrument import DEFAULT_SENSORS, Instrument, instrument
 from rangesim.motion import ConstantTwist, Motion, Timing
 from rangesim.pipeline.experiment_run import noise_seed, run
-from rangesim.pipeline.passes import group_by_rig
+from rangesim.pipeline.shared_passes import group_by_rig
 from rangesim.results.run_files import load_result
 from rangesim.rig import Lens
 from rangesim.sensors import DirectToF, IdealToF

@@ -14,7 +14,7 @@ from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
 from rangesim.geometry.correspondences import Array
 from rangesim.rig import Intrinsics, Rig
-from rangesim.sensors.structured_light import StructuredLight
+from rangesim.sensor import Sensor
 
 TRIES = 10000
 FILLS = (0.45, 0.8)
@@ -32,7 +32,7 @@ class RenderedSet:
 def render_set(
     board: Board,
     rig: Rig,
-    sensor: StructuredLight,
+    sensor: Sensor,
     n: int = 12,
     *,
     tilt_deg: float = 35.0,

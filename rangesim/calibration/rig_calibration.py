@@ -10,7 +10,7 @@ where black meets white, so no single decoded pixel would do.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,14 +20,14 @@ from rangesim.calibration.bundle import Bundle, Observation
 from rangesim.calibration.suspects import Suspect, suspects_told
 from rangesim.calibration.zhang import adjust_as_seen, check_views, first_camera, judged
 from rangesim.capture import Capture
-from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.coordinates import Coordinates
+from rangesim.decoding.triangulation import ProjectorCoordinates
 from rangesim.geometry.correspondences import Array
 from rangesim.geometry.homography import homography_dlt
 from rangesim.geometry.projective_plane import map_points
 from rangesim.geometry.reprojection import LENS, POSE
 from rangesim.rig import Rig
 from rangesim.robust_scale import sigma_from_median
-from rangesim.sensors.structured_light import WHITE, StructuredLight, StructuredLightDecoder
 
 MIN_AROUND, MAX_AROUND = 24, 600
 """Decoded pixels around a corner that its homography takes."""
@@ -67,20 +67,28 @@ class RigCalibration:
     suspects: tuple[Suspect, ...] = ()
 
 
-def projector_view(view: BoardView, decoded: RangeImage, spacing_px: float) -> BoardView:
-    """The board as the projector would see it: where the camera's corners lie in its image.
+def projector_view(view: BoardView, decoded: Coordinates, spacing_px: float) -> BoardView:
+    """The board as the projector would see it: the places of the camera's corners in its image.
+
+    Corners with fewer than `MIN_AROUND` decoded pixels around them are left out.
 
     Parameters
     ----------
-    view : of the camera. decoded : with columns and rows of the projector. spacing_px : camera pixels between
-        neighbouring corners, about; `REACH` of it is looked at around each, on which the lenses' distortion must
-        be nearly a homography's.
+    view : BoardView of the camera.
+    decoded : `ProjectorCoordinates` of the same capture, with columns and rows.
+    spacing_px : float, camera pixels between neighbouring corners, about. Decoded pixels are taken up to `REACH` of it
+        around each corner, where the lenses' distortion must be nearly a homography's.
 
-    Corners with fewer than `MIN_AROUND` decoded pixels around them are left out.
+    Raises
+    ------
+    ValueError
+        The decoded coordinates are not those of a projector, or of one axis alone.
     """
-    if decoded.projector_column is None or decoded.projector_row is None:
+    if not isinstance(decoded, ProjectorCoordinates):
+        raise ValueError("expected a sensor that decodes projector coordinates, got path lengths.")
+    column, row = decoded.column, decoded.row
+    if column is None or row is None:
         raise ValueError("expected columns and rows of the projector to be decoded, got one axis; show both.")
-    column, row = decoded.projector_column, decoded.projector_row
     height, width = column.shape
     reach = REACH * spacing_px
     indices, pixels = [], []
@@ -164,11 +172,10 @@ def calibrate_rig(
         views.append(view)
         projector_views.append(seen)
     check_views(board, views, coefficients, names)
-    sensor = captures[0].sensor
-    assert isinstance(sensor, StructuredLight)
+    size = captures[0].sensor.emitter.size
+    assert size is not None
     height, width = captures[0].frames.shape[1:]
     camera, T_camera_board, camera_noise = first_camera(board, views, width, height, coefficients, names)
-    size = sensor.projector_width, sensor.projector_height
     projector, T_projector_board, projector_noise = first_camera(board, projector_views, *size, coefficients, names)
     observations = [
         Observation(device, k, board.points[view.indices], view.pixels, noise)
@@ -224,10 +231,10 @@ def _rms(residuals: tuple[Array, ...]) -> float:
 
 def _views(board: Board, capture: Capture) -> tuple[BoardView, BoardView]:
     """The board as camera and projector see it."""
-    if not isinstance(capture.sensor, StructuredLight):
-        raise ValueError(f"expected a capture of StructuredLight, got one of {type(capture.sensor).__name__}.")
-    view = board.find(capture.frames[WHITE])
-    decoded = StructuredLightDecoder().decode(replace(capture, rig=None))
+    if capture.sensor.emitter.size is None:
+        raise ValueError(f"expected a capture of a sensor with a projector, got one of {capture.sensor.type_name}.")
+    view = board.find(capture.sensor.white_image(capture.frames))
+    decoded = capture.sensor.default_decoder.coordinates(capture)
     grid = np.full((board.rows, board.columns, 2), np.nan)
     grid[view.indices // board.columns, view.indices % board.columns] = view.pixels
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]

@@ -147,7 +147,7 @@ def find_board_ranges(board: Board, captures: Sequence[Capture], names: Sequence
         if capture.rig is None:
             raise ValueError(f"{name}: expected a rig with the calibrated camera, got none.")
         try:
-            view = board.find(capture.frames.mean(axis=0))
+            view = board.find(capture.sensor.white_image(capture.frames))
             found = fit_camera_pose(board.points[view.indices], view.pixels, capture.rig.camera)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error

@@ -13,21 +13,18 @@ import numpy as np
 from rangesim.capture import Capture
 from rangesim.causes.light_budget import LightBudget, light_budget, white_radiance
 from rangesim.causes.reference_frames import (
-    clean_frames,
     depth_on_plane,
     footprint_frames,
     points_in_projector,
     single_path_frames,
 )
-from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.electronics.spad import SpadDetector
-from rangesim.errors import without_warnings
 from rangesim.evaluation.comparison import neighbours
 from rangesim.evaluation.depth_edges import across, depth_edges
+from rangesim.evaluation.reference_readings import ReferenceReadings
 from rangesim.response import DIRECT, KINDS, MULTIPATH
-from rangesim.sensor import Decoder
 from rangesim.signals import GroundTruth
 
 if TYPE_CHECKING:
@@ -51,19 +48,28 @@ more."""
 class Evidence:
     """Masks and measures per pixel, each (h, w); they hold for failed pixels, and say nothing of others."""
 
-    image: RangeImage
-    capture: Capture
-    signals: Signals
+    readings: ReferenceReadings
     tolerance_m: float
 
     @property
-    def truth(self) -> GroundTruth:
-        return self.signals.truth
+    def image(self) -> RangeImage:
+        """The range image whose failures are explained."""
+        return self.readings.image
 
     @property
-    def decoder(self) -> Decoder:
-        """The decoder that the reading comes from."""
-        return self.image.decoder or self.capture.sensor.default_decoder
+    def capture(self) -> Capture:
+        """The capture that the range image was decoded from."""
+        return self.readings.capture
+
+    @property
+    def signals(self) -> Signals:
+        """The light that the capture was exposed from."""
+        return self.readings.signals
+
+    @property
+    def truth(self) -> GroundTruth:
+        """The true surfaces."""
+        return self.signals.truth
 
     # ---- The reading ---------------------------------------------------------------------------------
 
@@ -85,7 +91,7 @@ class Evidence:
     @cached_property
     def optical(self) -> np.ndarray:
         """Without noise, ambient light and saturation the pixel fails as well, or is off by half as much or more."""
-        return self._wrong(self._read(clean_frames(self.signals, self.capture.sensor)))
+        return self._wrong(self._of_failed_pixels(self.readings.projector_alone))
 
     @cached_property
     def saturated(self) -> np.ndarray:
@@ -175,7 +181,7 @@ class Evidence:
     @cached_property
     def budget(self) -> LightBudget:
         """What light there is, and what is needed."""
-        return light_budget(self.signals, self.capture, self.decoder)
+        return light_budget(self.signals, self.capture, self.readings.decoder)
 
     @cached_property
     def enough(self) -> np.ndarray:
@@ -272,9 +278,12 @@ class Evidence:
 
     def _read(self, frames: np.ndarray) -> np.ndarray:
         """(n,) depths that the decoder reads of noise-free frames (k, h, w) in the failed pixels, metres."""
-        clean = Capture(frames, self.capture.sensor, self.signals.rig)
-        with without_warnings():
-            return decode(clean, self.decoder).z[self.failed].astype(np.float64)
+        (z,) = self.readings.read([Capture(frames, self.capture.sensor, self.signals.rig)])
+        return self._of_failed_pixels(z)
+
+    def _of_failed_pixels(self, z: np.ndarray) -> np.ndarray:
+        """(n,) float64 depths of the failed pixels, out of depths (h, w) of all pixels, metres."""
+        return z[self.failed].astype(np.float64)
 
     def _wrong(self, z: np.ndarray) -> np.ndarray:
         """Where depths z (n,) of the failed pixels are off by half of their error or more."""

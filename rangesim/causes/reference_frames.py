@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of other light than a sensor got: its signals without noise, and one light path alone."""
+"""Frames of other light than a sensor received: of straight paths to the true surface alone."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,20 +12,12 @@ from rangesim.rig import Rig
 from rangesim.sensor import Sensor
 from rangesim.signals import GroundTruth
 
-if TYPE_CHECKING:
-    from rangesim.signals import Signals
-
 _CHUNK_VALUES = 32_000_000
 FOOTPRINT_PATHS = 55
 """Number of light paths over the area of a pixel, on a Fibonacci lattice: even along both sides, hence fine enough for
 stripes of a twentieth of the pixel, and over its area."""
 FOOTPRINT_STEP = 34
 """Step of the lattice along the second side, the Fibonacci number before."""
-
-
-def clean_frames(signals: Signals, sensor: Sensor) -> np.ndarray:
-    """(k, h, w) float32, W/m2/sr: frames of all light of the projector, without noise and ambient light."""
-    return signals.frames(sensor, ambient_transmission=0.0)
 
 
 def single_path_frames(sensor: Sensor, rig: Rig, truth: GroundTruth) -> np.ndarray:

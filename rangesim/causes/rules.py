@@ -12,6 +12,7 @@ from rangesim.causes.cause import Cause, CauseMap
 from rangesim.causes.evidence import Evidence
 from rangesim.decoding.range_image import RangeImage
 from rangesim.evaluation.comparison import OUTLIER_M
+from rangesim.evaluation.reference_readings import ReferenceReadings
 from rangesim.response import CAUSTIC, DIRECT, GLINT, MULTIPATH, SPECULAR
 
 if TYPE_CHECKING:
@@ -49,6 +50,12 @@ def explain(
         Image, capture and signals differ in size, the pass lacks the sensor's signals, or `tolerance_m` is not
         positive.
     """
+    return causes_of(ReferenceReadings(image, capture, signals), tolerance_m)
+
+
+def causes_of(readings: ReferenceReadings, tolerance_m: float) -> CauseMap:
+    """The cause of every failed pixel of a range image, from its reference readings; errors as of `explain`."""
+    image, capture, signals = readings.image, readings.capture, readings.signals
     shape = signals.truth.z.shape
     if image.z.shape != shape or capture.frames.shape[1:] != shape:
         raise ValueError(
@@ -59,7 +66,7 @@ def explain(
         raise ValueError("expected a capture that was exposed from these signals, got that of a camera elsewhere.")
     if not tolerance_m > 0:
         raise ValueError(f"expected a positive tolerance_m in metres, got {tolerance_m}.")
-    evidence = Evidence(image, capture, signals, tolerance_m)
+    evidence = Evidence(readings, tolerance_m)
     if not evidence.failed.any():
         return CauseMap(np.zeros(shape, dtype=np.uint8), tolerance_m)
     masks, causes = zip(*rules(evidence), strict=True)

@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rangesim.cli.decode import TOF_SUFFIX, load_frames, structured_light
+from rangesim.cli.decode import TOF_SUFFIX
+from rangesim.cli.images import (
+    ALL_AXES,
+    BitsOption,
+    CodeOption,
+    PeriodOption,
+    ProjectorOption,
+    SensorOption,
+    StepsOption,
+    load_frames,
+    sensor_of_images,
+)
 from rangesim.errors import one_line
 
 if TYPE_CHECKING:
@@ -46,17 +57,14 @@ def calibrate_command(
     ] = None,
     dictionary: Annotated[str, typer.Option(help="Of charuco markers, OpenCV's name.")] = "DICT_5X5_250",
     coefficients: Annotated[int, typer.Option(help="Free of k1, k2, p1, p2, k3, in this order.")] = 5,
-    code: Annotated[str, typer.Option(help="Of bare images: gray or gray-phase.")] = "gray",
-    projector: Annotated[
-        str | None, typer.Option(help="Of bare images: projector pixels, for example 1024x768.")
-    ] = None,
-    period: Annotated[float, typer.Option(help="Of gray-phase images: fringe period, projector pixels.")] = 16.0,
-    steps: Annotated[int, typer.Option(help="Of gray-phase images: phase steps per axis.")] = 4,
-    bits: Annotated[
-        int | None, typer.Option(help="Of bare images: depth, if less than the file's, such as 12.")
-    ] = None,
+    sensor: SensorOption = None,
+    code: CodeOption = None,
+    projector: ProjectorOption = None,
+    period: PeriodOption = None,
+    steps: StepsOption = None,
+    bits: BitsOption = None,
 ) -> None:
-    """Calibrate camera and projector from structured light, columns and rows, on a board in two or more poses.
+    """Calibrate camera and projector from coded light, along columns and rows, on a board in two or more poses.
 
     Ten to twenty poses all over the image, tilted by 20 to 40 degrees in different directions, make a good one.
 
@@ -79,8 +87,6 @@ def calibrate_command(
     from rangesim.errors import FileFormatError
     from rangesim.report.calibration_page import render_calibration
     from rangesim.rig.calibration_files import save_calibration
-    from rangesim.sensors import AmcwToF
-    from rangesim.sensors.structured_light import WHITE
 
     if out.suffix.lower() not in (".json", TOF_SUFFIX, *SUFFIXES):
         raise ValueError(
@@ -94,9 +100,11 @@ def calibrate_command(
     if any(path.is_file() for path in captures):
         _camera_alone(target, captures, out, coefficients, projector, report)
         return
-    sensor = None if projector is None else structured_light(code, projector, "columns,rows", period, steps)
-    taken = [load_frames(path, sensor, bits) for path in captures]
-    of_tof = any(isinstance(capture.sensor, AmcwToF) for capture in taken)
+    if sensor is not None and code is not None:
+        raise ValueError("expected either --sensor or --code.")
+    taken_with = sensor_of_images(sensor, code, projector, ALL_AXES, period, steps)
+    taken = [load_frames(path, taken_with, bits) for path in captures]
+    of_tof = any(capture.sensor.emitter.size is None for capture in taken)  # its light shows no pattern
     if of_tof != (out.suffix.lower() == TOF_SUFFIX):
         raise ValueError(
             f"expected --out to end in {TOF_SUFFIX} for captures by time of flight, and for no others, got "
@@ -104,7 +112,7 @@ def calibrate_command(
         )
     if of_tof:
         if report is not None:
-            raise ValueError("expected --report with structured light; there is no page for time of flight yet.")
+            raise ValueError("expected --report for a camera and a projector; there is no page for time of flight yet.")
         _time_of_flight(target, taken, [str(path) for path in captures], out)
         return
     found = calibrate_rig(target, taken, coefficients=coefficients, names=[str(path) for path in captures])
@@ -112,7 +120,9 @@ def calibrate_command(
     (save_calibration if out.suffix.lower() == ".json" else save_opencv)(found.rig, out)
     typer.echo(_table(found, captures))
     if report is not None:
-        page = render_calibration(found, [str(path) for path in captures], [c.frames[WHITE] for c in taken])
+        page = render_calibration(
+            found, [str(path) for path in captures], [c.sensor.white_image(c.frames) for c in taken]
+        )
         write_file(report, page.encode(), FileFormatError, make_parents=True)
         typer.echo(f"{one_line(report)}: written.")
     typer.echo(f"{one_line(out)}: written.")

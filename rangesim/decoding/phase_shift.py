@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""N-step phase shift: fringe frames to a phase, and to a sub-pixel coordinate with the help of Gray code."""
+"""N-step phase shift: fringe frames, or the taps of a modulated camera, to a phase with its standard deviation."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Annotated
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.decoding.gray import GrayCode, Threshold
-from rangesim.decoding.row_bands import bands
-from rangesim.decoding.status import Status
-from rangesim.sensor import Background, FrameContent, least_signal_for
+from rangesim.sensor import Background, FrameContent, Threshold, least_signal_for
 from rangesim.settings.bounds import Bounds, check_fields
+
+MIN_MODULATION = 1e-20
+"""Modulation, in the units of the capture, that stands for none in the standard deviation of a phase: so small that the
+phase is refused, and large enough for products with the result to stay finite in float32."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +81,18 @@ def phase_of(frames: np.ndarray) -> Phase:
 
 
 def phase_sigma(capture: Capture, phase: Phase, steps: int) -> np.ndarray | None:
-    """(h, w) standard deviation of the phase in radians, sqrt(2 / N) sigma_I / B; None if the detector is unknown."""
+    """(h, w) float32, radians, standard deviation of the phase, sqrt(2 / N) sigma_I / B; None if it is not known.
+
+    It is not known for unknown detectors and noise-free captures.
+
+    Parameters
+    ----------
+    capture : Capture that the frames of `phase` belong to. steps : int, N, number of frames.
+    """
     noise = capture.noise(phase.mean)
     if noise is None:
         return None
-    return np.asarray(np.sqrt(2 / steps) * noise / np.maximum(phase.modulation, np.finfo(np.float32).tiny))
+    return np.asarray(np.sqrt(2 / steps) * noise / np.maximum(phase.modulation, MIN_MODULATION))
 
 
 def tap_phase(taps: np.ndarray, exact_square: bool = False) -> Phase:
@@ -110,44 +118,17 @@ def tap_phase(taps: np.ndarray, exact_square: bool = False) -> Phase:
     return Phase(normalised - np.floor(normalised), 0.5 * np.hypot(cosine, sine), tap.mean(axis=0))
 
 
-def modulation_is_weak(capture: Capture, phase: Phase, steps: int, thresholds: PhaseThresholds) -> np.ndarray:
-    """(h, w) bool, where the phase is not to be trusted."""
-    sigma = phase_sigma(capture, phase, steps)
+def modulation_is_weak(
+    capture: Capture, phase: Phase, sigma: np.ndarray | None, thresholds: PhaseThresholds
+) -> np.ndarray:
+    """(h, w) bool, where the modulation is too weak for a phase.
+
+    Parameters
+    ----------
+    capture : Capture that the frames of `phase` belong to. sigma : as `phase_sigma` returns it.
+    """
     if sigma is not None:
         return np.asarray(sigma > thresholds.max_sigma_rad)
     if capture.is_digital:
         return np.asarray(phase.modulation < thresholds.modulation_of_scale * capture.full_scale)
     return np.asarray(~(phase.modulation > thresholds.relative_modulation * np.maximum(phase.mean, 0)))  # NaN is weak
-
-
-def refine_by_phase(
-    capture: Capture,
-    gray: GrayCode,
-    frames: np.ndarray,
-    period_px: float,
-    least_swing: np.ndarray,
-    thresholds: PhaseThresholds,
-) -> GrayCode:
-    """Sub-pixel coordinate: of all places with this phase, the one nearest to the Gray coordinate.
-
-    Gray cells are half a period at most, so the right place lies at most a quarter of a period off the centre
-    of its cell, and an eighth more is granted to noise and to camera pixels across a cell's edge. Farther
-    off, code and phase contradict each other (`CODE_ERROR`).
-
-    Parameters
-    ----------
-    frames : (N, h, w) fringe frames of the same axis. period_px : float, projector pixels.
-    least_swing : (h, w) float, least brightest - darkest of the fringes, in the capture's units.
-    """
-    coordinate, status = np.empty_like(gray.coordinate), gray.status.copy()
-    for rows in bands(len(status)):
-        phase, whole, refused = phase_of(frames[:, rows]), gray.coordinate[rows], status[rows]
-        periods = np.rint(whole / np.float32(period_px) - phase.normalised)
-        coordinate[rows] = (periods + phase.normalised) * np.float32(period_px)
-        ok = refused == Status.OK
-        contradiction = np.abs(coordinate[rows] - whole) > gray.cell_px / 2 + period_px / 8
-        washed_out = 2 * phase.modulation < least_swing[rows]  # as those seen by interreflection alone
-        refused[ok & contradiction] = Status.CODE_ERROR
-        refused[ok & (modulation_is_weak(capture, phase, len(frames), thresholds) | washed_out)] = Status.LOW_SIGNAL
-        refused[ok & capture.saturated(frames[:, rows])] = Status.SATURATED
-    return GrayCode(coordinate, status, gray.cell_px)

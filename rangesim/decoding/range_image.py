@@ -16,6 +16,10 @@ from rangesim.settings.config import ShortRepr
 if TYPE_CHECKING:
     from rangesim.sensor import Decoder
 
+MIN_MEASURED = 0.5
+"""Least fraction of the pixels that are measured in a sound capture of a whole scene. Below it, `Decoder.likely_cause`
+and `rangesim decode` look for a mistake; a larger value makes them suspect captures of dark or distant scenes."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RangeImage(ShortRepr):

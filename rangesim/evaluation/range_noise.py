@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.capture.exposure import exposed_again, noise_free_capture
+from rangesim.capture.exposure import exposed_again
 from rangesim.decoding.range_image import RangeImage
-from rangesim.errors import SamplingWarning, sentence, without_warnings
+from rangesim.errors import SamplingWarning, sentence
+from rangesim.evaluation.reference_readings import ReferenceReadings
 from rangesim.robust_scale import sigma_from_median
 from rangesim.settings.seeds import SEEDS
 from rangesim.signals import ALL
@@ -114,16 +115,23 @@ def range_noise(image: RangeImage, capture: Capture, signals: Signals) -> RangeN
     ValueError
         The signals do not know their sampling error (`Signals.knows_sampling_error`), or lack the capture's sensor.
     """
-    above, below = _noise_free_halves(image, capture, signals)
+    return noise_of(ReferenceReadings(image, capture, signals))
+
+
+def noise_of(readings: ReferenceReadings) -> RangeNoise:
+    """Noise of a range image, from its reference readings; errors as of `range_noise`."""
+    image, capture = readings.image, readings.capture
+    above, below = readings.halves
     _, sampling = _middle_and_draw(image, above, below)
     if not capture.is_digital:
         nothing = np.full(image.z.shape, np.nan, np.float32)
         return RangeNoise(nothing, sampling, Repeats(~image.valid, ~image.valid, (np.isnan(above), np.isnan(below))))
-    clean = _decoded_again(image, [noise_free_capture(signals, capture.sensor, capture.ambient)])[0].astype(np.float64)
+    clean = readings.noise_free.astype(np.float64)
     repeats = None
     if capture.detector is not None:
-        captures = [exposed_again(capture, signals, *of) for of in zip(NOISE_SEEDS, (0.0, 1.0, -1.0), strict=True)]
-        again, above, below = _decoded_again(image, captures)
+        seeds_and_errors = zip(NOISE_SEEDS, (0.0, 1.0, -1.0), strict=True)
+        captures = [exposed_again(capture, readings.signals, *each) for each in seeds_and_errors]
+        again, above, below = readings.read(captures)
         repeats = Repeats(~image.valid, np.isnan(again), (np.isnan(above), np.isnan(below)))
     return RangeNoise((image.z - clean).astype(np.float32), sampling, repeats)
 
@@ -138,22 +146,7 @@ def sampling_draw(image: RangeImage, capture: Capture, signals: Signals) -> tupl
     ValueError
         As `range_noise`.
     """
-    return _middle_and_draw(image, *_noise_free_halves(image, capture, signals))
-
-
-def _noise_free_halves(image: RangeImage, capture: Capture, signals: Signals) -> tuple[np.ndarray, np.ndarray]:
-    """Depths (h, w) float32 that each half of the samples gives without noise."""
-    captures = [noise_free_capture(signals, capture.sensor, capture.ambient, error) for error in (1.0, -1.0)]
-    above, below = _decoded_again(image, captures)
-    return above, below
-
-
-def _decoded_again(image: RangeImage, captures: Sequence[Capture]) -> list[np.ndarray]:
-    """Depths (h, w) float32 of captures by the decoder of a range image, which has warned already."""
-    from rangesim.decoding import decode
-
-    with without_warnings():
-        return [decode(capture, image.decoder).z for capture in captures]
+    return _middle_and_draw(image, *ReferenceReadings(image, capture, signals).halves)
 
 
 def _middle_and_draw(image: RangeImage, above: np.ndarray, below: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
