@@ -24,6 +24,7 @@ ROOMS = [
     "rangesim.files",
     "rangesim.fusion",
     "rangesim.geometry",
+    "rangesim.instrument",
     "rangesim.motion",
     "rangesim.multiview",
     "rangesim.point_cloud",
