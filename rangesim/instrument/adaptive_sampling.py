@@ -33,8 +33,8 @@ NEGLIGIBLE = 1e-5
 """Ratio of a standard deviation to the median depth of the scene below which sampling noise is always small enough. It
 limits the samples of noise-free captures, where a tenth of this ratio would need a hundred times as many samples."""
 BLOCK_PX = 16
-"""Edge of the squares in which the noise of an instance is estimated, in pixels. In a larger square the estimate rests on
-more pixels; in a smaller one it follows changes of the noise better."""
+"""Edge in pixels of the squares in which the noise of an instance is estimated. In larger squares the estimate uses
+more pixels; in smaller ones it follows changes of the noise better."""
 SPP_STEP = 4
 """The number of samples is a multiple of this, because the samples come in two halves, each of antithetic pairs."""
 
