@@ -12,6 +12,7 @@ import pytest
 ROOMS = [
     "pcgraph.plumbing",
     "rangesim.calibration",
+    "rangesim.decoding",
     "rangesim.electronics",
     "rangesim.fusion",
     "rangesim.geometry",
@@ -19,11 +20,12 @@ ROOMS = [
     "rangesim.multiview",
     "rangesim.response",
     "rangesim.rig",
+    "rangesim.sensors",
     "rangesim.settings",
     "rangesim.signals",
 ]
 """Packages whose docstrings are run, all of their modules."""
-MODULES = ["rangesim.errors", "rangesim.triangle_mesh"]
+MODULES = ["rangesim.errors", "rangesim.sensor", "rangesim.triangle_mesh"]
 """Modules outside these packages whose docstrings are run."""
 
 
