@@ -19,6 +19,7 @@ ROOMS = [
     "rangesim.calibration",
     "rangesim.capture",
     "rangesim.electronics",
+    "rangesim.evaluation",
     "rangesim.fusion",
     "rangesim.geometry",
     "rangesim.motion",
