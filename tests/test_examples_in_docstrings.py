@@ -18,6 +18,7 @@ ROOMS = [
     "pcgraph.plumbing",
     "rangesim.calibration",
     "rangesim.capture",
+    "rangesim.causes",
     "rangesim.electronics",
     "rangesim.evaluation",
     "rangesim.fusion",
