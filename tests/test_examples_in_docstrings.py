@@ -27,6 +27,7 @@ ROOMS = [
     "rangesim.instrument",
     "rangesim.motion",
     "rangesim.multiview",
+    "rangesim.pipeline",
     "rangesim.point_cloud",
     "rangesim.response",
     "rangesim.rig",
