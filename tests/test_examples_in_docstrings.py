@@ -30,6 +30,7 @@ ROOMS = [
     "rangesim.pipeline",
     "rangesim.point_cloud",
     "rangesim.response",
+    "rangesim.results",
     "rangesim.rig",
     "rangesim.settings",
     "rangesim.signals",
