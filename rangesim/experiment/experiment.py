@@ -47,7 +47,7 @@ class Experiment:
     ambient : Ambient, kind and strength of the light that the scene's own emitters give; None: not stated, see
         `rangesim.expose`.
     instruments : instruments to compare. Those whose emitter, wavelength and camera agree share a light-transport
-        pass, if nothing moves, see `rangesim.pipeline.passes`.
+        pass, if nothing moves, see `rangesim.pipeline.shared_passes`.
     motion : Motion, objects that move; None: nothing moves.
 
     Raises
