@@ -288,7 +288,7 @@ def test_a_failure_halfway_leaves_nothing(command: Command, tmp_path: Path, monk
     def fail(*_: object) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("rangesim.report.write_report", fail)
+    monkeypatch.setattr("rangesim.report.render_report", fail)
     answer = command("run", PLANE, *IDEAL, *TINY, "--out", tmp_path / "a" / "b")
     assert (answer.status, answer.err) == (1, "rangesim: no space left on device\n")
     assert list(tmp_path.iterdir()) == []
@@ -342,15 +342,17 @@ def test_names_of_shapes_give_no_orders_to_a_terminal(order: str) -> None:
     name = f"a{order}b"
     result: Any = SimpleNamespace(
         things=(name, "sphere"),
-        errors={name: None, "sphere": SimpleNamespace(accuracy_m=1e-3, recall=0.5)},
-        materials={name: order, "sphere": "matte"},
-        seen=None,
+        shapes={
+            name: SimpleNamespace(material=order, accuracy_m=None, recall=None),
+            "sphere": SimpleNamespace(material="matte", accuracy_m=1e-3, recall=0.5),
+        },
+        seen=SimpleNamespace(shapes=dict.fromkeys((name, "sphere"), SimpleNamespace(surface=0.25))),
         poses=None,
     )
     code = {"\n": "\\n"}.get(order[0], f"\\u{ord(order[0]):04x}") + order[1:]
     lines = _table(result).split("\n")
-    assert lines[1].split() == [f"a{code}b", code, "-", "-", "-"]
-    assert lines[2].split() == ["sphere", "matte", "1.000", "mm", "50.0%", "-"]
+    assert lines[1].split() == [f"a{code}b", code, "-", "-", "25.0%"]
+    assert lines[2].split() == ["sphere", "matte", "1.000", "mm", "50.0%", "25.0%"]
     assert len(lines) == 3
 
 

@@ -20,7 +20,7 @@ from rangesim.instrument.instrument import instrument
 from rangesim.motion import ConstantTwist, Motion, Timing
 from rangesim.pipeline import cost, experiment_run
 from rangesim.pipeline.cost import Cost, available_memory_bytes, estimate_cost
-from rangesim.pipeline.passes import group_by_rig
+from rangesim.pipeline.shared_passes import group_by_rig
 from rangesim.sensors import DirectToF
 from rangesim.settings import limits
 

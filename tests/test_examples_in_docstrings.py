@@ -6,27 +6,54 @@ from __future__ import annotations
 import doctest
 import importlib
 import pkgutil
+from functools import cache
+from typing import Any
 
 import pytest
+from synthetic import plane_signals, stereo_rig
+
+from rangesim import AmcwToF, Detector, decode, expose
 
 ROOMS = [
     "pcgraph.plumbing",
     "rangesim.calibration",
+    "rangesim.capture",
+    "rangesim.causes",
     "rangesim.decoding",
     "rangesim.electronics",
+    "rangesim.environment",
+    "rangesim.evaluation",
+    "rangesim.experiment",
+    "rangesim.files",
     "rangesim.fusion",
     "rangesim.geometry",
+    "rangesim.instrument",
     "rangesim.motion",
     "rangesim.multiview",
+    "rangesim.point_cloud",
     "rangesim.response",
     "rangesim.rig",
+    "rangesim.sensor",
     "rangesim.sensors",
     "rangesim.settings",
     "rangesim.signals",
 ]
 """Packages whose docstrings are run, all of their modules."""
-MODULES = ["rangesim.errors", "rangesim.sensor", "rangesim.triangle_mesh"]
+MODULES = ["rangesim", "rangesim.errors", "rangesim.triangle_mesh"]
 """Modules outside these packages whose docstrings are run."""
+
+
+GIVEN_A_WALL = ["rangesim.capture", "rangesim.causes", "rangesim.evaluation"]
+"""Packages whose examples start from the names of `a_wall`."""
+
+
+@cache
+def a_wall() -> dict[str, Any]:
+    """Signals of a wall at 1 m, the sensor that they are of, a capture and its range image; no renderer."""
+    sensor = AmcwToF()
+    signals = plane_signals(stereo_rig(64, 48, baseline_m=0.0), sensor)
+    capture = expose(signals, sensor, Detector())
+    return {"signals": signals, "sensor": sensor, "capture": capture, "image": decode(capture)}
 
 
 def modules_of(room: str) -> list[str]:
@@ -38,12 +65,12 @@ def modules_of(room: str) -> list[str]:
 @pytest.mark.parametrize("room", ROOMS)
 def test_the_examples_of_a_room_print_what_they_say(room):
     options = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-    modules = modules_of(room)
+    modules, given = modules_of(room), a_wall() if room in GIVEN_A_WALL else {}
     assert len(modules) > 1
     failures = {
         name: failed
         for name in modules
-        if (failed := doctest.testmod(importlib.import_module(name), optionflags=options).failed)
+        if (failed := doctest.testmod(importlib.import_module(name), optionflags=options, extraglobs=given).failed)
     }
     assert not failures, f"failed examples per module: {failures}; doctest's report stands above."
 

@@ -11,7 +11,7 @@ import pytest
 from synthetic import plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import BRIGHT_PERCENTILE
-from rangesim.capture.exposure import TARGET_FRACTION, expose, photons_per_pulse
+from rangesim.capture.exposure import TARGET_FRACTION, expose, exposed
 from rangesim.electronics.detector import Detector, PhotoDetector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import RangesimWarning
@@ -199,7 +199,6 @@ def test_photons_per_pulse_of_a_plain_wall_are_those_by_hand(
     detector = SpadDetector(pile_up=pile_up, dark_counts_hz=1e5, ambient_transmission=0.5)
     depth = np.full((rig.camera.height, rig.camera.width), wall_m)
     signals = signals_of_depth(rig, depth, [sensor], albedo=albedo, ambient=0.3)
-    capture = expose(signals, sensor, detector, 1e-4)
     period_s = sensor.bins * sensor.bin_s
     per_joule = detector.quantum_efficiency * detector.wavelength_m / (6.62607015e-34 * 299792458)
     camera, projector = rig.camera, rig.projector
@@ -209,7 +208,7 @@ def test_photons_per_pulse_of_a_plain_wall_are_those_by_hand(
     laser_photons = power_w * period_s * patch_m2 / lit_m2 * caught * per_joule
     lens_m2 = np.pi * rig.camera_lens.aperture_radius_m**2
     ambient_photons = 0.5 * 0.3 * lens_m2 / (camera.fx * camera.fy) * period_s * per_joule
-    found = photons_per_pulse(signals, capture)
+    found = exposed(signals, sensor, detector, 1e-4).photons_per_pulse()
     assert found is not None
     assert found.shape == depth.shape
     np.testing.assert_allclose(found, laser_photons + ambient_photons + 1e5 * period_s, rtol=1e-3)
@@ -220,8 +219,9 @@ def test_photons_per_pulse_are_what_the_counts_say() -> None:
     rig, sensor = stereo_rig(60, 40, baseline_m=0.0, projector_power_w=0.5), DirectToF()
     signals = plane_signals(rig, sensor, distance_m=1.5, ambient=0.2)
     for detector in (SpadDetector(bits=16), SpadDetector(bits=16, pile_up=False)):
-        capture = expose(signals, sensor, detector, 1e-3)
-        photons, pulses = photons_per_pulse(signals, capture), detector.pulses(sensor.gate, 1e-3)
+        exposure = exposed(signals, sensor, detector, 1e-3)
+        capture, photons = exposure.capture, exposure.photons_per_pulse()
+        pulses = detector.pulses(sensor.gate, 1e-3)
         assert photons is not None
         assert 0.1 < np.median(photons) < 3
         counted = -np.expm1(-photons) if detector.pile_up else photons
@@ -231,8 +231,8 @@ def test_photons_per_pulse_are_what_the_counts_say() -> None:
 def test_detectors_that_integrate_know_no_photons_per_pulse() -> None:
     rig, counting = stereo_rig(), DirectToF()
     signals = plane_signals(rig, SENSOR, counting)
-    assert photons_per_pulse(signals, expose(signals, SENSOR, Detector())) is None
-    assert photons_per_pulse(signals, expose(signals, counting)) is None  # noise-free
+    assert exposed(signals, SENSOR, Detector()).photons_per_pulse() is None
+    assert exposed(signals, counting).photons_per_pulse() is None  # noise-free
 
 
 def test_without_a_detector_frames_are_the_radiance() -> None:

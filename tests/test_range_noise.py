@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,19 @@ import numpy as np
 import pytest
 from tiers import to_validate
 
-from rangesim import AmcwToF, Capture, IdealToF, Scene, StructuredLight, compare, decode, expose, load_scene, transport
+from rangesim import (
+    AmcwToF,
+    Capture,
+    DirectToF,
+    IdealToF,
+    Scene,
+    StructuredLight,
+    compare,
+    decode,
+    expose,
+    load_scene,
+    transport,
+)
 from rangesim.causes import explain
 from rangesim.errors import RangesimWarning, SamplingWarning, warn
 from rangesim.evaluation.range_noise import Repeats, range_noise, robust_sigma, warn_of_sampling
@@ -19,6 +32,8 @@ from rangesim.instrument.adaptive_sampling import FIRST_SPP, AdaptiveSampling, g
 from rangesim.instrument.instrument import Instrument
 from rangesim.light_transport.loop import SampleAllocation
 from rangesim.light_transport.sampling_error import Halves
+from rangesim.pipeline.experiment_run import measure
+from rangesim.signals import StillSignals
 
 SMALL_IMAGE: dict[str, Any] = {"width": 96, "height": 72}
 
@@ -79,6 +94,38 @@ def test_what_is_decoded_again_for_comparison_does_not_warn_again(matte: Scene, 
         again, anew = range_noise(image, capture, signals), explain(image, capture, signals)
     np.testing.assert_array_equal(again.sampling, noise.sampling)
     np.testing.assert_array_equal(anew.cause, causes.cause)
+
+
+@pytest.mark.parametrize(("ambient", "decodings"), [(0.0, 9), (0.05, 10)])
+def test_an_instrument_decodes_and_exposes_the_same_light_once(
+    matte: Scene, monkeypatch: Any, ambient: float, decodings: int
+) -> None:
+    """Its own capture, both halves, all samples without noise, three with other noise, and three parts of the light:
+    the projector's alone (only where there is other light), the straight path, and paths over a pixel's area."""
+    sensor, rig = DirectToF(bins=64, bin_s=400e-12), matte.rig(0.03, width=48, height=36)
+    signals = transport(matte, rig, [sensor], spp=4)
+    energy = replace(signals.energy, ambient=np.full_like(signals.energy.ambient, ambient))
+    signals = replace(signals, energy=energy)
+    read: list[bytes] = []
+    lit: list[tuple[float, float]] = []
+    decoder, undisturbed = type(sensor.default_decoder), type(sensor.default_decoder).decode
+    frames_of = StillSignals.frames
+
+    def noted(self: Any, capture: Any) -> Any:
+        read.append(capture.frames.tobytes())
+        return undisturbed(self, capture)
+
+    def frames(self: Any, sensor: Any, ambient_transmission: float = 1.0, sampling_errors: float = 0.0) -> Any:
+        lit.append((ambient_transmission, sampling_errors))
+        return frames_of(self, sensor, ambient_transmission, sampling_errors)
+
+    monkeypatch.setattr(decoder, "decode", noted)
+    monkeypatch.setattr(StillSignals, "frames", frames)
+    measured = measure(Instrument("direct", sensor), signals, seed=1)
+    assert measured.causes.failed.any()
+    assert len(read) == len(set(read)) == decodings
+    filtered = lit[0]
+    assert lit.count(filtered) == 2  # the capture, which also says how many photons there are, and with other noise
 
 
 @pytest.mark.validation
@@ -316,7 +363,7 @@ def test_where_nothing_can_be_read_no_samples_are_wasted() -> None:
     scene = load_scene("glassware")
     sensor = AmcwToF()
     signals = transport(scene, scene.rig(0.03, **SMALL_IMAGE), [sensor], spp=16, photons=0, glint=False)
-    signals_of = {sensor: signals}.__getitem__
+    signals_of = {tuple(sensor.responses()): signals}.__getitem__
     for exposure_s in (1e-12, 10.0):
         one = Instrument("one", sensor, exposure_s=exposure_s)
         assert (AdaptiveSampling((one,)).samples(signals.truth, signals_of) == FIRST_SPP).all()

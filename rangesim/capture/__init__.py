@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames as a camera delivers them: exposure, and their files."""
+"""Captures: the frames that a camera delivers, and how they are exposed from signals."""
 
 from rangesim.capture.capture import (
     BRIGHT_PERCENTILE,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames as a camera delivers them, with what is needed to decode them."""
+"""Captures: the frames that a camera delivers, with the data that a decoder needs besides them."""
 
 from __future__ import annotations
 
@@ -18,52 +18,71 @@ if TYPE_CHECKING:
     from rangesim.electronics.ambient import Ambient
 
 DTYPES = ("uint8", "uint16", "uint32", "float32")
-
+"""Types that frames may have: digital numbers of up to 8, 16 or 32 bits, or radiance."""
 
 BRIGHT_PERCENTILE = 99.0
-"""Percentile of the lit pixels that counts as bright: highlights of mirrors and gloss lie beyond."""
+"""Percentile of the lit pixels, in percent, that counts as the level of bright pixels.
+
+The 1 % above it is left for highlights of mirrors and glossy surfaces, which would otherwise set the exposure and the
+contrast thresholds of the whole image.
+"""
 
 
 def bright_level(values: np.ndarray) -> float:
-    """Level of bright pixels: the 99th percentile of the positive values; 0 if there are none."""
+    """Level of bright pixels: percentile `BRIGHT_PERCENTILE` of the positive values; 0 if there are none."""
     positive = values[values > 0]
     return float(np.percentile(positive, BRIGHT_PERCENTILE)) if positive.size else 0.0
 
 
-MIN_CLIPPED_FRACTION = 0.005
-"""Least fraction of the pixels at the level where a camera clips."""
-MIN_CLIP_PEAK = 10.0
-"""Least ratio of the pixels at that level to those at an average one of the `CLIP_LEVELS` below."""
-MIN_CLIP_TAIL = 0.05
-"""Least ratio of the pixels in the `CLIP_LEVELS` below together to those at that level; an image of few grey levels has
-none."""
-CLIP_LEVELS = 16
-"""Number of levels looked at below, each 1/256 of the level where the camera clips."""
+@dataclass(frozen=True)
+class ClippingThresholds:
+    """Thresholds by which `clip_level` tells that the largest value in an image is the level where the camera clips.
+
+    With the defaults, images of which 5 to 50 % of the pixels clip are told from patterns of one brightness
+    (`tests/test_decode_summary.py`). How far each may be changed was not measured.
+
+    levels : number of levels below the largest value that are compared with it, each 1/256 of that value wide.
+    min_fraction : least fraction of the pixels that are at the largest value; fewer are single highlights.
+    min_peak : least ratio of their number to the mean number of pixels in one of the `levels` below; a smaller value
+        takes the peaks of fringes for clipping.
+    min_tail : least ratio of the number of pixels in all `levels` below to their number; an image of few grey levels
+        (black and white, for example) has no pixels there, and does not clip.
+    """
+
+    levels: int = 16
+    min_fraction: float = 0.005
+    min_peak: float = 10.0
+    min_tail: float = 0.05
+
+
+CLIPPING = ClippingThresholds()
+"""Thresholds that `Capture.saturated` uses where the detector is unknown."""
 
 
 def clip_level(brightest: np.ndarray, max_dn: int) -> int:
-    """The digital number at which a camera clips: `max_dn`, unless values pile up at a lower largest one.
+    """The digital number at which a camera clips: `max_dn`, or a lower one at which many pixels pile up.
 
-    Video levels end at 235 of 255, others at what a converter or a developer of raw images leaves. There the values
-    below go on up to the end, and many stand on it. Images of two values have nothing below, and peaks of fringes no
-    such pile: neither is clipped.
+    Video levels end at 235 of 255; other images end where a converter or a raw developer cuts them off. In such an
+    image the numbers of pixels continue up to the largest value, and many pixels are at that value. An image of two
+    values has no pixels below the largest one, and fringes have no such pile at their peaks: neither is clipped.
 
     Parameters
     ----------
     brightest : (h, w) integer, the largest value of each pixel in all frames.
+    max_dn : largest digital number that the type of the frames or the detector allows.
     """
     top = int(brightest.max())
-    if top >= max_dn or top < 2 * CLIP_LEVELS:
+    if top >= max_dn or top < 2 * CLIPPING.levels:
         return max_dn
     at_top = int((brightest == top).sum())
     width = max(1.0, top / 256)
-    below = int(((brightest < top) & (brightest >= top - CLIP_LEVELS * width)).sum())
-    piled = at_top > MIN_CLIP_PEAK * below / CLIP_LEVELS and below > MIN_CLIP_TAIL * at_top
-    return top if piled and at_top > MIN_CLIPPED_FRACTION * brightest.size else max_dn
+    below = int(((brightest < top) & (brightest >= top - CLIPPING.levels * width)).sum())
+    piled = at_top > CLIPPING.min_peak * below / CLIPPING.levels and below > CLIPPING.min_tail * at_top
+    return top if piled and at_top > CLIPPING.min_fraction * brightest.size else max_dn
 
 
 def _masked_in_all(frames: np.ndarray) -> np.ndarray:
-    """Frames (k, h, w), those of float32 with NaN in all where one of them is not finite."""
+    """Frames (k, h, w); a pixel of float32 frames that is not finite in one frame is NaN in all of them."""
     if np.issubdtype(frames.dtype, np.integer):
         return frames
     masked = np.zeros(frames.shape[1:], dtype=bool)
@@ -79,12 +98,29 @@ class Capture(ShortRepr):
     Parameters
     ----------
     frames : (k, h, w) uint8, uint16 or uint32 digital numbers; or float32 radiance (W/m2/sr) of a noise-free
-        capture. A pixel that is not finite in one frame is kept as NaN in all: it is masked, and measures nothing.
+        capture. A pixel that is not finite in one frame becomes NaN in all frames: it is masked, and has no reading.
     sensor : Sensor, the measuring principle the frames were taken with.
-    rig : Rig, or None for an uncalibrated capture.
-    detector : PhotoDetector, or None if unknown (a real capture) or noise-free.
+    rig : Rig; None: the capture is not calibrated.
+    detector : PhotoDetector; None: unknown (a real capture), or the capture is noise-free.
     exposure_s : float, seconds per frame; NaN if unknown.
-    ambient : Ambient, the ambient light it was taken in, or None if not stated.
+    ambient : Ambient, the ambient light that the capture was taken in; None: not stated.
+
+    Raises
+    ------
+    ValueError
+        The frames are not as many as the sensor takes, differ from the rig's camera in size, or have another type.
+
+    Examples
+    --------
+    Frames of a real camera are decoded like simulated ones:
+
+    >>> import numpy as np
+    >>> import rangesim
+    >>> sensor = rangesim.AmcwToF()
+    >>> frames = np.full((sensor.n_frames, 3, 4), 100, dtype=np.uint16)
+    >>> capture = rangesim.Capture(frames, sensor)
+    >>> capture.is_digital, capture.full_scale
+    (True, 65535.0)
     """
 
     frames: np.ndarray
@@ -116,12 +152,12 @@ class Capture(ShortRepr):
 
     @property
     def black_level(self) -> float:
-        """Digital number without light; 0 if unknown or noise-free."""
+        """Digital number of a pixel without light; 0 if the detector is unknown, or the capture is noise-free."""
         return self.detector.black_level_dn if self.detector else 0.0
 
     @property
     def full_scale(self) -> float:
-        """Largest signal above black that a frame can hold; of a noise-free capture, that of its bright pixels."""
+        """Largest signal above the black level that a frame can hold; the level of the bright pixels if noise-free."""
         if not self.is_digital:
             return bright_level(self.frames.max(axis=0)) or 1.0
         return self._max_dn - self.black_level
@@ -131,9 +167,9 @@ class Capture(ShortRepr):
         return self.detector.max_dn if self.detector else int(np.iinfo(self.frames.dtype).max)
 
     def saturated(self, frames: np.ndarray) -> np.ndarray:
-        """(h, w) bool, where any of `frames` (k, h, w) of this capture is at the level where the camera clips.
+        """(h, w) bool, whether any of `frames` (k, h, w) of this capture is at the level where the camera clips.
 
-        That is the largest digital number, or a lower one where an unknown detector's values end, see `clip_level`.
+        The level is the largest digital number of a known detector. For an unknown one, `clip_level` finds it.
         """
         if not self.is_digital:
             return np.zeros(frames.shape[1:], dtype=bool)
@@ -145,5 +181,6 @@ class Capture(ShortRepr):
         return clip_level(self.frames.max(axis=0), self._max_dn)
 
     def noise(self, frame: np.ndarray) -> np.ndarray | None:
-        """Standard deviation of the pixels of a frame, in its units; None if the detector is unknown, or counts."""
+        """Standard deviation of the noise of each pixel of a frame, in digital numbers, by the detector's formula; None
+        if the detector is unknown or counts photons."""
         return self.detector.noise_dn(frame) if self.detector else None

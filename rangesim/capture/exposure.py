@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals to a capture, as a camera would deliver it."""
+"""Exposure of signals: the capture that a camera would deliver of them."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +14,7 @@ from rangesim.errors import warn
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
 from rangesim.settings.bounds import SECONDS, check_number
+from rangesim.settings.config import ShortRepr
 from rangesim.settings.seeds import check_seed
 
 if TYPE_CHECKING:
@@ -21,7 +22,11 @@ if TYPE_CHECKING:
     from rangesim.signals import Signals
 
 TARGET_FRACTION = 0.7
-"""Fraction of the saturation capacity where automatic exposure puts the bright pixels (`bright_level`)."""
+"""Fraction of the saturation capacity to which automatic exposure brings the bright pixels (`bright_level`).
+
+A larger value saturates more of the brightest 1 % of the pixels; a smaller one uses less of the dynamic range. The
+value is a choice and was not optimised.
+"""
 
 
 def expose(
@@ -32,28 +37,97 @@ def expose(
     seed: int = 0,
     ambient: Ambient | None = None,
 ) -> Capture:
-    """Capture of `sensor`: its frames with the noise and limits of `detector`.
+    """The capture that a sensor takes of signals, with the noise and the limits of a detector.
 
     Parameters
     ----------
     signals : Signals of a transport pass that this sensor was part of.
     sensor : Sensor.
-    detector : Detector (EMVA 1288) or, for direct time of flight, SpadDetector. None: a noise-free capture,
-        float32 radiance in W/m2/sr, unfiltered ambient light included. The frames of an ideal sensor
-        (`Sensor.is_ideal`) are always noise-free.
+    detector : Detector (EMVA 1288) or, for direct time of flight, SpadDetector. None: the capture is noise-free; its
+        frames are float32 radiance in W/m2/sr and contain the ambient light without a filter. The frames of an ideal
+        sensor (`Sensor.is_ideal`) are always noise-free.
     exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`.
-    seed : int, 0 to 2^64 - 1, of the noise. Every frame, of a SpadDetector every image row, has its own stream; the
-        same seed gives the same bytes on any number of threads.
-    ambient : Ambient, what kind of light the scene's own emitters give, and how strong: the detector's
-        band (`band_width_m`) then decides what counts of it. None: unknown, and the detector's
-        `ambient_transmission` does. Other light needs no new pass.
+    seed : int from 0 to 2^64 - 1, seed of the noise. Every frame has a random stream of its own, with a SpadDetector
+        every image row; the same seed gives the same bytes on any number of threads.
+    ambient : Ambient, kind and strength of the light of the scene's own emitters; the detector's band
+        (`band_width_m`) then decides how much of it counts. None: unknown; the detector's `ambient_transmission`
+        decides. Another ambient light needs no new transport pass.
 
     Raises
     ------
     ValueError
         The pass lacks the sensor's signals, the exposure is not positive, the seed is out of its range, detector and
         sensor do not go together, or ambient light is stated for a scene that has none.
+
+    Examples
+    --------
+    `signals` is what `rangesim.transport(scene, rig, sensor)` returns, here of a wall at 1 m:
+
+    >>> from rangesim import Detector, expose
+    >>> capture = expose(signals, sensor, Detector(read_noise_e=5.0), exposure_s=1e-3, seed=1)
+    >>> capture.frames.dtype.name, capture.frames.shape == (sensor.n_frames, 48, 64)
+    ('uint16', True)
+    >>> expose(signals, sensor).is_digital  # noise-free: radiance
+    False
     """
+    return exposed(signals, sensor, detector, exposure_s, seed, ambient).capture
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Exposure(ShortRepr):
+    """A capture together with the light that it was exposed from.
+
+    capture : Capture.
+    signals : Signals.
+    radiance : (k, h, w) float32, W/m2/sr, mean of the light that the detector turns into each frame; None: the capture
+        is noise-free, and its frames are the radiance.
+    """
+
+    capture: Capture
+    signals: Signals
+    radiance: np.ndarray | None = None
+
+    def photons_per_pulse(self) -> np.ndarray | None:
+        """(h, w) float64, mean number of photons that each pixel detects per laser pulse; with pile-up, it counts only
+        the first of them. None if the detector integrates, or the capture is noise-free."""
+        capture = self.capture
+        if capture.detector is None or self.radiance is None or capture.sensor.gate is None:
+            return None
+        return capture.detector.photons_per_pulse(self.radiance, capture.sensor.gate, self.signals.rig)
+
+    def warn_of_overexposure(self, name: str) -> None:
+        """Warn if the detector's shortest exposure, which was chosen automatically, saturates the bright pixels.
+
+        name : of the instrument.
+
+        Warns
+        -----
+        RangesimWarning
+        """
+        capture, rig = self.capture, self.signals.rig
+        detector = capture.detector
+        if detector is None or self.radiance is None or capture.exposure_s > detector.min_exposure_s:
+            return
+        level = bright_level(self.radiance.max(axis=0)) * detector.electron_rate_per_radiance(rig)
+        if level * capture.exposure_s > detector.capacity_e:
+            lit = self.signals.energy.projector > 0
+            fraction = np.mean(capture.saturated(capture.frames), where=lit) if lit.any() else 0.0
+            warn(
+                f"{name}: the detector's shortest exposure, {capture.exposure_s:g} s, saturates {100 * fraction:.0f} % "
+                "of the pixels that get light of the emitter; take less light "
+                f"(its power_w is {rig.projector_power_w:g}), or a shorter min_exposure_s."
+            )
+
+
+def exposed(
+    signals: Signals,
+    sensor: Sensor,
+    detector: PhotoDetector | None = None,
+    exposure_s: float | None = None,
+    seed: int = 0,
+    ambient: Ambient | None = None,
+) -> Exposure:
+    """Capture of `sensor` with the light that it was exposed from; parameters and errors as of `expose`."""
     if detector is not None and not isinstance(detector, PhotoDetector):
         raise ValueError(f"expected a Detector, a SpadDetector or None, got {detector!r}.")
     seed = check_seed(seed)
@@ -62,39 +136,36 @@ def expose(
     if ambient is not None:
         ambient.check_emitters(bool(signals.energy.ambient.any()))
     if detector is None or sensor.is_ideal:
-        return noise_free_capture(signals, sensor, ambient)
+        return Exposure(noise_free_capture(signals, sensor, ambient), signals)
     radiance = _mean_radiance(signals, sensor, detector, ambient)
     if exposure_s is None:
         exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
     frames = detector.read_out(radiance, sensor.gate, signals.rig, exposure_s, seed)
-    return Capture(frames, sensor, signals.rig, detector, exposure_s, ambient)
-
-
-def photons_per_pulse(signals: Signals, capture: Capture) -> np.ndarray | None:
-    """(h, w) float64, photons that each pixel of the capture detected per laser pulse, on average, whether or not the
-    detector could count them; None if it integrates, or the capture is noise-free.
-
-    signals : those that the capture was exposed from.
-    """
-    sensor, detector = capture.sensor, capture.detector
-    if detector is None or sensor.gate is None:
-        return None
-    radiance = _mean_radiance(signals, sensor, detector, capture.ambient)
-    return detector.photons_per_pulse(radiance, sensor.gate, signals.rig)
+    return Exposure(Capture(frames, sensor, signals.rig, detector, exposure_s, ambient), signals, radiance)
 
 
 def noise_free_capture(
     signals: Signals, sensor: Sensor, ambient: Ambient | None = None, sampling_errors: float = 0.0
 ) -> Capture:
-    """Capture of radiance, without a detector; so many times the sampling error of the signals is added to them."""
+    """Capture of the radiance of signals, without a detector.
+
+    sampling_errors : factor on the draw of the sampling error that is added to the signals; 0: none is added.
+    """
     unfiltered = 1.0 if ambient is None else ambient.scale
     frames = signals.frames(sensor, unfiltered, sampling_errors)
     return Capture(_through_lens(frames, signals.rig), sensor, signals.rig, ambient=ambient)
 
 
 def exposed_again(capture: Capture, signals: Signals, seed: int, sampling_errors: float = 0.0) -> Capture:
-    """Capture of the same signals with the same settings and other noise of the detector, which must be known; so many
-    times the sampling error of the signals is added to them."""
+    """Capture of the same signals with the same settings, and with the noise of another seed.
+
+    sampling_errors : factor on the draw of the sampling error that is added to the signals; 0: none is added.
+
+    Raises
+    ------
+    ValueError
+        The detector of the capture is not known.
+    """
     if capture.detector is None:
         raise ValueError("expected a capture whose detector is known, got one without.")
     radiance = _mean_radiance(signals, capture.sensor, capture.detector, capture.ambient, sampling_errors)
@@ -109,21 +180,24 @@ def _mean_radiance(
     ambient: Ambient | None,
     sampling_errors: float = 0.0,
 ) -> np.ndarray:
-    """(k, h, w) W/m2/sr, of the frames that a detector takes, on average; so many times the sampling error is added."""
+    """(k, h, w) float32, W/m2/sr, mean radiance of the frames that a detector takes.
+
+    sampling_errors : factor on the draw of the sampling error that is added to the signals; 0: none is added.
+    """
     lit = signals.frames(sensor, detector.ambient_fraction(sensor.gate, ambient), sampling_errors)
     return _through_lens(lit, signals.rig)
 
 
 def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:
-    """Frames (k, h, w) as the camera's vignetting leaves them."""
+    """Frames (k, h, w) behind the camera's lens, which darkens the corners if it vignettes."""
     return frames * rig.camera_illumination if rig.camera_lens.vignetting else frames
 
 
 def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetector, rig: Rig) -> float:
-    """Exposure in seconds, one for all frames, that puts the bright pixels at 70 % of saturation.
+    """Exposure in seconds, one for all frames, that brings the bright pixels to 70 % of saturation.
 
-    Of the pixels that receive light, 99 % are at or below that level in their brightest frame: the highlights
-    of mirrors and gloss may saturate. Limited by the detector's shortest and longest exposure.
+    Of the pixels that receive light, 99 % are at or below that level in their brightest frame: highlights of mirrors
+    and glossy surfaces may saturate. The exposure stays between the detector's shortest and longest one.
 
     Parameters
     ----------
@@ -134,27 +208,3 @@ def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetecto
         return detector.max_exposure_s
     wanted = TARGET_FRACTION * detector.capacity_e / level
     return float(np.clip(wanted, detector.min_exposure_s, detector.max_exposure_s))
-
-
-def warn_of_overexposure(name: str, capture: Capture, signals: Signals) -> None:
-    """Warn of a capture whose automatic exposure is as short as can be, and yet too long for its bright pixels.
-
-    name : of the instrument. signals : those that the capture was exposed from.
-
-    Warns
-    -----
-    RangesimWarning
-    """
-    detector, rig = capture.detector, signals.rig
-    if detector is None or capture.exposure_s > detector.min_exposure_s:
-        return
-    radiance = _mean_radiance(signals, capture.sensor, detector, capture.ambient)
-    level = bright_level(radiance.max(axis=0)) * detector.electron_rate_per_radiance(rig)
-    if level * capture.exposure_s > detector.capacity_e:
-        lit = signals.energy.projector > 0
-        fraction = np.mean(capture.saturated(capture.frames), where=lit) if lit.any() else 0.0
-        warn(
-            f"{name}: the detector's shortest exposure, {capture.exposure_s:g} s, saturates {100 * fraction:.0f} % of "
-            "the pixels that get light of the projector; take less light "
-            f"(its power_w is {rig.projector_power_w:g}), or a shorter min_exposure_s."
-        )

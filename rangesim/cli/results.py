@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rangesim compare`, `report` and `verify`: results that are there already."""
+"""The commands `rangesim compare`, `report` and `verify`, which read results that are already on the disk."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 def compare_command(
     results: Annotated[list[Path], typer.Argument(help="Directories that `rangesim run` wrote.", show_default=False)],
-    markdown: Annotated[bool, typer.Option("--markdown", help="Markdown instead of a drawn table.")] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown instead of a drawn table.")] = False,
 ) -> None:
-    """Print errors per surface material and sensor, and why pixels failed; lengths in mm, fractions in %.
+    """Print the errors per material and sensor, and why pixels failed. Lengths are in mm, fractions in %.
 
     Example:
 
@@ -43,10 +43,14 @@ def report_command(
     result: Annotated[Path, typer.Argument(help="A directory that `rangesim run` wrote.", show_default=False)],
     sensor: Annotated[
         list[str] | None,
-        typer.Option(help="Sensors of your own in the result, as FILE.py:NAME; the files are run.", show_default=False),
+        typer.Option(
+            help="A sensor of your own that the result contains, as FILE.py:NAME. The file is run. Repeat the option "
+            "for several sensors.",
+            show_default=False,
+        ),
     ] = None,
 ) -> None:
-    """Write report.html anew from the files of a result.
+    """Write report.html again from the files of a result.
 
     Example:
 
@@ -58,8 +62,8 @@ def report_command(
     from rangesim.sensors import sensor_of
 
     for name in sensor or ():
-        sensor_of(name)
-    read_settings(result)  # says what it is, if it is no result
+        sensor_of(name)  # from then on the sensor's class is known by its type_name
+    read_settings(result)  # a clear error if the directory holds no result
     replace_listed_file(result, "report.html", lambda: render_report(load_result(result)).encode(), RESULT)
     typer.echo(one_line(result / "report.html"))
 
@@ -67,13 +71,12 @@ def report_command(
 def verify_command(
     directory: Annotated[
         Path,
-        typer.Argument(help="A directory that rangesim wrote: a result, a scan, a capture, or what it decodes to."),
+        typer.Argument(help="A directory that rangesim wrote: a result, a scan, a capture, or a decoded capture."),
     ],
 ) -> None:
-    """Compare a directory with its manifest: every file's size and SHA-256.
+    """Compare the size and SHA-256 of every file in a directory with its manifest.
 
-    Ends with status 1 if a file is missing or holds something else. Files of your own beside them are named and counted
-    for nothing.
+    Ends with status 1 if a file is missing or was changed. Files that are not rangesim's are listed and change nothing.
 
     Example:
 
@@ -99,14 +102,14 @@ def verify_command(
             typer.echo(f"{word}: {one_line(directory / name)}")
     if found.missing or found.changed:
         raise FileFormatError(
-            f"{directory}: of {found.files} files {len(found.missing)} are missing and {len(found.changed)} hold "
-            "something else than was written."
+            f"{directory}: of {found.files} files {len(found.missing)} are missing and {len(found.changed)} were "
+            "changed."
         )
     typer.echo(f"{one_line(directory)}: all {found.files} files are as they were written.")
 
 
 def _print(table: Table) -> None:
-    """Draw a table on the terminal; a cell of the first column that repeats the one above stays empty."""
+    """Draw a table on the terminal. A cell of the first column stays empty if it repeats the cell above."""
     from rich import box, console
     from rich import table as drawn
     from rich.text import Text
@@ -119,6 +122,6 @@ def _print(table: Table) -> None:
         drawing.add_column(head, justify="left" if is_text else "right", overflow="fold")
     for before, row in zip([table.heads, *table.rows], table.rows, strict=False):
         cells = ("" if row[0] == before[0] else row[0], *row[1:])
-        drawing.add_row(*(Text(on_one_line(cell)) for cell in cells))  # brackets are no markup
+        drawing.add_row(*(Text(on_one_line(cell)) for cell in cells))  # Text, because brackets in names are no markup
     screen = console.Console()
     (screen if screen.is_terminal else console.Console(width=140)).print(drawing)

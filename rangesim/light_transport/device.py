@@ -19,7 +19,7 @@ MAX_REPROJECTION_PX = 1e-2
 distortion has no inverse in single precision, and the pixel has no ray. A larger bound lets rays through beside the
 fold of a lens model; a smaller one comes near the rounding of single precision."""
 MAX_RADIUS2 = 1e30
-"""Stands for an infinite squared radius in single precision, whose largest number is 3e38."""
+"""Stands for an infinite squared radius on the plane z = 1, dimensionless, because single precision ends at 3e38."""
 
 
 class PrimaryRay(NamedTuple):

@@ -130,7 +130,7 @@ def estimate_cost(
 
     Parameters
     ----------
-    passes : as `rangesim.pipeline.passes.group_by_rig` returns.
+    passes : as `rangesim.pipeline.shared_passes.group_by_rig` returns.
     trial : whether small passes may be timed where the run is long.
     places : that each pass is traced from. rest : what is done with the signals; None: what a run does.
     """
@@ -177,14 +177,13 @@ def _traced_pixels(experiment: Experiment, rig: Rig, instruments: Sequence[Instr
 
 
 def _rest_of_run(passes: Sequence[tuple[Rig, list[Instrument]]]) -> Rest:
-    """Cost of what a run does with its signals; the report holds frames and results of all passes at once."""
-    seconds, report = 0.0, 0
+    """Cost of what a run does with its signals; the results of a pass are held while the next ones are traced."""
+    seconds, result_bytes = 0.0, []
     for rig, instruments in passes:
         pixels = rig.camera.width * rig.camera.height
-        for instrument in instruments:
-            seconds += pixels * (PIXEL_S + FRAME_S * instrument.sensor.n_frames)
-            report += pixels * (2 * instrument.sensor.n_frames + RESULT_BYTES)
-    return Rest(seconds, 0, report, 0)
+        seconds += sum(pixels * (PIXEL_S + FRAME_S * i.sensor.n_frames) for i in instruments)
+        result_bytes.append(sum(pixels * (2 * i.sensor.n_frames + RESULT_BYTES) for i in instruments))
+    return Rest(seconds, sum(result_bytes[:-1]), sum(result_bytes), 0)
 
 
 def _tracing_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int) -> float:

@@ -14,19 +14,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.capture.exposure import expose, photons_per_pulse, warn_of_overexposure
-from rangesim.causes import explain
+from rangesim.capture.exposure import exposed
 from rangesim.causes.range_limits import fraction_beyond_range, warn_of_range
+from rangesim.causes.rules import causes_of
 from rangesim.decoding import decode
 from rangesim.evaluation.comparison import compare
-from rangesim.evaluation.range_noise import range_noise, warn_of_sampling
+from rangesim.evaluation.range_noise import noise_of, warn_of_sampling
+from rangesim.evaluation.reference_readings import ReferenceReadings
 from rangesim.experiment import Experiment
 from rangesim.files.result_directories import new_directory
 from rangesim.instrument.instrument import Instrument
 from rangesim.motion import transport_moving
 from rangesim.pipeline.cost import Cost, estimate_cost
-from rangesim.pipeline.passes import group_by_rig
 from rangesim.pipeline.provenance import provenance
+from rangesim.pipeline.shared_passes import group_by_rig
 from rangesim.results.run_files import (
     RESULT,
     Measurement,
@@ -206,19 +207,21 @@ def measure(
     moves = signals.motion_m is not None
     with timed(times, "exposure"):
         detector = _in_time(instrument) if moves else instrument.detector_in_use
-        capture = expose(signals, instrument.sensor, detector, instrument.exposure_s, seed, ambient)
+        exposure = exposed(signals, instrument.sensor, detector, instrument.exposure_s, seed, ambient)
+    capture, photons = exposure.capture, exposure.photons_per_pulse()
     if instrument.exposure_s is None:
-        warn_of_overexposure(instrument.name, capture, signals)
+        exposure.warn_of_overexposure(instrument.name)
+    del exposure  # its radiance is as large as the frames
     with timed(times, "decode"):
         image = decode(capture, instrument.decoder)
-    noise = None
+    noise, readings = None, ReferenceReadings(image, capture, signals)
     if signals.knows_sampling_error:
         with timed(times, "noise"):
-            noise = range_noise(image, capture, signals)
+            noise = noise_of(readings)
         image = replace(image, sampling_sigma_m=np.abs(noise.sampling))
     comparison = compare(image, signals.truth)
     with timed(times, "causes"):
-        causes = explain(image, capture, signals, tolerance_m=comparison.outlier_m)
+        causes = causes_of(readings, comparison.outlier_m)
     rows = [row | failures for row, failures in zip(comparison.rows(), causes.fractions(signals.truth), strict=True)]
     if noise is not None:
         rows = [row | sigmas for row, sigmas in zip(rows, noise.by_material(signals.truth), strict=True)]
@@ -236,7 +239,7 @@ def measure(
         causes=causes,
         rows=complete_rows(rows),
         segmentation=segmentation,
-        metadata=acquisition(capture, signals, instrument.timing, points, times),
+        metadata=acquisition(capture, photons, instrument.timing, moves, points, times),
         light_pass=light_pass,
     )
 
@@ -265,15 +268,17 @@ def noise_seed(experiment: Experiment, instrument: Instrument) -> int:
 
 
 def acquisition(
-    capture: Capture, signals: Signals, timing: Timing, points: int, times_s: dict[str, float]
+    capture: Capture, photons: np.ndarray | None, timing: Timing, moves: bool, points: int, times_s: dict[str, float]
 ) -> MeasurementRecord:
-    """Frames, time and photons of a capture of signals; exposure None for a noise-free one, which takes no time.
+    """Frames, time and photons of a capture; exposure None for a noise-free one, which takes no time.
 
     Exposures follow each other at once, or, where something moves, as the timing says.
+
+    Parameters
+    ----------
+    photons : (h, w) float64, photons per laser pulse; None where they are not known.
     """
     exposure = capture.exposure_s if np.isfinite(capture.exposure_s) else None
-    moves = signals.motion_m is not None
-    photons = photons_per_pulse(signals, capture)
     camera = capture.frames.shape[1:]
     shots = len(timing.exposure_times_s(capture.sensor))
     taken = None

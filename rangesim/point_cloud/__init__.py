@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Organised point clouds, and their files."""
+"""Point clouds that are organised as the image they come from, with normals, and their files."""
 
 from rangesim.point_cloud.point_cloud import (
     COORDINATES,

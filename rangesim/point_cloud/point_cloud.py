@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points with normals, organised as the image they come from."""
+"""Point clouds with normals, organised as the image they come from."""
 
 from __future__ import annotations
 
@@ -15,14 +15,25 @@ from rangesim.rig import Intrinsics
 from rangesim.settings.config import ShortRepr
 
 COORDINATES = ("camera", "world")
+"""Coordinate frames that points may be in."""
 FAR_M = 100.0
-"""Coordinates of a camera, in metres, beyond which points in the world are double precision."""
+"""Largest coordinate of a camera in the world, in metres, with which points in the world are single precision.
+
+Beyond it they are double precision: neighbouring numbers of single precision are 8 µm apart at 100 m.
+"""
 NORMAL_RADIUS = 2
-"""Pixels; normals are fitted to a window of (2 r + 1)^2 pixels."""
+"""Radius, in pixels, of the window of (2 r + 1)^2 pixels that a normal is fitted to.
+
+A larger window averages more noise and rounds small details off; the value was not optimised.
+"""
 MAX_SLOPE = 4.0
-"""Depth step over lateral step between two pixels of one surface: 4 keeps surfaces seen up to 76 degrees off."""
+"""Largest ratio of depth step to lateral step between two pixels that count as one surface.
+
+With 4, surfaces whose normal is up to 76 degrees off the ray keep their neighbours. A larger value joins surfaces
+across depth edges.
+"""
 STEP_FLOOR = 0.005
-"""Fraction of z by which neighbours may always differ, for noise."""
+"""Fraction of z by which neighbours of one surface may always differ, whatever the slope: it leaves room for noise."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -31,13 +42,30 @@ class PointCloud(ShortRepr):
 
     Parameters
     ----------
-    points : (h, w, 3) or (n, 3) float32, metres, in `coordinates`; NaN where there is none. float64 in a world whose
-        origin is more than `FAR_M` from the camera.
+    points : (h, w, 3) or (n, 3) float32, metres, in `coordinates`; NaN where there is no point. They are float64 in
+        world coordinates if the camera is more than `FAR_M` from the origin.
     coordinates : "camera" (OpenCV: x right, y down, z forward) or "world".
-    normals : (..., 3) float32, unit, towards the camera, in `coordinates`; NaN where unknown (0 of `finite`). Or None.
-    intensity : (...) float32, the capture's units. Or None.
-    colors : (..., 3) uint8, RGB. Or None.
-    confidence : (...) float32 in 0..1, see `RangeImage`. Or None.
+    normals : (..., 3) float32, unit vectors towards the camera, in `coordinates`; NaN where unknown; 0 instead in what
+        `finite` returns. None: not known.
+    intensity : (...) float32, in the units of the capture's frames. None: not known.
+    colors : (..., 3) uint8, RGB. None: not known.
+    confidence : (...) float32 in 0..1, see `RangeImage`. None: not known.
+
+    Raises
+    ------
+    ValueError
+        The coordinates are unknown, or the arrays do not fit together.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim import PointCloud
+    >>> points = np.array([[[0, 0, 1], [0.1, 0, 1], [np.nan, np.nan, np.nan]]], dtype=np.float32)
+    >>> cloud = PointCloud(points, intensity=np.array([[10, 20, 0]], dtype=np.float32))
+    >>> cloud.valid
+    array([[ True,  True, False]])
+    >>> cloud.finite().points.shape, cloud.finite().intensity
+    ((2, 3), array([10., 20.], dtype=float32))
     """
 
     points: np.ndarray
@@ -58,18 +86,20 @@ class PointCloud(ShortRepr):
                 raise ValueError(f"expected {name} of shape {shape[:-1]} or {shape}, got {value.shape}.")
 
     def attributes(self) -> dict[str, np.ndarray]:
-        """The arrays that are there beside the points, by name."""
+        """Arrays besides the points that are not None, by name."""
         names = ("normals", "intensity", "colors", "confidence")
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
     @property
     def valid(self) -> np.ndarray:
-        """(...) bool, where there is a point."""
+        """(...) bool, whether there is a point."""
         return np.asarray(np.isfinite(self.points).all(axis=-1))
 
     def finite(self) -> PointCloud:
-        """The points that are there, as a list (n, ...), row by row; normals that are not known are 0, as NaN breaks
-        what other programs make of all of them."""
+        """The points that are finite, as a list (n, ...), row by row.
+
+        Unknown normals become 0, because one NaN spoils what many programs compute from all normals.
+        """
         keep = self.valid
         kept = {k: v[keep] for k, v in self.attributes().items()}
         if "normals" in kept:
@@ -77,13 +107,17 @@ class PointCloud(ShortRepr):
         return replace(self, points=self.points[keep], **kept)
 
     def save(self, path: str | Path) -> None:
-        """Write `.ply` (the finite points) or `.pcd` (organised, NaN kept); see `point_cloud_files`."""
+        """Write a `.ply` file (finite points only) or a `.pcd` file (organised, with NaN).
+
+        Errors are those of `rangesim.point_cloud.point_cloud_files.save_point_cloud`.
+        """
         from rangesim.point_cloud.point_cloud_files import save_point_cloud
 
         save_point_cloud(self, path)
 
     def to_open3d(self) -> Any:
-        """`open3d.geometry.PointCloud` of the finite points, with normals and colours (of intensity, if none)."""
+        """`open3d.geometry.PointCloud` of the finite points, with normals and colours; where the cloud has no colours,
+        they are grey by its intensity."""
         import open3d
 
         finite = self.finite()
@@ -111,14 +145,30 @@ def organised_cloud(
     Parameters
     ----------
     z : (h, w) float32, metres, along the optical axis; NaN where there is no reading.
-    camera : Intrinsics of the image. T_world_camera : (4, 4) float64, its pose.
-    intensity : (h, w) float32, also made into grey colours. confidence : (h, w) float32 in 0..1.
-    coordinates : "camera" or "world".
+    camera : Intrinsics of the image.
+    T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres.
+    intensity : (h, w) float32, in the units of the capture's frames; the colours are made from it.
+    confidence : (h, w) float32 in 0..1.
+    coordinates : "camera" or "world", the frame of the points and normals.
 
     Raises
     ------
     ValueError
-        These coordinates are unknown.
+        The coordinates are unknown.
+
+    Examples
+    --------
+    A wall at 1 m, seen by a camera of 4 x 3 pixels:
+
+    >>> import numpy as np
+    >>> from rangesim.point_cloud import organised_cloud
+    >>> from rangesim.rig import Intrinsics
+    >>> z = np.ones((3, 4), dtype=np.float32)
+    >>> cloud = organised_cloud(z, Intrinsics.from_fov(4, 3, 60), np.eye(4), intensity=z, confidence=z)
+    >>> cloud.points.shape
+    (3, 4, 3)
+    >>> cloud.normals[1, 1].round(6) + 0
+    array([ 0.,  0., -1.], dtype=float32)
     """
     if coordinates not in COORDINATES:
         raise ValueError(f"expected coordinates to be one of {', '.join(COORDINATES)}, got {coordinates!r}.")
@@ -141,16 +191,17 @@ def organised_cloud(
 
 
 def lattice_normals(z: np.ndarray, rays: np.ndarray, radius: int = NORMAL_RADIUS) -> np.ndarray:
-    """(h, w, 3) unit normals towards the camera from depths on an image lattice; NaN where there is no
+    """(h, w, 3) float64 unit normals towards the camera, in camera coordinates, of a depth image; NaN where there is no
     surface.
 
-    On a plane n.X = 1 the inverse depth is linear in the image, 1/z = n.(x, y, 1). It is fitted by least
-    squares to the window around each pixel; pixels across a depth step are left out, so edges are not rounded
-    off.
+    On a plane n.X = 1 the inverse depth is linear in the image, 1/z = n.(x, y, 1). This is fitted by least squares to
+    the window around each pixel. Pixels across a depth step are left out, so that edges are not rounded off.
 
     Parameters
     ----------
-    z : (h, w) float, metres, NaN where invalid. rays : (h, w, 3) float, directions with z = 1, camera coordinates.
+    z : (h, w) float, metres; NaN where there is no reading.
+    rays : (h, w, 3) float, directions of the pixels with z = 1, camera coordinates.
+    radius : pixels, see `NORMAL_RADIUS`.
     """
     steps = np.arange(-radius, radius + 1)
     limits = np.maximum(MAX_SLOPE * np.hypot(*np.meshgrid(steps, steps)) * _pixel_size(rays), STEP_FLOOR)
@@ -199,12 +250,12 @@ def _fit_normals(start, stop, radius, limits, z, inverse, rays, normals):  # typ
 
 
 def _pixel_size(rays: np.ndarray) -> float:
-    """Typical step between neighbouring rays at z = 1."""
+    """Median step between neighbouring rays of a row, at z = 1."""
     return float(np.median(np.abs(np.diff(rays[..., 0], axis=1)))) if rays.shape[1] > 1 else 1.0
 
 
 def _grey_colors(intensity: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """(h, w, 3) uint8 grey: the 99th percentile of the valid pixels is white, with display gamma 2.2."""
+    """(h, w, 3) uint8 grey for display, with gamma 2.2; the 99th percentile of the valid pixels is white."""
     bright = float(np.percentile(intensity[valid], 99)) if valid.any() else 0.0
     fraction = np.clip(np.nan_to_num(intensity) / (bright if bright > 0 else 1.0), 0, 1) ** (1 / 2.2)
     return np.repeat(np.rint(255 * fraction).astype(np.uint8)[..., None], 3, axis=-1)

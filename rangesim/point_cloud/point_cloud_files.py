@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Point clouds written as binary PLY and PCD files.
 
-Fields: x y z, and where present normals, intensity, colour and confidence, under the names that Open3D, PCL
-and MeshLab know; in single precision, but points in double precision stay so. The coordinates go into a comment line.
-`pcgraph.read_cloud` reads them back.
+The fields are x, y and z, and normals, intensity, colours and confidence if the cloud has them, under the names that
+Open3D, PCL and MeshLab know. They are in single precision, except points that are in double precision. A comment line
+names the coordinate frame. `pcgraph.read_cloud` reads both formats.
 """
 
 from __future__ import annotations
@@ -18,17 +18,19 @@ from rangesim.point_cloud import PointCloud
 
 _PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short",
               "u4": "uint", "i4": "int"}  # fmt: skip
+"""Names of number types in PLY files, by NumPy's codes."""
 
 
 def save_point_cloud(cloud: PointCloud, path: str | Path) -> None:
-    """Write a cloud by the suffix of `path`: `.ply` (finite points only) or `.pcd` (organised, NaN kept).
+    """Write a point cloud in the format that the suffix of `path` names.
 
+    `.ply` holds the finite points only; `.pcd` keeps the organisation of the image, with NaN where there is no point.
     The file appears only when it is complete.
 
     Raises
     ------
     ValueError
-        The suffix is neither, or the cloud has no finite point.
+        The suffix is another, or the cloud has no finite point.
     FileFormatError
         The place cannot be written.
     """
@@ -42,7 +44,7 @@ def save_point_cloud(cloud: PointCloud, path: str | Path) -> None:
 
 
 def _table(cloud: PointCloud, pcd: bool) -> np.ndarray:
-    """(n,) structured array of the cloud's fields, under the names of the format."""
+    """(n,) structured array of the cloud's fields, under the names of the format (PCD if `pcd`, else PLY)."""
     columns = {axis: cloud.points[..., i] for i, axis in enumerate("xyz")}
     if cloud.normals is not None:
         names = ("normal_x", "normal_y", "normal_z") if pcd else ("nx", "ny", "nz")

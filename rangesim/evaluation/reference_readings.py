@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reference readings of a range image: depths decoded from the same light without noise, or from parts of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rangesim.capture import Capture
+from rangesim.capture.exposure import noise_free_capture
+from rangesim.decoding import decode
+from rangesim.decoding.range_image import RangeImage
+from rangesim.errors import without_warnings
+from rangesim.sensor import Decoder
+
+if TYPE_CHECKING:
+    from rangesim.signals import Signals
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceReadings:
+    """Depths that the decoder of a range image reads from other captures; each is (h, w) float32, metres.
+
+    Each is decoded when it is first used, and only once, for the noise (`range_noise.noise_of`) and for the causes of
+    failures (`rangesim.causes.rules.causes_of`) alike. The decoder warned when it made the range image, and does not
+    warn again.
+
+    Parameters
+    ----------
+    image : RangeImage, decoded from `capture`.
+    capture : Capture, as `rangesim.expose` made it from `signals`.
+    signals : Signals of the pass.
+    """
+
+    image: RangeImage
+    capture: Capture
+    signals: Signals
+
+    @property
+    def decoder(self) -> Decoder:
+        """The decoder that made the range image."""
+        return self.image.decoder or self.capture.sensor.default_decoder
+
+    def read(self, captures: Sequence[Capture]) -> list[np.ndarray]:
+        """Depths of captures, read by the decoder of the range image."""
+        with without_warnings():
+            return [decode(capture, self.decoder).z for capture in captures]
+
+    @cached_property
+    def noise_free(self) -> np.ndarray:
+        """Depths without the noise and the limits of the detector, in the ambient light of the capture."""
+        return self.read([noise_free_capture(self.signals, self.capture.sensor, self.capture.ambient)])[0]
+
+    @cached_property
+    def halves(self) -> tuple[np.ndarray, np.ndarray]:
+        """Depths of each half of the samples, as `noise_free`.
+
+        Raises
+        ------
+        ValueError
+            The signals do not know their sampling error (`Signals.knows_sampling_error`).
+        """
+        sensor, ambient = self.capture.sensor, self.capture.ambient
+        above, below = self.read([noise_free_capture(self.signals, sensor, ambient, error) for error in (1.0, -1.0)])
+        return above, below
+
+    @cached_property
+    def projector_alone(self) -> np.ndarray:
+        """Depths in the projector's light alone: without noise, ambient light and the vignetting of the lens."""
+        moves = self.signals.motion_m is not None
+        if not (moves or self.signals.energy.ambient.any() or self.signals.rig.camera_lens.vignetting):
+            return self.noise_free
+        frames = self.signals.frames(self.capture.sensor, ambient_transmission=0.0)
+        return self.read([Capture(frames, self.capture.sensor, self.signals.rig)])[0]
