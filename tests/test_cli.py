@@ -289,7 +289,7 @@ def test_a_failure_halfway_leaves_nothing(command: Command, tmp_path: Path, monk
     def fail(*_: object) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("rangesim.report.write_report", fail)
+    monkeypatch.setattr("rangesim.report.render_report", fail)
     answer = command("run", PLANE, *IDEAL, *TINY, "--out", tmp_path / "a" / "b")
     assert (answer.status, answer.err) == (1, "rangesim: no space left on device\n")
     assert list(tmp_path.iterdir()) == []
