@@ -41,7 +41,7 @@ ROOMS = [
     "rangesim.signals",
 ]
 """Packages whose docstrings are run, all of their modules."""
-MODULES = ["rangesim", "rangesim.errors", "rangesim.triangle_mesh"]
+MODULES = ["rangesim", "rangesim.errors", "rangesim.light_transport.transport_settings", "rangesim.triangle_mesh"]
 """Modules outside these packages whose docstrings are run."""
 
 

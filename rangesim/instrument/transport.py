@@ -9,7 +9,7 @@ from typing import Unpack, overload
 
 from rangesim.instrument.adaptive_sampling import AdaptiveSampling
 from rangesim.light_transport.light_pass import trace_light
-from rangesim.light_transport.transport_settings import TransportOptions, TransportSettings, chosen
+from rangesim.light_transport.transport_settings import TransportOptions, TransportSettings, with_options
 from rangesim.light_transport.truncation import warn_of_truncation
 from rangesim.response import Response
 from rangesim.rig import Rig
@@ -87,7 +87,7 @@ def transport(
     >>> scene = rangesim.load_scene("tabletop")  # doctest: +SKIP
     >>> signals = rangesim.transport(scene, scene.rig(), [rangesim.AmcwToF()], spp=16)  # doctest: +SKIP
     """
-    settings = _with_sampler(chosen(settings, options), sensors)
+    settings = _with_sampler(with_options(settings, options), sensors)
     signals = trace_light(scene, [rig] if isinstance(rig, Rig) else rig, sensors, settings, progress)
     for number, one in enumerate(signals):
         of = f" of camera {number}" if len(signals) > 1 else ""

@@ -73,14 +73,14 @@ def scan(
     >>> scene = rangesim.load_scene("tabletop")  # doctest: +SKIP
     >>> views = scan(scene, scene.rig(), rangesim.StructuredLight(), Turntable(views=12))  # doctest: +SKIP
     """
-    from rangesim.light_transport.transport_settings import chosen
+    from rangesim.light_transport.transport_settings import with_options
 
     if not isinstance(sensor, (Sensor, Instrument)):
         raise ValueError(f"expected a sensor or an instrument, got {shown(sensor)}.")
     check_seed(seed)
     instrument = sensor if isinstance(sensor, Instrument) else Instrument("scan", sensor)
     poses = poses_of(path, Viewpoint(rig.T_world_camera, scene.working_distance_m))
-    chosen_settings = chosen(settings, cast("TransportOptions", options))
+    chosen_settings = with_options(settings, cast("TransportOptions", options))
     images, truths = [], []
     views = rendered_views(scene, rig, instrument, poses, chosen_settings, ambient, seed)
     for number, (image, truth) in enumerate(views, 1):

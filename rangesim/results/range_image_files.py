@@ -31,6 +31,8 @@ _RANGE = {
     "sampling_sigma_m": ArraySpec("float32", low=0, nan=True, inf=True, required=False),
     "settings": replace(SETTINGS, required=False),
 }
+"""Type, shape and bounds of the arrays of a range image, by their names in files. The bound of the confidence leaves
+room for the rounding of single precision."""
 
 
 def save_range_image(image: RangeImage, path: str | Path) -> None:
