@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from rangesim.rig import Intrinsics
 
 CELLS = (8, 6)
-"""Numbers of cells across and down an image in which the corners are counted; an image of 4 : 3 has square cells."""
+"""Counts of cells across and down an image in which corners are sought; square in images of 4 : 3, as most are."""
 MIN_COVERED = 0.6
-"""Fraction of the cells with corners below which the page warns: distortion is unknown where there are no corners."""
+"""Fraction of the cells with corners below which the page warns, because distortion is unknown in the other cells."""
 WORSE_FACTOR = 2.0
-"""Multiple of the median error of all boards above which the page names a board as worse than the others."""
+"""Ratio to the median error of all boards above which a board is named as worse; other values were not measured."""
 SHOWN_WIDTH = 400
-"""Approximate width of a view in the page, in pixels; larger images are averaged down to keep the page small."""
+"""Approximate width of a view in the page, in pixels; larger images are averaged so that the page stays small."""
 ARROW_LENGTH = 0.03
-"""Length at which an error of typical size is drawn, as a fraction of the image's width."""
+"""Length at which an error of typical size is drawn, as a fraction of the image's width, so that patterns show."""
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """Names of a device's parameters: pixels for the first four, OpenCV's distortion coefficients for the others."""
 
@@ -206,8 +206,8 @@ def _verdict(
     lines.append(
         (
             "The baseline",
-            f"is {1e3 * found.baseline_m:.3f} mm, known to {1e6 * found.baseline_deviation_m:.2g} µm, if the board is "
-            "as large as was said: an error of its size is one of all lengths.",
+            f"is {1e3 * found.baseline_m:.3f} mm, known to {1e6 * found.baseline_deviation_m:.2g} µm, if the size "
+            "of the board is right: a relative error of its size is the same relative error of all lengths.",
         )
     )
     for said in devices:

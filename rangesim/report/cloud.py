@@ -16,14 +16,14 @@ from rangesim.results.run_files import Measurement, Segmentation
 NO_ERROR = -32768
 """Value of a packed error where there is no reading or no true surface: the smallest int16."""
 ERROR_STEP_M = 1e-5
-"""Unit of packed errors, in metres; with int16 they reach 0.33 m, which is more than the error scale shows."""
+"""Unit of packed errors, in metres, chosen so that int16 reaches 0.33 m, which is more than the error scale shows."""
 DEFLATE_LEVEL = 4
 """Level of zlib's compression. Its default, 6, makes a page of 7 MB 1 % smaller, in twice the time."""
 FAR_FACTOR = 1.5
 """Multiple of the farthest true depth, beyond which points are not drawn.
 
-Readings of mirrors and of wrong periods may lie far behind the scene. With a larger value more of them are drawn, and
-all depths are packed in coarser steps.
+They are readings of mirrors and of wrong periods, far behind the scene. With a larger ratio more of them are drawn, and
+all depths are packed in coarser steps; other values were not measured.
 """
 
 

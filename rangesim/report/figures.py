@@ -17,7 +17,7 @@ from rangesim.results.run_files import Measurement
 from rangesim.signals import EnergySplit, GroundTruth
 
 GAMMA = 2.2
-"""Exponent of the display: grey value = (linear value)^(1/gamma), as in sRGB approximately."""
+"""Exponent of the display, dimensionless: grey value = (linear value)^(1/gamma), approximately as in sRGB."""
 
 
 @dataclass(frozen=True)

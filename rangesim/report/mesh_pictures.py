@@ -15,7 +15,7 @@ from rangesim.triangle_mesh import TriangleMesh
 GREY = (222, 219, 212)
 """Colour of a mesh without colours of its own, RGB 0..255."""
 EDGE_ON_BRIGHTNESS = 0.35
-"""Brightness of a surface that is seen edge on, as a fraction of that of one seen face on; it keeps slopes visible."""
+"""Brightness of a surface seen edge on, as a fraction of that of one seen face on, so that steep parts stay visible."""
 
 
 def mesh_picture(

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rangesim.results.scan_files import ScanResult
 
 PICTURES = 3
-"""Number of views, spread over the path, from which pictures of the mesh are taken."""
+"""Count of views, spread over the path, from which pictures of the mesh are taken: so many stand side by side."""
 WIDTH_PX = 480
 """Width of the pictures in pixels; larger ones make a larger page."""
 SAMPLES = 20_000
