@@ -23,7 +23,7 @@ Rows = list[dict[str, Any]]
 FAILURE_HEADS = ["failed (%)", "because (% of the pixels)"]
 """Heads of the columns that say how many pixels failed, and why."""
 UNRELIABLE = 0.5
-"""Fraction of outliers among the readings, or of missing readings, from which a sensor is called unreliable on a material.
+"""Fraction of outliers, or of missing readings, from which a sensor is called unreliable on a material.
 
 At one half, a reading is as likely wrong as right.
 """
