@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reports: HTML pages that open offline, and tables in Markdown."""
+"""Reports: HTML pages that open without a network, and tables in Markdown."""
 
 from rangesim.report.experiment_page import render_report, write_report
 from rangesim.report.tables import errors_markdown, failures_markdown
