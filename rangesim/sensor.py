@@ -108,7 +108,7 @@ class Sensor(Named, ABC):
         """
         return 1
 
-    # ---- What it comes with ------------------------------------------------------------------------------------------
+    # ---- Emitter, detector, decoder ----------------------------------------------------------------------------------
 
     @property
     @abstractmethod
@@ -160,7 +160,7 @@ class Sensor(Named, ABC):
         for response in self.responses():
             response.check(width, height)
 
-    # ---- What its readings mean --------------------------------------------------------------------------------------
+    # ---- Meaning of its readings -------------------------------------------------------------------------------------
 
     def white_image(self, frames: np.ndarray) -> np.ndarray:
         """(h, w) image as of even light, in which calibration finds boards; by default the mean of the frames.
@@ -282,7 +282,7 @@ class Decoder(Named, ABC):
 
     @abstractmethod
     def coordinates(self, capture: Capture) -> Coordinates:
-        """What the frames say before any geometry: `ProjectorCoordinates` or `PathLengths`. The rig is not looked at.
+        """Readings before any geometry: `ProjectorCoordinates` or `PathLengths`. The rig is not looked at.
 
         Raises
         ------

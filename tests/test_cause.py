@@ -356,9 +356,9 @@ def test_shares_are_of_the_pixels_of_a_material() -> None:
     assert failures_markdown(fractions).splitlines() == [
         "| material | failed (%) | because (% of the pixels) |",
         "| --- | --- | --- |",
-        "| matte | 66.7 | multipath 50.0, shadowed from projector 16.7 |",
+        "| matte | 66.7 | multipath 50.0, shadowed from emitter 16.7 |",
         "| mirror | 100.0 | specular away 100.0 |",
-        "| all | 71.4 | multipath 42.9, shadowed from projector 14.3, specular away 14.3 |",
+        "| all | 71.4 | multipath 42.9, shadowed from emitter 14.3, specular away 14.3 |",
     ]
     assert json.loads(json.dumps(fractions)) == list(fractions)
     nowhere = replace(truth, z=np.full((2, 4), np.nan, np.float32))

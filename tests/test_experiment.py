@@ -140,7 +140,7 @@ def test_the_result_holds_every_stage() -> None:
     result = load_result(small_result())
     assert [m.name for m in result.measurements] == list(SENSORS)
     assert result.experiment == small_experiment()
-    assert [m.light_pass for m in result.measurements] == [1, 2, 2, 2]
+    assert [m.light_pass for m in result.measurements] == [1, 2, 3, 2]  # direct time of flight has another wavelength
     for m in result.measurements:
         folder = small_result() / m.name
         assert (folder / "cloud.ply").is_file()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The causes of failed pixels, and a map of them."""
+"""Causes of failed pixels, and the map of the causes in an image."""
 
 from __future__ import annotations
 
@@ -14,9 +14,16 @@ from rangesim.signals import GroundTruth
 
 
 class Cause(IntEnum):
-    """Why a pixel failed: it has no reading, or one off by more than the tolerance. See `DEFINITIONS`.
+    """Cause of a failed pixel: one without a reading, or with an error larger than the tolerance.
 
-    The order is that of the families: geometry, surface, other light, noise, decoder; what came later stands last.
+    `DEFINITIONS` says what each means. The numbers follow the families geometry, surface, other light, noise and
+    decoder. They are written to files, so a cause that is added later gets the next number.
+
+    Examples
+    --------
+    >>> from rangesim.causes import Cause
+    >>> Cause.MULTIPATH.name, int(Cause.MULTIPATH)
+    ('MULTIPATH', 7)
     """
 
     NONE = 0
@@ -37,27 +44,27 @@ class Cause(IntEnum):
 
 
 DEFINITIONS = {
-    Cause.NONE: "Not failed: the reading is right, or there is no surface behind the pixel.",
-    Cause.SHADOWED: "The projector does not see the point: something is in between, or it lies beside its image.",
-    Cause.DEPTH_EDGE: "The pixel covers surfaces at different depths; it mixes them, or their codes contradict.",
+    Cause.NONE: "The pixel did not fail: its reading is right, or there is no surface behind it.",
+    Cause.SHADOWED: "The emitter does not light the point: something is in between, or it lies outside the lit field.",
+    Cause.DEPTH_EDGE: "The pixel covers surfaces at different depths and mixes their distances or their codes.",
     Cause.MOTION: "The surface moved while the frames were taken.",
-    Cause.SPECULAR_AWAY: "A mirror or a glossy surface sent the light elsewhere.",
-    Cause.MIRRORED_GHOST: "The light of another surface, seen in a mirror or in a gloss, took the place of its own.",
-    Cause.SEEN_THROUGH: "The light went through the surface; what was read, if anything, lies behind or within.",
-    Cause.MULTIPATH: "Light that came by way of further surfaces disturbed the reading.",
-    Cause.CAUSTIC: "Light that lit the surface off a mirror or through glass disturbed the reading.",
-    Cause.GLINT: "The detector saturated, or most of the light came straight from the lens of the projector.",
-    Cause.LOW_SIGNAL: "Too little projector light for the detector's own noise.",
-    Cause.AMBIENT: "Enough projector light, but ambient light fills the detector or swamps it with noise.",
-    Cause.RANGE_AMBIGUITY: "The distance lies beyond the unambiguous range, or a wrong period was picked.",
-    Cause.RESOLUTION: "Neither stray light nor noise: code, bins or baseline are too coarse for this depth.",
-    Cause.PILE_UP: "Photons came in so many of the pulses that the first ones hid the rest; less light would be read.",
+    Cause.SPECULAR_AWAY: "A mirror or a glossy surface reflected the light elsewhere.",
+    Cause.MIRRORED_GHOST: "Light of another surface, seen in a mirror or in gloss, replaced the light of this one.",
+    Cause.SEEN_THROUGH: "The light passed through the surface; the reading, if any, lies behind it or within it.",
+    Cause.MULTIPATH: "Light that was scattered by further surfaces disturbed the reading.",
+    Cause.CAUSTIC: "Light that reached the surface by way of a mirror or through glass disturbed the reading.",
+    Cause.GLINT: "The detector saturated, or most of the light came straight from the lens of the emitter.",
+    Cause.LOW_SIGNAL: "There was too little light of the emitter for the noise of the detector.",
+    Cause.AMBIENT: "The emitter's light sufficed, but ambient light filled the detector or added too much noise.",
+    Cause.RANGE_AMBIGUITY: "The distance lies beyond the unambiguous range, or a wrong period was chosen.",
+    Cause.RESOLUTION: "Neither stray light nor noise is to blame: code, bins or baseline are too coarse for the depth.",
+    Cause.PILE_UP: "So many pulses brought photons that the first ones hid the others; less light would be read.",
 }
-"""What each cause means, in a sentence."""
+"""Meaning of each cause, in a sentence; tables of docs/causes.md and of reports show it."""
 
 TITLES = {
     Cause.NONE: "right",
-    Cause.SHADOWED: "shadowed from projector",
+    Cause.SHADOWED: "shadowed from emitter",
     Cause.DEPTH_EDGE: "depth edge",
     Cause.MOTION: "motion",
     Cause.SPECULAR_AWAY: "specular away",
@@ -72,7 +79,7 @@ TITLES = {
     Cause.RESOLUTION: "too coarse",
     Cause.PILE_UP: "pile-up",
 }
-"""Names for tables and legends."""
+"""Name of each cause in tables and legends."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -80,7 +87,7 @@ class CauseMap(ShortRepr):
     """The cause of every failed pixel.
 
     cause : (h, w) uint8, values of `Cause`; `NONE` where the pixel did not fail.
-    tolerance_m : float, metres; a reading failed if |z - true z| is larger.
+    tolerance_m : float, metres; a pixel failed if |z - true z| of its reading is larger.
     """
 
     cause: np.ndarray
@@ -88,15 +95,19 @@ class CauseMap(ShortRepr):
 
     @property
     def failed(self) -> np.ndarray:
-        """(h, w) bool: there is a surface, but no reading of it to the tolerance."""
+        """(h, w) bool, whether there is a surface, but no reading of it within the tolerance."""
         return np.asarray(self.cause != Cause.NONE)
 
     def fractions(self, truth: GroundTruth) -> list[dict[str, Any]]:
-        """Per material class of the first surface, "all" last: what failed, and why, as fractions of its pixels.
+        """Fractions of failed pixels and of their causes, per material class of the first surface, "all" last.
 
-        Each entry is a dict of `material` (str), `failed` (fraction of the pixels of this class; None if it has none)
-        and `causes` (name in `Cause`, in lower case -> fraction of the pixels of this class, largest first, none of
-        them 0). `rangesim.report.failures_markdown` makes a table of them.
+        Each entry is a dict with `material` (str), `failed` (fraction of the pixels of this class; None if there are
+        none) and `causes` (name of the cause in lower case -> fraction of the pixels of this class; the largest is
+        first, and none is 0). `rangesim.report.failures_markdown` makes a table of the entries.
+
+        Parameters
+        ----------
+        truth : GroundTruth of the pass that the pixels were measured in.
         """
         return [_row(name, self.cause[mask]) for name, mask in truth.classes().items()]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of each pixel before a cause is named: its reading, its light, its geometry."""
+"""Evidence of each pixel for the cause of its failure: its reading, its light and its geometry, as masks."""
 
 from __future__ import annotations
 
@@ -31,22 +31,41 @@ if TYPE_CHECKING:
     from rangesim.signals import Signals
 
 NEAR = 2
-"""Pixels around an edge pixel, in both directions, that show how its surface fares off the edge."""
+"""Radius, in pixels, of the window around a pixel at an edge in which the same surface off the edge is looked for.
+
+A larger window may reach parts of the surface under other light; a smaller one finds fewer pixels off the edge. Other
+values were not measured.
+"""
 DIM = 0.1
-"""Less than this fraction of what white paper would return here is little light."""
+"""Fraction of the direct light that a white Lambertian surface would return, below which a surface is faint.
+
+It separates glossy surfaces that reflect the light elsewhere from those that return it. Other values were not measured.
+"""
 DISTURBING = 0.005
-"""Fraction of the projector's light, other than direct, from which it can shift a reading by the tolerance."""
+"""Fraction of indirect light in the emitter's light above which this light can shift a reading by the tolerance.
+
+With a larger fraction, errors of multipath are attributed to the resolution; with a smaller one, errors of the
+resolution are attributed to multipath. Other values were not measured.
+"""
 MAX_PULSES_HIT = 0.9
-"""Fraction of the pulses with a photon from which less light makes less noise: 2.3 photons a pulse, where Coates'
-estimate is best at 1 to 2."""
+"""Fraction of the laser pulses with a detected photon above which pile-up makes a reading worse.
+
+It is reached at 2.3 photons per pulse. Coates' estimate has least noise at 1 to 2 photons per pulse.
+"""
 MOTION_FRACTION = 0.1
-"""Fraction of the tolerance from which motion counts: triangulation magnifies it by distance over baseline, 5 or
-more."""
+"""Motion during the acquisition, as a fraction of the tolerance, above which it can explain an error.
+
+It is small because triangulation magnifies motion by the distance over the baseline, a ratio of 5 or more.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Masks and measures per pixel, each (h, w); they hold for failed pixels, and say nothing of others."""
+    """Evidence per pixel, each (h, w); a mask is bool. It is valid for failed pixels, and undefined for the others.
+
+    readings : ReferenceReadings, the range image with its capture, its signals and the readings to compare with.
+    tolerance_m : float, metres, error above which a pixel failed.
+    """
 
     readings: ReferenceReadings
     tolerance_m: float
@@ -75,34 +94,35 @@ class Evidence:
 
     @cached_property
     def missing(self) -> np.ndarray:
-        """No reading."""
+        """Whether the pixel has no reading."""
         return ~self.image.valid
 
     @cached_property
     def error(self) -> np.ndarray:
-        """z - true z, metres; NaN without a reading or a surface."""
+        """float64, z - true z in metres; NaN without a reading or a surface."""
         return np.where(self.image.valid, self.image.z.astype(np.float64) - self.truth.z, np.nan)
 
     @cached_property
     def failed(self) -> np.ndarray:
-        """A surface, but no reading of it to the tolerance."""
+        """Whether there is a surface, but no reading of it within the tolerance."""
         return np.isfinite(self.truth.z) & ~(np.abs(self.error) <= self.tolerance_m)
 
     @cached_property
     def optical(self) -> np.ndarray:
-        """Without noise, ambient light and saturation the pixel fails as well, or is off by half as much or more."""
+        """Whether optics is to blame: without noise, ambient light and saturation the pixel fails as well, or has at
+        least half of its error."""
         return self._wrong(self._of_failed_pixels(self.readings.projector_alone))
 
     @cached_property
     def saturated(self) -> np.ndarray:
-        """Some frame at its largest digital number, or no pulse left, which the decoder refused or made the error."""
+        """Whether some frame is saturated, or no pulse was left, and this made the decoder refuse the pixel or err."""
         full = self.capture.saturated(self.capture.frames) | (self.image.status == Status.SATURATED)
         return full & (self.missing | ~self.optical)
 
     @cached_property
     def piled_up(self) -> np.ndarray:
-        """Whether more than `MAX_PULSES_HIT` of the pulses brought a photon, or the decoder says
-        that they ran out though no counter is full."""
+        """Whether more than `MAX_PULSES_HIT` of the pulses brought a photon, or the decoder found no pulse left though
+        no counter is full."""
         detector, capture = self.capture.detector, self.capture
         if not isinstance(detector, SpadDetector) or not detector.pile_up:
             return np.zeros(self.truth.z.shape, dtype=bool)
@@ -113,40 +133,40 @@ class Evidence:
     # ---- The surface ---------------------------------------------------------------------------------
 
     def is_a(self, *materials: str) -> np.ndarray:
-        """First surface of one of these classes."""
+        """Whether the first surface is of one of these material classes."""
         names = self.truth.material_names
         return np.isin(self.truth.material, [names.index(m) for m in materials if m in names])
 
     @cached_property
     def in_shadow(self) -> np.ndarray:
-        """The projector does not see the surface at the centre of the pixel."""
+        """Whether the emitter does not light the surface at the centre of the pixel."""
         return ~self.truth.projector_visible
 
     @cached_property
     def unlit(self) -> np.ndarray:
-        """In shadow, and without a lit part that brings most of the light and enough of it."""
+        """Whether the pixel is in shadow, and has no lit part that brings most of its light and enough of it."""
         return self.in_shadow & ~(self.enough & self.mostly(DIRECT))
 
     @cached_property
     def beside_shadow(self) -> np.ndarray:
-        """A neighbouring pixel is in shadow, so that this one may be lit in part."""
+        """Whether a neighbouring pixel is in shadow, so that this one may be lit in part."""
         return np.any(neighbours(self.in_shadow & np.isfinite(self.truth.z), 1), axis=0)
 
     @cached_property
     def at_edge(self) -> np.ndarray:
-        """Of the depths of the pixel and its eight neighbours, some lie across a depth edge."""
+        """Whether a depth edge lies between the pixel and one of its eight neighbours."""
         return depth_edges(self.truth.z, self.tolerance_m)
 
     @cached_property
     def merely_inclined(self) -> np.ndarray:
-        """Pixels whose edge is one steep surface, which is read right over the area of the pixel, without the
-        other light that disturbs it."""
+        """Whether the apparent edge is one steep surface, which would be read right over the whole pixel without the
+        light that disturbs it."""
         return self.inclined & self._may_blur & ~self.blurred
 
     @cached_property
     def inclined(self) -> np.ndarray:
-        """All eight neighbours lie where the plane that touches the surface in the pixel's centre is: it holds one
-        surface, however steep."""
+        """Whether all eight neighbours lie on the tangent plane of the surface at the pixel's centre: the pixel covers
+        one surface, however steep."""
         rig, where = self.signals.rig, self.failed & self.at_edge
         rows, columns = np.nonzero(where)
         fits = np.ones(len(rows), dtype=bool)
@@ -161,7 +181,8 @@ class Evidence:
 
     @cached_property
     def fails_off_edge(self) -> np.ndarray:
-        """Around the pixel, off the edge, the same surface is off by half as much or more: it is not the edge."""
+        """Whether the same surface has at least half of the error around the pixel, off the edge: then the edge is not
+        to blame."""
         result, where = np.zeros(self.failed.shape, dtype=bool), self.failed & self.at_edge
         error = np.where(self.missing, np.inf, np.abs(self.error))
         around = error_off_edge(where, error, self.at_edge, self.truth.z, self.truth.instance, self.tolerance_m)
@@ -170,7 +191,7 @@ class Evidence:
 
     @cached_property
     def moving(self) -> np.ndarray:
-        """The surface moves by more than `MOTION_FRACTION` of the tolerance during the acquisition."""
+        """Whether the surface moves by more than `MOTION_FRACTION` of the tolerance during the acquisition."""
         motion_m = self.signals.motion_m
         if motion_m is None:
             return np.zeros(self.truth.z.shape, dtype=bool)
@@ -180,50 +201,53 @@ class Evidence:
 
     @cached_property
     def budget(self) -> LightBudget:
-        """What light there is, and what is needed."""
+        """LightBudget: the light of each pixel, and the light that its sensor needs there."""
         return light_budget(self.signals, self.capture, self.readings.decoder)
 
     @cached_property
     def enough(self) -> np.ndarray:
-        """Projector light above the thresholds of the decoder."""
+        """Whether the emitter's light is above the thresholds of the decoder."""
         return np.asarray(self.budget.signal >= self.budget.needed)
 
     @cached_property
     def enough_direct(self) -> np.ndarray:
-        """Direct light alone above the thresholds of the decoder."""
+        """Whether direct light alone is above the thresholds of the decoder."""
         return np.asarray(self.signals.energy.direct >= self.budget.needed)
 
     @cached_property
     def swamped(self) -> np.ndarray:
-        """Without ambient light the projector's would do, and ambient light makes most of the noise."""
+        """Whether the emitter's light would suffice without ambient light, which makes most of the noise."""
         return np.asarray((self.budget.signal >= self.budget.needed_in_the_dark) & self.mostly_ambient)
 
     @cached_property
     def mostly_ambient(self) -> np.ndarray:
-        """Ambient light makes most of the noise, hence most of what the detector collects."""
+        """Whether ambient light makes most of the variance of the noise, and so most of the detector's electrons."""
         return np.asarray(self.budget.ambient_fraction > 0.5)
 
     @cached_property
     def faint(self) -> np.ndarray:
-        """Less direct light than `DIM` of what a white Lambertian surface would return in this place."""
+        """Whether direct light is less than `DIM` of what a white Lambertian surface would return at this place."""
         rig, normal = self.signals.rig, self.truth.normal[self.failed] @ self.signals.rig.T_world_projector[:3, :3]
         white = white_radiance(rig, self._in_projector, normal)
         return self._of_failed(self.signals.energy.direct[self.failed] < DIM * white)
 
     @cached_property
     def disturbed(self) -> np.ndarray:
-        """Of the projector's light that the sensor reads, enough is not direct."""
+        """Whether enough of the emitter's light is not direct to shift the reading by the tolerance."""
         light = np.sum(self._kinds, axis=0)
         return np.asarray(light - self._kinds[DIRECT] > DISTURBING * light)
 
     def mostly(self, kind: int, among: range = range(len(KINDS))) -> np.ndarray:
-        """This kind of light is the largest `among` these kinds, and there is some."""
+        """Whether this kind of light is the largest among some kinds, and not zero.
+
+        kind : index into `KINDS`. among : range of such indices.
+        """
         parts = np.stack([self._kinds[k] for k in among])
         return np.asarray((parts.argmax(axis=0) == kind - among.start) & (parts[kind - among.start] > 0))
 
     @cached_property
     def _kinds(self) -> list[np.ndarray]:
-        """Radiance of each of `KINDS`; none of those that come after the first return for a sensor that stops there."""
+        """Radiance of each of `KINDS`, W/m2/sr; 0 for multipath where the sensor reads only the first return."""
         light = [getattr(self.signals.energy, kind) for kind in KINDS]
         if self.capture.sensor.first_return_frame is not None:
             light[MULTIPATH] = np.zeros_like(light[MULTIPATH])
@@ -233,13 +257,13 @@ class Evidence:
 
     @cached_property
     def coarse(self) -> np.ndarray:
-        """The straight path to the surface, alone, is not read to the tolerance, or makes half of the error or more."""
+        """Whether the straight path to the surface, alone, is read with half of the error or more, or not at all."""
         return self._wrong(self._read(single_path_frames(self.capture.sensor, self.signals.rig, self.truth)))
 
     @cached_property
     def blurred(self) -> np.ndarray:
-        """Straight paths to all over the pixel's area, on one plane, are not read to the tolerance, or make half of the
-        error or more; where it matters, as other light disturbs the pixel too."""
+        """Whether straight paths to one plane over the whole area of the pixel are read with half of the error or more,
+        or not at all; asked only where other light disturbs the pixel too."""
         rig, spread = self.signals.rig, self._may_blur
         if not spread.any():
             return spread
@@ -247,19 +271,21 @@ class Evidence:
 
     @cached_property
     def _may_blur(self) -> np.ndarray:
-        """Lit surfaces, neither mirrors nor glass, that fail without noise, and get other light."""
+        """Whether the pixel fails without noise, is disturbed by indirect light, and shows a lit surface that is
+        neither a mirror nor glass."""
         lit = ~self.in_shadow & ~self.is_a("transparent", "mirror")
         return self.failed & self.optical & self.disturbed & lit
 
     @cached_property
     def beyond_range(self) -> np.ndarray:
-        """Path length that a time-of-flight sensor takes for another, or has no bin for."""
+        """Whether a time-of-flight sensor takes the path length for another, or has no bin for it."""
         length = self.truth.range_m[self.failed] + np.linalg.norm(self._in_projector, axis=-1)
         return self._of_failed(self.capture.sensor.is_beyond_range(length))
 
     @cached_property
     def wrong_period(self) -> np.ndarray:
-        """Of sensors that read a phase: no distance, as phases contradict each other, or one off by half a period."""
+        """Whether a sensor that measures phases chose a wrong period: its phases contradict each other, or the distance
+        is wrong by more than half a period."""
         period_m = self.capture.sensor.shortest_period_m
         if period_m is None:
             return np.zeros(self.failed.shape, dtype=bool)
@@ -270,14 +296,14 @@ class Evidence:
 
     @cached_property
     def _half_of_error(self) -> np.ndarray:
-        """Half of the error, in metres; the tolerance where there is no reading.
+        """float64, half of the error in metres; the tolerance where there is no reading.
 
-        An effect that shifts a reading by more than that made most of its error.
+        An effect that shifts a reading by more than this made most of its error.
         """
         return np.asarray(np.where(self.missing, self.tolerance_m, np.abs(self.error) / 2))
 
     def _read(self, frames: np.ndarray) -> np.ndarray:
-        """(n,) depths that the decoder reads of noise-free frames (k, h, w) in the failed pixels, metres."""
+        """(n,) float64 depths that the decoder reads from noise-free frames (k, h, w) in the failed pixels, metres."""
         (z,) = self.readings.read([Capture(frames, self.capture.sensor, self.signals.rig)])
         return self._of_failed_pixels(z)
 
@@ -286,31 +312,36 @@ class Evidence:
         return z[self.failed].astype(np.float64)
 
     def _wrong(self, z: np.ndarray) -> np.ndarray:
-        """Where depths z (n,) of the failed pixels are off by half of their error or more."""
+        """(h, w) bool, whether depths z (n,) of the failed pixels have half of their error or more, or are NaN."""
         error = np.abs(z - self.truth.z[self.failed])
         return self._of_failed(~(error <= self._half_of_error[self.failed]))
 
     def _of_failed(self, values: np.ndarray) -> np.ndarray:
-        """(h, w) bool of (n,) values of the failed pixels."""
+        """(h, w) bool with (n,) values in the failed pixels, and False elsewhere."""
         result = np.zeros(self.failed.shape, dtype=bool)
         result[self.failed] = values
         return result
 
     @cached_property
     def _in_projector(self) -> np.ndarray:
-        """(n, 3) true surface points of the failed pixels in projector coordinates, metres."""
+        """(n, 3) float64 true surface points of the failed pixels in projector coordinates, metres."""
         return points_in_projector(self.signals.rig, self.truth.z, self.failed)
 
 
 def error_off_edge(
     where: np.ndarray, error: np.ndarray, edge: np.ndarray, z: np.ndarray, instance: np.ndarray, tolerance_m: float
 ) -> np.ndarray:
-    """(n,) float: median error of the same surface off the edge, around each of the n pixels `where`; NaN for none.
+    """(n,) float64 median error, in metres, of the same surface off the edge around each of n pixels; NaN if it is
+    nowhere in the window of `NEAR`.
 
     Parameters
     ----------
-    where, edge : (h, w) bool. error : (h, w) float, metres, not negative; infinity without a reading.
-    z : (h, w) float, metres, true depth. instance : (h, w) int, of the surface.
+    where : (h, w) bool, the n pixels.
+    error : (h, w) float, metres, absolute error; infinite without a reading.
+    edge : (h, w) bool, whether a pixel lies at a depth edge.
+    z : (h, w) float, metres, true depth.
+    instance : (h, w) int, number of the surface that the pixel sees.
+    tolerance_m : float, metres, see `depth_edges`.
     """
     rows, columns = np.nonzero(where)
     steps = np.arange(-NEAR, NEAR + 1)

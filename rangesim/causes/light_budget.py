@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much projector light a pixel has, and how much its sensor needs there, by the thresholds of its decoder."""
+"""Light budget: the emitter's light that a pixel receives, and the light that its decoder needs there."""
 
 from __future__ import annotations
 
@@ -19,12 +19,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class LightBudget:
-    """Projector light of each pixel against what its sensor needs; radiances, W/m2/sr.
+    """Light of the emitter that each pixel receives, and the light that its sensor needs; (h, w) float64 each.
 
-    signal : (h, w) float, projector light at full power, before the camera's lens, as all radiances here.
-    needed : (h, w) float, least signal that the decoder takes, in the ambient light there is.
-    needed_in_the_dark : (h, w) float, the same without ambient light.
-    ambient_fraction : (h, w) float in 0..1, of ambient light in the variance of the noise.
+    Radiances are in W/m2/sr, before the camera's lens.
+
+    signal : radiance of the emitter's light at full power.
+    needed : least signal that the decoder accepts, in the ambient light of the capture.
+    needed_in_the_dark : least signal that the decoder accepts without ambient light.
+    ambient_fraction : fraction (0..1) of the variance of the noise that ambient light makes.
     """
 
     signal: np.ndarray
@@ -34,7 +36,10 @@ class LightBudget:
 
 
 def light_budget(signals: Signals, capture: Capture, decoder: Decoder) -> LightBudget:
-    """Signal, least signal and fraction of ambient noise of every pixel of a capture made from these signals."""
+    """The light budget of each pixel of a capture that was exposed from these signals.
+
+    decoder : the decoder whose thresholds decide how much light is needed.
+    """
     sensor, content = capture.sensor, decoder.content(capture.sensor)
     signal = signals.energy.projector.astype(np.float64)
     ambient = signals.energy.ambient.astype(np.float64)
@@ -66,7 +71,10 @@ def light_budget(signals: Signals, capture: Capture, decoder: Decoder) -> LightB
 def _in_electrons(
     rig: Rig, capture: Capture, detector: PhotoDetector, signal: np.ndarray, ambient: np.ndarray
 ) -> tuple[Background, float]:
-    """Background in electrons, and electrons per W/m2/sr, of radiances behind the lens."""
+    """Background in electrons, and the gain in electrons per W/m2/sr, for radiances behind the lens.
+
+    signal, ambient : (h, w) float64, W/m2/sr, of the emitter and of ambient light.
+    """
     gate = capture.sensor.gate
     dark, bright = (float(detector.mean_electrons(np.full(1, x), gate, rig, capture.exposure_s)[0]) for x in (0.0, 1.0))
     gain = bright - dark
@@ -75,9 +83,10 @@ def _in_electrons(
 
 
 def white_radiance(rig: Rig, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(n,) float, W/m2/sr: what white Lambertian surfaces return of the projector's light.
+    """(n,) float64, W/m2/sr, radiance that white Lambertian surfaces return of the emitter's light.
 
-    points, normals : (n, 3) float, metres and unit, in projector coordinates.
+    points : (n, 3) float, metres, in projector coordinates.
+    normals : (n, 3) float, unit vectors of the surfaces there, in projector coordinates.
     """
     distance = np.linalg.norm(points, axis=-1)
     cosine = np.abs((normals * points).sum(axis=-1)) / distance

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Surfaces that lie outside the range of a time-of-flight sensor: as the depth is known, it is said."""
+"""Warning of surfaces that lie outside the range of a time-of-flight sensor; their true depth is known."""
 
 from __future__ import annotations
 
@@ -14,16 +14,19 @@ from rangesim.sensor import Sensor
 from rangesim.signals import GroundTruth
 
 ENOUGH = 0.01
-"""Fraction of the lit surface outside the range from which `warn_of_range` warns."""
+"""Least fraction of the lit pixels whose surface is outside the range, for a warning.
+
+A smaller fraction warns of single pixels at the far end of a scene, which spoil no statistics.
+"""
 
 
 def fraction_beyond_range(sensor: Sensor, rig: Rig, truth: GroundTruth) -> tuple[float, float]:
-    """Fraction of the lit surface that `sensor` cannot place (`Sensor.is_beyond_range`), and the range of its middle.
+    """Fraction of the lit pixels whose surface is outside the range of a sensor, and the distance of these surfaces.
 
     Returns
     -------
-    fraction : of the pixels whose surface the projector sees; 0 without any.
-    range_m : float, metres, median distance of those pixels from the camera; NaN without any.
+    fraction : fraction of the lit pixels whose surface is beyond the range, by `Sensor.is_beyond_range`.
+    range_m : float, metres, median distance of the surfaces outside the range from the camera; NaN if there are none.
     """
     lit = np.isfinite(truth.z) & truth.projector_visible
     range_m = truth.range_m[lit].astype(np.float64)
@@ -35,11 +38,11 @@ def fraction_beyond_range(sensor: Sensor, rig: Rig, truth: GroundTruth) -> tuple
 
 
 def warn_of_range(found: Sequence[tuple[str, float, float]]) -> None:
-    """Warn of the instruments that a noticeable part of the scene is out of reach of.
+    """Warn of instruments for which a noticeable part of the scene is out of range.
 
     Parameters
     ----------
-    found : name, and what `fraction_beyond_range` gives, of each instrument.
+    found : name of each instrument, with the two values of `fraction_beyond_range`.
 
     Warns
     -----

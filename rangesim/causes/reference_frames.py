@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of other light than a sensor received: of straight paths to the true surface alone."""
+"""Noise-free frames of the straight light paths to the true surface alone, without any other light."""
 
 from __future__ import annotations
 
@@ -13,18 +13,25 @@ from rangesim.sensor import Sensor
 from rangesim.signals import GroundTruth
 
 _CHUNK_VALUES = 32_000_000
+"""Largest count of weights that are computed at once, so that they take at most 256 MB; it changes no result."""
 FOOTPRINT_PATHS = 55
-"""Number of light paths over the area of a pixel, on a Fibonacci lattice: even along both sides, hence fine enough for
-stripes of a twentieth of the pixel, and over its area."""
+"""Number of light paths over the area of a pixel, on a Fibonacci lattice.
+
+The lattice is even along both sides of the pixel and over its area, so that 55 paths resolve stripes of a twentieth of
+a pixel.
+"""
 FOOTPRINT_STEP = 34
-"""Step of the lattice along the second side, the Fibonacci number before."""
+"""Step of the lattice along the second side of the pixel, counted in lattice points.
+
+It is the Fibonacci number before `FOOTPRINT_PATHS`, because two such numbers make the lattice even.
+"""
 
 
 def single_path_frames(sensor: Sensor, rig: Rig, truth: GroundTruth) -> np.ndarray:
-    """(k, h, w) float32: frames of the straight path to the true point of each pixel, alone, with a radiance of 1.
+    """(k, h, w) float32, W/m2/sr, frames of the straight path to the true point of each pixel, with a radiance of 1.
 
-    Where a reading of these is wrong, no light but that which belongs to the surface was needed to make it so: the
-    distance is beyond what the sensor can measure, or finer than it can tell. No light where there is no surface.
+    Where a reading of these frames is wrong, no other light is to blame: the distance is beyond the range of the
+    sensor, or finer than its resolution. Pixels without a surface get no light.
     """
     where = np.isfinite(truth.z)
     channels = _no_light(sensor, where.shape)
@@ -33,11 +40,16 @@ def single_path_frames(sensor: Sensor, rig: Rig, truth: GroundTruth) -> np.ndarr
 
 
 def footprint_frames(sensor: Sensor, rig: Rig, truth: GroundTruth, spread: np.ndarray) -> np.ndarray:
-    """Frames as of `single_path_frames`, but in the pixels `spread` (h, w) bool, which have a surface, the mean of
-    straight paths to all over the pixel's area, on the plane that touches the surface in the true point.
+    """(k, h, w) float32, W/m2/sr, frames of straight paths that cover the whole area of some pixels.
 
-    Where a reading of these is wrong, the pixel is too coarse for the pattern, or mixes too many distances of its one
-    surface. Where it is right, an inclined surface alone does no harm.
+    In the pixels `spread`, the frames are the mean over `FOOTPRINT_PATHS` straight paths to the tangent plane of the
+    surface. In the other pixels they are as in `single_path_frames`. Where a reading of these frames is wrong, the
+    pixel is too coarse for the pattern, or covers too many distances of its one surface. Where it is right, the
+    inclination of the surface alone does no harm.
+
+    Parameters
+    ----------
+    spread : (h, w) bool, pixels that have a surface.
     """
     where = np.isfinite(truth.z)
     channels, alone = _no_light(sensor, where.shape), where & ~spread
@@ -49,13 +61,19 @@ def footprint_frames(sensor: Sensor, rig: Rig, truth: GroundTruth, spread: np.nd
 
 
 def _no_light(sensor: Sensor, shape: tuple[int, ...]) -> list[np.ndarray]:
+    """Channels (c, h, w) of each response of a sensor, all 0; shape : h and w."""
     return [np.zeros((response.channels, *shape), dtype=np.float32) for response in sensor.responses()]
 
 
 def _add(
     channels: Sequence[np.ndarray], sensor: Sensor, where: np.ndarray, path: LightPath, radiance: float = 1.0
 ) -> None:
-    """Add a light path to each of the n pixels `where` (h, w) bool to the channels of the sensor's responses."""
+    """Add one light path per pixel to the channels of the sensor's responses.
+
+    channels : one (c, h, w) float32 per response; they are changed.
+    where : (h, w) bool, the n pixels.
+    path : LightPath of n paths.
+    """
     pixels = np.flatnonzero(where)
     for response, image in zip(sensor.responses(), channels, strict=True):
         values = image.reshape(response.channels, -1)
@@ -74,7 +92,10 @@ def _add(
 def _add_bins(
     values: np.ndarray, pixels: np.ndarray, response: SparseResponse, path: LightPath, radiance: float
 ) -> None:
-    """Add the bins of a light path (1, n) to values (channels, h w) at n pixels."""
+    """Add light paths to the bins of a response.
+
+    values : (c, h * w) float32; they are changed. pixels : (n,) int, index of each path's pixel. path : (1, n) paths.
+    """
     for index, weight in response.bin_weights(path, NumpyMath()):
         index, weight = (np.broadcast_to(x, path.u.shape)[0] for x in (index, weight))
         inside = index < response.channels
@@ -82,18 +103,19 @@ def _add_bins(
 
 
 def points_in_projector(rig: Rig, z: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """(n, 3) float64, metres: surface points at depths z (h, w) of the n pixels `where`, in projector coordinates."""
+    """(n, 3) float64 points at depths z (h, w) of the n pixels `where`, in projector coordinates, metres."""
     points = rig.camera.directions(rig.camera.pixel_centres()[where]) * z[where].astype(np.float64)[:, None]
     return np.asarray((points - rig.T_camera_projector[:3, 3]) @ rig.T_camera_projector[:3, :3])
 
 
 def _straight_path(rig: Rig, truth: GroundTruth, where: np.ndarray) -> LightPath:
-    """The direct path of each pixel; where the projector does not see, through the nearest place of its image."""
+    """Direct path to the true point of each of the n pixels `where`; a point outside the projector's image is clamped
+    to the nearest place in it."""
     return _path(rig, points_in_projector(rig, truth.z, where), truth.range_m[where])
 
 
 def _path_beside(rig: Rig, truth: GroundTruth, where: np.ndarray, offset: np.ndarray) -> LightPath:
-    """Light paths as of `_straight_path`, but `offset` (2,) pixels beside the centres, on the tangent planes."""
+    """Light paths as in `_straight_path`, but to the tangent planes, `offset` (2,) pixels beside the centres."""
     ray = rig.camera.directions(rig.camera.pixel_centres()[where] + offset)
     depth = depth_on_plane(rig, truth, where, ray)
     points = ray * np.where(np.isfinite(depth), depth, truth.z[where])[:, None]
@@ -102,8 +124,15 @@ def _path_beside(rig: Rig, truth: GroundTruth, where: np.ndarray, offset: np.nda
 
 
 def depth_on_plane(rig: Rig, truth: GroundTruth, where: np.ndarray, ray: np.ndarray) -> np.ndarray:
-    """(n,) float64, metres: depth at which rays (n, 3) with z = 1 meet the planes that touch the surfaces of the n
-    pixels `where`; NaN where they do so behind the camera, or never."""
+    """(n,) float64 depths, in metres, where rays meet the tangent planes of the surfaces of n pixels.
+
+    A depth is NaN where a ray meets its plane behind the camera, or not at all.
+
+    Parameters
+    ----------
+    where : (h, w) bool, the n pixels.
+    ray : (n, 3) float, directions with z = 1, camera coordinates.
+    """
     normal = truth.normal[where].astype(np.float64) @ rig.T_world_camera[:3, :3]
     centre = rig.camera.directions(rig.camera.pixel_centres()[where])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -112,7 +141,7 @@ def depth_on_plane(rig: Rig, truth: GroundTruth, where: np.ndarray, ray: np.ndar
 
 
 def _path(rig: Rig, point: np.ndarray, range_m: np.ndarray) -> LightPath:
-    """Light paths by points (n, 3) in projector coordinates, `range_m` (n,) from the camera; metres."""
+    """Light paths to points (n, 3), metres, in projector coordinates, at distances `range_m` (n,) from the camera."""
     uv = np.nan_to_num(rig.projector.project(point))
     u, v = np.clip(uv[:, 0], 0, rig.projector.width), np.clip(uv[:, 1], 0, rig.projector.height)
     return LightPath(u, v, range_m + np.linalg.norm(point, axis=-1), True)

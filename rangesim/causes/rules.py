@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules that name the cause of every failed pixel, from its range image and the light that made it."""
+"""Rules that name the cause of each failed pixel of a range image, from the light that it was exposed to."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     from rangesim.signals import Signals
 
 Rule = tuple[np.ndarray, Cause]
+"""A mask (h, w) bool, and the cause of failed pixels where it holds."""
 
 OTHER = range(MULTIPATH, GLINT + 1)
-"""Kinds of light that carry no depth of the surface a pixel sees."""
+"""Kinds of light, as indices into `rangesim.response.KINDS`, that carry no depth of the surface a pixel sees."""
 
 
 def explain(
@@ -30,31 +31,43 @@ def explain(
     signals: Signals,
     tolerance_m: float = OUTLIER_M,
 ) -> CauseMap:
-    """The cause of every failed pixel, from the energy split and the ground truth of its pass.
+    """The cause of each failed pixel of a range image.
 
-    A pixel fails if there is a surface behind it and no reading, or one off by more than `tolerance_m`. The cause
-    is the first thing that goes wrong on the way of the light: at the surface, at the pixel, in the detector, in
-    the decoder. To part optics from electronics, the same signals are decoded once more without noise and
-    without ambient light.
+    A pixel fails if there is a surface behind it and it has no reading, or one with an error above `tolerance_m`. The
+    cause is the first thing that goes wrong on the way of the light: at the surface, at the pixel, in the detector, in
+    the decoder. It is found from the energy split and the ground truth of the signals. To tell optics from
+    electronics, the signals are decoded again without noise and without ambient light. See docs/causes.md.
 
     Parameters
     ----------
     image : RangeImage, decoded from `capture`.
     capture : Capture, as `rangesim.expose` made it from `signals`.
-    signals : Signals of the pass; the sensor of the capture must have been part of it.
-    tolerance_m : float, metres.
+    signals : Signals of a transport pass that the sensor of the capture was part of.
+    tolerance_m : float, metres, error above which a reading failed.
 
     Raises
     ------
     ValueError
-        Image, capture and signals differ in size, the pass lacks the sensor's signals, or `tolerance_m` is not
-        positive.
+        Image, capture and signals differ in size or are of different cameras, the pass lacks the sensor's signals, or
+        `tolerance_m` is not positive.
+
+    Examples
+    --------
+    With `signals` of `rangesim.transport` that hold this sensor, here of a wall at 1 m, in too little light:
+
+    >>> from rangesim import Detector, decode, expose, explain
+    >>> capture = expose(signals, sensor, Detector(), exposure_s=1e-9)
+    >>> causes = explain(decode(capture), capture, signals)
+    >>> bool(causes.failed.all())
+    True
+    >>> causes.fractions(signals.truth)[-1]
+    {'material': 'all', 'failed': 1.0, 'causes': {'low_signal': 1.0}}
     """
     return causes_of(ReferenceReadings(image, capture, signals), tolerance_m)
 
 
 def causes_of(readings: ReferenceReadings, tolerance_m: float) -> CauseMap:
-    """The cause of every failed pixel of a range image, from its reference readings; errors as of `explain`."""
+    """The cause of each failed pixel, from the reference readings of a range image; errors as of `explain`."""
     image, capture, signals = readings.image, readings.capture, readings.signals
     shape = signals.truth.z.shape
     if image.z.shape != shape or capture.frames.shape[1:] != shape:
@@ -75,25 +88,26 @@ def causes_of(readings: ReferenceReadings, tolerance_m: float) -> CauseMap:
 
 
 def rules(e: Evidence) -> list[Rule]:
-    """Causes in the order in which they are considered; for a failed pixel the first that holds is the cause.
+    """Causes in the order in which they are tried; the first one that holds is the cause of a failed pixel.
 
-    The order is that of the light, except that saturation comes first: it hides everything else. The last rule
-    holds wherever it is asked, so no failed pixel is without a cause: with enough light, nothing that disturbs
-    it, and a right reading without noise, it was the noise.
+    The order follows the light from the emitter to the decoder. Saturation comes first, because it hides everything
+    else. The last rule always holds, so that every failed pixel has a cause: with enough light, nothing that disturbs
+    it, and a right reading without noise, the noise is to blame.
     """
     too_dark, disturbed = ~e.enough, e.optical & e.disturbed
-    dim = e.is_a("glossy") & e.faint & ~e.enough_direct  # without the light that it reflects, it would be dark
+    dim = e.is_a("glossy") & e.faint & ~e.enough_direct  # its direct light alone would be too dark
     return [
-        # ---- The detector, blinded
+        # ---- The detector is saturated
         (e.saturated & e.mostly_ambient & ~e.mostly(GLINT), Cause.AMBIENT),
         (e.saturated & e.piled_up & ~e.mostly(GLINT), Cause.PILE_UP),
         (e.saturated | e.mostly(GLINT), Cause.GLINT),
-        # ---- Surfaces that pass the light on: whether they are lit does not matter. Direct light is their neighbour's
+        # ---- Surfaces that reflect or transmit the light: it does not matter whether they are lit. Direct light in
+        # such a pixel comes from a neighbouring surface
         (e.is_a("transparent", "mirror") & e.at_edge & e.enough & e.mostly(DIRECT), Cause.DEPTH_EDGE),
         (e.is_a("transparent") | (e.is_a("translucent") & too_dark), Cause.SEEN_THROUGH),
         (e.is_a("mirror") & (~e.missing | e.enough), Cause.MIRRORED_GHOST),
         (e.is_a("mirror"), Cause.SPECULAR_AWAY),
-        # ---- No straight way for the light
+        # ---- There is no straight path from the emitter
         (e.unlit & e.enough & e.mostly(CAUSTIC), Cause.CAUSTIC),
         (e.unlit & e.enough & e.mostly(SPECULAR), Cause.MIRRORED_GHOST),
         (e.unlit, Cause.SHADOWED),
@@ -106,7 +120,7 @@ def rules(e: Evidence) -> list[Rule]:
         # ---- The distance itself
         (e.beyond_range, Cause.RANGE_AMBIGUITY),
         (e.optical & e.coarse, Cause.RESOLUTION),
-        # ---- The pixel holds more than one distance
+        # ---- The pixel covers more than one distance
         (e.moving, Cause.MOTION),
         (e.at_edge & ~(disturbed & (e.fails_off_edge | e.merely_inclined)), Cause.DEPTH_EDGE),
         (e.in_shadow, Cause.SHADOWED),

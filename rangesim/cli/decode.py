@@ -49,8 +49,8 @@ def decode_command(
     unit: Annotated[
         float | None,
         typer.Option(
-            help="Metres per unit of length of a calibration, .xml or .yml. Default: 1 for OpenCV's with "
-            "camera_matrix, 0.001 for procam-calibration's."
+            help="Metres per unit of length of a calibration, .xml or .yml. Default: 1 for OpenCV's files with "
+            "camera_matrix, 0.001 for those of procam-calibration."
         ),
     ] = None,
     bits: BitsOption = None,
@@ -62,13 +62,13 @@ def decode_command(
         ),
     ] = None,
 ) -> None:
-    """Decode a capture. Needs no scene and no renderer.
+    """Decode a capture to maps, and with a calibration to a point cloud, without scene and renderer.
 
-    Bare images are taken in the order of their names, which must be that of the sensor's frames. By default that is
-    OpenCV's: for each axis the patterns from the coarsest to the finest, each followed by its inverse; then white,
+    Bare images are taken in the order of their names, which must be that of the sensor's frames. By default it is
+    OpenCV's: for each axis the patterns from the coarsest to the finest, each followed by its inverse; then white and
     black.
 
-    Writes range.npz and pictures of the maps; with a calibration also cloud.ply, in metres.
+    The command writes range.npz and pictures of the maps, and with a calibration also cloud.ply, in metres.
 
     Examples:
 
@@ -101,7 +101,7 @@ def decode_command(
 
 
 def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibration: Path | None) -> None:
-    """ValueError if an option was given that has no effect on this input."""
+    """Raise ValueError if an option was given that would have no effect on this input."""
     from rangesim.calibration.opencv_files import SUFFIXES
     from rangesim.results.capture_files import SIDECAR
 
@@ -118,6 +118,7 @@ def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibra
 
 
 def _from_command_line(context: typer.Context, name: str) -> bool:
+    """Whether an option was given, and is not its default."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The summary of `rangesim decode`: fractions of pixels by status, and the likely cause where few are measured."""
+"""Summary of `rangesim decode`: fractions of pixels by status, and the likely cause where few are measured."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ MIN_BRIGHTEST = 1 / 8
 three bits less than its files, or the exposure may be too short."""
 
 MAX_BASELINE_M = 10.0
-"""Baseline in metres beyond which the calibration is probably in millimetres: rigs of one desk or robot are smaller,
-and 10 mm is shorter than the baseline of nearly all."""
+"""Baseline in metres beyond which the calibration is probably in millimetres. A rig on a desk or a robot is smaller,
+and few have a baseline of less than 10 mm, which such a file would give as 10 m."""
 
 
 def status_fractions(image: RangeImage) -> dict[str, float]:
-    """Fractions of the pixels, 0 to 1, by the name of their status; all statuses, also those of no pixel."""
+    """Fractions of the pixels, 0 to 1, by the name of their status, for all statuses."""
     counts = np.bincount(image.status.ravel(), minlength=len(Status))
     return {STATUS_NAMES[status]: float(counts[status] / image.status.size) for status in Status}
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What Gray code and fringes share: the frames of one projector axis, and what they decode to.
+"""Frames of one projector axis and the code they decode to, as Gray code and fringes share them.
 
 Both also check whether the frames contradict their code. A pixel alone may be wrong for many reasons, so the checks
 look at many at once: a capture that is read as what it is not (another start or direction of the fringes, another order

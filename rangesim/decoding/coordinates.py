@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Coordinates(ShortRepr, ABC):
-    """What the frames of a capture say about each camera pixel, before any geometry.
+    """Readings of the camera's pixels before any geometry.
 
     Subclasses add the coordinates: `ProjectorCoordinates` and `PathLengths`. They are NaN where `status` is not OK.
 

@@ -19,11 +19,19 @@ phase is refused, and large enough for products with the result to stay finite i
 
 @dataclass(frozen=True)
 class PhaseThresholds:
-    """Thresholds below which a phase is refused.
+    """Thresholds at which a phase is refused.
 
-    max_sigma_rad : a phase with a larger standard deviation is refused, where the detector is known.
-    modulation_of_scale : least modulation as a fraction of full scale, for digital captures of unknown detectors.
-    relative_modulation : least modulation as a fraction of the pixel's own brightness, for noise-free captures.
+    Parameters
+    ----------
+    max_sigma_rad : float, radians, largest standard deviation of a phase, where the detector is known.
+    modulation_of_scale : float, least modulation as a fraction of full scale, for digital captures of unknown
+        detectors.
+    relative_modulation : float, least modulation as a fraction of the pixel's own brightness, for noise-free captures.
+
+    Examples
+    --------
+    >>> PhaseThresholds(max_sigma_rad=0.1).max_sigma_rad
+    0.1
     """
 
     max_sigma_rad: Annotated[float, Bounds("positive and finite", 1e-6, 1e6)] = 0.2
@@ -34,9 +42,14 @@ class PhaseThresholds:
         check_fields(self)
 
     def least_signal(self, steps: int, visibility: float, content: FrameContent, background: Background) -> np.ndarray:
-        """(h, w) least light S of the projector at full power that the phase of `steps` frames takes.
+        """(h, w) float64, least light S of the emitter at full power that the phase takes, in the background's unit.
 
         With a modulation of `visibility` times S, sigma = sqrt(2 / steps) noise / (visibility S), see `phase_sigma`.
+
+        Parameters
+        ----------
+        steps : int, number of frames. visibility : float, modulation as a fraction of S.
+        content : FrameContent of one of the frames.
         """
         ambient = content.ambient * background.ambient
         if background.noise_variance is None:
@@ -47,9 +60,9 @@ class PhaseThresholds:
 
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """Phase of fringes or taps.
+    """Phase of fringes or taps, I = mean + modulation cos(phase - shift).
 
-    normalised : (h, w) float32 in [0, 1), the phase over 2 pi.
+    normalised : (h, w) float32 in [0, 1), the phase in turns, over 2 pi.
     modulation, mean : (h, w) float32, in the units of the capture.
     """
 
@@ -59,7 +72,19 @@ class Phase:
 
 
 def phase_of(frames: np.ndarray) -> Phase:
-    """Least-squares phase phi of frames I_s = mean + modulation cos(phi - 2 pi s / N), (N, h, w), N >= 3.
+    """Least-squares phase phi of frames I_s = mean + modulation cos(phi - 2 pi s / N).
+
+    Parameters
+    ----------
+    frames : (N, ...) of any number type, N >= 3, in any unit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> shifts = 2 * np.pi * np.arange(3) / 3
+    >>> phase = phase_of(5 + 2 * np.cos(2 * np.pi * 0.25 - shifts)[:, None, None])
+    >>> round(float(phase.normalised[0, 0]), 4), round(float(phase.modulation[0, 0]), 4)
+    (0.25, 2.0)
 
     References
     ----------
@@ -96,11 +121,22 @@ def phase_sigma(capture: Capture, phase: Phase, steps: int) -> np.ndarray | None
 
 
 def tap_phase(taps: np.ndarray, exact_square: bool = False) -> Phase:
-    """Phase of taps (4, h, w) at 0, 90, 180, 270 degrees, mean + modulation cos(phi - theta).
+    """Phase phi of taps at theta = 0, 90, 180 and 270 degrees, mean + modulation cos(phi - theta).
 
-    C = tap 0 - tap 180 and S = tap 90 - tap 270 give phi = atan2(S, C), modulation = hypot(C, S) / 2. For a
-    triangle correlation (`exact_square`) |C| + |S| is constant, and the phase is piecewise linear in S / (|C|
-    + |S|).
+    C = tap 0 - tap 180 and S = tap 90 - tap 270 give phi = atan2(S, C), modulation = hypot(C, S) / 2. For a triangle
+    correlation |C| + |S| is constant, and the phase is piecewise linear in S / (|C| + |S|).
+
+    Parameters
+    ----------
+    taps : (4, h, w) of any number type, in any unit. exact_square : whether the correlation is a triangle, as of a
+        square source and a square reference.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> theta = np.deg2rad([0, 90, 180, 270])[:, None, None]
+    >>> round(float(tap_phase(5 + 2 * np.cos(2 * np.pi * 0.7 - theta)).normalised[0, 0]), 4)
+    0.7
 
     References
     ----------

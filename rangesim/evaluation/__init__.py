@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings against the ground truth, and how much of their noise is the renderer's."""
+"""Errors of range images against the ground truth, and how much of their noise is the renderer's."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A range image against ground truth, by material class."""
+"""Comparison of a range image with the ground truth, by material class."""
 
 from __future__ import annotations
 
@@ -16,27 +16,35 @@ from rangesim.settings.config import ShortRepr
 from rangesim.signals import GroundTruth, Signals
 
 OUTLIER_M = 0.010
+"""Error of a reading, in metres, above which it is an outlier and counts as failed.
+
+The value is a choice. It decides what fraction of the readings is called wrong, and every table states it.
+"""
 EDGE_RADIUS = 2
-"""Pixels from a depth edge within which a pixel can be a flying pixel."""
+"""Distance from a depth edge, in pixels, within which a pixel can be a flying pixel.
+
+A larger radius counts more right readings beside the edge, and lowers the rate of flying pixels. Other values
+were not measured.
+"""
 
 
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Errors of one material class. NaN where there is nothing to count.
+    """Statistics of the errors of one material class. A value is NaN where there are no pixels to compute it from.
 
     Parameters
     ----------
     material : str, class of the first surface behind the pixel, or "all".
-    pixels : int, with a true depth.
-    lit : int, of those, seen by the projector (the others lie in its shadow or beside its image).
-    completeness : fraction of the lit pixels with a measurement.
-    coverage : fraction of all pixels with a measurement.
-    bias_m : mean of z - true z, metres, over all measured pixels; lit or not.
+    pixels : int, number of pixels with a true depth.
+    lit : int, number of those pixels that the projector sees; the others lie in its shadow or beside its image.
+    completeness : fraction of the lit pixels that have a reading.
+    coverage : fraction of all pixels that have a reading.
+    bias_m : mean of z - true z, metres, over all pixels with a reading, lit or not.
     median_abs_m, rmse_m, p95_abs_m : median, root mean square and 95th percentile of |z - true z|, metres.
-    outlier_rate : fraction of the measured pixels with |z - true z| > `outlier_m`.
-    edge_pixels : int, measured pixels within 2 pixels of a depth edge.
-    flying_rate : fraction of them that fly: their z is farther than `outlier_m` from every true depth in the 5 x
-        5 window, so they lie on neither side of the edge.
+    outlier_rate : fraction of the readings with |z - true z| > `outlier_m`.
+    edge_pixels : int, number of pixels with a reading within `EDGE_RADIUS` pixels of a depth edge.
+    flying_rate : fraction of the edge pixels that are flying pixels: their z differs by more than `outlier_m` from
+        every true depth in the window of 5 x 5 pixels, so that they lie on neither side of the edge.
     """
 
     material: str
@@ -55,12 +63,12 @@ class ErrorStatistics:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(ShortRepr):
-    """Statistics per material class, "all" last, and the error map.
+    """Statistics of the errors of a range image per material class, and its error map.
 
-    table : tuple of ErrorStatistics.
-    error_m : (h, w) float32, metres, z - true z; NaN where there is no measurement or no truth.
+    table : tuple of ErrorStatistics, one for each material class, "all" last.
+    error_m : (h, w) float32, metres, z - true z; NaN where there is no reading or no true surface.
     flying : (h, w) bool, flying pixels.
-    outlier_m : float, metres.
+    outlier_m : float, metres, error above which a reading is an outlier.
     """
 
     table: tuple[ErrorStatistics, ...]
@@ -69,14 +77,20 @@ class Comparison(ShortRepr):
     outlier_m: float
 
     def rows(self) -> list[dict[str, Any]]:
-        """One dict per class, for JSON: None where a value is not defined."""
+        """One dict per material class, as JSON can hold it: None in place of NaN."""
         return [
             {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(row).items()}
             for row in self.table
         ]
 
     def row(self, material: str) -> ErrorStatistics:
-        """Statistics of one class; ValueError if there is none of this name."""
+        """Statistics of one material class.
+
+        Raises
+        ------
+        ValueError
+            The comparison has no class of this name.
+        """
         for row in self.table:
             if row.material == material:
                 return row
@@ -85,22 +99,35 @@ class Comparison(ShortRepr):
 
 
 def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = OUTLIER_M) -> Comparison:
-    """Errors of a range image, per material class and over all.
+    """Errors of a range image against the ground truth, per material class and over all pixels.
 
     Parameters
     ----------
-    truth : GroundTruth, or Signals, whose ground truth is taken.
-    outlier_m : float, metres; readings that are off by more are outliers.
+    image : RangeImage.
+    truth : GroundTruth, or the Signals that contain it.
+    outlier_m : float, metres; readings with a larger error are outliers.
 
     Raises
     ------
     ValueError
-        Image and truth differ in size, or `outlier_m` is not positive.
+        Image and truth differ in size, the signals are of a camera elsewhere, or `outlier_m` is not positive.
+
+    Examples
+    --------
+    `image` is what `rangesim.decode` makes of a capture of these signals:
+
+    >>> from rangesim import compare
+    >>> comparison = compare(image, signals)
+    >>> [statistics.material for statistics in comparison.table]
+    ['matte', 'all']
+    >>> matte = comparison.row("matte")
+    >>> matte.completeness, matte.median_abs_m < 0.005
+    (1.0, True)
 
     References
     ----------
     Flying pixels: Sabov, Krüger: "Identification and correction of flying pixels in range camera data", SCCG
-    (2008); there detected from the image alone, here against the true depths.
+    (2008). They detect flying pixels from the image alone; here the true depths are known.
     """
     if isinstance(truth, Signals):
         there = truth.rig.T_world_camera
@@ -156,7 +183,7 @@ def _fraction(part: np.ndarray, whole: np.ndarray) -> float:
 
 
 def _flying(z: np.ndarray, true_z: np.ndarray, outlier_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """(h, w) bool each: near a depth edge, and flying."""
+    """Two masks, (h, w) bool each: pixels near a depth edge, and flying pixels."""
     far = np.where(np.isfinite(true_z), true_z, np.inf)
     nearest = np.full(z.shape, np.inf)
     measured = np.where(np.isfinite(z), z, np.nan)
@@ -167,7 +194,8 @@ def _flying(z: np.ndarray, true_z: np.ndarray, outlier_m: float) -> tuple[np.nda
 
 
 def neighbours(values: np.ndarray, radius: int) -> list[np.ndarray]:
-    """The array shifted to every offset of the window, edges repeated."""
+    """Copies of the array (h, w), one shifted by each offset of a window of (2 radius + 1)^2 pixels; beyond the border,
+    its values are repeated."""
     padded = np.pad(values, radius, mode="edge")
     h, w = values.shape
     size = 2 * radius + 1

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of a range image by where it comes from: the detector, which is physics, and the sampling of light paths, which
-is the renderer's and should be small against it.
+"""Noise of a range image by its source: the detector, or the renderer's random sampling of light paths.
 
-Signals keep one draw of their sampling error (`rangesim.signals.SamplingError`). Added to them and subtracted, it gives
-the signals of each half of the samples. Half the difference of what a decoder reads in these without noise is a draw of
-the sampling error of the reading, whatever the decoder makes of it. What a reading with noise differs by from that
-without is the error of the detector. Readings that a half lacks, or has alone, tell how uncertain the fraction of
-missing ones is.
+The noise of the detector is physics. The noise of sampling belongs to the renderer and should be small against it.
+
+Signals keep one draw of their sampling error (`rangesim.signals.SamplingError`). Added to the signals and subtracted
+from them, it gives the signals of each half of the samples. The decoder reads both without noise. Half the difference
+of the two readings is a draw of the sampling error of the reading, whatever the decoder does.
+
+The error that the detector makes is the difference between a reading with noise and the reading without.
+
+Pixels that have a reading in one half of the samples only tell how uncertain the fraction of missing readings is.
 """
 
 from __future__ import annotations
@@ -32,21 +35,30 @@ if TYPE_CHECKING:
     from rangesim.signals import GroundTruth, Signals
 
 SMALL = 0.5
-"""Sampling noise over the detector's, above which a warning is due: the sum of both is an eighth larger then."""
+"""Ratio of the sampling noise to the detector's noise above which a run warns.
+
+It was chosen because at this ratio the sum of both is an eighth larger than the detector's noise alone.
+"""
 SMALL_LOSS = 0.03
-"""Uncertainty of the fraction of pixels with a reading, above which a warning is due: losses that differ by less are
-rarely told apart by the few pixels of a material."""
+"""Uncertainty of the fraction of pixels with a reading above which a run warns, as a fraction of these pixels.
+
+Smaller differences between two sensors are rarely significant, because a material covers few pixels.
+"""
 ENOUGH_PIXELS = 100
-"""Readings of a material, or nothing is warned about."""
+"""Least number of pixels of a material on which a run warns; statistics of fewer pixels vary too much to act on."""
 NOISE_SEEDS = (SEEDS - 3, SEEDS - 2, SEEDS - 1)
-"""Seeds of the detector's noise where a capture is repeated; far from those that people and `derived_seed` give."""
+"""Seeds of the detector's noise in repeated captures.
+
+They are the three largest, so that the noise of a capture is hardly ever repeated.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """Pixels without a reading by the same decoder in repeated captures, each (h, w) bool.
+    """Pixels for which the same decoder has no reading, in a range image and in repeated captures; (h, w) bool each.
 
-    whole : of all samples, the range image itself. again : of all samples, with other noise of the detector.
+    whole : in the range image itself, of all samples.
+    again : of all samples, with other noise of the detector.
     halves : of each half of the samples, with other noise of the detector.
     """
 
@@ -55,13 +67,17 @@ class Repeats:
     halves: tuple[np.ndarray, np.ndarray]
 
     def completeness_error(self, mask: np.ndarray) -> float | None:
-        """Bound on how far the fraction of pixels of `mask` (h, w) bool with a reading is from that of very many
-        samples; None without pixels.
+        """Bound on the change of the fraction of pixels with a reading if very many samples were taken.
 
-        A pixel that has a reading with half of the samples and none with all of them, or the other way round, is one
-        that sampling decides about. More samples may change as many again, most of them in one direction, so the
-        larger of the two fractions is taken, summed over both halves. Twice the pixels that the detector's noise alone
-        changes are subtracted, and the standard error of these counts is added, which matters where pixels are few.
+        For a pixel that has a reading with half of the samples and none with all of them, or the other way round,
+        sampling decides. More samples may change as many pixels again, and most of them in one direction. The larger
+        of the two fractions is taken therefore, summed over both halves. Twice the number of pixels that the detector's
+        noise alone changes is subtracted, and the standard error of the counts is added, which matters where pixels
+        are few.
+
+        Parameters
+        ----------
+        mask : (h, w) bool, the pixels that are counted; without any, the bound is None.
         """
         if not mask.any():
             return None
@@ -77,12 +93,12 @@ class Repeats:
 
 @dataclass(frozen=True, eq=False)
 class RangeNoise:
-    """Errors of the readings of a range image, each (h, w) float32, metres, of z; NaN where there is no reading.
+    """Errors of z of a range image by their source, (h, w) float32, metres; NaN where there is no reading.
 
-    detector : the error that the detector's noise made of each reading; NaN also where it is not known.
-    sampling : a draw of the error that the sampling of light paths makes; of the same variance, not the error itself.
+    detector : error that the detector's noise made in each reading; NaN also where it is not known.
+    sampling : a draw with the variance of the error that the sampling of light paths makes; not the error itself.
         Infinite where sampling decides whether there is a reading at all.
-    repeats : what repeated captures read; None: the detector of the capture is not known.
+    repeats : pixels that lack a reading in repeated captures; None: the detector of the capture is not known.
     """
 
     detector: np.ndarray
@@ -90,12 +106,12 @@ class RangeNoise:
     repeats: Repeats | None = None
 
     def by_material(self, truth: GroundTruth) -> list[dict[str, Any]]:
-        """`detector_sigma_m`, `sampling_sigma_m` and `completeness_error` per material class of `truth` that occurs,
-        "all" last.
+        """Noise per material class of `truth` that occurs, "all" last; one dict for each.
 
-        The sigmas are robust: 1.4826 times the median of the absolute error, metres; None where there is nothing to
-        tell, or half of the errors are infinite. The last says by how much a pass of very many samples may change
-        `rangesim.evaluation.comparison.ErrorStatistics.completeness`; None where that is not known.
+        `detector_sigma_m` and `sampling_sigma_m` are standard deviations in metres, estimated as 1.4826 times the
+        median of the absolute error; None where there are no readings, or half of the errors are infinite.
+        `completeness_error` is the change of `rangesim.evaluation.comparison.ErrorStatistics.completeness` that a pass
+        of very many samples may bring, see `Repeats.completeness_error`; None where it is not known.
         """
         return [
             {
@@ -109,6 +125,12 @@ class RangeNoise:
 
 def range_noise(image: RangeImage, capture: Capture, signals: Signals) -> RangeNoise:
     """Noise of a range image that was decoded from a capture of these signals.
+
+    Parameters
+    ----------
+    image : RangeImage, decoded from `capture`.
+    capture : Capture, as `rangesim.expose` made it from `signals`.
+    signals : Signals that know their sampling error, as passes of at least 3 samples per pixel do.
 
     Raises
     ------
@@ -137,9 +159,9 @@ def noise_of(readings: ReferenceReadings) -> RangeNoise:
 
 
 def sampling_draw(image: RangeImage, capture: Capture, signals: Signals) -> tuple[np.ndarray, np.ndarray]:
-    """The mean of what both halves of the samples read without noise, (h, w) float64, and `RangeNoise.sampling`.
+    """Mean of the noise-free depths of both halves of the samples, (h, w) float64, metres, and `RangeNoise.sampling`.
 
-    Where sampling is large, a decoder is not linear, and this mean is not what it reads of all samples.
+    Where the sampling error is large, decoders are not linear: the mean then differs from the reading of all samples.
 
     Raises
     ------
@@ -150,7 +172,7 @@ def sampling_draw(image: RangeImage, capture: Capture, signals: Signals) -> tupl
 
 
 def _middle_and_draw(image: RangeImage, above: np.ndarray, below: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The mean of both halves' depths and `RangeNoise.sampling`, each (h, w)."""
+    """Mean of the depths of both halves, and `RangeNoise.sampling`, each (h, w), metres."""
     above, below = above.astype(np.float64), below.astype(np.float64)
     sampling = np.where(np.isnan(above) | np.isnan(below), np.inf, (above - below) / 2)
     sampling[~image.valid] = np.nan
@@ -158,14 +180,13 @@ def _middle_and_draw(image: RangeImage, above: np.ndarray, below: np.ndarray) ->
 
 
 def warn_of_sampling(tables: Mapping[str, Sequence[dict[str, Any]]], spp: int) -> None:
-    """Warn of the material classes on which sampling is not small against the detector's noise, or decides which pixels
-    have a reading.
+    """Warn of material classes on which sampling noise is not small, or sampling decides which pixels have a reading.
 
     Parameters
     ----------
-    tables : of each instrument by name, rows with `material`, `pixels`, `lit` and `completeness`, and what
-        `RangeNoise.by_material` gives.
-    spp : samples that a pixel had, at most.
+    tables : by the name of each instrument, rows of statistics: each has `material`, `pixels`, `lit` and
+        `completeness`, and the values of `RangeNoise.by_material`.
+    spp : largest number of samples that a pixel had.
 
     Warns
     -----
@@ -194,24 +215,26 @@ def warn_of_sampling(tables: Mapping[str, Sequence[dict[str, Any]]], spp: int) -
 
 
 def _missing(row: dict[str, Any]) -> str:
-    """Fraction of the lit pixels of a row without a reading, and its uncertainty."""
+    """Text of the fraction of lit pixels without a reading in a row, with its uncertainty."""
     return f"{100 * (1 - row['completeness']):.0f} ± {100 * row['completeness_error']:.0f} % on {row['material']}"
 
 
 def _power_of_two(number: int) -> int:
-    """The smallest power of two that is not below a number."""
+    """Smallest power of two that is not smaller than a number."""
     return 1 << (number - 1).bit_length()
 
 
 def noise_ratio(row: dict[str, Any]) -> float:
-    """Sampling noise over the detector's, of a row; 0 where either is not known, or there is none."""
+    """Ratio of sampling noise to detector noise in a row of statistics; 0 where one of them is unknown or 0."""
     sampling, detector = row["sampling_sigma_m"], row["detector_sigma_m"]
     return sampling / detector if sampling and detector else 0.0
 
 
 def robust_sigma(errors: np.ndarray) -> float | None:
-    """Standard deviation about 0 from the median of the absolute value of those errors that are not NaN; None if there
-    are none, or it is infinite."""
+    """Robust standard deviation about 0 of errors, from the median of their absolute values; NaN are left out.
+
+    It is None if no errors are left, or half of them are infinite.
+    """
     known = errors[~np.isnan(errors)]
     sigma = sigma_from_median(known) if known.size else np.inf
     return sigma if np.isfinite(sigma) else None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings that a range image is judged by: of the same light without noise, and of parts of it."""
+"""Reference readings of a range image: depths decoded from the same light without noise, or from parts of it."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceReadings:
-    """Depths that the decoder of a range image reads of other captures, each (h, w) float32, metres.
+    """Depths that the decoder of a range image reads from other captures; each is (h, w) float32, metres.
 
-    Each is decoded when it is first asked for, and only once. Nothing warns: the decoder warned when it made the range
-    image.
+    Each is decoded when it is first used, and only once, for the noise (`range_noise.noise_of`) and for the causes of
+    failures (`rangesim.causes.rules.causes_of`) alike. The decoder warned when it made the range image, and does not
+    warn again.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ class ReferenceReadings:
 
     @cached_property
     def projector_alone(self) -> np.ndarray:
-        """Depths of the projector's light alone: without noise, ambient light and the vignetting of the lens."""
+        """Depths in the projector's light alone: without noise, ambient light and the vignetting of the lens."""
         moves = self.signals.motion_m is not None
         if not (moves or self.signals.energy.ambient.any() or self.signals.rig.camera_lens.vignetting):
             return self.noise_free

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The walls between the data of a result and the page that shows it.
+"""Content security of the pages: text of a result can never become markup or code.
 
-Names in a result directory may come from anyone. The template escapes them and the script writes them as text. Behind
-that stands the page's own content security policy: the one script and the one style sheet of the package are named by
-their hash, pictures lie in the page, and all else is refused, by default and for good: markup out of strings, handlers
-and styles in attributes, requests, frames, forms.
+Names in a result directory may come from anyone. The template escapes them, and the script writes them as text. As a
+second defence, each page has a content security policy. It allows the package's own script and style sheet, which it
+names by their hashes, and pictures inside the page. It refuses everything else: markup from strings, handlers and
+styles in attributes, requests, frames and forms.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from markupsafe import Markup
 from rangesim.errors import visible
 
 _DECLARATIONS = re.compile(r"[a-z]+:[-#%.,() a-z0-9]+(;[a-z]+:[-#%.,() a-z0-9]+)*")
+"""CSS declarations that `StyleRules` takes: properties with plain values, and no URL or quote."""
 
 
 def content_policy(style: str, script: str) -> str:
-    """The page's Content-Security-Policy: nothing but this style sheet, this script and pictures in the page itself."""
+    """Content-Security-Policy of a page that allows this style sheet, this script and pictures in the page itself."""
     return "; ".join(
         (
             "default-src 'none'",
@@ -38,30 +39,47 @@ def content_policy(style: str, script: str) -> str:
 
 
 def visible_text(value: Any) -> Any:
-    """Text of a result with its control characters spelt out; anything else as it is."""
+    """The value; if it is text of a result, its control characters are spelt out."""
     return visible(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 class StyleRules:
-    """Declarations that the numbers decide (a colour, a width), as classes of the page's one style sheet.
+    """CSS classes for declarations that depend on the data, such as a colour or a width.
 
-    The policy allows no style attributes, and a page without scripts must look the same.
+    They are needed because the content security policy allows no style attributes. A script could set them, but a page
+    without scripts must look the same.
+
+    Examples
+    --------
+    >>> rules = StyleRules()
+    >>> rules.name("width:50%"), rules.name("width:20%"), rules.name("width:50%")
+    ('r0', 'r1', 'r0')
+    >>> print(rules.css(), end="")
+    .r0 { width:50% }
+    .r1 { width:20% }
     """
 
     def __init__(self) -> None:
         self._names: dict[str, str] = {}
 
     def name(self, declarations: str) -> str:
-        """Class that carries these declarations; ValueError for what is more than plain properties and values."""
+        """Name of the class with these declarations.
+
+        Raises
+        ------
+        ValueError
+            They are more than properties with plain values.
+        """
         if not _DECLARATIONS.fullmatch(declarations):
             raise ValueError(f"expected plain CSS declarations, got {declarations!r}.")
         return self._names.setdefault(declarations, f"r{len(self._names)}")
 
     def css(self) -> Markup:
-        """The rules of all names given out so far."""
+        """Rules of all classes that were named so far, for the page's style sheet."""
         rules = (f".{name} {{ {declarations} }}\n" for declarations, name in self._names.items())
         return Markup("".join(rules))  # each was checked when it was named
 
 
 def _hash(text: str) -> str:
+    """Hash of a script or style sheet as the policy names it."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")

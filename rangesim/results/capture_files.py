@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Captures as directories: one image per frame and `capture.json`; and folders of real images."""
+"""Writes and reads captures: a directory with one image per frame and `capture.json`, or a folder of real images."""
 
 from __future__ import annotations
 
@@ -24,8 +24,11 @@ from rangesim.sensors import Sensor, sensor_from_dict
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
 
 SIDECAR = "capture.json"
+"""File of a capture with its settings."""
 FORMAT = "rangesim-capture"
+"""Name of the format in the file."""
 FORMAT_VERSION = 1
+"""Version of the format, a count from 1. A change that older versions of the package cannot read increases it."""
 CAPTURE = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
 """Directories that hold a capture."""
 _KEYS = (
@@ -40,25 +43,33 @@ _KEYS = (
     "exposure_s",
     "ambient",
 )
+"""Keys of `capture.json`."""
 
 
 def save_capture(capture: Capture, directory: str | Path) -> None:
-    """Write a capture as a directory: PNG (8 or 16 bits) or EXR (float32) per frame, and `capture.json`.
+    """Write a capture as a directory with one image per frame and `capture.json`.
 
-    The files appear when all are complete. An older capture of that name is replaced; files that somebody else put
-    there stay.
+    The images are PNG of 8 or 16 bits, or EXR of float32 for a noise-free capture. The files appear when all of them
+    are complete. An older capture in the directory is replaced. Other files in it stay.
 
     Raises
     ------
     FileFormatError
-        `directory` exists and is neither empty nor a capture as it was written, or the frames do not fit 16 bits.
+        `directory` exists and is neither empty nor an unchanged capture, or the frames do not fit 16 bits.
+
+    Examples
+    --------
+    >>> from rangesim import expose, save_capture
+    >>> save_capture(expose(signals, sensor), "out/capture")  # doctest: +SKIP
     """
     with new_directory(directory, CAPTURE) as folder:
         write_capture(capture, folder)
 
 
 def write_capture(capture: Capture, folder: Path) -> None:
-    """Write the files of a capture and their manifest into an empty directory, one that is still in the making.
+    """Write the files of a capture and their manifest into an empty directory.
+
+    Nothing protects the files until they are complete; `save_capture` does that.
 
     Raises
     ------
@@ -67,7 +78,8 @@ def write_capture(capture: Capture, folder: Path) -> None:
     """
     if capture.is_digital and capture.frames.dtype.itemsize > 2 and capture.frames.max() > 65535:
         raise FileFormatError(
-            f"{folder}: the frames hold counts up to {capture.frames.max()}, the files at most 65535; expose shorter."
+            f"{folder}: expected counts up to 65535, the largest that the files hold, got {capture.frames.max()}; take "
+            "a shorter exposure."
         )
     names = _file_names(capture)
     for name, frame in zip(names, capture.frames, strict=True):
@@ -77,13 +89,18 @@ def write_capture(capture: Capture, folder: Path) -> None:
 
 
 def load_capture(directory: str | Path) -> Capture:
-    """The capture that `save_capture` wrote, bytes and settings equal.
+    """The capture that `save_capture` wrote, with equal frames and settings.
 
     Raises
     ------
     FileFormatError
-        Missing directory, sidecar or frame, broken JSON, unknown key, wrong size or type; the message names
-        the file.
+        The directory, `capture.json` or a frame is missing or broken, or has an unknown key, a wrong size or a wrong
+        type. The message names the file.
+
+    Examples
+    --------
+    >>> from rangesim import decode, load_capture
+    >>> image = decode(load_capture("out/tabletop/amcw/capture"))  # doctest: +SKIP
     """
     sidecar = Path(directory) / SIDECAR
     recover(directory, FileFormatError)
@@ -115,19 +132,30 @@ def load_capture(directory: str | Path) -> Capture:
 def import_capture(
     folder: str | Path, sensor: Sensor, rig: Rig | None = None, detector: PhotoDetector | None = None
 ) -> Capture:
-    """A real capture from a folder of images, one per frame, in the order of their names (numbers by value).
+    """A real capture from a folder with one image per frame.
+
+    The images are taken in the order of their names; numbers in the names are compared by value.
 
     Parameters
     ----------
-    folder : holds as many images (PNG, TIFF, JPEG, BMP, EXR; 8 or 16 bits; colour becomes grey) as the sensor
-        has frames.
-    sensor : Sensor, with the patterns in the order of `sensor.frame_names()`.
-    rig : Rig, or None if uncalibrated. detector : PhotoDetector, or None if unknown.
+    folder : folder with as many images as the sensor has frames: PNG, TIFF, JPEG, BMP or EXR of 8 or 16 bits. Colour
+        images are converted to grey.
+    sensor : Sensor, whose `frame_names()` are in the order of the images.
+    rig : Rig; None: not calibrated.
+    detector : PhotoDetector; None: not known.
 
     Raises
     ------
     FileFormatError
-        No such folder, another number of images, unreadable images, or images of different size or type.
+        There is no such folder, the number of images is wrong, or an image is broken or has another size or type than
+        the others.
+
+    Examples
+    --------
+    >>> from rangesim import StructuredLight, decode, import_capture, load_calibration
+    >>> sensor = StructuredLight(code="gray", projector_width=1024, projector_height=768, axes=("columns", "rows"))
+    >>> rig = load_calibration("rig.json")  # doctest: +SKIP
+    >>> image = decode(import_capture("photographs", sensor, rig))  # doctest: +SKIP
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -146,11 +174,13 @@ def import_capture(
 
 
 def _file_names(capture: Capture) -> list[str]:
+    """Name of the file of each frame, such as 000_columns_bit9.png."""
     suffix = ".png" if capture.is_digital else ".exr"
     return [f"{i:03d}_{name}{suffix}" for i, name in enumerate(capture.sensor.frame_names())]
 
 
 def _sidecar(capture: Capture, names: list[str]) -> dict[str, Any]:
+    """Contents of `capture.json`."""
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -166,6 +196,10 @@ def _sidecar(capture: Capture, names: list[str]) -> dict[str, Any]:
 
 
 def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor, size: tuple[int, int] | None) -> np.ndarray:
+    """Frames (k, h, w) of a capture, in the type that it had.
+
+    size : width and height that the frames must have; None: any.
+    """
     names, dtype = settings.get("frames"), settings.get("dtype")
     if dtype not in DTYPES:
         raise ValueError(f"expected dtype to be one of {', '.join(DTYPES)}, got {dtype!r}.")
@@ -182,4 +216,5 @@ def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor, size: 
 
 
 def _natural(path: Path) -> list[tuple[int, int | str]]:
+    """Key that sorts the names of files so that image2 comes before image10."""
     return [(0, int(s)) if s.isdigit() else (1, s) for s in re.split(r"(\d+)", path.name.lower())]

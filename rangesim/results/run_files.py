@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of an experiment as a directory, and back.
+"""Writes and reads the result of an experiment: the directory that `rangesim run` writes.
 
 DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
-    experiment.json      resolved settings, versions, and which instruments share which pass
-    pass_1.npz           energy split and ground truth of each transport pass
+    experiment.json      resolved settings, versions, and the pass that each instrument shares
+    pass_1.npz           energy split and ground truth of each light-transport pass
     comparison.md        statistics of all instruments
-    report.html
-    NAME/capture/        of each instrument: frames and sidecar
+    report.html          report for people
+    NAME/capture/        frames and settings of the capture of the instrument NAME
          range.npz       range image
          causes.npz      cause of every failed pixel
          cloud.ply       points, metres, camera coordinates
-         comparison.json, measurement.json, segmentation.npz
+         comparison.json statistics per material class
+         measurement.json exposure and times
+         segmentation.npz supervoxels, labels and tree
 """
 
 from __future__ import annotations
@@ -54,7 +56,9 @@ from rangesim.settings.config import ShortRepr, from_dict, shown
 from rangesim.signals import ALL, GroundTruth
 
 SETTINGS = "experiment.json"
+"""File of a result with its settings."""
 FORMAT = "rangesim-result"
+"""Name of the format in the file."""
 RESULT = DirectoryKind(FORMAT, SETTINGS, FileFormatError)
 """Directories that hold the results of an experiment."""
 
@@ -63,14 +67,18 @@ RESULT = DirectoryKind(FORMAT, SETTINGS, FileFormatError)
 
 
 class ShapeRecord(Record, frozen=True, kw_only=True):
-    """A shape of the scene."""
+    """A shape of the scene and its material class."""
 
     name: str
     material: Name
 
 
 class SceneRecord(Record, frozen=True, kw_only=True):
-    """The scene that was measured. sha256 : of its file; None if it came from elsewhere."""
+    """The scene that was measured.
+
+    sha256 : checksum of its file; None if the scene was not loaded from a file.
+    working_distance_m : distance from the camera to what it looks at, metres.
+    """
 
     name: str
     sha256: str | None
@@ -79,7 +87,7 @@ class SceneRecord(Record, frozen=True, kw_only=True):
 
 
 class InstrumentRecord(Record, frozen=True, kw_only=True, rename={"light_pass": "pass"}):
-    """An instrument, the pass it took part in (from 1), and its rig."""
+    """An instrument, the number of its light-transport pass (counted from 1), and its rig."""
 
     name: Name
     light_pass: Count
@@ -87,7 +95,7 @@ class InstrumentRecord(Record, frozen=True, kw_only=True, rename={"light_pass": 
 
 
 class ResultRecord(Record, frozen=True, kw_only=True):
-    """`experiment.json`."""
+    """The contents of `experiment.json`: settings, scene, rigs, versions and times."""
 
     format: Literal["rangesim-result"] = "rangesim-result"
     format_version: Literal[1] = 1
@@ -101,17 +109,23 @@ class ResultRecord(Record, frozen=True, kw_only=True):
 
 
 class PhotonsRecord(Record, frozen=True, kw_only=True):
-    """Photons that a pixel detects per laser pulse, on average: median and largest of the pixels. From about one on,
-    pile-up hides later ones."""
+    """Mean number of photons that a pixel detects per laser pulse: the median and the maximum over the pixels.
+
+    From about one photon per pulse on, pile-up hides the later photons of a pulse.
+    """
 
     median: Photons
     largest: Photons
 
 
 class MeasurementRecord(Record, frozen=True, kw_only=True):
-    """`measurement.json`: frames, exposure and time per stage; exposure None for a noise-free capture.
+    """The contents of `measurement.json`.
 
+    exposure_s : exposure of each frame, seconds; None for a noise-free capture.
+    acquisition_s : time from the start of the first exposure to the end of the last, seconds.
+    points : number of pixels with a reading.
     photons_per_pulse : None where no photons are counted.
+    times_s : seconds that each stage of the computation took.
     """
 
     format: Literal["rangesim-measurement"] = "rangesim-measurement"
@@ -127,8 +141,11 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
 
 
 class RowRecord(Record, frozen=True, kw_only=True):
-    """Statistics of one material class; see `rangesim.evaluation.comparison.ErrorStatistics`,
-    `rangesim.causes.CauseMap` and `rangesim.evaluation.range_noise.RangeNoise`."""
+    """Statistics of one material class.
+
+    Their meaning is that of `rangesim.evaluation.comparison.ErrorStatistics`, `rangesim.causes.CauseMap.fractions` and
+    `rangesim.evaluation.range_noise.RangeNoise.by_material`. None: not known.
+    """
 
     material: Name
     pixels: Count
@@ -150,7 +167,10 @@ class RowRecord(Record, frozen=True, kw_only=True):
 
 
 class ComparisonRecord(Record, frozen=True, kw_only=True):
-    """`comparison.json`: a row per material class, "all" last."""
+    """The contents of `comparison.json`: a row for each material class, the last one for "all".
+
+    outlier_m : error above which a reading counts as an outlier, metres.
+    """
 
     format: Literal["rangesim-comparison"] = "rangesim-comparison"
     format_version: Literal[1] = 1
@@ -159,21 +179,24 @@ class ComparisonRecord(Record, frozen=True, kw_only=True):
 
 
 _CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpec("float64", (), low=1e-9, high=1e9)}
+"""Type, shape and bounds of the arrays of `causes.npz`; the tolerance is in metres."""
 _SEGMENTATION = {
     "supervoxels": ArraySpec("int32", low=-1),
     "labels": ArraySpec("int32", low=-2),
     "parents": ArraySpec("int32", ("nodes",), low=0, per_pixel=2),
     "altitudes": ArraySpec("float64", ("nodes",), low=0, inf=True, per_pixel=2),
 }
+"""Type, shape and bounds of the arrays of `segmentation.npz`. A binary tree has less than two nodes per pixel."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Segmentation(ShortRepr):
-    """Supervoxels of a point cloud and the tree that merges them.
+    """Supervoxels of an organised point cloud, its objects, and the tree that merges the supervoxels.
 
-    supervoxels, labels : (h, w) int32, supervoxel and object per pixel, -1 without a point, -2 (labels) for outliers.
-    parents : (k,) int32, parent of each tree node, the supervoxels first; a root is its own parent.
-    altitudes : (k,) float64, not decreasing towards the root.
+    supervoxels : (h, w) int32, number of the supervoxel of each pixel; -1 where there is no point.
+    labels : (h, w) int32, number of the object of each pixel; -1 where there is no point, -2 for outliers.
+    parents : (k,) int32, parent of each node of the tree. The supervoxels come first; the root is its own parent.
+    altitudes : (k,) float64, altitude at which each node merges; it never decreases towards the root.
     """
 
     supervoxels: np.ndarray
@@ -184,15 +207,17 @@ class Segmentation(ShortRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Measurement(ShortRepr):
-    """What one instrument measured.
+    """The measurement of one instrument.
 
-    capture : Capture. image : RangeImage. truth : GroundTruth of its pass.
-    causes : CauseMap, why pixels failed.
-    rows : statistics per material class, "all" last; see `rangesim.evaluation.comparison.ErrorStatistics` and
-        `rangesim.causes.CauseMap.fractions`.
-    segmentation : Segmentation, or None if there were no points to group.
+    name : name of the instrument.
+    capture : Capture.
+    image : RangeImage.
+    truth : GroundTruth of the instrument's pass.
+    causes : CauseMap, the cause of each failed pixel.
+    rows : statistics per material class with the keys of `RowRecord`, "all" last.
+    segmentation : Segmentation; None if there were too few points.
     metadata : MeasurementRecord, frames, exposure, photons per pulse and time per stage.
-    light_pass : int from 1, the transport pass the instrument took part in.
+    light_pass : number of the light-transport pass, counted from 1.
     """
 
     name: str
@@ -208,11 +233,17 @@ class Measurement(ShortRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(ShortRepr):
-    """An experiment and its outcome.
+    """The result of an experiment.
 
-    measurements : one for each instrument, in the order of the experiment.
-    passes : one LightPass for each transport pass.
-    info : ResultRecord, scene, versions, times.
+    experiment : Experiment, as it was carried out.
+    measurements : one Measurement for each instrument, in the order of the experiment.
+    passes : one LightPass for each light-transport pass.
+    info : ResultRecord, with scene, versions and times.
+
+    Examples
+    --------
+    >>> result = load_result("out/tabletop")  # doctest: +SKIP
+    >>> {m.name: m.rows[-1]["median_abs_m"] for m in result.measurements}  # metres  # doctest: +SKIP
     """
 
     experiment: Experiment
@@ -222,7 +253,7 @@ class Result(ShortRepr):
 
 
 def complete_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Statistics per material class with all keys of `RowRecord`; None for what is not known."""
+    """The rows with all keys of `RowRecord`; a value is None where it is not known."""
     return [msgspec.to_builtins(RowRecord(**row)) for row in rows]
 
 
@@ -232,9 +263,11 @@ def complete_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def write_result(result: Result, folder: Path, pages: Mapping[str, bytes]) -> None:
     """Write the files of a result to an empty directory.
 
+    Nothing protects the files until they are complete; `rangesim.pipeline.experiment_run.run` does that.
+
     Parameters
     ----------
-    pages : contents of files for people, such as `report.html`, by name.
+    pages : contents of the files for people, such as `report.html`, by their names.
     """
     for number, light_pass in enumerate(result.passes, 1):
         write_pass(light_pass, folder / f"pass_{number}.npz")
@@ -250,7 +283,7 @@ def write_result(result: Result, folder: Path, pages: Mapping[str, bytes]) -> No
 
 
 def _write_readings(measurement: Measurement, folder: Path) -> None:
-    """Write what the frames of a measurement came to."""
+    """Write all files of a measurement except its capture."""
     causes, rows = measurement.causes, [RowRecord(**row) for row in measurement.rows]
     save_range_image(measurement.image, folder / "range.npz")
     write_arrays(folder / "causes.npz", {"cause": causes.cause, "tolerance_m": np.asarray(causes.tolerance_m)})
@@ -270,7 +303,7 @@ def load_result(directory: str | Path) -> Result:
     Raises
     ------
     FileFormatError
-        The directory is no result, or a part of it is missing or broken; the message names the file.
+        The directory holds no result, or a file is missing or broken. The message names the file.
     """
     folder = Path(directory)
     info = read_settings(folder)
@@ -297,7 +330,7 @@ def load_result(directory: str | Path) -> Result:
 
 
 def read_settings(folder: Path) -> ResultRecord:
-    """Contents of `experiment.json`; FileFormatError if there is none of ours."""
+    """The contents of `experiment.json` in the directory of a result; FileFormatError if it holds no result."""
     recover(folder, FileFormatError)
     if not (folder / SETTINGS).is_file():
         raise FileFormatError(f"{folder} is no {FORMAT} directory: it has no {SETTINGS}.")
@@ -305,7 +338,7 @@ def read_settings(folder: Path) -> ResultRecord:
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """Statistics per material class of one instrument, from its `comparison.json`; FileFormatError if it is broken."""
+    """The rows of `comparison.json` in the directory of an instrument; FileFormatError if the file is broken."""
     path = folder / "comparison.json"
     record = read_record(path, ComparisonRecord)
     materials = [row.material for row in record.rows]
@@ -321,7 +354,7 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
 
 
 def _image_sizes(info: ResultRecord, path: Path) -> dict[int, dict[str, int]]:
-    """Height and width of the camera of each pass, by the number of the pass."""
+    """Height "h" and width "w" of the camera of each pass in pixels, by the number of the pass."""
     sizes: dict[int, dict[str, int]] = {}
     for entry in info.instruments:
         try:
@@ -331,12 +364,13 @@ def _image_sizes(info: ResultRecord, path: Path) -> dict[int, dict[str, int]]:
         size = {"h": camera.height, "w": camera.width}
         if sizes.setdefault(entry.light_pass, size) != size:
             raise FileFormatError(
-                f"{path}: expected one size of the cameras of pass {entry.light_pass}, got another of {entry.name}."
+                f"{path}: expected cameras of one size in pass {entry.light_pass}, got another size for {entry.name}."
             )
     return sizes
 
 
 def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: dict[str, int]) -> Measurement:
+    """The measurement in the directory of an instrument, checked against its pass."""
     capture = load_capture(folder / "capture")
     if capture.rig is None or capture.frames.shape[1:] != (sizes["h"], sizes["w"]):
         raise FileFormatError(f"{folder / 'capture'}: expected a rig, and frames of the size of the ground truth.")
@@ -363,6 +397,7 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
 
 
 def _load_segmentation(path: Path, sizes: dict[str, int]) -> Segmentation | None:
+    """The segmentation of a file, checked to be a binary tree; None if there is no such file."""
     if not path.is_file():
         return None
     data = read_checked_arrays(path, _SEGMENTATION, dict(sizes))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A result becomes one self-contained HTML file."""
+"""The report of an experiment's result: one HTML file that needs no other file and no network."""
 
 from __future__ import annotations
 
@@ -17,21 +17,29 @@ from rangesim.results.run_files import Measurement, Result
 from rangesim.signals import GroundTruth
 
 SCRIPTS = ("scroll.js", "viewer.js", "report.js")
+"""Files of the page's JavaScript, in the order in which they use each other."""
 
 
 def write_report(result: Result, path: Path) -> None:
-    """Write the report of a result; the file appears when it is complete.
+    """Write the report of a result to a file, which appears only when it is complete.
 
     Raises
     ------
     FileFormatError
-        The place cannot be written.
+        The file cannot be written.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from rangesim.report import write_report
+    >>> from rangesim.results.run_files import load_result
+    >>> write_report(load_result("out/demo"), Path("report.html"))  # doctest: +SKIP
     """
     write_file(path, render_report(result).encode(), FileFormatError)
 
 
 def render_report(result: Result) -> str:
-    """The report of a result as HTML."""
+    """HTML page of the report of a result."""
     return render_page("report.html.j2", context(result), SCRIPTS)
 
 
@@ -105,6 +113,7 @@ def _camera(result: Result, group: Sequence[Measurement]) -> dict[str, Any]:
 
 
 def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -> dict[str, Any]:
+    """Maps of depth, of error and of causes of one instrument, with the legend of the causes."""
     causes, legend = figures.cause_map(m)
     return {
         "name": m.name,
@@ -116,6 +125,7 @@ def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -
 
 
 def _frames(m: Measurement) -> dict[str, Any]:
+    """Representative frames of one instrument, and how they were taken."""
     f = m.metadata
     taken = f"{f.frames} frame{'s' * (f.frames != 1)}"
     if f.exposure_s is not None:
@@ -134,6 +144,7 @@ def _frames(m: Measurement) -> dict[str, Any]:
 
 
 def _light(result: Result, number: int) -> dict[str, Any]:
+    """Pictures of the light of pass `number` (from 0) by the kind of light path, and its emitter."""
     of_pass = [m for m in result.measurements if m.light_pass == number + 1]
     rig = of_pass[0].capture.rig
     assert rig is not None
@@ -146,6 +157,7 @@ def _light(result: Result, number: int) -> dict[str, Any]:
 
 
 def _transport(result: Result, names: dict[str, str]) -> list[dict[str, str]]:
+    """Per transport pass: its instruments, the number of their frames, and the time that it took."""
     times = result.info.times_s
     return [
         {
@@ -189,7 +201,7 @@ def _pass_materials(truth: GroundTruth) -> dict[str, Any]:
 
 
 def _flat(data: Any, prefix: str = "") -> list[tuple[str, str]]:
-    """Dotted names and values of nested settings, in order."""
+    """Dotted names of nested settings with their values, in their order."""
     if isinstance(data, dict):
         return [pair for key, value in data.items() for pair in _flat(value, f"{prefix}.{key}" if prefix else key)]
     if isinstance(data, list) and data and isinstance(data[0], dict):
