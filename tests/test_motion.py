@@ -419,7 +419,7 @@ def test_a_motion_without_a_track_is_refused() -> None:
 
 def test_a_scene_that_cannot_be_loaded_again_is_refused(matte: Scene) -> None:
     once = replace(matte, reload=None)
-    with pytest.raises(ValueError, match="which can be loaded again"):
+    with pytest.raises(ValueError, match="it is loaded again"):
         transport_moving(
             once,
             matte.rig(width=8, height=6),
