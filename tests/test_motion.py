@@ -25,7 +25,7 @@ from rangesim.motion import ConstantTwist, Motion, MovingSignals, PoseTrack, Tim
 from rangesim.motion.passes import plan
 from rangesim.pipeline.experiment_run import run
 from rangesim.response import SPEED_OF_LIGHT
-from rangesim.results.run_files import load_result
+from rangesim.results.experiment_results import load_result
 from rangesim.rig import translation
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
