@@ -28,6 +28,7 @@ ROOMS = [
     "rangesim.point_cloud",
     "rangesim.report",
     "rangesim.response",
+    "rangesim.results",
     "rangesim.rig",
     "rangesim.settings",
     "rangesim.signals",

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records on the disk: for each kind one class, one writer and one loader."""
+"""Records on the disk: each kind of directory or file has one class, one writer and one loader here."""

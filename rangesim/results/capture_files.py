@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Captures as directories: one image per frame and `capture.json`; and folders of real images."""
+"""Captures as directories, with one image per frame and `capture.json`; and real captures from folders of images."""
 
 from __future__ import annotations
 
@@ -24,8 +24,12 @@ from rangesim.sensors import Sensor, sensor_from_dict
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
 
 SIDECAR = "capture.json"
+"""Name of the file with the settings of a capture."""
 FORMAT = "rangesim-capture"
+"""Name of the format in that file."""
 FORMAT_VERSION = 1
+"""Number of the file format, as a count from 1; a change that older versions cannot read increases it, so that they
+refuse the file."""
 CAPTURE = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
 """Directories that hold a capture."""
 _KEYS = (
@@ -40,25 +44,31 @@ _KEYS = (
     "exposure_s",
     "ambient",
 )
+"""Keys that `capture.json` may have."""
 
 
 def save_capture(capture: Capture, directory: str | Path) -> None:
-    """Write a capture as a directory: PNG (8 or 16 bits) or EXR (float32) per frame, and `capture.json`.
+    """Write a capture to a directory: a PNG (8 or 16 bits) or EXR (float32) per frame, and `capture.json`.
 
-    The files appear when all are complete. An older capture of that name is replaced; files that somebody else put
-    there stay.
+    The files appear when all are complete. An older capture of the same name is replaced; files of others stay.
 
     Raises
     ------
     FileFormatError
-        `directory` exists and is neither empty nor a capture as it was written, or the frames do not fit 16 bits.
+        `directory` exists and is neither empty nor an unchanged capture, or the frames do not fit 16 bits.
+
+    Examples
+    --------
+    >>> from rangesim import load_capture, save_capture
+    >>> save_capture(capture, "captures/first")  # doctest: +SKIP
+    >>> again = load_capture("captures/first")  # doctest: +SKIP
     """
     with new_directory(directory, CAPTURE) as folder:
         write_capture(capture, folder)
 
 
 def write_capture(capture: Capture, folder: Path) -> None:
-    """Write the files of a capture and their manifest into an empty directory, one that is still in the making.
+    """Write the files of a capture and their manifest into an empty directory, for a caller that makes it appear.
 
     Raises
     ------
@@ -77,13 +87,13 @@ def write_capture(capture: Capture, folder: Path) -> None:
 
 
 def load_capture(directory: str | Path) -> Capture:
-    """The capture that `save_capture` wrote, bytes and settings equal.
+    """The capture that `save_capture` wrote, with equal bytes and settings.
 
     Raises
     ------
     FileFormatError
-        Missing directory, sidecar or frame, broken JSON, unknown key, wrong size or type; the message names
-        the file.
+        The directory, its sidecar or a frame is missing, the JSON is broken, a key is unknown, or a size or type is
+        wrong; the message names the file.
     """
     sidecar = Path(directory) / SIDECAR
     recover(directory, FileFormatError)
@@ -115,19 +125,29 @@ def load_capture(directory: str | Path) -> Capture:
 def import_capture(
     folder: str | Path, sensor: Sensor, rig: Rig | None = None, detector: PhotoDetector | None = None
 ) -> Capture:
-    """A real capture from a folder of images, one per frame, in the order of their names (numbers by value).
+    """The capture of a real camera, from a folder with one image per frame.
+
+    The images are taken in the order of their names, in which numbers count by their value.
 
     Parameters
     ----------
-    folder : holds as many images (PNG, TIFF, JPEG, BMP, EXR; 8 or 16 bits; colour becomes grey) as the sensor
-        has frames.
-    sensor : Sensor, with the patterns in the order of `sensor.frame_names()`.
-    rig : Rig, or None if uncalibrated. detector : PhotoDetector, or None if unknown.
+    folder : holds as many images (PNG, TIFF, JPEG, BMP or EXR; 8 or 16 bits; colour becomes grey) as the sensor has
+        frames.
+    sensor : Sensor; its frames are in the order of `sensor.frame_names()`.
+    rig : Rig; None: the camera is not calibrated.
+    detector : PhotoDetector; None: unknown.
 
     Raises
     ------
     FileFormatError
-        No such folder, another number of images, unreadable images, or images of different size or type.
+        There is no such folder, it holds another number of images, an image cannot be read, or images differ in size
+        or type.
+
+    Examples
+    --------
+    >>> from rangesim import StructuredLight, decode, import_capture
+    >>> capture = import_capture("photographs", StructuredLight(1280, 800))  # doctest: +SKIP
+    >>> image = decode(capture)  # doctest: +SKIP
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -146,11 +166,13 @@ def import_capture(
 
 
 def _file_names(capture: Capture) -> list[str]:
+    """Name of the file of each frame."""
     suffix = ".png" if capture.is_digital else ".exr"
     return [f"{i:03d}_{name}{suffix}" for i, name in enumerate(capture.sensor.frame_names())]
 
 
 def _sidecar(capture: Capture, names: list[str]) -> dict[str, Any]:
+    """Content of `capture.json`; names : of the frames' files."""
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -166,6 +188,7 @@ def _sidecar(capture: Capture, names: list[str]) -> dict[str, Any]:
 
 
 def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor, size: tuple[int, int] | None) -> np.ndarray:
+    """(k, h, w) frames of the files that the settings name; size : expected width and height, None: any."""
     names, dtype = settings.get("frames"), settings.get("dtype")
     if dtype not in DTYPES:
         raise ValueError(f"expected dtype to be one of {', '.join(DTYPES)}, got {dtype!r}.")
@@ -182,4 +205,5 @@ def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor, size: 
 
 
 def _natural(path: Path) -> list[tuple[int, int | str]]:
+    """Key that sorts names with their numbers by value: frame_2 before frame_10."""
     return [(0, int(s)) if s.isdigit() else (1, s) for s in re.split(r"(\d+)", path.name.lower())]

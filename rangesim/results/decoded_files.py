@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `rangesim decode` writes, and back.
+"""Decoded captures as directories: `rangesim decode` writes them, `load_decoded` reads them.
 
 DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
-    decoded.json         sensor, rig, fractions of the pixels by status, likely cause where little was measured
+    decoded.json         sensor, rig, fractions of the pixels by status, likely cause if little was measured
     range.npz            range image
-    cloud.ply            points, metres, camera coordinates, where there are any
+    cloud.ply            points, metres, camera coordinates, if there are any
     depth.png ...        pictures of the maps
 """
 
@@ -26,13 +26,15 @@ from rangesim.sensors import Sensor, sensor_from_dict
 from rangesim.settings.config import ShortRepr, to_dict
 
 SIDECAR = "decoded.json"
+"""Name of the file with the sensor, the rig and the summary of a decoded capture."""
 FORMAT = "rangesim-decoded"
+"""Name of the format in that file."""
 DECODED = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
-"""Directories that hold what a capture decodes to."""
+"""Directories that hold a decoded capture."""
 
 
 class DecodedRecord(Record, frozen=True, kw_only=True):
-    """`decoded.json`. status : fraction of the pixels by the name of their status."""
+    """Content of `decoded.json`. status : fraction of the pixels by the name of their status."""
 
     format: Literal["rangesim-decoded"] = "rangesim-decoded"
     format_version: Literal[1] = 1
@@ -45,9 +47,11 @@ class DecodedRecord(Record, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Decoded(ShortRepr):
-    """A range image and what it was decoded from.
+    """A range image with the sensor and the rig that it was measured with, and a summary.
 
-    image : RangeImage. sensor : Sensor that took the capture. rig : Rig, None: not calibrated.
+    image : RangeImage.
+    sensor : Sensor that took the capture.
+    rig : Rig; None: not calibrated.
     status : fraction of the pixels by the name of their status.
     likely_cause : clause that says why little was measured; None if nothing points to a cause.
     """
@@ -69,7 +73,7 @@ def save_decoded(decoded: Decoded, directory: str | Path, pictures: Mapping[str,
     Raises
     ------
     FileFormatError
-        The directory exists and holds something else.
+        The directory exists and holds other files than an unchanged decoded capture.
     """
     record = DecodedRecord(
         sensor=to_dict(decoded.sensor),
@@ -94,7 +98,7 @@ def load_decoded(directory: str | Path) -> Decoded:
     Raises
     ------
     FileFormatError
-        The directory holds none, or a part of it is missing or broken; the message names the file.
+        The directory holds no decoded capture, or a part of it is missing or broken; the message names the file.
     """
     folder = Path(directory)
     recover(folder, FileFormatError)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Range images as files."""
+"""Files of range images."""
 
 from __future__ import annotations
 
@@ -31,12 +31,24 @@ _RANGE = {
     "sampling_sigma_m": ArraySpec("float32", low=0, nan=True, inf=True, required=False),
     "settings": replace(SETTINGS, required=False),
 }
+"""Arrays of a file, by name, with their types and limits; "h" and "w" are the size of the image."""
 
 
 def save_range_image(image: RangeImage, path: str | Path) -> None:
     """Write the arrays of a range image, its camera and its decoder to a compressed .npz file.
 
-    `load_range_image` reads it back equal.
+    `load_range_image` returns an equal range image.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be written.
+
+    Examples
+    --------
+    >>> from rangesim import load_range_image, save_range_image
+    >>> save_range_image(image, "range.npz")  # doctest: +SKIP
+    >>> again = load_range_image("range.npz")  # doctest: +SKIP
     """
     arrays = {f.name: getattr(image, f.name) for f in fields(image) if isinstance(getattr(image, f.name), np.ndarray)}
     settings = {"camera": to_dict(image.camera), "decoder": to_dict(image.decoder)}
@@ -46,7 +58,7 @@ def save_range_image(image: RangeImage, path: str | Path) -> None:
 def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> RangeImage:
     """The range image that `save_range_image` wrote.
 
-    sizes : its height h and width w, where they are known.
+    sizes : height "h" and width "w" of the image, in pixels, as far as they are known; others are refused.
 
     Raises
     ------

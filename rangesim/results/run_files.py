@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of an experiment as a directory, and back.
+"""Results of experiments as directories: `write_result` writes them, `load_result` reads them.
 
 DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
     experiment.json      resolved settings, versions, and which instruments share which pass
@@ -54,7 +54,9 @@ from rangesim.settings.config import ShortRepr, from_dict, shown
 from rangesim.signals import ALL, GroundTruth
 
 SETTINGS = "experiment.json"
+"""Name of the file with the settings, the scene and the versions of a result."""
 FORMAT = "rangesim-result"
+"""Name of the format in that file."""
 RESULT = DirectoryKind(FORMAT, SETTINGS, FileFormatError)
 """Directories that hold the results of an experiment."""
 
@@ -70,7 +72,7 @@ class ShapeRecord(Record, frozen=True, kw_only=True):
 
 
 class SceneRecord(Record, frozen=True, kw_only=True):
-    """The scene that was measured. sha256 : of its file; None if it came from elsewhere."""
+    """The scene that was measured. sha256 : checksum of its file; None if it was not loaded from a file."""
 
     name: str
     sha256: str | None
@@ -79,7 +81,7 @@ class SceneRecord(Record, frozen=True, kw_only=True):
 
 
 class InstrumentRecord(Record, frozen=True, kw_only=True, rename={"light_pass": "pass"}):
-    """An instrument, the pass it took part in (from 1), and its rig."""
+    """An instrument, the number (from 1) of the pass that it took part in, and its rig as plain data."""
 
     name: Name
     light_pass: Count
@@ -87,7 +89,7 @@ class InstrumentRecord(Record, frozen=True, kw_only=True, rename={"light_pass": 
 
 
 class ResultRecord(Record, frozen=True, kw_only=True):
-    """`experiment.json`."""
+    """Content of `experiment.json`."""
 
     format: Literal["rangesim-result"] = "rangesim-result"
     format_version: Literal[1] = 1
@@ -101,17 +103,22 @@ class ResultRecord(Record, frozen=True, kw_only=True):
 
 
 class PhotonsRecord(Record, frozen=True, kw_only=True):
-    """Photons that a pixel detects per laser pulse, on average: median and largest of the pixels. From about one on,
-    pile-up hides later ones."""
+    """Mean number of photons that a pixel detects per laser pulse: the median of all pixels, and the largest.
+
+    From about 1 on, pile-up matters: the first photon of a pulse hides the later ones.
+    """
 
     median: Photons
     largest: Photons
 
 
 class MeasurementRecord(Record, frozen=True, kw_only=True):
-    """`measurement.json`: frames, exposure and time per stage; exposure None for a noise-free capture.
+    """Content of `measurement.json`: frames, exposure and time per stage of an instrument.
 
-    photons_per_pulse : None where no photons are counted.
+    exposure_s : seconds per frame; None for a noise-free capture.
+    acquisition_s : seconds of all exposures; None for a noise-free capture.
+    photons_per_pulse : None if the detector does not count photons.
+    times_s : seconds of computing, by stage.
     """
 
     format: Literal["rangesim-measurement"] = "rangesim-measurement"
@@ -127,8 +134,11 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
 
 
 class RowRecord(Record, frozen=True, kw_only=True):
-    """Statistics of one material class; see `rangesim.evaluation.comparison.ErrorStatistics`,
-    `rangesim.causes.CauseMap` and `rangesim.evaluation.range_noise.RangeNoise`."""
+    """Statistics of one material class; None where a value is not defined or not known.
+
+    The values are explained in `rangesim.evaluation.comparison.ErrorStatistics`, `rangesim.causes.CauseMap.fractions`
+    and `rangesim.evaluation.range_noise.RangeNoise.by_material`.
+    """
 
     material: Name
     pixels: Count
@@ -150,7 +160,7 @@ class RowRecord(Record, frozen=True, kw_only=True):
 
 
 class ComparisonRecord(Record, frozen=True, kw_only=True):
-    """`comparison.json`: a row per material class, "all" last."""
+    """Content of `comparison.json`: a row per material class, "all" last; outlier_m : metres, limit of outliers."""
 
     format: Literal["rangesim-comparison"] = "rangesim-comparison"
     format_version: Literal[1] = 1
@@ -159,21 +169,24 @@ class ComparisonRecord(Record, frozen=True, kw_only=True):
 
 
 _CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpec("float64", (), low=1e-9, high=1e9)}
+"""Arrays of `causes.npz`, with their types and limits."""
 _SEGMENTATION = {
     "supervoxels": ArraySpec("int32", low=-1),
     "labels": ArraySpec("int32", low=-2),
     "parents": ArraySpec("int32", ("nodes",), low=0, per_pixel=2),
     "altitudes": ArraySpec("float64", ("nodes",), low=0, inf=True, per_pixel=2),
 }
+"""Arrays of `segmentation.npz`, with their types and limits."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Segmentation(ShortRepr):
     """Supervoxels of a point cloud and the tree that merges them.
 
-    supervoxels, labels : (h, w) int32, supervoxel and object per pixel, -1 without a point, -2 (labels) for outliers.
-    parents : (k,) int32, parent of each tree node, the supervoxels first; a root is its own parent.
-    altitudes : (k,) float64, not decreasing towards the root.
+    supervoxels : (h, w) int32, index of each pixel's supervoxel; -1 without a point.
+    labels : (h, w) int32, index of each pixel's object; -1 without a point, -2 for outliers.
+    parents : (k,) int32, parent of each node of the tree, the supervoxels first; the root is its own parent.
+    altitudes : (k,) float64, radians, mean concavity of each merge; it does not decrease towards the root.
     """
 
     supervoxels: np.ndarray
@@ -184,15 +197,17 @@ class Segmentation(ShortRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Measurement(ShortRepr):
-    """What one instrument measured.
+    """The measurement of one instrument of an experiment.
 
-    capture : Capture. image : RangeImage. truth : GroundTruth of its pass.
-    causes : CauseMap, why pixels failed.
-    rows : statistics per material class, "all" last; see `rangesim.evaluation.comparison.ErrorStatistics` and
-        `rangesim.causes.CauseMap.fractions`.
-    segmentation : Segmentation, or None if there were no points to group.
+    name : name of the instrument.
+    capture : Capture.
+    image : RangeImage, decoded from the capture.
+    truth : GroundTruth of the pass that the instrument took part in.
+    causes : CauseMap, causes of the failed pixels.
+    rows : statistics per material class, "all" last, with the keys of `RowRecord`.
+    segmentation : Segmentation of the point cloud; None if there were too few points to group.
     metadata : MeasurementRecord, frames, exposure, photons per pulse and time per stage.
-    light_pass : int from 1, the transport pass the instrument took part in.
+    light_pass : int from 1, number of the transport pass that the instrument took part in.
     """
 
     name: str
@@ -208,11 +223,12 @@ class Measurement(ShortRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(ShortRepr):
-    """An experiment and its outcome.
+    """An experiment and its outcome; `rangesim.pipeline.experiment_run.carry_out` returns it.
 
-    measurements : one for each instrument, in the order of the experiment.
+    experiment : Experiment, the settings.
+    measurements : one Measurement for each instrument, in the order of the experiment.
     passes : one LightPass for each transport pass.
-    info : ResultRecord, scene, versions, times.
+    info : ResultRecord, scene, versions and times.
     """
 
     experiment: Experiment
@@ -222,7 +238,7 @@ class Result(ShortRepr):
 
 
 def complete_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Statistics per material class with all keys of `RowRecord`; None for what is not known."""
+    """Statistics per material class with all keys of `RowRecord`; a value that is not known is None."""
     return [msgspec.to_builtins(RowRecord(**row)) for row in rows]
 
 
@@ -234,7 +250,8 @@ def write_result(result: Result, folder: Path, pages: Mapping[str, bytes]) -> No
 
     Parameters
     ----------
-    pages : contents of files for people, such as `report.html`, by name.
+    folder : empty directory; the caller makes it appear when it is complete.
+    pages : contents of files that people read, such as `report.html`, by name.
     """
     for number, light_pass in enumerate(result.passes, 1):
         write_pass(light_pass, folder / f"pass_{number}.npz")
@@ -250,7 +267,7 @@ def write_result(result: Result, folder: Path, pages: Mapping[str, bytes]) -> No
 
 
 def _write_readings(measurement: Measurement, folder: Path) -> None:
-    """Write what the frames of a measurement came to."""
+    """Write the files of a measurement besides its capture."""
     causes, rows = measurement.causes, [RowRecord(**row) for row in measurement.rows]
     save_range_image(measurement.image, folder / "range.npz")
     write_arrays(folder / "causes.npz", {"cause": causes.cause, "tolerance_m": np.asarray(causes.tolerance_m)})
@@ -265,12 +282,18 @@ def _write_readings(measurement: Measurement, folder: Path) -> None:
 
 
 def load_result(directory: str | Path) -> Result:
-    """The result that `rangesim.pipeline.experiment_run.run` wrote.
+    """The result that `rangesim.pipeline.experiment_run.run` wrote to a directory.
 
     Raises
     ------
     FileFormatError
         The directory is no result, or a part of it is missing or broken; the message names the file.
+
+    Examples
+    --------
+    >>> from rangesim.results.run_files import load_result
+    >>> result = load_result("out/demo")  # doctest: +SKIP
+    >>> result.measurements[0].image.z  # doctest: +SKIP
     """
     folder = Path(directory)
     info = read_settings(folder)
@@ -297,7 +320,13 @@ def load_result(directory: str | Path) -> Result:
 
 
 def read_settings(folder: Path) -> ResultRecord:
-    """Contents of `experiment.json`; FileFormatError if there is none of ours."""
+    """Content of the `experiment.json` of a result.
+
+    Raises
+    ------
+    FileFormatError
+        The directory is no result, or the file is broken.
+    """
     recover(folder, FileFormatError)
     if not (folder / SETTINGS).is_file():
         raise FileFormatError(f"{folder} is no {FORMAT} directory: it has no {SETTINGS}.")
@@ -305,7 +334,13 @@ def read_settings(folder: Path) -> ResultRecord:
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """Statistics per material class of one instrument, from its `comparison.json`; FileFormatError if it is broken."""
+    """Statistics per material class of one instrument, from the `comparison.json` in its folder.
+
+    Raises
+    ------
+    FileFormatError
+        The file is missing or broken.
+    """
     path = folder / "comparison.json"
     record = read_record(path, ComparisonRecord)
     materials = [row.material for row in record.rows]
@@ -321,7 +356,7 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
 
 
 def _image_sizes(info: ResultRecord, path: Path) -> dict[int, dict[str, int]]:
-    """Height and width of the camera of each pass, by the number of the pass."""
+    """Height "h" and width "w" of the camera of each pass, in pixels, by the number of the pass."""
     sizes: dict[int, dict[str, int]] = {}
     for entry in info.instruments:
         try:
@@ -337,6 +372,7 @@ def _image_sizes(info: ResultRecord, path: Path) -> dict[int, dict[str, int]]:
 
 
 def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: dict[str, int]) -> Measurement:
+    """Measurement in a folder; sizes : height "h" and width "w" of the images of its pass."""
     capture = load_capture(folder / "capture")
     if capture.rig is None or capture.frames.shape[1:] != (sizes["h"], sizes["w"]):
         raise FileFormatError(f"{folder / 'capture'}: expected a rig, and frames of the size of the ground truth.")
@@ -363,6 +399,7 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
 
 
 def _load_segmentation(path: Path, sizes: dict[str, int]) -> Segmentation | None:
+    """Segmentation in a file; None if there is no file."""
     if not path.is_file():
         return None
     data = read_checked_arrays(path, _SEGMENTATION, dict(sizes))

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans as directories, and back.
+"""Scans as directories: `write_scan` writes them, `load_scan` reads them.
 
 DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
     scan.json            resolved settings, versions, statistics of surface, shapes and views
     mesh.ply             the fused surface, metres, world
     poses.json           T_world_camera (n, 4, 4) of the views: as fused, and true
-    truth.npz            true surface of each shape, what the views saw of the space around them, weights of the mesh
+    truth.npz            true surface of each shape, states of the voxels around them, weights of the mesh's vertices
     view_01/range.npz    range image of each view, with its pose
     report.html
 """
@@ -51,7 +51,9 @@ from rangesim.settings.config import ShortRepr, from_dict, shown, to_dict
 from rangesim.triangle_mesh import TriangleMesh
 
 SIDECAR = "scan.json"
+"""Name of the file with the settings and statistics of a scan."""
 FORMAT = "rangesim-scan"
+"""Name of the format in that file."""
 SCAN = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
 """Directories that hold the results of a scan."""
 
@@ -60,7 +62,7 @@ SCAN = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
 
 
 class SeenRecord(Record, frozen=True, kw_only=True):
-    """What the views saw of a shape, as `SeenOfShape`; None where that is NaN."""
+    """Fractions of a shape that the views saw, as in `SeenOfShape`; None in place of NaN."""
 
     surface: Fraction | None
     volume_surface: Fraction | None
@@ -71,9 +73,9 @@ class SeenRecord(Record, frozen=True, kw_only=True):
 
 
 class ShapeStatistics(Record, frozen=True, kw_only=True):
-    """A shape of the scene and the errors of the part of the mesh that is nearest to it, as `SurfaceError`.
+    """A shape of the scene, and the errors of the part of the mesh that is nearest to it, as in `SurfaceError`.
 
-    The errors are None where no part of the mesh is nearest to the shape; `seen` is None of background.
+    The errors are None if no part of the mesh is nearest to the shape. `seen` is None for background.
     """
 
     material: Name
@@ -90,7 +92,7 @@ class ShapeStatistics(Record, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, material: str, error: SurfaceError | None, seen: SeenOfShape | None) -> ShapeStatistics:
-        """The statistics of a shape."""
+        """Statistics of a shape from the errors of its surface and the parts that were seen."""
         names = [f.name for f in msgspec.structs.fields(cls) if f.name not in ("material", "seen")]
         errors = {} if error is None else {name: float(getattr(error, name)) for name in names}
         known = {} if seen is None else {key: _none_of_nan(value) for key, value in asdict(seen).items()}
@@ -98,7 +100,7 @@ class ShapeStatistics(Record, frozen=True, kw_only=True):
 
 
 class ViewStatistics(Record, frozen=True, kw_only=True):
-    """Readings of a view, and the errors of its pose where that was found; degrees, metres."""
+    """Number of readings of a view, and the errors of its pose in degrees and metres; None if the pose was known."""
 
     readings: Count
     pixels: Count
@@ -107,7 +109,7 @@ class ViewStatistics(Record, frozen=True, kw_only=True):
 
 
 class ScanStatistics(Record, frozen=True, kw_only=True):
-    """Numbers of the surface, of the shapes by name and of the views."""
+    """Statistics of the fused surface, of the shapes by name, and of the views."""
 
     voxel_m: Positive
     truncation_m: Positive
@@ -121,7 +123,7 @@ class ScanStatistics(Record, frozen=True, kw_only=True):
 
 
 class ScanRecord(Record, frozen=True, kw_only=True):
-    """`scan.json`."""
+    """Content of `scan.json`. tolerance_m : metres, error within which a view measured the true surface."""
 
     format: Literal["rangesim-scan"] = "rangesim-scan"
     format_version: Literal[1] = 1
@@ -136,20 +138,21 @@ class ScanRecord(Record, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ScanResult(ShortRepr):
-    """A scan and its outcome.
+    """A scan and its outcome; `rangesim.pipeline.scan_run.run_scan` returns it.
 
     Parameters
     ----------
-    settings : as resolved.
-    scan : the views, with the poses they were fused with.
-    fused : the surface.
-    surfaces : true surface of each shape by name.
-    shapes : statistics of each shape by name.
-    things : names of the shapes that are no background.
-    seen : what the views saw of the things, and of the space around them.
-    poses : errors of poses that were found; None where they were known.
-    versions, variant : of the packages, and of Mitsuba.
-    times_s : seconds by stage.
+    settings : ScanSettings, with all defaults resolved.
+    scan : Scan, the views with the poses that they were fused with.
+    fused : FusedSurface.
+    surfaces : true surface of each shape, by name.
+    shapes : statistics of each shape, by name.
+    things : names of the shapes that are not background.
+    seen : Occupancy, the parts of the things and of the space around them that the views saw.
+    poses : errors of the poses that were found; None if the poses were known.
+    versions : version of each package.
+    variant : name of Mitsuba's variant.
+    times_s : seconds of computing, by stage.
     """
 
     settings: ScanSettings
@@ -165,7 +168,7 @@ class ScanResult(ShortRepr):
     times_s: dict[str, float]
 
     def statistics(self) -> ScanStatistics:
-        """The numbers of `scan.json`."""
+        """Statistics of the scan, as `scan.json` holds them."""
         views = []
         for number, image in enumerate(self.scan.images):
             errors = {}
@@ -187,6 +190,7 @@ class ScanResult(ShortRepr):
 
 
 _FINITE = MAX_METRES
+"""Largest coordinate of a vertex in a file, in metres, so that no infinite one is read."""
 _ARRAYS = {
     "vertices": ArraySpec("float64", ("vertices", 3), low=-_FINITE, high=_FINITE),
     "faces": ArraySpec("int32", ("faces", 3), low=0),
@@ -196,6 +200,7 @@ _ARRAYS = {
     "filled": ArraySpec("int32", ("nx", "ny", "nz"), low=-1),
     "vertex_weights": ArraySpec("float32", ("mesh",), low=0),
 }
+"""Arrays of `truth.npz`, with their types and limits."""
 
 
 # ---- Writing -------------------------------------------------------------------------------------------------------
@@ -206,7 +211,8 @@ def write_scan(result: ScanResult, folder: Path, pages: Mapping[str, bytes]) -> 
 
     Parameters
     ----------
-    pages : contents of files for people, such as `report.html`, by name.
+    folder : empty directory; the caller makes it appear when it is complete.
+    pages : contents of files that people read, such as `report.html`, by name.
     """
     record = ScanRecord(
         settings=scan_settings_to_dict(result.settings),
@@ -247,12 +253,17 @@ def write_scan(result: ScanResult, folder: Path, pages: Mapping[str, bytes]) -> 
 
 
 def load_scan(directory: str | Path) -> ScanResult:
-    """The scan that `rangesim.pipeline.scan_run.run_scan` wrote; without the ground truth of each view.
+    """The scan that `rangesim.pipeline.scan_run.run_scan` wrote to a directory; the views' ground truth is not kept.
 
     Raises
     ------
     FileFormatError
         The directory is no scan, or a part of it is missing or broken; the message names the file.
+
+    Examples
+    --------
+    >>> from rangesim.results.scan_files import load_scan
+    >>> mesh = load_scan("out/scan").fused.mesh  # doctest: +SKIP
     """
     folder = Path(directory)
     recover(folder, FileFormatError)
@@ -299,7 +310,7 @@ def load_scan(directory: str | Path) -> ScanResult:
 
 
 def _true_poses(path: Path, views: int) -> np.ndarray | None:
-    """(views, 4, 4) float64, T_world_camera that the views were rendered from; None where the file holds none."""
+    """(views, 4, 4) float64 poses T_world_camera that the views were rendered from; None if the file holds none."""
     data = read_json(path)
     found = data.get("true") if isinstance(data, dict) else None
     if found is None:
@@ -314,7 +325,7 @@ def _true_poses(path: Path, views: int) -> np.ndarray | None:
 
 
 def _surfaces(data: dict[str, np.ndarray], names: list[str], path: Path) -> dict[str, TriangleMesh]:
-    """True surface of each shape by name."""
+    """True surface of each shape, by name, from the arrays of `truth.npz`."""
     stops = {key: np.cumsum(data[f"{key}_counts"]) for key in ("vertex", "face")}
     if (stops["vertex"][-1:] != len(data["vertices"])).any() or (stops["face"][-1:] != len(data["faces"])).any():
         raise FileFormatError(f"{path}: expected counts that add up to the vertices and faces.")
@@ -327,7 +338,7 @@ def _surfaces(data: dict[str, np.ndarray], names: list[str], path: Path) -> dict
 
 
 def _seen_of(shape: ShapeStatistics, name: str, path: Path) -> SeenOfShape:
-    """What the views saw of a thing."""
+    """Fractions of a thing that the views saw."""
     if shape.seen is None:
         raise FileFormatError(f"{path}: expected what the views saw of {shown(name)}, which is no background.")
     values = msgspec.to_builtins(shape.seen)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of signals: complete ones, to expose them again without a new pass, and those of results, without channels."""
+"""Files of signals: complete ones, to be exposed again without a new pass, and those of results, without channels."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
     "motion_m": ArraySpec("float32", low=0, nan=True, required=False),
     "truncation": ArraySpec("float64", (len(fields(Truncation)),), low=0, high=1, nan=True, required=False),
 }
+"""Arrays of a pass, by name, with their types and limits."""
 
 
 def save_signals(signals: StillSignals, path: str | Path) -> None:
@@ -115,11 +116,11 @@ def load_signals(path: str | Path) -> StillSignals:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LightPass(ShortRepr):
-    """What a result keeps of a transport pass: all that signals hold besides their channels.
+    """A transport pass as results keep it: all parts of its signals except the channels.
 
     energy : EnergySplit. truth : GroundTruth.
-    motion_m : (h, w) float32, metres, as of `Signals.motion_m`; None: nothing moves.
-    truncation : Truncation, light that was left out; None: not known.
+    motion_m : (h, w) float32, metres, see `Signals.motion_m`; None: nothing moves.
+    truncation : Truncation, estimate of the light that is left out; None: not known.
     """
 
     energy: EnergySplit
@@ -129,12 +130,18 @@ class LightPass(ShortRepr):
 
     @classmethod
     def of(cls, signals: Signals) -> LightPass:
-        """The pass that signals come from."""
+        """The pass that the signals come from."""
         return cls(signals.energy, signals.truth, signals.motion_m, signals.truncation)
 
 
 def write_pass(light_pass: LightPass, path: str | Path) -> None:
-    """Write a pass to a compressed .npz file."""
+    """Write a pass to a compressed .npz file; `read_pass` reads it back.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be written.
+    """
     write_arrays(path, _pass_arrays(light_pass))
 
 
@@ -143,7 +150,7 @@ def read_pass(path: Path, sizes: dict[str, int]) -> LightPass:
 
     Parameters
     ----------
-    sizes : its height h and width w, pixels.
+    sizes : height "h" and width "w" of its images, in pixels.
 
     Raises
     ------
@@ -156,11 +163,12 @@ def read_pass(path: Path, sizes: dict[str, int]) -> LightPass:
 
 
 def _truncation(data: dict[str, np.ndarray]) -> Truncation | None:
+    """Truncation in the arrays of a file; None if there is none."""
     return Truncation(*map(float, data["truncation"])) if "truncation" in data else None
 
 
 def _pass_arrays(signals: Signals | LightPass) -> dict[str, np.ndarray]:
-    """Arrays of what signals hold besides channels, by name in files."""
+    """Arrays of signals besides their channels, by their names in files."""
     arrays = {f"energy_{f.name}": getattr(signals.energy, f.name) for f in fields(EnergySplit)}
     arrays |= {f"truth_{f.name}": np.asarray(getattr(signals.truth, f.name)) for f in fields(GroundTruth)}
     if signals.motion_m is not None:
@@ -171,6 +179,7 @@ def _pass_arrays(signals: Signals | LightPass) -> dict[str, np.ndarray]:
 
 
 def _energy_and_truth(path: Path, data: dict[str, np.ndarray]) -> tuple[EnergySplit, GroundTruth]:
+    """Energy split and ground truth in the arrays of a file."""
     for ids in ("instance", "material"):
         if data[f"truth_{ids}"].max(initial=-1) >= len(data[f"truth_{ids}_names"]):
             raise FileFormatError(f"{path}: array truth_{ids}: expected indices into truth_{ids}_names.")
@@ -182,6 +191,8 @@ def _energy_and_truth(path: Path, data: dict[str, np.ndarray]) -> tuple[EnergySp
 
 
 def _settings(path: Path) -> dict[str, Any]:
+    """Settings in a file of signals; FileFormatError if it is none, or of another version."""
+
     def check(name: str, place: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         if dtype != np.uint8 or len(shape) != 1 or shape[0] > MAX_SETTINGS:
             raise FileFormatError(f"{place}: expected up to {MAX_SETTINGS} bytes of text.")
@@ -198,7 +209,7 @@ def _settings(path: Path) -> dict[str, Any]:
 
 
 def _plain(response: Response) -> dict[str, Any]:
-    """Plain data of a response; ValueError if it cannot be read back."""
+    """Plain data of a response; ValueError if no response can be made of them again."""
     name = type(response).__name__
     if not hasattr(response, "type_name"):
         raise ValueError(f"expected responses with a type_name, which names them in files, got {name} without one.")
