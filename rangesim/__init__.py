@@ -1,15 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated range sensors: light transport, captures, decoders, comparison.
+"""Simulation of range sensors: light transport, captures, decoders, and comparison with the ground truth.
 
-Names are imported when they are first used, so that decoding a real capture starts no renderer.
+The names in `__all__` are the public interface. Each is imported when it is first used, so that a program that decodes
+a real capture loads no renderer.
+
+Examples
+--------
+>>> import rangesim
+>>> sensor = rangesim.StructuredLight(code="gray-phase")
+>>> sensor.n_frames
+22
+>>> scene = rangesim.load_scene("tabletop")  # doctest: +SKIP
+>>> signals = rangesim.transport(scene, scene.rig(baseline_m=0.2), [sensor])  # doctest: +SKIP
+>>> image = rangesim.decode(rangesim.expose(signals, sensor, sensor.default_detector))  # doctest: +SKIP
 """
 
 from __future__ import annotations
 
 from importlib import import_module
 
-TYPE_CHECKING = False  # the module typing would double the time of this import
-if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
+TYPE_CHECKING = False  # not imported from typing, because typing would double the time of this import
+if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from typing import Any
 
     from rangesim.capture import Capture as Capture
@@ -91,6 +102,7 @@ _HOME = {
     "scan": "rangesim.pipeline.views",
     "transport": "rangesim.instrument.transport",
 }
+"""The module that defines each public name."""
 
 __all__ = sorted(_HOME)
 __version__ = "0.1.0"

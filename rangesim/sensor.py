@@ -1,37 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
 """The interface of a range sensor and of its decoder.
 
-A new sensor is one file with two frozen dataclasses: a `Sensor`, which says what it reads of light paths and which
-frames it makes of them, and a `Decoder`, which makes a range image of the frames. Those that come with the package
-stand in `rangesim.sensors`; `examples/own_sensor.py` and `examples/own_code.py` are two from outside.
-"""
+A new sensor is one file with two frozen dataclasses. The `Sensor` says which responses to light paths it reads, and
+which frames it makes of them. The `Decoder` says what the frames mean: projector coordinates or path lengths, and then
+a range image. The sensors that come with the package are in `rangesim.sensors`; `examples/own_sensor.py` and
+`examples/own_code.py` are two from outside."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
 from rangesim.electronics.detector import Detector, Gate, PhotoDetector
 from rangesim.response import Response
+from rangesim.settings.bounds import Bounds
 from rangesim.settings.config import Named
 
 if TYPE_CHECKING:
     from rangesim.capture import Capture
+    from rangesim.decoding.coordinates import Coordinates
     from rangesim.decoding.range_image import RangeImage
 
 
 TOF_BASELINE_M = 0.03
-"""Metres from the camera's lens to the lamp beside it, of a common time-of-flight camera."""
+"""Distance from the camera's lens to the emitter beside it, metres, in a common time-of-flight camera."""
+
+Threshold = Annotated[float, Bounds("0 or positive", 0, 1e6)]
+"""Type of a decoder's threshold: a number of any unit that is not negative, so that it may be a fraction or a multiple
+of the noise; 1e6 times the noise refuses everything."""
 
 
 class Emitter(NamedTuple):
     """The emitter that a sensor comes with, where an instrument does not say otherwise.
 
-    size : (width, height) of the projector in pixels; None: as the camera, for light without a pattern.
+    size : (width, height) of the projector in pixels; None: that of the camera, for light without a pattern.
     baseline_m : metres from camera to emitter; None: a fifth of the working distance.
     """
 
@@ -40,10 +46,19 @@ class Emitter(NamedTuple):
 
 
 class Sensor(Named, ABC):
-    """A measuring principle: which responses to light paths it reads, and which frames it makes of them.
+    """A measuring principle: the responses to light paths that it reads, and the frames that it makes of them.
 
     A sensor holds no geometry (that is the `Rig`), no electronics (`PhotoDetector`) and no thresholds (`Decoder`), but
     it names the ones it comes with. Subclasses are frozen dataclasses.
+
+    Examples
+    --------
+    >>> from rangesim.sensors import AmcwToF
+    >>> sensor = AmcwToF((20e6, 80e6))
+    >>> sensor.n_frames, sensor.frame_names()[:2]
+    (8, ['20MHz_0deg', '20MHz_90deg'])
+    >>> sensor.details
+    '20, 80 MHz, 4 taps, sine wave'
     """
 
     known: ClassVar[dict[str, type[Any]]] = {}
@@ -51,28 +66,28 @@ class Sensor(Named, ABC):
     """Name in configuration files and sidecars."""
 
     is_ideal: ClassVar[bool] = False
-    """Whether this is a reference that nobody can build: its frames have no noise, and reports name no winner of it."""
+    """Whether this is a reference that nobody can build: its frames have no noise, and reports do not rank it."""
 
     first_return_frame: ClassVar[int | None] = None
-    """Index of the frame that holds the radiance of the first return, for a sensor that reads no light but that."""
+    """Index of the frame that holds the radiance of the first return, for a sensor that reads no other light."""
 
-    # ---- What it measures --------------------------------------------------------------------------------------------
+    # ---- How it measures ---------------------------------------------------------------------------------------------
 
     @abstractmethod
     def responses(self) -> tuple[Response, ...]:
-        """The basis of linear functionals that the transport pass has to accumulate; equal ones each time."""
+        """Linear functionals of light paths that the transport pass has to accumulate; equal ones at each call."""
 
     @abstractmethod
     def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
-        """(k, h, w) float32 mean radiance of the frames, W/m2/sr, from what the transport pass accumulated.
+        """(k, h, w) float32, W/m2/sr, mean radiance of the frames, from what the transport pass accumulated.
 
-        Images are always whole, so that a frame may depend on neighbouring pixels.
+        The arguments are whole images, so that a frame may depend on neighbouring pixels.
 
         Parameters
         ----------
         channels : one (c, h, w) float32 per response, in the order of `responses()`, W/m2/sr.
-        white : (h, w) float32, radiance under constant light of the projector at full power, without ambient.
-        ambient : (h, w) float32, radiance of all other light that passes the camera's filter.
+        white : (h, w) float32, W/m2/sr, radiance under constant light of the emitter at full power, without ambient.
+        ambient : (h, w) float32, W/m2/sr, radiance of all other light that passes the camera's filter.
         """
 
     @abstractmethod
@@ -85,13 +100,15 @@ class Sensor(Named, ABC):
         return len(self.frame_names())
 
     def frames_per_exposure(self, single_tap: bool = False) -> int:
-        """Number of frames, one after another in the capture, that one and the same exposure fills.
+        """Number of consecutive frames of a capture that one exposure fills.
 
-        `single_tap` : pixels have but one charge store, so that frames which could share an exposure do not.
+        Parameters
+        ----------
+        single_tap : whether pixels have one charge store alone, so that frames which could share an exposure do not.
         """
         return 1
 
-    # ---- What it comes with ------------------------------------------------------------------------------------------
+    # ---- Emitter, detector, decoder ----------------------------------------------------------------------------------
 
     @property
     @abstractmethod
@@ -110,48 +127,74 @@ class Sensor(Named, ABC):
 
     @property
     def gate(self) -> Gate | None:
-        """When photons are counted; None: frames integrate all light of an exposure."""
+        """Time in which photons are counted; None: frames integrate all light of an exposure."""
         return None
 
     @classmethod
     def presets(cls) -> dict[str, Sensor]:
         """Sensors of this kind by their names on the command line; by default `type_name` with default settings.
 
-        Not inherited: a subclass of a sensor has its own, or the default.
+        Presets are not inherited: a subclass of a sensor has its own, or the default.
         """
         return {cls.type_name: cls()}
+
+    def for_projector(self, width: int, height: int, axes: Sequence[str] | None = None) -> Sensor:
+        """This sensor with a code for a projector of another size. A sensor with such a code overrides this.
+
+        The command line asks for it, because images of a real camera do not say how large the projector was.
+
+        Parameters
+        ----------
+        width, height : int, pixels of the projector.
+        axes : coded axes, some of "columns" and "rows"; None: those of this sensor.
+
+        Raises
+        ------
+        ValueError
+            This sensor has no code, or one that cannot be shown by such a projector.
+        """
+        raise ValueError(f"expected a sensor whose code has the size of a projector, got {self.type_name}.")
 
     def check(self, width: int, height: int) -> None:
         """Raise ValueError if this sensor does not fit a projector of that many pixels."""
         for response in self.responses():
             response.check(width, height)
 
-    # ---- What its readings mean --------------------------------------------------------------------------------------
+    # ---- Meaning of its readings -------------------------------------------------------------------------------------
+
+    def white_image(self, frames: np.ndarray) -> np.ndarray:
+        """(h, w) image as of even light, in which calibration finds boards; by default the mean of the frames.
+
+        Parameters
+        ----------
+        frames : (k, h, w), all frames of a capture.
+        """
+        return np.asarray(frames.mean(axis=0))
 
     def is_beyond_range(self, path_length_m: np.ndarray) -> np.ndarray:
-        """(...) bool, where a path of that length is taken for another, or not seen at all."""
+        """(...) bool, where a path of that length (metres) is taken for another, or not seen at all."""
         return np.zeros(np.shape(path_length_m), dtype=bool)
 
     @property
     def shortest_period_m(self) -> float | None:
-        """Metres of range after which the finest signal repeats itself, so that readings can be off by that much; None
-        if none does."""
+        """Metres of range after which the finest signal repeats itself, so that a reading can be off by as much; None
+        if no signal repeats itself."""
         return None
 
-    # ---- For people --------------------------------------------------------------------------------------------------
+    # ---- How it is presented -----------------------------------------------------------------------------------------
 
     @property
     def title(self) -> str:
-        """What it is called in running text."""
+        """Name of the sensor in running text."""
         return self.type_name
 
     @property
     def details(self) -> str:
-        """Its settings in a few words."""
+        """Settings of the sensor in a few words."""
         return f"{self.n_frames} frame{'s' * (self.n_frames != 1)}"
 
     def representative_frames(self, frames: np.ndarray) -> list[int]:
-        """Indices of up to three of the captured frames (k, h, w) that show how it works."""
+        """Indices of up to three of the captured frames (k, h, w) that show how the sensor works."""
         return sorted({0, self.n_frames // 2, self.n_frames - 1})
 
 
@@ -160,14 +203,27 @@ S = TypeVar("S", bound=Sensor)
 
 @dataclass(frozen=True)
 class Background:
-    """What comes on top of the projector's light in each pixel, as far as the thresholds of decoders depend on it.
+    """Light and noise of each pixel beside the signal, on which the thresholds of decoders depend.
 
-    Units are electrons of an exposure, counts for sensors that count, or, of a noise-free capture, W/m2/sr.
+    All values share one unit, `unit`: electrons of an exposure (of a photon counter, its counts) for captures with
+    noise, and W/m2/sr for noise-free captures, whose thresholds are fractions of other radiances.
 
+    Parameters
+    ----------
     ambient : (h, w) float64, ambient light in a frame that integrates all of it.
-    bright : projector light in bright pixels, see `rangesim.capture.bright_level`.
-    dark : mean of a frame without light.
-    noise_variance : variance of what the detector itself adds to a frame; None for a noise-free capture.
+    bright : float, light of the emitter in bright pixels, see `rangesim.capture.bright_level`.
+    dark : float, mean of a frame without light.
+    noise_variance : float, variance of what the detector itself adds to a frame, in electrons squared; None for a
+        noise-free capture.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> Background(np.zeros((1, 2)), bright=5000.0, noise_variance=16.0).unit
+    'electrons'
+    >>> noise_free = Background(np.zeros((1, 2)), bright=0.5)
+    >>> noise_free.unit, noise_free.floor(0.01)
+    ('W/m2/sr', array([[0.005, 0.005]]))
     """
 
     ambient: np.ndarray
@@ -175,15 +231,20 @@ class Background:
     dark: float = 0.0
     noise_variance: float | None = None
 
+    @property
+    def unit(self) -> Literal["electrons", "W/m2/sr"]:
+        """Unit of `ambient`, `bright` and `dark`, and of the signals that are compared with them."""
+        return "W/m2/sr" if self.noise_variance is None else "electrons"
+
     def floor(self, fraction: float) -> np.ndarray:
-        """(h, w) least signal of a noise-free capture: that fraction of the bright pixels', and more than nothing."""
+        """(h, w) float64, least signal of a noise-free capture: that fraction of the bright pixels, never 0."""
         return np.full(self.ambient.shape, max(fraction * self.bright, float(np.finfo(np.float32).tiny)))
 
 
 class FrameContent(NamedTuple):
-    """What the frame, or group of frames, that a reading rests on holds of the light and dark current of an exposure.
+    """Light and dark current in the frame, or group of frames, that decides about a reading.
 
-    signal : fraction of the projector's light at full power. ambient : fraction of the ambient light.
+    signal : fraction of the emitter's light at full power. ambient : fraction of the ambient light.
     dark : multiple of the dark electrons of a frame.
     """
 
@@ -193,24 +254,35 @@ class FrameContent(NamedTuple):
 
 
 class Decoder(Named, ABC):
-    """Makes range images of captures. Subclasses are frozen dataclasses; their fields are thresholds.
+    """Makes range images of captures, in two steps: `coordinates` reads the frames, `decode` adds the geometry.
 
-    A decoder may look at as many pixels around each as it likes.
+    Subclasses are frozen dataclasses; their fields are thresholds. A decoder may look at as many pixels around each as
+    it likes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.capture import Capture
+    >>> from rangesim.sensors import StructuredLight
+    >>> sensor = StructuredLight(64, 48)
+    >>> seen = sensor.default_decoder.coordinates(Capture(sensor.patterns(), sensor))  # as if the camera saw them flat
+    >>> seen.column[0, :3].round(3)
+    array([0.5, 1.5, 2.5], dtype=float32)
     """
 
     known: ClassVar[dict[str, type[Any]]] = {}
     type_name: ClassVar[str]
     """Name in configuration files."""
     reads: ClassVar[type[Sensor]] = Sensor  # type: ignore[type-abstract]
-    """The sensors whose captures it takes."""
+    """Class of the sensors whose captures it takes."""
 
     def check(self, sensor: Sensor) -> None:
         """Raise ValueError if it takes no captures of the sensor."""
         of_type(sensor, self.reads)
 
     @abstractmethod
-    def decode(self, capture: Capture) -> RangeImage:
-        """Range image of a capture.
+    def coordinates(self, capture: Capture) -> Coordinates:
+        """Readings before any geometry: `ProjectorCoordinates` or `PathLengths`. The rig is not looked at.
 
         Raises
         ------
@@ -218,28 +290,64 @@ class Decoder(Named, ABC):
             The capture is of a sensor that this decoder does not know.
         """
 
+    def decode(self, capture: Capture) -> RangeImage:
+        """Range image of a capture: its `coordinates`, and the geometry of its rig.
+
+        Raises
+        ------
+        ValueError
+            The capture is of a sensor that this decoder does not know, or the sensor does not fit the rig's projector.
+        """
+        if capture.rig is not None:
+            capture.sensor.check(capture.rig.projector.width, capture.rig.projector.height)
+        return self.coordinates(capture).range_image(capture.rig)
+
     @abstractmethod
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        """(h, w) float64, least light of the projector at full power that the thresholds take, in the units of
-        `background`."""
+        """(h, w) float64, least light of the emitter at full power that the thresholds take, in `background.unit`."""
 
     def content(self, sensor: Sensor) -> FrameContent:
-        """What the frame that decides about a reading holds, on average over the patterns."""
+        """Light and dark current in the frame that decides about a reading, on average over the patterns."""
         return FrameContent()
+
+    def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
+        """Mistake in taking the capture that `image` points to, as a clause; None if this decoder knows none.
+
+        `rangesim decode` shows it, and adds the causes that do not depend on the measuring principle.
+        """
+        return None
 
 
 def of_type(sensor: Sensor, kind: type[S]) -> S:
-    """The sensor, which has to be of that type; ValueError if it is not."""
+    """The sensor, which has to be of that type; ValueError if it is not.
+
+    Examples
+    --------
+    >>> from rangesim.sensors import AmcwToF, IdealToF
+    >>> of_type(AmcwToF(), IdealToF)
+    Traceback (most recent call last):
+    ValueError: expected a capture of ideal-tof, got one of amcw-tof.
+    """
     if not isinstance(sensor, kind):
         raise ValueError(f"expected a capture of {kind.type_name}, got one of {sensor.type_name}.")
     return sensor
 
 
 def least_signal_for(sigmas2: float, signal: float, noise_variance: np.ndarray) -> np.ndarray:
-    """(h, w) least S with S^2 = `sigmas2` (`signal` S + `noise_variance`), electrons.
+    """(h, w) float64, electrons, least S with S^2 = `sigmas2` (`signal` S + `noise_variance`).
 
-    That is a threshold of so many standard deviations, squared, against the shot noise of a fraction `signal` of the
-    light itself and against all other noise, of variance `noise_variance`: a quadratic with one positive root.
+    A threshold of t standard deviations (`sigmas2` is t^2) against the shot noise of a fraction `signal` of the light
+    itself and against all other noise leads to this equation, a quadratic with one positive root.
+
+    Parameters
+    ----------
+    noise_variance : (h, w) float, electrons squared, variance of all other noise.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> least_signal_for(5.0**2, 1.0, np.array([[0.0, 144.0]]))
+    array([[25. , 73.78825336]])
     """
     half = 0.5 * sigmas2 * signal
     return np.asarray(half + np.sqrt(half**2 + sigmas2 * noise_variance))

@@ -94,6 +94,8 @@ def counted_return() -> tuple[FirstReturn, list[None]]:
     traces: list[None] = []
 
     class Counted(FirstReturn):
+        type_name = "counted"
+
         def weights(self, path: Any, m: Any) -> list[Any]:
             traces.append(None)
             return super().weights(path, m)

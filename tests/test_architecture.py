@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -245,6 +246,27 @@ def test_no_rooms_import_in_a_ring() -> None:
         for ring in rings(nx.DiGraph(places.keys())):
             found_rings.append([place for (a, b), place in sorted(places.items()) if {a, b} <= ring])
     assert found_rings == []
+
+
+def documented_rooms() -> list[str]:
+    """Rooms of rangesim in the order of the table in docs/architecture.md, from the ground up."""
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    table = text.split("| room | what is in it |")[1].split("\n\n")[0]
+    first_cells = [line.split("|")[1] for line in table.splitlines()[2:]]
+    return [name.strip("/").removesuffix(".py") for cell in first_cells for name in re.findall(r"`(.+?)`", cell)]
+
+
+def test_rooms_stand_in_the_order_of_the_documented_table() -> None:
+    order = documented_rooms()
+    rooms = {room_of(relative(path)) for path in files_of("rangesim")} - {"__init__", "__main__"}
+    assert set(order) == rooms
+
+    def is_offence(found: Import) -> bool:
+        own, other = room_of(found.file), room_of(found.module)
+        counts = found.moment != "types" and is_of(found.module, "rangesim") and own in order and other in order
+        return counts and order.index(other) > order.index(own)
+
+    assert offenders("rangesim", is_offence) == []
 
 
 def test_no_file_imports_the_facade_of_its_own_package() -> None:
@@ -492,6 +514,12 @@ def run(code: str) -> str:
 def test_import_is_light() -> None:
     loaded = run("import rangesim, sys; print(*sys.modules)").split()
     assert not {"mitsuba", "drjit", "open3d", "numpy"} & set(loaded)
+
+
+def test_settings_of_the_light_transport_load_neither_sensors_nor_decoders() -> None:
+    loaded = run("import rangesim.light_transport.transport_settings, sys; print(*sys.modules)").split()
+    rooms = {name.split(".")[1] for name in loaded if name.startswith("rangesim.")}
+    assert rooms == {"environment", "errors", "light_transport", "settings"}
 
 
 def test_decoding_loads_no_renderer() -> None:

@@ -16,9 +16,9 @@ from synthetic import plane_signals, stereo_rig
 
 import rangesim
 from rangesim import decode, explain, expose
-from rangesim.decoding.gray import GrayCode, GrayThresholds
+from rangesim.decoding.gray import GrayThresholds
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds
-from rangesim.decoding.triangulate import TriangulationLimits
+from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
 from rangesim.electronics.ambient import Ambient, Tungsten
 from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
@@ -262,11 +262,11 @@ def test_numbers_are_no_bools(name: str) -> None:
 
 MODULES = (
     *("electronics.ambient", "electronics.detector", "electronics.spad", "experiment.experiment"),
-    *("experiment.instrument", "motion.timing", "motion.track", "response.lengths", "response.patterns", "rig.rig"),
+    *("instrument.instrument", "motion.timing", "motion.track", "response.lengths", "response.patterns", "rig.rig"),
     *("sensors.structured_light", "sensors.amcw", "sensors.direct_tof", "sensors.ideal_tof"),
-    *("decoding.gray", "decoding.phase_shift", "decoding.triangulate"),
+    *("decoding.gray", "decoding.phase_shift", "decoding.triangulation"),
 )
-RESULTS = {GrayCode, Phase}
+RESULTS = {ProjectorCoordinates, Phase}
 
 
 def test_every_setting_has_a_case() -> None:

@@ -20,7 +20,6 @@ from PIL import Image
 from small_result import ROOT, SCENES, SENSORS, small_result
 
 import rangesim
-from rangesim import save_capture
 from rangesim.cli import main
 from rangesim.cli.progress import progress_bar
 from rangesim.rig.calibration_files import save_calibration
@@ -198,7 +197,7 @@ def _write_bad_files(folder: Path) -> None:
     white = next((folder / "crop").glob("*white.png"))
     with Image.open(white) as image:
         smaller = image.crop((0, 0, 60, 60))
-    save_capture(smaller, white)
+    smaller.save(white)
 
 
 @pytest.mark.parametrize(
@@ -343,15 +342,17 @@ def test_names_of_shapes_give_no_orders_to_a_terminal(order: str) -> None:
     name = f"a{order}b"
     result: Any = SimpleNamespace(
         things=(name, "sphere"),
-        errors={name: None, "sphere": SimpleNamespace(accuracy_m=1e-3, recall=0.5)},
-        materials={name: order, "sphere": "matte"},
-        seen=None,
+        shapes={
+            name: SimpleNamespace(material=order, accuracy_m=None, recall=None),
+            "sphere": SimpleNamespace(material="matte", accuracy_m=1e-3, recall=0.5),
+        },
+        seen=SimpleNamespace(shapes=dict.fromkeys((name, "sphere"), SimpleNamespace(surface=0.25))),
         poses=None,
     )
     code = {"\n": "\\n"}.get(order[0], f"\\u{ord(order[0]):04x}") + order[1:]
     lines = _table(result).split("\n")
-    assert lines[1].split() == [f"a{code}b", code, "-", "-", "-"]
-    assert lines[2].split() == ["sphere", "matte", "1.000", "mm", "50.0%", "-"]
+    assert lines[1].split() == [f"a{code}b", code, "-", "-", "25.0%"]
+    assert lines[2].split() == ["sphere", "matte", "1.000", "mm", "50.0%", "25.0%"]
     assert len(lines) == 3
 
 

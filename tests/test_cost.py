@@ -20,7 +20,7 @@ from rangesim.instrument.instrument import instrument
 from rangesim.motion import ConstantTwist, Motion, Timing
 from rangesim.pipeline import cost, experiment_run
 from rangesim.pipeline.cost import Cost, available_memory_bytes, estimate_cost
-from rangesim.pipeline.passes import group_by_rig
+from rangesim.pipeline.shared_passes import group_by_rig
 from rangesim.sensors import DirectToF
 from rangesim.settings import limits
 
@@ -86,10 +86,10 @@ def test_where_the_memory_is_unknown_nothing_is_refused(monkeypatch: pytest.Monk
 def test_the_least_of_all_limits_on_memory_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "memory.max").write_text("1000\n")
     (tmp_path / "memory.current").write_text("300\n")
-    left = cost._left(tmp_path, "memory.max", "memory.current")
+    left = cost._bytes_left(tmp_path, "memory.max", "memory.current")
     assert left == 700
     (tmp_path / "memory.max").write_text("max\n")
-    assert cost._left(tmp_path, "memory.max", "memory.current") is None
+    assert cost._bytes_left(tmp_path, "memory.max", "memory.current") is None
     monkeypatch.setattr(cost, "_meminfo", lambda: 500)
     monkeypatch.setattr(cost, "_cgroup", lambda: [None, left])
     assert available_memory_bytes() == 500
@@ -186,9 +186,9 @@ def test_a_long_run_is_estimated_by_a_trial_within_a_factor_of_two() -> None:
 
     compile_s, fixed_s, path_s = cost._timed_trial(experiment, scene, (rig, instruments))
     assert compile_s >= 0
-    start = cost._Took.now()
+    start = cost._Elapsed.now()
     transport(scene, rig, [i.sensor for i in instruments], spp=64)
-    took = (cost._Took.now() - start).idle_s
+    took = (cost._Elapsed.now() - start).idle_s
     assert took / 2 < fixed_s + 320 * 240 * 64 * path_s < took * 2
 
 

@@ -17,7 +17,7 @@ from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.decoding.phase_shift import phase_of
 from rangesim.decoding.status import Status
-from rangesim.decoding.triangulate import TriangulationLimits
+from rangesim.decoding.triangulation import TriangulationLimits
 from rangesim.electronics.detector import Detector
 from rangesim.errors import RangesimWarning
 from rangesim.geometry.camera_projector import triangulate_coordinates

@@ -103,7 +103,7 @@ def test_rows_shown_first_are_the_cause(size: tuple[int, int], tmp_path: Path) -
     capture = replace(capture, detector=None, rig=None)
     _, info = decoded(capture, tmp_path / "right", "--bits", "12")
     assert info["likely_cause"] is None
-    columns, rows = (run.frames for run in sensor.layout())
+    columns, rows = (run.span for run in sensor.layout())
     frames = np.concatenate([capture.frames[rows], capture.frames[columns], capture.frames[-2:]])
     text, info = decoded(replace(capture, frames=frames), tmp_path / "wrong", "--bits", "12")
     assert "rows may have been shown first" in str(info["likely_cause"])

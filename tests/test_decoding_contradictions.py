@@ -30,7 +30,7 @@ SENSORS = [
 
 def fringes(sensor: StructuredLight) -> list[slice]:
     """Where the frames of the fringes stand, per axis."""
-    return [run.frames for run in sensor.layout()][1::2]
+    return [run.span for run in sensor.layout()][1::2]
 
 
 def capture_of(sensor: StructuredLight, detector: Detector | None = None, exposure_s: float = 1e-3) -> Capture:
@@ -137,7 +137,7 @@ def as_plain_binary(capture: Capture) -> Capture:
     sensor = capture.sensor
     assert isinstance(sensor, StructuredLight)
     frames = capture.frames.copy()
-    runs = [run.frames for run in sensor.layout() if isinstance(run.response, GrayBits)]
+    runs = [run.span for run in sensor.layout() if isinstance(run.response, GrayBits)]
     for run in runs:
         pairs = frames[run].reshape(-1, 2, *frames.shape[1:])
         shown = np.logical_xor.accumulate(pairs[:, 0] > pairs[:, 1], axis=0)

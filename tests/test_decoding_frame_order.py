@@ -32,7 +32,7 @@ def reordered(capture: Capture, order: Callable[[np.ndarray], np.ndarray], axis:
     """The capture with the frames of an axis as `order` returns them, of (bits, 2, h, w), most significant first."""
     sensor, frames = capture.sensor, capture.frames.copy()
     assert isinstance(sensor, StructuredLight)
-    run = next(r.frames for r in sensor.layout() if r.axis == axis)
+    run = next(r.span for r in sensor.layout() if r.axis == axis)
     pairs = frames[run].reshape(-1, 2, *frames.shape[1:])
     frames[run] = order(pairs).reshape(-1, *frames.shape[1:])
     return replace(capture, frames=frames)

@@ -19,22 +19,30 @@ ROOMS = [
     "rangesim.calibration",
     "rangesim.capture",
     "rangesim.causes",
+    "rangesim.decoding",
     "rangesim.electronics",
+    "rangesim.environment",
     "rangesim.evaluation",
+    "rangesim.experiment",
+    "rangesim.files",
     "rangesim.fusion",
     "rangesim.geometry",
+    "rangesim.instrument",
     "rangesim.motion",
     "rangesim.multiview",
+    "rangesim.pipeline",
     "rangesim.point_cloud",
     "rangesim.report",
     "rangesim.response",
     "rangesim.results",
     "rangesim.rig",
+    "rangesim.sensor",
+    "rangesim.sensors",
     "rangesim.settings",
     "rangesim.signals",
 ]
 """Packages whose docstrings are run, all of their modules."""
-MODULES = ["rangesim.errors", "rangesim.triangle_mesh"]
+MODULES = ["rangesim", "rangesim.errors", "rangesim.light_transport.transport_settings", "rangesim.triangle_mesh"]
 """Modules outside these packages whose docstrings are run."""
 
 

@@ -25,7 +25,7 @@ from rangesim.experiment.scan_settings import scan_settings_from_dict
 from rangesim.instrument.instrument import DEFAULT_SENSORS, Instrument, instrument
 from rangesim.motion import ConstantTwist, Motion, Timing
 from rangesim.pipeline.experiment_run import noise_seed, run
-from rangesim.pipeline.passes import group_by_rig
+from rangesim.pipeline.shared_passes import group_by_rig
 from rangesim.results.run_files import load_result
 from rangesim.rig import Lens
 from rangesim.sensors import DirectToF, IdealToF
@@ -140,7 +140,7 @@ def test_the_result_holds_every_stage() -> None:
     result = load_result(small_result())
     assert [m.name for m in result.measurements] == list(SENSORS)
     assert result.experiment == small_experiment()
-    assert [m.light_pass for m in result.measurements] == [1, 2, 2, 2]
+    assert [m.light_pass for m in result.measurements] == [1, 2, 3, 2]  # direct time of flight has another wavelength
     for m in result.measurements:
         folder = small_result() / m.name
         assert (folder / "cloud.ply").is_file()

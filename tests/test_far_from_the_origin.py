@@ -352,7 +352,7 @@ def test_lamps_far_away_have_to_be_dictionaries() -> None:
     wall = {"type": "rectangle", "to_world": mi.ScalarTransform4d().translate(UTM), "bsdf": matte(0.5)}
     lamps = {"spot": mi.load_dict({"type": "spot"}), "sky": mi.load_dict({"type": "constant"})}
     load_scene(scene_at(UTM, wall=wall, sky=lamps["sky"]))
-    with pytest.raises(FileFormatError, match=r"lamps, sensors and grids .* as dictionaries"):
+    with pytest.raises(FileFormatError, match=r"emitters, sensors and grids .* as dictionaries"):
         load_scene(scene_at(UTM, wall=wall, **lamps))
 
 

@@ -15,7 +15,7 @@ from rangesim.electronics.detector import Detector
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
 from rangesim.instrument.instrument import Instrument, instrument
 from rangesim.pipeline.experiment_run import carry_out, run
-from rangesim.pipeline.passes import group_by_rig
+from rangesim.pipeline.shared_passes import group_by_rig
 from rangesim.results.run_files import load_result
 from rangesim.rig import translation
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight

@@ -166,6 +166,8 @@ def test_after_an_interruption_the_same_process_traces_the_same_bytes(tabletop: 
 
 def test_a_signal_while_a_loop_is_traced_comes_out_as_what_its_handler_raised(tabletop: Scene) -> None:
     class Interrupting(FirstReturn):
+        type_name = "interrupting"
+
         def weights(self, path: Any, m: Any) -> list[Any]:
             raise KeyboardInterrupt
 

@@ -8,7 +8,7 @@ import pytest
 from many_views import around, deforming, observed
 from scipy.spatial.transform import Rotation
 
-from rangesim.multiview import Tracks, factorise_affine, factorise_orthographic, factorise_projective
+from rangesim.multiview import Tracks, factorisation, factorise_affine, factorise_orthographic, factorise_projective
 from rangesim.rig import Intrinsics
 
 PINHOLE = Intrinsics(1280, 960, 1200, 1205, 640, 480)
@@ -29,6 +29,24 @@ def test_affine_factorisation_without_noise_is_the_singular_value_decomposition(
     if not missing:
         values = np.linalg.svd(matrix, compute_uv=False)[:3] / np.sqrt(8 * 40)
         np.testing.assert_allclose(found.singular_values, values, rtol=1e-10)
+
+
+def test_a_second_start_confirms_the_minimum_where_observations_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A first descent into a wrong minimum agrees with nothing: another start has to reach its cost."""
+    costs = []
+    descent = factorisation._affine_descent
+
+    def ends_high_first(*arguments):  # type: ignore[no-untyped-def]
+        found, cost = descent(*arguments)
+        costs.append(cost + (0 if costs else 1e6))
+        return (found, costs[-1]) if len(costs) > 1 else (found._replace(M=0 * found.M), costs[-1])
+
+    monkeypatch.setattr(factorisation, "_affine_descent", ends_high_first)
+    true = rigid(0, noise=0.5, missing=0.3)
+    found = factorise_affine(true.tracks)
+    assert len(costs) == 3  # the wrong one, the right one, and one that agrees with it
+    readings = np.einsum("nar,pr->npa", found.M, found.points) + found.t[:, None]
+    assert np.abs(readings - true.exact).max() < 5.0  # pixels; ten standard deviations of the noise
 
 
 @pytest.mark.parametrize("scale", [False, True])

@@ -29,12 +29,16 @@ from rangesim import (
     decode,
     explain,
     expose,
+    save_capture,
 )
+from rangesim.calibration import Checkerboard, default_rig, render_set
 from rangesim.causes import Cause
+from rangesim.decoding.coordinates import Coordinates
 from rangesim.decoding.gray import GrayThresholds
 from rangesim.errors import FileFormatError
 from rangesim.experiment import experiment_from_dict, load_experiment
 from rangesim.instrument.instrument import Instrument
+from rangesim.rig.calibration_files import load_calibration
 from rangesim.sensor import Background
 from rangesim.sensors import AmcwDecoder, StructuredLightDecoder, presets, sensor_from_dict, sensor_of
 
@@ -120,6 +124,44 @@ def test_the_command_line_names_them_too(tmp_path: Path) -> None:
     assert "did you mean 'amcw'" in command("run", "plane", "--sensor", "amwc", "--out", tmp_path / "no", fails=True)
 
 
+# ---- A code from outside is calibrated and decoded like those of the package ----------------------------------------
+
+
+def test_images_of_an_own_code_calibrate_a_rig_and_decode_with_it(tmp_path: Path) -> None:
+    """Its two classes suffice: no command and no calibration knows it, and the images say nothing of it."""
+    sensor = sensor_of(FRINGES).for_projector(400, 300, ("columns", "rows"))
+    rig = default_rig(320, 240, (400, 300))
+    rendered = render_set(Checkerboard(7, 5, 0.03), rig, sensor, n=4, spp=8)
+    folders = [tmp_path / f"pose_{k}" for k in range(4)]
+    for folder, capture in zip(folders, rendered.captures, strict=True):
+        save_capture(capture, folder)
+        (folder / "capture.json").unlink()
+        (folder / "manifest.json").unlink()
+    images = ("--sensor", FRINGES, "--projector", "400x300", "--bits", 12)
+    board = ("--points", "7x5", "--spacing", 0.03, "--coefficients", 0)
+    said = command("calibrate", *folders, *images, *board, "--out", tmp_path / "rig.json")
+    assert "baseline" in said
+    found = load_calibration(tmp_path / "rig.json")
+    assert found.projector.width == 400
+    assert found.baseline_m == pytest.approx(rig.baseline_m, rel=0.1)
+    with_rig = ("--axes", "columns,rows", "--calibration", tmp_path / "rig.json", "--out", tmp_path / "decoded")
+    assert "measured, z from" in command("decode", folders[0], *images, *with_rig)
+    with np.load(tmp_path / "decoded" / "range.npz") as image:
+        at_board = np.linalg.norm(rendered.T_camera_board[0, :3, 3])
+        assert np.nanmedian(image["z"]) == pytest.approx(at_board, rel=0.2)
+
+
+def test_options_of_bare_images_that_a_sensor_lacks_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    for options, message in (
+        (("--code", "amcw", "--projector", "64x64"), "expected a sensor whose code has the size of a projector"),
+        (("--sensor", FRINGES, "--period", 8), "unknown key 'period_px' (did you mean 'periods'?)"),
+        (("--sensor", FRINGES, "--code", "gray"), "expected either --sensor or --code"),
+        (("--code", "amcw"), "expected 12 images for amcw-tof"),
+    ):
+        assert message in command("decode", tmp_path / "images", *options, "--out", tmp_path / "out", fails=True)
+
+
 # ---- The two examples are right -------------------------------------------------------------------------------------
 
 
@@ -177,6 +219,9 @@ class Smoothed(Decoder):
     inner: AmcwDecoder = field(default_factory=AmcwDecoder)
     type_name: ClassVar[str] = "smoothed"
     shapes: ClassVar[list[tuple[int, ...]]] = []
+
+    def coordinates(self, capture: Capture) -> Coordinates:
+        return self.inner.coordinates(capture)
 
     def decode(self, capture: Capture) -> RangeImage:
         from scipy.ndimage import median_filter

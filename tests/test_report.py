@@ -25,7 +25,7 @@ from rangesim.causes import Cause
 from rangesim.decoding.status import Status
 from rangesim.environment.doctor import find_browser
 from rangesim.report import cloud, palette, render_report, tables, write_report
-from rangesim.report.build import by_camera
+from rangesim.report.experiment_page import by_camera
 from rangesim.report.verdict import verdict
 from rangesim.results.run_files import PhotonsRecord, load_result, write_result
 

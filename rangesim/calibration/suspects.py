@@ -30,7 +30,7 @@ DEVICES = ("camera", "projector")
 """Names of the devices of a rig, by their number in `Observation.device`."""
 
 MAX_COEFFICIENTS = 5
-"""Largest number of coefficients of distortion of a lens: k1, k2, p1, p2, k3 in `Intrinsics`."""
+"""Largest number of coefficients of distortion of a lens, a count: k1, k2, p1, p2, k3, as in `Intrinsics`."""
 MAX_SHIFT_SIGMAS = 2.0
 """Largest shift of a focal length or a principal point by distortion that is left out, in stated standard deviations.
 Beyond two, the stated deviations do not describe the errors."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A modulated time-of-flight camera calibrated by targets at known range: wiggling, and an offset for each pixel.
+"""Calibration of a modulated time-of-flight camera by targets at known range: wiggling, and an offset for each pixel.
 
 The correlation of source and reference is a periodic function of the phase phi = 2 pi f l / c with the harmonics
 a_1, a_2, ...; N taps, 2 pi / N apart, cannot tell harmonic n N + 1 from the first, nor n N - 1 from the first turned
@@ -7,11 +7,11 @@ the other way. What they measure is
 
     arg( sum over k = 1 mod N of a_k e^(i k phi) + sum over k = -1 mod N of a_k e^(-i k phi) ),
 
-off from phi by a function of period 2 pi / N: the wiggling (Godbaz, Cree, Dorrington: "Understanding and ameliorating
-non-linear phase and amplitude responses in AMCW lidar", Remote Sensing 2012). `wiggling` is that closed form, of known
-harmonics; `calibrate_tof` finds what is to be subtracted from targets, as a series of sines over the path length
+which differs from phi by a function of period 2 pi / N, the wiggling (Godbaz, Cree, Dorrington: "Understanding and
+ameliorating non-linear phase and amplitude responses in AMCW lidar", Remote Sensing 2012). `wiggling` is that closed
+form for known harmonics. `calibrate_tof` finds the correction from targets, as a series of sines over the path length
 that is read, together with the delay of each pixel (Lindner, Kolb: "Lateral and depth calibration of PMD-distance
-sensors", ISVC 2006; they took splines, which know nothing of the period).
+sensors", ISVC 2006; they took splines, which do not use the period).
 """
 
 from __future__ import annotations
@@ -38,49 +38,85 @@ from rangesim.response import SPEED_OF_LIGHT
 from rangesim.rig import Intrinsics, Rig, pose
 from rangesim.rig.calibration_files import SEAL
 from rangesim.robust_scale import sigma_from_median
-from rangesim.sensor import Decoder
+from rangesim.sensor import Decoder, of_type
 from rangesim.sensors.amcw import TAPS_DEG, AmcwToF
+from rangesim.sensors.registry import sensor_from_dict
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
 
-MULTIPLES = 4
-"""Of the number of taps: the orders of the wiggling that are looked for. Of square waves', 1.9 % is left."""
+N_ORDERS = 4
+"""Number of orders of the wiggling in the series, each a multiple of the number of taps. Four leave 1.9 % of the
+wiggling of square waves; more need more targets."""
+
 ROUNDS = 5
-"""Of weighing the targets by their noise and leaving outliers out."""
+"""Number of rounds in which the targets are weighed by their noise and outliers are left out. Each round takes the
+noise that the round before found."""
+
 OUTLIER = 5.0
-"""Robust standard deviations of its image beyond which a reading is left out: flying pixels, light by other ways."""
+"""Distance in robust standard deviations of its image beyond which a reading is left out: it is a flying pixel, or its
+light came by other ways. Normal noise reaches it once in two million readings."""
+
 SERIES_REST = 0.02
-"""Of the wiggling, what orders beyond those of the series may leave."""
+"""Largest part of the wiggling, as a fraction, that the orders beyond those of the series may leave: 1.9 % for square
+waves, see `N_ORDERS`. It counts as noise of the targets, so that they are not taken for outliers."""
+
 MAX_DEVIATION = 1.0
-"""Standard deviation of the correction over the noise of a reading, above which targets do not determine it."""
+"""Largest standard deviation of the correction, as a multiple of the noise of a reading. With a larger one, the targets
+do not determine the correction: it would add more error than a reading has."""
+
 BETWEEN = 1000
-"""Path lengths from the nearest target to the farthest at which it is asked."""
+"""Number of path lengths, from the nearest target to the farthest, at which the standard deviation of the correction is
+computed. Over 10 m, a period of order 16 at 100 MHz has 19 of them."""
+
 ROUNDING = 1e-14
-"""Eigenvalues of the normal equations below, relative to the largest, are 0."""
+"""Least eigenvalue of the normal equations, as a fraction of the largest, that differs from 0: fifty times the
+rounding of float64. Smaller ones are raised to it."""
+
+MAX_ORDER = 1000
+"""Largest order of the wiggling in a file or a call. It is far more than any camera shows, so a larger one is a
+mistake."""
+
 FORMAT = "rangesim.tof-calibration"
+"""Format of the files, in their settings."""
+
 _ARRAYS = {
     "cosines_m": ArraySpec("float64", ("f", "k"), low=-1e3, high=1e3),
     "sines_m": ArraySpec("float64", ("f", "k"), low=-1e3, high=1e3),
     "offset_m": ArraySpec("float64", low=-MAX_METRES, high=MAX_METRES, nan=True),
     "settings": SETTINGS,
 }
+"""Arrays of a file with their types, shapes and bounds; coefficients beyond 1 km are no calibration."""
 
 
 def triangle_harmonics(n: int) -> Array:
-    """(n,) a_1 .. a_n of the correlation of a square source with a square reference, a_1 = 1: 1 / k^2 of odd k."""
+    """(n,) float64, harmonics a_1 .. a_n of the correlation of a square source with a square reference.
+
+    They are 1 / k^2 for odd k, and 0 for even k, so that a_1 = 1.
+
+    Examples
+    --------
+    >>> triangle_harmonics(5).round(3)
+    array([1.   , 0.   , 0.111, 0.   , 0.04 ])
+    """
     k = np.arange(1, n + 1)
     return np.where(k % 2 == 1, 1.0 / k**2, 0.0)
 
 
 def wiggling(phase: ArrayLike, harmonics: ArrayLike, taps: int = len(TAPS_DEG)) -> Array:
-    """(...) phase that evenly spaced taps measure less the true one, in periods.
+    """(...) float64, phase that evenly spaced taps measure minus the true one, in periods.
 
-    The equation stands at the head of this file; it is exact for as many harmonics as there are. To first order in
-    them, the error is the sum over n of (a_(nN+1) - a_(nN-1)) sin(n N phi) / (2 pi a_1).
+    The equation is in the docstring of this module. It is exact for the given harmonics. To first order in them, the
+    error is the sum over n of (a_(nN+1) - a_(nN-1)) sin(n N phi) / (2 pi a_1).
 
     Parameters
     ----------
-    phase : (...) true phase in periods, l f / c. harmonics : (k,) a_1 .. a_k of an even correlation, a_1 positive.
-    taps : N, 3 or more; two cannot tell a direction.
+    phase : (...) float, true phase in periods, l f / c.
+    harmonics : (k,) float, a_1 .. a_k of an even correlation, a_1 positive.
+    taps : int, N, 3 or more; two cannot tell a direction.
+
+    Examples
+    --------
+    >>> wiggling([0.0, 0.0625, 0.125], triangle_harmonics(99)).round(4)  # four taps, square waves
+    array([ 0.    , -0.0113, -0.    ])
     """
     a = checked_array("harmonics", harmonics, None)
     if a.ndim != 1 or not len(a) or not a[0] > 0:
@@ -98,12 +134,20 @@ def wiggling(phase: ArrayLike, harmonics: ArrayLike, taps: int = len(TAPS_DEG)) 
 
 
 def plane_range(camera: Intrinsics, T_camera_plane: ArrayLike) -> Array:
-    """(h, w) metres from the camera centre to the plane z = 0 of a frame, along each pixel's ray; NaN where it meets
-    none.
+    """(h, w) float64, metres along each pixel's ray from the camera centre to the plane z = 0 of a frame.
+
+    NaN where the ray does not meet the plane.
 
     Parameters
     ----------
-    T_camera_plane : (4, 4) maps the plane's coordinates to the camera's, metres: of a stage that moves a wall.
+    T_camera_plane : (4, 4) float, maps coordinates of the frame to the camera's, metres; for example, the frame of a
+        wall on a stage.
+
+    Examples
+    --------
+    >>> from rangesim.rig import translation
+    >>> plane_range(Intrinsics(3, 1, 1.0, 1.0, 1.5, 0.5), translation(0, 0, 2.0)).round(3)
+    array([[2.828, 2.   , 2.828]])
     """
     T = pose(T_camera_plane, "T_camera_plane")
     rays = camera.directions(camera.pixel_centres())
@@ -114,11 +158,20 @@ def plane_range(camera: Intrinsics, T_camera_plane: ArrayLike) -> Array:
 
 
 def board_range(board: Board, camera: Intrinsics, T_camera_board: ArrayLike) -> Array:
-    """(h, w) metres from the camera centre to a board, along each pixel's ray; NaN beside it.
+    """(h, w) float64, metres along each pixel's ray from the camera centre to a board; NaN beside the board.
 
     Parameters
     ----------
-    T_camera_board : (4, 4), as `rangesim.geometry.fit_camera_pose` finds it from the corners in the same image.
+    T_camera_board : (4, 4) float, maps coordinates of the board to the camera's, metres, as
+        `rangesim.geometry.fit_camera_pose` finds it from the corners in the same image.
+
+    Examples
+    --------
+    >>> from rangesim.calibration import Checkerboard
+    >>> from rangesim.rig import translation
+    >>> board, camera = Checkerboard(3, 2, 0.1), Intrinsics(4, 1, 2.0, 2.0, 1.0, 0.5)
+    >>> board_range(board, camera, translation(0, 0, 0.5)).round(3)
+    array([[0.515, 0.515, 0.625,   nan]])
     """
     T = pose(T_camera_board, "T_camera_board")
     distance = plane_range(camera, T)
@@ -132,22 +185,26 @@ def board_range(board: Board, camera: Intrinsics, T_camera_board: ArrayLike) -> 
 
 
 def find_board_ranges(board: Board, captures: Sequence[Capture], names: Sequence[str] | None = None) -> list[Array]:
-    """(h, w) metres to the board, NaN beside it, for each capture by a calibrated camera.
+    """Range of the board in each capture by a calibrated camera: arrays (h, w) float64, metres, NaN beside the board.
 
-    The board is found in the mean of the frames, and its pose from its corners and the camera of the capture's rig: no
-    stage that moves it is needed. `names` of the captures go into messages; None: their numbers.
+    The board is found in the white image of the capture, and its pose from its corners and the camera of the rig. So no
+    stage that moves the board is needed.
+
+    Parameters
+    ----------
+    names : names of the captures, for messages; None: their numbers.
 
     Raises
     ------
     ValueError
-        A capture has no rig, or no board is found in it (which one, is said).
+        A capture has no rig, or no board is found in it; the message says which.
     """
     ranges = []
     for name, capture in zip(_named(names, len(captures)), captures, strict=True):
         if capture.rig is None:
             raise ValueError(f"{name}: expected a rig with the calibrated camera, got none.")
         try:
-            view = board.find(capture.frames.mean(axis=0))
+            view = board.find(capture.sensor.white_image(capture.frames))
             found = fit_camera_pose(board.points[view.indices], view.pixels, capture.rig.camera)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
@@ -159,15 +216,18 @@ def find_board_ranges(board: Board, captures: Sequence[Capture], names: Sequence
 class ToFCalibration:
     """Systematic errors of a time-of-flight camera, as functions of the path length that it reads.
 
-    A path length m (there and back) that a pixel reads is too long by its offset and by the sum over frequencies f and
-    orders k of cosines cos(2 pi k f m / c) + sines sin(2 pi k f m / c).
+    A path length m (there and back) that a pixel reads is too long by the pixel's offset, and by the sum over
+    frequencies f and orders k of cosines cos(2 pi k f m / c) + sines sin(2 pi k f m / c).
 
-    rig : Rig of the camera and its lamp, at the world's origin. sensor : AmcwToF and decoder : Decoder, whose readings
-    these are.
-    orders : of the wiggling. cosines_m, sines_m : (f, k) float64, metres of path length, by frequency and order.
-    offset_m : (h, w) float64, metres of path length; NaN of pixels that saw no target.
-    shortest_m, longest_m : path lengths of the targets; nothing is known beyond. noise_m : standard deviation of a path
-    length about the correction, typical of the targets.
+    Parameters
+    ----------
+    rig : Rig of the camera and its emitter, at the world's origin.
+    sensor : AmcwToF that took the readings. decoder : Decoder that made them.
+    orders : k integers, orders of the wiggling.
+    cosines_m, sines_m : (f, k) float64, metres of path length, by frequency and order.
+    offset_m : (h, w) float64, metres of path length; NaN at pixels that saw no target.
+    shortest_m, longest_m : float, metres, path lengths of the nearest and the farthest target; nothing is known beyond.
+    noise_m : float, metres, standard deviation of a path length about the correction, typical of the targets.
     """
 
     rig: Rig
@@ -194,15 +254,15 @@ class ToFCalibration:
             )
 
     def wiggling_m(self, length_m: ArrayLike) -> Array:
-        """(...) metres by which a path length that was read is too long, the pixel's offset left aside."""
+        """(...) float64, metres by which path lengths that were read are too long, apart from the pixels' offsets."""
         coefficients = np.concatenate([self.cosines_m.ravel(), self.sines_m.ravel()])
         return np.asarray(_series(_waves(self.sensor, self.orders), np.asarray(length_m, np.float64)) @ coefficients)
 
     def correct(self, image: RangeImage) -> RangeImage:
-        """The range image with wiggling and offsets taken off z and range: once, of an image decoded with this rig.
+        """Range image with z and range corrected for wiggling and offsets. Apply it once to an image of this rig.
 
         Pixels that saw no target, and readings beyond the path lengths of the targets, are refused with
-        `Status.OUT_OF_RANGE`: nothing is known of their error.
+        `Status.OUT_OF_RANGE`, because nothing is known of their error.
 
         Raises
         ------
@@ -238,7 +298,7 @@ class ToFCalibration:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write it, its rig, sensor and decoder to a compressed .npz file, which `load_tof_calibration` reads."""
+        """Write the calibration, with rig, sensor and decoder, to a .npz file that `load_tof_calibration` reads."""
         settings = {
             "format": FORMAT,
             "rig": to_dict(self.rig),
@@ -270,14 +330,14 @@ def load_tof_calibration(path: str | Path) -> ToFCalibration:
         if missing := [name for name in names if name not in settings]:
             raise ValueError(f"settings: missing {', '.join(missing)}.")
         orders = settings["orders"]
-        if not isinstance(orders, list) or not orders or any(type(k) is not int or not 0 < k <= 1000 for k in orders):
-            raise ValueError(f"expected orders as whole numbers from 1 to 1000, got {shown(orders)}.")
+        if not isinstance(orders, list) or not orders or not all(map(_is_order, orders)):
+            raise ValueError(f"expected orders as whole numbers from 1 to {MAX_ORDER}, got {shown(orders)}.")
         for name in numbers:
             if not isinstance(settings[name], float) or not 0 <= settings[name] <= MAX_METRES:
                 raise ValueError(f"expected {name} in metres, got {shown(settings[name])}.")
         return ToFCalibration(
             rig=Rig.from_dict(settings["rig"]),
-            sensor=from_dict(AmcwToF, settings["sensor"], "sensor"),
+            sensor=of_type(sensor_from_dict(settings["sensor"], "sensor"), AmcwToF),
             decoder=from_dict(Decoder, settings["decoder"], "decoder"),  # type: ignore[type-abstract]
             orders=tuple(orders),
             **{name: settings[name] for name in numbers},
@@ -287,8 +347,26 @@ def load_tof_calibration(path: str | Path) -> ToFCalibration:
         raise FileFormatError(f"{path}: {error}") from error
 
 
+def _is_order(value: Any) -> bool:
+    """Whether a value is an order of the wiggling: a whole number from 1 to `MAX_ORDER`."""
+    return type(value) is int and 0 < value <= MAX_ORDER
+
+
 def path_length(range_m: Array, rays: Array, rig: Rig) -> Array:
-    """(...) metres from the lamp to the point at a range along camera rays (..., 3), and back to the camera."""
+    """(...) float64, metres from the emitter to the point at a range along camera rays, and back to the camera.
+
+    Parameters
+    ----------
+    range_m : (...) float, metres from the camera centre. rays : (..., 3) float, of any length, camera coordinates.
+
+    Examples
+    --------
+    >>> from rangesim.rig import translation
+    >>> device = Intrinsics(640, 480, 800, 800, 320, 240)
+    >>> rig = Rig(device, device, np.eye(4), translation(0.6, 0, 0))  # the emitter stands 0.6 m to the right
+    >>> path_length(np.array([0.8]), np.array([[0.0, 0.0, 1.0]]), rig)
+    array([1.8])
+    """
     unit = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     r = np.asarray(range_m, np.float64)
     return np.asarray(r + np.linalg.norm(r[..., None] * unit - rig.T_camera_projector[:3, 3], axis=-1))
@@ -302,35 +380,40 @@ def calibrate_tof(
     orders: tuple[int, ...] | None = None,
     names: Sequence[str] | None = None,
 ) -> ToFCalibration:
-    """Wiggling and offsets of a camera, from captures of targets whose range is known.
+    """Calibration of wiggling and offsets of a camera, from captures of targets whose range is known.
 
-    Least squares over the series of `ToFCalibration` and one offset for each pixel, each target weighed by the scatter
-    of its readings about the fit, readings beyond `OUTLIER` of it left out.
+    It is a least-squares fit of the series of `ToFCalibration` and of one offset for each pixel. Each target is weighed
+    by the scatter of its readings about the fit, and readings beyond `OUTLIER` are left out.
 
     Parameters
     ----------
-    captures : of `AmcwToF`, all with one rig (wherever it stands) and one sensor, of matte targets that light reaches
-        by one way: walls or boards at many distances. Distances that lie evenly over a period of the wiggling (c / 8 f
-        of range for four taps) or more determine it best.
-    true_range_m : (h, w) each, metres from the camera centre; NaN beside the target. See `board_range`.
-    decoder : of the readings; None: the sensor's own, with `correct_wiggling` off, so that nothing is presumed.
-    orders : of the wiggling; None: `MULTIPLES` of the number of taps. Others come of pixels that are not linear.
-    names : of the captures, for messages; None: their numbers.
+    captures : two or more Captures of one `AmcwToF`, all with one rig (wherever it stands), of matte targets that light
+        reaches by one way: walls or boards at many distances. Distances that lie evenly over a period of the wiggling
+        (c / 8 f of range for four taps) or more determine it best.
+    true_range_m : (h, w) float each, metres from the camera centre; NaN beside the target. See `board_range`.
+    decoder : Decoder of the readings; None: the sensor's own, with `correct_wiggling` off, so that nothing is presumed.
+    orders : different integers, orders of the wiggling; None: the first `N_ORDERS` multiples of the number of taps.
+        Other orders appear where pixels are not linear.
+    names : names of the captures, for messages; None: their numbers.
 
     Raises
     ------
     ValueError
-        Captures of another sensor, without a rig, or with different ones; ranges of another shape; or targets that
-        leave the correction open: too few, or all at nearly one distance.
+        A capture is of another sensor, without a rig, or with another rig; a range has another shape; or the targets do
+        not determine the correction: they are too few, or all at nearly one distance.
+
+    Examples
+    --------
+    >>> calibration = calibrate_tof(captures, find_board_ranges(board, captures))  # doctest: +SKIP
     """
     names = _named(names, len(captures))
     sensor, rig = _checked(captures, true_range_m, names)
     if decoder is None:
         decoder = replace(sensor.default_decoder, correct_wiggling=False)
     if orders is None:
-        orders = tuple(len(TAPS_DEG) * n for n in range(1, MULTIPLES + 1))
-    if not orders or len(set(orders)) < len(orders) or any(type(k) is not int or not 0 < k <= 1000 for k in orders):
-        raise ValueError(f"expected orders as different whole numbers from 1 to 1000, got {shown(orders)}.")
+        orders = tuple(len(TAPS_DEG) * n for n in range(1, N_ORDERS + 1))
+    if not orders or len(set(orders)) < len(orders) or not all(map(_is_order, orders)):
+        raise ValueError(f"expected orders as different whole numbers from 1 to {MAX_ORDER}, got {shown(orders)}.")
     rays = rig.camera.directions(rig.camera.pixel_centres())
     readings = []
     for k, (capture, truth) in enumerate(zip(captures, true_range_m, strict=True)):
@@ -343,7 +426,7 @@ def calibrate_tof(
         if np.median(np.abs(read - true)) > sensor.searched_m / 2:
             raise ValueError(
                 f"{names[k]}: expected readings near the true range, got "
-                f"{np.median(image.range_m[seen]):.3g} m of {np.median(np.asarray(truth)[seen]):.3g} m; leave out "
+                f"{np.median(image.range_m[seen]):.3g} m at {np.median(np.asarray(truth)[seen]):.3g} m; leave out "
                 f"targets beyond the {sensor.unambiguous_range_m:.3g} m up to which the camera is unambiguous, and "
                 "check that its rig is the one that took them."
             )
@@ -373,7 +456,10 @@ def calibrate_tof(
 
 @dataclass(frozen=True, eq=False)
 class _Readings:
-    """Of one target. pixel : (m,) flat indices. length, off : (m,) path lengths, and their errors, metres."""
+    """Readings of one target.
+
+    pixel : (m,) flat indices. length, off : (m,) float64, metres, path lengths that were read, and their errors.
+    """
 
     pixel: NDArray[np.int64]
     length: Array
@@ -381,6 +467,7 @@ class _Readings:
 
 
 def _named(names: Sequence[str] | None, n: int) -> list[str]:
+    """One name for each of n captures; their numbers if none are given."""
     result = [f"capture {k}" for k in range(n)] if names is None else [str(name) for name in names]
     if len(result) != n:
         raise ValueError(f"expected a name for each of the {n} captures, got {len(result)}.")
@@ -388,6 +475,7 @@ def _named(names: Sequence[str] | None, n: int) -> list[str]:
 
 
 def _checked(captures: Sequence[Capture], true_range_m: Sequence[Any], names: Sequence[str]) -> tuple[AmcwToF, Rig]:
+    """The sensor and the rig, at the world's origin, that all captures share; ValueError if they share none."""
     if len(captures) < 2 or len(captures) != len(true_range_m):
         raise ValueError(
             f"expected captures of two or more targets and the range of each, got {len(captures)} and "
@@ -395,41 +483,45 @@ def _checked(captures: Sequence[Capture], true_range_m: Sequence[Any], names: Se
         )
     sensor, rig = captures[0].sensor, captures[0].rig
     for k, (capture, truth) in enumerate(zip(captures, true_range_m, strict=True)):
-        if not isinstance(capture.sensor, AmcwToF):
-            raise ValueError(f"{names[k]}: expected one of AmcwToF, got one of {type(capture.sensor).__name__}.")
+        try:
+            of_type(capture.sensor, AmcwToF)
+        except ValueError as error:
+            raise ValueError(f"{names[k]}: {error}") from error
         if capture.rig is None:
-            raise ValueError(f"{names[k]}: expected a rig: its camera, and where the lamp is.")
+            raise ValueError(f"{names[k]}: expected a rig, which holds the camera and the place of the emitter.")
         if capture.sensor != sensor or _at_origin(capture.rig) != _at_origin(rig):
             raise ValueError(f"{names[k]}: expected the sensor and the rig of {names[0]}, got another.")
         if np.shape(truth) != capture.frames.shape[1:]:
             raise ValueError(f"{names[k]}: expected true ranges {capture.frames.shape[1:]}, got {np.shape(truth)}.")
         if not (np.isnan(truth) | (np.asarray(truth) > 0)).all():
             raise ValueError(f"{names[k]}: expected true ranges in positive metres, or NaN beside the target.")
-    assert isinstance(sensor, AmcwToF)
-    return sensor, _at_origin(rig)
+    return of_type(sensor, AmcwToF), _at_origin(rig)
 
 
 def _at_origin(rig: Rig | None) -> Rig:
-    """The rig wherever it stands: the camera may move as well as the targets."""
+    """The rig moved to the world's origin. The camera may move as well as the targets."""
     assert rig is not None
     return replace(rig, T_world_camera=np.eye(4))
 
 
 def _waves(sensor: AmcwToF, orders: tuple[int, ...]) -> Array:
-    """(f k,) radians per metre of path length, by frequency and order."""
+    """(f k,) float64, angular wave numbers in radians per metre of path length, by frequency and order."""
     return np.outer(sensor.modulation_hz, orders).ravel() * (2 * np.pi / SPEED_OF_LIGHT)
 
 
 def _series(waves: Array, length_m: Array) -> Array:
-    """(..., 2 f k) cosines, then sines, of path lengths."""
+    """(..., 2 f k) float64, cosines, then sines, of the phases of path lengths (...) at all wave numbers (f k,)."""
     phase = length_m[..., None] * waves
     return np.concatenate([np.cos(phase), np.sin(phase)], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """coefficients : (c,) of the series. offset : (n_pixels,). shortest, longest : of the readings that count. noise :
-    of a reading. deviation : largest standard deviation of the correction between shortest and longest. All in metres.
+    """Result of the fit, all in metres of path length.
+
+    coefficients : (c,) of the series. offset : (n_pixels,); NaN at pixels without readings.
+    shortest, longest : path lengths of the readings that count. noise : standard deviation of a reading.
+    deviation : largest standard deviation of the correction between shortest and longest.
     """
 
     coefficients: Array
@@ -441,10 +533,14 @@ class _Fit:
 
 
 def _fit(readings: list[_Readings], waves: Array, n_pixels: int) -> _Fit:
-    """The series and the offsets of least squared error.
+    """The series and the offsets with the least squared error.
 
-    The offsets are eliminated: a pixel's errors and series are taken off their means over the targets, so that the
-    normal equations hold the few coefficients alone.
+    The offsets are eliminated: the means over the targets are subtracted from each pixel's errors and series, so that
+    the normal equations hold the few coefficients alone.
+
+    Parameters
+    ----------
+    waves : (f k,) radians per metre. n_pixels : int, number of pixels of the camera.
     """
     c = 2 * len(waves)
     spread = np.ones(len(readings))
@@ -478,7 +574,7 @@ def _fit(readings: list[_Readings], waves: Array, n_pixels: int) -> _Fit:
         for k, r in enumerate(readings):
             residual = over[k, r.pixel] - middle[r.pixel]
             spread[k] = sigma_from_median(residual, np.median(residual))
-        # what orders beyond the series' leave is no noise, and no outlier
+        # The orders beyond those of the series leave errors that are neither noise nor outliers.
         wiggled = [float(np.mean(r.off - row[r.pixel])) for row, r in zip(over, readings, strict=True)]
         rest = SERIES_REST * float(np.std(wiggled))
         spread = np.maximum(np.hypot(spread, rest), 1e-9)
@@ -491,7 +587,7 @@ def _fit(readings: list[_Readings], waves: Array, n_pixels: int) -> _Fit:
         for row, r, keep, sigma in zip(over, readings, kept, spread, strict=True)
     ]
     scale = float(np.sqrt(np.sum(squares) / freedom)) if freedom > 0 else np.inf
-    # an offset absorbs a constant: what matters is how the correction differs from its mean over the targets
+    # An offset absorbs a constant, so that the correction counts by its difference from its mean over the targets.
     lengths = [r.length[keep] for r, keep in zip(readings, kept, strict=True) if keep.any()]
     shortest, longest = float(min(x.min() for x in lengths)), float(max(x.max() for x in lengths))
     off = _series(waves, np.linspace(shortest, longest, BETWEEN)) - np.nanmean(means[:, :c], axis=0)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command `rangesim`. Heavy modules are imported inside the commands, so that `--help` is quick."""
+"""The command `rangesim`, with one module for each subcommand or group of them.
+
+Modules that take long to import are imported inside the functions of the commands, so that `--help` is quick.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,12 @@ import typer
 from pcgraph.plumbing.plain_files import said
 from rangesim import __version__
 from rangesim.cli.calibrate import calibrate_command
+from rangesim.cli.compare import compare_command
 from rangesim.cli.decode import decode_command
-from rangesim.cli.results import compare_command, report_command, verify_command
+from rangesim.cli.report import report_command
 from rangesim.cli.run import run_command
 from rangesim.cli.scan import scan_command
+from rangesim.cli.verify import verify_command
 from rangesim.environment.doctor import doctor_command
 from rangesim.errors import RangesimError, RangesimWarning, one_line, sentence
 
@@ -55,7 +60,10 @@ def root(
 
 
 def main() -> None:
-    """Run the command line: errors become one sentence on stderr and exit status 1, warnings one sentence each."""
+    """Run the command line.
+
+    An error prints one sentence to stderr and ends the process with status 1. A warning prints one line.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", RangesimWarning)
@@ -68,13 +76,16 @@ def main() -> None:
         sys.exit(1)
 
 
-def _show_warning(others: Callable[..., None]) -> Callable[..., None]:
-    """Prints warnings of our own as a line on stderr, and leaves `others` to whoever showed them before."""
+def _show_warning(show_other: Callable[..., None]) -> Callable[..., None]:
+    """A replacement for `warnings.showwarning` that prints a RangesimWarning as one line on stderr.
+
+    show_other : called for all other warnings.
+    """
 
     def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
         if issubclass(category, RangesimWarning):
             typer.echo(f"rangesim: {one_line(message)}", err=True)
         else:
-            others(message, category, *place)
+            show_other(message, category, *place)
 
     return show

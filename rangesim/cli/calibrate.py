@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rangesim.cli.decode import TOF_SUFFIX, load_frames, structured_light
+from rangesim.cli.decode import TOF_SUFFIX
+from rangesim.cli.images import (
+    ALL_AXES,
+    BitsOption,
+    CodeOption,
+    PeriodOption,
+    ProjectorOption,
+    SensorOption,
+    StepsOption,
+    load_frames,
+    sensor_of_images,
+)
 from rangesim.errors import one_line
 
 if TYPE_CHECKING:
@@ -20,15 +31,18 @@ if TYPE_CHECKING:
     from rangesim.rig import Intrinsics
 
 MAX_BOARD_M = 20.0
-"""Larger boards are taken for millimetres."""
+"""Largest size of a board, metres. A larger one means that its spacing was given in millimetres: 10 corners 25 mm apart
+would make 250 m, and no board for a room is larger than 20 m."""
+
 KINDS = ("checkerboard", "charuco", "circles")
+"""Names of the kinds of boards on the command line."""
 
 
 def calibrate_command(
     captures: Annotated[
         list[Path],
         typer.Argument(
-            help="Two or more, each a capture that rangesim wrote or a folder of images; images, for a camera alone.",
+            help="Two or more captures that rangesim wrote, or folders of images; for a camera alone, images.",
             show_default=False,
         ),
     ],
@@ -44,24 +58,23 @@ def calibrate_command(
     marker: Annotated[
         float | None, typer.Option(help="Metres: a charuco marker's side, or a disc's diameter.", show_default=False)
     ] = None,
-    dictionary: Annotated[str, typer.Option(help="Of charuco markers, OpenCV's name.")] = "DICT_5X5_250",
-    coefficients: Annotated[int, typer.Option(help="Free of k1, k2, p1, p2, k3, in this order.")] = 5,
-    code: Annotated[str, typer.Option(help="Of bare images: gray or gray-phase.")] = "gray",
-    projector: Annotated[
-        str | None, typer.Option(help="Of bare images: projector pixels, for example 1024x768.")
-    ] = None,
-    period: Annotated[float, typer.Option(help="Of gray-phase images: fringe period, projector pixels.")] = 16.0,
-    steps: Annotated[int, typer.Option(help="Of gray-phase images: phase steps per axis.")] = 4,
-    bits: Annotated[
-        int | None, typer.Option(help="Of bare images: depth, if less than the file's, such as 12.")
-    ] = None,
+    dictionary: Annotated[str, typer.Option(help="Dictionary of charuco markers, by OpenCV's name.")] = "DICT_5X5_250",
+    coefficients: Annotated[
+        int, typer.Option(help="Number of free coefficients of distortion, of k1, k2, p1, p2, k3 in this order.")
+    ] = 5,
+    sensor: SensorOption = None,
+    code: CodeOption = None,
+    projector: ProjectorOption = None,
+    period: PeriodOption = None,
+    steps: StepsOption = None,
+    bits: BitsOption = None,
 ) -> None:
-    """Calibrate camera and projector from structured light, columns and rows, on a board in two or more poses.
+    """Calibrate camera and projector from coded light, along columns and rows, on a board in two or more poses.
 
-    Ten to twenty poses all over the image, tilted by 20 to 40 degrees in different directions, make a good one.
+    Ten to twenty poses all over the image, tilted by 20 to 40 degrees in different directions, make a good calibration.
 
-    Of captures by a time-of-flight camera (AMCW) whose lens is known: what its ranges are off by, to a file .npz. The
-    board should stand at twenty distances or more, large in the image.
+    Captures by a modulated time-of-flight camera whose lens is known calibrate the errors of its ranges, to a file
+    .npz. The board should stand at twenty distances or more, large in the image.
 
     Examples:
 
@@ -71,6 +84,8 @@ def calibrate_command(
 
       rangesim calibrate photos/*.jpg --points 9x6 --spacing 0.025 --out camera.yml
 
+      rangesim calibrate pose_*/ --points 9x6 --spacing 0.025 --sensor FILE.py:NAME --projector 1280x800 --out rig.json
+
       rangesim calibrate board_*/ --points 6x5 --spacing 0.12 --out tof.npz
     """
     from pcgraph.plumbing.plain_files import write_file
@@ -79,8 +94,6 @@ def calibrate_command(
     from rangesim.errors import FileFormatError
     from rangesim.report.calibration_page import render_calibration
     from rangesim.rig.calibration_files import save_calibration
-    from rangesim.sensors import AmcwToF
-    from rangesim.sensors.structured_light import WHITE
 
     if out.suffix.lower() not in (".json", TOF_SUFFIX, *SUFFIXES):
         raise ValueError(
@@ -94,9 +107,12 @@ def calibrate_command(
     if any(path.is_file() for path in captures):
         _camera_alone(target, captures, out, coefficients, projector, report)
         return
-    sensor = None if projector is None else structured_light(code, projector, "columns,rows", period, steps)
-    taken = [load_frames(path, sensor, bits) for path in captures]
-    of_tof = any(isinstance(capture.sensor, AmcwToF) for capture in taken)
+    if sensor is not None and code is not None:
+        raise ValueError("expected either --sensor or --code.")
+    axes = ALL_AXES if sensor is None or projector is not None else None
+    taken_with = sensor_of_images(sensor, code, projector, axes, period, steps)
+    taken = [load_frames(path, taken_with, bits) for path in captures]
+    of_tof = any(capture.sensor.emitter.size is None for capture in taken)  # its light shows no pattern
     if of_tof != (out.suffix.lower() == TOF_SUFFIX):
         raise ValueError(
             f"expected --out to end in {TOF_SUFFIX} for captures by time of flight, and for no others, got "
@@ -104,27 +120,37 @@ def calibrate_command(
         )
     if of_tof:
         if report is not None:
-            raise ValueError("expected --report with structured light; there is no page for time of flight yet.")
+            raise ValueError("expected --report for a camera and a projector; there is no page for time of flight yet.")
         _time_of_flight(target, taken, [str(path) for path in captures], out)
         return
     found = calibrate_rig(target, taken, coefficients=coefficients, names=[str(path) for path in captures])
-    check_places(out, report)  # the work took its time
+    check_places(out, report)  # again, because the calibration may take minutes
     (save_calibration if out.suffix.lower() == ".json" else save_opencv)(found.rig, out)
     typer.echo(_table(found, captures))
     if report is not None:
-        page = render_calibration(found, [str(path) for path in captures], [c.frames[WHITE] for c in taken])
+        page = render_calibration(
+            found, [str(path) for path in captures], [c.sensor.white_image(c.frames) for c in taken]
+        )
         write_file(report, page.encode(), FileFormatError, make_parents=True)
         typer.echo(f"{one_line(report)}: written.")
     typer.echo(f"{one_line(out)}: written.")
 
 
 def check_places(out: Path, report: Path | None) -> None:
-    """Refuse what could not be written, or would be lost, before anything is computed.
+    """Refuse places where a file cannot be written or would be lost, before anything is computed.
+
+    Parameters
+    ----------
+    out, report : files to write; report None: none.
 
     Raises
     ------
     FileFormatError
-        A place is a directory, or holds a file that this command did not write, or that somebody changed since.
+        A place is a directory, or holds a file that this command did not write, or that somebody has changed since.
+
+    Examples
+    --------
+    >>> check_places(Path("no_such_folder/rig.json"), None)
     """
     from pcgraph.plumbing.plain_files import is_sealed
     from rangesim.errors import FileFormatError
@@ -151,7 +177,7 @@ def _camera_alone(
     from rangesim.files.image_files import read_grey
 
     if projector is not None or report is not None:
-        raise ValueError("expected folders of images with --projector and --report; images are of a camera alone.")
+        raise ValueError("expected folders of images with --projector and --report; images calibrate a camera alone.")
     if out.suffix.lower() not in SUFFIXES:
         raise ValueError(
             f"expected --out to end in {', '.join(SUFFIXES)} for a camera alone, got {out.name!r}; for camera and "
@@ -203,6 +229,7 @@ def _time_of_flight(board: Board, captures: list[Capture], names: list[str], out
 
 
 def _board(kind: str, points: str, spacing: float, marker: float | None, dictionary: str) -> Board:
+    """The board that the options describe; ValueError if they contradict each other."""
     from rangesim.calibration import CharucoBoard, Checkerboard, CircleGrid
     from rangesim.settings.config import nearest, shown
 
@@ -229,7 +256,7 @@ def _board(kind: str, points: str, spacing: float, marker: float | None, diction
 
 
 def _table(found: RigCalibration, captures: list[Path]) -> str:
-    """What was found, with standard deviations, and the errors of each capture."""
+    """Table of the calibrated values with their standard deviations, and of the errors of each capture."""
     import numpy as np
 
     lines = []
@@ -247,6 +274,7 @@ def _table(found: RigCalibration, captures: list[Path]) -> str:
 
 
 def _device_line(name: str, device: Intrinsics, deviations: np.ndarray) -> str:
+    """Line with the intrinsics of a device and their standard deviations (9,)."""
     values = (device.fx, device.fy, device.cx, device.cy, *device.coefficients)
     labels = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     shown = (f"{a} {v:.6g} ± {d:.2g}" for a, v, d in zip(labels, values, deviations, strict=True))

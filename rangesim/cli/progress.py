@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a command says on stderr before and while it works."""
+"""Lines that a command prints on stderr before and during its work: cost, place of the output, progress, warnings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, float], None] | None]:
-    """A callable that takes the name of the stage and the fraction done, 0..1; None if nobody watches."""
+    """Show a progress bar while the block runs, if stderr is a terminal.
+
+    Yields a callable that takes the name of the stage and the fraction done, 0..1; None if stderr is no terminal.
+    """
     if not sys.stderr.isatty():
         yield None
         return
@@ -40,20 +43,20 @@ def progress_bar() -> Iterator[Callable[[str, float], None] | None]:
 
 
 def announce(cost: Cost) -> None:
-    """Print a line if the work is long or large."""
+    """Print a line with the estimated cost, if the work takes long or needs much memory."""
     if cost.is_large:
         typer.echo(f"rangesim: this takes {cost}.", err=True)
 
 
 def say_where(out: Path, target: Path) -> None:
-    """Print a line if the output is reached by a link, and so lies elsewhere than its name says."""
+    """Print a line if `out` is a link to another directory, `target`, where the results go."""
     if out.is_symlink():
         typer.echo(f"rangesim: {one_line(out)} is a link; the results go to {one_line(target)}.", err=True)
 
 
 @contextmanager
 def light_left_out_in_a_line() -> Iterator[None]:
-    """Afterwards print a line if passes left out light: the warning of the one that left out most."""
+    """Print one truncation warning after the block: that of the pass that left out the most light."""
     left_out: list[TruncationWarning] = []
     show_others: Callable[..., None] = warnings.showwarning
 

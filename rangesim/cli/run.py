@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rangesim run`: a whole experiment."""
+"""The command `rangesim run`, which carries out an experiment and writes its results."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def run_command(
         Path | None,
         typer.Argument(
             help="Mitsuba 3 scene (.xml) or mesh (.ply, .obj, .glb, .stl, .off), in metres, or the name of a scene "
-            f"that comes with rangesim: {', '.join(scene_names())}."
+            f"that rangesim contains: {', '.join(scene_names())}."
         ),
     ] = None,
     out: Annotated[
@@ -39,47 +39,57 @@ def run_command(
         typer.Option(
             "--sensor",
             "-s",
-            help="gray, gray-phase, amcw, direct-tof or ideal-tof, or FILE.py:NAME for one of your own; "
-            "repeat for more. (default: gray-phase, amcw, ideal-tof)",
+            help="gray, gray-phase, amcw, direct-tof, ideal-tof, or FILE.py:NAME for a sensor of your own. Repeat the "
+            "option for several sensors. (default: gray-phase, amcw, ideal-tof)",
             show_default=False,
         ),
     ] = None,
     spp: Annotated[
-        int | None, typer.Option(help="Light paths per pixel. (default: 8, more where the detector needs it)")
+        int | None,
+        typer.Option(help="Light paths per pixel. (default: 8, and up to --max-spp where readings need more)"),
     ] = None,
-    max_spp: Annotated[int | None, typer.Option(help="At most so many where --spp is not given. (default: 64)")] = None,
+    max_spp: Annotated[
+        int | None, typer.Option(help="Largest number of light paths per pixel without --spp. (default: 64)")
+    ] = None,
     width: Annotated[int | None, typer.Option(help="Camera width, pixels. (default: the scene's)")] = None,
     height: Annotated[int | None, typer.Option(help="Camera height, pixels. (default: the scene's)")] = None,
     max_depth: Annotated[
         int | None,
         typer.Option(
-            help="Segments of a light path between surfaces that scatter it; glass and mirrors do not count; "
-            "2 is direct light alone. (default: 5)"
+            help="Largest number of segments of a light path between surfaces that scatter it. Glass and mirrors do "
+            "not count. 2 means direct light only. (default: 5)"
         ),
     ] = None,
     photons: Annotated[
         int | None,
-        typer.Option(help="Photons for light through glass and off mirrors; 0 for none. (default: 500000)"),
+        typer.Option(
+            help="Number of photons for the projector's light through glass and off mirrors. 0 leaves this light out. "
+            "(default: 500000)"
+        ),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="The same seed gives the same bytes. (default: 0)")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of the random numbers. The same seed gives the same bytes. (default: 0)")
+    ] = None,
     baseline: Annotated[
         float | None,
         typer.Option(
-            help="Metres from camera to emitter, of every sensor. "
-            "(default: structured light a fifth of the working distance, time of flight 0.03)"
+            help="Distance from camera to emitter in metres, for every sensor. "
+            "(default: a fifth of the working distance for structured light, 0.03 for time of flight)"
         ),
     ] = None,
     material: Annotated[
-        str | None, typer.Option(help="Of a bare mesh: matte, glossy, mirror, transparent. (default: matte)")
+        str | None,
+        typer.Option(help="Material of a bare mesh: matte, glossy, mirror or transparent. (default: matte)"),
     ] = None,
     unit_m: Annotated[
-        float | None, typer.Option(help="Metres per unit of a bare mesh: 0.001 if it is in millimetres. (default: 1)")
+        float | None,
+        typer.Option(help="Metres per unit of a bare mesh: 0.001 if it is in millimetres. (default: 1)"),
     ] = None,
     noise_free: Annotated[
-        bool, typer.Option("--noise-free", help="Ideal electronics: no noise, no quantisation.")
+        bool, typer.Option("--noise-free", help="Simulate ideal electronics, without noise and quantisation.")
     ] = False,
     estimate: Annotated[
-        bool, typer.Option("--estimate", help="Print what the run will cost, and end; nothing is written.")
+        bool, typer.Option("--estimate", help="Print the estimated cost of the run and end. Nothing is written.")
     ] = False,
 ) -> None:
     """Measure a scene with several sensors, and write captures, clouds, segments and report.html.
@@ -128,22 +138,23 @@ def run_command(
 
 
 def _say_what_measured_nothing(result: Result) -> None:
-    """A line on stderr for the instruments that have not a single point, of each cause that most of their pixels have.
+    """Print a line on stderr for the instruments that have no point at all.
 
-    Where that is too little light or a distance that cannot be read, the scene most often is not in metres: the suffix
-    of its file tells how to bring it to metres.
+    Instruments whose pixels fail by the same most frequent cause share a line. Where this cause is low signal or a
+    distance that the sensor cannot read, the scene is most often not in metres, so the line says how to scale it.
     """
     from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
     from rangesim.scene.mesh import MESH_SUFFIXES
     from rangesim.signals import ALL
 
-    of_distance = (Cause.LOW_SIGNAL, Cause.RANGE_AMBIGUITY, Cause.RESOLUTION)
-    blind: dict[Cause, list[str]] = {}
+    causes_of_wrong_scale = (Cause.LOW_SIGNAL, Cause.RANGE_AMBIGUITY, Cause.RESOLUTION)
+    blind: dict[Cause, list[str]] = {}  # names by cause; Cause.NONE stands for a wrong scale
     for measurement in result.measurements:
         if not measurement.metadata.points:
             fractions = next(row["causes"] for row in measurement.rows if row["material"] == ALL)
             cause = Cause[max(fractions, key=fractions.get).upper()] if fractions else Cause.NONE
-            blind.setdefault(Cause.NONE if cause in of_distance else cause, []).append(measurement.name)
+            is_wrong_scale = cause in causes_of_wrong_scale
+            blind.setdefault(Cause.NONE if is_wrong_scale else cause, []).append(measurement.name)
     for cause, names in blind.items():
         start = f"rangesim: {one_line(', '.join(names))} measured no pixel at all"
         if cause:
@@ -151,17 +162,18 @@ def _say_what_measured_nothing(result: Result) -> None:
             continue
         is_mesh = Path(result.experiment.scene).suffix.lower() in MESH_SUFFIXES
         advice = (
-            "a mesh in millimetres needs --unit-m 0.001" if is_mesh else "scale the scene's shapes and camera to them"
+            "a mesh in millimetres needs --unit-m 0.001" if is_mesh else "scale the scene's shapes and camera to metres"
         )
         typer.echo(
             f"{start}, at a working distance of {result.info.scene.working_distance_m:g} m; coordinates are metres "
-            f"({advice}); in the dark, --spp or power helps.",
+            f"({advice}). If the scene is dark, a larger --spp or power_w helps.",
             err=True,
         )
 
 
 def _instruments(sensors: list[str]) -> tuple[Instrument, ...]:
-    """An instrument for each sensor; those of files are called by their NAME there where their types are the same."""
+    """One instrument per sensor. Sensors from files that have the same `type_name` are named by the NAME of their class
+    or object instead, because the names of instruments must differ."""
     from rangesim.instrument.instrument import instrument
     from rangesim.sensors import is_file_name
 
@@ -176,7 +188,7 @@ def _instruments(sensors: list[str]) -> tuple[Instrument, ...]:
 def _experiment(
     scene: Path | None, config: Path | None, settings: dict[str, Any], sensors: list[str] | None
 ) -> Experiment:
-    """The experiment of a file or of a scene, with what the command line sets itself."""
+    """The experiment of an experiment file or of a scene, with the options of the command line in place of its own."""
     from rangesim.experiment import Experiment, load_experiment
 
     if config is None and scene is None:

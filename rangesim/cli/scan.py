@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rangesim scan`: many views to one surface."""
+"""The command `rangesim scan`, which takes many views of a scene and fuses them to one surface."""
 
 from __future__ import annotations
 
@@ -18,12 +18,16 @@ if TYPE_CHECKING:
     from rangesim.results.scan_files import ScanResult
 
 PATHS = ("turntable", "dome", "hand-held")
+"""Names of the camera paths that need no file of poses."""
 
 
 def scan_command(
     scene: Annotated[
         Path | None,
-        typer.Argument(help="Scene (.xml), mesh, or name of a scene, as for `rangesim run`.", show_default=False),
+        typer.Argument(
+            help="Scene (.xml), mesh, or name of a scene that rangesim contains, as for `rangesim run`.",
+            show_default=False,
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -35,34 +39,48 @@ def scan_command(
     path: Annotated[
         str | None,
         typer.Option(
-            help=f"{', '.join(PATHS)}, or a .json file with poses T_world_camera (n, 4, 4). (default: turntable)"
+            help=f"Camera path: {', '.join(PATHS)}, or a .json file with poses T_world_camera (n, 4, 4). "
+            "(default: turntable)"
         ),
     ] = None,
-    views: Annotated[int | None, typer.Option(help="Number of views. (default: 12; dome, hand-held: 24)")] = None,
+    views: Annotated[
+        int | None, typer.Option(help="Number of views. (default: 12 for turntable, 24 for dome and hand-held)")
+    ] = None,
     sensor: Annotated[
         list[str] | None,
-        typer.Option("--sensor", "-s", help="As for `rangesim run`, but one alone. (default: gray-phase)"),
+        typer.Option("--sensor", "-s", help="One sensor, named as for `rangesim run`. (default: gray-phase)"),
     ] = None,
     voxel: Annotated[
-        float | None, typer.Option(help="Metres, edge of a voxel. (default: 1.5 times the distance between readings)")
+        float | None,
+        typer.Option(help="Edge of a voxel in metres. (default: 1.5 times the distance between readings)"),
     ] = None,
     unknown_poses: Annotated[
-        bool, typer.Option("--unknown-poses", help="Find the poses from the readings instead of taking the path's.")
+        bool, typer.Option("--unknown-poses", help="Find the poses from the readings and ignore those of the path.")
     ] = False,
-    uniform: Annotated[bool, typer.Option("--uniform", help="All readings weigh the same.")] = False,
-    spp: Annotated[int | None, typer.Option(help="Light paths per pixel. (default: by the surface)")] = None,
+    uniform: Annotated[
+        bool, typer.Option("--uniform", help="Give all readings the same weight. (default: by their confidence)")
+    ] = False,
+    spp: Annotated[
+        int | None, typer.Option(help="Light paths per pixel. (default: 8, and up to 64 where readings need more)")
+    ] = None,
     width: Annotated[int | None, typer.Option(help="Camera width, pixels. (default: the scene's)")] = None,
     height: Annotated[int | None, typer.Option(help="Camera height, pixels. (default: the scene's)")] = None,
-    seed: Annotated[int | None, typer.Option(help="The same seed gives the same bytes. (default: 0)")] = None,
-    material: Annotated[
-        str | None, typer.Option(help="Of a bare mesh: matte, glossy, mirror, transparent. (default: matte)")
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of the random numbers. The same seed gives the same bytes. (default: 0)")
     ] = None,
-    unit_m: Annotated[float | None, typer.Option(help="Metres per unit of a bare mesh. (default: 1)")] = None,
+    material: Annotated[
+        str | None,
+        typer.Option(help="Material of a bare mesh: matte, glossy, mirror or transparent. (default: matte)"),
+    ] = None,
+    unit_m: Annotated[
+        float | None,
+        typer.Option(help="Metres per unit of a bare mesh: 0.001 if it is in millimetres. (default: 1)"),
+    ] = None,
     estimate: Annotated[
-        bool, typer.Option("--estimate", help="Print what the scan will cost, and end; nothing is written.")
+        bool, typer.Option("--estimate", help="Print the estimated cost of the scan and end. Nothing is written.")
     ] = False,
 ) -> None:
-    """Scan a scene from many sides and fuse the views: mesh.ply, poses, range images, statistics and report.html.
+    """Scan a scene from many sides, fuse the views, and write mesh.ply, poses, range images and report.html.
 
     Examples:
 
@@ -81,7 +99,7 @@ def scan_command(
     given: dict[str, Any] = {"spp": spp, "width": width, "height": height, "seed": seed, "voxel_m": voxel}
     given |= {"material": material, "unit_m": unit_m}
     if sensor and len(sensor) > 1:
-        raise ValueError(f"expected one --sensor, got {', '.join(sensor)}; scan once for each.")
+        raise ValueError(f"expected one --sensor, got {', '.join(sensor)}; run one scan for each.")
     settings = _settings(
         scene, config, {k: v for k, v in given.items() if v is not None}, sensor[0] if sensor else None
     )
@@ -105,6 +123,7 @@ def scan_command(
 
 
 def _settings(scene: Path | None, config: Path | None, given: dict[str, Any], sensor: str | None) -> ScanSettings:
+    """The scan of a file of settings or of a scene, with the options of the command line in place of its own."""
     from rangesim.experiment.scan_settings import ScanSettings, load_scan_settings
     from rangesim.instrument.instrument import instrument
 
@@ -120,7 +139,11 @@ def _settings(scene: Path | None, config: Path | None, given: dict[str, Any], se
 
 
 def _path(before: CameraPath, name: str | None, views: int | None) -> CameraPath:
-    """The path of a name, or the one there is, with another number of views."""
+    """The camera path that the options ask for.
+
+    before : the path of the settings. name : of a path, or a .json file of poses; None: the path of the settings.
+    views : number of views; None: as the path says.
+    """
     from rangesim.experiment.camera_paths import CameraPath, PoseList
     from rangesim.files.text_files import read_json
     from rangesim.settings.config import nearest, shown
@@ -148,7 +171,7 @@ def _path(before: CameraPath, name: str | None, views: int | None) -> CameraPath
 
 
 def _table(result: ScanResult) -> str:
-    """Errors of the shapes, and of poses that were found."""
+    """Text table with the errors of each shape, and a line with the errors of the poses that were found."""
     lines = [f"{'shape':20s}{'material':14s}{'accuracy':>10s}{'complete':>10s}{'seen':>8s}"]
     for name in result.things:
         shape = result.shapes[name]
@@ -162,5 +185,5 @@ def _table(result: ScanResult) -> str:
         lines.append(f"no view measured any of these: {NOTHING_SEEN}")
     if result.poses is not None:
         angle, centre = result.poses.angle_deg.max(), 1e3 * result.poses.centre_m.max()
-        lines.append(f"poses found: off by at most {angle:.3f} degrees, camera centres {centre:.3f} mm")
+        lines.append(f"largest error of the poses found: {angle:.3f} degrees, camera centre {centre:.3f} mm")
     return "\n".join(lines)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Captures to range images. No decoder needs the scene or the renderer."""
+"""Decoding: captures to coordinates, and to range images. No decoder needs the scene or the renderer.
+
+The decoders are in `rangesim.sensors`; here are the steps that they are made of. docs/decoding.md
+"""
 
 from __future__ import annotations
 
@@ -18,12 +21,22 @@ def decode(capture: Capture, decoder: Decoder | None = None) -> RangeImage:
 
     Parameters
     ----------
+    capture : Capture, simulated or real.
     decoder : Decoder; None: the one its sensor comes with, with the default thresholds.
 
     Raises
     ------
     ValueError
-        Not a capture, one of a sensor that the decoder does not know, or the decoder returned no range image of it.
+        The argument is no capture, or one of a sensor that the decoder does not know; or the decoder returned something
+        other than a range image of it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.sensors import IdealToF
+    >>> frames = np.array([[[0.5, 0.0]], [[1.5, 0.0]]], dtype=np.float32)  # 0.5 W/m2/sr after 3 m, and darkness
+    >>> decode(Capture(frames, IdealToF())).range_m
+    array([[1.5, nan]], dtype=float32)
     """
     if not isinstance(capture, Capture):
         raise ValueError(f"expected a Capture, as expose, load_capture or import_capture return, got {capture!r}.")

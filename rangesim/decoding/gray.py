@@ -1,34 +1,79 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gray code with inverse patterns: frames to projector coordinates."""
+"""Gray code with inverse patterns: frames to projector coordinates, and checks of what is read as Gray code."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from functools import partial
 
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
+from rangesim.decoding.axis_code import MIN_PIXELS, AxisCode, AxisFrames, Contrast, evenly_spread
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
-from rangesim.settings.bounds import Bounds, check_fields
+from rangesim.sensor import Threshold
+from rangesim.settings.bounds import check_fields
 
-Threshold = Annotated[float, Bounds("0 or positive", 0, 1e6)]
+CELL_SIGMA = 12**-0.5
+"""Standard deviation of a place that is known to lie in a cell, in cells: that of an even distribution."""
+
+MAX_UNPAIRED_FRACTION = 0.2
+"""Largest fraction of the pixels at which a pattern and its inverse may miss white + black. Of two patterns that are no
+pair, half of the pixels do."""
+
+MIN_UNPAIRED = 0.75
+"""Least distance by which a pattern and its inverse miss white + black, as a fraction of white - black. Where both are
+lit or both are dark they miss it by 1; a gamma brings them to 0.56 at most."""
+
+MAX_PAIRS = 50_000
+"""Largest number of pairs of neighbouring pixels, across and down each, that every other order of the frames is tried
+on. It bounds the time, which grows with the number of orders."""
+
+MIN_STEPS = 100
+"""Least number of pairs of neighbouring pixels in different cells on which a check of their order concludes
+anything."""
+
+MAX_FARTHER_OCTAVES = 0.3
+"""Largest mean distance by which neighbours may lie farther apart when read as Gray code than when read as plain binary
+numbers, in powers of two. Plain binary read as Gray code has about 1."""
+
+MAX_NEARER_FRACTION = 0.8
+"""Largest fraction of neighbours that another order of the frames may bring nearer to each other, of those that it
+brings to half or twice their distance. If that order is the right one, it brings nearly all nearer."""
+
+MIN_REPEATED_FRACTION = 0.9
+"""Least fraction of the changes of one bit, from pixel to pixel, that another bit has too if both are the same frame.
+In Gray code that is seen sharply, no two bits change together."""
+
+MIN_ALONE_FRACTION = 0.3
+"""Least fraction of these changes at which no third bit changes, if both bits are the same frame. At a step of the
+scene other bits change too."""
 
 
 @dataclass(frozen=True)
 class GrayThresholds:
     """Least differences of frames that count.
 
-    Where the detector is known, they are multiples of the noise; in digital captures of an unknown one, fractions of
-    full scale, as OpenCV's; in noise-free captures, fractions of brightness.
+    Where the detector is known, they are multiples of the noise; in digital captures of an unknown detector, fractions
+    of full scale, as OpenCV's; in noise-free captures, fractions of brightness.
 
-    contrast_sigmas, bit_sigmas : of white - black and of pattern - inverse, in standard deviations of the difference.
-    contrast_of_scale, bit_of_scale : the same as fractions of full scale, for digital captures of unknown detectors.
-    relative_contrast : white - black of noise-free captures, as a fraction of that of the bright pixels.
-    relative_bit : pattern - inverse as a fraction of the pixel's white - black, unless the detector is unknown: pixels
-        in shadow that see the patterns by interreflection alone show fine stripes fainter than that, at whatever
-        exposure.
+    Parameters
+    ----------
+    contrast_sigmas, bit_sigmas : float, least white - black and least pattern - inverse, in standard deviations of the
+        difference.
+    contrast_of_scale, bit_of_scale : float, the same as fractions of full scale, for digital captures of unknown
+        detectors.
+    relative_contrast : float, least white - black of noise-free captures, as a fraction of that of the bright pixels.
+    relative_bit : float, least pattern - inverse as a fraction of the pixel's white - black, unless the detector is
+        unknown. Pixels in shadow that see the patterns by interreflection alone show fine stripes fainter than that, at
+        whatever exposure.
+
+    Examples
+    --------
+    >>> GrayThresholds(contrast_sigmas=8.0).contrast_sigmas
+    8.0
     """
 
     contrast_sigmas: Threshold = 5.0
@@ -42,64 +87,37 @@ class GrayThresholds:
         check_fields(self)
 
 
-class Contrast(NamedTuple):
-    """values : (h, w) float32, white - black in the capture's units. is_enough : (h, w) bool."""
-
-    values: np.ndarray
-    is_enough: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class GrayCode:
-    """Decoded Gray code along one axis.
-
-    coordinate : (h, w) float32, projector pixels: centre of the cell, or its edge where the camera pixel lies
-        on it.
-    status : (h, w) uint8, `Status`.
-    cell_px : int, size of a cell, projector pixels (1, or coarser where a phase follows).
-    """
-
-    coordinate: np.ndarray
-    status: np.ndarray
-    cell_px: int
-
-
 def direct_contrast(capture: Capture, white: np.ndarray, black: np.ndarray, thresholds: GrayThresholds) -> Contrast:
-    """White - black of frames (h, w) of a capture, and where it is enough to decode."""
-    white, black = white.astype(np.float32), black.astype(np.float32)
-    contrast = white - black
-    noise = _difference_noise(capture, white, black)
+    """Contrast of the white and the black frame (h, w) of a capture."""
+    bright, dark = white.astype(np.float32), black.astype(np.float32)
+    contrast = bright - dark
+    noise = _difference_noise(capture, bright, dark)
     if noise is not None:
         least: np.ndarray | float = thresholds.contrast_sigmas * noise
     elif capture.is_digital:
         least = thresholds.contrast_of_scale * capture.full_scale
     else:
         least = thresholds.relative_contrast * bright_level(contrast)
-    return Contrast(contrast, np.asarray(contrast > least))
+    return Contrast(white, black, contrast, np.asarray(contrast > least))
 
 
-def decode_gray(
-    capture: Capture, frames: np.ndarray, shift: int, size: int, contrast: Contrast, thresholds: GrayThresholds
-) -> GrayCode:
+def decode_gray(seen: AxisFrames, shift: int, size: int, thresholds: GrayThresholds) -> AxisCode:
     """Projector coordinate of each pixel from Gray bits.
 
-    A bit is the sign of pattern - inverse; it is uncertain where the difference drowns in noise. One
-    uncertain bit is what a pixel on a stripe edge shows, and does no harm if flipping it leads to a
-    neighbouring cell: then the edge between the two is returned. Anything else is refused.
+    A bit is the sign of pattern - inverse; it is uncertain where the difference drowns in noise. A pixel on the edge of
+    a stripe has one uncertain bit, which does no harm if flipping it leads to a neighbouring cell: then the edge
+    between the two is returned. Anything else is refused.
 
     Parameters
     ----------
-    frames : (2 b, h, w), pattern and inverse by turns, most significant bit first.
-    shift : int, finest bits left out. size : int, projector pixels along the axis.
-    contrast : of the same capture.
+    seen : frames (2 b, h, w), each pattern followed by its inverse, most significant bit first.
+    shift : int, number of the finest bits that are left out. size : int, projector pixels along the axis.
     """
-    cell = 1 << shift
-    coordinate, status = (
-        np.empty(contrast.values.shape, dtype=np.float32),
-        np.zeros(contrast.values.shape, dtype=np.uint8),
-    )
+    capture, contrast, cell = seen.capture, seen.contrast, 1 << shift
+    coordinate = np.empty(contrast.values.shape, dtype=np.float32)
+    status = np.zeros(contrast.values.shape, dtype=np.uint8)
     for rows in bands(len(status)):
-        code, uncertain = _classify(capture, frames[:, rows], contrast.values[rows], thresholds)
+        code, uncertain = _classify(capture, seen.frames[:, rows], contrast.values[rows], thresholds)
         low, high = binary_of_gray(code), binary_of_gray(code ^ uncertain)
         on_edge = (uncertain & (uncertain - 1) == 0) & (np.abs(low - high) <= 1)
         coordinate[rows] = (0.5 * (low + high) + 0.5) * cell
@@ -107,7 +125,8 @@ def decode_gray(
         failed = ~contrast.is_enough[rows] | ~on_edge
         status[rows][failed] = Status.LOW_SIGNAL
         status[rows][failed & capture.saturated(capture.frames[:, rows])] = Status.SATURATED
-    return GrayCode(coordinate, status, cell)
+    sigma_px = np.broadcast_to(np.float32(CELL_SIGMA * cell), status.shape)
+    return AxisCode(coordinate, status, cell, sigma_px)
 
 
 def _classify(
@@ -128,6 +147,7 @@ def _classify(
 def _least_bit(
     capture: Capture, pattern: np.ndarray, inverse: np.ndarray, contrast: np.ndarray, thresholds: GrayThresholds
 ) -> np.ndarray | float:
+    """Least |pattern - inverse| of a certain bit, in the capture's units."""
     noise = _difference_noise(capture, pattern, inverse)
     if noise is not None:
         return np.maximum(thresholds.bit_sigmas * noise, thresholds.relative_bit * contrast)
@@ -137,13 +157,218 @@ def _least_bit(
 
 
 def _difference_noise(capture: Capture, a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
+    """(h, w) standard deviation of a - b; None if the detector is unknown or the capture is noise-free."""
     noise_a, noise_b = capture.noise(a), capture.noise(b)
     return None if noise_a is None or noise_b is None else np.sqrt(noise_a**2 + noise_b**2)
 
 
 def binary_of_gray(gray: np.ndarray) -> np.ndarray:
-    """Number whose Gray code is `gray` (up to 32 bits): the running exclusive or of its bits from the top."""
+    """Numbers whose Gray codes are `gray` (integers of up to 32 bits): the running exclusive or from the top bit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> binary_of_gray(np.array([0b000, 0b001, 0b011, 0b010, 0b110]))
+    array([0, 1, 2, 3, 4])
+    """
     result = gray.copy()
     for step in (16, 8, 4, 2, 1):
         result ^= result >> step
     return result
+
+
+# ---- Frames that contradict Gray code --------------------------------------------------------------------------------
+
+
+def pair_contradiction(seen: AxisFrames) -> str | None:
+    """A sentence if patterns and inverses do not add up to white + black; None if they do.
+
+    A pair adds up at any blur and any interreflection, for light adds up. Two frames that are no pair do so at half of
+    the pixels.
+
+    Parameters
+    ----------
+    seen : frames (2 b, h, w), each pattern followed by its inverse.
+    """
+    contrast = seen.contrast
+    white, black, values = contrast.white.ravel(), contrast.black.ravel(), contrast.values.ravel()
+    usable = contrast.is_enough & ~seen.capture.saturated(contrast.white[None])
+    used = evenly_spread(np.flatnonzero(usable))
+    if len(used) < MIN_PIXELS:
+        return None
+    used = used[values[used] >= np.median(values[used])]
+    total = white[used].astype(np.float64) + black[used]
+    fractions = []
+    for k in range(0, len(seen.frames), 2):
+        pattern, inverse = (seen.frames[i].ravel()[used].astype(np.float64) for i in (k, k + 1))
+        fractions.append(float((np.abs(pattern + inverse - total) > MIN_UNPAIRED * values[used]).mean()))
+    unpaired = [k for k, fraction in enumerate(fractions) if fraction > MAX_UNPAIRED_FRACTION]
+    if not unpaired:
+        return None
+    worst = max(unpaired, key=fractions.__getitem__)
+    pattern_name, inverse_name = seen.names[2 * worst : 2 * worst + 2]
+    return (
+        f"{len(unpaired)} of {len(fractions)} pairs of pattern and inverse along {seen.axis} contradict white and "
+        f"black: frames {pattern_name} and {inverse_name} do not add up to them at {100 * fractions[worst]:.0f} % "
+        "of the pixels: check the order of the frames, that none is missing or there twice, and that all have one "
+        "exposure."
+    )
+
+
+def binary_contradiction(seen: AxisFrames, gray: AxisCode) -> str | None:
+    """A sentence if the patterns look like plain binary numbers; None if they look like Gray code.
+
+    Neighbouring pixels see neighbouring cells. Plain binary numbers that are read as Gray code lie farther apart. Gray
+    code whose frames are in another order may lie farther apart too, but it lies nearest when read in that order: then
+    the result is None.
+
+    Parameters
+    ----------
+    seen : frames (2 b, h, w), each pattern followed by its inverse, most significant bit first. gray : their code.
+    """
+    cell = gray.coordinate / gray.cell_px
+    usable = (cell % 1 == 0.5) & (gray.status == Status.OK)
+    number = np.where(usable, cell, 0).astype(np.int64)
+    plain = number ^ (number >> 1)  # the bits as shown
+    pairs = []
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        both = usable[here] & usable[there] & (number[here] != number[there])
+        pairs.append(np.stack([plain[here][both], plain[there][both]]))
+    words = np.concatenate(pairs, axis=1)
+    as_gray, as_binary = np.log2(_apart(words, 0)), np.log2(np.abs(words[1] - words[0]))
+    if len(as_gray) < MIN_STEPS or as_gray.mean() < as_binary.mean() + MAX_FARTHER_OCTAVES:
+        return None
+    few = words[:, :: 1 + words.shape[1] // MAX_PAIRS]
+    orders = [np.log2(_apart(reorder(few), 0)).mean() for _, reorder in _other_orders(seen.names[-2::-2])]
+    if min(orders) < np.log2(np.abs(few[1] - few[0])).mean():
+        return None
+    return (
+        f"the bits along {seen.axis} contradict Gray code: read as plain binary numbers neighbouring pixels lie "
+        f"{2 ** as_binary.mean():.1f} cells apart, as Gray code {2 ** as_gray.mean():.1f}: check which code was shown."
+    )
+
+
+def order_contradiction(seen: AxisFrames, gray: AxisCode) -> str | None:
+    """A sentence if the bits of the Gray code seem to be in another order, inverted or repeated; None if not.
+
+    Neighbouring pixels see neighbouring cells. Other orders are tried; where one brings nearly all neighbours that it
+    moves nearer to each other, the frames were in that order.
+
+    Parameters
+    ----------
+    seen : frames (2 b, h, w), each pattern followed by its inverse, most significant bit first. gray : their code.
+    """
+    number = np.floor(gray.coordinate / gray.cell_px).astype(np.int64)
+    usable = ((gray.coordinate / gray.cell_px) % 1 == 0.5) & (gray.status != Status.LOW_SIGNAL)
+    usable &= gray.status != Status.SATURATED
+    word = number ^ (number >> 1)  # the bits as shown
+    pairs = []
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        both = usable[here] & usable[there]
+        pairs.append(np.stack([word[here][both], word[there][both]]))
+    bits = seen.names[-2::-2]  # least significant first
+    few = [words[:, :: 1 + words.shape[1] // MAX_PAIRS] for words in pairs]
+    across = max(few, key=lambda words: np.count_nonzero(words[0] != words[1]))
+    step = _coarse_step(across, len(bits))
+    # This looks at all pairs, because the coarsest bits change at a line or two of the image.
+    text = None if step is None else _repeated_bit(_that_differ(pairs) >> step, bits[step:])
+    text = text or _better_order(across, _that_differ(few), bits)
+    if text is None:
+        return None
+    return f"the bits along {seen.axis} contradict Gray code, where neighbouring pixels see neighbouring cells: {text}."
+
+
+def _that_differ(pairs: list[np.ndarray]) -> np.ndarray:
+    """(2, m) words of all pairs (2, n) whose two words differ."""
+    words = np.concatenate(pairs, axis=1)
+    return np.asarray(words[:, words[0] != words[1]])
+
+
+def _better_order(across: np.ndarray, words: np.ndarray, bits: list[str]) -> str | None:
+    """The fault of the frames whose removal brings neighbours nearest together; None if none brings them nearer.
+
+    Parameters
+    ----------
+    across : (2, n) int, Gray words of neighbours in the direction in which the code changes more.
+    words : (2, m) int, Gray words of the neighbours in both directions whose words differ.
+    bits : (b,) names of the patterns, least significant first.
+    """
+    best, text = 0.0, None
+    for fault, reorder in _other_orders(bits):
+        step = _coarse_step(reorder(across), len(bits))
+        if step is None:
+            continue
+        octaves = np.log2(np.maximum(_apart(words, step), 0.5) / np.maximum(_apart(reorder(words), step), 0.5))
+        moved, nearer, gain = np.abs(octaves) >= 1, octaves >= 1, float(octaves.sum())
+        if moved.sum() >= MIN_STEPS and nearer.sum() > MAX_NEARER_FRACTION * moved.sum() and gain > best:
+            best, text = gain, fault
+    return text
+
+
+def _coarse_step(words: np.ndarray, n_bits: int) -> int | None:
+    """Least number of finest bits to leave out so that half of the neighbours with Gray words (2, n) see one cell.
+
+    Bits that are finer than the camera's pixels do not tell neighbours. None if less than three bits would be left.
+    """
+    first, second = binary_of_gray(words)
+    for step in range(n_bits - 2):
+        if np.count_nonzero(first >> step == second >> step) >= 0.5 * len(first):
+            return step
+    return None
+
+
+def _apart(words: np.ndarray, step: int) -> np.ndarray:
+    """(n,) int, distance of the neighbours with Gray words (2, n), in cells as large as 2^step of the finest ones."""
+    first, second = binary_of_gray(words)
+    return np.asarray(np.abs((second >> step) - (first >> step)))
+
+
+def _other_orders(bits: list[str]) -> Iterator[tuple[str, Callable[[np.ndarray], np.ndarray]]]:
+    """Faults that the order of the frames may have, each with the function that corrects Gray words for it.
+
+    Parameters
+    ----------
+    bits : (b,) names of the patterns, least significant first.
+    """
+    n = len(bits)
+    yield "every inverse seems to stand before its pattern", partial(np.bitwise_xor, (1 << n) - 1)
+    yield "the least significant bit seems to come first", partial(_reversed, n)
+    for i in range(n):
+        yield f"frame {bits[i]} and its inverse seem to be exchanged", partial(np.bitwise_xor, 1 << i)
+        for j in range(i):
+            both = f"frames {bits[i]} and {bits[j]}, each with its inverse,"
+            yield f"{both} seem to be exchanged", partial(_exchanged, i, j)
+
+
+def _reversed(n_bits: int, words: np.ndarray) -> np.ndarray:
+    """Words of `n_bits` bits, with the bits in reverse order."""
+    result = np.zeros_like(words)
+    for k in range(n_bits):
+        result |= ((words >> k) & 1) << (n_bits - 1 - k)
+    return result
+
+
+def _exchanged(i: int, j: int, words: np.ndarray) -> np.ndarray:
+    """Words with bits i and j exchanged."""
+    differ = ((words >> i) ^ (words >> j)) & 1
+    return np.asarray(words ^ (differ << i) ^ (differ << j))
+
+
+def _repeated_bit(words: np.ndarray, bits: list[str]) -> str | None:
+    """A clause that names two bits which always change together; None if no two do.
+
+    Parameters
+    ----------
+    words : (2, m) int, Gray words of neighbours that differ. bits : (b,) names of the patterns, least significant
+        first."""
+    changed = words[0] ^ words[1]
+    counts = [int(np.count_nonzero(changed & (1 << i))) for i in range(len(bits))]
+    for i in range(len(bits)):
+        for j in range(i):
+            two = (1 << i) | (1 << j)
+            both = int(np.count_nonzero((changed & two) == two))
+            if both < MIN_STEPS or both < MIN_REPEATED_FRACTION * max(counts[i], counts[j]):
+                continue
+            if np.count_nonzero(changed == two) > MIN_ALONE_FRACTION * both:
+                return f"frames {bits[i]} and {bits[j]} seem to be one pattern shown twice"
+    return None

@@ -1,23 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photon histograms: the peak, and what pile-up hides."""
+"""Photon histograms: the place of the peak with its standard deviation, and the correction of pile-up."""
 
 from __future__ import annotations
 
 import numpy as np
 
 MIN_PULSES_LEFT = 10
-"""Least number of pulses that have met no photon by the end of a peak's window; with fewer, Coates' estimate is off."""
+"""Least number of pulses that have met no photon by the end of a peak's window. With m left, a bin that Coates' formula
+corrects is too large by 1 / (2 m) on average, so by 5 % here, and its noise grows as 1 / sqrt(m)."""
 
 
 def find_peak(
     histogram: np.ndarray, sigma_bins: float, is_cyclic: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Strongest peak of histograms (k, n): its place, its height and the background under it, each (n,).
+    """Place, height and background of the strongest peak of each histogram, each (n,) float64.
 
-    Place in bins from the start of the first bin (the centre of bin b is b + 0.5); height is the sum over the
-    peak's window less the background, background the sum under that window. `is_cyclic`: a window goes on at the
-    other end. Of a peak that the first or the last bin cuts off, place is that of the whole Gaussian, which may lie
-    outside of the histogram.
+    The place is in bins from the start of the first bin (the centre of bin b is b + 0.5). The background is the sum of
+    the counts under the window of the peak that do not belong to it, the height is the sum of the others. If the first
+    or the last bin cuts the peak off, the place is that of the whole Gaussian, which may lie outside the histogram.
+
+    Parameters
+    ----------
+    histogram : (k, n) float32 or float64, counts, one histogram per column.
+    sigma_bins : float, bins, standard deviation of the pulse.
+    is_cyclic : whether a window goes on at the other end.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> counts = np.ones((12, 1))
+    >>> counts[4:7, 0] = 2.0, 9.0, 2.0
+    >>> [float(x[0]) for x in find_peak(counts, sigma_bins=0.0)]  # the centre of bin 5, and what is above 1 per bin
+    [5.5, 10.0, 3.0]
     """
     from rangesim.decoding.histogram_kernels import measure_peaks
     from rangesim.decoding.matched_filter import gaussian_filter
@@ -30,16 +44,32 @@ def find_peak(
 
 
 def window_reach(bins: int, sigma_bins: float, is_cyclic: bool) -> int:
-    """Bins on either side of a peak that its window holds."""
+    """Number of bins on either side of a peak that its window holds: two standard deviations, and one bin at least.
+
+    Examples
+    --------
+    >>> window_reach(256, sigma_bins=4.2, is_cyclic=True)
+    9
+    """
     reach = max(1, int(np.ceil(2 * sigma_bins + 0.5)))
     return min(reach, (bins - 1) // 2) if is_cyclic else reach
 
 
 def coates(counts: np.ndarray, pulses: int) -> np.ndarray:
-    """(k, ...) counts without pile-up, from histograms of the first photon of each of `pulses` pulses.
+    """(k, ...) float64, counts without pile-up, from histograms of the first photon of each of `pulses` pulses.
 
-    A bin that leaves m pulses without a photon is too large by the fraction 1 / (2 m) at most, on average, and has the
-    variance pulses^2 f / m, f the fraction of the pulses before it that it took. Without any left it is a mere bound.
+    A bin that leaves m pulses without a photon is too large by the fraction 1 / (2 m) at most, on average. Its variance
+    is pulses^2 f / m, f the fraction of the pulses before it that it took. A bin that leaves no pulse is a lower bound.
+
+    Parameters
+    ----------
+    counts : (k, ...) int, histograms along the first axis.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> coates(np.array([500, 250]), pulses=1000).round(1)  # each bin took half of the pulses that were left
+    array([693.1, 693.1])
 
     References
     ----------
@@ -52,17 +82,20 @@ def coates(counts: np.ndarray, pulses: int) -> np.ndarray:
     return np.asarray(-pulses * np.log1p(-fraction)).reshape(counts.shape)
 
 
-def runs_out(counts: np.ndarray, place: np.ndarray, pulses: int, sigma_bins: float, is_cyclic: bool) -> np.ndarray:
-    """(n,) bool: the pulses run out before the end of the peak's window, so that its place is not known.
+def pulses_left(counts: np.ndarray, place: np.ndarray, pulses: int, sigma_bins: float, is_cyclic: bool) -> np.ndarray:
+    """(n,) int64, number of pulses that have met no photon by the end of the window of each peak.
 
     Parameters
     ----------
-    counts : (k, n), bins, of the first photon of each of `pulses` pulses, as the detector counted them.
-    place : (n,) float, bins, of the peaks that `find_peak` found in `coates` of them with the same `sigma_bins` and
-        `is_cyclic`.
+    counts : (k, n) int, histograms of the first photon of each of `pulses` pulses, as the detector counted them.
+    place : (n,) float, bins, places of the peaks that `find_peak` found in `coates` of them with the same `sigma_bins`
+        and `is_cyclic`.
 
-    Fewer than `MIN_PULSES_LEFT` are left, or than half of all where there are fewer than twice as many. With as many
-    left, a bin of the window is 5 % too large at most, on average.
+    Examples
+    --------
+    >>> import numpy as np
+    >>> pulses_left(np.array([[0], [5], [20], [5], [0], [0]]), np.array([2.5]), 100, sigma_bins=0.5, is_cyclic=False)
+    array([70])
     """
     bins = len(counts)
     first = np.clip(np.floor(place).astype(np.int64), 0, bins - 1)
@@ -71,4 +104,47 @@ def runs_out(counts: np.ndarray, place: np.ndarray, pulses: int, sigma_bins: flo
     if is_cyclic:
         last[first < reach] = bins - 1  # the window begins at the other end, where fewest are left
     used = np.cumsum(counts, axis=0, dtype=np.int64)[last, np.arange(counts.shape[1])]
-    return np.asarray(pulses - used < min(MIN_PULSES_LEFT, pulses / 2))
+    return np.asarray(pulses - used)
+
+
+def runs_out(left: np.ndarray, pulses: int) -> np.ndarray:
+    """(n,) bool, where too few of the pulses are left by the end of a peak's window for its place to be known.
+
+    Too few are fewer than `MIN_PULSES_LEFT`, or fewer than half of all if there are fewer than twice as many. With as
+    many left, a bin of the window is 5 % too large at most, on average.
+
+    Parameters
+    ----------
+    left : (n,) int, as `pulses_left` returns them.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> runs_out(np.array([9, 10]), pulses=1000)
+    array([ True, False])
+    """
+    return np.asarray(left < min(MIN_PULSES_LEFT, pulses / 2))
+
+
+def place_sigma(peak: np.ndarray, background: np.ndarray, bins: int, sigma_bins: float, is_cyclic: bool) -> np.ndarray:
+    """(...) float64, bins, standard deviation of the place of a peak by the shot noise of the counts, without pile-up.
+
+    The place is the centroid of the window. The counts of the pulse scatter it by their own spread, those of the
+    background by that of an even distribution over the window. It is infinite where there is no peak.
+
+    Parameters
+    ----------
+    peak, background : (...) float, counts of the peak and of the background under it, as `find_peak` returns them.
+    bins : int, number of bins in a histogram. sigma_bins : float, bins, standard deviation of the pulse.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> place_sigma(np.array([100.0, 10_000.0]), np.zeros(2), bins=256, sigma_bins=4.0, is_cyclic=True).round(3)
+    array([0.401, 0.04 ])
+    """
+    window = 2 * window_reach(bins, sigma_bins, is_cyclic) + 1
+    counts = np.maximum(peak, np.finfo(np.float64).tiny)
+    of_pulse, of_background = sigma_bins**2 + 1 / 12, background * window**2 / 12
+    with np.errstate(over="ignore"):
+        return np.asarray(np.sqrt((of_pulse + of_background / counts) / counts))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pile-up and peaks of photon histograms, in compiled loops."""
+"""Compiled loops over photon histograms: pile-up and peaks."""
 
 from __future__ import annotations
 
@@ -10,20 +10,33 @@ import numpy as np
 from pcgraph.kernel_cache import cached_njit
 
 MAX_FRACTION = 1 - 1e-6
-"""Of pulses in which a photon was detected: more leave no estimate."""
+"""Largest fraction of the pulses before a bin that it may have taken. At 1 the logarithm of Coates' formula is
+infinite; the value here is one pulse of a million away from it."""
+
+
 MAX_OUTSIDE = 3.0
-"""Largest distance of a pulse's middle from the bins that show its flank, in standard deviations of the pulse."""
+"""Largest distance of a pulse's middle from the bins that show its flank, in standard deviations of the pulse. Farther
+out, less than 0.2 % of the pulse would be in them, so that noise alone decides its place."""
+
 MAX_STEPS = 50
-"""Largest number of Newton steps to the place of a pulse that is cut off."""
+"""Largest number of Newton steps to the place of a pulse that is cut off. A few usually suffice; the limit ends those
+that never converge."""
+
 MIN_RATE = 1e-3
-"""Least rate of a cut-off pulse's centroid over its place, as the steps would grow without bound."""
+"""Least rate at which a cut-off pulse's centroid grows with its place (a ratio) in a Newton step. A smaller one, as of
+a pulse far outside, would make the step grow without bound."""
+
 CONVERGED = 1e-6
-"""Step at which the place of a pulse is found, in standard deviations of the pulse."""
+"""Largest step, in standard deviations of the pulse, at which its place counts as found. Noise is larger by far: that
+of a million counts is a thousandth."""
 
 
 @cached_njit(nogil=True, error_model="numpy")
 def detected_fraction(counts, pulses, fraction):  # type: ignore[no-untyped-def]
-    """Write, of histograms (k, n) of first photons, the fraction of the pulses that were left before each bin."""
+    """Write the fraction (k, n) that each bin took of the pulses that were left before it.
+
+    counts : (k, n) int, histograms of the first photon of each of `pulses` pulses.
+    """
     left = np.full(counts.shape[1], float(pulses))
     for b in range(len(counts)):
         for column in range(counts.shape[1]):
@@ -35,10 +48,11 @@ def detected_fraction(counts, pulses, fraction):  # type: ignore[no-untyped-def]
 def measure_peaks(  # type: ignore[no-untyped-def]
     histograms, filtered, reach, sigma, is_cyclic, place, height, background
 ):
-    """Of histograms (k, n), write what `rangesim.decoding.histogram.find_peak` returns, (n,) each.
+    """Write the place, height and background (n,) of the peak of each histogram, see `find_peak`.
 
-    filtered : (k, n), the matched filter's output, whose largest value is the peak. reach : bins on either side of it
-    that belong to its window. sigma : of the pulse, bins.
+    histograms : (k, n) counts. filtered : (k, n), the matched filter's output, whose largest value is the peak.
+    reach : number of bins on either side of the peak that its window holds. sigma : bins, standard deviation of the
+    pulse.
     """
     bins, columns = histograms.shape
     everything, highest, largest = np.zeros(columns), np.zeros(columns, np.int64), filtered[0].copy()
@@ -53,7 +67,7 @@ def measure_peaks(  # type: ignore[no-untyped-def]
         if not is_cyclic:
             width = min(peak + reach, bins - 1) - max(peak - reach, 0) + 1
         outside = everything[column] - _counts(histograms, column, peak, reach, is_cyclic)
-        level = max(outside, 0.0) / max(bins - width, 1)  # a difference: rounding may leave less than nothing
+        level = max(outside, 0.0) / max(bins - width, 1)  # rounding may make the difference negative
         recentred = math.floor(_centroid(histograms, column, peak, reach, is_cyclic, level))
         recentred = recentred % bins if is_cyclic else min(max(recentred, 0), bins - 1)
         centroid = _centroid(histograms, column, recentred, reach, is_cyclic, level)
@@ -71,8 +85,8 @@ def measure_peaks(  # type: ignore[no-untyped-def]
 def whole_peak(centroid, low, high, sigma):  # type: ignore[no-untyped-def]
     """Place of a Gaussian pulse whose part between `low` and `high` has this centroid; all in bins, sigma > 0.
 
-    The mean of a normal distribution that is cut off grows with that of the whole one, at the rate variance of the part
-    over sigma^2: Newton's method. A pulse farther outside than `MAX_OUTSIDE` sigmas counts as that far off.
+    The mean of a normal distribution that is cut off grows with the mean of the whole one, at the rate variance of the
+    part over sigma^2. Newton's method uses that rate. A pulse farther outside than `MAX_OUTSIDE` is placed there.
     """
     first, last = low - MAX_OUTSIDE * sigma, high + MAX_OUTSIDE * sigma
     place = centroid
@@ -91,7 +105,7 @@ def whole_peak(centroid, low, high, sigma):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy")
 def _counts(histograms, column, centre, reach, is_cyclic):  # type: ignore[no-untyped-def]
-    """Sum of the window around the bin `centre`."""
+    """Sum of the counts in the window around the bin `centre`."""
     total = 0.0
     for b in range(centre - reach, centre + reach + 1):
         total += _count(histograms, column, b, is_cyclic)
@@ -100,7 +114,10 @@ def _counts(histograms, column, centre, reach, is_cyclic):  # type: ignore[no-un
 
 @cached_njit(nogil=True, error_model="numpy")
 def _centroid(histograms, column, centre, reach, is_cyclic, level):  # type: ignore[no-untyped-def]
-    """Mean place of what the window has above `level`, bins, beyond the ends if need be; without any its middle."""
+    """Centroid in bins of the counts above `level` in the window; its middle if there are none.
+
+    It may lie beyond the ends of the histogram, where the window goes on at the other end.
+    """
     total = moment = 0.0
     for b in range(centre - reach, centre + reach + 1):
         above = max(_count(histograms, column, b, is_cyclic) - level, 0.0)
@@ -111,7 +128,7 @@ def _centroid(histograms, column, centre, reach, is_cyclic, level):  # type: ign
 
 @cached_njit(nogil=True, error_model="numpy")
 def _count(histograms, column, b, is_cyclic):  # type: ignore[no-untyped-def]
-    """Count of bin b; beyond the ends zero, or that of the other end."""
+    """Count of bin b. Beyond the ends it is zero, or that of the bin at the other end if the histogram is cyclic."""
     if is_cyclic:
         return histograms[b % len(histograms), column]
     return histograms[b, column] if 0 <= b < len(histograms) else 0.0

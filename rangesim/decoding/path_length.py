@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from rangesim.capture import Capture
+from rangesim.decoding.coordinates import Coordinates
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
@@ -13,16 +15,26 @@ from rangesim.rig import Rig
 
 
 def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
-    """(...) range in metres along camera rays at which the path emitter -> point -> camera has this length.
+    """(...) float64, ranges in metres along camera rays at which the path emitter -> point -> camera has this length.
 
-    With unit ray d and emitter centre b (camera coordinates) the length is l = r + |r d - b|. Squaring (l - r)^2 =
-    r^2 - 2 r d.b + b^2 leaves r linear: r = (l^2 - b^2) / (2 (l - d.b)), where the ray meets the ellipsoid
-    with foci at camera and emitter. NaN where the length is not larger than the baseline |b|: no such point
-    is in front.
+    With the unit ray d and the emitter's centre b (camera coordinates) the length is l = r + |r d - b|. Squaring
+    (l - r)^2 = r^2 - 2 r d.b + b^2 leaves r linear: r = (l^2 - b^2) / (2 (l - d.b)), where the ray meets the ellipsoid
+    with foci at camera and emitter. The range is NaN where the length is not larger than the baseline |b|: then no such
+    point exists.
 
     Parameters
     ----------
-    length_m : (...) float, metres. directions : (..., 3) float, camera rays of any length, camera coordinates.
+    length_m : (...) float, metres, there and back.
+    directions : (..., 3) float, camera rays of any length, camera coordinates.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.rig import Intrinsics, Rig, translation
+    >>> device = Intrinsics(640, 480, 800, 800, 320, 240)
+    >>> rig = Rig(device, device, np.eye(4), translation(0.6, 0, 0))  # the emitter stands 0.6 m to the right
+    >>> range_from_path_length(np.array([1.8, 0.5]), np.array([[0.0, 0.0, 1.0]]), rig)  # 0.8 m there, 1 m back
+    array([0.8, nan])
     """
     b = rig.T_camera_projector[:3, 3]
     d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -32,42 +44,63 @@ def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Ri
         return np.asarray(np.where(length > np.linalg.norm(b), result, np.nan))
 
 
-def range_image_from_path_length(
-    capture: Capture,
-    length_m: np.ndarray,
-    *,
-    status: np.ndarray,
-    confidence: np.ndarray,
-    intensity: np.ndarray,
-) -> RangeImage:
-    """Range image of decoded path lengths; lengths that lead to no point in front of the camera are
-    OUT_OF_RANGE.
-
-    Without a rig, range is half the path length and z is NaN.
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class PathLengths(Coordinates):
+    """Path lengths of a time-of-flight capture, from the emitter to the surface and back to the camera.
 
     Parameters
     ----------
-    length_m : (h, w) float, metres. status : (h, w) uint8. confidence, intensity : (h, w) float.
+    length_m : (h, w) float64, metres; NaN where `status` is not OK.
+    sigma_m : (h, w) float32, metres, standard deviation of `length_m` by the noise of the frames; NaN where `status` is
+        not OK. None: not known, as for noise-free captures and unknown detectors.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> one = np.ones((1, 2))
+    >>> lengths = PathLengths(length_m=np.array([[3.0, 9.0]]), status=np.array([[0, 1]]), confidence=one, intensity=one)
+    >>> lengths.length_m
+    array([[ 3., nan]])
+    >>> lengths.range_image(None).range_m  # without a rig, half of the length
+    array([[1.5, nan]], dtype=float32)
     """
-    rig, status = capture.rig, status.astype(np.uint8)
-    z_m, range_m = np.empty((2, *status.shape), dtype=np.float32)
-    for rows in bands(len(status)):
-        if rig is None:
-            along_ray, z = length_m[rows] / 2, np.float64(np.nan)
-        else:
-            directions = rig.camera.directions(rig.camera.pixel_centres(rows))
-            along_ray = range_from_path_length(length_m[rows], directions, rig)
-            z = along_ray / np.linalg.norm(directions, axis=-1)
-        in_front = np.nan_to_num(along_ray, nan=-1.0) > 0
-        status[rows][(status[rows] == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
-        ok = status[rows] == Status.OK
-        z_m[rows], range_m[rows] = np.where(ok, z, np.nan), np.where(ok, along_ray, np.nan)
-    return RangeImage(
-        z=z_m,
-        range_m=range_m,
-        confidence=np.clip(confidence, 0, 1).astype(np.float32),
-        status=status,
-        intensity=np.asarray(intensity, dtype=np.float32),
-        camera=rig.camera if rig else None,
-        T_world_camera=rig.T_world_camera if rig else None,
-    )
+
+    length_m: np.ndarray
+    sigma_m: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._keep_valid("length_m", np.float64)
+        self._keep_valid("sigma_m", np.float32)
+
+    def range_image(self, rig: Rig | None) -> RangeImage:
+        """Range image of these path lengths.
+
+        Lengths that lead to no point in front of the camera are `OUT_OF_RANGE`.
+
+        Parameters
+        ----------
+        rig : Rig that took the capture; None: the range is half of the path length, and z is NaN everywhere.
+        """
+        status = self.status.copy()
+        z_m, range_m = np.empty((2, *status.shape), dtype=np.float32)
+        for rows in bands(len(status)):
+            if rig is None:
+                along_ray, z = self.length_m[rows] / 2, np.float64(np.nan)
+            else:
+                directions = rig.camera.directions(rig.camera.pixel_centres(rows))
+                along_ray = range_from_path_length(self.length_m[rows], directions, rig)
+                z = along_ray / np.linalg.norm(directions, axis=-1)
+            in_front = np.nan_to_num(along_ray, nan=-1.0) > 0
+            status[rows][(status[rows] == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
+            ok = status[rows] == Status.OK
+            z_m[rows], range_m[rows] = np.where(ok, z, np.nan), np.where(ok, along_ray, np.nan)
+        return RangeImage(
+            z=z_m,
+            range_m=range_m,
+            confidence=self.confidence,
+            status=status,
+            intensity=self.intensity,
+            camera=rig.camera if rig else None,
+            T_world_camera=rig.T_world_camera if rig else None,
+        )

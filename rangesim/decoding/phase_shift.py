@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""N-step phase shift: fringe frames to a phase, and to a sub-pixel coordinate with the help of Gray code."""
+"""N-step phase shift: fringe frames, or the taps of a modulated camera, to a phase with its standard deviation."""
 
 from __future__ import annotations
 
@@ -9,20 +9,29 @@ from typing import Annotated
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.decoding.gray import GrayCode, Threshold
-from rangesim.decoding.row_bands import bands
-from rangesim.decoding.status import Status
-from rangesim.sensor import Background, FrameContent, least_signal_for
+from rangesim.sensor import Background, FrameContent, Threshold, least_signal_for
 from rangesim.settings.bounds import Bounds, check_fields
+
+MIN_MODULATION = 1e-20
+"""Modulation, in the units of the capture, that stands for none in the standard deviation of a phase: so small that the
+phase is refused, and large enough for products with the result to stay finite in float32."""
 
 
 @dataclass(frozen=True)
 class PhaseThresholds:
-    """Thresholds below which a phase is refused.
+    """Thresholds at which a phase is refused.
 
-    max_sigma_rad : a phase with a larger standard deviation is refused, where the detector is known.
-    modulation_of_scale : least modulation as a fraction of full scale, for digital captures of unknown detectors.
-    relative_modulation : least modulation as a fraction of the pixel's own brightness, for noise-free captures.
+    Parameters
+    ----------
+    max_sigma_rad : float, radians, largest standard deviation of a phase, where the detector is known.
+    modulation_of_scale : float, least modulation as a fraction of full scale, for digital captures of unknown
+        detectors.
+    relative_modulation : float, least modulation as a fraction of the pixel's own brightness, for noise-free captures.
+
+    Examples
+    --------
+    >>> PhaseThresholds(max_sigma_rad=0.1).max_sigma_rad
+    0.1
     """
 
     max_sigma_rad: Annotated[float, Bounds("positive and finite", 1e-6, 1e6)] = 0.2
@@ -33,9 +42,14 @@ class PhaseThresholds:
         check_fields(self)
 
     def least_signal(self, steps: int, visibility: float, content: FrameContent, background: Background) -> np.ndarray:
-        """(h, w) least light S of the projector at full power that the phase of `steps` frames takes.
+        """(h, w) float64, least light S of the emitter at full power that the phase takes, in the background's unit.
 
         With a modulation of `visibility` times S, sigma = sqrt(2 / steps) noise / (visibility S), see `phase_sigma`.
+
+        Parameters
+        ----------
+        steps : int, number of frames. visibility : float, modulation as a fraction of S.
+        content : FrameContent of one of the frames.
         """
         ambient = content.ambient * background.ambient
         if background.noise_variance is None:
@@ -46,9 +60,9 @@ class PhaseThresholds:
 
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """Phase of fringes or taps.
+    """Phase of fringes or taps, I = mean + modulation cos(phase - shift).
 
-    normalised : (h, w) float32 in [0, 1), the phase over 2 pi.
+    normalised : (h, w) float32 in [0, 1), the phase in turns, over 2 pi.
     modulation, mean : (h, w) float32, in the units of the capture.
     """
 
@@ -58,7 +72,19 @@ class Phase:
 
 
 def phase_of(frames: np.ndarray) -> Phase:
-    """Least-squares phase phi of frames I_s = mean + modulation cos(phi - 2 pi s / N), (N, h, w), N >= 3.
+    """Least-squares phase phi of frames I_s = mean + modulation cos(phi - 2 pi s / N).
+
+    Parameters
+    ----------
+    frames : (N, ...) of any number type, N >= 3, in any unit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> shifts = 2 * np.pi * np.arange(3) / 3
+    >>> phase = phase_of(5 + 2 * np.cos(2 * np.pi * 0.25 - shifts)[:, None, None])
+    >>> round(float(phase.normalised[0, 0]), 4), round(float(phase.modulation[0, 0]), 4)
+    (0.25, 2.0)
 
     References
     ----------
@@ -80,19 +106,37 @@ def phase_of(frames: np.ndarray) -> Phase:
 
 
 def phase_sigma(capture: Capture, phase: Phase, steps: int) -> np.ndarray | None:
-    """(h, w) standard deviation of the phase in radians, sqrt(2 / N) sigma_I / B; None if the detector is unknown."""
+    """(h, w) float32, radians, standard deviation of the phase, sqrt(2 / N) sigma_I / B; None if it is not known.
+
+    It is not known for unknown detectors and noise-free captures.
+
+    Parameters
+    ----------
+    capture : Capture that the frames of `phase` belong to. steps : int, N, number of frames.
+    """
     noise = capture.noise(phase.mean)
     if noise is None:
         return None
-    return np.asarray(np.sqrt(2 / steps) * noise / np.maximum(phase.modulation, np.finfo(np.float32).tiny))
+    return np.asarray(np.sqrt(2 / steps) * noise / np.maximum(phase.modulation, MIN_MODULATION))
 
 
 def tap_phase(taps: np.ndarray, exact_square: bool = False) -> Phase:
-    """Phase of taps (4, h, w) at 0, 90, 180, 270 degrees, mean + modulation cos(phi - theta).
+    """Phase phi of taps at theta = 0, 90, 180 and 270 degrees, mean + modulation cos(phi - theta).
 
-    C = tap 0 - tap 180 and S = tap 90 - tap 270 give phi = atan2(S, C), modulation = hypot(C, S) / 2. For a
-    triangle correlation (`exact_square`) |C| + |S| is constant, and the phase is piecewise linear in S / (|C|
-    + |S|).
+    C = tap 0 - tap 180 and S = tap 90 - tap 270 give phi = atan2(S, C), modulation = hypot(C, S) / 2. For a triangle
+    correlation |C| + |S| is constant, and the phase is piecewise linear in S / (|C| + |S|).
+
+    Parameters
+    ----------
+    taps : (4, h, w) of any number type, in any unit. exact_square : whether the correlation is a triangle, as of a
+        square source and a square reference.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> theta = np.deg2rad([0, 90, 180, 270])[:, None, None]
+    >>> round(float(tap_phase(5 + 2 * np.cos(2 * np.pi * 0.7 - theta)).normalised[0, 0]), 4)
+    0.7
 
     References
     ----------
@@ -110,44 +154,17 @@ def tap_phase(taps: np.ndarray, exact_square: bool = False) -> Phase:
     return Phase(normalised - np.floor(normalised), 0.5 * np.hypot(cosine, sine), tap.mean(axis=0))
 
 
-def modulation_is_weak(capture: Capture, phase: Phase, steps: int, thresholds: PhaseThresholds) -> np.ndarray:
-    """(h, w) bool, where the phase is not to be trusted."""
-    sigma = phase_sigma(capture, phase, steps)
+def modulation_is_weak(
+    capture: Capture, phase: Phase, sigma: np.ndarray | None, thresholds: PhaseThresholds
+) -> np.ndarray:
+    """(h, w) bool, where the modulation is too weak for a phase.
+
+    Parameters
+    ----------
+    capture : Capture that the frames of `phase` belong to. sigma : as `phase_sigma` returns it.
+    """
     if sigma is not None:
         return np.asarray(sigma > thresholds.max_sigma_rad)
     if capture.is_digital:
         return np.asarray(phase.modulation < thresholds.modulation_of_scale * capture.full_scale)
     return np.asarray(~(phase.modulation > thresholds.relative_modulation * np.maximum(phase.mean, 0)))  # NaN is weak
-
-
-def refine_by_phase(
-    capture: Capture,
-    gray: GrayCode,
-    frames: np.ndarray,
-    period_px: float,
-    least_swing: np.ndarray,
-    thresholds: PhaseThresholds,
-) -> GrayCode:
-    """Sub-pixel coordinate: of all places with this phase, the one nearest to the Gray coordinate.
-
-    Gray cells are half a period at most, so the right place lies at most a quarter of a period off the centre
-    of its cell, and an eighth more is granted to noise and to camera pixels across a cell's edge. Farther
-    off, code and phase contradict each other (`CODE_ERROR`).
-
-    Parameters
-    ----------
-    frames : (N, h, w) fringe frames of the same axis. period_px : float, projector pixels.
-    least_swing : (h, w) float, least brightest - darkest of the fringes, in the capture's units.
-    """
-    coordinate, status = np.empty_like(gray.coordinate), gray.status.copy()
-    for rows in bands(len(status)):
-        phase, whole, refused = phase_of(frames[:, rows]), gray.coordinate[rows], status[rows]
-        periods = np.rint(whole / np.float32(period_px) - phase.normalised)
-        coordinate[rows] = (periods + phase.normalised) * np.float32(period_px)
-        ok = refused == Status.OK
-        contradiction = np.abs(coordinate[rows] - whole) > gray.cell_px / 2 + period_px / 8
-        washed_out = 2 * phase.modulation < least_swing[rows]  # as those seen by interreflection alone
-        refused[ok & contradiction] = Status.CODE_ERROR
-        refused[ok & (modulation_is_weak(capture, phase, len(frames), thresholds) | washed_out)] = Status.LOW_SIGNAL
-        refused[ok & capture.saturated(frames[:, rows])] = Status.SATURATED
-    return GrayCode(coordinate, status, gray.cell_px)

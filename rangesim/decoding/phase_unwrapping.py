@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Phases of several modulation frequencies to one path length.
+"""Phase unwrapping: the phases of several modulation frequencies to one path length.
 
 References
 ----------
@@ -17,15 +17,18 @@ from rangesim.response import SPEED_OF_LIGHT
 
 @dataclass(frozen=True, eq=False)
 class Unwrapped:
-    """Common path length of several phases.
+    """Path length on which the phases of several frequencies agree.
 
-    length_m : (h, w) float64, metres. residual : (h, w), largest misfit of any frequency's phase.
-    ambiguity : (h, w) in 0..1, root of the best cost over the second best; 0 if there is no second.
+    length_m : (h, w) float64, metres, there and back.
+    residual : (h, w) float64, largest misfit of any frequency's phase, in turns, 0 to 0.5.
+    ambiguity : (h, w) float64 in 0..1, root of the least cost over the second least; 0 if there is no second.
+    weight : (h, w) float64, sum of the weights of all frequencies: the inverse variance of `length_m`, in their scale.
     """
 
     length_m: np.ndarray
     residual: np.ndarray
     ambiguity: np.ndarray
+    weight: np.ndarray
 
 
 def unwrap(
@@ -33,15 +36,25 @@ def unwrap(
 ) -> Unwrapped:
     """Path length that agrees best with the phases of all frequencies.
 
-    Every wrap count of the highest frequency gives a candidate; the other frequencies take the wrap nearest
-    to it, and the candidate with the least weighted sum of squared differences between their lengths wins.
-    The result is the weighted mean of the unwrapped lengths.
+    Every wrap count of the highest frequency gives a candidate. The other frequencies take the wrap nearest to it. The
+    candidate with the least weighted sum of squared differences between the lengths of all frequencies wins, and the
+    result is the weighted mean of its lengths.
 
     Parameters
     ----------
-    normalised : per frequency (h, w) in [0, 1). weights : per frequency (h, w), inverse variance of its length
-        (any scale).
+    normalised : per frequency (h, w) float32, phases in turns, in [0, 1).
+    weights : per frequency (h, w) float, inverse variance of its length, in any scale.
     longest_m : float, metres, path length up to which candidates are searched.
+
+    Examples
+    --------
+    The phases of 20 and 30 MHz after a path of 12 m, longer than both wavelengths (15 and 10 m, nearly):
+
+    >>> import numpy as np
+    >>> hertz, one = (20e6, 30e6), np.ones((1, 1))
+    >>> phases = [np.array([[12.0 * f / SPEED_OF_LIGHT % 1]]) for f in hertz]
+    >>> unwrap(phases, hertz, [one, one], longest_m=30.0).length_m.round(6)
+    array([[12.]])
     """
     wavelengths = [SPEED_OF_LIGHT / f for f in modulation_hz]
     base = int(np.argmin(wavelengths))
@@ -60,4 +73,4 @@ def unwrap(
         best = np.where(better, mean, best)
     misfits = [best / w - t for t, w in zip(normalised, wavelengths, strict=True)]
     residual = np.max([np.abs(m - np.rint(m)) for m in misfits], axis=0)
-    return Unwrapped(best, residual, np.sqrt(best_cost / np.maximum(second_cost, 1e-30)))
+    return Unwrapped(best, residual, np.sqrt(best_cost / np.maximum(second_cost, 1e-30)), total)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a decoder returns: one measurement, or the reason for none, per pixel."""
+"""Range images: for each camera pixel one measurement, or the reason why there is none."""
 
 from __future__ import annotations
 
@@ -16,6 +16,10 @@ from rangesim.settings.config import ShortRepr
 if TYPE_CHECKING:
     from rangesim.sensor import Decoder
 
+MIN_MEASURED = 0.5
+"""Least fraction of the pixels that are measured in a sound capture of a whole scene. Below it, `Decoder.likely_cause`
+and `rangesim decode` look for a mistake; a larger value makes them suspect captures of dark or distant scenes."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RangeImage(ShortRepr):
@@ -25,20 +29,33 @@ class RangeImage(ShortRepr):
     ----------
     z : (h, w) float32, metres, along the optical axis of the camera; NaN where `status` is not OK.
     range_m : (h, w) float32, metres, Euclidean distance from the camera centre; NaN likewise.
-    confidence : (h, w) float32 in 0..1, strength of the useful signal as a fraction of the largest the capture can hold
-        (of a noise-free capture: does hold). Structured light: white - black; AMCW: twice the modulation amplitude;
-        direct ToF: counts in the peak, of the highest peak; ideal: radiance.
+    confidence : (h, w) float32 in 0..1, strength of the useful signal as a fraction of the largest that the capture can
+        hold, or, if it is noise-free, does hold. The signal is white - black of structured light, twice the modulation
+        amplitude of AMCW, the counts in the peak of direct time of flight (as a fraction of the highest peak), and the
+        radiance of the ideal sensor.
     status : (h, w) uint8, values of `Status`.
     intensity : (h, w) float32, mean signal in the capture's units, for colouring points.
-    camera : Intrinsics, or None for an uncalibrated capture (then z and range_m are all NaN).
-    T_world_camera : (4, 4) float64.
+    camera : Intrinsics, or None for an uncalibrated capture, whose z is all NaN.
+    T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres; None as `camera`.
     projector_column, projector_row : (h, w) float32, decoded projector pixel coordinates (pixel centres at
         integer + 0.5), NaN where not decoded; None for sensors without a code along that axis.
-    sampling_sigma_m : (h, w) float32, metres, of a simulated reading: standard deviation of z by the sampling of light
-        paths, estimated from one pair of draws for each pixel, so take medians over many; NaN where there is no
+    sampling_sigma_m : (h, w) float32, metres, standard deviation of a simulated z by the sampling of light paths. It is
+        estimated from one pair of draws for each pixel, so take medians over many pixels. NaN where there is no
         reading, infinite where sampling decides whether there is one. None: not known, see
         `rangesim.evaluation.range_noise`.
-    decoder : Decoder it comes from; None: not known.
+    decoder : Decoder that made it; None: not known.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rangesim.rig import Intrinsics
+    >>> z = np.array([[1.0, np.nan]], dtype=np.float32)
+    >>> status, one = np.array([[0, 1]], dtype=np.uint8), np.ones((1, 2), dtype=np.float32)
+    >>> image = RangeImage(z, z, one, status, one, Intrinsics(2, 1, 2.0, 2.0, 1.0, 0.5), np.eye(4))
+    >>> image.valid
+    array([[ True, False]])
+    >>> image.to_point_cloud().points[0, 0]
+    array([-0.25,  0.  ,  1.  ], dtype=float32)
     """
 
     z: np.ndarray
@@ -60,7 +77,7 @@ class RangeImage(ShortRepr):
 
     @property
     def is_consistent(self) -> bool:
-        """Whether z is finite where `status` is OK and NaN elsewhere; without a camera it may be NaN anywhere."""
+        """Whether z is finite where `status` is OK, and NaN elsewhere. Without a camera, z may be NaN anywhere."""
         finite, ok = np.isfinite(self.z), self.valid
         return not (finite > ok).any() and (self.camera is None or not (finite < ok).any())
 

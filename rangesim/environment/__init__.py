@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the machine must have: LLVM for Dr.Jit, and the command that looks for it."""
+"""Requirements on the machine: LLVM for Dr.Jit, the choice of a backend, and the command that checks both."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which Dr.Jit backend renders, chosen and checked before the first kernel.
+"""Choice of the Dr.Jit backend that renders, before the first kernel runs.
 
-Dr.Jit loads its LLVM when it is imported, so the library is chosen here, before that. Finding none is no error yet: a
-GPU may do without.
+Dr.Jit loads LLVM when it is imported. Therefore this module chooses the library first and imports Dr.Jit afterwards. A
+missing LLVM is no error at this point, because rendering on a GPU does not need it.
 """
 
 from __future__ import annotations
@@ -13,26 +13,35 @@ from contextlib import contextmanager, suppress
 from rangesim.environment.llvm import ensure_llvm
 from rangesim.errors import EnvironmentProblem
 
-with suppress(EnvironmentProblem):  # raised again by `select_variant`, where LLVM is really needed
+with suppress(EnvironmentProblem):  # `select_variant` raises it again if LLVM is needed
     ensure_llvm()
 
 import drjit as dr
 import mitsuba as mi
 
 VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
+"""Mitsuba variants that rangesim supports: one band of light, on the CPU or on a GPU."""
 
 
 def select_variant(variant: str | None = None) -> str:
-    """Name of the Mitsuba variant now active: `variant`, or CUDA where a GPU answers, else LLVM.
+    """Activate a Mitsuba variant, and return its name.
 
-    A monochrome variant that is active already is kept unless `variant` asks for another.
+    Parameters
+    ----------
+    variant : one of `VARIANTS`. None: the active variant if it is one of them, else CUDA if there is a usable GPU, else
+        LLVM.
 
     Raises
     ------
     ValueError
-        `variant` is not one of `VARIANTS` or this build of Mitsuba lacks it.
+        `variant` is not one of `VARIANTS`, or this build of Mitsuba lacks it.
     EnvironmentProblem
-        No suitable LLVM library; the message names the fix.
+        There is no suitable LLVM library; the message says how to install one.
+
+    Examples
+    --------
+    >>> select_variant("llvm_ad_mono")
+    'llvm_ad_mono'
     """
     if variant is not None and variant not in VARIANTS:
         raise ValueError(f"expected a variant out of {', '.join(VARIANTS)}, got {variant!r}.")
@@ -51,8 +60,11 @@ def select_variant(variant: str | None = None) -> str:
 
 @contextmanager
 def images_can_be_read() -> Iterator[None]:
-    """A second thread of Dr.Jit where it has but one, as on a single core: with that one, Mitsuba 3.9 waits for ever
-    for a file of OpenEXR (its issue 21). Not for longer, as two spin on one core: a pass takes a tenth longer."""
+    """Let Dr.Jit have two threads while the block runs, if it has only one, as on a machine with a single core.
+
+    With one thread, Mitsuba 3.9 waits forever for an OpenEXR file (its issue 21). The second thread is removed
+    afterwards, because two threads that spin on one core make a light-transport pass a tenth slower.
+    """
     threads = dr.thread_count()
     if threads > 1:
         yield
@@ -66,5 +78,5 @@ def images_can_be_read() -> Iterator[None]:
 
 
 def cuda_available() -> bool:
-    """Whether Dr.Jit finds a CUDA device and this Mitsuba can use it."""
+    """Whether Dr.Jit finds a CUDA device and this build of Mitsuba can use it."""
     return "cuda_ad_mono" in mi.variants() and bool(dr.has_backend(dr.JitBackend.CUDA))

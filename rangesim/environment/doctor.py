@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rangesim doctor`: what this machine has and lacks, one line each with the fix.
+"""The command `rangesim doctor`: checks of this machine, one line each, with advice on how to fix a failure.
 
-What can end a process (an old LLVM at the first kernel, a library that is not there) is tried in another one.
+A check that could end the process (an old LLVM at the first kernel, a missing library) runs in a process of its own.
 """
 
 from __future__ import annotations
@@ -25,6 +25,10 @@ from rangesim.errors import EnvironmentProblem
 __all__ = ["Check", "doctor_command", "find_browser", "run_checks"]
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+"""Names under which Chromium and its relatives are installed."""
+TIMEOUT_S = 120
+"""Seconds that a check may take. An import of Mitsuba or Open3D from a cold disk can take tens of seconds; a check that
+takes longer than this has most likely stopped."""
 _VERSIONS = "import drjit, mitsuba; print(f'Mitsuba {mitsuba.__version__}, Dr.Jit {drjit.__version__}')"
 _MITSUBA_FIX = "apt-get install libatomic1 (Debian, Ubuntu), or pip install mitsuba if it is not installed"
 _VARIANT = """
@@ -48,7 +52,16 @@ _FONT_FIX = "pip install --force-reinstall matplotlib, which brings DejaVu Sans"
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the doctor; rangesim is unusable where a `required` one fails, otherwise only less able."""
+    """A check of the machine, printed as one line.
+
+    name : short name. ok : whether it succeeded. detail : the finding. fix : advice if it failed. required : whether
+    rangesim cannot work without it; otherwise it lacks only some ability.
+
+    Examples
+    --------
+    >>> print(Check("CUDA", False, "no GPU", required=False))
+    none  CUDA      no GPU
+    """
 
     name: str
     ok: bool
@@ -63,7 +76,7 @@ class Check:
 
 
 def run_checks() -> list[Check]:
-    """Every check of this machine, in the order in which a failure explains the later ones."""
+    """All checks of this machine, ordered so that a failure explains those after it."""
     checks: list[Callable[[], Check]] = [
         _check_python,
         _check_llvm,
@@ -91,7 +104,7 @@ def doctor_command() -> None:
 
 
 def find_browser() -> str | None:
-    """Path of a Chromium-like browser that can take a picture of the report, or None."""
+    """Path of Chromium or a relative of it, which can render a report; None if there is none."""
     return next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
@@ -136,12 +149,12 @@ def _check_browser() -> Check:
 
 
 def _try_in_process(code: str, environment: Mapping[str, str] | None = None) -> tuple[bool, str]:
-    """Whether the code runs to its end in a Python of its own, and what it printed or its first error."""
+    """Whether code runs to its end in a new Python process, and its output, or its error on one line."""
     command = [sys.executable, "-c", code]
     try:
-        run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+        run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
-        return False, "no answer within 120 s"
+        return False, f"no answer within {TIMEOUT_S} s"
     if run.returncode < 0:
         return False, f"the process was ended by signal {-run.returncode}"
     if run.returncode == 0:

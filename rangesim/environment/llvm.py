@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The LLVM shared library that Dr.Jit compiles kernels with, chosen and checked before the first kernel.
+"""Choice of the LLVM shared library that Dr.Jit compiles kernels with.
 
-Dr.Jit loads a libLLVM when it is imported, and a too old one ends the process at the first kernel, with no
-exception to catch. So the version is read from file names, without loading anything, and a known bad
-version is never used.
+Dr.Jit loads libLLVM when it is imported. If that is too old, the process ends at the first kernel without an exception.
+Therefore the version is read from file names, without loading anything, and a version known to fail is never used.
 
-Measured with Dr.Jit 1.5.0 and Mitsuba 3.9.1 on x86-64 (a sin/min/max kernel, then a Cornell box):
+Results with Dr.Jit 1.5.0 and Mitsuba 3.9.1 on x86-64 (a kernel with sin, min and max, then a Cornell box):
 
     LLVM 14               refused by Dr.Jit ("could not be found" is all it says)
     LLVM 15, 16           abort: "Cannot select: fminimum"
     LLVM 17, 18, 19, 22   work, with the same image
 
-x86 has no instruction for IEEE minimum/maximum, and LLVM learnt to expand it in version 17 (LLVM issue
-53353), which agrees with the table. LLVM 20 and 21 are not measured; they lie between versions that work.
-A version newer than `NEWEST_TESTED` is used only if no tested one is there, since LLVM changes its C API.
+x86 has no instruction for the IEEE minimum and maximum, and LLVM expands them since version 17 (LLVM issue 53353). This
+agrees with the table. LLVM 20 and 21 were not tried; they lie between versions that work. A version newer than
+`NEWEST_TESTED` is used only if no tested one is installed, because LLVM changes its C API.
 """
 
 from __future__ import annotations
@@ -33,10 +32,13 @@ from rangesim.errors import EnvironmentProblem
 __all__ = ["MINIMUM", "NEWEST_TESTED", "VARIABLE", "LlvmLibrary", "ensure_llvm", "find_llvm"]
 
 MINIMUM = 17
+"""Oldest major version of LLVM that works; see the table in the docstring of this module."""
 NEWEST_TESTED = 22
+"""Newest major version of LLVM that was tried; see the table in the docstring of this module."""
 VARIABLE = "DRJIT_LIBLLVM_PATH"
+"""Environment variable that names the library; Dr.Jit reads it when it is imported."""
 
-# libLLVM-15.so.1, libLLVM-18.so.18.1, libLLVM.so.19.1, libLLVM.so, libLLVM.dylib, LLVM-C.dll; a private
+# Names such as libLLVM-15.so.1, libLLVM-18.so.18.1, libLLVM.so.19.1, libLLVM.so, libLLVM.dylib or LLVM-C.dll. A private
 # build such as libLLVM.so.19.1-rust-1.80 is not meant for others and does not match.
 _NAME = re.compile(r"libLLVM(?:-(?P<before>\d+(?:\.\d+)*))?\.(?:so(?:\.(?P<after>\d+(?:\.\d+)*))?|dylib)|LLVM-C\.dll")
 _ASK = """
@@ -49,19 +51,19 @@ print(*[number.value for number in numbers], sep=".")
 
 @dataclass(frozen=True)
 class LlvmLibrary:
-    """A libLLVM file and its version; the version is () where it could not be told."""
+    """A libLLVM file and its version, which is () if it is unknown."""
 
     path: Path
     version: tuple[int, ...]
 
     @property
     def suitable(self) -> bool:
-        """Whether Dr.Jit can compile with it."""
+        """Whether Dr.Jit can compile kernels with the library."""
         return self.version >= (MINIMUM,)
 
     @property
     def rank(self) -> tuple[bool, tuple[int, ...]]:
-        """Sort key: the newest of the tested versions comes last, an untested newer one before them."""
+        """Sort key with which the best library is the largest: the newest tested version, then untested newer ones."""
         return self.version < (NEWEST_TESTED + 1,), self.version
 
     def __str__(self) -> str:
@@ -69,13 +71,16 @@ class LlvmLibrary:
 
 
 def ensure_llvm(variant: str = "llvm_ad_mono") -> LlvmLibrary | None:
-    """The library Dr.Jit will use, named in `DRJIT_LIBLLVM_PATH`; None if the variant does without LLVM.
+    """Choose a suitable LLVM library for Dr.Jit, and return it; None if the variant does not need LLVM.
 
-    Call it before the first `import mitsuba` or `import drjit`.
+    The choice is stored in the environment variable `DRJIT_LIBLLVM_PATH`. Call this before the first `import mitsuba`
+    or `import drjit`.
 
-    Raises:
-        EnvironmentProblem: there is no suitable library, `DRJIT_LIBLLVM_PATH` names a bad one, or Dr.Jit
-            was imported earlier and holds a bad one.
+    Raises
+    ------
+    EnvironmentProblem
+        There is no suitable library, `DRJIT_LIBLLVM_PATH` names an unsuitable one, or Dr.Jit was imported earlier and
+        has loaded an unsuitable one.
     """
     if not variant.startswith("llvm"):
         return None
@@ -91,13 +96,16 @@ def ensure_llvm(variant: str = "llvm_ad_mono") -> LlvmLibrary | None:
 
 
 def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:
-    """The library named by `DRJIT_LIBLLVM_PATH`, otherwise the newest suitable one of this machine.
+    """The library that `DRJIT_LIBLLVM_PATH` names; without that, the best one on this machine.
 
-    Args:
-        folders: where to look instead of the standard library folders of this platform.
+    Parameters
+    ----------
+    folders : folders to search instead of the usual library folders of this platform.
 
-    Raises:
-        EnvironmentProblem: the named library, or every library found, is missing or unsuitable.
+    Raises
+    ------
+    EnvironmentProblem
+        The named library is missing or unsuitable, or no suitable one was found.
     """
     named = os.environ.get(VARIABLE)
     if named:
@@ -131,7 +139,7 @@ def _fix() -> str:
 
 
 def _usual_folders() -> Iterator[Path]:
-    """Folders that hold libLLVM on Linux, macOS and Windows; the ones asked for by the user first."""
+    """Folders that may hold libLLVM on Linux, macOS and Windows; those in environment variables come first."""
     for variable in ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH") + (("PATH",) if os.name == "nt" else ()):
         yield from (Path(entry) for entry in os.environ.get(variable, "").split(os.pathsep) if entry)
     multiarch = sysconfig.get_config_var("MULTIARCH") or f"{platform.machine()}-linux-gnu"
@@ -143,7 +151,7 @@ def _usual_folders() -> Iterator[Path]:
 
 
 def _libraries_in(folders: Iterable[Path]) -> list[LlvmLibrary]:
-    """Every libLLVM file in the folders, each file once however many links lead to it."""
+    """All libLLVM files in the folders; a file with several links to it appears once."""
     found: dict[Path, LlvmLibrary] = {}
     for folder in filter(Path.is_dir, folders):
         for path in sorted((*folder.glob("libLLVM[-.]*"), *folder.glob("LLVM-C.dll"))):
@@ -155,7 +163,7 @@ def _libraries_in(folders: Iterable[Path]) -> list[LlvmLibrary]:
 
 
 def _libraries_of_linker() -> list[LlvmLibrary]:
-    """What the dynamic linker's cache knows; asked only if the standard folders hold nothing suitable."""
+    """The libLLVM files in the folders that the cache of the dynamic linker lists; empty without `ldconfig`."""
     try:
         listing = subprocess.run(["/sbin/ldconfig", "-p"], capture_output=True, text=True, timeout=10).stdout
     except (OSError, subprocess.TimeoutExpired):
@@ -165,7 +173,7 @@ def _libraries_of_linker() -> list[LlvmLibrary]:
 
 
 def _version_of(path: Path) -> tuple[int, ...]:
-    """The version in the name of the file a link leads to, else in the link's, else as the library says."""
+    """Version of a library: from the name of the file, else of the link to it, else from the library itself."""
     file = path.resolve()
     matches = filter(None, (_NAME.fullmatch(name) for name in (file.name, path.name)))
     named = (match["before"] or match["after"] for match in matches)
@@ -174,7 +182,10 @@ def _version_of(path: Path) -> tuple[int, ...]:
 
 
 def _ask(path: Path) -> str:
-    """The version the library itself reports, or ""; in another process, where loading can do no harm."""
+    """The version that the library itself reports; empty if it does not.
+
+    It is loaded in another process, so that a crash does no harm.
+    """
     try:
         command = [sys.executable, "-c", _ASK, str(path)]
         answer = subprocess.run(command, capture_output=True, text=True, timeout=30)
@@ -184,7 +195,7 @@ def _ask(path: Path) -> str:
 
 
 def _is_for_this_machine(path: Path) -> bool:
-    """False for an ELF library of another word size or processor than the running Python's."""
+    """Whether a library fits the running Python; False for an ELF file of another word size or processor."""
     with path.open("rb") as file, Path(sys.executable).open("rb") as interpreter:
         library, python = file.read(20), interpreter.read(20)
     both_elf = library.startswith(b"\x7fELF") and python.startswith(b"\x7fELF")
@@ -192,7 +203,7 @@ def _is_for_this_machine(path: Path) -> bool:
 
 
 def _version_held_by_drjit() -> tuple[int, ...] | None:
-    """The version of the LLVM that an already imported Dr.Jit has loaded; None if it has loaded none."""
+    """Version of the LLVM that Dr.Jit has loaded; None if Dr.Jit is not imported or has loaded none."""
     drjit = sys.modules.get("drjit")
     version = drjit.detail.llvm_version() if drjit is not None else None
     return tuple(version) if version else None

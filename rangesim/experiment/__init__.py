@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of what is carried out: experiments, scans and the paths of their cameras; as files and as plain data."""
+"""Settings of experiments and scans: what is measured, with which instruments, and along which camera path.
+
+They are frozen dataclasses that can be written to and read from TOML and JSON. Nothing is carried out here;
+`rangesim.pipeline` does that. The settings of a sweep over experiments would be a further module here.
+"""
 
 from rangesim.experiment.camera_paths import CameraPath, Dome, HandHeld, PoseList, Turntable, Viewpoint
 from rangesim.experiment.experiment import Experiment, experiment_from_dict, experiment_to_dict, load_experiment

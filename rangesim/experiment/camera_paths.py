@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a scan's views are taken from: turntable, dome, hand-held, or a list of poses. The world's z is up."""
+"""Camera paths of a scan: turntable, dome, hand-held, or a list of poses. The z axis of the world points up.
+
+A new path is a subclass of `CameraPath` with a `type_name`.
+"""
 
 from __future__ import annotations
 
@@ -16,17 +19,38 @@ from rangesim.settings.config import Named, shown, to_dict
 from rangesim.settings.seeds import check_seed
 
 Views = Annotated[int, whole(1, "passes")]
+"""Number of views. The limit is that of `passes`, because each view is a light-transport pass."""
 Elevation = Annotated[float, Bounds("degrees above the horizon", -89, 89)]
+"""Elevation of a camera, degrees above the horizon. It excludes 90, because there the direction up is not defined."""
 Degrees = Annotated[float, Bounds("degrees", -360, 360)]
+"""Azimuth, or difference of azimuths, in degrees."""
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+"""Difference of azimuth between two views of a dome, radians. With this step the views cover a sphere evenly, because
+no small number of steps comes close to a full turn."""
 SWINGS = 3
-"""Sine waves that a hand's unrest is made of, in each direction."""
+"""Number of sine waves whose sum moves the hand along one direction. More waves make the motion less regular; its
+standard deviation stays the same, because the sum is divided by the root of this number."""
+MAX_ELEVATION_DEG = 85.0
+"""Largest elevation that a path takes from a scene's camera, or that a hand-held path reaches, degrees. A camera that
+looks straight down has no direction up, so that paths stay at least five degrees away from the vertical."""
 
 
 class Viewpoint(NamedTuple):
-    """Where the camera of a scene stands, which a path takes what it is not told from.
+    """Pose of a scene's camera and its distance to what it looks at.
 
-    T_world_camera : (4, 4). distance_m : along its axis, to what it looks at.
+    A path takes its centre, distance and elevation from here where its own settings are None.
+
+    T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres.
+    distance_m : metres along the camera's axis.
+
+    Examples
+    --------
+    >>> from rangesim.rig import look_at
+    >>> viewpoint = Viewpoint(look_at((0, -1, 1), (0, 0, 0)), distance_m=2**0.5)
+    >>> viewpoint.centre_m.round(6) + 0.0
+    array([0., 0., 0.])
+    >>> round(viewpoint.elevation_deg)
+    45
     """
 
     T_world_camera: Array
@@ -34,17 +58,17 @@ class Viewpoint(NamedTuple):
 
     @property
     def centre_m(self) -> Array:
-        """(3,) metres, world, what the camera looks at."""
+        """Point that the camera looks at, (3,) float64, metres, world coordinates."""
         return np.asarray(self.T_world_camera[:3, 3] + self.distance_m * self.T_world_camera[:3, 2])
 
     @property
     def elevation_deg(self) -> float:
-        """Degrees of the camera above what it looks at."""
+        """Elevation of the camera seen from the point that it looks at, degrees above the horizon."""
         return float(np.degrees(np.arcsin(np.clip(-self.T_world_camera[2, 2], -1, 1))))
 
 
 class CameraPath(Named, ABC):
-    """Poses of a rig's camera, one for each view. Subclasses are frozen dataclasses."""
+    """A sequence of poses of a rig's camera, one per view. Subclasses are frozen dataclasses."""
 
     known: ClassVar[dict[str, type[Any]]] = {}
     type_name: ClassVar[str]
@@ -52,22 +76,44 @@ class CameraPath(Named, ABC):
 
     @abstractmethod
     def poses(self, viewpoint: Viewpoint | None = None) -> Array:
-        """(n, 4, 4) float64, T_world_camera of each view, metres.
+        """T_world_camera of each view, (n, 4, 4) float64, metres.
 
-        viewpoint : gives centre, distance and elevation where the path names none; ValueError if there is none either.
+        Parameters
+        ----------
+        viewpoint : Viewpoint, gives centre, distance and elevation where the path does not state them.
+
+        Raises
+        ------
+        ValueError
+            The path needs a viewpoint, and none is given.
         """
 
 
 @dataclass(frozen=True)
 class Turntable(CameraPath):
-    """Views on a circle about a vertical axis, all looking at one point: as of a thing that turns before the rig.
+    """Views on a circle about a vertical axis, all looking at its centre.
+
+    This is how a fixed rig sees an object on a turntable.
 
     Parameters
     ----------
-    views : number of them, evenly over `sweep_deg`; of a full turn the last is one step before the first.
-    centre_m : (x, y, z) metres, world, what they look at. distance_m : metres from there. elevation_deg : degrees above
-        the horizon. None: as the scene's camera.
-    start_deg : azimuth of the first view, degrees from x to y.
+    views : number of views, at equal steps over `sweep_deg`. In a full turn the last view is one step before the first.
+    centre_m : (x, y, z) of the point that the views look at, metres, world coordinates.
+    distance_m : metres from the camera to that point.
+    elevation_deg : degrees of the camera above the horizon.
+    start_deg : azimuth of the first view, degrees, counted from x towards y.
+    sweep_deg : difference of azimuth between the first and the last view, degrees; 360 for a full turn.
+
+    `centre_m`, `distance_m` and `elevation_deg` of None are those of the scene's camera.
+
+    Examples
+    --------
+    >>> path = Turntable(views=4, centre_m=(0, 0, 0), distance_m=1, elevation_deg=0)
+    >>> path.poses()[:, :3, 3].round(6) + 0.0  # places of the cameras
+    array([[ 0., -1.,  0.],
+           [ 1.,  0.,  0.],
+           [ 0.,  1.,  0.],
+           [-1.,  0.,  0.]])
     """
 
     views: Views = 12
@@ -94,13 +140,21 @@ class Turntable(CameraPath):
 class Dome(CameraPath):
     """Views spread evenly over a zone of a sphere, all looking at its centre.
 
-    Heights are in equal steps, each view the golden angle further on: a Fibonacci lattice (Gonzalez: "Measurement of
-    areas on a sphere using Fibonacci and latitude-longitude lattices", 2010).
+    The views form a Fibonacci lattice: their heights increase in equal steps, and their azimuth by the golden angle
+    (Gonzalez: "Measurement of areas on a sphere using Fibonacci and latitude-longitude lattices", 2010).
 
     Parameters
     ----------
-    views : number of them. centre_m, distance_m : as of `Turntable`.
-    lowest_deg, highest_deg : degrees above the horizon between which they lie.
+    views : number of views.
+    centre_m, distance_m : as for `Turntable`.
+    lowest_deg, highest_deg : the zone's lowest and highest elevation, degrees above the horizon.
+
+    Examples
+    --------
+    >>> path = Dome(views=100, centre_m=(0, 0, 0), distance_m=2, lowest_deg=0, highest_deg=60)
+    >>> heights_m = path.poses()[:, 2, 3]
+    >>> bool(heights_m.min() > 0), bool(heights_m.max() < 2 * np.sin(np.radians(60)))
+    (True, True)
     """
 
     views: Views = 24
@@ -128,16 +182,27 @@ class Dome(CameraPath):
 
 @dataclass(frozen=True)
 class HandHeld(CameraPath):
-    """Views along a walk around a thing, up and down once, with the unrest of a hand.
+    """Views of a sensor that a person carries around an object, with the small motions of a hand.
 
-    Position, aim and roll swing about the walk by random sums of three sine waves each; neighbouring views are near
-    each other. The same seed gives the same walk.
+    The camera goes around once and its elevation rises and falls once. Position, aim and roll swing about this path:
+    each is a random sum of three sine waves. The swing is smooth, so that neighbouring views are near each other.
 
     Parameters
     ----------
-    views : number of them, over `sweep_deg` of azimuth. centre_m, distance_m, elevation_deg : as of `Turntable`.
-    rise_deg : degrees that the elevation goes up and down. start_deg : azimuth of the first view.
-    shake_m, shake_deg : standard deviation of place along each axis, and of aim and roll.
+    views : number of views, over `sweep_deg` of azimuth.
+    centre_m, distance_m, elevation_deg, start_deg, sweep_deg : as for `Turntable`.
+    rise_deg : degrees by which the elevation rises above and falls below `elevation_deg`.
+    shake_m : standard deviation of the position along each axis, metres.
+    shake_deg : standard deviation of aim and roll, degrees.
+    seed : of the random motions, 0 to 2^64 - 1. The same seed gives the same poses.
+
+    Examples
+    --------
+    >>> steady = HandHeld(views=8, centre_m=(0, 0, 0), distance_m=1, elevation_deg=30, shake_m=0, shake_deg=0)
+    >>> shaken = HandHeld(views=8, centre_m=(0, 0, 0), distance_m=1, elevation_deg=30)
+    >>> moved_m = (shaken.poses() - steady.poses())[:, :3, 3]
+    >>> bool(abs(moved_m).max() < 0.05)
+    True
     """
 
     views: Views = 24
@@ -164,7 +229,8 @@ class HandHeld(CameraPath):
         elevation = _elevation(self.elevation_deg, viewpoint)
         s = np.arange(self.views) / max(1, self.views - 1)
         azimuths = np.radians(self.start_deg + self.sweep_deg * s)
-        elevations = np.radians(np.clip(elevation + self.rise_deg * np.sin(2 * np.pi * s), -85, 85))
+        risen = elevation + self.rise_deg * np.sin(2 * np.pi * s)
+        elevations = np.radians(np.clip(risen, -MAX_ELEVATION_DEG, MAX_ELEVATION_DEG))
         result = _looking_in(azimuths, elevations, distance_m, centre)
         random = np.random.default_rng(self.seed)
         frequency, phase = random.uniform(1, 4, (2, 3, SWINGS)), random.uniform(0, 2 * np.pi, (2, 3, SWINGS))
@@ -177,9 +243,21 @@ class HandHeld(CameraPath):
 
 @dataclass(frozen=True, eq=False)
 class PoseList(CameraPath):
-    """Views from given poses.
+    """Views from a list of poses.
 
-    matrices : (n, 4, 4) float64, T_world_camera of each, rigid, metres, OpenCV's axes.
+    Parameters
+    ----------
+    matrices : (n, 4, 4) float64, T_world_camera of each view, rigid, metres, OpenCV's axes.
+
+    Raises
+    ------
+    ValueError
+        No pose, another shape, or a matrix that is not rigid.
+
+    Examples
+    --------
+    >>> PoseList([np.eye(4), np.eye(4)]).poses().shape
+    (2, 4, 4)
     """
 
     matrices: np.ndarray
@@ -211,22 +289,27 @@ class PoseList(CameraPath):
 def _place(
     centre_m: tuple[float, float, float] | None, distance_m: float | None, viewpoint: Viewpoint | None
 ) -> tuple[Array, float]:
+    """Centre (3,) and distance of a path, metres, those of the viewpoint where they are None."""
     if viewpoint is None and (centre_m is None or distance_m is None):
-        raise ValueError("expected a path with centre_m and distance_m, as no scene's camera gives them.")
+        raise ValueError("expected a path with centre_m and distance_m, or a viewpoint that gives them; got neither.")
     centre = viewpoint.centre_m if centre_m is None else np.asarray(centre_m)  # type: ignore[union-attr]
     return centre, viewpoint.distance_m if distance_m is None else distance_m  # type: ignore[union-attr]
 
 
 def _elevation(elevation_deg: float | None, viewpoint: Viewpoint | None) -> float:
+    """Elevation of a path in degrees, that of the viewpoint where it is None."""
     if elevation_deg is not None:
         return elevation_deg
     if viewpoint is None:
-        raise ValueError("expected a path with elevation_deg, as no scene's camera gives it.")
-    return float(np.clip(viewpoint.elevation_deg, -85, 85))
+        raise ValueError("expected a path with elevation_deg, or a viewpoint that gives it; got neither.")
+    return float(np.clip(viewpoint.elevation_deg, -MAX_ELEVATION_DEG, MAX_ELEVATION_DEG))
 
 
 def _looking_in(azimuths: Array, elevations: Array, distance_m: float, centre: Array) -> Array:
-    """(n, 4, 4) poses on a sphere, radians, that look at its centre."""
+    """Poses (n, 4, 4) of cameras on a sphere that look at its centre.
+
+    azimuths, elevations : (n,) radians. distance_m : radius of the sphere, metres. centre : (3,) metres, world.
+    """
     across = np.cos(elevations)
     away = np.stack([across * np.cos(azimuths), across * np.sin(azimuths), np.sin(elevations)], axis=-1)
     return np.stack([look_at(centre + distance_m * d, centre) for d in away])

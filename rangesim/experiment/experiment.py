@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to measure and with what: a scene, the settings of the light transport, and the instruments to compare."""
+"""The settings of an experiment: a scene, the instruments that measure it, and the settings of the light transport."""
 
 from __future__ import annotations
 
@@ -24,26 +24,44 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A scene, seen by one or more instruments.
+    """A scene that one or more instruments measure.
+
+    `rangesim.pipeline.experiment_run.carry_out` measures it, and `run` writes the results as well.
 
     Parameters
     ----------
-    scene : path of a Mitsuba 3 XML scene or of a mesh (PLY, OBJ, GLB ...), or the name of a scene that comes with the
-        package, such as tabletop.
-    material : material class of a bare mesh (None: matte); refused for a scene, which names its own.
-    unit_m : metres per unit of a bare mesh, 0.001 for millimetres (None: 1); refused for a scene.
-    width, height : pixels of the camera; None: as in the scene. The field of view is kept.
-    spp : light paths per pixel; None: 8, and up to `max_spp` where these leave noise that is not small against that
-        of the detectors, see `rangesim.instrument.adaptive_sampling`.
-    max_spp : light paths per pixel, at most, where `spp` is None.
-    max_depth : longest path, in segments between surfaces that scatter it, up to the light; 2 is direct light alone.
-        Glass and mirrors do not count.
-    photons : caustic photons of each pass; 0: no light through glass or off mirrors; None: the default of `transport`.
+    scene : path of a Mitsuba 3 XML scene or of a mesh (PLY, OBJ, GLB ...), or the name of a scene that the package
+        contains, such as "tabletop".
+    material : material class of a bare mesh; None: matte. A scene has materials of its own, so it is refused there.
+    unit_m : metres per unit of a bare mesh, 0.001 for millimetres; None: 1. Refused for a scene.
+    width, height : size of the camera's image, pixels; None: as in the scene. The field of view is kept.
+    spp : light paths per pixel. None: 8, and up to `max_spp` where the renderer's noise would not be small against
+        the detector's noise, see `rangesim.instrument.adaptive_sampling`.
+    max_spp : largest number of light paths per pixel where `spp` is None.
+    max_depth : largest number of segments of a path between surfaces that scatter it, the last segment to the light
+        included. 2 means direct light only. Glass and mirrors do not count.
+    photons : number of caustic photons of each pass. 0: no light through glass or off mirrors. None: the default of
+        `transport`.
     glint : whether the camera sees the projector's lens in mirrors.
-    seed : of transport and noise, 0 to 2^64 - 1; the same seed gives the same bytes.
-    ambient : what kind of light the scene's own emitters give, and how strong; None: not stated, see `expose`.
-    instruments : those whose emitters stand in the same place share one light-transport pass, if nothing moves.
-    motion : what moves; None: nothing.
+    seed : seed of light transport and noise, 0 to 2^64 - 1. The same seed gives the same bytes.
+    ambient : Ambient, kind and strength of the light that the scene's own emitters give; None: not stated, see
+        `rangesim.expose`.
+    instruments : instruments to compare. Those whose emitter, wavelength and camera agree share a light-transport
+        pass, if nothing moves, see `rangesim.pipeline.shared_passes`.
+    motion : Motion, objects that move; None: nothing moves.
+
+    Raises
+    ------
+    ValueError
+        A number out of its range, no instrument, or two instruments of the same name.
+
+    Examples
+    --------
+    >>> experiment = Experiment("tabletop", width=320, height=240)
+    >>> [each.name for each in experiment.instruments]
+    ['gray-phase', 'amcw', 'ideal-tof']
+    >>> experiment_from_dict(experiment_to_dict(experiment)) == experiment
+    True
     """
 
     scene: str
@@ -82,7 +100,7 @@ class Experiment:
             raise ValueError(f"expected instruments of different names, got {twice[0]!r} twice.")
 
     def transport_settings(self, instruments: Sequence[Instrument]) -> TransportSettings:
-        """How the light of a pass for these instruments is sampled."""
+        """Settings of the light-transport pass that these instruments share."""
         from rangesim.instrument.adaptive_sampling import AdaptiveSampling
         from rangesim.light_transport.transport_settings import PHOTONS, TransportSettings
 
@@ -96,22 +114,33 @@ class Experiment:
 
 
 def load_experiment(path: str | Path) -> Experiment:
-    """The experiment of a TOML file; a relative scene path counts from the file's directory.
+    """The experiment that a TOML file describes.
 
-    A scene that comes with the package is meant where its name is given and no file of that name is there.
+    A relative path of the scene counts from the directory of the file. If there is no such file, the name may be that
+    of a scene that the package contains. `examples/tabletop.toml` shows the common keys.
 
     Raises
     ------
     FileFormatError
-        The file is missing or no valid TOML, or holds an unknown key or a bad value; the message names the place.
+        The file is missing, is no valid TOML, or has an unknown key or a bad value. The message names the place.
     """
     return load_settings(path, "an experiment", experiment_from_dict)
 
 
 def experiment_from_dict(data: Mapping[str, Any], files_in: Path | None = None) -> Experiment:
-    """The experiment of plain data; each table under `instrument` is one instrument. ValueError as `from_dict`.
+    """The experiment that plain data describes. Each table under `instrument` is one instrument.
 
     files_in : as for `rangesim.instrument.instrument.instrument_from_dict`.
+
+    Raises
+    ------
+    ValueError
+        An unknown key or a bad value. The message names the place.
+
+    Examples
+    --------
+    >>> experiment_from_dict({"scene": "matte", "instrument": [{"sensor": "amcw", "power_w": 2.0}]}).instruments[0].name
+    'amcw'
     """
     check_keys(data, ["instrument" if f.name == "instruments" else f.name for f in fields(Experiment)], "experiment")
     rest = {key: value for key, value in data.items() if key not in ("instrument", "motion")}
@@ -122,7 +151,7 @@ def experiment_from_dict(data: Mapping[str, Any], files_in: Path | None = None) 
     if tables is None:
         return experiment
     if not isinstance(tables, list):
-        raise ValueError("expected instruments as tables headed [[instrument]], with two brackets.")
+        raise ValueError("expected instruments as tables with the header [[instrument]], with two brackets.")
     return replace(
         experiment,
         instruments=tuple(instrument_from_dict(t, f"instrument[{i}]", files_in) for i, t in enumerate(tables)),
@@ -130,7 +159,7 @@ def experiment_from_dict(data: Mapping[str, Any], files_in: Path | None = None) 
 
 
 def experiment_to_dict(experiment: Experiment) -> dict[str, Any]:
-    """Plain data that `experiment_from_dict` reads back equal."""
+    """The experiment as plain data, from which `experiment_from_dict` makes an equal experiment."""
     data = to_dict(experiment)
     data["instrument"] = data.pop("instruments")
     return dict(data)

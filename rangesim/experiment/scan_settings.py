@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `rangesim scan` does: a scene, an instrument, a path, and how its views become a surface."""
+"""The settings of a scan: a scene, an instrument, a camera path, and how the views are fused to a surface."""
 
 from __future__ import annotations
 
@@ -21,21 +21,39 @@ if TYPE_CHECKING:
     from rangesim.light_transport.transport_settings import TransportSettings
 
 SENSOR = "gray-phase"
+"""Preset of the sensor that a scan uses if none is given."""
 
 
 @dataclass(frozen=True)
 class ScanSettings:
-    """A scan: many views of a scene, fused.
+    """A scan: one instrument takes many views of a scene, and the views are fused to a surface.
+
+    `rangesim.pipeline.scan_run.carry_out_scan` carries it out, and `run_scan` writes the results as well.
 
     Parameters
     ----------
-    scene, material, unit_m, width, height, spp, max_depth, photons, glint, seed, ambient : as of
-        `rangesim.experiment.Experiment`; spp None: the default of `transport`.
-    instrument : one, whose camera and emitter move together.
-    path : where its views are taken from; what it does not say comes from the scene's camera.
-    registration : "known": poses are those of the path; "unknown": they are found from the readings (`align`).
-    voxel_m : metres; None: 1.5 times the distance between readings.
-    truncation_m, weights, min_weight : as of `fuse`.
+    scene, material, unit_m, width, height, max_depth, photons, glint, seed, ambient : as for
+        `rangesim.experiment.Experiment`.
+    spp : light paths per pixel; None: the default of `rangesim.transport`.
+    instrument : Instrument, whose camera and emitter move together.
+    path : CameraPath. What it does not state comes from the scene's camera.
+    registration : "known": the poses are those of the path. "unknown": they are found from the readings
+        (`rangesim.fusion.multiway_registration.align`).
+    voxel_m : edge of a voxel, metres; None: 1.5 times the distance between readings.
+    truncation_m, weights, min_weight : as for `rangesim.fusion.truncated_average.fuse`.
+
+    Raises
+    ------
+    ValueError
+        A number out of its range.
+
+    Examples
+    --------
+    >>> settings = ScanSettings("matte", path=Turntable(views=6), voxel_m=2e-3)
+    >>> settings.instrument.name
+    'gray-phase'
+    >>> scan_settings_from_dict(scan_settings_to_dict(settings)) == settings
+    True
     """
 
     scene: str
@@ -65,7 +83,7 @@ class ScanSettings:
         object.__setattr__(self, "seed", check_seed(self.seed))
 
     def transport_settings(self) -> TransportSettings:
-        """How the light of a view is sampled."""
+        """Settings of the light-transport pass of each view."""
         from rangesim.light_transport.transport_settings import PHOTONS, TransportSettings
 
         photons = PHOTONS if self.photons is None else self.photons
@@ -75,20 +93,29 @@ class ScanSettings:
 
 
 def load_scan_settings(file: str | Path) -> ScanSettings:
-    """The scan of a TOML file: the fields of `ScanSettings`, tables `[instrument]` and `[path]` with their `type`.
+    """The scan that a TOML file describes.
 
-    A relative scene path counts from the file's directory.
+    The file has the fields of `ScanSettings`. `[instrument]` and `[path]` are tables; that of the path has a `type`. A
+    relative path of the scene counts from the directory of the file.
 
     Raises
     ------
     FileFormatError
-        The file is missing or no valid TOML, or holds an unknown key or a bad value; the message names the place.
+        The file is missing, is no valid TOML, or has an unknown key or a bad value. The message names the place.
     """
     return load_settings(file, "the settings of a scan", scan_settings_from_dict)
 
 
 def scan_settings_from_dict(data: Mapping[str, Any], files_in: Path | None = None) -> ScanSettings:
-    """The settings of plain data; ValueError as `from_dict`. files_in : as of `instrument_from_dict`."""
+    """The scan that plain data describes.
+
+    files_in : as for `rangesim.instrument.instrument.instrument_from_dict`.
+
+    Raises
+    ------
+    ValueError
+        An unknown key or a bad value. The message names the place.
+    """
     check_keys(data, [f.name for f in fields(ScanSettings)], "scan")
     settings = from_dict(ScanSettings, {k: v for k, v in data.items() if k not in ("instrument", "path")})
     if data.get("instrument") is not None:
@@ -99,5 +126,5 @@ def scan_settings_from_dict(data: Mapping[str, Any], files_in: Path | None = Non
 
 
 def scan_settings_to_dict(settings: ScanSettings) -> dict[str, Any]:
-    """Plain data that `scan_settings_from_dict` reads back equal."""
+    """The scan as plain data, from which `scan_settings_from_dict` makes an equal scan."""
     return dict(to_dict(settings))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays in .npz files, as NumPy's: written whole or not at all, and read within the limits.
+"""Arrays in .npz files, the format of NumPy: written completely or not at all, and read within the limits.
 
-Sizes are known, and checked, before anything is decompressed.
+The size of every array is checked before anything is decompressed.
 """
 
 from __future__ import annotations
@@ -25,27 +25,44 @@ from rangesim.settings import limits
 from rangesim.settings.config import brief, shown
 
 Check = Callable[[str, str, tuple[int, ...], "np.dtype[Any]"], None]
+"""A check of an array before it is read; see `read_arrays`."""
 KINDS = "biufcSU"
-"""Kinds of NumPy types that are read: numbers and text of fixed size, no objects."""
+"""Kinds of NumPy types that are read: numbers and text of fixed size, but no objects."""
 MAX_ARRAYS = 1000
+"""Largest number of arrays in a file. Files of this package have some tens; without a limit, the directory of a hostile
+file could fill the memory."""
 COMPRESSION_LEVEL = 1
-"""Measured arrays are noise in their lower digits: more effort takes twice as long and saves 2 %."""
+"""Level of deflate, 1 to 9. The lower digits of measured arrays are noise: measured, the default level 6 takes twice as
+long and makes files 2 % smaller."""
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Methods of compression that are read, those of `numpy.savez` and `numpy.savez_compressed`."""
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
+"""Functions that read the header of a .npy file, by its version."""
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], seal: str | None = None) -> None:
-    """Write arrays to a compressed .npz file; the same arrays give the same bytes.
+    """Write arrays to a compressed .npz file. The same arrays always give the same bytes.
 
-    `seal` : its mark, see `pcgraph.plumbing.plain_files.sealed`; None: no seal.
+    Parameters
+    ----------
+    arrays : the arrays by name.
+    seal : mark of the seal at the end of the file, see `pcgraph.plumbing.plain_files.sealed`; None: no seal.
 
     Raises
     ------
     FileFormatError
-        The place cannot be written.
+        The file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_arrays(f"{folder}/depth.npz", {"z": np.ones((2, 3), np.float32)})
+    ...     read_arrays(f"{folder}/depth.npz")["z"].shape
+    (2, 3)
     """
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=COMPRESSION_LEVEL) as archive:
@@ -60,20 +77,21 @@ def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], seal: str |
 def read_arrays(
     path: str | Path, names: Iterable[str] | None = None, check: Check | None = None
 ) -> dict[str, np.ndarray]:
-    """Arrays of a .npz file by name, as `numpy.savez` and `numpy.savez_compressed` write it.
+    """Arrays by name of a .npz file that `numpy.savez` or `numpy.savez_compressed` may have written.
 
-    Nothing is unpickled. Their sizes, as the file states them, are checked against the limit `bytes` first, and hold:
-    a member that is longer or shorter than it states is refused.
+    Nothing is unpickled. The sizes stated in the file are checked against the limit `bytes` first; an array whose size
+    differs from the stated one is refused.
 
     Parameters
     ----------
-    names : those to read; None: all.
-    check : called with the place (for messages), name, shape and dtype of each, before memory is allocated for it.
+    names : names of the arrays to read; None: all.
+    check : function of name, place (for messages), shape and dtype of an array. It is called before memory is
+        allocated, and raises if it does not accept the array.
 
     Raises
     ------
     FileFormatError
-        The file is missing, broken, too large, lacks one of `names`, or holds objects.
+        The file is missing, broken or too large, lacks one of `names`, or holds objects.
     """
     path = Path(path)
     check_file(path, FileFormatError)
@@ -95,7 +113,12 @@ def read_arrays(
     except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, OSError) as error:
         reason = getattr(error, "strerror", None) or brief(error) or "it ends early"
         raise FileFormatError(f"{path} cannot be read as .npz: {reason}.") from error
-    except (NotImplementedError, RuntimeError, ValueError, OverflowError) as error:  # of odd entries in the directory
+    except (
+        NotImplementedError,
+        RuntimeError,
+        ValueError,
+        OverflowError,
+    ) as error:  # odd entries of the directory
         raise FileFormatError(f"{path} cannot be read as .npz: {brief(error)}.") from error
 
 
@@ -134,7 +157,7 @@ def _read(
             if not count:
                 raise FileFormatError(f"{place} ends early.")
             filled += count
-        file.read(1)  # the end, where the checksum is compared
+        file.read(1)  # at the end of the entry its checksum is verified
     return array.reshape(shape, order="F" if fortran_order else "C")
 
 
@@ -144,7 +167,7 @@ def _header(file: IO[bytes], place: str) -> tuple[tuple[int, ...], bool, np.dtyp
         if version not in _HEADERS:
             raise ValueError(f"version {version} is unknown")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of headers as Python 2 wrote them
+            warnings.simplefilter("ignore")  # NumPy warns of headers that Python 2 wrote
             shape, fortran_order, dtype = _HEADERS[version](file)
     except (ValueError, TypeError, SyntaxError, TokenError, RecursionError, MemoryError, EOFError) as error:
         raise FileFormatError(f"{place}: its header is broken: {brief(error)}.") from error

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scenes and materials that come with the package, and how a scene's name becomes a file."""
+"""The scenes and materials that come with the package, and the files that scene names stand for."""
 
 from __future__ import annotations
 
@@ -8,24 +8,31 @@ from pathlib import Path
 from rangesim.errors import FileFormatError
 
 _INSTALLED = Path(__file__).resolve().parents[1] / "scene" / "catalogue"
+"""Directory of the scenes in an installed package."""
 CATALOGUE = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[2] / "scenes"
-"""Directory of the scenes and of `materials/`: a copy inside an installed package, `scenes` in a checkout."""
+"""Directory of the scenes and of `materials/`: inside an installed package, or `scenes` in a checkout."""
 
 
 def scene_names() -> tuple[str, ...]:
-    """Names of the scenes that come with the package, in alphabetical order."""
+    """Names of the scenes that come with the package, in alphabetical order.
+
+    Examples
+    --------
+    >>> "tabletop" in scene_names()
+    True
+    """
     return tuple(sorted(path.stem for path in CATALOGUE.glob("*.xml")))
 
 
 def scene_file(source: str | Path) -> Path:
-    """Path of a scene or mesh: the file itself where there is one, else the scene of that name in the catalogue.
+    """Path of a scene or mesh file: `source` itself if it is a file, else the bundled scene of that name.
 
     Raises
     ------
     FileFormatError
-        Neither; the message says which names there are.
+        `source` is neither; the message lists the names.
     """
-    from rangesim.settings.config import nearest  # imports NumPy, which the command line's help does without
+    from rangesim.settings.config import nearest  # imports NumPy, which the help of the command line does not need
 
     path, names = Path(source), scene_names()
     if path.is_file():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One grey image per file: PNG, TIFF or JPEG for digital numbers, OpenEXR for radiance."""
+"""Files of one grey image each: PNG, TIFF and others for digital numbers, OpenEXR for radiance."""
 
 from __future__ import annotations
 
@@ -24,37 +24,38 @@ from rangesim.settings import limits
 from rangesim.settings.config import brief
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".exr")
-"""Files that `read_grey` takes for images."""
+"""Suffixes of the files that `read_grey` reads."""
 _BROKEN = (
     *(OSError, ValueError, SyntaxError, RuntimeError, LookupError, TypeError, EOFError, ArithmeticError, MemoryError),
     *(struct.error, zlib.error),
 )
-"""What Pillow and OpenEXR raise on a file that is no image, or broken."""
-
-
+"""Errors that Pillow and OpenEXR raise on a file that is broken or no image."""
 PNG_STRATEGY = zlib.Z_RLE
-"""Of deflate. Noise does not repeat itself: to search for it takes longer and makes files 5 % larger."""
+"""Strategy of deflate for PNG. Noise does not repeat, so searching for repetitions takes longer and, as measured, makes
+the files of frames 5 % larger."""
 GREY_LEVELS = 5
-"""Of 255, difference at most between the channels of a pixel that counts as grey."""
-
-
+"""Largest difference between the channels (0 to 255) of a pixel that counts as grey. JPEG compression changes the
+channels of a grey image by a few levels; at 0, such images would count as coloured."""
 _EXR = b"\x76\x2f\x31\x01"
+"""First four bytes of an OpenEXR file."""
 _TARGA = b"TRUEVISION-XFILE.\0"
+"""Last bytes of a Targa file."""
 _MAX_HEADER = 1 << 16
-"""Bytes of a text header that are searched for the size of the image."""
+"""Number of bytes of a float map in which the size of the image is searched. The header is a few words; the limit keeps
+the search from reading the pixels."""
 
 
 class _OtherFormatError(OSError):
-    """A file begins like none of the formats that are read here."""
+    """A file is of no format that Pillow reads here."""
 
 
 def write_grey(path: Path, image: np.ndarray) -> None:
-    """Write (h, w) uint8 or uint16 as PNG, or float32 as OpenEXR with one channel Y, by the suffix of `path`.
+    """Write an image (h, w): float32 as OpenEXR with one channel Y if `path` ends in .exr, else uint8 or uint16 as PNG.
 
     Raises
     ------
     OSError
-        The disk takes no more.
+        The file cannot be written, for example because the disk is full.
     """
     if path.suffix == ".exr":
         import OpenEXR
@@ -63,7 +64,7 @@ def write_grey(path: Path, image: np.ndarray) -> None:
         try:
             with utf8_name(path) as name:
                 OpenEXR.File(header, {"Y": np.ascontiguousarray(image, dtype=np.float32)}).write(name)
-        except RuntimeError as error:  # OpenEXR's for whatever the system says
+        except RuntimeError as error:  # OpenEXR raises it for every error of the system
             said = next((number for number in DISK if os.strerror(number) in str(error)), errno.EIO)
             raise OSError(said, os.strerror(said), str(path)) from error
         return
@@ -73,12 +74,12 @@ def write_grey(path: Path, image: np.ndarray) -> None:
 
 
 def read_grey(path: Path) -> np.ndarray:
-    """(h, w) uint8, uint16 or float32 image of a file; colour becomes grey by luma (ITU-R BT.601).
+    """The image in a file as (h, w) uint8, uint16 or float32. Colours become grey by their luma (ITU-R BT.601).
 
     Raises
     ------
     FileFormatError
-        The file cannot be read, or its pixels are none of these types.
+        The file cannot be read, or its pixels are of another type.
     """
     check_file(path, FileFormatError)
     try:
@@ -91,25 +92,26 @@ def read_grey(path: Path) -> np.ndarray:
 
 
 def is_coloured(path: Path) -> bool:
-    """Whether an image has colours, as far as a few of its pixels tell; False for what cannot be read here."""
+    """Whether an image has colours, judged by 32 x 32 of its pixels; False for a file that cannot be read here."""
     try:
         with _quiet(), _open_raster(path) as image:
             small = np.asarray(image.convert("RGB").resize((32, 32), 0), dtype=np.int16)
-    except _BROKEN:  # Mitsuba says so, or reads what Pillow does not
+    except _BROKEN:  # Mitsuba reports it, or reads a format that Pillow does not
         return False
     return bool((small.max(axis=-1) - small.min(axis=-1)).max() > GREY_LEVELS)
 
 
 def check_pixels(path: Path) -> None:
-    """Raise FileFormatError if an image file states more pixels, or bytes, than the limits allow, or is damaged.
+    """Raise FileFormatError if an image file is damaged, or states more pixels or bytes than the limits allow.
 
-    For files that others will decode: Mitsuba's libpng crashed on some. Of Radiance files, float maps and Targa only
-    the stated size is checked; a file of yet another format than those of `read_grey` passes.
+    Mitsuba will decode the file afterwards, and its libpng crashed on some damaged files. Only the stated size is
+    checked of Radiance files, float maps and Targa files. A file of a further format that `read_grey` does not read is
+    accepted.
     """
     check_file(path, FileFormatError)
     try:
         with _quiet():
-            if path.suffix.lower() == ".exr" or _start_of(path).startswith(_EXR):  # Mitsuba goes by the contents
+            if path.suffix.lower() == ".exr" or _start_of(path).startswith(_EXR):  # Mitsuba goes by the contents, too
                 _open_exr(path)
                 return
             try:
@@ -124,9 +126,10 @@ def check_pixels(path: Path) -> None:
 
 
 def read_stack(paths: list[Path], size: tuple[int, int] | None = None) -> np.ndarray:
-    """(k, h, w) uint8, uint16 or float32 images of files.
+    """The images in several files as one array (k, h, w), uint8, uint16 or float32.
 
-    size : (w, h) that they must have, if it is known; then it is asked before memory is allocated for all of them.
+    size : (w, h) that the images must have, pixels; None: that of the first. It is checked before memory is allocated
+        for all images.
 
     Raises
     ------
@@ -135,7 +138,7 @@ def read_stack(paths: list[Path], size: tuple[int, int] | None = None) -> np.nda
     """
     first: np.ndarray | None = None
     for i, path in enumerate(paths):
-        if not os.path.lexists(path):  # unlike Path.exists, also of names that cannot be
+        if not os.path.lexists(path):  # unlike Path.exists, accepts impossible names
             raise FileFormatError(f"frame {path} is missing.")
         image = read_grey(path)
         if first is None:
@@ -162,7 +165,7 @@ def read_stack(paths: list[Path], size: tuple[int, int] | None = None) -> np.nda
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep libraries from printing: OpenEXR and libtiff print what they also raise, Pillow warns of metadata."""
+    """Silence libraries while the block runs: OpenEXR and libtiff print errors that they also raise; Pillow warns."""
     sys.stdout.flush()
     sys.stderr.flush()
     with warnings.catch_warnings(), ExitStack() as kept:
@@ -170,7 +173,7 @@ def _quiet() -> Iterator[None]:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         kept.callback(os.close, nowhere)
         for stream in (1, 2):
-            with suppress(OSError):  # it is closed
+            with suppress(OSError):  # the stream is closed
                 before = os.dup(stream)
                 kept.callback(os.close, before)
                 kept.callback(os.dup2, before, stream)
@@ -184,9 +187,9 @@ def _start_of(path: Path) -> bytes:
 
 
 def _check_stated_size(path: Path) -> None:
-    """Check the size that a Radiance file (RGBE), float map (PFM) or Targa states; none of them is decoded here.
+    """Check the size that a Radiance file (RGBE), a float map (PFM) or a Targa file states, without decoding it.
 
-    Mitsuba reads them, and makes room for as much as they state.
+    Mitsuba allocates as much memory as the file states.
     """
     content = path.read_bytes()
     words: list[bytes] = []
@@ -205,13 +208,13 @@ def _check_stated_size(path: Path) -> None:
     if len(words) != 2 or not all(word.isdigit() and len(word) < 20 for word in words):
         raise ValueError("its header states no size")
     pixels = math.prod(map(int, words))
-    if pixels == 0:  # Mitsuba ends Python over a Radiance file of no rows
+    if pixels == 0:  # Mitsuba ends the process on a Radiance file without rows
         raise ValueError(f"its header states {int(words[0])} by {int(words[1])} pixels")
     limits.check("pixels", pixels, f"pixels in {path}", FileFormatError)
 
 
 def _open_exr(path: Path) -> None:
-    """Check the sizes in the headers of an OpenEXR file, before the library allocates them."""
+    """Check the sizes stated in the headers of an OpenEXR file, before the library allocates memory for them."""
     import OpenEXR
 
     pixels = size = 0
@@ -242,9 +245,9 @@ def _read_exr(path: Path) -> np.ndarray:
 
 @contextmanager
 def _open_raster(path: Path) -> Iterator[Any]:
-    """The Pillow image of a file, not yet decoded, whose size is within the limits.
+    """The Pillow image of a file, not yet decoded, after a check of its size.
 
-    `Image.open` would try every format, and apply a limit of its own, which is one for the whole process.
+    `Image.open` is not used, because it would try every format and apply a limit that holds for the whole process.
     """
     from PIL import (
         BmpImagePlugin,
@@ -258,7 +261,7 @@ def _open_raster(path: Path) -> Iterator[Any]:
     plugins = (PngImagePlugin.PngImageFile, JpegImagePlugin.JpegImageFile, BmpImagePlugin.BmpImageFile,
                PpmImagePlugin.PpmImageFile, TiffImagePlugin.TiffImageFile)  # fmt: skip
     with path.open("rb") as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of damaged tags, which the pixels do not need
+        warnings.simplefilter("ignore", UserWarning)  # Pillow warns of damaged tags, which the pixels do not need
         start = file.read(16)
         for plugin in plugins:
             factory, accepts = Image.OPEN[plugin.format]
@@ -291,7 +294,10 @@ def _read_raster(path: Path) -> np.ndarray:
 
 
 def _pages_of_one_size(image: Any) -> int:
-    """Pages of a TIFF as large as the first, it included; a smaller one may be a preview. The first stays chosen."""
+    """Number of pages of a TIFF file that have the size of the first; a smaller page may be a preview.
+
+    Afterwards the first page is selected again.
+    """
     sizes = []
     for page in range(image.n_frames):
         image.seek(page)
@@ -301,7 +307,7 @@ def _pages_of_one_size(image: Any) -> int:
 
 
 def _is_deep_colour_png(path: Path) -> bool:
-    """Whether the header says 16 bits and colour; Pillow would cut those to 8 bits without a word."""
+    """Whether a PNG file has colours of 16 bits, which Pillow would silently reduce to 8 bits."""
     with path.open("rb") as file:
         header = file.read(26)
     return header[24] == 16 and header[25] in (2, 6)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Schemas of the files that this package writes and reads back: typed, versioned, checked before they are used.
+"""Schemas of the files that this package writes and reads back. Files are checked against them before they are used.
 
-A file of settings is a `Record`: a msgspec structure without unknown fields, whose format and version are constants. A
-file of arrays has one `ArraySpec` for each array. Whoever reads gets what the types promise, or one sentence that names
-file and place.
+A JSON file is a `Record`: a msgspec structure that refuses unknown fields, and whose format and version are constants.
+A file of arrays has an `ArraySpec` for each array. Reading returns data that agree with the schema, or raises an error
+whose message names the file and the place in it.
 """
 
 from __future__ import annotations
@@ -25,36 +25,44 @@ from rangesim.settings import limits
 from rangesim.settings.config import shown
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]
+"""A count, at most 2^53: from there on, JSON readers with double precision skip integers."""
 Photons = Annotated[float, msgspec.Meta(ge=0, le=1e300)]
-"""A mean number of photons."""
+"""A mean count of photons; the upper bound only excludes infinity."""
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
+"""A fraction from 0 to 1."""
 Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
+"""A duration in seconds, at most 30 years."""
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
+"""A positive number in whatever unit; the upper bound only excludes nonsense."""
 MAX_METRES = 1e9
+"""Largest distance in a file, in metres: a hundred times `rangesim.settings.bounds.MAX_COORDINATE_M`. It only excludes
+damaged numbers; a wrong measurement may lie far outside the scene."""
 Metres = Annotated[float, msgspec.Meta(ge=-MAX_METRES, le=MAX_METRES)]
+"""A length in metres, of either sign."""
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
+"""A name of 1 to 1000 characters."""
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of what a JSON file holds."""
+    """Base of the contents of a JSON file: a structure that refuses unknown fields."""
 
 
 R = TypeVar("R", bound=Record)
 
 
 def read_record(path: Path, kind: type[R]) -> R:
-    """What a JSON file holds, as `kind`.
+    """The contents of a JSON file as a structure of type `kind`.
 
     Raises
     ------
     FileFormatError
-        The file is missing, broken, of another format or version, or a value is not what `kind` says.
+        The file is missing, broken, of another format or version, or does not match `kind`.
     """
-    if path.exists() and not path.is_file():  # a pipe would be waited for
+    if path.exists() and not path.is_file():  # reading a pipe would wait
         raise FileFormatError(f"{path} is no plain file.")
     data = read_json(path)
     expected = {f.name: f.type for f in msgspec.structs.fields(kind) if f.name in ("format", "format_version")}
-    for name, constant in expected.items():  # before all other fields: they may be those of another version
+    for name, constant in expected.items():  # first, because another version has other fields
         (value,) = constant.__args__
         found = data.get(name) if isinstance(data, dict) else None
         if type(found) is not type(value) or found != value:
@@ -71,17 +79,17 @@ def read_record(path: Path, kind: type[R]) -> R:
 
 
 def write_record(path: Path, record: Record) -> None:
-    """Write a record as JSON, indented; `read_record` reads it back equal."""
+    """Write a record as indented JSON; `read_record` reads it back equal."""
     try:
         content = msgspec.json.encode(record)
-    except UnicodeEncodeError:  # a file's name that is no UTF-8: json spells half surrogate pairs out
+    except UnicodeEncodeError:  # a file name that is not UTF-8 has lone surrogates, which `json` escapes
         write_json(path, msgspec.to_builtins(record))
     else:
         path.write_bytes(msgspec.json.format(content, indent=1) + b"\n")
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write plain data, indented."""
+    """Write plain data as indented JSON."""
     path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
@@ -91,12 +99,16 @@ def _plain(sentence: str) -> str:
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """What an array of a file has to be.
+    """Requirements on an array in a file.
 
-    dtype : name of the NumPy type; "str" for text. shape : numbers, or letters that stand for the same number wherever
-    they occur. low, high : bounds of its finite values. per_pixel : how many values there are at most for each of h x w
-    pixels; 0: no bound. nan, inf : whether it may hold these. required : whether the
-    file has to have it.
+    Parameters
+    ----------
+    dtype : name of the NumPy type; "str" for text.
+    shape : sizes of the axes, as numbers or as letters. A letter stands for the same number in all arrays of the file.
+    low, high : bounds of the finite values.
+    nan, inf : whether NaN and infinity are allowed.
+    required : whether the file must have the array.
+    per_pixel : largest number of values per pixel of the h x w pixels; 0: any number.
     """
 
     dtype: str
@@ -110,15 +122,19 @@ class ArraySpec:
 
 
 def read_checked_arrays(path: Path, specs: Mapping[str, ArraySpec], sizes: dict[str, int]) -> dict[str, np.ndarray]:
-    """Arrays of an .npz file by name.
+    """The arrays of an .npz file by name, checked against their specs.
 
-    sizes : numbers that letters in shapes stand for, h and w among them; completed by those that occur here for the
-        first time. Types and shapes are checked before memory is allocated.
+    Types and shapes are checked before memory is allocated.
+
+    Parameters
+    ----------
+    specs : the requirements by name of array; the file may hold no other arrays.
+    sizes : the numbers that letters in shapes stand for, at least h and w. Letters that are new are added to it.
 
     Raises
     ------
     FileFormatError
-        The file is missing or broken, lacks an array or has one too many, or one is not what its spec says.
+        The file is missing or broken, lacks an array, has one too many, or has one that does not meet its spec.
     """
     if not path.is_file():
         raise FileFormatError(f"{path} is missing.")
@@ -138,16 +154,22 @@ def read_checked_arrays(path: Path, specs: Mapping[str, ArraySpec], sizes: dict[
 
 
 SETTINGS = ArraySpec("uint8", ("settings",))
-"""An array of settings in a file of arrays; see `settings_array`."""
+"""Requirement on the array of settings in a file of arrays; see `settings_array`."""
 
 
 def settings_array(data: Mapping[str, Any]) -> np.ndarray:
-    """Plain data as an array of bytes, JSON, to stand beside others in a file of arrays."""
+    """Plain data as an array of bytes (JSON), so that a file of arrays can hold settings as well."""
     return np.frombuffer(json.dumps(data).encode(), np.uint8)
 
 
 def settings_of(array: np.ndarray, path: Path) -> dict[str, Any]:
-    """The plain data that `settings_array` made an array of; FileFormatError if it is no table."""
+    """The plain data in an array that `settings_array` made; FileFormatError if it holds no table.
+
+    Examples
+    --------
+    >>> settings_of(settings_array({"steps": 4}), Path("capture.npz"))
+    {'steps': 4}
+    """
     try:
         settings = json.loads(array.tobytes().decode())
     except (ValueError, RecursionError) as error:
@@ -158,13 +180,14 @@ def settings_of(array: np.ndarray, path: Path) -> dict[str, Any]:
 
 
 MAX_TEXT = 1000
-"""Characters of a name in an array of text."""
+"""Largest number of characters of a name in an array of text, as for `Name`. NumPy stores each name of an array with as
+many characters as the longest, so one long name would make a huge array."""
 
 
 def _check_header(
     shape: tuple[int, ...], dtype: np.dtype[Any], spec: ArraySpec, sizes: dict[str, int], place: str
 ) -> None:
-    """Check what is known before memory is allocated; completes `sizes`."""
+    """Check type and shape of an array, which are known before memory is allocated, and add new letters to `sizes`."""
     is_text = spec.dtype == "str" and dtype.kind == "U" and dtype.itemsize <= 4 * MAX_TEXT
     if not is_text and dtype != np.dtype(spec.dtype if spec.dtype != "str" else object):
         raise FileFormatError(f"{place}: expected {spec.dtype}, got {str(dtype)[:100]}.")

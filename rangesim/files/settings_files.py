@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""TOML files of settings that name a scene: an experiment, a scan."""
+"""TOML files of settings that name a scene: those of experiments and of scans."""
 
 from __future__ import annotations
 
@@ -16,12 +16,16 @@ T = TypeVar("T")
 
 
 def load_settings(file: str | Path, expected: str, read: Callable[[Mapping[str, Any], Path], T]) -> T:
-    """The settings of a TOML file; a relative `scene` counts from the file's directory.
+    """The settings in a TOML file, with the path of their scene relative to the current directory.
 
-    A scene that comes with the package is meant where its name is given and no file of that name is there.
+    In the file, the path of the scene is relative to the file's directory. If no such file exists, it may be the name
+    of a scene that comes with the package.
 
-    expected : what the file should be, for the message. read : frozen dataclass with a field `scene`, of the file's
-    data and directory; its ValueError becomes FileFormatError.
+    Parameters
+    ----------
+    expected : name for this kind of file, for the message.
+    read : function that makes the settings, a frozen dataclass with a field `scene`, from the data of the file and its
+        directory. A ValueError that it raises becomes a FileFormatError.
 
     Raises
     ------

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JSON, TOML and XML files, read within the limits: their size, and how deep they nest.
+"""JSON, TOML and XML files, read within the limits of their size and of their nesting.
 
-Parsers of all three recurse, and Mitsuba's crashes the process where the stack ends. So depth is counted first.
+The parsers of all three formats are recursive, and that of Mitsuba ends the process when the stack is full. Therefore
+the depth is checked first.
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ from rangesim.settings import limits
 from rangesim.settings.config import brief
 
 _LONG_KEY = r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){%d}"""
+"""Pattern of a TOML key of more than %d parts, such as a.b.c; parsing it takes quadratic time."""
 _PARAMETER = re.compile(r"\$(\w+)")
+"""Pattern of a parameter `$name` in a scene file."""
 
 
 def read_text(path: str | Path) -> str:
-    """Contents of a UTF-8 file; FileFormatError if it is missing, too large or no text."""
+    """Contents of a text file in UTF-8; FileFormatError if it is missing, too large or no text."""
     path = Path(path)
     check_file(path, FileFormatError)
     try:
@@ -38,13 +41,13 @@ def read_text(path: str | Path) -> str:
 
 
 def read_json(path: str | Path) -> Any:
-    """Contents of a JSON file; FileFormatError if it is missing, too large, nested too deep or no JSON."""
+    """Plain data of a JSON file; FileFormatError if it is missing, too large, nested too deep or no JSON."""
     text = read_text(path)
     try:
         data = json.loads(text)
     except RecursionError:
         raise _too_deep(path) from None
-    except ValueError as error:  # also of a number of more digits than Python converts
+    except ValueError as error:  # also for a number with more digits than Python converts
         raise FileFormatError(f"{path} is no valid JSON: {brief(error)}.") from error
     if is_nested_deeper(data, limits.current().nesting):
         raise _too_deep(path)
@@ -52,10 +55,10 @@ def read_json(path: str | Path) -> Any:
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """Contents of a TOML file; FileFormatError if it is missing, too large, nested too deep or no TOML."""
+    """Plain data of a TOML file; FileFormatError if it is missing, too large, nested too deep or no TOML."""
     text = read_text(path)
     deepest = limits.current().nesting
-    if re.search(_LONG_KEY % deepest, text):  # a.b.c ... takes quadratic time
+    if re.search(_LONG_KEY % deepest, text):
         raise _too_deep(path)
     try:
         data = tomllib.loads(text)
@@ -69,11 +72,17 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def is_nested_deeper(data: Any, levels: int) -> bool:
-    """Whether plain data holds mappings or lists more than `levels` deep; also if it holds itself."""
+    """Whether plain data contains mappings or lists nested more than `levels` deep, or contains itself.
+
+    Examples
+    --------
+    >>> is_nested_deeper({"a": [1, 2]}, levels=2), is_nested_deeper({"a": [1, 2]}, levels=1)
+    (False, True)
+    """
     layer = [data] if _is_container(data) else []
     for _ in range(levels):
         inner = (v for values in layer for v in (values.values() if isinstance(values, Mapping) else values))
-        layer = list({id(v): v for v in inner if _is_container(v)}.values())  # a thing that is used often counts once
+        layer = list({id(v): v for v in inner if _is_container(v)}.values())  # each object once
         if not layer:
             return False
     return bool(layer)
@@ -84,26 +93,31 @@ def _is_container(value: Any) -> bool:
 
 
 class SearchPaths(Protocol):
-    """Folders in which the files lie that an XML file names."""
+    """Folders in which the files named by an XML file are searched."""
 
     def resolve(self, name: str) -> Path:
-        """Path of the file of a name, which may be missing."""
+        """Path of the file with a name; it need not exist."""
 
     def within(self, folder: str, beside: Path) -> SearchPaths:
-        """Paths with a folder before those so far, as `<path value="folder"/>` in the file `beside` asks for."""
+        """These paths with a folder in front, as `<path value="folder"/>` in the file `beside` states."""
 
 
 def check_xml(path: str | Path, search: SearchPaths | None = None, ignored: tuple[str, ...] = ()) -> dict[str, str]:
-    """Values for the parameters (`$name`) without a default that stand inside elements which are ignored alone.
+    """Check an XML file and the files that it includes, and return values for parameters that need none.
 
-    search : finds the files that `filename="..."` of an element names. Those that are there have to be plain files
-        within the limits; one that an `<include>` names is checked in its place. None: names of files mean nothing.
-    ignored : names of elements whose contents do not matter.
+    These are the parameters (`$name`) without a default that occur only inside ignored elements. Mitsuba asks for a
+    value all the same, so they get an arbitrary one.
+
+    Parameters
+    ----------
+    search : search paths for the files that elements name with `filename="..."`. Existing ones must be plain files
+        within the limits, and included files are checked like the file itself. None: file names are not followed.
+    ignored : names of the elements whose contents are ignored.
 
     Raises
     ------
     FileFormatError
-        The file is missing, too large, nested too deep, no XML, or declares entities.
+        The file is missing, too large, nested too deep or no XML, includes itself, or declares entities.
     """
     xml = _Xml(ignored)
     xml.read(Path(path), 0, (), search)
@@ -111,20 +125,20 @@ def check_xml(path: str | Path, search: SearchPaths | None = None, ignored: tupl
 
 
 class _Xml:
-    """Depth and size of an XML file with what it includes."""
+    """The check of an XML file together with the files that it includes."""
 
     def __init__(self, ignored: tuple[str, ...]) -> None:
         self.ignored = ignored
         self.size = 0
         self.defaults: dict[str, str] = {}
-        self.open: list[str] = []  # elements around the present place
-        self.fillers: dict[str, str] = {}  # for parameters without a default inside ignored elements
-        self.needed: set[str] = set()  # parameters without a default elsewhere
+        self.open: list[str] = []  # elements that contain the current one
+        self.fillers: dict[str, str] = {}  # values for parameters without a default inside ignored elements
+        self.needed: set[str] = set()  # parameters without a default in other elements
 
     def read(self, path: Path, depth: int, within: tuple[Path, ...], search: SearchPaths | None) -> None:
-        """Check a file that stands `depth` levels deep inside the files `within`; paths that it adds are its own."""
+        """Check a file that the files `within` include, `depth` levels deep. Paths that it adds hold in it alone."""
         check_file(path, FileFormatError)
-        real = path.resolve()  # what it includes lies beside it by its name, though
+        real = path.resolve()  # relative includes, however, start from `path`
         if real in within:
             raise FileFormatError(f"{path} includes itself.")
         try:
@@ -153,7 +167,7 @@ class _Xml:
                 named = self.filled(attributes["filename"])
                 beside = path.parent / named
                 found = beside if name == "include" and os.path.exists(beside) else search.resolve(named)
-                if not os.path.exists(found):  # also of names that cannot be; whoever reads it says so
+                if not os.path.exists(found):  # False for impossible names too; Mitsuba reports a missing file
                     return
                 check_file(found, FileFormatError)
                 limits.check("text", found.stat().st_size, f"bytes in {found}", FileFormatError)
@@ -172,11 +186,11 @@ class _Xml:
         parser.StartElementHandler, parser.EndElementHandler, parser.EntityDeclHandler = start, end, entity
         try:
             parser.Parse(data, True)
-        except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: of an unknown encoding
+        except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two for an unknown encoding
             raise FileFormatError(f"{path} is no valid XML: {brief(error)}.") from error
 
     def note_parameters(self, name: str, attributes: Mapping[str, str]) -> None:
-        """Keep the parameters of an element that have no default yet: a value where it is ignored, else the name."""
+        """Note the parameters of an element that have no default, as needed or, in an ignored element, with a value."""
         missing = {match for text in attributes.values() for match in _PARAMETER.findall(text)} - set(self.defaults)
         if any(element in self.ignored for element in self.open):
             self.fillers |= dict.fromkeys(missing, "false" if name == "boolean" else "1")
@@ -184,7 +198,7 @@ class _Xml:
             self.needed |= missing
 
     def filled(self, text: str) -> str:
-        """An attribute with the parameters put in that `<default>` has named before."""
+        """The text of an attribute with the values of parameters that a `<default>` has set before."""
         return _PARAMETER.sub(lambda m: self.defaults.get(m[1], m[0]), text)
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names in UTF-8 for files whose own are none, for libraries in C++, which take no others.
+"""Names in UTF-8 for files whose own names are not UTF-8, for libraries that accept nothing else.
 
-Linux lets a name be any bytes, such as those that older systems wrote in Latin-1. Python keeps such bytes in half
-surrogate pairs; Mitsuba and OpenEXR refuse them. A link in a temporary directory gives the file another name.
+On Linux a file name can be any bytes, for example Latin-1 from an older system. Python represents such bytes by lone
+surrogates; Mitsuba and OpenEXR refuse them. A symbolic link in a temporary directory gives such a file another name.
 """
 
 from __future__ import annotations
@@ -18,7 +18,13 @@ from rangesim.errors import FileFormatError
 
 
 def is_utf8(path: str | Path) -> bool:
-    """Whether a name can be written in UTF-8."""
+    """Whether a name can be encoded in UTF-8.
+
+    Examples
+    --------
+    >>> is_utf8("scène.xml"), is_utf8("sc\\udce8ne.xml")  # the second is Latin-1 on the disk
+    (True, False)
+    """
     try:
         str(path).encode()
     except UnicodeEncodeError:
@@ -27,20 +33,20 @@ def is_utf8(path: str | Path) -> bool:
 
 
 PLACES = ("/tmp", "/var/tmp")
-"""Folders for temporary files besides that of the user, whose name may be no UTF-8 either."""
+"""Folders for temporary files that are tried if the name of the user's own (TMPDIR) is not UTF-8."""
 
 
 class Utf8Names:
-    """Links to directories and files whose names are no UTF-8, in a `folder` whose own is."""
+    """Links to directories and files whose names are not UTF-8, in a `folder` whose name is."""
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self._names: dict[str, str] = {}
 
     def of(self, path: Path) -> Path:
-        """The path itself if it is UTF-8, as is what it leads to; else another of the same file, or directory.
+        """A path in UTF-8 of the same file or directory: the path itself if it and what it leads to are UTF-8.
 
-        What is beside a file is beside the new path too, unless the file's own name is no UTF-8.
+        The neighbours of a file are neighbours of the returned path too, unless the file's own name is not UTF-8.
         """
         real = Path(os.path.realpath(path))
         if is_utf8(real):
@@ -50,7 +56,7 @@ class Utf8Names:
         return self._link(real.parent) / real.name if is_utf8(real.name) else self._link(real)
 
     def restored(self, text: str) -> str:
-        """A message that may name links, with the names that they stand for."""
+        """A message in which the names of links are replaced by the names that they stand for."""
         for link, name in self._names.items():
             text = text.replace(link, name)
         return text
@@ -67,7 +73,9 @@ class Utf8Names:
 
 @contextmanager
 def utf8_names() -> Iterator[Utf8Names]:
-    """Names in UTF-8 while the block runs; a FileFormatError that leaves it says the files' own.
+    """Names in UTF-8 for files, valid while the block runs.
+
+    A FileFormatError that leaves the block names the files by their own names.
 
     Raises
     ------
@@ -87,7 +95,7 @@ def utf8_names() -> Iterator[Utf8Names]:
 
 @contextmanager
 def utf8_name(path: Path) -> Iterator[str]:
-    """A name of a file, which need not exist yet, that is UTF-8 while the block runs: its own if that is."""
+    """A name in UTF-8 of a file, valid while the block runs: its own name if possible. The file need not exist yet."""
     if is_utf8(path):
         yield str(path)
         return
@@ -96,7 +104,7 @@ def utf8_name(path: Path) -> Iterator[str]:
 
 
 def _place() -> str:
-    """A folder for temporary files: the user's, if its name is UTF-8."""
+    """A folder for temporary files whose name is UTF-8: the user's if possible."""
     users = tempfile.gettempdir()
     for place in (users, *PLACES):
         if is_utf8(os.path.abspath(place)) and os.access(place, os.W_OK):

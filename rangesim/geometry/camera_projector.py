@@ -6,7 +6,7 @@ coordinate decoded there has an error. So the optimal triangulation of camera an
 coordinate, to the nearest place on the epipolar line of the ray. The optimal triangulation of two cameras
 (`two_view_triangulation`) moves the pixels in both views; here it would give the depth of a ray that was not measured.
 
-Used by: rangesim.decoding.triangulate.
+Used by: rangesim.decoding.triangulation.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many samples a pixel needs: so many that sampling adds little to the noise of the detectors."""
+"""Adaptive sampling: each pixel takes as many samples as keep the renderer's noise small against the detector's."""
 
 from __future__ import annotations
 
@@ -24,31 +24,51 @@ if TYPE_CHECKING:
     from rangesim.signals import GroundTruth, StillSignals
 
 FIRST_SPP = 8
-"""Samples that all pixels get."""
+"""Number of samples that every pixel takes first; their scatter tells how many more are needed. With fewer samples the
+scatter is known less well; with more, pixels that need few samples take longer than they must."""
 FRACTION = 1 / 3
-"""Of the detector's noise, that of sampling at most: together they are then a twentieth above the detector's alone."""
+"""Largest ratio of the sampling noise to the detector's noise. At 1/3 the two together are 5 % above the detector's
+noise alone, because variances add."""
 NEGLIGIBLE = 1e-5
-"""Standard deviation, over the median depth of the scene, that is small enough in any case."""
+"""Ratio of a standard deviation to the median depth of the scene below which sampling noise is always small enough. It
+limits the samples of noise-free captures, where a tenth of this ratio would need a hundred times as many samples."""
 BLOCK_PX = 16
-"""Edge of the squares whose pixels of one instance are judged together."""
+"""Edge in pixels of the squares in which the noise of an instance is estimated. In larger squares the estimate uses
+more pixels; in smaller ones it follows changes of the noise better."""
+SPP_STEP = 4
+"""The number of samples is a multiple of this, because the samples come in two halves, each of antithetic pairs."""
 
 
 @dataclass(frozen=True)
 class AdaptiveSampling(Sampler):
-    """Some samples of every pixel, and then as many more as the noise of its readings asks for.
+    """A sampler that takes a few samples in every pixel, and then as many more as the noise of the readings needs.
 
-    The variance of a mean falls with the number of samples, so the first ones tell how many there have to be (two-stage
-    sampling: Stein, Ann. Math. Statist. 16, 1945). Pixels are judged in groups, for every instrument; the noisiest one
-    decides.
+    The variance of a mean is inversely proportional to the number of samples. The first samples therefore tell how many
+    samples are needed (two-stage sampling: Stein, Ann. Math. Statist. 16, 1945). The noise is estimated in groups of
+    pixels, for every instrument. The instrument that needs the most samples decides.
 
-    Where an instrument has no detector, all noise is the renderer's, and only what is negligible is small.
+    An instrument without a detector has only the renderer's noise; its limit is `NEGLIGIBLE`.
 
     Parameters
     ----------
-    instruments : whose detectors, exposures and decoders decide.
-    max_spp : int >= 1, samples that no pixel exceeds.
-    fraction : positive, standard deviation of a reading by sampling, over that by the detector, that is small enough.
-    ambient : Ambient, as for `expose`.
+    instruments : instruments whose detectors, exposures and decoders give the readings and the detectors' noise.
+    max_spp : int >= 1, largest number of samples of a pixel.
+    fraction : positive, largest ratio of the standard deviation of a reading by sampling to that by the detector.
+    ambient : Ambient, as for `rangesim.expose`.
+
+    Raises
+    ------
+    ValueError
+        A number out of its range.
+
+    Examples
+    --------
+    >>> from rangesim.light_transport.transport_settings import TransportSettings
+    >>> from rangesim.sensors import AmcwToF
+    >>> sampler = AdaptiveSampling.of([AmcwToF()])
+    >>> sampler.first_spp, sampler.most_spp
+    (8, 64)
+    >>> settings = TransportSettings(spp=sampler, seed=1)  # for `rangesim.transport`
     """
 
     instruments: tuple[Instrument, ...]
@@ -61,7 +81,7 @@ class AdaptiveSampling(Sampler):
 
     @classmethod
     def of(cls, sensors: Sequence[Sensor]) -> AdaptiveSampling:
-        """For sensors with their default detectors."""
+        """The sampler for sensors with their default detectors and decoders."""
         return cls(tuple(Instrument(f"sensor-{i}", sensor) for i, sensor in enumerate(sensors)))
 
     @property
@@ -81,7 +101,7 @@ class AdaptiveSampling(Sampler):
 
     def samples(self, truth: GroundTruth, signals_of: Callable[[Sequence[Response]], StillSignals]) -> np.ndarray:
         group = groups(truth.instance)
-        excess = np.zeros(group.max() + 1)  # of the variance, over what is small enough
+        excess = np.zeros(group.max() + 1)  # ratio of the variance by sampling to the largest one allowed, per group
         z = truth.z[np.isfinite(truth.z)]
         negligible = NEGLIGIBLE * float(np.median(z)) if z.size else 0.0
         for instrument in self.instruments:
@@ -91,18 +111,29 @@ class AdaptiveSampling(Sampler):
             )
             image = decode(capture, instrument.decoder)
             middle, sampling = sampling_draw(image, capture, signals)
-            from_middle = (image.z - middle).astype(np.float32)  # at little cost, the detector's error, or more
+            # The difference from the middle of both draws estimates the detector's error and costs no further decoding.
+            from_middle = (image.z - middle).astype(np.float32)
             enough = np.full(len(excess), negligible)
-            if capture.is_digital:  # where nothing can be read, samples are of no use
+            if capture.is_digital:  # a group without any reading needs no further samples: its limit is infinite
                 enough = np.maximum(enough, self.fraction * group_sigma(from_middle, group, where_unknown=np.inf))
             with np.errstate(divide="ignore", invalid="ignore"):
                 excess = np.fmax(excess, (group_sigma(sampling, group) / enough) ** 2)
-        wanted = 4 * np.ceil(self.first_spp * np.minimum(excess, self.max_spp) / 4)  # whole pairs in both halves
-        return np.clip(wanted, self.first_spp, max(self.first_spp, self.max_spp // 4 * 4)).astype(np.int64)[group]
+        wanted = SPP_STEP * np.ceil(self.first_spp * np.minimum(excess, self.max_spp) / SPP_STEP)
+        most = max(self.first_spp, self.max_spp // SPP_STEP * SPP_STEP)
+        return np.clip(wanted, self.first_spp, most).astype(np.int64)[group]
 
 
 def groups(instance: np.ndarray) -> np.ndarray:
-    """(h, w) int, numbers of groups: pixels of one instance (-1 counts as one) in a square of `BLOCK_PX`."""
+    """Number of the group of each pixel, (h, w) int: the pixels of one instance in one square of `BLOCK_PX`.
+
+    instance : (h, w) int, number of the instance that a pixel sees; -1, for none, forms groups of its own.
+
+    Examples
+    --------
+    >>> groups(np.array([[0, 0, -1], [0, 1, 1]]))
+    array([[1, 1, 0],
+           [1, 2, 2]])
+    """
     h, w = instance.shape
     y, x = np.ogrid[:h, :w]
     block = y // BLOCK_PX * (w // BLOCK_PX + 1) + x // BLOCK_PX
@@ -111,8 +142,13 @@ def groups(instance: np.ndarray) -> np.ndarray:
 
 
 def group_sigma(errors: np.ndarray, group: np.ndarray, where_unknown: float = 0.0) -> np.ndarray:
-    """(groups,) standard deviation about 0 of errors (h, w), from the median of the absolute values that are not NaN;
-    `where_unknown` in groups without any."""
+    """Standard deviation of the errors in each group, (k,) float64.
+
+    It is the median of the absolute values times `TO_SIGMA`, so that a few large errors have little influence.
+
+    errors : (h, w) with mean 0; NaN where there is none. group : (h, w) int, number of the group.
+    where_unknown : value for a group without any error.
+    """
     known = ~np.isnan(errors)
     values, of = np.abs(errors[known]), group[known]
     values = np.append(values[np.lexsort((values, of))], 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Instruments: a sensor with its camera, emitter, electronics, decoder and place."""
+"""An instrument: a sensor with its camera, emitter, detector, decoder and its place in the scene."""
 
 from __future__ import annotations
 
@@ -23,43 +23,48 @@ if TYPE_CHECKING:
     from rangesim.scene import Scene
 
 MAX_NAME = 100
-"""Characters; the name becomes that of a directory."""
+"""Largest number of characters of an instrument's name. The name is also that of a directory, and file systems allow
+255 bytes."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+"""Names that are safe as names of directories on all systems."""
 
 
 @dataclass(frozen=True, eq=False)
 class Instrument:
-    """A sensor with its camera, its emitter, its electronics, its decoder and its place in the scene.
+    """A sensor with its camera, emitter, detector, decoder and its place in the scene.
 
-    What is None comes from the sensor (emitter, detector, decoder) or from the scene (camera and its pose).
+    A field of None is taken from the sensor (emitter, detector, decoder) or from the scene (camera and its pose).
 
     Parameters
     ----------
-    name : names its directory in the results: letters, digits, hyphens and underscores.
+    name : name of the instrument and of its directory in the results: letters, digits, hyphens and underscores.
     sensor : Sensor, the measuring principle.
     detector : PhotoDetector; None: `Sensor.default_detector`.
-    noise : bool; False: the detector is not used, and frames are noise-free float32.
+    noise : bool. False: the detector is not used, and frames are noise-free float32.
     decoder : Decoder, with its thresholds; None: `Sensor.default_decoder`.
-    camera : Intrinsics; None: the scene's camera.
-    width, height : pixels of the scene's camera, whose field of view is kept; None: as the experiment says.
+    camera : Intrinsics; None: those of the scene's camera.
+    width, height : size of the image, pixels, if the scene's camera is used. Its field of view is kept. None: as the
+        experiment says.
     T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres; None: the scene's camera.
-    projector : Intrinsics of the emitter; None: as the sensor comes, with a field that covers the camera's view.
-    T_camera_projector : (4, 4) float64, maps projector coordinates to camera coordinates, metres; None: to the right
-        of the camera by `baseline_m`, turned towards the point that the camera looks at.
-    baseline_m : metres between camera and emitter; None: as the sensor comes, a fifth of the working distance for
-        structured light, 0.03 m for time of flight.
-    wavelength_m : metres, of the emitter's light; None: that of the detector. Instruments of different wavelengths
-        share no light-transport pass.
-    power_w : watts, mean radiant power of the emitter when it is fully on.
-    exposure_s : seconds per frame; None: automatic.
+    projector : Intrinsics of the emitter; None: the size that the sensor states, with a field of view that covers the
+        camera's.
+    T_camera_projector : (4, 4) float64, maps projector coordinates to camera coordinates, metres. None: the emitter
+        stands to the right of the camera, at the distance `baseline_m`, and is turned towards the point that the
+        camera looks at.
+    baseline_m : metres between camera and emitter. None: as the sensor states, which is a fifth of the working
+        distance for structured light and 0.03 m for time of flight.
+    wavelength_m : wavelength of the emitter's light, metres; None: that of the detector. Instruments of different
+        wavelengths do not share a light-transport pass.
+    power_w : mean radiant power of the emitter when it is fully on, watts.
+    exposure_s : exposure of each frame, seconds; None: automatic.
     camera_lens, projector_lens : Lens, aperture, focus and vignetting.
-    timing : when its frames are taken, in an experiment in which something moves.
+    timing : Timing, the times at which frames are taken, for an experiment in which something moves.
 
     Raises
     ------
     ValueError
-        A name or a number out of range, a decoder or detector that does not fit the sensor, or two statements about
-        one thing: `camera` and `width`, `T_camera_projector` and `baseline_m`.
+        A name or a number out of its range, a decoder or detector that does not fit the sensor, or two fields that
+        contradict each other: `camera` and `width`, `T_camera_projector` and `baseline_m`.
 
     Examples
     --------
@@ -116,20 +121,20 @@ class Instrument:
 
     @property
     def detector_in_use(self) -> PhotoDetector | None:
-        """The detector that frames are taken with, as for `rangesim.expose`; None: they are noise-free."""
+        """The detector that takes the frames, as `rangesim.expose` expects it; None: the frames are noise-free."""
         return self.detector if self.noise else None
 
     @property
     def emitter_wavelength_m(self) -> float | None:
-        """Wavelength of the emitter's light, metres; None: an ideal instrument, to which any wavelength is the same."""
+        """Wavelength of the emitter's light, metres; None: the instrument is ideal and has no wavelength."""
         return self.wavelength_m or getattr(self.detector, "wavelength_m", None)
 
     def rig(self, scene: Scene, width: int | None = None, height: int | None = None) -> Rig:
-        """Its camera and emitter in a scene.
+        """The instrument's camera and emitter in a scene.
 
         Parameters
         ----------
-        width, height : pixels of the scene's camera, where the instrument does not say how many.
+        width, height : size of the scene's camera, pixels, if the instrument does not state one.
         """
         size, baseline_m = self.sensor.emitter
         if (self.width, self.height) != (None, None):
@@ -149,34 +154,65 @@ class Instrument:
 
 
 DEFAULT_SENSORS = ("gray-phase", "amcw", "ideal-tof")
-"""Structured light against time of flight, and the reference that says what no time-of-flight camera can better."""
+"""Presets that an experiment compares if none are given: structured light, time of flight, and the ideal ranger, which
+no time-of-flight camera can surpass."""
 
 
 def instrument(name: str, **settings: Any) -> Instrument:
-    """The instrument with the sensor of a name, see `rangesim.sensors.sensor_of`; errors as there."""
+    """The instrument with the sensor that a name stands for.
+
+    Parameters
+    ----------
+    name : a preset such as "amcw", or FILE.py:NAME, see `rangesim.sensors.sensor_of`.
+    settings : fields of `Instrument` besides name and sensor.
+
+    Raises
+    ------
+    ValueError, FileFormatError
+        As `rangesim.sensors.sensor_of` and `Instrument`.
+
+    Examples
+    --------
+    >>> instrument("direct-tof", power_w=0.5).power_w
+    0.5
+    """
     sensor = sensor_of(name)
     return Instrument(_name_of(name, sensor), sensor, **settings)
 
 
 def _name_of(given: str, sensor: Sensor) -> str:
-    """The name of an instrument given by its sensor alone: of the preset, or the type of a sensor from a file."""
+    """Name of an instrument that is given by its sensor only: the preset's, or the `type_name` if it is from a file."""
     return sensor.type_name if is_file_name(given) else given
 
 
 def instrument_from_dict(table: Any, place: str, files_in: Path | None = None) -> Instrument:
-    """An instrument; its sensor is the name of a preset, or a table with a `type`.
+    """The instrument that a table of settings describes.
 
     Parameters
     ----------
-    files_in : folder from which a sensor named as FILE.py:NAME is loaded, see `rangesim.sensors.sensor_of`; None:
-        no file is, as in what is read back of results.
+    table : fields of `Instrument`. `sensor` is the name of a preset, or a table with a `type`. The tables `detector`
+        and `decoder` change the sensor's own ones key by key.
+    place : where the table stands, for messages.
+    files_in : folder that relative paths FILE.py:NAME of sensors count from, see `rangesim.sensors.sensor_of`. None:
+        no file is loaded, as for results that are read back.
+
+    Raises
+    ------
+    ValueError
+        An unknown key or a bad value. The message names the place.
+
+    Examples
+    --------
+    >>> one = instrument_from_dict({"sensor": "amcw", "detector": {"read_noise_e": 8.0}}, "instrument[0]")
+    >>> one.name, one.detector.read_noise_e
+    ('amcw', 8.0)
     """
     if not isinstance(table, Mapping):
         raise ValueError(f"{place}: expected a table of settings, got {shown(table)}.")
     values = dict(table)
     if "optics" in values:
         raise ValueError(
-            f"{place}: expected tables camera_lens and projector_lens in place of optics, see docs/optics.md."
+            f"{place}: expected the tables camera_lens and projector_lens instead of optics, see docs/optics.md."
         )
     check_keys(values, [f.name for f in fields(Instrument)], place)
     given, sensor = values.get("sensor"), None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rangesim.transport`: scene + rig + sensors -> signals, with as many samples as the readings need."""
+"""`rangesim.transport`: one light-transport pass for several sensors, with as many samples as their readings need."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Unpack, overload
 
 from rangesim.instrument.adaptive_sampling import AdaptiveSampling
 from rangesim.light_transport.light_pass import trace_light
-from rangesim.light_transport.transport_settings import TransportOptions, TransportSettings, chosen
+from rangesim.light_transport.transport_settings import TransportOptions, TransportSettings, with_options
 from rangesim.light_transport.truncation import warn_of_truncation
 from rangesim.response import Response
 from rangesim.rig import Rig
@@ -55,39 +55,39 @@ def transport(
 
     Parameters
     ----------
-    scene : Scene
-    rig : Rig, or a list of rigs that differ in their cameras alone: one emitter and several cameras, as in active
-        stereo (see `Rig.with_camera`). Photons are then traced once for all.
-    sensors : sensors, or bare responses; none for energy split and ground truth alone.
+    scene : Scene, as `rangesim.load_scene` returns.
+    rig : Rig, or a list of rigs that have the same emitter and different cameras, as in active stereo (see
+        `Rig.with_camera`). The photons are then traced once for all cameras.
+    sensors : sensors, or bare responses. An empty list gives the energy split and the ground truth only.
     settings : TransportSettings, how the light is sampled; None: the defaults.
-    progress : called with the fraction done, 0..1, after each kernel launch, at most ten times a second. What it raises
-        ends the pass.
-    options : fields of `settings` in place of those, such as spp=64 or seed=1.
+    progress : function that is called with the fraction done, 0..1, after each kernel launch, at most ten times a
+        second. An exception that it raises ends the pass.
+    options : fields of `TransportSettings`, which replace those of `settings`, such as spp=64 or seed=1.
 
     Returns
     -------
     StillSignals
-        With a list of rigs, a list of them, one for each camera. The first has the bytes of its camera alone, if pixels
-        take equally many samples; cameras do not share random numbers.
+        A list of them, one for each camera, if a list of rigs is given. Cameras do not share random numbers. The first
+        camera gets the same bytes as alone, if its pixels take the same number of samples.
 
     Raises
     ------
     ValueError
-        A number out of its range, patterns that do not fit the projector, too little memory, rigs of different
-        emitters, a camera or projector inside fog, water or another medium, or a medium
-        on the wrong side of its boundary.
+        A number out of its range; patterns that do not fit the projector; too little memory; rigs with different
+        emitters; a camera or projector inside fog, water or another medium; a medium on the wrong side of its boundary.
 
     Warns
     -----
     TruncationWarning
-        By estimate (`Signals.truncation`), more than 2 % of the projector's light is left out.
+        The pass leaves out more than 2 % of the projector's light, as estimated in `Signals.truncation`.
 
     Examples
     --------
+    >>> import rangesim
     >>> scene = rangesim.load_scene("tabletop")  # doctest: +SKIP
     >>> signals = rangesim.transport(scene, scene.rig(), [rangesim.AmcwToF()], spp=16)  # doctest: +SKIP
     """
-    settings = _with_sampler(chosen(settings, options), sensors)
+    settings = _with_sampler(with_options(settings, options), sensors)
     signals = trace_light(scene, [rig] if isinstance(rig, Rig) else rig, sensors, settings, progress)
     for number, one in enumerate(signals):
         of = f" of camera {number}" if len(signals) > 1 else ""
@@ -96,7 +96,11 @@ def transport(
 
 
 def _with_sampler(settings: TransportSettings, sensors: Sequence[Sensor | Response]) -> TransportSettings:
-    """The settings, in which "auto" samples stand for AdaptiveSampling where nothing but sensors is given."""
+    """The settings, with `AdaptiveSampling` for these sensors in place of spp="auto".
+
+    They stay as they are if a bare response is among the sensors, because no reading tells how many samples it needs,
+    or if the sampling error is not estimated.
+    """
     readers = [sensor for sensor in sensors if isinstance(sensor, Sensor)] if isinstance(sensors, Sequence) else []
     if settings.spp != "auto" or not settings.sampling_error or not readers or len(readers) < len(sensors):
         return settings

@@ -21,11 +21,11 @@ from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.scene.media import is_boundary, medium_numbers
 
 ENDLESS_M = 1e30
-"""Length in metres of a ray that meets no surface. Stands for infinity in single precision: infinity times a
-coefficient of 0 would be NaN."""
+"""Length in metres of a ray that meets no surface. It stands for infinity, because infinity times a coefficient of 0
+would be NaN."""
 UNCHANGED = -1.0
-"""Coefficient in the table that stands for surfaces which bound no absorbing medium. Real coefficients are not
-negative."""
+"""Coefficient, in 1/m, of surfaces that bound no absorbing medium: the one along the ray stays. It is negative, so that
+no real coefficient is the same."""
 
 
 class Absorbers:

@@ -25,19 +25,21 @@ from rangesim.response import CAUSTIC, LightPath
 from rangesim.rig import Rig
 
 PHOTONS_PER_DISC = 400
-"""Number of photons of all maps within the radius of the first map, where light is neither spread nor focused. It sets
-the radius. An estimate from n photons has a relative noise of about 1 / sqrt(n); a larger number blurs more."""
+"""Number of photons of all maps within the radius of the first map, where light is neither spread nor focused; the
+radius is chosen by it. An estimate from n photons has a relative noise of about 1 / sqrt(n); more photons per disc blur
+more."""
 MAX_RADIUS_PROJECTOR_PX = 3.0
-"""Largest radius of the first map, in projector pixels as large as at the point itself. The bound keeps the
-blur finer than the stripes of structured light."""
+"""Largest radius of the first map, in projector pixels at the distance of the point, so that the blur stays finer than
+the stripes of structured light."""
 MIN_RADIUS_CAMERA_PX = 0.3
-"""Smallest radius of the first map, in camera pixels as large as at the point itself. The image shows nothing finer."""
+"""Smallest radius of the first map, in camera pixels at the distance of the point, because the image shows nothing
+finer."""
 MAX_RADIUS_CAMERA_PX = 3.0
-"""Largest radius of the first map, in camera pixels as large as at the point itself. A larger one would blur the image
-of a caustic."""
+"""Largest radius of the first map, in camera pixels at the distance of the point, so that the image of a caustic stays
+sharp."""
 MAX_COSINE_RATIO = 4.0
-"""Largest ratio of a photon's cosine to the facet at the vertex to its cosine to the facet on which it landed. The
-radiance is divided by the latter, which may be near 0 where the facet turns away; the bound keeps the light finite."""
+"""Largest ratio of a photon's cosine to the facet at the vertex to its cosine to the facet on which it landed. Radiance
+is divided by the latter, so that without a bound a facet seen edge-on would bring light without a bound."""
 
 
 def caustic_photons(

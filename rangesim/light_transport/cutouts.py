@@ -12,8 +12,8 @@ from rangesim.light_transport.surfaces import Surfaces, number_of, table_of
 from rangesim.scene.materials import holes
 
 MAX_CUTOUTS = 8
-"""Number of holes in a row through which a camera ray is followed to find the first surface. A larger number costs one
-intersection each, in scenes with holes alone; with a smaller one, the ground truth may name the sheet of a hole."""
+"""Number of holes in a row through which a camera ray is followed to the first surface, so that the time per pixel is
+bounded. If there are more, the ground truth names the sheet of a hole."""
 
 
 class Cutouts:

@@ -25,9 +25,9 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.accumulators import Accumulators
-from rangesim.light_transport.device import Device
 from rangesim.light_transport.kernel_launches import Launches, min_lanes
 from rangesim.light_transport.photons import meets_delta
+from rangesim.light_transport.rays import Device
 from rangesim.light_transport.sampling import Continued, Seed, aligned, of_part, random_stream, stratified
 from rangesim.light_transport.scattering import bounded
 from rangesim.light_transport.spectrum import mono
@@ -38,31 +38,37 @@ from rangesim.response import GLINT, LightPath, Response
 from rangesim.rig import Rig
 
 PROBES = 32
-"""Number of probing paths of a pixel. Fewer probes miss more lenses; the time of the search grows with the number."""
+"""Number of probing paths per pixel. It is small, because all pixels around glass and mirrors are probed; the fewer
+probes, the more lenses are missed."""
 NEAR_SPREADS = 1.5
 """A pixel is near the lens if a probe passes the edge of the lens at less than this distance, in spreads. The spread is
 the least distance between the places at which successive probes cross the plane of the lens. A larger value sends paths
 to pixels that do not see the lens."""
 UNKNOWN_SPREAD = 8.0
-"""Spread, in radii of the lens, that is assumed where only one probe crossed the plane of the lens."""
+"""Spread, in radii of the lens, of pixels whose spread is not measured because only one probe crossed the plane of the
+lens."""
 MIN_RADIUS_SPREADS = 0.2
-"""Radius, in spreads, of the smallest disc that a pixel's paths hit well: it covers about a tenth of the pixel."""
+"""Radius, in spreads, of the smallest disc that stands for the lens. Such a disc covers about a tenth of the pixel, so
+that enough of the pixel's paths hit it."""
 MAX_ENLARGEMENT = 16.0
 """Largest radius, in radii of the lens, of the disc that stands for it. A larger disc is hit by more paths, but may
 reach into pixels that do not see the lens."""
 MAX_PATHS = 1 << 22
-"""Largest number of paths of all pixels together, which bounds the time."""
+"""Largest number of paths of all pixels together, so that the time is bounded: 2 to 3 s among 10 000 balls on two cores
+(docs/benchmarks.md)."""
 MIN_PATHS_PER_PIXEL = 64
-"""Smallest number of paths of a pixel, however many pixels there are: fewer would make glint noisy."""
+"""Smallest number of paths per pixel, however many pixels there are, because fewer would make glint noisy."""
 MAX_PATHS_PER_PIXEL = 4096
-"""Largest number of paths of a pixel, however few pixels there are."""
+"""Largest number of paths per pixel, however few pixels there are, so that a single highlight takes little time."""
 SCREENING = 8
-"""One path in this many is sent first. The other paths are sent only to pixels where one of the first came close."""
+"""Ratio of all paths of a pixel to those that are sent first. The others are sent only if one of the first came close,
+so that pixels which do not see the lens cost little."""
 CLOSE_RADII = 8.0
 """Distance from the centre of the lens, in its radii, at which a path counts as close. If one path in 4000 hits the
 lens, 64 in 4000 come that close, so 8 of the first 512 do; all of them miss by chance once in 3000 times."""
 SEGMENTS = 4
-"""Segments that a path is taken to have when the size of the first launch is chosen. Later launches go by the time."""
+"""Number of segments per path that is assumed when the size of a launch is chosen. Launches adapt to the time they
+take, so that a wrong number costs little."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +195,7 @@ class GlintView(NamedTuple):
 
 @dataclass
 class ChainState:
-    """How far a lane has come in the delta chains of its pixel.
+    """The delta chain at work in each lane, and the number of chains that are finished.
 
     random : UInt64, state of the random numbers.
     number : UInt32, number of chains that are finished.
@@ -290,7 +296,7 @@ class LensDisc:
         self.radiance = mi.Float(aligned(radiance, np.float32))
 
     def crossing(self, ray: mi.Ray3f, si: mi.SurfaceInteraction3f) -> tuple[mi.Point2f, mi.Float, mi.Bool]:
-        """Where the ray crosses the plane of the lens from the front, before it meets the surface `si`.
+        """The point where the ray crosses the plane of the lens from the front, before it meets the surface `si`.
 
         Returns
         -------

@@ -28,28 +28,28 @@ from pcgraph.kernel_cache import cached_njit
 from pcgraph.parallel import MIN_ROWS, in_blocks
 
 LEVELS = 2
-"""Number of levels of the window, which is 3^LEVELS pixels wide. One more level would make it three times as wide, with
-less noise and more bias."""
+"""Number of levels of the window, which is 3^LEVELS pixels wide. It is chosen small, because one more level would make
+the window, and with it the bias, three times as wide."""
 REACH_PX = 3**LEVELS // 2
-"""Largest distance, in pixels along an axis, over which pixels share light."""
+"""Largest distance, in pixels along an axis, over which pixels share light; it follows from the levels."""
 MIN_NORMAL_COSINE = 0.9
-"""Smallest cosine between the normals of two pixels that share light (26 degrees). A smaller one would share light
-around edges; a larger one would stop the filter on curved surfaces."""
+"""Smallest cosine between the normals of two pixels that share light (26 degrees), so that none is shared around edges.
+A larger one would stop the filter on curved surfaces."""
 MAX_PLANE_SINE = 0.3
 """Largest sine of the angle between a pixel's surface and the line to a neighbour that shares light with it (17
-degrees). A larger one would share light between surfaces that lie behind each other."""
+degrees), so that none is shared between surfaces that lie behind each other."""
 MIN_JUMP = 0.02
 """Distance of a neighbour from a pixel's tangent plane, as a fraction of the distance from the camera, above which the
 pixel counts as mixed: it sees an edge and something behind, and lends no light to others. A smaller value would stop
 the filter on curved surfaces; a larger one would spread light across edges."""
 RIDGE = 0.05
-"""Number added to the second moments of the regression, as a fraction of the weight times the squared step. The larger
-it is, the sooner a one-sided window takes the plain mean. At 0, a window of a single row or column would divide by
-zero."""
+"""Fraction of the weight times the squared step that is added to the second moments of the regression, because a window
+of a single row or column would divide by zero otherwise. A larger fraction draws one-sided windows towards the plain
+mean."""
 CHANNELS_AT_ONCE = 32
-"""Number of channels that are filtered together, so that they fit into the caches."""
+"""Number of channels that are filtered together, so that a few rows of pixels of all of them fit into the caches."""
 ROWS_AT_ONCE = 16
-"""Number of rows that are filtered together, so that their weights stay in the cache for all channels."""
+"""Number of rows of pixels that are filtered together, so that their weights stay in the cache for all channels."""
 
 
 class Guides(NamedTuple):

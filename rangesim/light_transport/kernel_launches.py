@@ -11,9 +11,9 @@ Compiling a kernel is one more stretch without signals: a tenth of a second to a
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -22,22 +22,23 @@ import numpy as np
 from pcgraph.plumbing import interrupts
 
 LAUNCH_S = 1.0
-"""Duration of a launch, in seconds, at which the size of launches aims. It is the time that Ctrl-C waits; shorter
-launches spend more of their time on the start of kernels."""
+"""Duration in seconds at which the size of launches aims. It is short, because Ctrl-C waits for a launch; the shorter
+it is, the more time goes into the start of kernels."""
 UNWATCHED_LAUNCH_S = 20.0
-"""The same where nobody waits for a launch: no progress is reported, and a thread of its own handles signals by ending
-the process."""
+"""The same in seconds where nobody waits for a launch, because no progress is reported, and a thread of its own handles
+signals by ending the process."""
 MAX_OVERRUN = 1.5
-"""Largest number of iterations of a launch, as a multiple of those that fit into its duration. After them the launch
-ends, even if some lanes have not finished; those go on in the next launch."""
+"""Largest ratio of the iterations of a launch to those that fit into its duration. Lanes that have not finished then go
+on in the next launch, so that one slow lane cannot make a launch long."""
 FIRST_UNITS = 1 << 21
-"""Work of a first launch, before any time was measured, in units: iterations of a loop, rays or photons. A first launch
-that is too large delays Ctrl-C once."""
+"""Work of a first launch, in iterations of a loop, rays or photons, chosen before any time was measured. If it is too
+large for a slow machine, Ctrl-C waits longer once."""
 MAX_STRETCH = 2.0
-"""Largest factor by which launches become longer where the kernel takes long to be made (thousands of shapes), because
+"""Largest ratio by which launches become longer where the kernel takes long to be made (thousands of shapes), because
 each launch makes it again."""
 LANES_TOGETHER = 16
-"""Number of lanes that a vector of the processor holds (AVX-512). They take as long as the slowest of them."""
+"""Number of lanes per vector of the widest processors. They are counted together, because a vector is at work as long
+as one of its lanes is."""
 MIN_AT_WORK = 256
 """Smallest number of lanes that is assumed when a launch's iterations are chosen: fewer lanes take as long as this
 many."""
@@ -47,11 +48,11 @@ not make the next one very long."""
 MAX_ITERATIONS = 1 << 31
 """Largest number of iterations of a launch, so that 32 bits can count them."""
 REPORT_S = 0.1
-"""Smallest time between two reports of progress, in seconds."""
+"""Smallest time between two reports of progress, in seconds, so that reports cost nothing and a display still moves."""
 
 State = TypeVar("State")
 Report = Callable[[float], None]
-"""Called with the fraction done, 0..1, after each launch."""
+"""A function that is called with the fraction done, 0..1, after each launch."""
 
 
 class Launches:
@@ -78,7 +79,7 @@ class Launches:
         self.launch_s = LAUNCH_S if is_watched or not interrupts.handled else UNWATCHED_LAUNCH_S
         self.units = int(FIRST_UNITS * self.launch_s / LAUNCH_S)
 
-    def evaluate(self, arrays: Any, units: int) -> None:
+    def evaluate(self, arrays: object, units: int) -> None:
         """Compute Dr.Jit arrays, wait for them, and learn from the time that these units of work took."""
         self.learn(units, evaluate(arrays))
 
@@ -88,15 +89,15 @@ class Launches:
         fits = units * launch_s / max(seconds, 1e-6)
         if fits > self.units:
             self.units = int(min(fits, MAX_GROWTH * self.units))
-        elif seconds > launch_s / 2:  # a shorter launch says how long its overhead takes
+        elif seconds > launch_s / 2:  # a shorter launch took mostly overhead
             self.units = max(1, int(fits))
 
     def run(
         self,
-        loop: Callable[[State, Any], tuple[State, Any]],
+        loop: Callable[[State, mi.UInt32], tuple[State, mi.UInt32]],
         state: State,
         lanes: int,
-        pending: Callable[[], Any] = list,
+        pending: Callable[[], Sequence[mi.Float]] = list,
         report: Callable[[State], None] = lambda state: None,
     ) -> tuple[State, int]:
         """Run a loop until all lanes are finished; returns their state, and the iterations that they took together.
@@ -164,14 +165,15 @@ def raised_as_it_is() -> Iterator[None]:
         raise root from None
 
 
-def evaluate(arrays: Any) -> float:
-    """Compute Dr.Jit arrays and wait for them; returns the seconds that the kernels took after they were compiled.
+def evaluate(arrays: object) -> float:
+    """Compute a nested structure of Dr.Jit arrays and wait for it; returns the seconds that its kernels took.
 
-    If Dr.Jit has a single thread, it runs the kernels before it returns, so that the time of compilation is included.
+    The time in which kernels were compiled does not count, unless Dr.Jit has a single thread: then it runs the kernels
+    before it returns.
     """
     begin = time.perf_counter()
     try:
-        dr.eval(arrays)  # where there are more, returns when the last kernel is compiled and under way
+        dr.eval(arrays)  # with several threads, returns when the last kernel is compiled and under way
         if mi.variant().startswith("cuda") or dr.thread_count() > 1:
             begin = time.perf_counter()
     finally:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One pass of light paths: scene + rigs + responses -> signals."""
+"""A light-transport pass: it traces the light of a scene once and returns the signals of every camera and sensor.
+
+`trace_light` is the whole pass. `_CameraPass` is the part of one camera, and `loop.py` the loop over its light paths.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from rangesim.light_transport.caustics import caustic_maps, caustic_photons
-from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
 from rangesim.light_transport.indirect_filter import LightFilter
@@ -19,6 +21,7 @@ from rangesim.light_transport.kernel_launches import Launches, Progress, Report,
 from rangesim.light_transport.loop import PathSettings, Radiance, View
 from rangesim.light_transport.narrow_lobes import warn_of_narrow_lobes
 from rangesim.light_transport.photons import Photons
+from rangesim.light_transport.rays import Device
 from rangesim.light_transport.sampler import Sampler
 from rangesim.light_transport.sampling_error import MIN_FOR_HALVES, Estimate
 from rangesim.light_transport.traced_scene import TracedScene
@@ -33,14 +36,21 @@ from rangesim.settings.config import shown
 from rangesim.settings.seeds import derived_seed
 from rangesim.signals import EnergySplit, StillSignals
 
-MATTE_SPP, OTHER_SPP = 16, 64
-"""Samples of a pixel that shares its indirect light, and of others, where no sensor says how many it needs."""
+MATTE_SPP = 16
+"""Samples per pixel for pixels that share their indirect light, if no sampler decides. Sharing averages over many
+pixels, so these need fewer samples than others."""
+OTHER_SPP = 64
+"""Samples per pixel for all other pixels, if no sampler decides. Twice as many would lower the noise by a factor of 1.4
+and take twice the time."""
 PATHS_FRACTION = 0.95
-"""Fraction of the progress that is reported when all samples are taken; the filter and the sums take the rest."""
+"""Fraction of the progress that is reported when all samples are taken. The rest is for the filter and the sums. It
+changes the progress bar and nothing else."""
 RAYS_TO_MEDIA = 16
-"""Columns and rows of rays that look for media on the wrong side."""
+"""Number of columns, and of rows, of the rays that look for media on the wrong side of their boundary. A body that none
+of these 256 rays meets, because it covers less than one of the cells between them, may be missed."""
 TEXTURE_SAMPLES = 64
-"""Samples of a pixel, at most, over which the reflectance of a texture is averaged."""
+"""Largest number of samples per pixel over which the reflectance of a texture is averaged. More samples change a mean
+over a pixel little, because they are spread evenly, and take longer."""
 
 
 @raised_as_it_is()
@@ -55,10 +65,11 @@ def trace_light(
 
     Parameters
     ----------
-    rigs : rigs that differ in their cameras alone. Photons are traced once for all.
+    rigs : rigs with the same emitter and different cameras. The photons are traced once for all cameras.
     sensors : sensors, or bare responses. Equal responses share their channels.
-    settings : of the pass. spp "auto": 16 samples where pixels share their indirect light, 64 elsewhere.
-    progress : as of `rangesim.transport`.
+    settings : TransportSettings. spp "auto" means `MATTE_SPP` samples where pixels share their indirect light, and
+        `OTHER_SPP` elsewhere.
+    progress : as for `rangesim.transport`.
 
     Raises
     ------
@@ -84,13 +95,14 @@ def trace_light(
 
 
 class _CameraPass:
-    """What one camera sees, before and after its light is traced.
+    """The part of a pass that belongs to one camera: its ground truth, its samples and its signals.
 
     Parameters
     ----------
-    scene, rig, settings : of the pass.
-    traced : TracedScene, of some camera with the same emitter.
-    number : int, of the camera; each has random numbers of its own.
+    scene, settings : as for `trace_light`.
+    traced : TracedScene with the emitter of the pass; its camera is replaced.
+    rig : Rig of this camera.
+    number : index of the camera, from 0. Each camera has random numbers of its own.
     """
 
     def __init__(
@@ -121,7 +133,15 @@ class _CameraPass:
         launches: Launches,
         report: Report,
     ) -> StillSignals:
-        """Signals of this camera; photons are those of its emitter."""
+        """Signals of this camera.
+
+        Parameters
+        ----------
+        responses : responses whose channels are accumulated.
+        photons : Photons of the emitter; None: there are none.
+        launches : size of the kernel launches.
+        report : function that is called with the fraction of this camera's work that is done, 0..1.
+        """
         settings, rig, guides = self.settings, self.rig, self.guides
         sampler = settings.spp if isinstance(settings.spp, Sampler) else None
         fewest = int(self.samples.min())
@@ -146,7 +166,7 @@ class _CameraPass:
             energy = _energy(channels, radiance, glints)
             return StillSignals(rig, energy, self.truth, channels=channels, sampling=error)
 
-        left = 0.5 * PATHS_FRACTION if sampler else 0.0  # how much follows is not known
+        left = 0.5 * PATHS_FRACTION if sampler else 0.0  # assumed, because the sampler's second number is not known yet
         pixels = np.arange(len(self.samples))
         estimate.sample(pixels, self.samples, partial(report_part, report, 0.0, PATHS_FRACTION - left))
         if sampler and sampler.most_spp > fewest:
@@ -162,7 +182,7 @@ class _CameraPass:
 
 
 def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Glint | None) -> EnergySplit:
-    """The energy split; glint is added to it and to the channels."""
+    """The energy split of a camera. Glint is added to it, and in place to the channels."""
     highlights = np.zeros((1, *radiance.direct.shape), np.float32)
     if glints:
         glints.add_to(highlights, glints.radiance[None])
@@ -179,6 +199,7 @@ def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Gl
 
 
 def _check(scene: Scene, rigs: Sequence[Rig], sensors: Sequence[Sensor | Response], progress: Any) -> None:
+    """Raise ValueError if an argument of `trace_light` has a wrong type or does not fit the others."""
     if not isinstance(scene, Scene):
         raise ValueError(f"expected a Scene, as load_scene returns, got {type(scene).__name__}.")
     if not isinstance(rigs, Sequence):
@@ -190,7 +211,7 @@ def _check(scene: Scene, rigs: Sequence[Rig], sensors: Sequence[Sensor | Respons
     for number, rig in enumerate(rigs):
         if differ := rigs[0].differences_of_emitter(rig):
             raise ValueError(
-                f"expected rigs that share their emitter, as of `Rig.with_camera`; rig {number} has another "
+                f"expected rigs that share their emitter, as `Rig.with_camera` makes them; rig {number} has another "
                 f"{', another '.join(differ)} than rig 0."
             )
     if progress is not None and not callable(progress):
@@ -202,9 +223,9 @@ def _check(scene: Scene, rigs: Sequence[Rig], sensors: Sequence[Sensor | Respons
 
 
 def _check_in_air(scene: Scene, rig: Rig) -> None:
-    """Raise ValueError if the camera or the projector is inside a body of a medium: its light would start outside.
+    """Raise ValueError if the camera or the projector is inside a medium, or sees one from the wrong side.
 
-    Or if one sees a medium on the wrong side of its boundary.
+    Light paths start in air, so both would be rendered wrongly.
     """
     T_camera = scene.in_renderer(rig).T_world_camera
     devices = ("camera", rig.camera, T_camera), ("projector", rig.projector, T_camera @ rig.T_camera_projector)

@@ -35,10 +35,10 @@ import numpy as np
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.ambient_light import ambient_on_ray, sampled_ambient, sampled_ambient_through_media
 from rangesim.light_transport.caustics import Vertex, caustic_light, gather
-from rangesim.light_transport.device import connect
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
 from rangesim.light_transport.photon_maps import PhotonMaps
 from rangesim.light_transport.photons import has_delta
+from rangesim.light_transport.rays import connect
 from rangesim.light_transport.sampling import Continued, Seed, Stream, aligned, in_pairs, of_part, random_stream
 from rangesim.light_transport.scattering import MAX_EVENTS, ROULETTE_BELOW
 from rangesim.light_transport.spectrum import mono
@@ -55,16 +55,17 @@ NEIGHBOURS = 256
 take about equally long. Longer runs spread less evenly; runs shorter than a vector of the processor (16 lanes) would
 put pixels into one vector whose paths differ."""
 ITERATIONS_PER_SAMPLE = 2
-"""Iterations of the loop that a sample is taken to need, before any were counted. It sets the size of the first launch
-alone: later ones go by the count."""
+"""Number of iterations of the loop per sample that is assumed before any were counted. Only the first launch is chosen
+by it; later ones go by the count."""
 GOLDEN_STEP = 2654435769
-"""2^32 divided by the golden ratio. Its multiples modulo 2^32 are spread evenly, however many there are."""
+"""Step of a sequence of fractions of 2^32: 2^32 divided by the golden ratio, because its multiples modulo 2^32 are
+spread evenly, however many there are."""
 
 Array = TypeVar("Array")
 
 
 class PathSettings(NamedTuple):
-    """How the loop samples paths. Numbers are opaque to the kernel cache; the flags shape the kernel.
+    """Settings of the loop. Numbers are opaque to the kernel cache; the flags shape the kernel.
 
     seed : Seed. max_depth, rr_depth : UInt32, see `TransportSettings`.
     delta : whether some surface of the scene has a delta interaction.
@@ -95,7 +96,7 @@ class PathSettings(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SampleAllocation:
-    """How many samples some of the pixels get, and the projector's light.
+    """Numbers of samples for some of the pixels, and the projector's light.
 
     pixels : (n,) int, flat indices in the whole image.
     samples : (n,) uint32, number of samples to be taken of each pixel.
@@ -315,7 +316,7 @@ class Lanes:
         width = mi.UInt32(view.traced.camera.size.x)
         self.corner = mi.Point2f(mi.Float(self.pixel % width), mi.Float(self.pixel // width))
         rng = random_stream(settings.seed, self.pixel)
-        self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())  # of the samples in the pixel
+        self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())  # of the places of samples within the pixel
         on_lens = view.traced.camera.has_lens
         self.lens_shift = mi.Point2f(rng.next_float32(), rng.next_float32()) if on_lens else None
         self.random = Continued(of_part(rng, self.part))
@@ -426,7 +427,7 @@ def walk(
                 path.ray_state.inside, path.ray_state.previous, ray.d, si, hit, rng.next_float32()
             )
         at_surface = hit & ~scatters
-        # It counts if it scatters the path; whether it does is known when the next direction is
+        # The surface counts towards the depth if it scatters the path; the next direction will tell
         if dr.hint(media is not None, mode="scalar"):
             arrives = ~(crosses | (scatters & path.scattered_inside))
             path.depth += dr.select(arrives, mi.UInt32(1), mi.UInt32(0))
@@ -468,7 +469,7 @@ def walk(
             xi = mi.Point2f(rng.next_float32(), rng.next_float32())
             wo = dr.select(scatters, medium.scattered(ray.d, xi), wo)
         light = dr.select(link.lit, path.throughput * value * link.geometry * lanes.irradiance, 0)
-        # Nothing undefined (u at z = 0, say) may reach a response: 0 times it is not always 0
+        # No undefined number (u at z = 0, for example) may reach a response: 0 times NaN is not 0
         u, v, path_length = (
             dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, path.ray_state.length + link.distance)
         )
@@ -518,7 +519,7 @@ def walk(
         if dr.hint(settings.delta, mode="scalar"):
             path.depth -= dr.select(path.left_delta, mi.UInt32(1), mi.UInt32(0))
             path.chain = dr.select(crosses, path.chain, dr.select(path.left_delta, path.chain + 1, 0))
-        fraction = path.throughput * dr.square(path.ray_state.ior)  # of the light, that this path stands for
+        fraction = path.throughput * dr.square(path.ray_state.ior)  # of the light is left on the path
         chance = dr.select(path.depth > settings.rr_depth, dr.minimum(fraction, 0.95), 1)
         if dr.hint(settings.delta, mode="scalar"):
             chance = dr.minimum(chance, survival(path.chain, fraction))
@@ -544,7 +545,7 @@ def walk(
         path.ray_state = path.ray_state.entering(traced, si, wo, at_surface, crosses)
 
         # ---- Or next sample --------------------------------------------------------------------------
-        # The last surface can only be seen to emit, so it is needed for ambient light alone
+        # At the last surface only its own emission matters, so it is met for ambient light alone
         last = settings.max_depth if settings.ambient else settings.max_depth - 1
         goes_on = path.depth < last
         if dr.hint(media is not None, mode="scalar"):

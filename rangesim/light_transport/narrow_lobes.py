@@ -22,17 +22,18 @@ from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.scene.materials import MAX_NARROW_ALPHA, has_narrow_lobe
 
 RAYS = (128, 128)
-"""Columns and rows of the grid of rays over the projector's image. More rays find smaller surfaces and take more
-time."""
+"""Columns and rows of the grid of rays over the projector's pixels, so that the smallest surface that is found is about
+one cell of the grid; the time is in proportion to the number of cells."""
 MAX_SURFACES = 8
-"""Number of surfaces over which a ray is followed; a hollow glass has four."""
+"""Number of surfaces over which a ray is followed, so that its time is bounded; a hollow glass has four."""
 MIN_THROWN = 0.005
 """Fraction of the projector's light, thrown onto other surfaces by narrow lobes, above which a pass warns. A smaller
 value would warn of light that changes few readings."""
 MIN_NAMED = 0.1
-"""Fraction of the thrown light that a shape throws or receives, above which the warning names it."""
+"""Fraction of the thrown light that a shape throws or receives, above which the warning names it, so that it names
+causes and not bystanders."""
 MAX_NAMED = 3
-"""Largest number of shapes that the warning names, so that it stays one sentence."""
+"""Largest count of shapes that the warning names, so that it stays one sentence."""
 
 
 class ThrownLight(NamedTuple):

@@ -140,7 +140,7 @@ def _chain(
         goes_on &= (remains > 0) & is_delta(bs)
         chance = survival(chain, remains / emitted)
         goes_on &= rng.next_float32() < chance
-        remains = dr.select(goes_on, remains / chance, 0)  # on average nothing is absorbed by this
+        remains = dr.select(goes_on, remains / chance, 0)  # roulette absorbs nothing on average
         absorbed += dr.select(hit & ~(~mirrors & (chain == 0)), flux - remains - dr.select(lands, landing_flux, 0), 0)
         flux = dr.select(active, remains, flux)
         chain += dr.select(goes_on & ~crosses, mi.UInt32(1), mi.UInt32(0))

@@ -30,14 +30,15 @@ from rangesim.light_transport.photons import Photons
 from rangesim.light_transport.sampling import aligned
 
 ALPHA = 2 / 3
-"""Says how fast the radii of successive maps shrink (Knaus and Zwicker 2011). The noise of n maps falls as
-n^(-alpha / 2) and their bias as n^(alpha - 1); at 2/3 both fall alike. At 1 radii do not shrink, and the blur stays."""
+"""Number that says how fast the radii of successive maps shrink, dimensionless, alpha of Knaus and Zwicker (2011). The
+noise of n maps falls as n^(-alpha / 2) and their bias as n^(alpha - 1). It is chosen so that both fall alike; at 1
+radii would not shrink, and the blur would stay."""
 MAX_MAPS = 64
 """Largest number of photon maps. With more samples per pixel than this, several samples share a map. The number of maps
 is a multiple of 32, because `_occupancy` keeps a bit for each in words of 32."""
 CLASSES_PER_OCTAVE = 4
-"""Number of classes of radii for each factor of two. More classes fit cells more tightly to the radii, but put more
-photons into the cells of two classes."""
+"""Number of classes of radii per factor of two. It is chosen small, because photons near a border between two classes
+are stored twice; fewer classes would have cells larger than their radii need."""
 STEEPEST = 1 / 12
 """Largest ratio of the radius of the brightest level to the distance from a device. The radius of the faintest level is
 six times as large, so it is half the distance at most."""
@@ -45,36 +46,37 @@ FLATNESS = 0.3
 """Largest distance of a photon from the tangent plane, as a fraction of the radius. Photons farther off lie on another
 surface. A smaller value loses photons on curved surfaces; a larger one takes light from beyond edges."""
 MAX_LOOKED_AT = 16
-"""Number of photons that a gather looks at. Where n times as many are near, it looks at every n-th, and counts each n
-times. A larger number makes less noise in bright caustics and takes more time."""
+"""Number of photons that a gather looks at, so that the time per vertex is bounded. Where n times as many are near, it
+looks at every n-th photon and counts it n times; a larger number makes less noise in bright caustics."""
 OCCUPANCY_CELLS = 1 << 18
-"""Number of places in the table that says where photons may be, a power of two. A larger table has fewer false hits and
-needs more of the cache: it takes 2 MiB for each level."""
+"""Number of places per level in the table that says where photons may be, a power of two. At 2 MiB it fits into caches;
+a smaller table has more false hits, because more cells share a place."""
 PRIMES = (73856093, 19349663, 83492791)
 """Factors of the spatial hash of a cell's coordinates (Teschner et al. 2003). They are added up here: combined by
 exclusive or, as in the paper, opposite cells would share a place."""
 CLASS_PRIME = 50331653
-"""Factor of the class in the same hash."""
+"""Factor of the class in the same hash, see `_hash`; dimensionless."""
 ROW_FACTORS = (0x9E3779B3, 0x85EBCA75)
 """Factors of a row's y and z in the hash of rows. Modulo 16 they keep neighbouring rows apart, see `_row`."""
 CLASS_FACTOR = 0xC2B2AE3D
-"""Factor of the class in the hash of rows."""
+"""Factor of the class in the hash of rows, see `_row`; dimensionless."""
 ROUNDING = 1e-4
-"""Relative error of a radius for which classes allow, far above the unit of rounding in single precision (6e-8)."""
+"""Relative error, a fraction of a radius, for which classes allow, so that rounding in single precision (6e-8 per
+operation) puts no photon into a wrong class."""
 TYPICAL_QUANTILE = 0.05
 """Quantile of the ratios of radius to distance from the camera that decides whether a level is wide. It is low, so that
 a level counts as wide only if nearly all of its photons are gathered over wide circles."""
 FOLD = 1024
-"""Number of cells along x after which a row turns back on itself, so that the table stays small in a large scene. Cells
-far apart then share a place, which costs time."""
+"""Number of cells along x after which a row turns back on itself, so that the table stays small in a large scene.
+Places 1024 or more cells apart may then share an entry, which costs time."""
 UNBOUNDED_M = 1e30
-"""Stands for an infinite radius in single precision, in metres."""
+"""Stands for an infinite radius, in metres, because single precision ends at 3e38."""
 MIN_M = 1e-9
-"""Smallest radius and distance in metres, at a device itself, where the radius would be 0."""
+"""Smallest radius and distance in metres, because both are 0 at a device itself, and are divided by."""
 
 
 class Level(NamedTuple):
-    """How the photons of one range of brightness are gathered.
+    """Radius and chance with which photons of one range of brightness are gathered.
 
     brightest : upper end of the range: irradiance as a fraction of the projector's direct light.
     radius : ratio of the radius to that of the brightest level.
@@ -87,9 +89,9 @@ class Level(NamedTuple):
 
 
 LEVELS = (Level(np.inf, 1.0, 1.0), Level(0.1, 2.5, 0.25), Level(0.01, 6.0, 0.1))
-"""Levels of photons, brightest first. Light that brings less than a tenth of the direct light is gathered over 2.5
-times the radius, at every fourth vertex; light below a hundredth over 6 times the radius, at every tenth vertex. More
-vertices would cost time for light that adds little to a reading."""
+"""Levels of photons, brightest first. Light below a tenth of the direct light is gathered over 2.5 times the radius at
+every fourth vertex, below a hundredth over 6 times the radius at every tenth, because few photons carry it and little
+depends on it."""
 
 
 Whole = TypeVar("Whole", np.ndarray, "mi.UInt32", "mi.Int32")
@@ -276,7 +278,7 @@ class PhotonMaps:
         starts, counts = self._ranges(point, of_map + level * self.maps, reach.edge * shrunk, reach.kind, active)
         one, two = counts[0] + counts[1], counts[0] + counts[1] + counts[2]
         count = two + counts[3]
-        # Where photons crowd, every n-th will do; they are in the order in which they left the projector
+        # Where photons crowd, only every n-th is looked at. They are in the order in which they left the projector
         every = (count + (MAX_LOOKED_AT - 1)) // MAX_LOOKED_AT
         k = mi.UInt32(offset * mi.Float(every))
         total, chosen, pick = mi.Float(0), mi.UInt32(0), mi.Float(pick)
@@ -294,7 +296,7 @@ class PhotonMaps:
             fraction = dr.select(beside, weight / total, 0)
             taken = pick < fraction
             chosen = dr.select(taken, index, chosen)
-            pick = dr.select(taken, pick / fraction, (pick - fraction) / (1 - fraction))  # as good as new
+            pick = dr.select(taken, pick / fraction, (pick - fraction) / (1 - fraction))  # uniform again
             k += every
         return Gathered(chosen, total * mi.Float(every) * (2 / dr.pi) * inverse_square)
 

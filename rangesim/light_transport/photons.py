@@ -17,34 +17,33 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from rangesim.light_transport.device import Device
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.photon_flight import trace_photon_paths
+from rangesim.light_transport.rays import Device
 from rangesim.light_transport.sampling import Seed, Stream, random_stream
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.scene.media import is_boundary
 
 DEFENSIVE_FRACTION = 0.05
-"""Fraction of the photons that go through pixels where the pre-pass found no delta surface. Any fraction above 0 leaves
-the mean as it is; a larger one spends more photons where most meet no delta surface."""
+"""Fraction of the photons that go through pixels where the pre-pass found no delta surface, so that surfaces finer than
+a pixel get some. Any fraction above 0 has the same mean; a larger one takes photons from the pixels that need them."""
 SURFACES_PER_PHOTON = 2
-"""Surfaces that a photon is taken to meet when the size of the first launch is chosen. Later launches go by the
-time."""
+"""Number of surfaces per photon that is assumed when the size of a launch is chosen. Launches adapt to the time they
+take, so that a wrong number costs little."""
 SUMMED_TOGETHER = 1 << 16
-"""Number of successive photons whose power is added up first. Launches hold whole blocks of this size, so the sum does
-not depend on how the photons are cut into launches."""
+"""Number of photons per block whose power is added up first. A launch holds whole blocks, so that the sum does not
+depend on how photons are cut into launches."""
 MAX_AT_ONCE = 1 << 20
 """Largest number of photons of a launch, so that NumPy's work on them between launches is short as well."""
 BYTES_PER_PHOTON = 128
-"""Memory of a photon during its flight, in bytes, an upper bound."""
+"""Memory per photon during its flight, in bytes, an upper bound from which the largest launch follows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +192,7 @@ def _chances(scene: mi.Scene, projector: Device) -> tuple[np.ndarray, np.ndarray
     chance = np.where(
         mask, 1.0, DEFENSIVE_FRACTION / (1 - DEFENSIVE_FRACTION) * max(mask.sum(), 1) / max(rest.sum(), 1)
     )
-    # Places grow along every row of the image: runs, which a stable sort merges
+    # Places grow along every row of the image, so a stable sort has only to merge sorted runs
     order = np.argsort(_morton(w, h).ravel(), kind="stable")
     return order, chance[order]
 
@@ -235,6 +234,6 @@ def stratified_choice(cumulative: np.ndarray, number: np.ndarray, per_map: int, 
     return np.minimum(np.searchsorted(cumulative, place * cumulative[-1], side="right"), len(cumulative) - 1)
 
 
-def _columns(array: Any) -> np.ndarray:
+def _columns(array: mi.Float | mi.Vector3f) -> np.ndarray:
     """A Dr.Jit array as an array (n,) or (n, 3) of NumPy."""
     return np.ascontiguousarray(np.array(array).T)

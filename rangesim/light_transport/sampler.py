@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The interface of a sampler: it looks at the first samples of a pass and decides how many more each pixel takes."""
+"""The interface of a sampler, which looks at the first samples of a pass and decides how many each pixel takes."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ if TYPE_CHECKING:
 
 
 class Sampler(ABC):
-    """Decides how many samples (camera paths) each pixel takes.
+    """An object that decides how many samples (camera paths) each pixel takes.
 
-    `rangesim.instrument.adaptive_sampling.AdaptiveSampling` decides by the noise of readings. The light transport knows
-    this interface alone.
+    `rangesim.instrument.adaptive_sampling.AdaptiveSampling` decides by the noise of the readings. The light transport
+    knows this interface only, so that it needs no sensors and no decoders.
     """
 
     @property
     @abstractmethod
     def first_spp(self) -> int:
-        """Number of samples that each pixel takes before the sampler is asked."""
+        """Number of samples that each pixel takes before `samples` is called."""
 
     @property
     @abstractmethod
     def most_spp(self) -> int:
-        """Largest number of samples of a pixel."""
+        """Largest number of samples that a pixel may take."""
 
     @abstractmethod
     def check(self, responses: Sequence[Response]) -> None:
-        """Raise ValueError if a pass that accumulates these responses does not tell what the sampler needs to know."""
+        """Raise ValueError if the sampler needs a response that the pass does not accumulate."""
 
     @abstractmethod
     def samples(self, truth: GroundTruth, signals_of: Callable[[Sequence[Response]], StillSignals]) -> np.ndarray:
-        """(h, w) int, the number of samples that each pixel should take, the first ones included.
+        """Number of samples that each pixel should take, (h, w) int, the first samples included.
 
         Parameters
         ----------
         truth : GroundTruth of the pass.
-        signals_of : makes signals of the first samples, with the channels of the given responses.
+        signals_of : function that returns the signals of the first samples, with the channels of the given responses.
         """

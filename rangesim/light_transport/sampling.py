@@ -11,9 +11,10 @@ import mitsuba as mi
 import numpy as np
 
 R2 = (0.7548776662466927, 0.5698402909980532)
-"""Steps of the R2 sequence: 1 / phi and 1 / phi^2 with phi^3 = phi + 1 (Roberts 2018)."""
+"""Steps of the R2 sequence, fractions of a pixel: 1 / phi and 1 / phi^2 with phi^3 = phi + 1 (Roberts 2018)."""
 R4 = (0.8566748838545029, 0.733891856627126, 0.6287067210378087, 0.5385972572236101)
-"""Steps of the R4 sequence: the first four powers of 1 / phi with phi^5 = phi + 1 (Roberts 2018)."""
+"""Steps of the R4 sequence, fractions of a pixel and of the lens: the first four powers of 1 / phi with phi^5 = phi + 1
+(Roberts 2018)."""
 
 
 class Seed(NamedTuple):

@@ -22,9 +22,9 @@ from rangesim.rig import Rig
 from rangesim.signals import SamplingError
 
 BYTES_PER_LANE = 512
-"""Memory of the state of a lane besides its channels, in bytes, an upper bound."""
+"""Memory per lane besides its channels, in bytes, an upper bound from which the size of tiles follows."""
 MIN_FOR_HALVES = 3
-"""Smallest number of samples of a pixel that can be dealt into halves: two and one."""
+"""Smallest number of samples per pixel that can be dealt into halves, because samples come in pairs: two and one."""
 SMOOTH = [i for i, field in enumerate(fields(Radiance)) if field.name in ("multipath", "smooth_caustic")]
 """Indices of the kinds of light that neighbouring pixels may share, in the order of the fields of `Radiance`."""
 

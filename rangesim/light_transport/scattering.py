@@ -21,13 +21,14 @@ from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.scene.media import is_boundary, medium_numbers
 
 MAX_EVENTS = 1 << 14
-"""Number of scattering events and crossed boundaries after which a path is cut off, apart from `max_depth`. In whole
-milk a walk takes some 4000 events to a throughput of `ROULETTE_BELOW`."""
+"""Number of scattering events and crossed boundaries per path after which it is cut off, so that its time is bounded.
+In whole milk a walk takes some 4000 events to a throughput of `ROULETTE_BELOW`."""
 ROULETTE_BELOW = 0.2
-"""Throughput below which Russian roulette may end a walk inside a medium. A smaller value makes less noise, and walks
-last longer."""
+"""Throughput, a fraction of the light, below which Russian roulette may end a walk inside a medium, so that walks end
+in time. A smaller fraction makes less noise and longer walks."""
 OPAQUE = 30.0
-"""Optical thickness that counts as a wall, no unit: exp(-30) = 1e-13 is below the rounding of single precision."""
+"""Optical thickness, dimensionless, that counts as a wall, because exp(-30) = 1e-13 is below the rounding of single
+precision."""
 
 
 @dataclass
@@ -68,7 +69,7 @@ class Medium:
 
         `direction` is the one before; `xi` is uniform in the unit square.
         """
-        g = dr.select(dr.abs(self.g) < 1e-3, 1e-3, self.g)  # the inverse has no value at g = 0
+        g = dr.select(dr.abs(self.g) < 1e-3, 1e-3, self.g)  # the inverse would be 0 / 0 at g = 0
         way = (1 - dr.square(g)) / (1 - g + 2 * g * xi.x)
         cosine = dr.clip((1 + dr.square(g) - dr.square(way)) / (2 * g), -1, 1)
         cosine = dr.select(dr.abs(self.g) < 1e-3, 1 - 2 * xi.x, cosine)

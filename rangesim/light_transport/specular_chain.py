@@ -22,18 +22,17 @@ from rangesim.light_transport.scattering import Medium
 from rangesim.light_transport.traced_scene import TracedScene
 
 MAX_CHAIN = 128
-"""Number of delta interactions in a row after which light is cut off. A pane has two faces, a hollow glass four; light
-in a brilliant is reflected dozens of times. Of photons into one of n = 2.4, 0.2 % are cut off (5.8 % at a limit of 16).
-"""
+"""Number of delta interactions in a row after which light is cut off, so that time is bounded. A pane has two faces, a
+hollow glass four. Of photons into a brilliant of n = 2.4, 0.2 % are cut off (5.8 % were measured at a limit of 16)."""
 ROULETTE_AFTER = 8
-"""Number of delta interactions in a row after which Russian roulette may end the light: the faces of two hollow
-glasses. A smaller number makes more noise behind glass; a larger one takes more time among metals."""
+"""Number of delta interactions in a row after which Russian roulette may end the light, so that it adds no noise to
+light through a few panes or two hollow glasses. A larger number takes more time among metals."""
 CLEARANCE = 0.1
 """Distance at which rays start from a delta surface, as a fraction of Mitsuba's own: 0.009 mm at 1 m. Glass thinner
 than this distance loses its far face; a smaller fraction comes near the rounding of single precision."""
 MIN_COSINE = 0.05
-"""Smallest cosine of the angle of incidence at which a point is corrected. At more grazing incidence, the point where
-the line meets the tangent plane may be far off, and the correction would be worse than the error."""
+"""Smallest cosine of the angle between ray and normal at which a point is corrected, because at more grazing incidence
+the corrected point may be far off."""
 
 
 @dataclass

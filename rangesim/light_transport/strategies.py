@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which strategy brings a light path from the projector to the camera.
+"""The strategies that bring light from the projector to the camera, and which of them owns a light path.
 
 A vertex of a light path is a surface point where light scatters into many directions, or a scattering event inside a
 medium. Between vertices, light runs along segments and through delta interactions (glass, mirrors, thin panes, coats,
@@ -33,20 +33,30 @@ class Owner(NamedTuple):
 def owner(has_vertex: mi.Bool, delta_interactions: mi.UInt32 | int) -> Owner:
     """The strategy that owns a light path.
 
-    | strategy | paths | kinds | files |
-    | --- | --- | --- | --- |
-    | next-event estimation | a straight segment leads from the projector to a vertex | direct, specular, multipath \
-| `loop.py` |
-    | caustic photons | delta interactions lie between the projector and the vertex next to it | caustic \
-| `photons.py` and `photon_flight.py` trace them before the pass, `photon_maps.py` sorts them, `loop.py` gathers them |
-    | glint | no vertex at all: the camera sees the projector's lens, directly or by delta interactions | glint \
-| `glint.py`, beside the pass |
+    | strategy              | paths                                              | kinds of light              |
+    | --------------------- | -------------------------------------------------- | --------------------------- |
+    | next-event estimation | a straight segment leads from the projector to a   | direct, specular, multipath |
+    |                       | vertex                                             |                             |
+    | caustic photons       | delta interactions lie between the projector and   | caustic                     |
+    |                       | the vertex next to it                              |                             |
+    | glint                 | no vertex at all: the camera sees the projector's  | glint                       |
+    |                       | lens, directly or by delta interactions            |                             |
+
+    Next-event estimation is carried out in `loop.py`. Photons start in `photons.py` and fly in `photon_flight.py`
+    before the pass; `photon_maps.py` sorts them, and `loop.py` gathers them. Glint is traced in `glint.py`, beside the
+    pass.
 
     Parameters
     ----------
     has_vertex : Bool, whether the path has any vertex.
     delta_interactions : UInt32, number of delta interactions between the projector and the vertex next to it. It does
         not count where there is no vertex.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> owner(has_vertex=np.array([True, True, False]), delta_interactions=np.array([0, 2, 2])).photons
+    array([False,  True, False])
     """
     is_straight = delta_interactions == 0
     return Owner(has_vertex & is_straight, has_vertex & (delta_interactions != 0), ~has_vertex)

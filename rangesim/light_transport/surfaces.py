@@ -20,11 +20,11 @@ from numpy.typing import ArrayLike
 from rangesim.light_transport.sampling import aligned
 
 MANY = 100
-"""Number of shapes from which on branches are shared. In smaller scenes virtual calls take little time, and the tables
-of a branch would not pay."""
+"""Number of shapes from which on branches are shared. In smaller scenes their tables are not worth making, because
+virtual calls take little time there."""
 MAX_FACES = 4096
-"""Largest number of faces of a mesh that is copied into a joint mesh. Copies of larger meshes would take much memory,
-and a scene has few of them."""
+"""Largest count of faces of a mesh that is copied into a joint mesh, so that copies take little memory; a scene has few
+larger meshes."""
 
 
 def surfaces_of(scene: mi.Scene) -> mi.Scene | Surfaces:
@@ -143,7 +143,7 @@ class Meshes:
             np.concatenate([own + np.uint32(first) for own, first in zip(own_faces, vertices[:-1], strict=True)])
         )
         parameters["vertex_positions"] = _joined([m.vertex_positions_buffer() for m in meshes])
-        parameters.update()  # makes normals, so those of the meshes come later
+        parameters.update()  # computes normals, so those of the meshes are set later
         if has_normals:
             parameters["vertex_normals"] = _joined([m.vertex_normals_buffer() for m in meshes])
         if has_texcoords:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the light of a scene is sampled: samples, path lengths, photons, seed."""
+"""The settings of a light-transport pass: number of samples, length of paths, photons, seed, memory."""
 
 from __future__ import annotations
 
@@ -12,42 +12,56 @@ from rangesim.settings.config import check_keys, shown
 from rangesim.settings.seeds import check_seed
 
 Indirect = Literal["filtered", "raw"]
+"""How indirect light is estimated, see `TransportSettings.indirect`."""
 PHOTONS = 500_000
+"""Default number of caustic photons. On `tabletop`, 50 000 photons take the same time and make caustics twice as noisy;
+5 000 000 take nearly four times as long (docs/caustics.md)."""
 
 
 @dataclass(frozen=True)
 class TransportSettings:
-    """Settings of `rangesim.transport`, which takes each of them by name as well.
+    """Settings of `rangesim.transport`, which also takes each of them by name.
 
     Parameters
     ----------
-    spp : int >= 1, samples (camera paths) per pixel. Or AdaptiveSampling: 8, and then up to 64, as many as it takes
-        until the renderer's noise in the readings of its instruments is small against that of their detectors. "auto":
-        this, for the sensors with their default detectors; for bare responses, and without `sampling_error`, 16 where
-        pixels share their indirect light and 64 elsewhere.
-    max_depth : int >= 1, segments of a path between surfaces that scatter it, up to the light: 2 is direct light alone,
-        as in Mitsuba. Delta interactions (glass, mirrors, thin panes, coats, holes) do not count; they have a limit of
-        their own, `rangesim.light_transport.specular_chain.MAX_CHAIN` in a row.
-    rr_depth : int >= 1, surfaces that scatter after which Russian roulette may end a path.
-    seed : int, 0 to 2^64 - 1; the same seed gives the same bytes, whatever the number of threads and the memory
-        budget, and each its own noise.
-    photons : int >= 0, caustic photons: the projector's light through glass and off mirrors, see
-        `rangesim.light_transport.photons`; 0: none, and such light is missing. No cost without such surfaces.
-    caustic_radius_m : metres, largest radius over which photons are gathered; None: as wide as the number of photons
-        asks for, at most three pixels of the projector or of the camera at the distance of the point. Caustics are
-        blurred by about half of it.
+    spp : int >= 1, number of samples (camera paths) per pixel; or a Sampler such as AdaptiveSampling, which takes 8
+        samples and then up to 64, until the renderer's noise in the readings of its instruments is small against the
+        noise of their detectors. "auto" is AdaptiveSampling for the sensors of the pass with their default detectors.
+        For bare responses, and without `sampling_error`, "auto" is 16 samples where pixels share their indirect light,
+        and 64 elsewhere.
+    max_depth : int >= 1, largest number of segments of a path between surfaces that scatter it, the last segment to the
+        light included. 2 means direct light only, as in Mitsuba. Delta interactions (glass, mirrors, thin panes, coats,
+        holes) do not count. They have a limit of their own, `rangesim.light_transport.specular_chain.MAX_CHAIN` in a
+        row.
+    rr_depth : int >= 1, number of surfaces that scatter after which Russian roulette may end a path.
+    seed : int, 0 to 2^64 - 1. The same seed gives the same bytes for any number of threads and any memory budget.
+    photons : int >= 0, number of caustic photons, which bring the projector's light through glass and off mirrors, see
+        `rangesim.light_transport.photons`. With 0 this light is missing. They cost nothing in a scene without glass and
+        mirrors.
+    caustic_radius_m : metres, largest radius over which photons are gathered. None: the radius follows from the number
+        of photons, and is at most three pixels of the projector or of the camera at the distance of the point.
+        Caustics are blurred by about half of the radius.
     glint : whether the camera sees the projector's lens, in a mirror, through glass or directly.
-    indirect : "filtered": neighbouring pixels of a matte surface share their multipath, with a small bias and far less
-        noise (`rangesim.light_transport.indirect_filter`); "raw": the unbiased sum over each pixel's own paths.
-    sampling_error : whether `StillSignals.sampling` is estimated, which takes as much memory again as the signals and
-        some time; adaptive sampling needs it.
-    memory_bytes : the image is rendered in tiles that keep the renderer's arrays below this size; photons that landed
-        come on top, some 200 bytes each.
+    indirect : "filtered": neighbouring pixels of a matte surface share their multipath, with a small bias and much less
+        noise (`rangesim.light_transport.indirect_filter`). "raw": the unbiased sum over each pixel's own paths.
+    sampling_error : whether `StillSignals.sampling` is estimated. This takes some time, and as much memory as the
+        signals themselves. A Sampler needs it.
+    memory_bytes : bytes. The image is rendered in tiles so that the renderer's arrays stay below this size. Photons
+        that landed take another 200 bytes each.
 
     Raises
     ------
     ValueError
-        A setting is out of its range, or adaptive sampling has no sampling error to go by.
+        A setting is out of its range, or spp is a Sampler and `sampling_error` is False.
+
+    Examples
+    --------
+    >>> settings = TransportSettings(spp=64, max_depth=8, seed=1)
+    >>> settings.photons
+    500000
+    >>> TransportSettings(spp=0)
+    Traceback (most recent call last):
+    ValueError: expected spp to be a whole number of at least 1, got 0.
     """
 
     spp: Annotated[int, whole(1, "spp")] | Literal["auto"] | Sampler = "auto"
@@ -65,7 +79,7 @@ class TransportSettings:
         object.__setattr__(self, "seed", check_seed(self.seed))
         check_fields(self)
         if isinstance(self.spp, Sampler) and not self.sampling_error:
-            raise ValueError(f"expected sampling_error=True with {type(self.spp).__name__}, which goes by it.")
+            raise ValueError(f"expected sampling_error=True with {type(self.spp).__name__}, which needs it.")
 
 
 class TransportOptions(TypedDict, total=False):
@@ -83,8 +97,24 @@ class TransportOptions(TypedDict, total=False):
     memory_bytes: int
 
 
-def chosen(settings: TransportSettings | None, options: TransportOptions) -> TransportSettings:
-    """The settings, or the defaults, with some changed; ValueError names one that is not there or out of its range."""
+def with_options(settings: TransportSettings | None, options: TransportOptions) -> TransportSettings:
+    """The settings with some of their fields replaced.
+
+    Parameters
+    ----------
+    settings : None: the defaults.
+    options : new values by the names of the fields.
+
+    Raises
+    ------
+    ValueError
+        An option is no field, or is out of its range. The message names it.
+
+    Examples
+    --------
+    >>> with_options(None, {"spp": 16}).spp
+    16
+    """
     check_keys(options, [f.name for f in fields(TransportSettings)], "options")
     if settings is None:
         settings = TransportSettings()

@@ -27,13 +27,14 @@ from rangesim.light_transport.specular_chain import MAX_CHAIN
 from rangesim.signals import EnergySplit, Truncation
 
 DIRECT_ALONE = 2
-"""The `max_depth` that asks for direct light alone. The light at later vertices is not known then."""
+"""The `max_depth`, a count of segments, that asks for direct light alone, so that light at later vertices is not
+known."""
 MAX_LEFT_OUT = 0.02
 """Fraction of the projector's light that a pass may leave out without a warning. A smaller value would warn more often,
 of light that changes few readings."""
 MAX_DECAY = 0.99
-"""Largest ratio t of the throughputs at successive vertices. In a closed room that absorbs next to nothing t comes near
-1, and the estimate t / (1 - t) grows without a bound."""
+"""Largest ratio t of the throughputs at successive vertices, because t / (1 - t) grows without a bound in a closed room
+that absorbs next to nothing."""
 
 
 Array = TypeVar("Array")

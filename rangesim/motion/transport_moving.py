@@ -76,12 +76,12 @@ def transport_moving(
     """
     from rangesim.light_transport.light_pass import trace_light
     from rangesim.light_transport.sampler import Sampler
-    from rangesim.light_transport.transport_settings import chosen
+    from rangesim.light_transport.transport_settings import with_options
     from rangesim.light_transport.truncation import warn_of_truncation
     from rangesim.scene.rigid_motion import MovingScene
 
     _check(scene, rig, timings, motion)
-    settings = chosen(settings, options)
+    settings = with_options(settings, options)
     if isinstance(settings.spp, Sampler):
         raise ValueError(
             f'expected a number of samples or "auto" where something moves, got {type(settings.spp).__name__}.'

@@ -53,14 +53,14 @@ MAX_STEPS = 1000
 """Largest number of steps of a final adjustment. The 100 views of docs/multiview.md need four. Hundreds are needed
 where the views leave a direction nearly open, because the descent then follows a long curved valley."""
 ROUGH_STEPS = 200
-"""Largest number of steps while more views are still to come. Such a result need not be at the minimum, because the
-next views change it anyway."""
+"""Largest number of steps while more views are still to come, a count. Such a result need not be at the minimum,
+because the next views change it anyway."""
 CONVERGED = 1e-8
-"""Relative decrease of the cost at which a descent ends. For a million residuals it is 1 % of the variance of one
-residual, so the parameters are within about 0.1 standard deviations of the minimum."""
+"""Relative decrease of the cost at which a descent ends, a ratio. For a million residuals, 1e-8 of the cost is 1 % of
+the variance of one residual, so that the parameters are then within about 0.1 standard deviations of the minimum."""
 MIN_DAMPING = 1e-10
-"""Smallest damping of Levenberg-Marquardt, relative to the diagonal of the normal equations. It keeps them regular
-where the residuals leave parameters open, such as the gauge. Larger values slow the descent near the minimum."""
+"""Smallest damping of Levenberg-Marquardt over the diagonal of the normal equations, a ratio. It must not be 0, because
+the residuals leave parameters open, such as the gauge. Larger values slow the descent near the minimum."""
 MAX_ROTATION_DEVIATION = 0.3
 """Largest standard deviation of a rotation, radians. Beyond about 17 degrees the covariance, which is linear in the
 rotation, means little, and the pose counts as undetermined."""
@@ -71,7 +71,7 @@ ONE_PLACE = 1e-6
 """Extent of the start's cameras over the median distance of the points, a ratio. Below it the cameras count as being in
 one place. It only has to exceed rounding: what noise leaves open is found after the descent."""
 MIN_IMAGES = 2
-"""Smallest number of images, and of images that see a point: one image has no depth."""
+"""Smallest number of images, and of images that see a point, a count: two, because one image has no depth."""
 MAX_SHAPE_DEVIATION = 0.5
 """Largest standard deviation of the median point over the extent of the points, a ratio. A shape that is known less
 well is refused: its errors would be as large as half of the shape."""
@@ -82,11 +82,12 @@ TESTED_OBSERVATIONS = 30_000
 """Number of observations, about, in the F test against cameras that only rotate. It bounds the time of the test; fewer
 observations make it weaker for cameras that hardly move."""
 ROTATION_ROUNDS = 10
-"""Number of rounds that find rotations and mean directions in turns. The result is only the start of a descent, which
-more rounds make shorter."""
+"""Number of rounds that find rotations and mean directions in turns, a count. They give the start of a descent.
+Measured with 3 scenes of 12 images, rotations off by 0.02 rad: without a round the descent takes 3 steps, after 1 to 30
+rounds it takes 2, and ends at the same minimum."""
 ROTATION_STEPS = 30
-"""Largest number of steps of the descent of cameras that only rotate. It ends earlier where a step lowers the cost by
-less than 1e-4 of it."""
+"""Largest number of steps of the descent of cameras that only rotate, a count. Measured as for `ROTATION_ROUNDS`: 2 or
+3 steps are enough. It ends when a step lowers the cost by less than 1e-4 of it."""
 MAX_INLIER_DEVIATIONS = 4.0
 """Largest error of a right observation under a robust loss, in standard deviations of the noise. Gaussian noise exceeds
 four of them in one coordinate of 16 000."""
@@ -420,8 +421,10 @@ def _freedom(some: Tracks, sizes: Sizes, held: Sequence[int]) -> int:
 
 
 def _refuse_undetermined(covariance: Array, T: Array, sizes: Sizes, is_free: np.ndarray, noise: float) -> None:
-    """Raise ValueError if the rotation of a pose has a deviation above `MAX_ROTATION_DEVIATION`, or its translation one
-    above the extent of all cameras."""
+    """Raise ValueError if the deviation of a pose is too large.
+
+    The limit of a rotation is `MAX_ROTATION_DEVIATION`, that of a translation the extent of all cameras.
+    """
     of_images = np.diag(covariance)[sizes.shared :].reshape(-1, POSE)
     centres = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
     extent = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()

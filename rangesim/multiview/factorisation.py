@@ -44,9 +44,11 @@ from rangesim.multiview.schur_complement import NormalEquations, Sizes, Step, Te
 from rangesim.multiview.tracks import Tracks
 
 AFFINE_RANK = 3
-"""Rank of the pixels of affine cameras minus their translations: the three coordinates of a point."""
+"""Rank of the pixels of affine cameras minus their translations, a count: one for each coordinate of a point (Tomasi,
+Kanade 1992)."""
 PROJECTIVE_RANK = 4
-"""Rank of the homogeneous pixels times their depths: the four homogeneous coordinates of a point."""
+"""Rank of the homogeneous pixels times their depths, a count: one for each homogeneous coordinate of a point (Sturm,
+Triggs 1996)."""
 FILL_ROUNDS = 60
 """Number of rounds that fill in missing pixels and decompose the matrix, before the descent. Measured with 12 scenes of
 8 images and 40 points, 30 % missing: 0 to 200 rounds end at the same minimum; 200 take three times as long as 60."""
@@ -54,16 +56,16 @@ DEPTH_ROUNDS = 100
 """Number of rounds that find the projective depths, before the descent. Measured with 12 scenes of 8 images and 40
 points, 30 % missing: 1 to 300 rounds end at the same minimum, and 30 to 100 take the least time."""
 RANDOM_STARTS = 4
-"""Number of random starts after the first one. They only run if the first descent ends without a finite sum of squares,
-because the first start counts as agreeing with the infinite cost before it. Measured with 25 scenes each, 30 % missing:
-with 8 images of 40 points no random start found a lower minimum; with 4 images of 20 points one did in 4 scenes."""
+"""Largest number of random starts after the first one. They end as soon as one agrees with the best minimum so far.
+Measured with 25 scenes each, 30 % missing: with 8 images of 40 points no random start found a lower minimum; with 4
+images of 20 points one did in 4 scenes."""
 SAME_AFFINE_COST = 1e-6
-"""Relative difference of the sums of squares of two starts, below which they found the same minimum. It must exceed the
-1e-12 that a descent leaves when it ends. The different minima in the scenes of `RANDOM_STARTS` had a ratio of 30 or
-more."""
+"""Relative difference of the sums of squares of two starts, a ratio, below which they found the same minimum. It must
+exceed the 1e-12 that a descent leaves when it ends. Measured in the scenes of `RANDOM_STARTS`: different minima have a
+ratio of 30 or more."""
 MIN_DAMPING = 1e-12
-"""Smallest damping of Levenberg-Marquardt, relative to the diagonal of the normal equations. It keeps them regular
-along the gauge, which changes no residual."""
+"""Smallest damping of Levenberg-Marquardt over the diagonal of the normal equations, a ratio. It must not be 0, because
+the gauge changes no residual and would leave the equations singular."""
 MAX_ROTATION_DEVIATION = 0.3
 """Largest standard deviation of a rotation, radians. Beyond about 17 degrees the covariance, which is linear in the
 rotation, means little, and the rotation counts as undetermined."""
@@ -301,7 +303,7 @@ def low_rank(tracks: Tracks, rank: int, seed: int) -> AffineCameras:
             cameras = AffineCameras(M, np.nanmean(dense, axis=1), np.zeros_like(cameras.X))
         found, cost = _affine_descent(tracks, cameras)
         floor = (ROUNDING * spread) ** 2 * len(tracks)
-        is_same = abs(cost - least) <= SAME_AFFINE_COST * least + floor
+        is_same = attempt > 0 and abs(cost - least) <= SAME_AFFINE_COST * least + floor
         if cost < least:
             best, least = found, cost
         if is_same or least <= floor:
@@ -344,8 +346,10 @@ def _affine_descent(tracks: Tracks, start: AffineCameras) -> tuple[AffineCameras
 
 
 def whitened(cameras: AffineCameras) -> tuple[AffineCameras, Array]:
-    """The same cameras, their points with zero mean and unit covariance along principal axes, and the singular
-    values."""
+    """The same cameras with whitened points, and the singular values of the pixels.
+
+    Whitened points have zero mean and unit covariance, along their principal axes.
+    """
     middle = cameras.X.mean(axis=0)
     t = cameras.t + cameras.M @ middle
     n, _, rank = cameras.M.shape

@@ -38,28 +38,29 @@ from rangesim.multiview.tracks import Tracks
 from rangesim.rig import Intrinsics
 
 MIN_COMMON = 12
-"""Smallest number of points that the images of the first pair share. A relative pose needs five; twelve leave some for
-wrong ones and for a test of the pose."""
+"""Smallest number of points that the images of the first pair share. It is larger than the five points of a relative
+pose, so that some can be wrong and the others can test the pose."""
 MIN_KNOWN_POINTS = 6
 """Smallest number of known points that an image must see before its pose is found. A pose needs three, and a fourth to
 be unique; six leave two for wrong ones."""
 MAX_PAIRS = 12
-"""Largest number of pairs tried as the first one. More pairs take longer, and may find a pair with more parallax."""
+"""Largest number of pairs tried as the first one, a count. More pairs take longer, and may find a pair with more
+parallax. Nobody measured the value."""
 WIDE_RAD = np.radians(10)
 """Angle between the two rays of a point, radians, above which a wider angle makes a pair no better. The depth deviation
 falls as the inverse of the angle, but matches become rarer; nobody measured the value."""
 ADJUSTMENT_GROWTH = 1.2
-"""Growth of the number of images, a ratio, after which all of them are adjusted again. A smaller ratio needs more
-adjustments; a larger one lets the errors of new poses add up. With 1.2 the number of adjustments grows as the logarithm
-of the number of images."""
+"""Growth of the number of images, a ratio, after which all of them are adjusted again. Measured with 5 scenes of 16
+views, 5 or 20 % of the observations wrong: 1.0 to 3.0 end at the same result, and 1.2 takes 0.6 to 0.8 times the time
+of 1.0. With 1.2 the number of adjustments grows as the logarithm of the number of images."""
 MAX_NOISE_RATIO = 1.5
 """Largest noise found over the noise stated, a ratio; above it the result comes with a warning."""
 MIN_AGREEING = 0.5
 """Smallest fraction of observations that agree, among those of points in several images; below it the result comes with
 a warning, because most tracks are then wrong."""
 FINAL_ROUNDS = 4
-"""Largest number of rounds of bundle adjustment and outlier removal at the end. They end earlier if the inliers do not
-change."""
+"""Largest number of rounds of bundle adjustment and outlier removal at the end, a count. They end earlier if the
+inliers do not change. Measured in the scenes of `ADJUSTMENT_GROWTH`: two rounds are enough."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,8 +238,10 @@ def _ray_angles(K: Array, T: Array, first: Array, second: Array) -> Array:
 def _with_next(
     tracks: Tracks, camera: Intrinsics, T: Array, X: Array, waiting: np.ndarray, noise_px: float, seed: int
 ) -> Array:
-    """The poses T (n, 4, 4) with that of one more image: the one of those waiting that sees most of the known points
-    X."""
+    """The poses (n, 4, 4) with that of one more image, the one of `waiting` that sees most of the known points.
+
+    T : (n, 4, 4), NaN for an image without a pose. X : (n_points, 3), NaN for an unknown point.
+    """
     known = np.asarray(np.isfinite(X).all(axis=1))
     counts = np.bincount(tracks.image[known[tracks.point]], minlength=tracks.n_images)
     refusal = ""

@@ -31,9 +31,9 @@ GAUSS_NEWTON_STEPS = 5
 """Number of Gauss-Newton steps after the linear solution. Measured with 5 cameras around 200 points at 5 m and 5 px of
 noise: one step leaves a point at most 2e-4 m from the minimum, two steps 2e-6 m, five steps 5e-12 m."""
 MAX_DROPS = 20
-"""Largest number of rounds; each leaves out the worst observation of every point that still has a too large error. A
-point that still has one after the last round is NaN. More rounds only matter for a point with more than 20 wrong
-observations, and cost one triangulation of such points each."""
+"""Largest number of rounds, a count; each leaves out the worst observation of every point that still has a too large
+error. A point that still has one after the last round is NaN. More rounds only matter for points with more than 20
+wrong observations, and each costs one triangulation of such points."""
 MAX_WRONG = 0.5
 """Largest fraction of a point's observations that may be left out; a point that needs more is NaN. With half of them
 wrong or more, the wrong ones could outvote the right ones."""
@@ -49,6 +49,10 @@ class ManyViewPoints:
     deviation : (n_points,) float64, standard deviation of a point if the poses are exact, in the unit of the poses: the
         square root of the sum of the variances of its three coordinates. NaN where the point is NaN.
     agrees : (m,) bool, whether the point of an observation was found and projects within `max_error_px` of its pixel.
+
+    Examples
+    --------
+    See `triangulate_many`.
     """
 
     points: Array

@@ -61,17 +61,17 @@ from rangesim.multiview.tracks import Tracks
 from rangesim.settings.config import shown
 
 STARTS = 20
-"""Largest number of starts of the metric upgrade; if no two agree by then, it raises an error. More starts take longer
-to refuse, and rarely help tracks that do not determine the shape."""
+"""Largest number of starts of the metric upgrade, a count; if no two agree by then, it raises an error. Measured with
+24 sets of 50 points in 10 images at K = 4, half of them with 10 % missing: 3 to 7 starts are needed."""
 START_STEPS = 120
-"""Largest number of steps from each start. The best start goes on from there, so that a start need not converge; it
-must come near enough to its minimum to be compared within `SAME_SHAPE_COST`."""
+"""Largest number of steps from each start, a count. A start need not converge, because the best one goes on from there;
+it must come near enough to its minimum to be compared within `SAME_SHAPE_COST`."""
 START_TURN_RAD = 0.3
 """Standard deviation of a component of the rotation vector by which a start turns each image of the first start,
 radians. Smaller turns end in the same minimum again; larger ones are no better than random rotations."""
 SAME_SHAPE_COST = 1e-4
-"""Relative difference of the sums of squares of two starts, below which they agree. It is larger than 1e-9, at which
-the descent from a start ends."""
+"""Relative difference of the sums of squares of two starts, a ratio, below which they agree. It is larger than 1e-9,
+from which on a descent from a start counts as ended."""
 MAX_SHAPE_DEVIATION = 0.5
 """Largest standard deviation of the median coordinate over the extent of the mean shape, a ratio. A shape that is known
 less well is refused: its errors would be as large as half of the shape."""

@@ -25,8 +25,8 @@ from rangesim.multiview.schur_complement import NormalEquations, Prior, Sizes, S
 from rangesim.multiview.tracks import Tracks
 
 MIN_DAMPING = 1e-12
-"""Smallest damping of Levenberg-Marquardt, relative to the diagonal of the normal equations. It keeps them regular
-along the gauge, which changes no residual."""
+"""Smallest damping of Levenberg-Marquardt over the diagonal of the normal equations, a ratio. It must not be 0, because
+the gauge changes no residual and would leave the equations singular."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,8 +184,10 @@ def _flat(by_point: Array) -> Array:
 
 
 def _shape_bends(shapes: Shapes, sizes: Sizes, deviation: float) -> Term:
-    """The term of the prior on the shape: second differences over the images of each point, residuals (p (n - 2),
-    3)."""
+    """The term of the prior on the shape, with residuals (p (n - 2), 3).
+
+    They are the second differences of each point over the images.
+    """
     n, K = shapes.coefficients.shape
     p = len(shapes.basis)
     point, middle = (a.ravel() for a in np.meshgrid(np.arange(p), np.arange(1, n - 1), indexing="ij"))

@@ -32,8 +32,8 @@ from pcgraph.parallel import in_blocks, kernel
 from rangesim.geometry.correspondences import Array
 
 CHUNK_BYTES = 16e6
-"""Largest size of Y at a time, bytes. Larger chunks need more memory; smaller ones make the matrix products less
-efficient."""
+"""Largest size of Y at a time, bytes. Measured with 60 views of 3000 points: 1e6 to 1e8 take the same time, 1e5 takes
+2.5 times as long. More bytes need more memory."""
 
 
 class Step(NamedTuple):

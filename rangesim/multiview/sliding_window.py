@@ -44,6 +44,10 @@ class OnlineAdjustment:
     points : (n_points, 3) world, triangulated from all images at the end; NaN where the tracks do not determine a
         point.
     largest : largest number of images, anchors included, in one adjustment.
+
+    Examples
+    --------
+    See `adjust_online`.
     """
 
     T_camera_world: Array

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an experiment will cost: light paths, memory and time, before the work starts.
+"""Estimates the cost of an experiment in light paths, memory and time, before the work starts.
 
-Memory is counted: arrays of the light transport, of the signals, of the frames as they are exposed, of the report.
-Time is light paths over a rate. The rate is one constant per core, good within a factor of three on opaque scenes and
-tables with some glass; where that makes a run long, two small passes of the scene itself are timed instead, after one
-that compiles (glass on glass takes longer, mostly to compile). They are timed by the processor time of this process, so
-that other work on the machine does not count: the estimate is of a machine whose cores are idle.
+Memory is the sum of the arrays that exist at the same time: those of the light transport, the signals, the exposed
+frames and the report. Time is the number of light paths divided by a rate. The rate is one constant per core; it is
+right within a factor of three for opaque scenes and for tables with some glass. If the constants predict a long run,
+three small passes of the scene are rendered. The first one compiles, and the other two are timed (scenes with much
+glass take longer, mostly to compile). They are timed by the processor time of this process, so that other work on the
+machine does not count: the estimate is for a machine with idle cores.
+
+The constants below were set by hand so that estimates keep to that factor. A docstring states a measurement where there
+is one. Larger constants announce more runs as long or large; smaller ones refuse fewer runs for their memory.
 """
 
 from __future__ import annotations
@@ -28,46 +32,75 @@ if TYPE_CHECKING:
     from rangesim.scene import Scene
 
 LONG_S = 30.0
-"""A run that takes longer is announced."""
+"""Seconds; a run that takes longer is announced, so that nobody waits without knowing for how long."""
 LARGE_BYTES = 1e9
-"""A run that takes more is announced."""
+"""Bytes of memory; a run that needs more is announced, because it may be too much beside other programs."""
 TYPICAL_SPP = 24
-"""Of light paths per pixel, if their number is not given: 16 to 64, by the surface."""
+"""Light paths per pixel that are assumed if their number is not given. Adaptive sampling takes 8 to 64 of them, as many
+as the surfaces need; this value lies in the middle, on a logarithmic scale."""
 PATHS_PER_CORE_S = 1.1e6
-"""Camera paths per second and core: tabletop and matte scenes, 5 segments, LLVM."""
+"""Camera paths per second and core, measured with LLVM on `tabletop` and `matte`, 5 segments."""
 PATHS_PER_GPU_S = 5e7
-"""Camera paths per second: tabletop scene, from 5 to 50 million paths, an H100, which has no ray-tracing cores."""
+"""Camera paths per second on a GPU, measured on `tabletop` with 5 to 50 million paths on an H100, which has no
+ray-tracing cores."""
 PHOTON_S = 3e-6
-PASS_S, START_S = 1.0, 4.0
-"""Seconds to compile a pass, and to import, load the scene and write the report."""
+"""Seconds per caustic photon, its tracing and its place in the maps included. It counts little: the default 500 000
+photons are 1.5 s of a pass."""
+PASS_S = 1.0
+"""Seconds to compile the kernels of a pass, independent of the size of the image. Measured on `tabletop` with 64 x 48
+pixels on two busy cores: 2 s for the whole pass with 500 000 photons, most of it for the photons."""
+START_S = 4.0
+"""Seconds per run to import the packages, load the scene and write the report. It only matters for short runs."""
 REPEATED_PASS_S = 0.3
-"""Seconds of a pass from another place, besides its paths and photons: nothing is compiled. 0.02 of `matte`, 0.5 of
-`tabletop`."""
-FRAME_S, PIXEL_S = 100e-9, 6e-6
-"""Seconds per pixel of each frame (noise, files), and per pixel of each instrument (decoding, segments, report)."""
+"""Seconds of each further pass from another place, besides its paths and photons. Nothing is compiled again. Measured:
+0.02 s on `matte`, 0.5 s on `tabletop`."""
+FRAME_S = 100e-9
+"""Seconds per pixel of each frame, for its noise and its file."""
+PIXEL_S = 6e-6
+"""Seconds per pixel of each instrument, for decoding, causes, segmentation and its part of the report."""
 BASE_BYTES = 4e8
-"""Of the process with its libraries and a scene."""
+"""Bytes that the process takes with its libraries, a scene and its kernels, before any image. Measured on `tabletop`:
+2.6e8 with everything loaded, 6.1e8 after a run of 64 x 48 pixels."""
 TRANSPORT_BYTES = 2 << 30
-"""Tiles of the light transport stay below, see `transport`."""
+"""Bytes that the tiles of the light transport stay below: the default of `TransportSettings.memory_bytes`."""
 LANE_BYTES = 512
-"""Per pixel of a tile, besides 4 for each channel."""
-TRUTH_BYTES, RESULT_BYTES = 64, 200
-"""Per pixel of a pass, and of each instrument in the report."""
+"""Bytes of the renderer per pixel of a tile, besides 8 for each channel: the state of the loop over light paths."""
+TRUTH_BYTES = 64
+"""Bytes per pixel of a pass, from the types of its arrays: 37 for the ground truth and 24 for the energy split."""
+RESULT_BYTES = 200
+"""Bytes per pixel of the results of each instrument while the report is written: maps, causes, points, segmentation and
+their pictures."""
 PHOTON_BYTES = 200
+"""Bytes per caustic photon that landed, as stated in `TransportSettings.memory_bytes`."""
 TRIAL_S = 60.0
-"""A run that takes longer by the constants is worth a trial."""
-TRIAL_WIDTH, TRIAL_SPP = 96, (4, 256)
-"""Camera pixels across a trial pass, and the samples of the two that are timed: with 64 in place of 256, the time per
-path of `tabletop` was between 1.7 and 3.2e-7 s from trial to trial."""
+"""Seconds; if the constants predict a longer run, a trial of the scene is worth its time."""
+TRIAL_WIDTH = 96
+"""Width of the images of a trial in pixels. With the samples below, a trial takes a few seconds; a wider image would
+measure the time per path more exactly and take longer."""
+TRIAL_SPP = (4, 256)
+"""Samples per pixel of the two passes of a trial that are timed; their difference gives the time per path. With 64 in
+place of 256, this time scattered between 1.7e-7 and 3.2e-7 s on `tabletop`."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """An estimate.
+    """Estimated cost of a run or of a scan.
 
-    light_paths : camera paths of all passes. segments : at most so many in each. photons : of all passes.
-    passes : of the light transport. memory_bytes : at the peak. seconds : on this machine if it is idle. machine : what
-    of it was counted on, in words. disk_bytes : of the results; 0: not counted.
+    Parameters
+    ----------
+    light_paths : number of camera paths of all passes.
+    segments : largest number of segments of a path.
+    photons : number of caustic photons of all passes.
+    passes : number of light-transport passes.
+    memory_bytes : bytes of memory at the peak.
+    seconds : time on this machine if it is idle.
+    machine : processors that the time was estimated for, in words, such as "2 idle cores".
+    disk_bytes : bytes of the results on the disk; 0: not counted.
+
+    Examples
+    --------
+    >>> print(Cost(4_900_000, 5, 500_000, 2, int(8e8), 14.0, "2 idle cores"))
+    about 4.9 M light paths of up to 5 segments and 500 k photons in 2 passes, 0.8 GB, 14 s on 2 idle cores
     """
 
     light_paths: int
@@ -81,7 +114,7 @@ class Cost:
 
     @property
     def is_large(self) -> bool:
-        """Whether a user should know before the work starts."""
+        """Whether the run takes so long, or so much memory, that it should be announced before the work starts."""
         return self.seconds > LONG_S or self.memory_bytes > LARGE_BYTES
 
     def __str__(self) -> str:
@@ -94,21 +127,27 @@ class Cost:
         )
 
     def check_memory(self) -> None:
-        """Raise ValueError if the machine has not the memory; where that cannot be known, nothing is refused."""
-        chosen = limits.current().memory
-        most = available_memory_bytes() if chosen == limits.Limits().memory else chosen
+        """Raise ValueError if the run needs more memory than is available.
+
+        The limit `memory` takes the place of the available memory if it is set. If neither is known, nothing is
+        refused.
+        """
+        limit = limits.current().memory
+        most = available_memory_bytes() if limit == limits.Limits().memory else limit
         if most is not None and self.memory_bytes > most:
             raise ValueError(
-                f"expected a run within the {most / 1e9:.1f} GB of memory that are available, this one takes "
+                f"expected a run within the {most / 1e9:.1f} GB of memory that are available, but this one takes "
                 f"{self}; take fewer pixels, frames or bins, or raise the limit with {limits.VARIABLE}=memory=N."
             )
 
 
-class Rest(NamedTuple):
-    """Cost of what comes with the light transport.
+class CostBesideTracing(NamedTuple):
+    """Cost of all work with the signals of the light transport: exposure, decoding, results, report.
 
-    seconds : of all that is done with its signals. held_bytes : of results that are held while light is traced.
-    peak_bytes : of all arrays at once, while no light is traced. disk_bytes : of the results.
+    seconds : time of this work.
+    held_bytes : memory of results that are kept while further light is traced.
+    peak_bytes : memory of all arrays at the peak while no light is traced.
+    disk_bytes : size of the results on the disk; 0: not counted.
     """
 
     seconds: float
@@ -124,47 +163,53 @@ def estimate_cost(
     trial: bool = True,
     *,
     places: int = 1,
-    rest: Rest | None = None,
+    beside: CostBesideTracing | None = None,
 ) -> Cost:
-    """Cost of an experiment.
+    """Estimated cost of an experiment.
 
     Parameters
     ----------
-    passes : as `rangesim.pipeline.passes.group_by_rig` returns.
-    trial : whether small passes may be timed where the run is long.
-    places : that each pass is traced from. rest : what is done with the signals; None: what a run does.
+    passes : rig and instruments of each pass, as `rangesim.pipeline.shared_passes.group_by_rig` returns.
+    trial : whether small passes of the scene may be rendered and timed if the run is long.
+    places : number of places that each pass is traced from, such as the views of a scan.
+    beside : cost of the work with the signals; None: that of a run.
     """
     from rangesim.light_transport.photons import has_delta
 
     photons = experiment.transport_settings(()).photons if has_delta(scene.mitsuba) else 0
     pixels, count = 0, 0
     for rig, instruments in passes:
-        size = rig.camera.width * rig.camera.height * TRUTH_BYTES  # read back for the report
+        size = rig.camera.width * rig.camera.height * TRUTH_BYTES  # the file of a pass, as it is read for a report
         limits.check("bytes", size, "bytes in the results of one pass")
         traced, n = _traced_pixels(experiment, rig, instruments)
         pixels, count = pixels + traced, count + n
     paths, all_photons = places * pixels * (experiment.spp or TYPICAL_SPP), places * photons * count
-    rest = rest or _rest_of_run(passes)
-    rest_s, again = START_S + rest.seconds, (places - 1) * count
-    seconds = rest_s + count * PASS_S + again * REPEATED_PASS_S + all_photons * PHOTON_S + paths / _paths_per_s()
-    memory = int(BASE_BYTES + max(_tracing_bytes(passes, photons) + rest.held_bytes, rest.peak_bytes))
-    cost = Cost(paths, experiment.max_depth, all_photons, places * count, memory, seconds, _machine(), rest.disk_bytes)
+    beside = beside or _beside_tracing(passes)
+    beside_s, again = START_S + beside.seconds, (places - 1) * count
+    seconds = beside_s + count * PASS_S + again * REPEATED_PASS_S + all_photons * PHOTON_S + paths / _paths_per_s()
+    memory = int(BASE_BYTES + max(_tracing_bytes(passes, photons) + beside.held_bytes, beside.peak_bytes))
+    cost = Cost(
+        paths, experiment.max_depth, all_photons, places * count, memory, seconds, _machine(), beside.disk_bytes
+    )
     if trial and seconds > TRIAL_S:
         compile_s, fixed_s, path_s = _timed_trial(experiment, scene, passes[0])
         traced_s = (len(passes) - 1) * compile_s + places * count * fixed_s + paths * path_s
-        cost = replace(cost, seconds=rest_s + traced_s)
+        cost = replace(cost, seconds=beside_s + traced_s)
     return cost
 
 
 def available_memory_bytes() -> int | None:
-    """Memory that this process may still take: of the machine, and of its control group; None where unknown."""
+    """Bytes of memory that this process may still take, by the machine and by its control groups; None if unknown."""
     found = [_meminfo(), *_cgroup()]
     known = [n for n in found if n is not None]
     return min(known) if known else None
 
 
 def _traced_pixels(experiment: Experiment, rig: Rig, instruments: Sequence[Instrument]) -> tuple[int, int]:
-    """Pixels that are rendered for a rig, over all light-transport passes, and the number of these."""
+    """Number of pixels that are rendered for a rig over all its light-transport passes, and the number of passes.
+
+    If something moves, each frame has a pass, which renders only the window where something changes.
+    """
     if experiment.motion is None:
         return rig.camera.width * rig.camera.height, 1
     from rangesim.motion.passes import plan
@@ -176,31 +221,30 @@ def _traced_pixels(experiment: Experiment, rig: Rig, instruments: Sequence[Instr
     return sum((w.bottom - w.top) * (w.right - w.left) for w in windows), len(planned)
 
 
-def _rest_of_run(passes: Sequence[tuple[Rig, list[Instrument]]]) -> Rest:
-    """Cost of what a run does with its signals; the report holds frames and results of all passes at once."""
-    seconds, report = 0.0, 0
+def _beside_tracing(passes: Sequence[tuple[Rig, list[Instrument]]]) -> CostBesideTracing:
+    """Cost of the work with the signals of a run. The results of a pass are kept while the next ones are traced."""
+    seconds, result_bytes = 0.0, []
     for rig, instruments in passes:
         pixels = rig.camera.width * rig.camera.height
-        for instrument in instruments:
-            seconds += pixels * (PIXEL_S + FRAME_S * instrument.sensor.n_frames)
-            report += pixels * (2 * instrument.sensor.n_frames + RESULT_BYTES)
-    return Rest(seconds, 0, report, 0)
+        seconds += sum(pixels * (PIXEL_S + FRAME_S * i.sensor.n_frames) for i in instruments)
+        result_bytes.append(sum(pixels * (2 * i.sensor.n_frames + RESULT_BYTES) for i in instruments))
+    return CostBesideTracing(seconds, sum(result_bytes[:-1]), sum(result_bytes), 0)
 
 
 def _tracing_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int) -> float:
-    """The largest of what is held at once: while light is traced, and while frames are exposed."""
+    """Largest number of bytes of the arrays of a pass that exist at once, while it is traced or its frames exposed."""
     at_once = 0.0
     for rig, instruments in passes:
         pixels = rig.camera.width * rig.camera.height
         responses = dict.fromkeys(r for instrument in instruments for r in instrument.sensor.responses())
         channels = sum(r.channels for r in responses)
-        tiles = min(TRANSPORT_BYTES, pixels * (LANE_BYTES + 2 * 4 * channels))  # indirect light apart
+        tiles = min(TRANSPORT_BYTES, pixels * (LANE_BYTES + 2 * 4 * channels))  # indirect light has its own channels
         largest = max(sum(r.channels for r in instrument.sensor.responses()) for instrument in instruments)
         frames = max(instrument.sensor.n_frames for instrument in instruments)
-        exposed = pixels * 14 * frames  # three times float32, and the digital numbers
-        judged = pixels * 2 * 4 * largest + exposed  # means and their error
+        exposed = pixels * 14 * frames  # three arrays of float32, and the digital numbers
+        judged = pixels * 2 * 4 * largest + exposed  # means and their error, for adaptive sampling
         tracing = max(tiles, judged) + pixels * (4 * 4 * channels + TRUTH_BYTES) + photons * PHOTON_BYTES
-        exposing = pixels * (2 * 4 * channels + 4 * largest + TRUTH_BYTES) + exposed  # signals and their error
+        exposing = pixels * (2 * 4 * channels + 4 * largest + TRUTH_BYTES) + exposed  # signals with their error
         at_once = max(at_once, tracing, exposing)
     return at_once
 
@@ -208,9 +252,9 @@ def _tracing_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int)
 def _timed_trial(
     experiment: Experiment, scene: Scene, one_pass: tuple[Rig, Sequence[Instrument]]
 ) -> tuple[float, float, float]:
-    """Seconds to compile a pass, of a pass whatever its size, and per light path, of small passes of the scene.
+    """Three times in seconds, measured on small passes of the scene: to compile a pass, per pass, and per light path.
 
-    All of an idle machine, see `_Took`.
+    They hold for an idle machine, see `_Elapsed`.
     """
     from rangesim.instrument.transport import transport
 
@@ -220,21 +264,22 @@ def _timed_trial(
     sensors = [instrument.sensor for instrument in instruments]
     took: list[float] = []
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", TruncationWarning)  # the run itself will tell
+        warnings.simplefilter("ignore", TruncationWarning)  # the run itself will warn
         for spp in (TRIAL_SPP[0], *TRIAL_SPP):  # the first compiles
-            start = _Took.now()
+            start = _Elapsed.now()
             transport(scene, replace(rig, camera=camera), sensors, settings, spp=spp)
-            took.append((_Took.now() - start).idle_s)
+            took.append((_Elapsed.now() - start).idle_s)
     paths = camera.width * camera.height * (TRIAL_SPP[1] - TRIAL_SPP[0])
     path_s = max((took[2] - took[1]) / paths, 0.1 / _paths_per_s())
     return max(took[0] - took[1], 0.0), took[1], path_s
 
 
-class _Took(NamedTuple):
-    """Time that some work took, in seconds.
+class _Elapsed(NamedTuple):
+    """Readings of three clocks in seconds, or the differences between two readings.
 
-    wall_s : on the clock. thread_s : of a processor, for this thread, which traces paths beside the others. process_s :
-    of processors, for all threads of this process.
+    wall_s : wall clock.
+    thread_s : processor time of this thread, which traces paths beside the worker threads.
+    process_s : processor time of all threads of this process.
     """
 
     wall_s: float
@@ -242,42 +287,49 @@ class _Took(NamedTuple):
     process_s: float
 
     @classmethod
-    def now(cls) -> _Took:
+    def now(cls) -> _Elapsed:
+        """The readings of the clocks at this moment."""
         return cls(time.monotonic(), time.thread_time(), time.process_time())
 
-    def __sub__(self, other: _Took) -> _Took:
-        return _Took(*(a - b for a, b in zip(self, other, strict=True)))
+    def __sub__(self, other: _Elapsed) -> _Elapsed:
+        return _Elapsed(*(a - b for a, b in zip(self, other, strict=True)))
 
     @property
     def idle_s(self) -> float:
-        """Seconds on the clock of an idle machine. No other work counts, but the graphics card's waits do."""
+        """Wall-clock seconds that the work would take on an idle machine.
+
+        On the CPU, other work on the machine does not count. On a GPU it does, because the wall clock is all there is.
+        """
         return self.wall_s if _on_gpu() else max(self.thread_s, self.process_s / _cores())
 
 
 def _on_gpu() -> bool:
+    """Whether Mitsuba renders on a GPU."""
     import mitsuba as mi
 
     return (mi.variant() or "").startswith("cuda")
 
 
 def _machine() -> str:
-    """The machine that an estimate assumes, in words."""
+    """Description of the processors that an estimate assumes."""
     if _on_gpu():
         return "an idle GPU"
     return "1 idle core" if _cores() == 1 else f"{_cores()} idle cores"
 
 
 def _paths_per_s() -> float:
+    """Camera paths per second on this machine, by the constants."""
     return PATHS_PER_GPU_S if _on_gpu() else PATHS_PER_CORE_S * _cores()
 
 
 def _cores() -> int:
-    affinity = getattr(os, "sched_getaffinity", None)  # Linux alone
+    """Number of cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)  # it exists on Linux only
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def _meminfo() -> int | None:
-    """Bytes that Linux can give without swapping."""
+    """Bytes that Linux can give without swapping; None on other systems."""
     path = Path("/proc/meminfo")
     if not path.is_file():
         return None
@@ -288,7 +340,7 @@ def _meminfo() -> int | None:
 
 
 def _cgroup() -> list[int | None]:
-    """Bytes left of the limits of the control groups that this process is in (version 2, and version 1)."""
+    """Bytes left below the limit of each control group of this process, versions 2 and 1; None without a limit."""
     root = Path("/sys/fs/cgroup")
     groups = [root, root / "memory"]
     membership = Path("/proc/self/cgroup")
@@ -298,18 +350,21 @@ def _cgroup() -> list[int | None]:
             base = root if not controllers else root / "memory"
             if not controllers or "memory" in controllers.split(","):
                 groups += [base / Path(*parts) for parts in _prefixes(name)]
-    return [_left(g, *names) for g in dict.fromkeys(groups) for names in _NAMES]
+    return [_bytes_left(g, *names) for g in dict.fromkeys(groups) for names in _LIMIT_AND_USAGE]
 
 
-_NAMES = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
+_LIMIT_AND_USAGE = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
+"""Files of a control group that hold its limit and its usage in bytes, in versions 2 and 1."""
 
 
 def _prefixes(name: str) -> list[tuple[str, ...]]:
+    """The parts of a control group's path and of the paths of all groups around it, such as (a,), (a, b) for /a/b."""
     parts = tuple(part for part in name.split("/") if part not in ("", ".", ".."))
     return [parts[: n + 1] for n in range(len(parts))]
 
 
-def _left(group: Path, limit: str, usage: str) -> int | None:
+def _bytes_left(group: Path, limit: str, usage: str) -> int | None:
+    """Bytes left below the limit of a control group; None if it has no limit, or no such files."""
     if not (group / limit).is_file() or not (group / usage).is_file():
         return None
     most = (group / limit).read_text(encoding="ascii").strip()
@@ -319,6 +374,7 @@ def _left(group: Path, limit: str, usage: str) -> int | None:
 
 
 def _count(n: int) -> str:
+    """A number with three digits and a prefix, such as 4.9 M."""
     for scale, word in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
         if n >= scale:
             return f"{n / scale:.3g} {word}"
@@ -326,10 +382,12 @@ def _count(n: int) -> str:
 
 
 def _bytes(n: int) -> str:
+    """A size in GB, or in MB where it is small."""
     return f"{n / 1e9:.1f} GB" if n >= 1e8 else f"{max(1, round(n / 1e6))} MB"
 
 
 def _duration(seconds: float) -> str:
+    """A duration in days, hours, minutes or seconds, with two digits."""
     for scale, word in ((86400.0, "d"), (3600.0, "h"), (100.0, "min")):
         if seconds >= scale:
             return f"{seconds / (60.0 if word == 'min' else scale):.2g} {word}"

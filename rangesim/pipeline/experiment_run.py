@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole experiment: scene -> light -> captures -> range images -> points -> comparison, segments; and its files."""
+"""Carries out an experiment, from the scene to the comparison with the ground truth.
+
+`carry_out` computes the result and writes nothing. `run` computes it and writes its directory. Each instrument passes
+through the stages of `measure`: capture, range image, noise, comparison, causes, points, segmentation.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +30,8 @@ from rangesim.files.result_directories import new_directory
 from rangesim.instrument.instrument import Instrument
 from rangesim.motion import transport_moving
 from rangesim.pipeline.cost import Cost, estimate_cost
-from rangesim.pipeline.passes import group_by_rig
 from rangesim.pipeline.provenance import provenance
+from rangesim.pipeline.shared_passes import group_by_rig
 from rangesim.results.run_files import (
     RESULT,
     Measurement,
@@ -51,10 +55,12 @@ if TYPE_CHECKING:
     from rangesim.signals import Signals
 
 Progress = Callable[[str, float], None]
-"""Called with the name of the stage and the fraction of the whole job done, 0..1."""
+"""Function that is called with the name of the stage and the fraction of the whole work done, 0..1."""
 _TRANSPORT_FRACTION = 0.7
+"""Fraction of the progress of a pass that is shown when its light is traced; the rest is for its instruments. It
+changes the progress bar and nothing else."""
 MIN_POINTS = 3
-"""Fewer points are no cloud worth grouping."""
+"""Smallest number of points that are segmented. Fewer points make no surface, because a plane needs three."""
 
 
 def run(
@@ -66,22 +72,28 @@ def run(
 ) -> Result:
     """Carry out an experiment and write its results, with `report.html`, to the directory `out`.
 
-    The files appear when all is done; a failure leaves nothing behind. An older result of that name is replaced; files
-    that somebody else put there stay. See `rangesim.files.result_directories`.
+    The files appear when all of them are complete, and a failure leaves nothing behind. An older result in the
+    directory is replaced. Other files in it stay. See `rangesim.files.result_directories`.
 
     Parameters
     ----------
-    experiment, progress, scene, announce : as of `carry_out`.
+    experiment, progress, scene, announce : as for `carry_out`.
+    out : directory of the results.
 
     Raises
     ------
     ValueError, FileFormatError, EnvironmentProblem
-        As `carry_out`, or an `out` that cannot take a result (see `rangesim.files.result_directories.check_directory`).
+        As `carry_out`, or `out` cannot take a result (see `rangesim.files.result_directories.check_directory`).
 
     Warns
     -----
     RangesimWarning, SamplingWarning
         As `carry_out`.
+
+    Examples
+    --------
+    >>> from rangesim.experiment import Experiment
+    >>> result = run(Experiment("tabletop", width=320, height=240), "out/tabletop")  # doctest: +SKIP
     """
     from rangesim.report import render_report
     from rangesim.report.tables import comparison_markdown
@@ -102,25 +114,34 @@ def carry_out(
     scene: Scene | None = None,
     announce: Callable[[Cost], None] | None = None,
 ) -> Result:
-    """The result of an experiment; nothing is written.
+    """The result of an experiment. Nothing is written.
+
+    Experiment and result can be pickled, so that this can run in another process or on another machine.
 
     Parameters
     ----------
-    progress : called with the name of the stage and the fraction done, 0..1.
-    scene : a scene that is loaded already, for example from a dictionary; `experiment.scene` then only names it.
-    announce : called with the estimated cost before the work starts.
+    progress : function that is called with the name of the stage and the fraction done, 0..1.
+    scene : a scene that is already loaded, for example from a dictionary. `experiment.scene` is then only its name.
+    announce : function that is called with the estimated cost before the work starts.
 
     Raises
     ------
     ValueError, FileFormatError, EnvironmentProblem
-        A setting out of range, more memory than there is, a scene that cannot be loaded, or no suitable LLVM.
+        A setting is out of its range, the memory does not suffice, the scene cannot be loaded, or there is no suitable
+        LLVM.
 
     Warns
     -----
     RangesimWarning
-        Surfaces outside the range of a sensor (`rangesim.causes.range_limits`).
+        Surfaces lie outside the range of a sensor (`rangesim.causes.range_limits`).
     SamplingWarning
-        See `warn_of_sampling`.
+        The sampling error is not small (`rangesim.evaluation.range_noise.warn_of_sampling`).
+
+    Examples
+    --------
+    >>> from rangesim.experiment import Experiment
+    >>> result = carry_out(Experiment("matte", width=160, height=120))  # doctest: +SKIP
+    >>> result.measurements[0].image.valid.mean()  # fraction of pixels with a reading  # doctest: +SKIP
     """
     result = _computed(experiment, progress or _unwatched, scene, announce)
     _warn(result)
@@ -128,12 +149,14 @@ def carry_out(
 
 
 def estimate(experiment: Experiment) -> Cost:
-    """Cost of `run`, in light paths, memory and time; the scene is loaded, and rendered small if it may take long.
+    """Estimated cost of `run` in light paths, memory and time.
+
+    The scene is loaded. If the run may take long, small images of it are rendered to measure the time.
 
     Raises
     ------
     ValueError, FileFormatError, EnvironmentProblem
-        As `run`, but for the memory.
+        As `carry_out`, except that too little memory raises nothing; `Cost.check_memory` does.
     """
     from rangesim.scene import load_scene
 
@@ -144,7 +167,10 @@ def estimate(experiment: Experiment) -> Cost:
 def _computed(
     experiment: Experiment, tell: Progress, scene: Scene | None, announce: Callable[[Cost], None] | None
 ) -> Result:
-    """The result, before anything is warned about."""
+    """The result of an experiment, without the warnings of `carry_out`.
+
+    `run` issues the warnings after the files are written, so that a warning raised as an error loses no result.
+    """
     import mitsuba as mi
 
     from pcgraph.all_kernels import compile_kernels
@@ -162,7 +188,7 @@ def _computed(
     cost.check_memory()
     if announce is not None:
         announce(cost)
-    with timed(times, "compile_segmentation"):  # once per machine; not to be charged to the first sensor
+    with timed(times, "compile_segmentation"):  # once per machine; the first sensor's time must not include it
         compile_kernels()
     passes, measurements = [], {}
     for number, (rig, instruments) in enumerate(groups, 1):
@@ -182,7 +208,7 @@ def _computed(
 
 
 def _warn(result: Result) -> None:
-    """Warn of surfaces out of range, and of readings that sampling decides."""
+    """Warn of surfaces outside a sensor's range, and of readings whose sampling error is not small."""
     beyond = []
     for m in result.measurements:
         assert m.capture.rig is not None
@@ -195,13 +221,14 @@ def _warn(result: Result) -> None:
 def measure(
     instrument: Instrument, signals: Signals, seed: int, ambient: Ambient | None = None, light_pass: int = 1
 ) -> Measurement:
-    """The measurement of one instrument: exposed, decoded, compared, explained and segmented.
+    """The measurement of one instrument, with its capture, range image, errors, causes and segmentation.
 
     Parameters
     ----------
-    signals : of the pass that the instrument takes part in, `light_pass`.
-    seed : of the detector's noise.
+    signals : Signals of the light-transport pass that the instrument shares.
+    seed : seed of the detector's noise.
     ambient : as for `rangesim.expose`.
+    light_pass : number of the pass, counted from 1.
     """
     times: dict[str, float] = {}
     moves = signals.motion_m is not None
@@ -211,7 +238,7 @@ def measure(
     capture, photons = exposure.capture, exposure.photons_per_pulse()
     if instrument.exposure_s is None:
         exposure.warn_of_overexposure(instrument.name)
-    del exposure  # its radiance is as large as the frames
+    del exposure  # frees its radiance, which is as large as the frames
     with timed(times, "decode"):
         image = decode(capture, instrument.decoder)
     noise, readings = None, ReferenceReadings(image, capture, signals)
@@ -245,7 +272,7 @@ def measure(
 
 
 def _in_time(instrument: Instrument) -> PhotoDetector | None:
-    """The instrument's detector, whose automatic exposure ends before the next one begins."""
+    """The instrument's detector, with its automatic exposure limited to the time between two frames."""
     period_s = instrument.timing.frame_period_s
     detector = instrument.detector_in_use
     if detector is None or not period_s:
@@ -263,20 +290,24 @@ def segmented(cloud: PointCloud) -> Segmentation:
 
 
 def noise_seed(experiment: Experiment, instrument: Instrument) -> int:
-    """Seed of an instrument's noise: its own for each position in the experiment."""
+    """Seed of an instrument's noise. It depends on the position of the instrument in the experiment."""
     return derived_seed(experiment.seed, experiment.instruments.index(instrument))
 
 
 def acquisition(
     capture: Capture, photons: np.ndarray | None, timing: Timing, moves: bool, points: int, times_s: dict[str, float]
 ) -> MeasurementRecord:
-    """Frames, time and photons of a capture; exposure None for a noise-free one, which takes no time.
+    """The record of a capture: its frames, exposure, acquisition time and photons.
 
-    Exposures follow each other at once, or, where something moves, as the timing says.
+    A noise-free capture has no exposure and takes no time.
 
     Parameters
     ----------
-    photons : (h, w) float64, photons per laser pulse; None where they are not known.
+    photons : (h, w) float64, photons per laser pulse; None: not known.
+    timing : when the exposures begin, if something moves. Otherwise each begins when the one before it ends.
+    moves : whether something moves.
+    points : number of points of the cloud.
+    times_s : seconds that each stage took.
     """
     exposure = capture.exposure_s if np.isfinite(capture.exposure_s) else None
     camera = capture.frames.shape[1:]
@@ -303,7 +334,7 @@ def _photons_record(photons: np.ndarray) -> PhotonsRecord:
 
 
 def _unwatched(stage: str, fraction: float) -> None:
-    """Tell nobody how far the work is."""
+    """Ignore the progress, for a caller that does not ask for it."""
 
 
 @contextmanager
@@ -321,7 +352,7 @@ def _trace(
     instruments: list[Instrument],
     progress: Callable[[float], None] | None,
 ) -> Signals:
-    """The light of a pass; `progress` is called with the fraction of it that is done."""
+    """Signals of a pass. `progress` is called with the fraction of the pass that is done, 0..1."""
     from rangesim.instrument.transport import transport
 
     settings = experiment.transport_settings(instruments)
@@ -333,4 +364,5 @@ def _trace(
 
 
 def _fraction(number: int, passes: int, of_pass: float) -> float:
+    """Fraction of the whole work done, when the fraction `of_pass` of tracing pass `number` (from 1) is done."""
     return 0.05 + 0.9 * (number - 1 + _TRANSPORT_FRACTION * of_pass) / passes

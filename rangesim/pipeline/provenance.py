@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What made a result: resolved settings, the scene's fingerprint, versions."""
+"""The provenance of a result: resolved settings, checksum of the scene, rigs of the instruments, and versions."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rangesim.scene import Scene
 
 PACKAGES = ("rangesim", "mitsuba", "drjit", "numpy", "scipy", "numba", "open3d")
+"""Packages whose versions a result records, because the bytes of its files may depend on them."""
 
 
 def provenance(
@@ -29,7 +30,14 @@ def provenance(
     variant: str,
     times_s: dict[str, float],
 ) -> ResultRecord:
-    """Contents of `experiment.json`."""
+    """The contents of `experiment.json`.
+
+    Parameters
+    ----------
+    passes : rig and instruments of each pass, as `rangesim.pipeline.shared_passes.group_by_rig` returns.
+    variant : Mitsuba's variant, such as "llvm_ad_mono".
+    times_s : seconds that each stage took.
+    """
     placed = {i.name: (number, rig) for number, (rig, ones) in enumerate(passes, 1) for i in ones}
     return ResultRecord(
         experiment=experiment_to_dict(experiment),
@@ -51,12 +59,12 @@ def provenance(
 
 
 def _checksum(path: Path | None) -> str | None:
-    """SHA-256 of the scene's file; None if there is none, or none any more."""
+    """SHA-256 of the scene's file; None if the scene has no file, or if the file no longer exists."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path is not None and path.is_file() else None
 
 
 def _version(package: str) -> str:
-    """Version of a package, or of its build for the CPU alone."""
+    """Version of a package, or of its build for the CPU only, such as open3d-cpu."""
     for name in (package, f"{package}-cpu"):
         try:
             return version(name)

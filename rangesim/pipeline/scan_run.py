@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole scan: scene -> views -> poses -> surface -> errors, what was seen, report; and its directory of results."""
+"""Carries out a scan, from the views of a scene to the fused surface and its errors.
+
+`carry_out_scan` computes the result and writes nothing. `run_scan` computes it and writes its directory.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ from rangesim.fusion.seen_volume import occupancy
 from rangesim.fusion.truncated_average import fuse
 from rangesim.fusion.voxel_grid import VoxelGrid
 from rangesim.pipeline.scan_cost import VOXEL_SPACINGS, estimate_scan_cost
-from rangesim.pipeline.views import poses_of, taken
+from rangesim.pipeline.views import poses_of, rendered_views
 from rangesim.results.scan_files import SCAN, ScanResult, ShapeStatistics, write_scan
 from rangesim.triangle_mesh import TriangleMesh
 
@@ -33,12 +36,18 @@ if TYPE_CHECKING:
     from rangesim.scene import Scene
 
 Progress = Callable[[str, float], None]
-"""Called with the name of the stage and the fraction of the whole job done, 0..1."""
+"""Function that is called with the name of the stage and the fraction of the whole work done, 0..1."""
 MAX_COMPARED_VOXELS = 1_000_000
-"""Of the grid on which seen and true volume are compared."""
+"""Largest number of voxels of the grid on which the seen and the true volume are compared. The voxels of this grid are
+larger than those of the fusion where there would be more. Time and memory of the comparison grow with this number."""
 BACKGROUND = 0.3
-"""Shapes with a larger fraction of the scene's extent are background (a table, a wall), as long as there are others."""
+"""Ratio of the size of a shape to that of the largest shape, above which the shape is background, such as a table or a
+wall. Statistics of what was seen leave background out, as long as there are other shapes."""
 SAMPLES = 20_000
+"""Number of points sampled on each surface to measure its error. The standard error of a fraction of them, such as the
+recall, is then at most 0.5 / sqrt(20 000) = 0.35 %."""
+REGISTRATION_SEEDS = 0x7FFFFFFF
+"""Bit mask that makes a seed of the registration from the seed of a scan, because Open3D takes seeds of 31 bits."""
 
 
 def run_scan(
@@ -50,18 +59,24 @@ def run_scan(
 ) -> ScanResult:
     """Carry out a scan and write its results, with `report.html`, to the directory `out`.
 
-    The files appear when all is done; a failure leaves nothing behind. See `rangesim.files.result_directories`.
+    The files appear when all of them are complete, and a failure leaves nothing behind. See
+    `rangesim.files.result_directories`.
 
     Parameters
     ----------
-    scene : a scene that is loaded already; `settings.scene` then only names it.
-    announce : called with the estimated cost before the work starts.
+    settings, progress, scene, announce : as for `carry_out_scan`.
+    out : directory of the results.
 
     Raises
     ------
     ValueError, FileFormatError, EnvironmentProblem
-        A setting out of range, more memory than there is, a scene that cannot be loaded, poses that cannot be found, no
-        surface, or an `out` that cannot take a result (see `rangesim.files.result_directories.check_directory`).
+        As `carry_out_scan`, or `out` cannot take a result (see `rangesim.files.result_directories.check_directory`).
+
+    Examples
+    --------
+    >>> from rangesim.experiment import ScanSettings, Turntable
+    >>> settings = ScanSettings("tabletop", path=Turntable(views=12), width=320)
+    >>> result = run_scan(settings, "out/scan")  # doctest: +SKIP
     """
     from rangesim.report.scan_page import render_scan_page
 
@@ -74,7 +89,15 @@ def run_scan(
 
 
 def estimate_scan(settings: ScanSettings) -> Cost:
-    """Cost of `run_scan`; the scene is loaded, and rendered small if it may take long. Errors as `run_scan`."""
+    """Estimated cost of `run_scan` in light paths, memory, time and space on the disk.
+
+    The scene is loaded. If the scan may take long, small images of it are rendered to measure the time.
+
+    Raises
+    ------
+    ValueError, FileFormatError, EnvironmentProblem
+        As `carry_out_scan`, except that too little memory raises nothing; `Cost.check_memory` does.
+    """
     from rangesim.scene import load_scene
 
     scene = load_scene(settings.scene, material=settings.material, unit_m=settings.unit_m)
@@ -87,7 +110,20 @@ def carry_out_scan(
     scene: Scene | None = None,
     announce: Callable[[Cost], None] | None = None,
 ) -> ScanResult:
-    """The result of a scan; nothing is written. Errors as `run_scan`."""
+    """The result of a scan. Nothing is written.
+
+    Parameters
+    ----------
+    progress : function that is called with the name of the stage and the fraction done, 0..1.
+    scene : a scene that is already loaded. `settings.scene` is then only its name.
+    announce : function that is called with the estimated cost before the work starts.
+
+    Raises
+    ------
+    ValueError, FileFormatError, EnvironmentProblem
+        A setting is out of its range, the memory does not suffice, the scene cannot be loaded, poses cannot be found,
+        or the readings make no surface.
+    """
     import mitsuba as mi
 
     from rangesim.scene import load_scene
@@ -106,11 +142,11 @@ def carry_out_scan(
     if announce is not None:
         announce(cost)
     poses = poses_of(settings.path, Viewpoint(rig.T_world_camera, scene.working_distance_m))
-    registration_seed = settings.seed & 0x7FFFFFFF
+    registration_seed = settings.seed & REGISTRATION_SEEDS
     with _timed(times, "views"):
         images, truths = [], []
         for number, (image, truth) in enumerate(
-            taken(
+            rendered_views(
                 scene, rig, settings.instrument, poses, settings.transport_settings(), settings.ambient, settings.seed
             ),
             1,
@@ -118,7 +154,7 @@ def carry_out_scan(
             images.append(image)
             truths.append(truth)
             tell(f"View {number} of {len(poses)}", 0.05 + 0.6 * number / len(poses))
-            if number == 2 < len(poses) and settings.registration == "unknown":  # before the others take their time
+            if number == 2 < len(poses) and settings.registration == "unknown":  # fail before the other views are taken
                 _check_readings(images)
                 check_first_pair(Scan(tuple(images)), seed=registration_seed)
     _check_readings(images)
@@ -153,7 +189,13 @@ def carry_out_scan(
 def errors_by_shape(
     mesh: TriangleMesh, surfaces: Mapping[str, TriangleMesh], threshold_m: float
 ) -> dict[str, SurfaceError | None]:
-    """Errors of the part of a mesh that is nearest to each shape; None for shapes that no part is nearest to."""
+    """Errors of a mesh by the shape that each of its triangles is nearest to; None for a shape without triangles.
+
+    Parameters
+    ----------
+    mesh : the fused surface. surfaces : true surface of each shape by name.
+    threshold_m : distance up to which a point counts for precision and recall, metres.
+    """
     middles = mesh.corners.mean(axis=1)
     nearest = np.stack([distances_to(middles, surface) for surface in surfaces.values()]).argmin(axis=0)
     result: dict[str, SurfaceError | None] = {}
@@ -165,6 +207,7 @@ def errors_by_shape(
 
 
 def _voxel_m(views: Scan) -> float:
+    """Default edge of a voxel in metres, from the median distance between neighbouring readings of the views."""
     spacings = [
         float(np.median(i.z[i.valid])) / i.camera.fx for i in views.images if i.camera is not None and i.valid.any()
     ]
@@ -172,27 +215,29 @@ def _voxel_m(views: Scan) -> float:
 
 
 def _check_readings(images: Sequence[RangeImage]) -> None:
+    """Raise ValueError if no view has a reading."""
     if not any(image.valid.any() for image in images):
         raise ValueError(
-            f"expected readings in some of {len(images)} views, got none: the path may look past the scene, its poses "
-            "not be T_world_camera in metres, or the scene not be in metres (a mesh in millimetres needs unit_m = "
-            "0.001)."
+            f"expected readings in some of {len(images)} views, got none. Perhaps the path looks past the scene, its "
+            "poses are not T_world_camera in metres, or the scene is not in metres (a mesh in millimetres needs "
+            "unit_m = 0.001)."
         )
 
 
 def _things(surfaces: Mapping[str, TriangleMesh]) -> tuple[str, ...]:
-    """Shapes that are no background, by their size; all if there are no others."""
+    """Names of the shapes that are not background by their size; all shapes if all are background."""
     sizes = {name: float(np.linalg.norm(np.ptp(m.vertices, axis=0))) for name, m in surfaces.items()}
     largest = max(sizes.values())
     return tuple(n for n, size in sizes.items() if size <= BACKGROUND * largest) or tuple(surfaces)
 
 
 def _unwatched(stage: str, fraction: float) -> None:
-    """Tell nobody how far the work is."""
+    """Ignore the progress, for a caller that does not ask for it."""
 
 
 @contextmanager
 def _timed(times: dict[str, float], stage: str) -> Iterator[None]:
+    """Set `times[stage]` to the seconds that the block takes."""
     start = time.monotonic()
     yield
     times[stage] = time.monotonic() - start

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several views of a scene in one call: poses of a rig, a range image from each."""
+"""Takes several views of a scene in one call: a rig stands in each pose in turn and takes a range image there."""
 
 from __future__ import annotations
 
@@ -40,34 +40,50 @@ def scan(
     progress: Callable[[int], None] | None = None,
     **options: Any,
 ) -> Scan:
-    """Range images of a scene from each pose of a path, one `transport` each; the scene is loaded once and shared.
+    """Range images of a scene from each pose of a path, with their ground truth.
+
+    Each view is a light-transport pass. The scene is loaded once for all of them.
 
     Parameters
     ----------
-    rig : camera and emitter, which move together; its own pose does not count, but where a path names no centre: then
-        that is what the rig looks at, at the scene's working distance.
-    sensor : Sensor with its default electronics and decoder, or an Instrument with its own.
-    path : CameraPath, or poses (n, 4, 4) T_world_camera.
-    settings, options : of the light transport, as for `transport`; the seed is derived, other noise in each view.
-    ambient : as for `expose`.
-    seed : of light transport and noise, 0 to 2^64 - 1.
-    progress : called with the number of views done.
+    scene : Scene.
+    rig : Rig, whose camera and emitter move together. Its own pose is used only if the path does not state its centre,
+        distance or elevation.
+    sensor : Sensor, with its default detector and decoder, or an Instrument, with its own.
+    path : CameraPath, or poses (n, 4, 4) float64, T_world_camera, metres.
+    settings, options : as for `rangesim.transport`. Their seed is not used, because each view has its own.
+    ambient : as for `rangesim.expose`.
+    seed : seed of light transport and noise, 0 to 2^64 - 1. The seeds of the views are derived from it.
+    progress : function that is called with the number of views done.
+
+    Returns
+    -------
+    Scan
+        Range images with their poses, the ground truth of each view, and the true poses.
 
     Raises
     ------
     ValueError
-        Poses that are not rigid, or as `transport`, `expose` and `decode`.
+        A pose is not rigid, or as `rangesim.transport`, `rangesim.expose` and `rangesim.decode`.
+
+    Examples
+    --------
+    >>> import rangesim
+    >>> from rangesim.experiment import Turntable
+    >>> scene = rangesim.load_scene("tabletop")  # doctest: +SKIP
+    >>> views = scan(scene, scene.rig(), rangesim.StructuredLight(), Turntable(views=12))  # doctest: +SKIP
     """
-    from rangesim.light_transport.transport_settings import chosen
+    from rangesim.light_transport.transport_settings import with_options
 
     if not isinstance(sensor, (Sensor, Instrument)):
         raise ValueError(f"expected a sensor or an instrument, got {shown(sensor)}.")
     check_seed(seed)
     instrument = sensor if isinstance(sensor, Instrument) else Instrument("scan", sensor)
     poses = poses_of(path, Viewpoint(rig.T_world_camera, scene.working_distance_m))
-    chosen_settings = chosen(settings, cast("TransportOptions", options))
+    chosen_settings = with_options(settings, cast("TransportOptions", options))
     images, truths = [], []
-    for number, (image, truth) in enumerate(taken(scene, rig, instrument, poses, chosen_settings, ambient, seed), 1):
+    views = rendered_views(scene, rig, instrument, poses, chosen_settings, ambient, seed)
+    for number, (image, truth) in enumerate(views, 1):
         images.append(image)
         truths.append(truth)
         if progress is not None:
@@ -75,7 +91,7 @@ def scan(
     return Scan(tuple(images), tuple(truths), poses)
 
 
-def taken(
+def rendered_views(
     scene: Scene,
     rig: Rig,
     instrument: Instrument,
@@ -84,9 +100,9 @@ def taken(
     ambient: Ambient | None,
     seed: int,
 ) -> Iterator[tuple[RangeImage, GroundTruth]]:
-    """The views of `scan` one after the other, each rendered when it is asked for: its readings, and the truth.
+    """Range image and ground truth of each view, rendered when the caller asks for the next one.
 
-    poses : (n, 4, 4) T_world_camera. The rest as of `scan`.
+    poses : (n, 4, 4) float64, T_world_camera, metres. The other parameters are those of `scan`.
     """
     from rangesim.instrument.transport import transport
 
@@ -102,5 +118,5 @@ def taken(
 
 
 def poses_of(path: CameraPath | ArrayLike | Sequence[ArrayLike], viewpoint: Viewpoint | None = None) -> Array:
-    """(n, 4, 4) poses of a path, or as they are given."""
+    """Poses (n, 4, 4) float64, T_world_camera, of a camera path or of a list of poses."""
     return (path if isinstance(path, CameraPath) else PoseList(np.asarray(path))).poses(viewpoint)

@@ -22,6 +22,8 @@ const BACKGROUND = [16, 21, 29];
 const START = { yaw: -0.45, pitch: 0.22, zoom: 1, shift: [0, 0] };
 
 // Positions (3 per point; x right, y up, z towards the viewer, metres) and the pixel of each, of a depth image.
+// The camera is the pinhole of rangesim.rig.camera_model, repeated here for the browser; tests/test_rig.py compares them.
+// Distortion is left out.
 function unproject(instrument, z) {
   const [fx, fy, cx, cy] = instrument.camera, width = instrument.width;
   const count = z.reduce((n, v) => n + (v > 0), 0);

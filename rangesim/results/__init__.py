@@ -1,2 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records on the disk: each kind of directory or file has one class, one writer and one loader here."""
+"""Writes and reads every result on the disk. Each kind of record has one class, one writer and one loader, in one file.
+
+| kind | class | writer | loader |
+| --- | --- | --- | --- |
+| a run | `run_files.Result` | `write_result` | `load_result` |
+| a scan | `scan_files.ScanResult` | `write_scan` | `load_scan` |
+| a decoded capture | `decoded_files.Decoded` | `save_decoded` | `load_decoded` |
+| a capture | `rangesim.capture.Capture` | `save_capture` | `load_capture`, `import_capture` |
+| a range image | `rangesim.decoding.range_image.RangeImage` | `save_range_image` | `load_range_image` |
+| signals | `rangesim.signals.StillSignals` | `save_signals` | `load_signals` |
+"""

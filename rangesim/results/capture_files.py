@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Captures as directories, with one image per frame and `capture.json`; and real captures from folders of images."""
+"""Writes and reads captures: a directory with one image per frame and `capture.json`, or a folder of real images."""
 
 from __future__ import annotations
 
@@ -24,12 +24,11 @@ from rangesim.sensors import Sensor, sensor_from_dict
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
 
 SIDECAR = "capture.json"
-"""Name of the file with the settings of a capture."""
+"""File of a capture with its settings."""
 FORMAT = "rangesim-capture"
-"""Name of the format in that file."""
+"""Name of the format in the file."""
 FORMAT_VERSION = 1
-"""Number of the file format, as a count from 1; a change that older versions cannot read increases it, so that they
-refuse the file."""
+"""Version of the format, a count from 1. A change that older versions of the package cannot read increases it."""
 CAPTURE = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
 """Directories that hold a capture."""
 _KEYS = (
@@ -44,13 +43,14 @@ _KEYS = (
     "exposure_s",
     "ambient",
 )
-"""Keys that `capture.json` may have."""
+"""Keys of `capture.json`."""
 
 
 def save_capture(capture: Capture, directory: str | Path) -> None:
-    """Write a capture to a directory: a PNG (8 or 16 bits) or EXR (float32) per frame, and `capture.json`.
+    """Write a capture as a directory with one image per frame and `capture.json`.
 
-    The files appear when all are complete. An older capture of the same name is replaced; files of others stay.
+    The images are PNG of 8 or 16 bits, or EXR of float32 for a noise-free capture. The files appear when all of them
+    are complete. An older capture in the directory is replaced. Other files in it stay.
 
     Raises
     ------
@@ -59,16 +59,17 @@ def save_capture(capture: Capture, directory: str | Path) -> None:
 
     Examples
     --------
-    >>> from rangesim import load_capture, save_capture
-    >>> save_capture(capture, "captures/first")  # doctest: +SKIP
-    >>> again = load_capture("captures/first")  # doctest: +SKIP
+    >>> from rangesim import expose, save_capture
+    >>> save_capture(expose(signals, sensor), "out/capture")  # doctest: +SKIP
     """
     with new_directory(directory, CAPTURE) as folder:
         write_capture(capture, folder)
 
 
 def write_capture(capture: Capture, folder: Path) -> None:
-    """Write the files of a capture and their manifest into an empty directory, for a caller that makes it appear.
+    """Write the files of a capture and their manifest into an empty directory.
+
+    Nothing protects the files until they are complete; `save_capture` does that.
 
     Raises
     ------
@@ -77,7 +78,8 @@ def write_capture(capture: Capture, folder: Path) -> None:
     """
     if capture.is_digital and capture.frames.dtype.itemsize > 2 and capture.frames.max() > 65535:
         raise FileFormatError(
-            f"{folder}: the frames hold counts up to {capture.frames.max()}, the files at most 65535; expose shorter."
+            f"{folder}: expected counts up to 65535, the largest that the files hold, got {capture.frames.max()}; take "
+            "a shorter exposure."
         )
     names = _file_names(capture)
     for name, frame in zip(names, capture.frames, strict=True):
@@ -87,13 +89,18 @@ def write_capture(capture: Capture, folder: Path) -> None:
 
 
 def load_capture(directory: str | Path) -> Capture:
-    """The capture that `save_capture` wrote, with equal bytes and settings.
+    """The capture that `save_capture` wrote, with equal frames and settings.
 
     Raises
     ------
     FileFormatError
-        The directory, its sidecar or a frame is missing, the JSON is broken, a key is unknown, or a size or type is
-        wrong; the message names the file.
+        The directory, `capture.json` or a frame is missing or broken, or has an unknown key, a wrong size or a wrong
+        type. The message names the file.
+
+    Examples
+    --------
+    >>> from rangesim import decode, load_capture
+    >>> image = decode(load_capture("out/tabletop/amcw/capture"))  # doctest: +SKIP
     """
     sidecar = Path(directory) / SIDECAR
     recover(directory, FileFormatError)
@@ -125,29 +132,30 @@ def load_capture(directory: str | Path) -> Capture:
 def import_capture(
     folder: str | Path, sensor: Sensor, rig: Rig | None = None, detector: PhotoDetector | None = None
 ) -> Capture:
-    """The capture of a real camera, from a folder with one image per frame.
+    """A real capture from a folder with one image per frame.
 
-    The images are taken in the order of their names, in which numbers count by their value.
+    The images are taken in the order of their names; numbers in the names are compared by value.
 
     Parameters
     ----------
-    folder : holds as many images (PNG, TIFF, JPEG, BMP or EXR; 8 or 16 bits; colour becomes grey) as the sensor has
-        frames.
-    sensor : Sensor; its frames are in the order of `sensor.frame_names()`.
-    rig : Rig; None: the camera is not calibrated.
-    detector : PhotoDetector; None: unknown.
+    folder : folder with as many images as the sensor has frames: PNG, TIFF, JPEG, BMP or EXR of 8 or 16 bits. Colour
+        images are converted to grey.
+    sensor : Sensor, whose `frame_names()` are in the order of the images.
+    rig : Rig; None: not calibrated.
+    detector : PhotoDetector; None: not known.
 
     Raises
     ------
     FileFormatError
-        There is no such folder, it holds another number of images, an image cannot be read, or images differ in size
-        or type.
+        There is no such folder, the number of images is wrong, or an image is broken or has another size or type than
+        the others.
 
     Examples
     --------
-    >>> from rangesim import StructuredLight, decode, import_capture
-    >>> capture = import_capture("photographs", StructuredLight(1280, 800))  # doctest: +SKIP
-    >>> image = decode(capture)  # doctest: +SKIP
+    >>> from rangesim import StructuredLight, decode, import_capture, load_calibration
+    >>> sensor = StructuredLight(code="gray", projector_width=1024, projector_height=768, axes=("columns", "rows"))
+    >>> rig = load_calibration("rig.json")  # doctest: +SKIP
+    >>> image = decode(import_capture("photographs", sensor, rig))  # doctest: +SKIP
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -166,13 +174,13 @@ def import_capture(
 
 
 def _file_names(capture: Capture) -> list[str]:
-    """Name of the file of each frame."""
+    """Name of the file of each frame, such as 000_columns_bit9.png."""
     suffix = ".png" if capture.is_digital else ".exr"
     return [f"{i:03d}_{name}{suffix}" for i, name in enumerate(capture.sensor.frame_names())]
 
 
 def _sidecar(capture: Capture, names: list[str]) -> dict[str, Any]:
-    """Content of `capture.json`; names : of the frames' files."""
+    """Contents of `capture.json`."""
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -188,7 +196,10 @@ def _sidecar(capture: Capture, names: list[str]) -> dict[str, Any]:
 
 
 def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor, size: tuple[int, int] | None) -> np.ndarray:
-    """(k, h, w) frames of the files that the settings name; size : expected width and height, None: any."""
+    """Frames (k, h, w) of a capture, in the type that it had.
+
+    size : width and height that the frames must have; None: any.
+    """
     names, dtype = settings.get("frames"), settings.get("dtype")
     if dtype not in DTYPES:
         raise ValueError(f"expected dtype to be one of {', '.join(DTYPES)}, got {dtype!r}.")
@@ -205,5 +216,5 @@ def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor, size: 
 
 
 def _natural(path: Path) -> list[tuple[int, int | str]]:
-    """Key that sorts names with their numbers by value: frame_2 before frame_10."""
+    """Key that sorts the names of files so that image2 comes before image10."""
     return [(0, int(s)) if s.isdigit() else (1, s) for s in re.split(r"(\d+)", path.name.lower())]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decoded captures as directories: `rangesim decode` writes them, `load_decoded` reads them.
+"""Writes and reads a decoded capture: the directory that `rangesim decode` writes.
 
 DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
-    decoded.json         sensor, rig, fractions of the pixels by status, likely cause if little was measured
+    decoded.json         sensor, rig, fraction of the pixels by status, likely cause if few pixels have a reading
     range.npz            range image
-    cloud.ply            points, metres, camera coordinates, if there are any
+    cloud.ply            points, metres, camera coordinates; missing if there are none
     depth.png ...        pictures of the maps
 """
 
@@ -26,15 +26,15 @@ from rangesim.sensors import Sensor, sensor_from_dict
 from rangesim.settings.config import ShortRepr, to_dict
 
 SIDECAR = "decoded.json"
-"""Name of the file with the sensor, the rig and the summary of a decoded capture."""
+"""File of a decoded capture with its settings."""
 FORMAT = "rangesim-decoded"
-"""Name of the format in that file."""
+"""Name of the format in the file."""
 DECODED = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
 """Directories that hold a decoded capture."""
 
 
 class DecodedRecord(Record, frozen=True, kw_only=True):
-    """Content of `decoded.json`. status : fraction of the pixels by the name of their status."""
+    """The contents of `decoded.json`; the fields are those of `Decoded`."""
 
     format: Literal["rangesim-decoded"] = "rangesim-decoded"
     format_version: Literal[1] = 1
@@ -47,13 +47,13 @@ class DecodedRecord(Record, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Decoded(ShortRepr):
-    """A range image with the sensor and the rig that it was measured with, and a summary.
+    """A range image with the sensor and the rig of its capture.
 
     image : RangeImage.
     sensor : Sensor that took the capture.
     rig : Rig; None: not calibrated.
-    status : fraction of the pixels by the name of their status.
-    likely_cause : clause that says why little was measured; None if nothing points to a cause.
+    status : fraction of the pixels with each status, by the status's name.
+    likely_cause : clause that says why few pixels have a reading; None if no cause is likely.
     """
 
     image: RangeImage
@@ -64,16 +64,16 @@ class Decoded(ShortRepr):
 
 
 def save_decoded(decoded: Decoded, directory: str | Path, pictures: Mapping[str, bytes]) -> None:
-    """Write the files of a decoded capture; they appear when all are complete.
+    """Write the files of a decoded capture. They appear when all of them are complete.
 
     Parameters
     ----------
-    pictures : PNG files of the maps by name, as `rangesim.report.figures.map_pictures` makes them.
+    pictures : contents of PNG files of the maps by name, as `rangesim.report.figures.map_pictures` makes them.
 
     Raises
     ------
     FileFormatError
-        The directory exists and holds other files than an unchanged decoded capture.
+        The directory exists and is neither empty nor an unchanged decoded capture.
     """
     record = DecodedRecord(
         sensor=to_dict(decoded.sensor),
@@ -98,7 +98,7 @@ def load_decoded(directory: str | Path) -> Decoded:
     Raises
     ------
     FileFormatError
-        The directory holds no decoded capture, or a part of it is missing or broken; the message names the file.
+        The directory holds no decoded capture, or a file is missing or broken. The message names the file.
     """
     folder = Path(directory)
     recover(folder, FileFormatError)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of range images."""
+"""Writes and reads range images: one .npz file with the arrays, the camera and the decoder."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rangesim.errors import FileFormatError
 from rangesim.files.array_files import write_arrays
 from rangesim.files.schema import MAX_METRES, SETTINGS, ArraySpec, read_checked_arrays, settings_array, settings_of
 from rangesim.rig import Intrinsics
-from rangesim.sensors import Decoder  # with those of the package, which are known from then on
+from rangesim.sensors import Decoder  # this import also makes the package's own decoders known by their type_name
 from rangesim.settings.config import check_keys, from_dict, to_dict
 
 _DEPTH = ArraySpec("float32", low=-MAX_METRES, high=MAX_METRES, nan=True)
@@ -31,24 +31,19 @@ _RANGE = {
     "sampling_sigma_m": ArraySpec("float32", low=0, nan=True, inf=True, required=False),
     "settings": replace(SETTINGS, required=False),
 }
-"""Arrays of a file, by name, with their types and limits; "h" and "w" are the size of the image."""
+"""Type, shape and bounds of the arrays of a range image, by their names in files. The bound of the confidence leaves
+room for the rounding of single precision."""
 
 
 def save_range_image(image: RangeImage, path: str | Path) -> None:
     """Write the arrays of a range image, its camera and its decoder to a compressed .npz file.
 
-    `load_range_image` returns an equal range image.
-
-    Raises
-    ------
-    FileFormatError
-        The file cannot be written.
+    `load_range_image` reads an equal range image from it.
 
     Examples
     --------
-    >>> from rangesim import load_range_image, save_range_image
-    >>> save_range_image(image, "range.npz")  # doctest: +SKIP
-    >>> again = load_range_image("range.npz")  # doctest: +SKIP
+    >>> from rangesim import decode, save_range_image
+    >>> save_range_image(decode(capture), "out/range.npz")  # doctest: +SKIP
     """
     arrays = {f.name: getattr(image, f.name) for f in fields(image) if isinstance(getattr(image, f.name), np.ndarray)}
     settings = {"camera": to_dict(image.camera), "decoder": to_dict(image.decoder)}
@@ -58,12 +53,18 @@ def save_range_image(image: RangeImage, path: str | Path) -> None:
 def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> RangeImage:
     """The range image that `save_range_image` wrote.
 
-    sizes : height "h" and width "w" of the image, in pixels, as far as they are known; others are refused.
+    sizes : height "h" and width "w" that the image must have, pixels; None: any.
 
     Raises
     ------
     FileFormatError
-        The file is missing or broken, or its decoder is of a class that is not loaded.
+        The file is missing or broken, or the class of its decoder is not loaded, for example one from a file of the
+        user's.
+
+    Examples
+    --------
+    >>> from rangesim import load_range_image
+    >>> load_range_image("out/range.npz").to_point_cloud().save("out/cloud.ply")  # doctest: +SKIP
     """
     path = Path(path)
     arrays: dict[str, Any] = read_checked_arrays(path, _RANGE, dict(sizes or {}))
@@ -81,5 +82,5 @@ def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> R
     if not image.is_consistent:
         raise FileFormatError(f"{path}: expected z to be finite where status is {Status.OK.value}.")
     if image.camera is not None and image.z.shape != (image.camera.height, image.camera.width):
-        raise FileFormatError(f"{path}: expected arrays of the size of the camera.")
+        raise FileFormatError(f"{path}: expected arrays of the camera's size.")
     return image

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of experiments as directories: `write_result` writes them, `load_result` reads them.
+"""Writes and reads the result of an experiment: the directory that `rangesim run` writes.
 
 DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
-    experiment.json      resolved settings, versions, and which instruments share which pass
-    pass_1.npz           energy split and ground truth of each transport pass
+    experiment.json      resolved settings, versions, and the pass that each instrument shares
+    pass_1.npz           energy split and ground truth of each light-transport pass
     comparison.md        statistics of all instruments
-    report.html
-    NAME/capture/        of each instrument: frames and sidecar
+    report.html          report for people
+    NAME/capture/        frames and settings of the capture of the instrument NAME
          range.npz       range image
          causes.npz      cause of every failed pixel
          cloud.ply       points, metres, camera coordinates
-         comparison.json, measurement.json, segmentation.npz
+         comparison.json statistics per material class
+         measurement.json exposure and times
+         segmentation.npz supervoxels, labels and tree
 """
 
 from __future__ import annotations
@@ -54,9 +56,9 @@ from rangesim.settings.config import ShortRepr, from_dict, shown
 from rangesim.signals import ALL, GroundTruth
 
 SETTINGS = "experiment.json"
-"""Name of the file with the settings, the scene and the versions of a result."""
+"""File of a result with its settings."""
 FORMAT = "rangesim-result"
-"""Name of the format in that file."""
+"""Name of the format in the file."""
 RESULT = DirectoryKind(FORMAT, SETTINGS, FileFormatError)
 """Directories that hold the results of an experiment."""
 
@@ -65,14 +67,18 @@ RESULT = DirectoryKind(FORMAT, SETTINGS, FileFormatError)
 
 
 class ShapeRecord(Record, frozen=True, kw_only=True):
-    """A shape of the scene."""
+    """A shape of the scene and its material class."""
 
     name: str
     material: Name
 
 
 class SceneRecord(Record, frozen=True, kw_only=True):
-    """The scene that was measured. sha256 : checksum of its file; None if it was not loaded from a file."""
+    """The scene that was measured.
+
+    sha256 : checksum of its file; None if the scene was not loaded from a file.
+    working_distance_m : distance from the camera to what it looks at, metres.
+    """
 
     name: str
     sha256: str | None
@@ -81,7 +87,7 @@ class SceneRecord(Record, frozen=True, kw_only=True):
 
 
 class InstrumentRecord(Record, frozen=True, kw_only=True, rename={"light_pass": "pass"}):
-    """An instrument, the number (from 1) of the pass that it took part in, and its rig as plain data."""
+    """An instrument, the number of its light-transport pass (counted from 1), and its rig."""
 
     name: Name
     light_pass: Count
@@ -89,7 +95,7 @@ class InstrumentRecord(Record, frozen=True, kw_only=True, rename={"light_pass": 
 
 
 class ResultRecord(Record, frozen=True, kw_only=True):
-    """Content of `experiment.json`."""
+    """The contents of `experiment.json`: settings, scene, rigs, versions and times."""
 
     format: Literal["rangesim-result"] = "rangesim-result"
     format_version: Literal[1] = 1
@@ -103,9 +109,9 @@ class ResultRecord(Record, frozen=True, kw_only=True):
 
 
 class PhotonsRecord(Record, frozen=True, kw_only=True):
-    """Mean number of photons that a pixel detects per laser pulse: the median of all pixels, and the largest.
+    """Mean number of photons that a pixel detects per laser pulse: the median and the maximum over the pixels.
 
-    From about 1 on, pile-up matters: the first photon of a pulse hides the later ones.
+    From about one photon per pulse on, pile-up hides the later photons of a pulse.
     """
 
     median: Photons
@@ -113,12 +119,13 @@ class PhotonsRecord(Record, frozen=True, kw_only=True):
 
 
 class MeasurementRecord(Record, frozen=True, kw_only=True):
-    """Content of `measurement.json`: frames, exposure and time per stage of an instrument.
+    """The contents of `measurement.json`.
 
-    exposure_s : seconds per frame; None for a noise-free capture.
-    acquisition_s : seconds of all exposures; None for a noise-free capture.
-    photons_per_pulse : None if the detector does not count photons.
-    times_s : seconds of computing, by stage.
+    exposure_s : exposure of each frame, seconds; None for a noise-free capture.
+    acquisition_s : time from the start of the first exposure to the end of the last, seconds.
+    points : number of pixels with a reading.
+    photons_per_pulse : None where no photons are counted.
+    times_s : seconds that each stage of the computation took.
     """
 
     format: Literal["rangesim-measurement"] = "rangesim-measurement"
@@ -134,10 +141,10 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
 
 
 class RowRecord(Record, frozen=True, kw_only=True):
-    """Statistics of one material class; None where a value is not defined or not known.
+    """Statistics of one material class.
 
-    The values are explained in `rangesim.evaluation.comparison.ErrorStatistics`, `rangesim.causes.CauseMap.fractions`
-    and `rangesim.evaluation.range_noise.RangeNoise.by_material`.
+    Their meaning is that of `rangesim.evaluation.comparison.ErrorStatistics`, `rangesim.causes.CauseMap.fractions` and
+    `rangesim.evaluation.range_noise.RangeNoise.by_material`. None: not known.
     """
 
     material: Name
@@ -160,7 +167,10 @@ class RowRecord(Record, frozen=True, kw_only=True):
 
 
 class ComparisonRecord(Record, frozen=True, kw_only=True):
-    """Content of `comparison.json`: a row per material class, "all" last; outlier_m : metres, limit of outliers."""
+    """The contents of `comparison.json`: a row for each material class, the last one for "all".
+
+    outlier_m : error above which a reading counts as an outlier, metres.
+    """
 
     format: Literal["rangesim-comparison"] = "rangesim-comparison"
     format_version: Literal[1] = 1
@@ -169,24 +179,24 @@ class ComparisonRecord(Record, frozen=True, kw_only=True):
 
 
 _CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpec("float64", (), low=1e-9, high=1e9)}
-"""Arrays of `causes.npz`, with their types and limits."""
+"""Type, shape and bounds of the arrays of `causes.npz`; the tolerance is in metres."""
 _SEGMENTATION = {
     "supervoxels": ArraySpec("int32", low=-1),
     "labels": ArraySpec("int32", low=-2),
     "parents": ArraySpec("int32", ("nodes",), low=0, per_pixel=2),
     "altitudes": ArraySpec("float64", ("nodes",), low=0, inf=True, per_pixel=2),
 }
-"""Arrays of `segmentation.npz`, with their types and limits."""
+"""Type, shape and bounds of the arrays of `segmentation.npz`. A binary tree has less than two nodes per pixel."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Segmentation(ShortRepr):
-    """Supervoxels of a point cloud and the tree that merges them.
+    """Supervoxels of an organised point cloud, its objects, and the tree that merges the supervoxels.
 
-    supervoxels : (h, w) int32, index of each pixel's supervoxel; -1 without a point.
-    labels : (h, w) int32, index of each pixel's object; -1 without a point, -2 for outliers.
-    parents : (k,) int32, parent of each node of the tree, the supervoxels first; the root is its own parent.
-    altitudes : (k,) float64, radians, mean concavity of each merge; it does not decrease towards the root.
+    supervoxels : (h, w) int32, number of the supervoxel of each pixel; -1 where there is no point.
+    labels : (h, w) int32, number of the object of each pixel; -1 where there is no point, -2 for outliers.
+    parents : (k,) int32, parent of each node of the tree. The supervoxels come first; the root is its own parent.
+    altitudes : (k,) float64, altitude at which each node merges; it never decreases towards the root.
     """
 
     supervoxels: np.ndarray
@@ -197,17 +207,17 @@ class Segmentation(ShortRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Measurement(ShortRepr):
-    """The measurement of one instrument of an experiment.
+    """The measurement of one instrument.
 
     name : name of the instrument.
     capture : Capture.
-    image : RangeImage, decoded from the capture.
-    truth : GroundTruth of the pass that the instrument took part in.
-    causes : CauseMap, causes of the failed pixels.
-    rows : statistics per material class, "all" last, with the keys of `RowRecord`.
-    segmentation : Segmentation of the point cloud; None if there were too few points to group.
+    image : RangeImage.
+    truth : GroundTruth of the instrument's pass.
+    causes : CauseMap, the cause of each failed pixel.
+    rows : statistics per material class with the keys of `RowRecord`, "all" last.
+    segmentation : Segmentation; None if there were too few points.
     metadata : MeasurementRecord, frames, exposure, photons per pulse and time per stage.
-    light_pass : int from 1, number of the transport pass that the instrument took part in.
+    light_pass : number of the light-transport pass, counted from 1.
     """
 
     name: str
@@ -223,12 +233,17 @@ class Measurement(ShortRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(ShortRepr):
-    """An experiment and its outcome; `rangesim.pipeline.experiment_run.carry_out` returns it.
+    """The result of an experiment.
 
-    experiment : Experiment, the settings.
+    experiment : Experiment, as it was carried out.
     measurements : one Measurement for each instrument, in the order of the experiment.
-    passes : one LightPass for each transport pass.
-    info : ResultRecord, scene, versions and times.
+    passes : one LightPass for each light-transport pass.
+    info : ResultRecord, with scene, versions and times.
+
+    Examples
+    --------
+    >>> result = load_result("out/tabletop")  # doctest: +SKIP
+    >>> {m.name: m.rows[-1]["median_abs_m"] for m in result.measurements}  # metres  # doctest: +SKIP
     """
 
     experiment: Experiment
@@ -238,7 +253,7 @@ class Result(ShortRepr):
 
 
 def complete_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Statistics per material class with all keys of `RowRecord`; a value that is not known is None."""
+    """The rows with all keys of `RowRecord`; a value is None where it is not known."""
     return [msgspec.to_builtins(RowRecord(**row)) for row in rows]
 
 
@@ -248,10 +263,11 @@ def complete_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def write_result(result: Result, folder: Path, pages: Mapping[str, bytes]) -> None:
     """Write the files of a result to an empty directory.
 
+    Nothing protects the files until they are complete; `rangesim.pipeline.experiment_run.run` does that.
+
     Parameters
     ----------
-    folder : empty directory; the caller makes it appear when it is complete.
-    pages : contents of files that people read, such as `report.html`, by name.
+    pages : contents of the files for people, such as `report.html`, by their names.
     """
     for number, light_pass in enumerate(result.passes, 1):
         write_pass(light_pass, folder / f"pass_{number}.npz")
@@ -267,7 +283,7 @@ def write_result(result: Result, folder: Path, pages: Mapping[str, bytes]) -> No
 
 
 def _write_readings(measurement: Measurement, folder: Path) -> None:
-    """Write the files of a measurement besides its capture."""
+    """Write all files of a measurement except its capture."""
     causes, rows = measurement.causes, [RowRecord(**row) for row in measurement.rows]
     save_range_image(measurement.image, folder / "range.npz")
     write_arrays(folder / "causes.npz", {"cause": causes.cause, "tolerance_m": np.asarray(causes.tolerance_m)})
@@ -282,18 +298,12 @@ def _write_readings(measurement: Measurement, folder: Path) -> None:
 
 
 def load_result(directory: str | Path) -> Result:
-    """The result that `rangesim.pipeline.experiment_run.run` wrote to a directory.
+    """The result that `rangesim.pipeline.experiment_run.run` wrote.
 
     Raises
     ------
     FileFormatError
-        The directory is no result, or a part of it is missing or broken; the message names the file.
-
-    Examples
-    --------
-    >>> from rangesim.results.run_files import load_result
-    >>> result = load_result("out/demo")  # doctest: +SKIP
-    >>> result.measurements[0].image.z  # doctest: +SKIP
+        The directory holds no result, or a file is missing or broken. The message names the file.
     """
     folder = Path(directory)
     info = read_settings(folder)
@@ -320,13 +330,7 @@ def load_result(directory: str | Path) -> Result:
 
 
 def read_settings(folder: Path) -> ResultRecord:
-    """Content of the `experiment.json` of a result.
-
-    Raises
-    ------
-    FileFormatError
-        The directory is no result, or the file is broken.
-    """
+    """The contents of `experiment.json` in the directory of a result; FileFormatError if it holds no result."""
     recover(folder, FileFormatError)
     if not (folder / SETTINGS).is_file():
         raise FileFormatError(f"{folder} is no {FORMAT} directory: it has no {SETTINGS}.")
@@ -334,13 +338,7 @@ def read_settings(folder: Path) -> ResultRecord:
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """Statistics per material class of one instrument, from the `comparison.json` in its folder.
-
-    Raises
-    ------
-    FileFormatError
-        The file is missing or broken.
-    """
+    """The rows of `comparison.json` in the directory of an instrument; FileFormatError if the file is broken."""
     path = folder / "comparison.json"
     record = read_record(path, ComparisonRecord)
     materials = [row.material for row in record.rows]
@@ -356,7 +354,7 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
 
 
 def _image_sizes(info: ResultRecord, path: Path) -> dict[int, dict[str, int]]:
-    """Height "h" and width "w" of the camera of each pass, in pixels, by the number of the pass."""
+    """Height "h" and width "w" of the camera of each pass in pixels, by the number of the pass."""
     sizes: dict[int, dict[str, int]] = {}
     for entry in info.instruments:
         try:
@@ -366,13 +364,13 @@ def _image_sizes(info: ResultRecord, path: Path) -> dict[int, dict[str, int]]:
         size = {"h": camera.height, "w": camera.width}
         if sizes.setdefault(entry.light_pass, size) != size:
             raise FileFormatError(
-                f"{path}: expected one size of the cameras of pass {entry.light_pass}, got another of {entry.name}."
+                f"{path}: expected cameras of one size in pass {entry.light_pass}, got another size for {entry.name}."
             )
     return sizes
 
 
 def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: dict[str, int]) -> Measurement:
-    """Measurement in a folder; sizes : height "h" and width "w" of the images of its pass."""
+    """The measurement in the directory of an instrument, checked against its pass."""
     capture = load_capture(folder / "capture")
     if capture.rig is None or capture.frames.shape[1:] != (sizes["h"], sizes["w"]):
         raise FileFormatError(f"{folder / 'capture'}: expected a rig, and frames of the size of the ground truth.")
@@ -399,7 +397,7 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
 
 
 def _load_segmentation(path: Path, sizes: dict[str, int]) -> Segmentation | None:
-    """Segmentation in a file; None if there is no file."""
+    """The segmentation of a file, checked to be a binary tree; None if there is no such file."""
     if not path.is_file():
         return None
     data = read_checked_arrays(path, _SEGMENTATION, dict(sizes))

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans as directories: `write_scan` writes them, `load_scan` reads them.
+"""Writes and reads the result of a scan: the directory that `rangesim scan` writes.
 
 DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
-    scan.json            resolved settings, versions, statistics of surface, shapes and views
-    mesh.ply             the fused surface, metres, world
-    poses.json           T_world_camera (n, 4, 4) of the views: as fused, and true
-    truth.npz            true surface of each shape, states of the voxels around them, weights of the mesh's vertices
+    scan.json            resolved settings, versions, statistics of the surface, the shapes and the views
+    mesh.ply             the fused surface, metres, world coordinates
+    poses.json           T_world_camera (n, 4, 4) of the views: the poses used for the fusion, and the true ones
+    truth.npz            true surface of each shape, state of the voxels around them, weights of the mesh
     view_01/range.npz    range image of each view, with its pose
-    report.html
+    report.html          report for people
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ from rangesim.settings.config import ShortRepr, from_dict, shown, to_dict
 from rangesim.triangle_mesh import TriangleMesh
 
 SIDECAR = "scan.json"
-"""Name of the file with the settings and statistics of a scan."""
+"""File of a scan with its settings."""
 FORMAT = "rangesim-scan"
-"""Name of the format in that file."""
+"""Name of the format in the file."""
 SCAN = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
 """Directories that hold the results of a scan."""
 
@@ -62,7 +62,7 @@ SCAN = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
 
 
 class SeenRecord(Record, frozen=True, kw_only=True):
-    """Fractions of a shape that the views saw, as in `SeenOfShape`; None in place of NaN."""
+    """The fields of `rangesim.fusion.seen_volume.SeenOfShape`; None where they are NaN, which JSON does not have."""
 
     surface: Fraction | None
     volume_surface: Fraction | None
@@ -73,9 +73,10 @@ class SeenRecord(Record, frozen=True, kw_only=True):
 
 
 class ShapeStatistics(Record, frozen=True, kw_only=True):
-    """A shape of the scene, and the errors of the part of the mesh that is nearest to it, as in `SurfaceError`.
+    """A shape of the scene and the errors of the part of the mesh that is nearest to it.
 
-    The errors are None if no part of the mesh is nearest to the shape. `seen` is None for background.
+    The errors are those of `rangesim.fusion.mesh_error.SurfaceError`. They are None if no part of the mesh is nearest
+    to the shape. `seen` is None for background.
     """
 
     material: Name
@@ -92,7 +93,7 @@ class ShapeStatistics(Record, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, material: str, error: SurfaceError | None, seen: SeenOfShape | None) -> ShapeStatistics:
-        """Statistics of a shape from the errors of its surface and the parts that were seen."""
+        """The statistics of a shape, made of its errors and of what the views saw of it."""
         names = [f.name for f in msgspec.structs.fields(cls) if f.name not in ("material", "seen")]
         errors = {} if error is None else {name: float(getattr(error, name)) for name in names}
         known = {} if seen is None else {key: _none_of_nan(value) for key, value in asdict(seen).items()}
@@ -100,7 +101,10 @@ class ShapeStatistics(Record, frozen=True, kw_only=True):
 
 
 class ViewStatistics(Record, frozen=True, kw_only=True):
-    """Number of readings of a view, and the errors of its pose in degrees and metres; None if the pose was known."""
+    """The number of readings of a view, and the errors of its pose.
+
+    angle_error_deg, centre_error_m : errors of a pose that was found, degrees and metres; None if it was known.
+    """
 
     readings: Count
     pixels: Count
@@ -109,7 +113,10 @@ class ViewStatistics(Record, frozen=True, kw_only=True):
 
 
 class ScanStatistics(Record, frozen=True, kw_only=True):
-    """Statistics of the fused surface, of the shapes by name, and of the views."""
+    """Statistics of the fused surface, of the shapes by name, and of the views.
+
+    things : names of the shapes that are not background.
+    """
 
     voxel_m: Positive
     truncation_m: Positive
@@ -123,7 +130,11 @@ class ScanStatistics(Record, frozen=True, kw_only=True):
 
 
 class ScanRecord(Record, frozen=True, kw_only=True):
-    """Content of `scan.json`. tolerance_m : metres, error within which a view measured the true surface."""
+    """The contents of `scan.json`.
+
+    grid : the voxel grid on which the seen and the true volume are compared.
+    tolerance_m : distance up to which a reading counts as on the surface, metres.
+    """
 
     format: Literal["rangesim-scan"] = "rangesim-scan"
     format_version: Literal[1] = 1
@@ -138,21 +149,26 @@ class ScanRecord(Record, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ScanResult(ShortRepr):
-    """A scan and its outcome; `rangesim.pipeline.scan_run.run_scan` returns it.
+    """The result of a scan.
 
     Parameters
     ----------
-    settings : ScanSettings, with all defaults resolved.
-    scan : Scan, the views with the poses that they were fused with.
-    fused : FusedSurface.
-    surfaces : true surface of each shape, by name.
-    shapes : statistics of each shape, by name.
+    settings : ScanSettings, as they were resolved.
+    scan : Scan, the views with the poses that were used for the fusion.
+    fused : FusedSurface, the mesh.
+    surfaces : true surface of each shape by name.
+    shapes : statistics of each shape by name.
     things : names of the shapes that are not background.
-    seen : Occupancy, the parts of the things and of the space around them that the views saw.
-    poses : errors of the poses that were found; None if the poses were known.
-    versions : version of each package.
-    variant : name of Mitsuba's variant.
-    times_s : seconds of computing, by stage.
+    seen : Occupancy, the state of the voxels around the things, and the fractions of each thing that were seen.
+    poses : errors of the poses that were found; None if they were known.
+    versions : version of each package by name.
+    variant : Mitsuba's variant, such as "llvm_ad_mono".
+    times_s : seconds that each stage took.
+
+    Examples
+    --------
+    >>> result = load_scan("out/scan")  # doctest: +SKIP
+    >>> {name: result.shapes[name].accuracy_m for name in result.things}  # metres  # doctest: +SKIP
     """
 
     settings: ScanSettings
@@ -168,7 +184,7 @@ class ScanResult(ShortRepr):
     times_s: dict[str, float]
 
     def statistics(self) -> ScanStatistics:
-        """Statistics of the scan, as `scan.json` holds them."""
+        """The statistics that `scan.json` holds."""
         views = []
         for number, image in enumerate(self.scan.images):
             errors = {}
@@ -189,10 +205,8 @@ class ScanResult(ShortRepr):
         )
 
 
-_FINITE = MAX_METRES
-"""Largest coordinate of a vertex in a file, in metres, so that no infinite one is read."""
 _ARRAYS = {
-    "vertices": ArraySpec("float64", ("vertices", 3), low=-_FINITE, high=_FINITE),
+    "vertices": ArraySpec("float64", ("vertices", 3), low=-MAX_METRES, high=MAX_METRES),
     "faces": ArraySpec("int32", ("faces", 3), low=0),
     "vertex_counts": ArraySpec("int64", ("shapes",), low=0),
     "face_counts": ArraySpec("int64", ("shapes",), low=0),
@@ -200,7 +214,7 @@ _ARRAYS = {
     "filled": ArraySpec("int32", ("nx", "ny", "nz"), low=-1),
     "vertex_weights": ArraySpec("float32", ("mesh",), low=0),
 }
-"""Arrays of `truth.npz`, with their types and limits."""
+"""Type, shape and bounds of the arrays of `truth.npz`; the vertices are in metres."""
 
 
 # ---- Writing -------------------------------------------------------------------------------------------------------
@@ -209,10 +223,11 @@ _ARRAYS = {
 def write_scan(result: ScanResult, folder: Path, pages: Mapping[str, bytes]) -> None:
     """Write the files of a scan to an empty directory.
 
+    Nothing protects the files until they are complete; `rangesim.pipeline.scan_run.run_scan` does that.
+
     Parameters
     ----------
-    folder : empty directory; the caller makes it appear when it is complete.
-    pages : contents of files that people read, such as `report.html`, by name.
+    pages : contents of the files for people, such as `report.html`, by their names.
     """
     record = ScanRecord(
         settings=scan_settings_to_dict(result.settings),
@@ -253,17 +268,12 @@ def write_scan(result: ScanResult, folder: Path, pages: Mapping[str, bytes]) -> 
 
 
 def load_scan(directory: str | Path) -> ScanResult:
-    """The scan that `rangesim.pipeline.scan_run.run_scan` wrote to a directory; the views' ground truth is not kept.
+    """The scan that `rangesim.pipeline.scan_run.run_scan` wrote, without the ground truth of each view.
 
     Raises
     ------
     FileFormatError
-        The directory is no scan, or a part of it is missing or broken; the message names the file.
-
-    Examples
-    --------
-    >>> from rangesim.results.scan_files import load_scan
-    >>> mesh = load_scan("out/scan").fused.mesh  # doctest: +SKIP
+        The directory holds no scan, or a file is missing or broken. The message names the file.
     """
     folder = Path(directory)
     recover(folder, FileFormatError)
@@ -310,7 +320,7 @@ def load_scan(directory: str | Path) -> ScanResult:
 
 
 def _true_poses(path: Path, views: int) -> np.ndarray | None:
-    """(views, 4, 4) float64 poses T_world_camera that the views were rendered from; None if the file holds none."""
+    """True poses of the views, (n, 4, 4) float64, T_world_camera, metres; None if the file holds none."""
     data = read_json(path)
     found = data.get("true") if isinstance(data, dict) else None
     if found is None:
@@ -325,7 +335,7 @@ def _true_poses(path: Path, views: int) -> np.ndarray | None:
 
 
 def _surfaces(data: dict[str, np.ndarray], names: list[str], path: Path) -> dict[str, TriangleMesh]:
-    """True surface of each shape, by name, from the arrays of `truth.npz`."""
+    """True surface of each shape by name, cut from the arrays in which the shapes follow one another."""
     stops = {key: np.cumsum(data[f"{key}_counts"]) for key in ("vertex", "face")}
     if (stops["vertex"][-1:] != len(data["vertices"])).any() or (stops["face"][-1:] != len(data["faces"])).any():
         raise FileFormatError(f"{path}: expected counts that add up to the vertices and faces.")
@@ -338,7 +348,7 @@ def _surfaces(data: dict[str, np.ndarray], names: list[str], path: Path) -> dict
 
 
 def _seen_of(shape: ShapeStatistics, name: str, path: Path) -> SeenOfShape:
-    """Fractions of a thing that the views saw."""
+    """The fractions of a shape that the views saw, from its statistics."""
     if shape.seen is None:
         raise FileFormatError(f"{path}: expected what the views saw of {shown(name)}, which is no background.")
     values = msgspec.to_builtins(shape.seen)
@@ -346,4 +356,5 @@ def _seen_of(shape: ShapeStatistics, name: str, path: Path) -> SeenOfShape:
 
 
 def _none_of_nan(value: float) -> float | None:
+    """The value, or None for NaN, which JSON does not have."""
     return None if np.isnan(value) else float(value)

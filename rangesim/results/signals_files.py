@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of signals: complete ones, to be exposed again without a new pass, and those of results, without channels."""
+"""Writes and reads signals: complete ones, which can be exposed again, and those of a result, without channels."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from rangesim.settings.config import ShortRepr, check_keys, from_dict, shown, to
 from rangesim.signals import EnergySplit, GroundTruth, SamplingError, Signals, StillSignals, Truncation
 
 FORMAT = "rangesim-signals"
+"""Name of the format in the file."""
 FORMAT_VERSION = 1
-"""Number of the file format, as a count from 1; a change that older versions cannot read increases it."""
+"""Version of the format, a count from 1. A change that older versions of the package cannot read increases it."""
 MAX_SETTINGS = 1_000_000
-"""Largest size of the settings in a file, in bytes. Real settings have a few kilobytes; the limit protects from files
-that would fill the memory."""
+"""Largest size of the settings in a file, in bytes. Real settings take a few kilobytes; the limit keeps a damaged file
+from filling the memory."""
 
 _RADIANCE = ArraySpec("float32", low=0)
 _TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=MAX_METRES, nan=True)
@@ -40,18 +41,24 @@ _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
     "motion_m": ArraySpec("float32", low=0, nan=True, required=False),
     "truncation": ArraySpec("float64", (len(fields(Truncation)),), low=0, high=1, nan=True, required=False),
 }
-"""Arrays of a pass, by name, with their types and limits."""
+"""Type, shape and bounds of the arrays of a pass, by their names in files. The bounds of a normal leave room for the
+rounding of single precision."""
 
 
 def save_signals(signals: StillSignals, path: str | Path) -> None:
-    """Write signals with their channels and sampling error to a compressed .npz file; `load_signals` reads them back.
+    """Write signals with their channels and sampling error to a compressed .npz file.
 
     Raises
     ------
     ValueError
-        A response holds arrays (`Images`).
+        A response holds arrays (`rangesim.response.Images`), which files cannot hold.
     FileFormatError
-        The place cannot be written.
+        The file cannot be written.
+
+    Examples
+    --------
+    >>> from rangesim import save_signals
+    >>> save_signals(signals, "out/signals.npz")  # doctest: +SKIP
     """
     responses = list(signals.channels)
     settings = {
@@ -69,18 +76,18 @@ def save_signals(signals: StillSignals, path: str | Path) -> None:
 
 
 def load_signals(path: str | Path) -> StillSignals:
-    """Signals that `save_signals` wrote; `expose` makes captures of them as of traced ones.
+    """The signals that `save_signals` wrote. `rangesim.expose` makes captures of them without a new pass.
 
     Raises
     ------
     FileFormatError
-        The file is missing or broken, or holds a response of a class that is not loaded.
+        The file is missing or broken, or the class of a response is not loaded.
 
     Examples
     --------
     >>> from rangesim import expose, load_signals
-    >>> signals = load_signals("signals.npz")  # doctest: +SKIP
-    >>> capture = expose(signals, sensor)  # doctest: +SKIP
+    >>> signals = load_signals("out/signals.npz")  # doctest: +SKIP
+    >>> capture = expose(signals, sensor, sensor.default_detector)  # doctest: +SKIP
     """
     path = Path(path)
     settings = _settings(path)
@@ -93,7 +100,7 @@ def load_signals(path: str | Path) -> StillSignals:
     except (ValueError, TypeError) as error:
         raise FileFormatError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
     if len(set(responses)) < len(responses):
-        raise FileFormatError(f"{path}: expected responses that differ, got one twice.")
+        raise FileFormatError(f"{path}: expected different responses, got one twice.")
     sizes = {"h": rig.camera.height, "w": rig.camera.width}
     specs = {**_PASS, "settings": SETTINGS, "error_projector": _OPTIONAL}
     for i, response in enumerate(responses):
@@ -116,11 +123,12 @@ def load_signals(path: str | Path) -> StillSignals:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LightPass(ShortRepr):
-    """A transport pass as results keep it: all parts of its signals except the channels.
+    """A light-transport pass without its channels, as a result keeps it.
 
-    energy : EnergySplit. truth : GroundTruth.
-    motion_m : (h, w) float32, metres, see `Signals.motion_m`; None: nothing moves.
-    truncation : Truncation, estimate of the light that is left out; None: not known.
+    energy : EnergySplit.
+    truth : GroundTruth.
+    motion_m : (h, w) float32, metres, as `Signals.motion_m`; None: nothing moves.
+    truncation : Truncation, the light that was left out; None: not known.
     """
 
     energy: EnergySplit
@@ -130,18 +138,12 @@ class LightPass(ShortRepr):
 
     @classmethod
     def of(cls, signals: Signals) -> LightPass:
-        """The pass that the signals come from."""
+        """The pass that these signals are from."""
         return cls(signals.energy, signals.truth, signals.motion_m, signals.truncation)
 
 
 def write_pass(light_pass: LightPass, path: str | Path) -> None:
-    """Write a pass to a compressed .npz file; `read_pass` reads it back.
-
-    Raises
-    ------
-    FileFormatError
-        The file cannot be written.
-    """
+    """Write a pass to a compressed .npz file."""
     write_arrays(path, _pass_arrays(light_pass))
 
 
@@ -150,7 +152,7 @@ def read_pass(path: Path, sizes: dict[str, int]) -> LightPass:
 
     Parameters
     ----------
-    sizes : height "h" and width "w" of its images, in pixels.
+    sizes : height "h" and width "w" that the images must have, pixels.
 
     Raises
     ------
@@ -163,12 +165,11 @@ def read_pass(path: Path, sizes: dict[str, int]) -> LightPass:
 
 
 def _truncation(data: dict[str, np.ndarray]) -> Truncation | None:
-    """Truncation in the arrays of a file; None if there is none."""
     return Truncation(*map(float, data["truncation"])) if "truncation" in data else None
 
 
 def _pass_arrays(signals: Signals | LightPass) -> dict[str, np.ndarray]:
-    """Arrays of signals besides their channels, by their names in files."""
+    """The arrays of a pass by their names in files."""
     arrays = {f"energy_{f.name}": getattr(signals.energy, f.name) for f in fields(EnergySplit)}
     arrays |= {f"truth_{f.name}": np.asarray(getattr(signals.truth, f.name)) for f in fields(GroundTruth)}
     if signals.motion_m is not None:
@@ -179,7 +180,7 @@ def _pass_arrays(signals: Signals | LightPass) -> dict[str, np.ndarray]:
 
 
 def _energy_and_truth(path: Path, data: dict[str, np.ndarray]) -> tuple[EnergySplit, GroundTruth]:
-    """Energy split and ground truth in the arrays of a file."""
+    """Energy split and ground truth made of the arrays of a pass; FileFormatError for an index without a name."""
     for ids in ("instance", "material"):
         if data[f"truth_{ids}"].max(initial=-1) >= len(data[f"truth_{ids}_names"]):
             raise FileFormatError(f"{path}: array truth_{ids}: expected indices into truth_{ids}_names.")
@@ -191,7 +192,7 @@ def _energy_and_truth(path: Path, data: dict[str, np.ndarray]) -> tuple[EnergySp
 
 
 def _settings(path: Path) -> dict[str, Any]:
-    """Settings in a file of signals; FileFormatError if it is none, or of another version."""
+    """The settings of a file of signals, checked in size before they are read."""
 
     def check(name: str, place: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         if dtype != np.uint8 or len(shape) != 1 or shape[0] > MAX_SETTINGS:
@@ -209,7 +210,7 @@ def _settings(path: Path) -> dict[str, Any]:
 
 
 def _plain(response: Response) -> dict[str, Any]:
-    """Plain data of a response; ValueError if no response can be made of them again."""
+    """A response as plain data; ValueError if it could not be read back."""
     name = type(response).__name__
     if not hasattr(response, "type_name"):
         raise ValueError(f"expected responses with a type_name, which names them in files, got {name} without one.")

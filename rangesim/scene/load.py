@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes from Mitsuba XML, dictionaries and bare meshes."""
+"""Loading of scenes from Mitsuba XML, from scene dictionaries and from bare meshes."""
 
 from __future__ import annotations
 
@@ -60,13 +60,14 @@ from rangesim.scene.spectral_reflectance import (
     coloured_materials,
     take_sensor_reflectances,
     warn_of_colours,
-    warn_of_lamps_behind_glass,
+    warn_of_emitters_behind_glass,
 )
 from rangesim.settings.bounds import Bounds, check_number
 
 IGNORED_ELEMENTS = ("integrator", "sampler", "rfilter")
-"""Elements of a scene file that do not matter, so that a parameter without a value there needs none."""
+"""Elements of a scene file that are ignored. A parameter that stands in one of them therefore needs no value."""
 Source = str | Path | Mapping[str, Any]
+"""Anything that `load_scene` accepts: a path, the name of a bundled scene, or a scene dictionary."""
 
 
 def load_scene(
@@ -77,30 +78,43 @@ def load_scene(
     sensor: int | None = None,
     variant: str | None = None,
 ) -> Scene:
-    """A scene to measure.
+    """Load a scene to measure.
 
     Parameters
     ----------
-    source : path of a Mitsuba 3 XML file or of a mesh (PLY, OBJ, GLB, STL), the name of a scene that comes with the
-        package (`rangesim.files.bundled_scenes.scene_names`; a file of that name goes first), or a Mitsuba scene
-        dictionary. XML and dictionary must hold a perspective sensor, which becomes the camera; integrator, film filter
-        and sampler are ignored. Projectors in it count as ambient light. A mesh is put on a matte table before a
-        camera. A shape or BSDF may set `<string name="material_class" value="..."/>` to override its derived class.
-        `<include filename="materials/silver.xml"/>` finds the material catalogue from anywhere (docs/materials.md);
-        files beside the scene come first. BSDFs of type `retroreflector` are known (`rangesim.scene.retroreflector`).
-    material : material class of a bare mesh, one of matte (default), glossy, mirror, transparent.
-    unit_m : metres per unit of length of a bare mesh, 0.001 for one in millimetres; default 1.
-    sensor : which of the scene's sensors becomes the camera; default the first, with a warning if there are several.
-    variant : Mitsuba variant; default CUDA where there is a GPU, else LLVM.
+    source : one of
+
+        - the path of a Mitsuba 3 XML file;
+        - the path of a mesh (PLY, OBJ, GLB, STL, OFF), which is put on a matte table in front of a camera;
+        - the name of a scene that comes with the package (`rangesim.files.bundled_scenes.scene_names`), unless a file
+          of that name exists;
+        - a Mitsuba scene dictionary.
+
+        An XML file or a dictionary must hold a perspective sensor, which becomes the camera. Its integrator, film
+        filter and sampler are ignored. A `projector` emitter in it is ambient light. The material class of a shape is
+        derived from its BSDF, unless shape or BSDF state `<string name="material_class" value="..."/>`.
+        `<include filename="materials/silver.xml"/>` finds the material catalogue from everywhere (docs/materials.md),
+        but a file beside the scene comes first. BSDFs may be of type `retroreflector`
+        (`rangesim.scene.retroreflector`).
+    material : material class of a bare mesh: matte (default), glossy, mirror or transparent.
+    unit_m : metres per unit of length of a bare mesh, for example 0.001 for millimetres; default 1.
+    sensor : index of the sensor of the scene that becomes the camera. By default it is the first, with a warning if the
+        scene has several.
+    variant : Mitsuba variant; by default CUDA if there is a GPU, else LLVM.
 
     Raises
     ------
     FileFormatError
-        Missing, broken or empty file, a scene without a perspective sensor, or with shapes that cannot be traced
-        (instances; participating media other than homogeneous ones: those that scatter inside closed shapes with a
-        `null` BSDF, those that absorb alone also inside and around bodies that refract).
+        The file is missing, broken or empty; the scene has no perspective sensor; or it has shapes that cannot be
+        traced. These are instances, and participating media that are not homogeneous. A medium that scatters must fill
+        a closed shape with a `null` BSDF; one that only absorbs may also fill a body that refracts, or surround one.
     ValueError
-        Unknown material class, or one for a scene that names its own; no such sensor.
+        The material class is unknown, or given for a scene that has materials of its own; or there is no such sensor.
+
+    Examples
+    --------
+    >>> load_scene("tabletop")  # doctest: +SKIP
+    Scene('tabletop', 12 shapes, camera 640 x 480)
     """
     if not isinstance(source, (str, Path, Mapping)):
         raise ValueError(f"expected a path or a scene dictionary, got {type(source).__name__} {source!r}.")
@@ -122,7 +136,7 @@ def load_scene(
     _check(loaded, ids, sensor, label)
     if chosen is None and (n := len(loaded.sensors())) > 1:
         warn(f"{label} has {n} sensors, and the first becomes the camera; Python's load_scene(sensor=) takes another.")
-    warn_of_lamps_behind_glass(loaded, label)
+    warn_of_emitters_behind_glass(loaded, label)
     repeat_normals(loaded)
     camera, T_camera = camera_of(loaded.sensors()[sensor], label)
     working_distance_m = _median_depth(loaded, camera, T_camera)
@@ -147,7 +161,10 @@ def load_scene(
 def _instantiate(
     source: Source, material: str, unit_m: float, sensor: int, label: str, advises: bool = False
 ) -> tuple[Any, set[str], dict[str, str], np.ndarray]:
-    """The Mitsuba scene, the ids of its shapes, the material classes that the file states, and the scene's origin."""
+    """The Mitsuba scene, the ids of its shapes, the material classes stated in the file, and the origin (3,), metres.
+
+    advises : whether to warn of settings that probably are mistakes.
+    """
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = config.merge_equivalent = False  # merged shapes would lose their instance ids
 
@@ -187,7 +204,7 @@ def _instantiate(
             raise FileFormatError(f"{label} does not fit into memory; use smaller meshes and images.") from None
         except (RuntimeError, TypeError, OverflowError, UnicodeDecodeError) as error:
             reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
-            # a traceback is of a BSDF in Python
+            # A BSDF written in Python, such as the retroreflector, adds its traceback
             reason = re.sub(r"Traceback \(most recent call last\): .* (?=\w+Error: )", "", reason)
             raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
     warn_of_colours(coloured, label)
@@ -226,17 +243,17 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, names: Utf
 
 
 class _SearchPaths:
-    """Mitsuba's search paths while a file is checked, with those that the file itself adds."""
+    """Search paths of Mitsuba while a file is checked, including those that the file itself adds."""
 
     def __init__(self, paths: Any) -> None:
         self.paths = paths
 
     def resolve(self, name: str) -> Path:
-        """Path of the file of a name, which may be missing."""
+        """Path of the file with a name; it need not exist."""
         return Path(str(self.paths.resolve(name)))
 
     def within(self, folder: str, beside: Path) -> _SearchPaths:
-        """Paths with a folder before those so far: one beside the file, else one in these."""
+        """These paths with a folder in front: the one beside the file, or else the one found by these paths."""
         near, paths = beside.parent / folder, mi.FileResolver(self.paths)
         paths.prepend(str(near if os.path.exists(near) else self.resolve(folder)))
         return _SearchPaths(paths)
@@ -244,12 +261,12 @@ class _SearchPaths:
 
 @contextmanager
 def _own_file_resolver(names: Utf8Names) -> Iterator[None]:
-    """Search paths of this scene, forgotten afterwards, so that no scene finds another's files."""
+    """Search paths for one scene. They are restored afterwards, so that no scene finds files of another."""
     before = mi.file_resolver()
     mi.set_file_resolver(mi.FileResolver(before))
     resolver = mi.file_resolver()
     here = os.path.realpath(os.curdir)
-    if not is_utf8(here):  # Mitsuba has it among its paths, and can find files there, but not say where they are
+    if not is_utf8(here):  # Mitsuba finds files there too, but cannot return their paths
         resolver.prepend(str(names.of(Path(here))))  # type: ignore[attr-defined]
     resolver.prepend(str(OF_MITSUBA))  # type: ignore[attr-defined]
     try:
@@ -289,19 +306,22 @@ def _is_mesh(source: Source) -> bool:
 
 
 def _looks_elsewhere(scene: Any, sensor: int, place: np.ndarray, label: str) -> bool:
-    """Whether a camera is farther from the origin than from what it sees: that is far from the origin then, too."""
+    """Whether a camera is so much farther from the origin than from what it sees that this is far away as well."""
     camera, T_camera = camera_of(scene.sensors()[sensor], label)
     return bool(np.linalg.norm(place) > AS_FAR * _median_depth(scene, camera, T_camera))
 
 
 def _median_depth(scene: Any, camera: Intrinsics, T_camera: np.ndarray) -> float:
-    """Median z over a coarse grid of camera rays; 1 where the camera sees nothing. `T_camera` is to the renderer."""
+    """Median depth in metres over a coarse grid of camera rays; 1 if the camera sees nothing.
+
+    T_camera : (4, 4) maps camera coordinates to the renderer's coordinates.
+    """
     z = _depths(scene, camera, T_camera)
     return float(np.nanmedian(z)) if np.isfinite(z).any() else 1.0
 
 
 def _depths(scene: Any, camera: Intrinsics, T_camera: np.ndarray, columns: int = 64) -> np.ndarray:
-    """(n,) float32, z in metres over a coarse grid of camera rays, NaN where they meet nothing."""
+    """(n,) float32, depth z in metres along a coarse grid of camera rays; NaN where a ray meets no surface."""
     grid = camera.resized(columns, max(1, round(columns * camera.height / camera.width)))
     directions = grid.directions(grid.pixel_centres()).reshape(-1, 3) @ T_camera[:3, :3].T
     ray = mi.Ray3f(o=mi.Point3f(*map(float, T_camera[:3, 3])), d=mi.Vector3f(directions.T.astype(np.float32)))

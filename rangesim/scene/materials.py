@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Material classes: how a surface treats the light of a range sensor, read off its BSDF."""
+"""Material classes: the behaviour of a surface towards a range sensor, derived from its BSDF."""
 
 from __future__ import annotations
 
@@ -10,31 +10,41 @@ import mitsuba as mi
 import numpy as np
 
 MATERIAL_CLASSES = ("matte", "glossy", "mirror", "transparent", "translucent", "other")
-"""matte: diffuse. glossy: a diffuse or wide lobe under a specular one. mirror: (nearly) specular reflection only.
-transparent: (nearly) specular refraction. translucent: scattered transmission. other: none of these."""
+"""Names of the material classes.
 
-SMOOTH = 0.05
-"""Microfacet roughness alpha up to which a surface looks polished to a range sensor."""
+- matte: diffuse reflection only.
+- glossy: a diffuse lobe together with a specular one, or a wide lobe alone.
+- mirror: specular reflection only, or nearly so.
+- transparent: specular refraction, or nearly so.
+- translucent: scattered transmission.
+- other: none of these.
+"""
+
+MAX_POLISHED_ALPHA = 0.05
+"""Largest microfacet roughness alpha, dimensionless, of a surface that counts as polished: its lobe is about 2 alpha =
+6 degrees wide. A larger value would call brushed metal a mirror; it changes only the class, not the light."""
 
 MAX_NARROW_ALPHA = 0.03
-"""Microfacet roughness alpha up to which light paths that start elsewhere hardly meet the lobe: its solid angle,
-about pi (2 alpha)^2, is a five-hundredth of a hemisphere there."""
+"""Largest microfacet roughness alpha, dimensionless, of a narrow lobe. Its solid angle, about pi (2 alpha)^2, is then
+at most a five-hundredth of a hemisphere, so light paths that start elsewhere hardly ever meet it."""
 
 ALL_COMPONENTS = 0xFFFFFFFF
+"""Mask of all components of a BSDF, as in `mitsuba.BSDFContext`."""
 
 _TEXTURE_PARTS = re.compile(r"(\.color[01])*(\.value|\.data)?$")
-"""The end of a parameter's name that tells which part of a texture it is."""
+"""End of the name of a parameter that only says which part of a texture it is."""
 _ALPHAS = ("alpha", "alpha_u", "alpha_v")
+"""Names of the parameters that hold a microfacet roughness."""
 
 
 def material_class(bsdf: Any) -> str:
-    """One of `MATERIAL_CLASSES`, from the lobes of a mitsuba.BSDF and its roughness.
+    """The class out of `MATERIAL_CLASSES` of a mitsuba.BSDF, from its lobes and their roughness.
 
-    Wrappers (`twosided`, `mask`, `bumpmap`) count as what they wrap; a blend has the lobes of all its parts.
+    A wrapper (`twosided`, `mask`, `bumpmap`) has the class of the BSDF inside; a blend has the lobes of all its parts.
     """
     parameters = _numbers(bsdf)
     alphas = _alphas(parameters)
-    polished = all(alpha <= SMOOTH for alpha in alphas)
+    polished = all(alpha <= MAX_POLISHED_ALPHA for alpha in alphas)
     delta = _has(bsdf, "DeltaReflection") or (polished and _has(bsdf, "GlossyReflection"))
     if _has(bsdf, "DeltaTransmission", "GlossyTransmission") or _has_thin_glass(bsdf):
         return "transparent" if polished else "translucent"
@@ -50,48 +60,49 @@ def material_class(bsdf: Any) -> str:
 
 
 def is_cutout(bsdf: Any) -> bool:
-    """Whether the surface has holes (`mask`, `null`); thin glass, which light passes unchanged as well, is none."""
+    """Whether the surface has holes (`mask`, `null`). Thin glass has none, although light passes it unchanged too."""
     return holes(bsdf) != 0
 
 
 def has_narrow_lobe(bsdf: Any) -> bool:
-    """Whether a mitsuba.BSDF has a lobe that is as narrow as a mirror's nearly, but no delta interaction."""
+    """Whether a mitsuba.BSDF has lobes almost as narrow as those of a mirror, but not delta distributions."""
     alphas = _alphas(_numbers(bsdf))
     return _has(bsdf, "GlossyReflection", "GlossyTransmission") and bool(alphas) and max(alphas) <= MAX_NARROW_ALPHA
 
 
 def is_closed_mask(bsdf: Any) -> bool:
-    """Whether the surface is a `mask` whose opacity is 1 everywhere, over what lets nothing through unchanged."""
+    """Whether the surface is a `mask` with opacity 1 everywhere, around a BSDF without thin glass."""
     return bool(bsdf.class_name() == "MaskBSDF" and not _has_thin_glass(bsdf) and _numbers(bsdf).get("opacity") == 1)
 
 
 def holes(bsdf: Any) -> int:
-    """Bits of the components of a mitsuba.BSDF that are holes: light passes there as if nothing were there."""
+    """Bits of the components of a mitsuba.BSDF that are holes, where light passes as if there were no surface."""
     if not _has(bsdf, "Null"):
         return 0
     if not _has_thin_glass(bsdf):
         return ALL_COMPONENTS
-    return 1 << (bsdf.component_count() - 1) if bsdf.class_name() == "MaskBSDF" else 0  # of a mask, the last one
+    # A mask has its hole as the last component
+    return 1 << (bsdf.component_count() - 1) if bsdf.class_name() == "MaskBSDF" else 0
 
 
 def transmits(bsdf: Any) -> bool:
-    """Whether light gets through the material itself, not through its holes alone."""
+    """Whether light passes through the material itself, not only through its holes."""
     return _has(bsdf, "DiffuseTransmission", "GlossyTransmission", "DeltaTransmission") or _has_thin_glass(bsdf)
 
 
 def is_matte(shape: Any) -> bool:
-    """Whether a surface is nothing but a diffuse reflector, without holes and with nothing inside that scatters."""
+    """Whether a surface is a diffuse reflector only, without holes and without a medium inside."""
     flags = shape.bsdf().flags() & mi.BSDFFlags.All.value
     return bool(flags == flags & mi.BSDFFlags.DiffuseReflection.value != 0) and shape.interior_medium() is None
 
 
 def has_texture(bsdf: Any) -> bool:
-    """Whether the reflectance of a matte mitsuba.BSDF is not the same everywhere."""
+    """Whether the reflectance of a matte mitsuba.BSDF varies over the surface."""
     return any(not name.endswith("reflectance.value") for name in mi.traverse(bsdf).keys())  # noqa: SIM118
 
 
 def _has_thin_glass(bsdf: Any) -> bool:
-    """Whether a `thindielectric` is in it: what passes that has the flag of what passes a hole."""
+    """Whether the BSDF contains a `thindielectric`, whose transmission has the same flag as a hole."""
     parts = mi.traverse(bsdf).hierarchy if _has(bsdf, "Null") else {}
     return any(isinstance(part, mi.BSDF) and part.class_name() == "ThinDielectric" for part in parts)
 
@@ -101,20 +112,20 @@ def _has(bsdf: Any, *lobes: str) -> bool:
 
 
 def _alphas(parameters: dict[str, float]) -> list[float]:
-    """The microfacet roughnesses among the parameters of a BSDF."""
+    """Values of the microfacet roughness among the parameters of a BSDF."""
     alphas = [parameters[key] for key in _ALPHAS if key in parameters]
     return alphas + ([parameters["roughness"] ** 2] if "roughness" in parameters else [])  # principled (Burley 2012)
 
 
 def _numbers(bsdf: Any) -> dict[str, float]:
-    """Parameters that hold one number, by their last name: `nested_bsdf.alpha.value` is `alpha`.
+    """Parameters of a BSDF that are one number, by the last part of their name: `nested_bsdf.alpha.value` is `alpha`.
 
-    A texture counts as its mean; one whose values are not its own (`mesh_attribute`) as NaN.
+    A texture counts with its mean; one whose values are in the mesh (`mesh_attribute`) counts as NaN.
     """
     values: dict[str, list[float]] = {}
     try:
         parameters = list(mi.traverse(bsdf))
-    except TypeError:  # Mitsuba 3.9 cannot list those of `hair` in a variant of one wavelength
+    except TypeError:  # Mitsuba 3.9 cannot list the parameters of `hair` in a monochrome variant
         return {}
     for key, value in parameters:
         if isinstance(value, (float, mi.Float, mi.TensorXf)):

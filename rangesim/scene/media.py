@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The media of shapes: which ones are traced, and their numbers."""
+"""Participating media of shapes: their coefficients, and which of them can be traced."""
 
 from __future__ import annotations
 
@@ -17,30 +17,33 @@ _OBLIQUE = np.array(
     ]
 )
 DIRECTIONS = _OBLIQUE / np.linalg.norm(_OBLIQUE, axis=1, keepdims=True)
-"""(7, 3) float64, unit vectors to all sides, oblique to the axes, along which edges of shapes like to lie."""
+"""(7, 3) float64, unit vectors to all sides. None is along an axis, because edges of shapes often are, and a ray that
+meets an edge may be counted wrongly. Seven is odd, so a majority exists."""
 MAX_SURFACES = 64
-"""Number of surfaces, one behind another, that are looked through for the bodies a place is in."""
+"""Number of surfaces along a ray after which the search for enclosing bodies stops; surfaces beyond are ignored. A
+larger number costs time only where a ray crosses more surfaces."""
 
 
 def is_boundary(shape: Any) -> bool:
-    """Whether a medium fills the shape behind a boundary of matched index, so that light walks through it."""
+    """Whether the shape is a boundary of matched index (BSDF `null`) that is filled with a medium."""
     has_interior = bool(shape.is_medium_transition()) and shape.interior_medium() is not None
     return has_interior and _lobes(shape.bsdf()) == int(mi.BSDFFlags.Null)
 
 
 def medium_numbers(medium: Any) -> tuple[float, float, float]:
-    """sigma_t (1/m), albedo and g of a homogeneous mitsuba.Medium."""
+    """Coefficients of a homogeneous mitsuba.Medium: sigma_t in 1/m, the albedo, and the mean cosine g of scattering."""
     at = dr.zeros(mi.MediumInteraction3f, 1)
     sigma_s, _, sigma_t = (float(mi.unpolarized_spectrum(c)[0][0]) for c in medium.get_scattering_coefficients(at))
-    g = np.ravel(dict(mi.traverse(medium)).get("phase_function.g", 0.0))[0]  # isotropic: no such entry
+    g = np.ravel(dict(mi.traverse(medium)).get("phase_function.g", 0.0))[0]  # isotropic media have no such entry
     return sigma_t, sigma_s / sigma_t if sigma_t else 0.0, float(g)
 
 
 def why_not_traced(shape: Any) -> str | None:
-    """What keeps the media of a shape from being traced; None: nothing.
+    """The reason why the media of a shape cannot be traced, as the end of a sentence; None if they can.
 
-    A medium that scatters fills a shape behind a boundary of matched index; one that absorbs alone may also fill a body
-    that refracts, or lie around either (`rangesim.light_transport.absorption`).
+    A medium that scatters must fill a shape whose boundary has a matched index of refraction. A medium that only
+    absorbs may also fill a body that refracts, or surround such a shape or body
+    (`rangesim.light_transport.absorption`).
     """
     if not shape.is_medium_transition():
         return None
@@ -61,10 +64,10 @@ def why_not_traced(shape: Any) -> str | None:
 
 
 def body_around(scene: Any, place: np.ndarray) -> str | None:
-    """The id of a shape that is filled with a medium and has a place (3,), metres, inside; None if there is none.
+    """The id of a shape that is filled with a medium and contains a place (3,), metres; None if there is none.
 
-    Rays in several directions count how often each such shape is left and entered, by the side of its normals. The
-    place is inside where most of them leave it more often than they enter it.
+    Rays in several directions count how often they leave and enter each filled shape, judged by its normals. The place
+    is inside a shape if most rays leave it more often than they enter it.
     """
     filled = [shape for shape in scene.shapes() if shape.interior_medium() is not None]
     filled = [shape for shape in filled if medium_numbers(shape.interior_medium())[0] > 0]
@@ -79,10 +82,12 @@ def body_around(scene: Any, place: np.ndarray) -> str | None:
 
 
 def _crossings(scene: Any, place: np.ndarray, directions: np.ndarray) -> Iterator[tuple[np.ndarray, Any]]:
-    """The surfaces that rays from a place (3,), metres, in directions (n, 3) pass, one behind another.
+    """The surfaces that rays from a place (3,), metres, in directions (n, 3) cross, one after another.
 
-    Yields (n,) int64, 1 where a ray passes along the normal, -1 against it, 0 where there is no further surface; and
-    the shapes, n pointers of Mitsuba.
+    Yields
+    ------
+    outward : (n,) int64, 1 where a ray crosses along the normal, -1 against it, 0 where it meets no further surface.
+    shapes : n pointers of Mitsuba to the shapes crossed.
     """
     ray = mi.Ray3f(o=mi.Point3f(*map(float, place)), d=mi.Vector3f(np.asarray(directions, np.float32).T))
     active = mi.Bool(True)
@@ -96,17 +101,17 @@ def _crossings(scene: Any, place: np.ndarray, directions: np.ndarray) -> Iterato
 
 
 def inside_out(scene: Any, place: np.ndarray, directions: np.ndarray) -> tuple[str, str] | None:
-    """A medium that the way from a place in air goes through although no body that holds it was entered.
+    """A shape that rays leave without having entered it, which means that its normals point the wrong way.
 
     Parameters
     ----------
-    place : (3,) metres. directions : (n, 3), of rays from there.
+    place : (3,) metres, in air. directions : (n, 3), directions of rays from there.
 
     Returns
     -------
-    The id of a shape, and "interior" if most of the rays that first meet it outside of all bodies leave it there (its
-    normals point inwards), "exterior" if most enter it there from a medium that is around it; None if there is no such
-    shape.
+    None if there is no such shape; else its id and a side. The side is "interior" if most rays that first meet the
+    shape outside of all bodies leave its interior medium there, so that its normals point inwards. It is "exterior" if
+    most of them come from its exterior medium, although they started in air.
     """
     filled, around = (
         [s for s in scene.shapes() if m(s) is not None and medium_numbers(m(s))[0] > 0]
@@ -114,7 +119,7 @@ def inside_out(scene: Any, place: np.ndarray, directions: np.ndarray) -> tuple[s
     )
     if not filled and not around:
         return None
-    bodies = np.zeros(len(directions), np.int64)  # that a ray is in
+    bodies = np.zeros(len(directions), np.int64)  # number of bodies that each ray is inside of
     sides = [(s, "interior", 1) for s in filled] + [(s, "exterior", -1) for s in around]
     votes, unmet = [0] * len(sides), [np.ones(len(directions), bool) for _ in sides]
     for outward, shapes in _crossings(scene, place, directions):
@@ -136,7 +141,7 @@ def _why_not_homogeneous(medium: Any) -> str | None:
 
 
 def _why_not_absorbing(bsdf: Any, media: list[Any]) -> str | None:
-    """What keeps media from being traced on the sides of a surface that is no boundary of matched index."""
+    """The reason why media beside a surface that is no boundary of matched index cannot be traced; None if they can."""
     if any(medium_numbers(medium)[1] > 0 for medium in media):
         bounds = f"bounds a medium that scatters by a {bsdf.class_name()}"
         return f"{bounds}; only boundaries of matched index are traced (null)"

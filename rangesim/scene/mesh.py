@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bare mesh becomes a scene: on a matte table, in front of a camera."""
+"""A scene around a bare mesh: a matte table, a camera and some ambient light."""
 
 from __future__ import annotations
 
@@ -18,32 +18,47 @@ from rangesim.settings.bounds import MAX_COORDINATE_M
 from rangesim.settings.config import brief, nearest
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
+"""Suffixes of files that are taken for meshes."""
 Y_UP_SUFFIXES = (".glb", ".gltf")
-"""glTF defines y as up; the other formats define nothing, and z is taken."""
-
+"""Suffixes of formats in which y points up. glTF defines this; for the other formats, which define nothing, z is up."""
 MESH_MATERIALS: dict[str, dict[str, Any]] = {
     "matte": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.6}},
     "glossy": {"type": "twosided", "bsdf": {"type": "roughplastic", "diffuse_reflectance": 0.5, "alpha": 0.1}},
     "mirror": {"type": "twosided", "bsdf": {"type": "conductor", "material": "Ag"}},
     "transparent": {"type": "dielectric", "int_ior": "bk7"},
 }
+"""BSDFs for bare meshes by material class, as Mitsuba dictionaries."""
 
 
 def scene_around_mesh(path: Path, material: str, unit_m: float, folder: Path, advises: bool = False) -> dict[str, Any]:
-    """Mitsuba scene dictionary with the mesh standing on a table, camera 640 x 480, 57 degrees wide.
+    """Mitsuba scene dictionary of a mesh that stands on a table in front of a camera.
 
-    `unit_m` is the length of the mesh's unit in metres; table and camera distance follow the size of the mesh.
-    Mitsuba reads fewer formats than there are, so it gets a copy of the mesh in `folder`, which must live until the
-    scene is instantiated. With `advises`, vertices that single precision has rounded are warned of.
+    The camera has 640 x 480 pixels and a field of view of 57 degrees. The size of the table and the distance of the
+    camera follow the size of the mesh. Mitsuba reads fewer formats than trimesh, so it gets a copy of the mesh.
+
+    Parameters
+    ----------
+    path : file of the mesh.
+    material : key of `MESH_MATERIALS`.
+    unit_m : metres per unit of length of the mesh.
+    folder : folder for the copy, which must exist until the scene is instantiated.
+    advises : whether to warn if single precision has rounded the vertices.
+
+    Raises
+    ------
+    ValueError
+        Unknown material.
+    FileFormatError
+        The file is missing, broken or too large, or holds no triangles of finite size.
     """
     if material not in MESH_MATERIALS:
         hint = nearest(material, MESH_MATERIALS)
         raise ValueError(f"expected a material out of {', '.join(MESH_MATERIALS)}, got {material!r}{hint}.")
     vertices, faces = _read(path)
-    with np.errstate(over="ignore"):  # what is too large is refused below
+    with np.errstate(over="ignore"):  # coordinates that are too large are refused below
         is_single = np.array_equal(vertices, np.float32(vertices))
     if advises and is_single:
-        offset = np.clip(0, vertices.min(axis=0), vertices.max(axis=0))  # of the mesh from the origin of the file
+        offset = np.clip(0, vertices.min(axis=0), vertices.max(axis=0))  # of the mesh from the file's origin
         warn_of_coarse_mesh(Rounding(unit_m * rounding_of(offset), path.stem), str(path))
     vertices = vertices * unit_m
     if path.suffix.lower() in Y_UP_SUFFIXES:
@@ -82,14 +97,14 @@ def scene_around_mesh(path: Path, material: str, unit_m: float, folder: Path, ad
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) float64 vertices in metres and (m, 3) faces of a mesh file, parts of a scene graph put in their places."""
+    """Vertices (n, 3), in units of the file, and faces (m, 3) of a mesh file; the parts of a scene graph are joined."""
     import trimesh
 
-    logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it says there what it also raises
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())  # trimesh logs what it also raises
     check_file(path, FileFormatError)
 
     class Beside(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
-        """Finds the files that a mesh refers to: plain files beside it or below."""
+        """Finds the files that a mesh refers to, which must be plain files beside it or below."""
 
         def get(self, name: str) -> bytes:
             check_file(Path(self.parent) / name.strip(), FileFormatError)
@@ -100,7 +115,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
             mesh = trimesh.load_mesh(path, process=False, skip_materials=True, resolver=Beside(str(path)))
     except FileFormatError as error:
         raise FileFormatError(f"{path} refers to a file beside it: {error}") from error
-    except Exception as error:  # each of trimesh's parsers fails in its own way
+    except Exception as error:  # every parser of trimesh raises errors of its own
         reason = brief(error) or type(error).__name__
         raise FileFormatError(f"expected a mesh in {path}, but it cannot be read: {reason}.") from error
     vertices, faces = np.asarray(mesh.vertices), np.asarray(getattr(mesh, "faces", ()))
@@ -115,7 +130,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _write(folder: Path, vertices: np.ndarray, faces: np.ndarray) -> str:
-    """Name of a PLY file in `folder` with this mesh."""
+    """Path of a new PLY file in `folder` that holds the mesh."""
     import trimesh
 
     target = folder / "mesh.ply"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PLY and serialized files that a scene names, checked before Mitsuba reads them.
+"""Checks of the PLY and serialized files that a scene names, before Mitsuba reads them.
 
-Mitsuba 3.9 computes normals before anybody can look at the mesh: a face of a vertex that is not there reads, and
-writes, outside the arrays. Of a negative index it makes vertex 0.
+Mitsuba 3.9 computes vertex normals while it loads a mesh. A face with the index of a missing vertex makes it read and
+write outside of its arrays, and it takes a negative index for vertex 0.
 """
 
 from __future__ import annotations
@@ -25,44 +25,50 @@ _TYPES = (
     | {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
     | {"half": "f2", "float": "f4", "double": "f8", "float16": "f2", "float32": "f4", "float64": "f8"}
 )
-"""Types of a property, in Mitsuba's words, as of NumPy."""
+"""NumPy's name of each type that a property of a PLY file may have for Mitsuba."""
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+"""NumPy's letter of the byte order for each format of a PLY file; empty for text."""
 _MAX_HEADER = 1 << 20
-"""Bytes of a header, a longer one is refused."""
+"""Largest size of a header in bytes. A header is a few lines of text; without a limit, a huge file without an end of
+header would be searched completely."""
 _MAGIC = 0x041C
-"""First two bytes of a serialized file, as Mitsuba writes them."""
+"""Number in the first two bytes of a serialized file, from the format of Mitsuba."""
 _DOUBLE = 0x2000
-"""Flag of a serialized file whose numbers are of double precision."""
+"""Flag in a serialized file that its numbers are of double precision, from the format of Mitsuba."""
 _NUMBERS_PER_VERTEX = {0x1: 3, 0x2: 2, 0x8: 3}
-"""Numbers of a vertex beside its place, by flag of a serialized file: normals, texture coordinates, colours."""
+"""Count of numbers per vertex that each flag of a serialized file adds to the position: for a normal, texture
+coordinates, and a colour."""
 _CORNERS = 3
-"""Entries of each list of a PLY face: Mitsuba takes every face for a triangle."""
+"""Count of entries in each list of a PLY face, because Mitsuba takes every face for a triangle."""
 
 
 @dataclass
 class _Element:
-    """An element of a PLY file: how many records it has, and the type of each field of a record."""
+    """An element of a PLY file, such as "vertex" or "face".
+
+    count : number of its records. types : NumPy type of each field of a record. corners : indices of the fields that
+    are entries of a list.
+    """
 
     name: str
     count: int
     types: list[str] = field(default_factory=list)
     corners: list[int] = field(default_factory=list)
-    """Fields that are entries of a list."""
 
     def add(self, words: list[str]) -> None:
-        """A property, as a line of the header states it."""
+        """Add the property that a line of the header states."""
         if words[1] == "list":
             start = len(self.types) + 1
             self.types += [_TYPES[words[2]]] + [_TYPES[words[3]]] * _CORNERS
             self.corners += range(start, start + _CORNERS)
         else:
             self.types.append(_TYPES[words[1]])
-            if self.name == "face" and words[2] in ("i0", "i1", "i2"):  # so Mitsuba calls the entries of a list
+            if self.name == "face" and words[2] in ("i0", "i1", "i2"):  # Mitsuba's names for the entries of a list
                 raise ValueError(f"a property named {words[2]}")
 
 
 def check_ply(path: Path) -> None:
-    """Raise FileFormatError if a triangle of a PLY file has a vertex that the file lacks, or the file is no PLY."""
+    """Raise FileFormatError if the file is no PLY file, or a triangle has the index of a missing vertex."""
     content = read_file(path, FileFormatError)
     try:
         order, elements, start = _header(content)
@@ -75,7 +81,7 @@ def check_ply(path: Path) -> None:
 
 
 def check_serialized(path: Path, index: int) -> None:
-    """Raise FileFormatError as `check_ply` does, for mesh `index` of a file in Mitsuba's own format, version 3, 4."""
+    """Raise FileFormatError as `check_ply` does, for mesh `index` of a file in Mitsuba's serialized format (3 or 4)."""
     content = read_file(path, FileFormatError)
     try:
         count, indices = _unpacked(content, index)
@@ -96,7 +102,7 @@ def _check_indices(indices: np.ndarray, count: int, path: Path) -> None:
 
 
 def _unpacked(content: bytes, index: int) -> tuple[int, np.ndarray]:
-    """Number of vertices, and (3 faces,) uint32 indices, of a mesh of a serialized file."""
+    """Number of vertices of a mesh of a serialized file, and its (3 * number of faces,) uint32 indices."""
     magic, version = struct.unpack_from("<HH", content)
     if magic != _MAGIC or version not in (3, 4):
         raise ValueError("expected version 3 or 4 of the format")
@@ -123,7 +129,7 @@ def _unpacked(content: bytes, index: int) -> tuple[int, np.ndarray]:
 
 
 def _header(content: bytes) -> tuple[str, list[_Element], int]:
-    """NumPy's letter of the byte order (empty for ASCII), the elements, and where they start."""
+    """NumPy's letter of the byte order (empty for text), the elements, and the byte at which their records start."""
     order, elements, start = None, list[_Element](), 0
     while True:
         end = content.find(b"\n", start, _MAX_HEADER)
@@ -153,7 +159,7 @@ def _header(content: bytes) -> tuple[str, list[_Element], int]:
 
 
 def _indices(content: bytes, order: str, elements: list[_Element], start: int) -> np.ndarray:
-    """(k,) array of all entries of the lists of the faces, in the type of the file."""
+    """(k,) array of the vertex indices of all faces, in the type that the file has."""
     found = np.zeros(0, np.int64)
     words = iter(content[start:].split() if order == "" else ())
     for element in elements:
@@ -173,7 +179,7 @@ def _indices(content: bytes, order: str, elements: list[_Element], start: int) -
 
 
 def _of_text(element: _Element, words: list[bytes]) -> list[np.ndarray]:
-    """The fields of the lists of an element; ValueError if a word is no number of the type of its field."""
+    """The list entries of an element in a text file; ValueError if a word is no number of the type of its field."""
     width = len(element.types)
     if len(words) < element.count * width:
         raise ValueError("it ends early")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scene file says of its shapes, read and completed before Mitsuba makes objects of it."""
+"""Nodes of a parsed scene: checked, completed and stripped of our own keys, before Mitsuba makes objects of them."""
 
 from __future__ import annotations
 
@@ -19,18 +19,21 @@ from rangesim.settings import limits
 from rangesim.settings.config import nearest, shown
 
 CLASS_KEY = "material_class"
+"""Property of a shape or BSDF that states its material class; Mitsuba does not know it."""
 COMPOSITES = ("instance", "shapegroup", "merge")
-"""Shapes that stand for others, whose parts would have neither name nor material."""
+"""Shapes that stand for other shapes. They are refused, because the parts would have neither name nor material."""
 OF_MITSUBA = Path(mi.__file__).resolve().parent
-"""Mitsuba's own directory: its plugins are in `plugins`."""
+"""Directory in which Mitsuba is installed; its plugins are in the folder `plugins` there."""
 IGNORED_PLUGINS = {"Integrator": "path", "Film": "hdrfilm", "Sampler": "independent", "ReconstructionFilter": "box"}
-"""What stands in for a plugin that Mitsuba lacks, by the kind of node, where the kind does not matter."""
+"""Kinds of nodes whose plugin is ignored, each with the plugin of Mitsuba that replaces an unknown one."""
 FILM_SIZES = ("width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
-"""What of a film matters."""
+"""Properties of a film that are used."""
 _OBJECTS = ("Any", "Object", "Reference", "ResolvedReference")
 """Kinds of properties that hold other objects."""
 _LIBRARIES = (".so", ".dylib", ".dll")
+"""Suffixes of shared libraries on Linux, macOS and Windows."""
 _PLAIN_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,99}")
+"""Names of plugins that cannot be part of a path."""
 
 
 @lru_cache(maxsize=1)
@@ -42,9 +45,9 @@ def shipped_types() -> frozenset[str]:
 def check_type(name: str, label: str) -> None:
     """Raise FileFormatError on a plugin type for which Mitsuba would run a library that a scene brings along.
 
-    Mitsuba takes `plugins/NAME.so` out of the first search path that has it. Its own plugins pass (`OF_MITSUBA` has to
-    be the first path, then); of others, plain names that no library has: those that are registered in Python, and those
-    that Mitsuba refuses.
+    Mitsuba loads `plugins/NAME.so` from the first search path that has it. Accepted are the plugins that come with
+    Mitsuba, provided that `OF_MITSUBA` is the first search path, and plain names for which no search path has a
+    library. The latter are registered in Python, or Mitsuba refuses them.
     """
     if name in shipped_types():
         return
@@ -60,15 +63,15 @@ def check_type(name: str, label: str) -> None:
 
 
 def named_file(name: str, label: str) -> Path:
-    """Path of a file that the scene `label` names; it may be missing, which Mitsuba says.
+    """Path of a file that the scene `label` names. The file may be missing; Mitsuba reports that.
 
     Raises
     ------
     FileFormatError
-        It is a pipe, a device or a directory, or larger than the limit `bytes`.
+        The file is a pipe, a device or a directory, or larger than the limit `bytes`.
     """
     path = Path(str(mi.file_resolver().resolve(name)))
-    if os.path.exists(path):  # False also of names that cannot be
+    if os.path.exists(path):  # False for impossible names too
         try:
             check_file(path, FileFormatError)
         except FileFormatError as error:
@@ -85,12 +88,12 @@ def check_types(state: Any, label: str) -> None:
 
 
 def ids_of_shapes(state: Any, label: str) -> set[str]:
-    """Ids of all shapes; an anonymous one gets a unique id first.
+    """Ids of all shapes; a shape without an id gets a unique one first.
 
     Raises
     ------
     FileFormatError
-        There are composite shapes.
+        A shape is composite, or refers to a medium without saying whether it is inside or outside.
     """
     taken = {node.props.id() for node in state.nodes}
     ids = set()
@@ -112,7 +115,10 @@ def ids_of_shapes(state: Any, label: str) -> set[str]:
 
 
 def _check_media(state: Any, node: Any, place: str) -> None:
-    """A medium counts only as the interior (or exterior) of a shape; under another name Mitsuba would pass it over."""
+    """Raise FileFormatError if a shape has a medium under another name than interior or exterior.
+
+    Mitsuba ignores such a medium.
+    """
     for key, value in node.props.items():
         is_medium = (
             isinstance(value, mi.Properties.ResolvedReference)
@@ -123,7 +129,7 @@ def _check_media(state: Any, node: Any, place: str) -> None:
 
 
 def check_camera(state: Any, node: Any, label: str) -> None:
-    """Raise FileFormatError if the node of a sensor states what the light transport does not take into account."""
+    """Raise FileFormatError if a sensor stands in a medium, which the light transport does not support."""
     for _, value in node.props.items():
         is_medium = (
             isinstance(value, mi.Properties.ResolvedReference)
@@ -137,10 +143,10 @@ def check_camera(state: Any, node: Any, label: str) -> None:
 
 
 def replace_ignored_plugins(state: Any) -> None:
-    """Put Mitsuba's own in place of integrators, films and samplers that it does not have.
+    """Replace integrators, films, samplers and filters that Mitsuba does not have by some of its own.
 
-    They belong to a renderer built on Mitsuba, such as mitransient, and what they do is ignored. The size of the image
-    stays.
+    A scene of a renderer built on Mitsuba, such as mitransient, has such plugins. They are ignored anyway; only the
+    size of the film is kept.
     """
     for node in state.nodes:
         own = IGNORED_PLUGINS.get(node.type.name)
@@ -155,9 +161,9 @@ def replace_ignored_plugins(state: Any) -> None:
 
 
 def forget_reading(state: Any) -> None:
-    """Let Mitsuba refuse values that their plugin does not ask for, as misspelt ones: checks have read them all.
+    """Mark all values as not yet read, so that Mitsuba refuses those that no plugin reads, such as misspelt ones.
 
-    Not those of integrators, films and samplers, which do not matter.
+    The checks have read them all, so Mitsuba would miss the mistakes. The nodes of `IGNORED_PLUGINS` are left out.
     """
     for node in state.nodes:
         if node.type.name in IGNORED_PLUGINS:
@@ -168,7 +174,10 @@ def forget_reading(state: Any) -> None:
 
 
 def take_material_classes(state: Any, label: str) -> dict[str, str]:
-    """Shape id -> class, where the shape or its BSDF states one; removes the entries, which Mitsuba does not know."""
+    """Stated material classes by the id of the shape, where the shape or its BSDF states one.
+
+    The entries are removed from the nodes, because Mitsuba does not know them.
+    """
     stated: dict[int, str] = {}
     for index, node in enumerate(state.nodes):
         if CLASS_KEY in node.props:
@@ -190,7 +199,7 @@ def _shapes(state: Any) -> Iterator[tuple[int, Any]]:
 
 
 def _stated_class(state: Any, index: int, stated: dict[int, str]) -> str | None:
-    """Class stated at a node, or at the nearest BSDF inside."""
+    """The material class stated at a node or at the nearest BSDF inside; None if there is none."""
     if index in stated:
         return stated[index]
     for _, value in state.nodes[index].props.items():

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Smooth normals of meshes whose file has none, the same in every load.
+"""Vertex normals of meshes whose file has none, computed so that every load gives the same.
 
-Mitsuba gives a vertex the mean normal of its faces, weighted by their angles there (G. Thuermer and C. A. Wuethrich,
-Computing vertex normals from polygonal facets, Journal of Graphics Tools 3, 1998). Its threads add into the sums in
-whatever order they come, so that the last digits differ from load to load, and with them every path through the
-surface. Here the faces are added in their order.
+Mitsuba gives a vertex the mean normal of its faces, weighted by their angles at the vertex (G. Thuermer and
+C. A. Wuethrich, Computing vertex normals from polygonal facets, Journal of Graphics Tools 3, 1998). Its threads add to
+the sums in a random order, so the last digits differ from load to load, and with them every light path. Here the faces
+are added in their order.
 """
 
 from __future__ import annotations
@@ -16,16 +16,18 @@ import mitsuba as mi
 import numpy as np
 
 EPSILON = float(np.finfo(np.float32).eps)
+"""Relative spacing of numbers in single precision, 1.2e-7."""
 UNKNOWN = (1.0, 0.0, 0.0)
-"""What Mitsuba too takes at a vertex whose faces have no normal, or cancel."""
+"""Unit normal of a vertex whose faces have no area or cancel each other; it is the one that
+Mitsuba uses, so that such a vertex is shaded as in Mitsuba."""
 
 
 def repeat_normals(scene: Any) -> Any:
-    """The mitsuba.Scene itself, whose meshes have vertex normals that every load repeats where Mitsuba has made them.
+    """Replace the vertex normals that Mitsuba has computed for the meshes of a mitsuba.Scene, and return the scene.
 
-    Normals of a file stay. Mitsuba's are told from them by their values: all of a mesh agree with the sums here, up to
-    the rounding of additions. A mesh whose faces cancel at every vertex (a sheet wound both ways) stays as it is too,
-    since nothing tells where its normals came from.
+    Normals from a file stay. They are told apart by their values: the normals of a mesh count as Mitsuba's if all of
+    them agree with the sums computed here, up to rounding. A mesh whose faces cancel at every vertex (a sheet with
+    faces on both sides) keeps its normals, because nothing tells where they came from.
     """
     for shape in scene.shapes():
         parameters = mi.traverse(shape) if shape.is_mesh() else {}
@@ -37,7 +39,7 @@ def repeat_normals(scene: Any) -> Any:
         loaded = np.array(parameters["vertex_normals"], dtype=np.float64).reshape(-1, 3)
         agrees = np.linalg.norm(sums - lengths[:, None] * loaded, axis=1) <= errors
         decisive = clear & is_exact
-        if not decisive.any() or not agrees[decisive].all():  # those of the file
+        if not decisive.any() or not agrees[decisive].all():  # they come from the file
             continue
         normals = np.tile(UNKNOWN, (len(sums), 1))
         normals[clear] = sums[clear] / lengths[clear, None]
@@ -47,14 +49,14 @@ def repeat_normals(scene: Any) -> Any:
 
 
 def _sums_at_vertices(vertices: Any, indices: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sum of the normals of the faces at each vertex times their angles there, and how far Mitsuba's may be from it.
+    """Sums of the face normals at each vertex, weighted by the angles of the faces there.
 
     Returns
     -------
-    sums : (n, 3) float64. The summands come from the operations of Mitsuba's `Mesh::recompute_vertex_normals`, in
-        single precision, so that they equal its own in slivers too.
-    errors : (n,) float64, bound of the error of Mitsuba's sum, which is added in single precision.
-    is_exact : (n,) bool, False where a face has no area and so no normal: it is left out here, but may spoil
+    sums : (n, 3) float64. The summands are computed in single precision with the operations of Mitsuba's
+        `Mesh::recompute_vertex_normals`, so that they are equal to those of Mitsuba even for very thin triangles.
+    errors : (n,) float64, upper bound of the rounding error of Mitsuba's sum, which it adds in single precision.
+    is_exact : (n,) bool, False where a face has no area and hence no normal. The face is left out here, but may spoil
         Mitsuba's sum.
     """
     faces = [dr.gather(mi.UInt32, indices, 3 * dr.arange(mi.UInt32, dr.width(indices) // 3) + i) for i in range(3)]

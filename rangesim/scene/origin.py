@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the renderer has its origin: near the camera, so that single precision is enough wherever the scene stands.
+"""The renderer's origin: near the camera, so that single precision suffices wherever the scene stands.
 
-The renderer computes in single precision: 5000 km from the origin, in metres of a map, coordinates are half a metre
-apart, and already at 50 m Mitsuba starts rays 4.5 mm off the surface that they leave. A scene file is parsed in double
-precision, so there a translation brings the camera near the origin before anything is rounded. Scenes whose camera, or
-what it sees, is near it already keep their coordinates, and with them their bytes.
+The renderer computes in single precision. At 5000 km from the origin, as in the coordinates of a map, neighbouring
+numbers are half a metre apart, and already at 50 m Mitsuba starts rays 4.5 mm off the surface that they leave. A scene
+file is parsed in double precision, so a translation there moves the camera near the origin before anything is rounded.
+If the camera, or what it sees, is near the origin of the file, the coordinates and so the results stay unchanged.
 """
 
 from __future__ import annotations
@@ -17,26 +17,33 @@ import numpy as np
 from rangesim.errors import FileFormatError, warn
 
 NEAR_M = 10.0
-"""Coordinates of a camera, in metres, up to which the renderer keeps the file's origin: Mitsuba starts rays
-0.09 mm (1 + c) off a surface with coordinates up to c, here a millimetre, and rounds coordinates to a micrometre."""
+"""Largest coordinate of a camera, in metres, at which the renderer keeps the origin of the file. Mitsuba starts rays
+0.09 mm * (1 + c) off a surface with coordinates up to c metres, which is 1 mm here, and rounds coordinates to 1 um."""
 AS_FAR = 2.0
-"""Distance of the camera from the origin, over that from what it sees, above which this is far from the origin too."""
+"""Smallest ratio of two distances of the camera, that to the origin and that to what it sees, at which what it sees
+counts as far from the origin too. At 2, it is at least half as far from the origin as the camera."""
 COARSE_M = 1e-4
-"""Rounding of a mesh's vertices, or of a place, that is worth a warning."""
+"""Smallest rounding of vertices or places, in metres, that causes a warning: 0.1 mm, which good
+sensors can measure."""
 PLACED_EMITTERS = ("point", "spot", "projector")
+"""Types of emitters that stand at a place in the world."""
 CAMERAS = ("perspective", "thinlens")
+"""Types of sensors that can be the camera."""
 ENDS = {"sphere": ("center",), "cylinder": ("p0", "p1")}
-"""Points, by the kind of shape, that place it besides its `to_world`."""
+"""Properties, by type of shape, that place the shape in addition to its `to_world`."""
 
 
 def camera_place(state: Any, sensor: int) -> np.ndarray:
-    """(3,) float64, metres, world: the place of one of the sensors of a parsed scene; 0 if it is a loaded object."""
+    """(3,) float64, metres, world: the place of one of the sensors of a parsed scene.
+
+    It is 0 if the sensor is a loaded object, whose place is not known here.
+    """
     node = camera_node(state, sensor)
     return np.zeros(3) if node is None else _matrix(node.props.get("to_world"))[:3, 3]
 
 
 def camera_node(state: Any, sensor: int) -> Any:
-    """The node of one of the sensors of a parsed scene; None if there is no such sensor, or it is a loaded object."""
+    """The node of sensor number `sensor` of a parsed scene; None if it does not exist or is a loaded object."""
     children = [value for _, value in state.nodes[0].props.items()]
     sensors = [v for v in children if isinstance(v, mi.Sensor) or _type_of(state, v) == mi.ObjectType.Sensor]
     if not 0 <= sensor < len(sensors) or isinstance(sensors[sensor], mi.Sensor):
@@ -45,26 +52,26 @@ def camera_node(state: Any, sensor: int) -> Any:
 
 
 def is_far(place: np.ndarray) -> bool:
-    """Whether a camera is so far from the file's origin that what it sees may be, too."""
+    """Whether the place (3,) of a camera, metres, is farther from the origin than `NEAR_M`."""
     return bool(np.abs(place).max() > NEAR_M)
 
 
 def move_to_origin(state: Any, origin_m: np.ndarray, label: str) -> None:
-    """Subtract `origin_m` (3,) from the place of everything in a parsed scene, in double precision.
+    """Subtract `origin_m` (3,), metres, from the places of all nodes of a parsed scene, in double precision.
 
     Raises
     ------
     FileFormatError
-        A lamp, a sensor or a grid of reflectances is a loaded object, which cannot be moved any more.
+        An emitter, a sensor or a grid of reflectances is a loaded object, which cannot be moved any more.
     """
     if not origin_m.any():
         return
     for node in state.nodes:
         for _, value in node.props.items():
-            is_lamp = isinstance(value, mi.Emitter) and not _is_infinite(value)
-            if isinstance(value, mi.Sensor) or is_lamp or (isinstance(value, mi.BSDF) and _has_grid(value)):
+            is_placed = isinstance(value, mi.Emitter) and not _is_infinite(value)
+            if isinstance(value, mi.Sensor) or is_placed or (isinstance(value, mi.BSDF) and _has_grid(value)):
                 raise FileFormatError(
-                    f"expected lamps, sensors and grids of {label}, whose camera is far from the origin, as "
+                    f"expected emitters, sensors and grids of {label}, whose camera is far from the origin, as "
                     "dictionaries, got a loaded object; give its dictionary."
                 )
         if "position" in node.props and node.type == mi.ObjectType.Emitter:
@@ -74,7 +81,10 @@ def move_to_origin(state: Any, origin_m: np.ndarray, label: str) -> None:
 
 
 def warn_of_loaded_camera(sensors: Any, sensor: int, place: np.ndarray, label: str) -> None:
-    """Warn if a camera is far from the origin whose place is not known before it is loaded."""
+    """Warn if the camera is a loaded object far from the origin.
+
+    place : what `camera_place` returned, 0 for a loaded object.
+    """
     if not place.any() and 0 <= sensor < len(sensors):
         loaded_at = np.array(sensors[sensor].world_transform().matrix, np.float64).reshape(4, 4)[:3, 3]
         if is_far(loaded_at):
@@ -85,17 +95,23 @@ def warn_of_loaded_camera(sensors: Any, sensor: int, place: np.ndarray, label: s
 
 
 class Rounding(NamedTuple):
-    """How far single precision has moved something, at most, before it came here."""
+    """An upper bound on the error that single precision has made in the place of a node.
+
+    error_m : metres. name : id of the node.
+    """
 
     error_m: float
     name: str
 
 
 def coarsest_mesh(state: Any, scene: Any) -> Rounding | None:
-    """The mesh file whose vertices are rounded worst where they are nearest to the renderer's origin.
+    """The mesh from a file whose vertices near the renderer's origin have the largest rounding; None without meshes.
 
-    Mitsuba reads vertices in single precision, whatever the file has, and before it applies `to_world`. `state` is what
-    the mitsuba.Scene was made of.
+    Mitsuba reads vertices in single precision, whatever precision the file has, and before it applies `to_world`.
+
+    Parameters
+    ----------
+    state : the parsed scene. scene : the mitsuba.Scene made from it.
     """
     nodes = {node.props.id(): node for node in state.nodes if node.type == mi.ObjectType.Shape}
     found = []
@@ -110,15 +126,15 @@ def coarsest_mesh(state: Any, scene: Any) -> Rounding | None:
 
 
 def coarsest_transform(state: Any) -> Rounding | None:
-    """The `to_world` of a parsed scene, not moved yet, that was made in single precision and moves its node farthest;
-    None if none moves it by what is worth a warning.
+    """The `to_world` of a parsed scene that was made in single precision and has the largest rounding.
 
-    Rotations and scales tell: their digits fill single precision, but not double.
+    None if no rounding is larger than `COARSE_M`. The scene must not have been moved yet. Rotation and scale show which
+    precision was used: their digits fill single, but not double precision.
     """
     found = []
     for node in state.nodes:
         T = _matrix(node.props.get("to_world"))
-        if rounding_of(T[:3, 3]) <= COARSE_M:  # most: spare them the rest
+        if rounding_of(T[:3, 3]) <= COARSE_M:  # true of most nodes, which skip the rest
             continue
         with np.errstate(over="ignore"):
             single, half = (T[:3, :3].astype(kind) for kind in (np.float32, np.float16))
@@ -128,12 +144,12 @@ def coarsest_transform(state: Any) -> Rounding | None:
 
 
 def rounding_of(coordinates: np.ndarray) -> float:
-    """How far single precision rounds the largest of some coordinates, at most, in their unit."""
+    """Largest rounding error of coordinates in single precision, in the unit of the coordinates."""
     return float(2.0**-24 * np.abs(coordinates).max())
 
 
 def warn_of_coarse_mesh(mesh: Rounding | None, label: str) -> None:
-    """Warn once if the rounding of its vertices is worth it."""
+    """Warn if the vertices of a mesh are rounded by more than `COARSE_M`."""
     if mesh is not None and mesh.error_m > COARSE_M:
         warn(
             f"{label}: the vertices of mesh {mesh.name!r} are so far from the origin of its file that single "
@@ -143,7 +159,7 @@ def warn_of_coarse_mesh(mesh: Rounding | None, label: str) -> None:
 
 
 def warn_of_coarse_transform(transform: Rounding | None, label: str) -> None:
-    """Warn once if the rounding of the places is worth it."""
+    """Warn if a place is rounded by more than `COARSE_M`."""
     if transform is not None and transform.error_m > COARSE_M:
         warn(
             f"{label}: to_world of {transform.name!r} was made in single precision, which rounds its place by up to "
@@ -152,8 +168,11 @@ def warn_of_coarse_transform(transform: Rounding | None, label: str) -> None:
 
 
 def _move(node: Any, origin_m: np.ndarray) -> None:
-    """Subtract an origin from the place of one node. Ends of a shape are rounded by Mitsuba before it applies
-    `to_world`, so the first of them becomes zero and goes into `to_world`."""
+    """Subtract an origin (3,), metres, from the place of one node.
+
+    Mitsuba rounds the ends of a shape (`ENDS`) before it applies `to_world`. Therefore the first end is moved to zero
+    and its place goes into `to_world`.
+    """
     T = mi.ScalarTransform4d
     to_world = node.props.get("to_world", T())
     ends = [key for key in ENDS.get(node.props.plugin_name(), ()) if key in node.props]
@@ -166,7 +185,7 @@ def _move(node: Any, origin_m: np.ndarray) -> None:
 
 
 def _is_placed(node: Any) -> bool:
-    """Whether a node without `to_world` stands in the world all the same."""
+    """Whether a node without `to_world` has a place in the world."""
     if node.type == mi.ObjectType.Shape:
         return True
     kinds = {mi.ObjectType.Emitter: PLACED_EMITTERS, mi.ObjectType.Volume: ("gridvolume",)}
@@ -178,7 +197,7 @@ def _is_infinite(emitter: Any) -> bool:
 
 
 def _has_grid(bsdf: Any) -> bool:
-    """Whether a loaded BSDF has values by place in the world (a `gridvolume`)."""
+    """Whether the values of a loaded BSDF depend on the place in the world (a `gridvolume`)."""
     return any(part.class_name() == "GridVolume" for part in mi.traverse(bsdf).hierarchy)
 
 
@@ -187,7 +206,7 @@ def _type_of(state: Any, value: Any) -> Any:
 
 
 def _matrix(transform: Any) -> np.ndarray:
-    """(4, 4) float64 of a transform; the identity of None, and of what Mitsuba refuses."""
+    """(4, 4) float64, the matrix of a transform; the identity for anything that is no transform."""
     if not isinstance(transform, mi.ScalarTransform4d):
         return np.eye(4)
     return np.array(transform.matrix, dtype=np.float64).reshape(4, 4)

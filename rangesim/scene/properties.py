@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the properties of a scene may be: checked on the parsed nodes, before Mitsuba makes objects of them.
+"""Checks of the properties in a scene, on its parsed nodes, before Mitsuba makes objects of them.
 
-Mitsuba takes most numbers as they come; a reflectance of 2 or a radius of NaN shows, if at all, as odd light.
+Mitsuba accepts most numbers unchecked. A reflectance of 2 or a radius of NaN then shows, if at all, as odd light.
 """
 
 from __future__ import annotations
@@ -23,16 +23,23 @@ from rangesim.files.utf8_names import is_utf8
 from rangesim.scene.mesh_files import check_ply, check_serialized
 from rangesim.scene.nodes import check_type, named_file
 from rangesim.settings import limits
-from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds
+from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds, whole
 from rangesim.settings.config import shown
 
 ANY = Bounds("finite", -1e30, 1e30)
+"""Bounds of a property that is not in `PROPERTIES`: any number that single precision holds."""
 PLACE = Bounds("a coordinate in metres", -MAX_COORDINATE_M, MAX_COORDINATE_M)
+"""Bounds of a coordinate of the world, metres."""
 POSITIVE = Bounds("positive and finite", 1e-12, 1e12)
+"""Bounds of a number that has to be above 0, in whatever unit."""
 LENGTH = Bounds("positive and finite", 1e-12, MAX_COORDINATE_M)
+"""Bounds of a length, metres."""
 NOT_NEGATIVE = Bounds("0 or positive, and finite", 0, 1e12)
+"""Bounds of a number of at least 0, in whatever unit."""
 FRACTION = Bounds("a fraction", 0, 1)
+"""Bounds of a reflectance or another fraction."""
 WAVELENGTHS_NM = Bounds("nanometres", 1, 1e7)
+"""Bounds of the wavelengths of a spectrum, nanometres: from X-rays to 1 cm."""
 
 PROPERTIES: dict[str, dict[str, Bounds]] = {
     "Shape": {"radius": LENGTH, "center": PLACE, "p0": PLACE, "p1": PLACE},
@@ -55,17 +62,19 @@ PROPERTIES: dict[str, dict[str, Bounds]] = {
     "PhaseFunction": {"g": Bounds("above -1 and below 1", -0.9999, 0.9999)},
     "Sensor": {"fov": Bounds("degrees between 0 and 180", 1e-3, 179.999)}
     | dict.fromkeys(("near_clip", "far_clip"), POSITIVE),
-    "Film": dict.fromkeys(("width", "height"), Bounds("a whole number of at least 1", 1)),
+    "Film": dict.fromkeys(("width", "height"), whole(1)),
 }
-"""Bounds of the properties of each kind of node, in Mitsuba's words; the others have to be finite."""
+"""Bounds of properties, by kind of node and name of property as in Mitsuba; all other properties must be finite."""
 COLOURS = ("value", "color", "color0", "color1", "filename", "bitmap", "data")
-"""Properties of a texture that hold what the property it stands for may be."""
+"""Properties of a texture that hold its values. They have the bounds of the property that the texture is for."""
 ENTRIES_PER_SHAPE = 20
-"""Of a scene dictionary, at most, on average; one that holds the same dictionary again and again has more."""
+"""Mean count of entries per allowed shape (limit `shapes`) above which a scene dictionary is refused. Usual shapes have
+fewer, their BSDF included. A dictionary that contains another one many times over, in many levels, has more and would
+take up the memory."""
 NOT_OF_MEDIA = ("sigma_a", "sigma_s", "material")
-"""Ways to state a medium that Mitsuba 3.9 does not know, and says nothing about."""
+"""Properties of media in other renderers, which Mitsuba 3.9 silently ignores."""
 BITMAP_SOURCES = ("filename", "bitmap", "data")
-"""What a bitmap texture may be made of; without any, Mitsuba 3.9 crashes."""
+"""Properties that a bitmap texture can be made from; Mitsuba 3.9 crashes if all are missing."""
 FAIL_IN_ONE_BAND = {
     "blackbody": "give the emission at the sensor's wavelength as a number",
     "regular": "give the value at the sensor's wavelength as a number",
@@ -74,9 +83,9 @@ FAIL_IN_ONE_BAND = {
     "sunsky": "give a constant emitter for the sky and a directional one for the sun",
     "timed_sunsky": "give a constant emitter for the sky and a directional one for the sun",
 }
-"""Plugins that load but cannot be evaluated without a spectrum, and what to do.
+"""Plugins that load but cannot be evaluated without a spectrum, each with the advice for the message.
 
-One of them stops the light transport of every scene that is in memory at the same time.
+A single one of them stops the light transport of every scene that is in memory at the same time.
 """
 LOADED_CLASSES = {
     "BlackBodySpectrum": "blackbody",
@@ -84,40 +93,45 @@ LOADED_CLASSES = {
     "IrregularSpectrum": "irregular",
     "Hair": "hair",
 }
-"""The plugin of a loaded object, by the name of its class."""
+"""Name of the plugin of a loaded object, by the name of its class."""
 TEXTURES_WITHOUT = {
     "bumpmap": ("slopes", ("checkerboard", "mesh_attribute", "rawconstant", "srgb", "volume")),
     "normalmap": ("three channels", ("checkerboard",)),
 }
-"""What the map of a BSDF needs, and the textures of Mitsuba 3.9 that do not have it and stop the light transport."""
+"""Requirement on the texture of these BSDFs, and the textures of Mitsuba 3.9 that do not meet it.
+
+Such a texture stops the light transport.
+"""
 FLOAT_IMAGES = (".exr", ".pfm", ".hdr", ".rgbe")
-"""Texture files whose values may lie outside 0..1."""
+"""Suffixes of texture files whose values may lie outside 0 to 1."""
 
 
 def check_depth(state: Any, label: str) -> None:
-    """Raise FileFormatError if the nodes of a scene refer to each other in chains beyond the limit `nesting`, on which
-    Mitsuba would run out of stack, or if it has too many shapes."""
+    """Raise FileFormatError if a parsed scene has too many shapes or too long chains of references between nodes.
+
+    The limits are `shapes` and `nesting`. On a long chain Mitsuba would run out of stack.
+    """
     shapes = sum(node.type == mi.ObjectType.Shape for node in state.nodes)
     limits.check("shapes", shapes, f"shapes in {label}", FileFormatError)
     by_id = {node.props.id(): index for index, node in enumerate(state.nodes)}
     children = [_children(node, by_id) for node in state.nodes]
-    waiting = [0] * len(children)  # for so many nodes that refer to it
+    waiting = [0] * len(children)  # number of nodes not yet visited that refer to this one
     for child in chain.from_iterable(children):
         waiting[child] += 1
     depth = [1] * len(children)
     ready = [index for index, count in enumerate(waiting) if count == 0]
-    for parent in ready:  # grows: each node comes after all that refer to it
+    for parent in ready:  # the list grows meanwhile; each node follows all nodes that refer to it
         for child in children[parent]:
             depth[child] = max(depth[child], depth[parent] + 1)
             waiting[child] -= 1
             if waiting[child] == 0:
                 ready.append(child)
-    if len(ready) == len(children):  # else some refer to each other in a circle, which Mitsuba names
+    if len(ready) == len(children):  # otherwise there is a cycle, which Mitsuba reports
         limits.check("nesting", max(depth, default=0), f"objects of {label} that refer to each other", FileFormatError)
 
 
 def check_dictionary(scene: Any, label: str) -> None:
-    """Raise FileFormatError if a scene dictionary is nested deeper than the limit, or holds what Mitsuba crashes on."""
+    """Raise FileFormatError if a scene dictionary is nested too deep, too large, or holds values that crash Mitsuba."""
     deepest, entries = limits.current().nesting, 0
     todo = [(1, "", scene)]
     while todo:
@@ -142,12 +156,12 @@ def check_dictionary(scene: Any, label: str) -> None:
                 raise FileFormatError(f"{label}: expected names as keys, got {shown(key)}.")
             if key == "type" and isinstance(value, str):
                 check_type(value, label)
-            elif key == "filename" and isinstance(value, str):  # of a spectrum, which Mitsuba reads as it parses
+            elif key == "filename" and isinstance(value, str):  # Mitsuba reads files of spectra while it parses
                 named_file(value, label)
 
 
 def check_evaluable(state: Any, label: str) -> None:
-    """Raise FileFormatError if a node would load, but not be evaluated with the one band of the light transport."""
+    """Raise FileFormatError if a node would load, but cannot be evaluated in the single band of the light transport."""
     parents = {value.index(): parent for parent, node in enumerate(state.nodes) for _, value in _references(node)}
     for index, node in enumerate(state.nodes):
         names = [node.props.plugin_name()]
@@ -168,9 +182,9 @@ def check_evaluable(state: Any, label: str) -> None:
 
 
 def check_properties(state: Any, label: str) -> None:
-    """Raise FileFormatError on the first property of a node that is not finite, or out of its bounds.
+    """Raise FileFormatError on the first property of a node that is not finite or is out of its bounds.
 
-    The message names the node and the property: 'shape "ball": expected radius to be positive and finite, got nan'.
+    The message names node and property: 'shape "ball": expected radius to be positive and finite, got nan'.
     """
     parents = {value.index(): parent for parent, node in enumerate(state.nodes) for _, value in _references(node)}
     for index, node in enumerate(state.nodes):
@@ -191,7 +205,7 @@ def check_properties(state: Any, label: str) -> None:
 
 
 def _check_mesh(props: Any, label: str) -> None:
-    """Raise FileFormatError, which names the scene too, if the file of a mesh would make Mitsuba crash."""
+    """Raise FileFormatError if the file of a mesh would make Mitsuba crash; the message names the scene too."""
     name = props.get("filename")
     if not isinstance(name, str):
         return
@@ -206,10 +220,13 @@ def _check_mesh(props: Any, label: str) -> None:
 
 
 def check_vertices(scene: Any, label: str) -> None:
-    """Raise FileFormatError on the first mesh with a vertex that is not finite, or too far out, or without extent."""
+    """Raise FileFormatError on the first mesh of a loaded scene that is empty, has no extent, or has a bad vertex.
+
+    A vertex is bad if it is not finite, too far from the origin, or missing although a face refers to it.
+    """
     for shape in scene.shapes():
         parameters = mi.traverse(shape) if shape.is_mesh() else {}
-        if "vertex_positions" not in parameters:  # a rectangle calls itself a mesh
+        if "vertex_positions" not in parameters:  # a rectangle has none, although `is_mesh` holds
             continue
         vertices = np.array(parameters["vertex_positions"])
         limits.check("points", len(vertices) // 3, f"vertices of shape {shape.id()!r}", FileFormatError)
@@ -232,13 +249,13 @@ def check_vertices(scene: Any, label: str) -> None:
 
 
 class _Property:
-    """A property of a node, and the bounds of all numbers in it."""
+    """A property of a node, with the bounds of all numbers in it."""
 
     def __init__(self, state: Any, key: str, bounds: Bounds, label: str) -> None:
         self.state, self.key, self.bounds, self.label = state, key, bounds, label
 
     def problem(self, value: Any, key: str = "") -> str:
-        """What is wrong with the value of the property, or an empty text."""
+        """The reason to refuse a value of the property, as a clause for a message; empty if there is none."""
         key = key or self.key
         if isinstance(value, mi.Properties.ResolvedReference):
             return self._problem_of_texture(self.state.nodes[value.index()], key)
@@ -268,7 +285,7 @@ class _Property:
 
     def _problem_of_image(self, path: Path, key: str) -> str:
         if not path.is_file():
-            return ""  # Mitsuba says so
+            return ""  # Mitsuba reports a missing file
         if path.stat().st_size == 0:
             return f"expected {key} to name a file with contents, but {path.name} is empty"
         check_pixels(path)
@@ -283,10 +300,10 @@ class _Property:
 
 
 def _problem_of_medium(state: Any, node: Any) -> str:
-    """What is wrong with how a homogeneous medium states its coefficients; empty: nothing.
+    """The reason to refuse the coefficients of a homogeneous medium, as a clause for a message; empty if there is none.
 
-    There is but one band, that of the sensor: Mitsuba would cut a spectrum of 1/m off at 1, and read colours for the
-    eye; and it passes over keys of other renderers.
+    The coefficients must be single numbers, for the band of the sensor. Mitsuba would cut off a spectrum in 1/m at 1,
+    would convert colours as for the eye, and ignores the properties that other renderers use (`NOT_OF_MEDIA`).
     """
     if node.props.plugin_name() != "homogeneous":
         return ""
@@ -304,7 +321,7 @@ def _problem_of_medium(state: Any, node: Any) -> str:
 
 
 def _numbers(value: Any) -> Iterable[float]:
-    """All numbers in the value of a property; none if it holds another kind of thing."""
+    """All numbers in the value of a property, or the extremes of an array; empty for other kinds of values."""
     if isinstance(value, bool):
         return ()
     if isinstance(value, (int, float)):
@@ -319,7 +336,7 @@ def _numbers(value: Any) -> Iterable[float]:
 
 
 def _extremes(values: np.ndarray) -> Iterable[float]:
-    """Least and largest value, NaN if there is one."""
+    """Smallest and largest value; both are NaN if one value is."""
     return (float(values.min()), float(values.max())) if values.size else ()
 
 
@@ -338,7 +355,7 @@ def _problem_of_transform(value: Any, key: str) -> str:
 
 
 def _children(node: Any, by_id: dict[str, int]) -> list[int]:
-    """Indices of the nodes that a node refers to, before Mitsuba has resolved references by id."""
+    """Indices of the nodes that a node refers to; references by id, which Mitsuba has not resolved yet, included."""
     named = (value.id() for _, value in node.props.items() if isinstance(value, mi.Properties.Reference))
     return [value.index() for _, value in _references(node)] + [by_id[name] for name in named if name in by_id]
 
@@ -348,12 +365,12 @@ def _references(node: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _loaded(node: Any) -> Iterator[Any]:
-    """Mitsuba objects among the properties of a node, which a dictionary may hold in place of a description."""
+    """Mitsuba objects among the properties of a node, which a dictionary may hold instead of descriptions."""
     return (value for _, value in node.props.items() if isinstance(value, (mi.BSDF, mi.Texture)))
 
 
 def _place(state: Any, parents: dict[int, int], index: int) -> str:
-    """Kind and id of a node; of one without an id, its plugin and the node that holds it."""
+    """Name of a node for messages: its kind and id; without an id, its plugin and the node that holds it."""
     node = state.nodes[index]
     kind, name = node.type.name.lower(), node.props.id()
     if name and not name.startswith("_arg_"):

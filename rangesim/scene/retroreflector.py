@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Retro-reflection, which Mitsuba lacks: a BSDF `retroreflector` that sends the lobe of another one back.
+"""The BSDF `retroreflector`, which Mitsuba lacks: it sends the lobe of another BSDF back to where light came from.
 
     <bsdf type="retroreflector">
         <float name="falloff" value="3.5"/>
         <bsdf type="roughconductor"> ... </bsdf>
     </bsdf>
 
-The nested BSDF is evaluated with the incident direction mirrored about the normal ("back vector"): what it would send
-off in the mirror direction comes back to where the light came from. Reciprocity, energy and sampling stay those of the
-nested BSDF (Portsmouth, Raab, Belcour, Liu, The Minimal Retroreflective Microfacet Model, JCGT 15(1), 2026). Its
-`alpha` sets the observation angle: most light returns within a few times alpha radians.
+The nested BSDF is evaluated with the incident direction mirrored about the normal ("back vector"). Light that it would
+reflect in the mirror direction then returns to where it came from. Reciprocity, energy and sampling are those of the
+nested BSDF (Portsmouth, Raab, Belcour, Liu, The Minimal Retroreflective Microfacet Model, JCGT 15(1), 2026). The
+roughness `alpha` of the nested BSDF sets the observation angle: most light returns within a few times alpha radians.
 
-`falloff` p >= 0, default 0: real sheeting returns less of the light that comes in at an angle. The lobe is weighed with
-(cos theta_i cos theta_o)^(p / 2): reciprocal, at most 1, and cos^p of the entrance angle on the axis.
+Real sheeting returns less of the light that comes in at an angle. The exponent `falloff` p >= 0, default 0, describes
+this: the lobe is multiplied by (cos theta_i cos theta_o)^(p / 2), which is reciprocal and at most 1. On the axis of the
+lobe it is cos^p of the entrance angle.
 """
 
 from __future__ import annotations
@@ -23,19 +24,20 @@ import drjit as dr
 import mitsuba as mi
 
 TYPE_NAME = "retroreflector"
+"""Name of the BSDF in scene files."""
 _registered: set[str] = set()
-"""Variants that know the BSDF: Mitsuba keeps plugins per variant and for the life of the process."""
+"""Variants in which the BSDF is registered. Mitsuba keeps plugins per variant until the process ends."""
 
 
 def register() -> None:
-    """Make `retroreflector` known to the active Mitsuba variant; a second call does nothing."""
+    """Register `retroreflector` with the active Mitsuba variant; further calls do nothing."""
     if mi.variant() not in _registered:
         mi.register_bsdf(TYPE_NAME, _retroreflector_class())
         _registered.add(mi.variant())
 
 
 def _retroreflector_class() -> type:
-    """The class for the active variant; it derives from that variant's `mitsuba.BSDF`."""
+    """The class of the BSDF for the active variant: it derives from the `mitsuba.BSDF` of that variant."""
 
     class RetroReflector(mi.BSDF):  # type: ignore[misc, name-defined]
         def __init__(self, props: Any) -> None:

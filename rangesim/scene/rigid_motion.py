@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene whose shapes stand elsewhere than in its file."""
+"""A scene with some of its shapes moved."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from rangesim.scene.scene import Scene
 
 
 class MovingScene:
-    """Shapes of a scene at other poses.
+    """A scene whose shapes can be moved to other poses.
 
-    The scene itself is never touched: a second one, loaded from the same source, is moved and thrown away.
-    Putting shapes back would not do, because Mitsuba derives a shape's data from `to_world` with other roundings
-    when it changes than when the shape is made, and the same seed would no longer give the same bytes.
+    The original scene is never changed: a copy, loaded from the same source, is moved. Moving shapes of the original
+    and putting them back would not restore it, because Mitsuba rounds differently when a `to_world` changes than when
+    the shape is made; the same seed would then give other bytes.
 
     Parameters
     ----------
     scene : Scene, as `load_scene` returns it.
-    names : the shapes that will move.
+    names : names of the shapes that will move.
 
     Raises
     ------
     ValueError
-        A shape of a kind that cannot be moved (curves).
+        A shape is of a kind that cannot be moved (curves).
     """
 
     def __init__(self, scene: Scene, names: tuple[str, ...]) -> None:
@@ -44,10 +44,20 @@ class MovingScene:
                 raise ValueError(f"expected a mesh or a shape with a pose, but {name!r} is a {shape.class_name()}.")
 
     def at(self, transforms: Mapping[str, np.ndarray]) -> Scene:
-        """The scene with `transforms` (4, 4), rigid, world, applied to shapes as they stand in the scene file.
+        """The scene with some shapes moved.
 
-        Shapes that are not named stand where the file has them; if all do, this is the scene itself. The next call
-        moves the returned scene on.
+        The next call moves the same copy again, so use the returned scene before that.
+
+        Parameters
+        ----------
+        transforms : rigid world transforms (4, 4), metres, by name of shape; each applies to the shape as it stands in
+            the scene file. Other shapes stay where they are. If all transforms are the identity, the original scene is
+            returned.
+
+        Raises
+        ------
+        ValueError
+            The scene cannot be loaded again.
         """
         if all(np.array_equal(T, np.eye(4)) for T in transforms.values()):
             return self.scene
@@ -63,7 +73,7 @@ class MovingScene:
             self._parameters[f"{name}.vertex_positions"] = mi.Float(np.float32(points).ravel())
             normals[f"{name}.vertex_normals"] = self._rest[f"{name}.vertex_normals"] @ T[:3, :3].T
         self._parameters.update()
-        # Mitsuba has just made new normals of the vertices; those of the file were perhaps smoother
+        # Mitsuba has just computed new normals from the vertices, so those of the file are put back
         for key, directions in normals.items():
             if directions.size:
                 self._parameters[key] = mi.Float(np.float32(directions).ravel())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Mitsuba scene with what range sensing needs to know of it."""
+"""A Mitsuba scene together with its camera, the names of its shapes, and their material classes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,17 @@ from rangesim.rig import Intrinsics, Rig, look_at, pose, translation
 from rangesim.settings.bounds import Bounds, check_number, whole
 
 BASELINE = Bounds("a positive baseline in metres", 1e-9, 1e6)
+"""Bounds of the distance between camera and projector, metres."""
 PROJECTOR_PIXELS = (1280, 800)
+"""Default width and height of a projector in pixels: WXGA, a common format."""
 
 
 @dataclass(frozen=True)
 class Instance:
-    """One shape of the scene: its name (id in the scene file) and material class."""
+    """A shape of a scene.
+
+    name : id of the shape in the scene file. material : its class, one of `rangesim.scene.materials.MATERIAL_CLASSES`.
+    """
 
     name: str
     material: str
@@ -27,19 +32,22 @@ class Instance:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene:
-    """Geometry and materials to measure.
+    """Geometry and materials to measure, as `load_scene` returns them.
 
+    Attributes
+    ----------
     name : str
-    mitsuba : mitsuba.Scene of the active variant, in the renderer's coordinates: the world less `origin_m`.
+    mitsuba : mitsuba.Scene of the active variant, in the renderer's coordinates, which are the world's minus
+        `origin_m`.
     instances : one per shape, in the order of `mitsuba.shapes()`.
-    camera, T_world_camera : the scene's own sensor.
-    working_distance_m : float, median depth the camera sees; sets default baseline and vergence.
-    has_cutouts : bool, whether some surface lets light pass unchanged (`mask`, `null`).
-    has_matte_textures : bool, whether the reflectance of some matte surface is not the same everywhere.
-    source : Path of the file it was loaded from; None for a dictionary.
-    reload : makes another mitsuba.Scene of the same source, for shapes to be moved in.
-    origin_m : (3,) float64, metres, world: where the renderer has its origin (`rangesim.scene.origin`); nothing else
-        here and nothing in a result is relative to it.
+    camera, T_world_camera : intrinsics and pose (4, 4), metres, of the sensor in the scene file.
+    working_distance_m : float, median depth that the camera sees, metres; the default baseline and vergence follow it.
+    has_cutouts : bool, whether light passes some surface unchanged (`mask`, `null`).
+    has_matte_textures : bool, whether the reflectance of some matte surface varies over it.
+    source : Path of the file that the scene was loaded from; None for a dictionary.
+    reload : function that makes another mitsuba.Scene of the same source, in which shapes can be moved.
+    origin_m : (3,) float64, metres, world: origin of the renderer's coordinates (`rangesim.scene.origin`). Everything
+        else here, and all results, are in coordinates of the world.
     """
 
     name: str
@@ -60,20 +68,20 @@ class Scene:
 
     @property
     def has_ambient(self) -> bool:
-        """Whether the scene has light sources of its own."""
+        """Whether the scene has emitters of its own, which are ambient light for a sensor."""
         return len(self.mitsuba.emitters()) > 0
 
     @property
     def has_lamps(self) -> bool:
-        """Whether some of that light comes from somewhere, rather than evenly from all around."""
+        """Whether some ambient light comes from lamps, the sun or a sky, rather than evenly from all directions."""
         return any(emitter.class_name() != "ConstantBackgroundEmitter" for emitter in self.mitsuba.emitters())
 
     def in_renderer(self, rig: Rig) -> Rig:
-        """The rig in the renderer's coordinates."""
+        """The same rig with its pose in the renderer's coordinates."""
         return replace(rig, T_world_camera=translation(*-self.origin_m) @ rig.T_world_camera)
 
     def motion_in_renderer(self, T: np.ndarray) -> np.ndarray:
-        """(4, 4) in the renderer's coordinates of a world transform (4, 4) that moves a shape."""
+        """(4, 4) transform that moves a shape in the renderer's coordinates as T (4, 4), metres, does in the world."""
         return np.asarray(translation(*-self.origin_m) @ T @ translation(*self.origin_m))
 
     def rig(
@@ -87,18 +95,23 @@ class Scene:
         camera: Intrinsics | None = None,
         T_world_camera: np.ndarray | None = None,
     ) -> Rig:
-        """Rig of the scene's camera and a projector to its right that covers the camera's view.
+        """A rig of the scene's camera and a projector to its right that covers the camera's field of view.
 
         Parameters
         ----------
-        baseline_m : metres; default a fifth of the working distance. The projector turns towards the point that the
-            optical axis meets at the working distance.
-        projector_size : (width, height) in projector pixels; default 1280 x 800.
-        power_w : radiant power of white.
-        width, height : camera pixels; default as in the scene file; one alone keeps the aspect ratio. The
-            horizontal field of view is kept.
-        camera : Intrinsics in place of the scene's camera; `width` and `height` then do not count.
-        T_world_camera : (4, 4) float64, pose of the camera in place of the scene's, metres.
+        baseline_m : distance from camera to projector, metres; default a fifth of the working distance. The projector
+            looks at the point on the optical axis of the camera at the working distance.
+        projector_size : (width, height), pixels; default 1280 x 800.
+        power_w : radiant power in watts that leaves the projector when it shows white.
+        width, height : size of the camera's image, pixels; default as in the scene file. One alone keeps the aspect
+            ratio. The horizontal field of view stays the same.
+        camera : Intrinsics to use instead of the scene's camera; `width` and `height` are then ignored.
+        T_world_camera : (4, 4) float64, rigid, metres; pose of the camera to use instead of the scene's.
+
+        Raises
+        ------
+        ValueError
+            A value out of its bounds.
         """
         for name, value in (("width", width), ("height", height)):
             if value is not None:
@@ -125,7 +138,10 @@ class Scene:
 
 
 def covering(camera: Intrinsics, width: int, height: int, margin: float = 1.1) -> Intrinsics:
-    """Projector of the given pixel count, square pixels, whose field covers the camera's with a margin."""
+    """Intrinsics of a projector of width x height square pixels whose field of view contains that of the camera.
+
+    margin : ratio of the tangents of the half fields of view; 1.1 leaves a tenth around the camera's view.
+    """
     half_x = margin * max(camera.cx, camera.width - camera.cx) / camera.fx
     half_y = margin * max(camera.cy, camera.height - camera.cy) / camera.fy
     f = min(0.5 * width / half_x, 0.5 * height / half_y)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scene says in colours, and what a sensor sees at its own wavelength.
+"""Reflectances at the wavelength of the sensor, and warnings where a scene states only colours.
 
-Scenes are mostly made for the eye: their reflectances are RGB. The light transport has one band, that of the sensor,
-and reads colours as their luminance. That is a guess: at 850 nm many dyes are white and leaves are bright. So a BSDF
-may state `<float name="sensor_reflectance" value="0.7"/>`, which replaces its colour; who leaves it out is told.
+Most scenes are made for the eye: their reflectances are RGB colours. The light transport has one band, that of the
+sensor, and takes the luminance of a colour as its reflectance. This is a guess: at 850 nm many dyes are white and
+leaves are bright. A BSDF may therefore state `<float name="sensor_reflectance" value="0.7"/>`, which replaces its
+colour. Where a coloured BSDF does not, a warning says so.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from rangesim.scene.media import is_boundary
 from rangesim.settings.config import shown
 
 REFLECTANCE_KEY = "sensor_reflectance"
+"""Property of a BSDF that states its reflectance for the sensor, a fraction from 0 to 1."""
 COLOUR_OF = {
     "diffuse": "reflectance",
     "plastic": "diffuse_reflectance",
@@ -28,19 +30,21 @@ COLOUR_OF = {
     "principled": "base_color",
     "principledthin": "base_color",
 }
-"""The colour of a BSDF by its type: what `sensor_reflectance` replaces."""
+"""Property with the colour of a BSDF, by its type; `sensor_reflectance` replaces it."""
 GREY = 0.02
-"""Difference, at most, between the channels of a colour that counts as grey."""
+"""Largest difference between the channels (0 to 1) of a colour that counts as grey: five steps of 8 bits, as the eye
+hardly sees. At 0, rounding of greys would cause warnings."""
 MAX_NAMED = 3
+"""Number of materials that a warning names, so that it stays one readable sentence."""
 
 
 def take_sensor_reflectances(state: Any, label: str) -> None:
-    """Put stated reflectances in place of colours; removes the entries, which Mitsuba does not know.
+    """Replace colours by the `sensor_reflectance` of their BSDF, and remove that entry, which Mitsuba does not know.
 
     Raises
     ------
     FileFormatError
-        A BSDF without a colour states one.
+        The reflectance is stated for a BSDF without a colour, or is no number.
     """
     for node in state.nodes:
         if REFLECTANCE_KEY not in node.props:
@@ -58,12 +62,12 @@ def take_sensor_reflectances(state: Any, label: str) -> None:
 
 
 def coloured_materials(state: Any) -> list[str]:
-    """Names of the BSDFs whose reflectance is given in colours."""
+    """Names of the BSDFs whose reflectance is a colour other than grey, each once."""
     return list(dict.fromkeys(_coloured(state)))
 
 
 def warn_of_colours(names: list[str], label: str) -> None:
-    """Warn once if these BSDFs, or any, are in colours."""
+    """Warn once about the BSDFs of these names, whose reflectances are colours; no names: no warning."""
     if names:
         listed = ", ".join(names[:MAX_NAMED]) + (" ..." if len(names) > MAX_NAMED else "")
         warn(
@@ -72,20 +76,20 @@ def warn_of_colours(names: list[str], label: str) -> None:
         )
 
 
-def warn_of_lamps_behind_glass(scene: Any, label: str) -> None:
-    """Warn once if there are lamps without extent, and clear surfaces or holes that keep paths from them."""
+def warn_of_emitters_behind_glass(scene: Any, label: str) -> None:
+    """Warn once if a scene has emitters without extent, and glass or holes through which light paths miss them."""
     without_extent = mi.EmitterFlags.DeltaPosition.value | mi.EmitterFlags.DeltaDirection.value
-    if any(e.flags() & without_extent for e in scene.emitters()) and any(map(_hides_lamps, scene.shapes())):
+    if any(e.flags() & without_extent for e in scene.emitters()) and any(map(_hides_emitters, scene.shapes())):
         warn(
             f"{label}: light of directional, point and spot emitters does not pass glass or holes (mask, null) and is "
-            "missing behind it; give the lamp an extent (an area emitter, an envmap)."
+            "missing behind it; give the emitter an extent (an area emitter, an envmap)."
         )
 
 
-def _hides_lamps(shape: Any) -> bool:
-    """Whether light passes a shape that a straight line to a lamp does not: through glass, thin glass or holes.
+def _hides_emitters(shape: Any) -> bool:
+    """Whether light passes the shape (glass, thin glass or holes), but a straight connection to an emitter does not.
 
-    Boundaries of media are passed on the way to a lamp (`rangesim.light_transport.scattering`).
+    Connections pass boundaries of media (`rangesim.light_transport.scattering`), so these hide nothing.
     """
     bsdf = shape.bsdf()
     if mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaTransmission):
@@ -94,7 +98,7 @@ def _hides_lamps(shape: Any) -> bool:
 
 
 def _coloured(state: Any) -> Iterator[str]:
-    """Names of the BSDFs whose colour is not grey."""
+    """Names of the BSDFs whose colour is not grey, in the order of the nodes."""
     for index, node in enumerate(state.nodes):
         if node.type != mi.ObjectType.BSDF:
             continue

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The true surfaces of a scene as triangles, for what is measured to be compared with."""
+"""The true surfaces of a scene as triangle meshes, to compare measurements with."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from rangesim.scene.scene import Scene
 from rangesim.triangle_mesh import TriangleMesh
 
 SEGMENTS = 256
-"""Of a full circle: a sphere of 0.1 m is then nowhere more than 8 micrometres from its triangles."""
+"""Number of segments of a full circle. With 256, the triangles of a sphere of radius 0.1 m are at most 8 um inside it:
+r (1 - cos(pi / 256)). More segments take memory and time in proportion to their square."""
 
 
 def true_surfaces(scene: Scene) -> dict[str, TriangleMesh]:
-    """The surface of each shape by its name (id in the scene file), metres, world; round ones in 256 segments.
+    """The surface of each shape in metres, world, by the name of the shape (its id in the scene file).
 
-    A surface is where its file has it: cut-outs and bumps are not cut out, thin panes have no thickness.
+    Round shapes are approximated with 256 segments per circle. A surface is the bare geometry: holes of a `mask` are
+    filled, bump maps are flat, and thin panes have no thickness.
 
     Raises
     ------
@@ -45,18 +47,18 @@ def _triangles(shape: Any, parameters: Any) -> TriangleMesh:
 
 
 def _lattice(points: np.ndarray) -> TriangleMesh:
-    """Two triangles in each cell of a lattice of points (k, l, 3)."""
+    """The mesh of two triangles in each cell of a lattice of points (k, l, 3)."""
     k, l = points.shape[:2]  # noqa: E741
     index = np.arange(k * l).reshape(k, l)
     a, b, c, d = (index[i : k - 1 + i, j : l - 1 + j].ravel() for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)))
     faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
     mesh = TriangleMesh(points.reshape(-1, 3), faces)
-    return TriangleMesh(mesh.vertices, faces[mesh.face_areas_m2 > 1e-12])  # not those at the poles
+    return TriangleMesh(mesh.vertices, faces[mesh.face_areas_m2 > 1e-12])  # cells at a pole have one triangle
 
 
 def _circle() -> np.ndarray:
     a = 2 * np.pi * np.arange(SEGMENTS + 1) / SEGMENTS
-    a[-1] = 0  # the last is the first
+    a[-1] = 0  # the last point is exactly the first
     return np.stack([np.cos(a), np.sin(a), 0 * a], axis=-1)
 
 
@@ -80,4 +82,4 @@ def _rectangle() -> TriangleMesh:
 
 
 _UNIT_SHAPES = {"Sphere": _sphere, "Cylinder": _cylinder, "Disk": _disk, "Rectangle": _rectangle}
-"""At their places before `to_world`."""
+"""Functions that mesh a shape as it is before its `to_world`, by the name of its class in Mitsuba."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sensors that come with the package, each with its decoder; the interface is in `rangesim.sensor`."""
+"""Sensors that come with the package, each with its decoder. Their interface is in `rangesim.sensor`."""
 
 from rangesim.sensor import Decoder, Emitter, Sensor
 from rangesim.sensors.amcw import AmcwDecoder, AmcwToF

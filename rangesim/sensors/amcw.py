@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""AMCW (indirect) time of flight: four taps per modulation frequency, and the decoder."""
+"""AMCW (indirect) time of flight: a camera with four taps per modulation frequency, and its decoder."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
@@ -10,10 +11,9 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.decoding.path_length import range_image_from_path_length
+from rangesim.decoding.path_length import PathLengths
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds, modulation_is_weak, phase_sigma, tap_phase
 from rangesim.decoding.phase_unwrapping import unwrap
-from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
@@ -23,29 +23,52 @@ from rangesim.settings import limits
 from rangesim.settings.bounds import HERTZ, Bounds, Hertz, check_fields, check_number
 
 MAX_RANGE_M = 100.0
-"""Ranges beyond are not searched by phase unwrapping, even if the frequencies were unambiguous farther out."""
+"""Largest range, metres, that phase unwrapping searches, even if the frequencies are unambiguous farther out. The time
+of the search grows with it, and the emitter of such a camera does not reach as far."""
+
 TAPS_DEG = (0, 90, 180, 270)
-"""Delays of the taps of each frequency, in degrees of its phase; `frames` and `tap_phase` are for quarter turns."""
+"""Delays of the taps of each frequency, in degrees of its phase: quarter turns, as in nearly all such cameras. `frames`
+and `tap_phase` are written for them."""
+
 TAP_FRACTION = 1 / len(TAPS_DEG)
-"""Fraction of an exposure's light that each tap collects on average: the taps divide it, and none is lost."""
+"""Fraction of an exposure's light that each tap collects on average. All are equal, because the taps divide the light
+and lose none."""
+
+WEIGHT_HZ = 1e8
+"""Modulation frequency, hertz, in whose units the weights of phase unwrapping are. It is a typical one, so that a phase
+with a standard deviation of one radian has a weight near 1. Any other value scales all weights alike."""
+
+RADIAN_M = SPEED_OF_LIGHT / (2 * math.pi * WEIGHT_HZ)
+"""Path length, metres, over which the phase of `WEIGHT_HZ` grows by one radian. It follows from the speed of light."""
+
 RELATIVE_SIGNAL = 1e-4
-"""Light of noise-free captures that counts as none, as a fraction of that of the bright pixels."""
+"""Light of noise-free captures that counts as none, as a fraction of that of the bright pixels: far below what any
+detector tells from noise. A larger value lets causes report low signal where a noise-free capture is read."""
 
 
 @dataclass(frozen=True)
 class AmcwToF(Sensor):
     """Amplitude-modulated continuous wave camera with four taps per frequency (0, 90, 180, 270 degrees).
 
-    The four taps of a pixel share the light of one exposure: the mean of tap theta is (A + contrast * B cos(phi -
+    The four taps of a pixel share the light of one exposure. The mean of tap theta is (A + contrast * B cos(phi -
     theta)) / 4 with phi = 2 pi f l / c over the path length l (there and back); A holds white and ambient light. So the
-    taps add up to A. A pixel of two taps that takes two exposures has as much in each as this one with twice the
-    `exposure_s`. Frames: frequency by frequency, four taps each.
+    taps add up to A. A pixel with two taps, which takes two exposures, collects as much in each tap as this one with
+    twice the `exposure_s`. Frames: frequency by frequency, four taps each.
 
     Parameters
     ----------
     modulation_hz : tuple of floats, hertz; or one float.
     contrast : float in (0, 1], demodulation contrast.
-    waveform : "sine", or "square" for a square source against a square reference (triangle correlation, "wiggling").
+    waveform : "sine", or "square" for a square source against a square reference. The correlation is then a triangle,
+        and a decoder that takes it for a sine has a periodic error, the "wiggling".
+
+    Examples
+    --------
+    >>> camera = AmcwToF((20e6, 80e6))
+    >>> round(camera.shortest_period_m, 2), round(camera.unambiguous_range_m, 2)  # of 80 MHz, and of both together
+    (1.87, 7.49)
+    >>> AmcwToF(50e6, waveform="square").details
+    '50 MHz, 4 taps, square wave'
     """
 
     modulation_hz: tuple[Hertz, ...] = (20e6, 80e6, 100e6)
@@ -71,18 +94,18 @@ class AmcwToF(Sensor):
 
     @property
     def unambiguous_range_m(self) -> float:
-        """Range beyond which all frequencies together wrap, c / (2 gcd f); frequencies are taken to 1 kHz."""
+        """Range in metres beyond which all frequencies together repeat, c / (2 gcd f), frequencies rounded to 1 kHz."""
         common = int(np.gcd.reduce([round(f / 1e3) for f in self.modulation_hz])) * 1e3
         return SPEED_OF_LIGHT / (2 * max(common, 1e3))
 
     @property
     def searched_m(self) -> float:
-        """Path length up to which decoding tells the wraps of the highest frequency apart."""
+        """Path length in metres up to which decoding tells the wraps of the highest frequency apart."""
         return min(2 * self.unambiguous_range_m, 2 * MAX_RANGE_M)
 
     @property
     def wraps(self) -> int:
-        """How often the highest frequency wraps within `searched_m`: the candidates of phase unwrapping."""
+        """Number of wraps of the highest frequency within `searched_m`: the candidates of phase unwrapping."""
         return max(1, int(np.ceil(self.searched_m * max(self.modulation_hz) / SPEED_OF_LIGHT - 1e-6)))
 
     def responses(self) -> tuple[Response, ...]:
@@ -113,7 +136,7 @@ class AmcwToF(Sensor):
 
     @property
     def default_detector(self) -> Detector:
-        """A lock-in pixel."""
+        """A detector of lock-in pixels."""
         return Detector.time_of_flight()
 
     @classmethod
@@ -121,7 +144,7 @@ class AmcwToF(Sensor):
         return {"amcw": cls()}
 
     def is_beyond_range(self, path_length_m: np.ndarray) -> np.ndarray:
-        """Path lengths beyond the last of the wraps that are searched, which ends at `searched_m` or after it."""
+        """(...) bool, path lengths beyond the last wrap that is searched, which ends at `searched_m` or later."""
         longest_m = min(self.wraps * SPEED_OF_LIGHT / max(self.modulation_hz), 2 * self.unambiguous_range_m)
         return np.asarray(path_length_m > longest_m)
 
@@ -135,24 +158,29 @@ class AmcwToF(Sensor):
         return f"{megahertz} MHz, {len(TAPS_DEG)} taps, {self.waveform} wave"
 
     def representative_frames(self, frames: np.ndarray) -> list[int]:
-        """A tap of the first frequency, and two of the last one."""
+        """Indices of a tap of the first frequency, and of two taps of the last one."""
         last = len(TAPS_DEG) * (len(self.modulation_hz) - 1)
         return sorted({0, last, last + 1})
 
 
 @dataclass(frozen=True)
 class AmcwDecoder(Decoder):
-    """Phase and amplitude of each frequency, and the one path length on which they agree.
+    """Decodes phase and amplitude of each frequency, and the one path length on which the phases agree.
 
     Parameters
     ----------
     phase : PhaseThresholds.
-    correct_wiggling : bool; for a square waveform, True inverts the triangle correlation exactly (what a
-        calibrated camera does with a look-up table), False uses the sine formula and shows the raw wiggling
-        error, up to 0.011 periods. Multipath sums triangles of different phase, for which neither is exact.
-    max_residual : a frequency whose phase is farther off that of the common path length contradicts it.
-    max_ambiguity : misfit of the best wrap counts over that of the second best: above, the choice between them is a
-        guess.
+    correct_wiggling : bool; for a square waveform, True inverts the triangle correlation exactly (what a calibrated
+        camera does with a look-up table), False uses the sine formula and shows the raw wiggling error, up to 0.011
+        periods. Multipath adds triangles of different phase, for which neither is exact.
+    max_residual : float, turns; a frequency whose phase is farther off that of the common path length contradicts it.
+    max_ambiguity : float, largest misfit of the best wrap counts as a fraction of that of the second best. Above it,
+        the choice between the two is a guess.
+
+    Examples
+    --------
+    >>> AmcwDecoder(correct_wiggling=False).correct_wiggling
+    False
     """
 
     phase: PhaseThresholds = field(default_factory=PhaseThresholds)
@@ -166,28 +194,33 @@ class AmcwDecoder(Decoder):
     def __post_init__(self) -> None:
         check_fields(self)
 
-    def decode(self, capture: Capture) -> RangeImage:
+    def coordinates(self, capture: Capture) -> PathLengths:
+        """Path lengths of an `AmcwToF` capture; their standard deviations are those of sine waves."""
         sensor = of_type(capture.sensor, AmcwToF)
         exact_square = sensor.waveform == "square" and self.correct_wiggling
         groups = np.split(capture.frames, len(sensor.modulation_hz))
         shape = capture.frames.shape[1:]
         status, length = np.zeros(shape, dtype=np.uint8), np.empty(shape)
         amplitude, mean = np.empty((2, *shape), dtype=np.float32)
+        sigma_m = None if capture.noise(capture.frames[0, :1]) is None else np.empty(shape, dtype=np.float32)
         for rows in bands(len(status)):
             phases = [tap_phase(taps[:, rows], exact_square) for taps in groups]
-            weights = [_weight(capture, phase, f) for phase, f in zip(phases, sensor.modulation_hz, strict=True)]
+            sigmas = [phase_sigma(capture, phase, len(TAPS_DEG)) for phase in phases]
+            weights = [_weight(*read) for read in zip(phases, sigmas, sensor.modulation_hz, strict=True)]
             unwrapped = unwrap([p.normalised for p in phases], sensor.modulation_hz, weights, sensor.searched_m)
             contradiction = unwrapped.residual > self.max_residual
             status[rows][contradiction | (unwrapped.ambiguity > self.max_ambiguity)] = Status.UNWRAPPING_FAILED
-            for phase in phases:
-                status[rows][modulation_is_weak(capture, phase, len(TAPS_DEG), self.phase)] = Status.LOW_SIGNAL
+            for phase, sigma in zip(phases, sigmas, strict=True):
+                status[rows][modulation_is_weak(capture, phase, sigma, self.phase)] = Status.LOW_SIGNAL
             status[rows][capture.saturated(capture.frames[:, rows])] = Status.SATURATED
             length[rows] = unwrapped.length_m
+            if sigma_m is not None:
+                sigma_m[rows] = RADIAN_M / np.sqrt(unwrapped.weight)
             amplitude[rows] = np.mean([p.modulation for p in phases], axis=0)
             mean[rows] = np.mean([p.mean for p in phases], axis=0)
-        return range_image_from_path_length(
-            capture,
-            length,
+        return PathLengths(
+            length_m=length,
+            sigma_m=sigma_m,
             status=status,
             confidence=2 * amplitude / capture.full_scale,
             intensity=mean - capture.black_level,
@@ -204,9 +237,14 @@ class AmcwDecoder(Decoder):
         return FrameContent(signal=TAP_FRACTION, ambient=TAP_FRACTION)
 
 
-def _weight(capture: Capture, phase: Phase, modulation_hz: float) -> np.ndarray:
-    """(h, w) inverse variance of the path length by this frequency, in relative units."""
-    sigma = phase_sigma(capture, phase, len(TAPS_DEG))
+def _weight(phase: Phase, sigma: np.ndarray | None, modulation_hz: float) -> np.ndarray:
+    """(h, w) float64, inverse variance of the path length by this frequency, in `RADIAN_M`^-2.
+
+    Parameters
+    ----------
+    sigma : (h, w) radians, standard deviation of the phase; None: not known. Then it counts as the inverse of the
+        modulation, and the weights are relative.
+    """
     precision = phase.modulation if sigma is None else 1 / np.maximum(sigma, 1e-9)
-    scale = np.float64(modulation_hz / 1e8)
+    scale = np.float64(modulation_hz / WEIGHT_HZ)
     return np.asarray((scale * precision.astype(np.float64)) ** 2 + 1e-30)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Direct time of flight: a photon histogram per pixel, and the decoder that finds its strongest peak."""
+"""Direct time of flight: a camera with a photon histogram per pixel, and the decoder that finds its strongest peak."""
 
 from __future__ import annotations
 
@@ -10,22 +10,24 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.decoding.gray import Threshold
-from rangesim.decoding.histogram import coates, find_peak, runs_out, window_reach
-from rangesim.decoding.path_length import range_image_from_path_length
-from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.histogram import coates, find_peak, place_sigma, pulses_left, runs_out, window_reach
+from rangesim.decoding.path_length import PathLengths
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Gate
 from rangesim.electronics.spad import SpadDetector
 from rangesim.response import SPEED_OF_LIGHT, Response, TransientHistogram
-from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, of_type
+from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, Threshold, of_type
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 OVERSAMPLING = (1, 2, 4)
-"""Bins of the transport pass per bin of a sensor with a pulse: so many that its sigma is at least one of them."""
+"""Numbers of bins of the transport pass per bin of a sensor with a pulse. The first one is taken that makes the
+standard deviation of the pulse at least one bin of the pass, else the last. Narrower bins cost memory alone."""
+
 SHARED_VARIANCE = 1 / 6
-"""Mean variance in bins squared of light that is shared by two bins, which the blur leaves out."""
+"""Mean variance, in bins squared, of light that two bins share: t (1 - t) of a path at the fraction t of the way
+between their centres, on average over t. The blur by the pulse is smaller by as much, so that the sum has the pulse's
+variance."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,8 @@ class DirectToF(Sensor):
     """Pulsed time of flight with a photon histogram per pixel (SPAD and TDC). Frames: the bins.
 
     The laser fires again as soon as the histogram is full, every `period_s`. So light that comes back later is counted
-    with that of a later pulse: a wall at 1.2 times the range is a ghost at 0.2 times. Ambient light spreads evenly over
-    the bins.
+    with that of a later pulse: a wall at 1.2 times the range is a ghost at 0.2 times the range. Ambient light spreads
+    evenly over the bins.
 
     Parameters
     ----------
@@ -42,10 +44,17 @@ class DirectToF(Sensor):
     bin_s : float, seconds, width of a bin.
     start_s : float, seconds, delay of the first bin after the pulse.
     pulse_fwhm_s : float, seconds, full width at half maximum of the Gaussian instrument response, at most half of the
-        histogram; 0 for none. With a
-        pulse, a path is shared by the two bins next to it, so that its place within a bin is kept; bins of the pass are
-        up to four times as fine where the pulse is narrow (`OVERSAMPLING`).
+        histogram; 0 for none. With a pulse, a path is shared by the two bins next to it, so that its place within a bin
+        is kept. The bins of the pass are up to four times as fine where the pulse is narrow (`OVERSAMPLING`).
     laser : "periodic", or "single-shot": light that comes back after the histogram is full is lost.
+
+    Examples
+    --------
+    >>> camera = DirectToF(bins=128, bin_s=200e-12)
+    >>> camera.n_frames, camera.details
+    (128, '128 bins of 200 ps')
+    >>> camera.is_beyond_range(np.array([7.0, 8.0]))  # metres there and back; the histogram ends at 7.67 m
+    array([False,  True])
     """
 
     bins: Annotated[int, whole(2, "bins")] = 256
@@ -110,6 +119,7 @@ class DirectToF(Sensor):
 
     @property
     def _fine(self) -> int:
+        """Number of bins of the pass per bin of the sensor."""
         if self.pulse_fwhm_s == 0:
             return 1
         return next((n for n in OVERSAMPLING if n * self.sigma_bins >= 1), OVERSAMPLING[-1])
@@ -149,26 +159,31 @@ class DirectToF(Sensor):
         return f"{self.bins} bins of {self.bin_s * 1e12:g} ps"
 
     def representative_frames(self, frames: np.ndarray) -> list[int]:
-        """The bins at the quartiles of the light."""
+        """Indices of the bins at the quartiles of the light."""
         energy = np.cumsum(frames.reshape(len(frames), -1).sum(axis=1, dtype=np.float64))
         return sorted({int(np.searchsorted(energy, fraction * energy[-1])) for fraction in (0.25, 0.5, 0.75)})
 
 
 @dataclass(frozen=True)
 class DirectToFDecoder(Decoder):
-    """The strongest return of each histogram.
+    """Decodes the path length of the strongest return of each histogram.
 
     Pile-up is undone if the detector has it (Coates 1968, see `coates`). A filter matched to the instrument response
-    finds the peak; the centroid of the counts above the background around it, re-centred once, gives the place within
-    a bin. A peak that the end of the histogram cuts off is completed to a Gaussian; where that lies outside, the
-    reading is out of range. Where the pulses run out within the window of the peak, the reading is saturated (see
-    `runs_out`); less light helps.
+    finds the peak. The centroid of the counts above the background around it, re-centred once, gives the place within a
+    bin. A peak that the end of the histogram cuts off is completed to a Gaussian; where that lies outside, the reading
+    is out of range. Where the pulses run out within the window of the peak, the reading is saturated (see `runs_out`);
+    less light helps.
 
     Parameters
     ----------
-    peak_sigmas, min_counts : least height of a peak over the background: standard deviations of the counts in its
-        window, and counts.
-    relative_peak : least peak as a fraction of the bright ones of the image, for noise-free captures.
+    peak_sigmas, min_counts : float, least height of a peak over the background, in standard deviations of the counts in
+        its window, and in counts.
+    relative_peak : float, least peak as a fraction of the bright ones of the image, for noise-free captures.
+
+    Examples
+    --------
+    >>> DirectToFDecoder(peak_sigmas=8.0)
+    DirectToFDecoder(peak_sigmas=8.0, min_counts=5.0, relative_peak=0.0001)
     """
 
     peak_sigmas: Threshold = 5.0
@@ -181,13 +196,14 @@ class DirectToFDecoder(Decoder):
     def __post_init__(self) -> None:
         check_fields(self)
 
-    def decode(self, capture: Capture) -> RangeImage:
+    def coordinates(self, capture: Capture) -> PathLengths:
+        """Path lengths of a `DirectToF` capture, with standard deviations of the photons' shot noise."""
         from pcgraph.parallel import MIN_ROWS, in_blocks
 
         sensor = of_type(capture.sensor, DirectToF)
         height, width = capture.frames.shape[1:]
         position, peak, background, intensity = np.empty((4, height, width))
-        spent, pulses = np.zeros((height, width), dtype=bool), _pulses(capture)
+        left, pulses = np.empty((height, width), dtype=np.int64), _pulses(capture)
 
         def measure(start: int, stop: int) -> None:
             for row in range(start, stop):
@@ -196,7 +212,7 @@ class DirectToFDecoder(Decoder):
                 found = find_peak(histogram, sensor.sigma_bins, sensor.is_cyclic)
                 position[row], peak[row], background[row] = found
                 if pulses is not None:
-                    spent[row] = runs_out(frames, found[0], pulses, sensor.sigma_bins, sensor.is_cyclic)
+                    left[row] = pulses_left(frames, found[0], pulses, sensor.sigma_bins, sensor.is_cyclic)
                 intensity[row] = frames.sum(axis=0, dtype=np.float64)
 
         in_blocks(measure, height, smallest=MIN_ROWS)
@@ -205,9 +221,20 @@ class DirectToFDecoder(Decoder):
         is_strong = peak >= self._least_counts(background) if capture.is_digital else peak > self.relative_peak * bright
         status = np.where(is_strong, Status.OK, Status.LOW_SIGNAL)
         status[is_strong & ((position < 0) | (position > sensor.bins))] = Status.OUT_OF_RANGE
-        status[spent | capture.saturated(capture.frames)] = Status.SATURATED
-        return range_image_from_path_length(
-            capture, length, status=status, confidence=peak / (bright or 1.0), intensity=intensity
+        status[capture.saturated(capture.frames)] = Status.SATURATED
+        sigma_m = None
+        if capture.detector is not None:
+            sigma_bins = place_sigma(peak, background, sensor.bins, sensor.sigma_bins, sensor.is_cyclic)
+            if pulses is not None:
+                status[runs_out(left, pulses)] = Status.SATURATED
+                sigma_bins *= np.sqrt(pulses / np.maximum(left, 1))  # Coates' correction adds to the variance of counts
+            sigma_m = sigma_bins * sensor.bin_s * SPEED_OF_LIGHT
+        return PathLengths(
+            length_m=length,
+            sigma_m=sigma_m,
+            status=status,
+            confidence=peak / (bright or 1.0),
+            intensity=intensity,
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
@@ -217,22 +244,22 @@ class DirectToFDecoder(Decoder):
         return self._least_counts(window * (background.dark + background.ambient / bins))
 
     def _least_counts(self, background: np.ndarray) -> np.ndarray:
-        """Least height of a peak over so many counts of background in its window."""
+        """(...) float64, counts, least height of a peak over the counts (...) of background in its window."""
         return np.asarray(np.maximum(self.min_counts, self.peak_sigmas * np.sqrt(background)))
 
     def content(self, sensor: Sensor) -> FrameContent:
-        """What the window of a peak holds."""
+        """Light and dark counts in the window of a peak."""
         window = _window_bins(of_type(sensor, DirectToF))
         return FrameContent(signal=1.0, ambient=window / of_type(sensor, DirectToF).bins, dark=window)
 
 
 def _window_bins(sensor: DirectToF) -> int:
-    """Bins in the window of a peak."""
+    """Number of bins in the window of a peak."""
     return 2 * window_reach(sensor.bins, sensor.sigma_bins, sensor.is_cyclic) + 1
 
 
 def _pulses(capture: Capture) -> int | None:
-    """How many pulses the exposure holds, if only the first photon of each was counted; None without pile-up."""
+    """Number of pulses in the exposure, if only the first photon of each was counted; None without pile-up."""
     if isinstance(capture.detector, SpadDetector) and capture.detector.pile_up:
         return capture.detector.pulses(capture.sensor.gate, capture.exposure_s)
     return None

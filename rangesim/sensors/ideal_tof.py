@@ -10,8 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.decoding.path_length import range_image_from_path_length
-from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.path_length import PathLengths
 from rangesim.decoding.status import Status
 from rangesim.response import FirstReturn, Response
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, of_type
@@ -19,9 +18,14 @@ from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameC
 
 @dataclass(frozen=True)
 class IdealToF(Sensor):
-    """Range from the path length of the first return alone: the best any time of flight sensor could do.
+    """Time of flight that reads the path length of the first return alone: the best that any such sensor could do.
 
-    Frames: `radiance` of the first return, and `radiance_x_length`, the same times its path length in metres.
+    Frames: `radiance` of the first return, W/m2/sr, and `radiance_x_length`, the same times its path length in metres.
+
+    Examples
+    --------
+    >>> IdealToF().frame_names()
+    ['radiance', 'radiance_x_length']
     """
 
     type_name: ClassVar[str] = "ideal-tof"
@@ -66,19 +70,27 @@ class IdealToF(Sensor):
 
 @dataclass(frozen=True)
 class IdealToFDecoder(Decoder):
-    """Path length = radiance_x_length / radiance; no radiance is LOW_SIGNAL."""
+    """Decodes the path length as radiance_x_length / radiance. Pixels without radiance are `LOW_SIGNAL`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> frames = np.array([[[0.5, 0.0]], [[1.5, 0.0]]], dtype=np.float32)  # 0.5 W/m2/sr after 3 m, and darkness
+    >>> IdealToFDecoder().coordinates(Capture(frames, IdealToF())).length_m
+    array([[ 3., nan]])
+    """
 
     type_name: ClassVar[str] = "ideal-tof"
     reads: ClassVar[type[Sensor]] = IdealToF
 
-    def decode(self, capture: Capture) -> RangeImage:
+    def coordinates(self, capture: Capture) -> PathLengths:
         of_type(capture.sensor, IdealToF)
         radiance, weighted = (frame.astype(np.float64) for frame in capture.frames)
         dark = ~(radiance > 0)
         length = weighted / np.where(dark, 1.0, radiance)
         status = np.where(dark, Status.LOW_SIGNAL, Status.OK)
         confidence = radiance / (bright_level(radiance) or 1.0)
-        return range_image_from_path_length(capture, length, status=status, confidence=confidence, intensity=radiance)
+        return PathLengths(length_m=length, status=status, confidence=confidence, intensity=radiance)
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         return background.floor(0.0)

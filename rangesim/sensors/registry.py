@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which sensors there are: those of the package, and those of files that a user names."""
+"""Registry of sensors: those of the package, and those of files that a user names."""
 
 from __future__ import annotations
 
@@ -15,12 +15,24 @@ from rangesim.errors import FileFormatError
 from rangesim.sensor import Decoder, Sensor
 from rangesim.settings.config import brief, from_dict, nearest, shown, to_dict
 
+IMAGES_PRESET = "gray"
+"""Preset of the sensor that took a folder of bare images if nobody names one: the code of OpenCV's GrayCodePattern."""
+
 _SEPARATOR = ".py:"
+"""Mark between the two parts of FILE.py:NAME."""
+
 _FRAME_NAME = re.compile(r"[\w.+-]+")
+"""Names of frames that are safe in the names of files on every system."""
 
 
 def presets() -> dict[str, Sensor]:
-    """Sensors by the names that stand for them on the command line, of all classes that are loaded."""
+    """Sensors of all classes that are loaded, by the names that stand for them on the command line.
+
+    Examples
+    --------
+    >>> sorted(set(presets()) & {"gray", "gray-phase", "amcw", "direct-tof", "ideal-tof"})
+    ['amcw', 'direct-tof', 'gray', 'gray-phase', 'ideal-tof']
+    """
     found: dict[str, Sensor] = {}
     for kind in Sensor.known.values():
         for name, sensor in _presets_of(kind).items():
@@ -29,6 +41,7 @@ def presets() -> dict[str, Sensor]:
 
 
 def _presets_of(kind: type[Sensor]) -> dict[str, Sensor]:
+    """Presets of one class; none of a class that cannot be made without settings."""
     if "presets" in vars(kind):
         return kind.presets()
     try:
@@ -38,14 +51,15 @@ def _presets_of(kind: type[Sensor]) -> dict[str, Sensor]:
 
 
 def sensor_of(name: str, files_in: Path | None = Path()) -> Sensor:
-    """The sensor of a preset's name, or of FILE.py:NAME, a sensor or class of sensors in a Python file.
+    """The sensor of a name: that of a preset, or FILE.py:NAME, a sensor or class of sensors in a Python file.
 
     Loading a file runs it, so only name files that you trust. Its classes are known from then on, in captures and
     results too. A file that has changed is loaded again.
 
     Parameters
     ----------
-    files_in : folder from which a relative FILE counts; None: no file is loaded.
+    name : name of a preset, or FILE.py:NAME. files_in : folder from which a relative FILE counts; None: no file is
+        loaded.
 
     Raises
     ------
@@ -53,6 +67,14 @@ def sensor_of(name: str, files_in: Path | None = Path()) -> Sensor:
         No such preset; the message names the nearest one.
     FileFormatError
         The file is missing or fails, or NAME is no sensor.
+
+    Examples
+    --------
+    >>> sensor_of("gray").code
+    'gray'
+    >>> sensor_of("grey", files_in=None)
+    Traceback (most recent call last):
+    ValueError: expected a sensor out of ..., got 'grey' (did you mean 'gray'?).
     """
     if files_in is not None and is_file_name(name):
         path, _, attribute = name.rpartition(":")
@@ -73,12 +95,18 @@ def sensor_from_dict(data: Any, place: str, files_in: Path | None = None) -> Sen
 
     Parameters
     ----------
+    data : str, or mapping of settings. place : name of the place in the file, for messages.
     files_in : as for `sensor_of`; the default loads no file, for what is read back from captures and results.
 
     Raises
     ------
     ValueError
         An unknown name or type, or settings that the sensor refuses; the message names the place.
+
+    Examples
+    --------
+    >>> sensor_from_dict({"type": "amcw-tof", "contrast": 0.5}, "instrument[0].sensor").contrast
+    0.5
     """
     try:
         if isinstance(data, str):
@@ -100,12 +128,26 @@ def sensor_from_dict(data: Any, place: str, files_in: Path | None = None) -> Sen
 
 
 def is_file_name(name: str) -> bool:
-    """Whether this is FILE.py:NAME."""
+    """Whether the name is of the form FILE.py:NAME.
+
+    Examples
+    --------
+    >>> is_file_name("own_code.py:MultiFrequency"), is_file_name("gray")
+    (True, False)
+    """
     return _SEPARATOR in name
 
 
 def check_sensor(sensor: Sensor) -> None:
-    """Raise ValueError if a sensor of a user's own is not made as sensors have to be."""
+    """Raise ValueError if a user's own sensor breaks a rule that all sensors keep.
+
+    The rules are those of files and records: a `type_name`, frozen dataclasses, and frame names that files can have.
+
+    Examples
+    --------
+    >>> from rangesim.sensors import IdealToF
+    >>> check_sensor(IdealToF())
+    """
     kind = type(sensor)
     if not getattr(kind, "type_name", ""):
         raise ValueError(f"expected {kind.__name__} to have a type_name.")
@@ -122,6 +164,7 @@ def check_sensor(sensor: Sensor) -> None:
 
 
 def _sensor_in(path: Path, attribute: str) -> Sensor:
+    """The sensor of that name in a Python file; of a class, the one with its default settings."""
     found = getattr(_module(path), attribute, None)
     try:
         if isinstance(found, type) and issubclass(found, Sensor):
@@ -135,7 +178,7 @@ def _sensor_in(path: Path, attribute: str) -> Sensor:
 
 
 def _module(path: Path) -> ModuleType:
-    """The module of a file, which runs once, and again when it has changed."""
+    """The module of a file. The file runs once, and again when it has changed."""
     if not path.is_file():
         raise FileFormatError(f"{path} does not exist; expected a Python file with a sensor.")
     before = [(family, dict(family.known)) for family in (Sensor, Decoder)]

@@ -56,6 +56,12 @@ class GroundTruth(ShortRepr):
     material : (h, w) int32, index into `material_names`.
     projector_uv : (h, w, 2) float32, pixel coordinates of the point in the projector, also outside its image.
     projector_visible : (h, w) bool, whether the straight line to the projector is free and the point is in its image.
+
+    Examples
+    --------
+    >>> from rangesim import load_signals
+    >>> truth = load_signals("signals.npz").truth  # doctest: +SKIP
+    >>> pixels = {name: int(mask.sum()) for name, mask in truth.classes().items()}  # doctest: +SKIP
     """
 
     z: np.ndarray

@@ -207,6 +207,18 @@ def _result(path: Path, _: Arguments) -> Any:
     return load_result(path)
 
 
+def _scan(path: Path, _: Arguments) -> Any:
+    from rangesim.results.scan_files import load_scan
+
+    return load_scan(path)
+
+
+def _decoded_record(path: Path, _: Arguments) -> Any:
+    from rangesim.results.decoded_files import load_decoded
+
+    return load_decoded(path)
+
+
 def _signals(path: Path, _: Arguments) -> Any:
     import rangesim
 
@@ -547,6 +559,8 @@ READERS = {
             )
             for part, targets in _RESULT_PARTS.items()
         ),
+        Reader("scan", _scan, seeds.scans, ("scan/*.json", "scan/*.npz", "scan/*.ply"), (_by_suffix,), share=0.3),
+        Reader("decoded", _decoded_record, seeds.decoded, ("decoded/*.json",), (_by_suffix,), share=0.3),
         Reader(
             "report", _rangesim, _with_arguments(seeds.results, "report {entry}"),
             ("result/*.json", "result/*.npz", "result/*/capture/00*"), (_sidecar_trees,), share=0.2,

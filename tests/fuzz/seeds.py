@@ -78,6 +78,36 @@ def results() -> Seeds:
     return {"result": Input(result_files(), "result")}
 
 
+def scans() -> Seeds:
+    """A scan directory of two views of a plane."""
+    from rangesim.experiment import ScanSettings, Turntable
+    from rangesim.instrument.instrument import Instrument
+    from rangesim.pipeline.scan_run import run_scan
+    from rangesim.sensors import IdealToF
+
+    settings = ScanSettings(
+        str(SCENES / "plane.xml"), width=16, height=12, spp=1, photons=1000, voxel_m=0.2,
+        path=Turntable(views=2), instrument=Instrument("ideal", IdealToF()),
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder, mock.patch("time.monotonic", itertools.count(0.0, 0.01).__next__):
+        run_scan(settings, Path(folder) / "scan")
+        return {"scan": Input(directory(Path(folder) / "scan", "scan"), "scan")}
+
+
+def decoded() -> Seeds:
+    """What a capture decodes to, as a directory."""
+    from synthetic import plane_signals, stereo_rig
+
+    from rangesim import IdealToF, decode, expose
+    from rangesim.results.decoded_files import Decoded, save_decoded
+
+    capture = expose(plane_signals(stereo_rig(12, 8), IdealToF()), IdealToF())
+    of_capture = Decoded(decode(capture), capture.sensor, capture.rig, {"ok": 1.0}, None)
+    with tempfile.TemporaryDirectory() as folder:
+        save_decoded(of_capture, Path(folder) / "decoded", {})
+        return {"decoded": Input(directory(Path(folder) / "decoded", "decoded"), "decoded")}
+
+
 def captures() -> Seeds:
     """Capture directories: digital numbers in PNG, radiance in EXR."""
     seeds: Seeds = {}

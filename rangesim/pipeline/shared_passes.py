@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which instruments share a light-transport pass: those whose emitter, wavelength and camera agree."""
+"""Decides which instruments share a light-transport pass: those whose emitter, wavelength and camera agree."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ if TYPE_CHECKING:
 
 
 def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[Instrument]]]:
-    """The passes of an experiment: a rig each, and the instruments that share it; in order of first appearance.
+    """The passes of an experiment, each as a rig and the list of instruments that share it.
 
-    An ideal instrument has no wavelength and joins the first group with its camera and emitter. Where something moves,
-    each instrument has a pass of its own, because its frames are taken at times of its own.
+    The passes are in the order in which their first instruments appear. An ideal instrument has no wavelength, so it
+    joins the first pass with its camera and emitter. If something moves, each instrument has a pass of its own, because
+    its frames are taken at times of its own.
     """
     groups: list[tuple[Rig, list[Instrument]]] = []
     for instrument in experiment.instruments:
@@ -33,7 +34,7 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
 
 
 def _first_that_agrees(groups: list[tuple[Rig, list[Instrument]]], rig: Rig) -> int | None:
-    """Index of the first group whose light and camera are those of a rig; None: there is none."""
+    """Index of the first group whose emitter, wavelength and camera are those of a rig; None if there is none."""
     for index, (other, _) in enumerate(groups):
         is_same_light = None in (rig.wavelength_m, other.wavelength_m) or rig.wavelength_m == other.wavelength_m
         if is_same_light and replace(rig, wavelength_m=other.wavelength_m) == other:

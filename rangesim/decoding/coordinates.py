@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coordinates: the first result of a decoder, before any geometry.
+
+A decoder works in two steps. The first one reads the frames alone: it gives projector coordinates or path lengths, with
+their standard deviations. The second one is geometry, and needs a rig: it makes a range image of them. Calibration
+needs the first step, for it is what finds the rig.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rangesim.decoding.status import Status
+from rangesim.settings.config import ShortRepr
+
+if TYPE_CHECKING:
+    from rangesim.decoding.range_image import RangeImage
+    from rangesim.rig import Rig
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Coordinates(ShortRepr, ABC):
+    """Readings of the camera's pixels before any geometry.
+
+    Subclasses add the coordinates: `ProjectorCoordinates` and `PathLengths`. They are NaN where `status` is not OK.
+
+    Parameters
+    ----------
+    status : (h, w) integer, values of `Status`; kept as uint8.
+    confidence : (h, w) float, strength of the useful signal, as in `RangeImage`; kept as float32, clipped to 0..1.
+    intensity : (h, w) float, mean signal in the capture's units; kept as float32.
+    """
+
+    status: np.ndarray
+    confidence: np.ndarray
+    intensity: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "status", np.asarray(self.status).astype(np.uint8))
+        object.__setattr__(self, "confidence", np.clip(self.confidence, 0, 1).astype(np.float32))
+        object.__setattr__(self, "intensity", np.asarray(self.intensity, dtype=np.float32))
+
+    @property
+    def valid(self) -> np.ndarray:
+        """(h, w) bool, where `status` is OK."""
+        return np.asarray(self.status == Status.OK)
+
+    @abstractmethod
+    def range_image(self, rig: Rig | None) -> RangeImage:
+        """Range image of these coordinates.
+
+        Parameters
+        ----------
+        rig : Rig that took the capture; None: z is NaN everywhere.
+        """
+
+    def _keep_valid(self, name: str, dtype: type[np.floating]) -> None:
+        """Set NaN in the array of that name, where there is one, wherever `status` is not OK."""
+        values = getattr(self, name)
+        if values is not None:
+            valid_values = np.where(self.valid, values, np.float32(np.nan))
+            object.__setattr__(self, name, valid_values.astype(dtype, copy=False))

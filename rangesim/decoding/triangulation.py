@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Projector coordinates to ranges, and which of the readings are within the working range."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+
+from rangesim.decoding.axis_code import MIN_PIXELS
+from rangesim.decoding.coordinates import Coordinates
+from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.row_bands import bands
+from rangesim.decoding.status import Status
+from rangesim.errors import warn
+from rangesim.geometry.camera_projector import triangulate_coordinates
+from rangesim.rig import Rig
+from rangesim.settings.bounds import Bounds, check_fields
+
+COORDINATE_ERROR_PX = 0.5
+"""Error of a projector coordinate, in projector pixels, that the working range must allow for: half a pixel, the
+largest error of a sound Gray code, which decodes to whole pixels. Phase shift is finer."""
+
+MAX_BEHIND_FRACTION = 0.2
+"""Largest fraction of the decoded pixels whose rays may meet clearly behind a device before the capture is doubted. A
+few do by interreflection; with a mirrored image or an inverted calibration most do."""
+
+MIN_BEHIND_PX = 10.0
+"""Distance in projector pixels to a coordinate that would make the rays parallel, from which on they meet clearly
+behind a device. With less, the point may be far away in front, and noise has moved it behind."""
+
+
+@dataclass(frozen=True)
+class TriangulationLimits:
+    """Limits beyond which triangulated pixels are refused.
+
+    Parameters
+    ----------
+    epipolar_tolerance_px : float, projector pixels; where both axes are coded, pixels whose column and row miss the
+        epipolar line by more get `CODE_ERROR`.
+    max_relative_error : float, the working range: pixels where half a projector pixel of error would shift the depth by
+        a larger fraction get `OUT_OF_RANGE`. With parallel axes z may be at most 2 f b max_relative_error, f the
+        projector's focal length in pixels, b the baseline; light planes along the baseline measure nothing.
+
+    Examples
+    --------
+    >>> TriangulationLimits(max_relative_error=0.01)  # five times as strict as the default
+    TriangulationLimits(epipolar_tolerance_px=5.0, max_relative_error=0.01)
+    """
+
+    epipolar_tolerance_px: Annotated[float, Bounds("0 or positive", 0, 1e9)] = 5.0
+    max_relative_error: Annotated[float, Bounds("0 or positive", 0, 1e9)] = 0.05
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class ProjectorCoordinates(Coordinates):
+    """Projector pixel coordinates that the camera's pixels see, with pixel centres at integer + 0.5.
+
+    Parameters
+    ----------
+    column, row : (h, w) float32, projector pixels; NaN where `status` is not OK; None for an axis that is not coded.
+    column_sigma_px, row_sigma_px : (h, w) float32, projector pixels, standard deviations of `column` and `row`; NaN
+        where `status` is not OK. None: not known, as for fringes of an unknown detector.
+    limits : TriangulationLimits that `range_image` applies.
+    is_doubted : whether the decoder has warned that the capture contradicts its code. Then rays that meet behind a
+        device have their cause, and `range_image` does not warn of them.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> one = np.ones((1, 2))
+    >>> seen = ProjectorCoordinates(
+    ...     column=np.array([[10.5, 11.5]]), row=None, status=np.array([[0, 3]]), confidence=one, intensity=one
+    ... )
+    >>> seen.column
+    array([[10.5,  nan]], dtype=float32)
+    >>> seen.range_image(None).status  # without a rig, that of the code
+    array([[0, 3]], dtype=uint8)
+    """
+
+    column: np.ndarray | None
+    row: np.ndarray | None
+    column_sigma_px: np.ndarray | None = None
+    row_sigma_px: np.ndarray | None = None
+    limits: TriangulationLimits = field(default_factory=TriangulationLimits)
+    is_doubted: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("column", "row", "column_sigma_px", "row_sigma_px"):
+            self._keep_valid(name, np.float32)
+
+    def range_image(self, rig: Rig | None) -> RangeImage:
+        """Range image of these coordinates, triangulated.
+
+        `RangesimWarning` if many rays meet behind a device.
+
+        Parameters
+        ----------
+        rig : Rig that took the capture; None: z is NaN everywhere, and `status` is that of the code.
+        """
+        column, row, status, decoded = self.column, self.row, self.status.copy(), self.valid
+        z = np.full(status.shape, np.nan, dtype=np.float32)
+        range_m = z.copy()
+        if rig is not None:
+            behind_px = []
+            for rows in bands(len(status)):
+                y, x = np.nonzero(decoded[rows])
+                directions = rig.camera.directions(np.stack([x + 0.5, y + rows.start + 0.5], axis=-1))
+                found = triangulate_coordinates(
+                    directions,
+                    rig,
+                    None if column is None else column[rows][y, x],
+                    None if row is None else row[rows][y, x],
+                )
+                behind_px.append(found.behind_px.astype(np.float32))
+                outcome = np.zeros(len(directions), dtype=np.uint8)
+                usable = found.relative_error * COORDINATE_ERROR_PX <= self.limits.max_relative_error
+                outcome[~(np.isfinite(found.z) & usable)] = Status.OUT_OF_RANGE
+                outcome[found.epipolar_px > self.limits.epipolar_tolerance_px] = Status.CODE_ERROR
+                depth = np.where(outcome == Status.OK, found.z, np.nan)
+                status[rows][y, x], z[rows][y, x] = outcome, depth
+                range_m[rows][y, x] = depth * np.linalg.norm(directions, axis=-1)
+            contradiction = behind_contradiction(np.concatenate(behind_px))
+            if contradiction and not self.is_doubted:
+                warn(contradiction)
+        return RangeImage(
+            z=z,
+            range_m=range_m,
+            confidence=self.confidence,
+            status=status,
+            intensity=self.intensity,
+            camera=rig.camera if rig else None,
+            T_world_camera=rig.T_world_camera if rig else None,
+            projector_column=column,
+            projector_row=row,
+        )
+
+
+def behind_contradiction(behind_px: np.ndarray) -> str | None:
+    """A sentence if many rays meet behind camera or projector; None if not.
+
+    Parameters
+    ----------
+    behind_px : (n,) float, projector pixels, as `ProjectorTriangulation` has it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> behind_contradiction(np.zeros(1000)) is None
+    True
+    >>> behind_contradiction(np.full(1000, 50.0))[:54]
+    '100 % of the decoded rays meet behind camera or projec'
+    """
+    fraction = float((behind_px > MIN_BEHIND_PX).mean()) if len(behind_px) >= MIN_PIXELS else 0.0
+    if fraction <= MAX_BEHIND_FRACTION:
+        return None
+    return (
+        f"{100 * fraction:.0f} % of the decoded rays meet behind camera or projector, where nothing is, so the depth "
+        "of the others is doubtful: check that no image is mirrored, that T_camera_projector is not its inverse, and "
+        "that the axes and their order are those shown."
+    )
