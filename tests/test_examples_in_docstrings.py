@@ -36,6 +36,7 @@ ROOMS = [
     "rangesim.response",
     "rangesim.results",
     "rangesim.rig",
+    "rangesim.scene",
     "rangesim.sensor",
     "rangesim.sensors",
     "rangesim.settings",

@@ -25,9 +25,9 @@ from rangesim.pipeline.scan_run import run_scan
 from rangesim.report import render_report
 from rangesim.report.figures import map_pictures
 from rangesim.report.scan_page import render_scan_page
-from rangesim.results.decoded_files import Decoded, load_decoded, save_decoded
-from rangesim.results.run_files import Result, load_result
-from rangesim.results.scan_files import load_scan
+from rangesim.results.decoded_captures import Decoded, load_decoded, save_decoded
+from rangesim.results.experiment_results import Result, load_result
+from rangesim.results.scan_results import load_scan
 from rangesim.sensors import IdealToF
 
 

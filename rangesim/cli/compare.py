@@ -23,7 +23,7 @@ def compare_command(
       rangesim compare out/tabletop out/matte
     """
     from rangesim.report.tables import comparison_markdown, comparison_tables
-    from rangesim.results.run_files import read_rows, read_settings
+    from rangesim.results.experiment_results import read_rows, read_settings
 
     tables = []
     for folder in results:

@@ -30,11 +30,11 @@ def report_command(
 
       rangesim report out/tabletop
     """
-    from rangesim.files.result_directories import replace_listed_file
+    from rangesim.files.atomic_directories import replace_listed_file
     from rangesim.report import render_report
     from rangesim.report.scan_page import render_scan_page
-    from rangesim.results.run_files import RESULT, load_result, read_settings
-    from rangesim.results.scan_files import SCAN, load_scan
+    from rangesim.results.experiment_results import RESULT, load_result, read_settings
+    from rangesim.results.scan_results import SCAN, load_scan
     from rangesim.sensors import sensor_of
 
     for name in sensor or ():

@@ -26,11 +26,11 @@ def verify_command(
       rangesim verify out/tabletop
     """
     from rangesim.errors import FileFormatError
-    from rangesim.files.result_directories import verify_directory
-    from rangesim.results.capture_files import CAPTURE
-    from rangesim.results.decoded_files import DECODED
-    from rangesim.results.run_files import RESULT
-    from rangesim.results.scan_files import SCAN
+    from rangesim.files.atomic_directories import verify_directory
+    from rangesim.results.captures import CAPTURE
+    from rangesim.results.decoded_captures import DECODED
+    from rangesim.results.experiment_results import RESULT
+    from rangesim.results.scan_results import SCAN
 
     kinds = (RESULT, SCAN, CAPTURE, DECODED)
     kind = next((k for k in kinds if (directory / k.sidecar).is_file()), None)

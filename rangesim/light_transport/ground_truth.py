@@ -9,11 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.camera_rays import connect
 from rangesim.light_transport.cutouts import first_surface
 from rangesim.light_transport.indirect_filter import Guides
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.loop import Lanes, PathSettings, SampleAllocation, View
-from rangesim.light_transport.rays import connect
 from rangesim.light_transport.sampling import in_pairs
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.surfaces import number_of, table_of

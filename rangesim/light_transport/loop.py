@@ -34,11 +34,11 @@ import numpy as np
 
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.ambient_light import ambient_on_ray, sampled_ambient, sampled_ambient_through_media
+from rangesim.light_transport.camera_rays import connect
 from rangesim.light_transport.caustics import Vertex, caustic_light, gather
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
 from rangesim.light_transport.photon_maps import PhotonMaps
 from rangesim.light_transport.photons import has_delta
-from rangesim.light_transport.rays import connect
 from rangesim.light_transport.sampling import Continued, Seed, Stream, aligned, in_pairs, of_part, random_stream
 from rangesim.light_transport.scattering import MAX_EVENTS, ROULETTE_BELOW
 from rangesim.light_transport.spectrum import mono

@@ -23,9 +23,9 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from rangesim.light_transport.camera_rays import Device
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.photon_flight import trace_photon_paths
-from rangesim.light_transport.rays import Device
 from rangesim.light_transport.sampling import Seed, Stream, random_stream
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene

@@ -44,11 +44,11 @@ PATHS_PER_GPU_S = 5e7
 """Camera paths per second on a GPU, measured on `tabletop` with 5 to 50 million paths on an H100, which has no
 ray-tracing cores."""
 PHOTON_S = 3e-6
-"""Seconds per caustic photon, its tracing and its place in the maps included. It counts little: the default 500 000
-photons are 1.5 s of a pass."""
+"""Seconds per caustic photon. Tracing it and building the maps takes 0.5e-6 s on two cores (docs/caustics.md); the rest
+stands for gathering it."""
 PASS_S = 1.0
 """Seconds to compile the kernels of a pass, independent of the size of the image. Measured on `tabletop` with 64 x 48
-pixels on two busy cores: 2 s for the whole pass with 500 000 photons, most of it for the photons."""
+pixels on two busy cores: 2 s for a whole pass, with 500 000 photons."""
 START_S = 4.0
 """Seconds per run to import the packages, load the scene and write the report. It only matters for short runs."""
 REPEATED_PASS_S = 0.3

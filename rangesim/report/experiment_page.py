@@ -9,11 +9,11 @@ from typing import Any
 
 from pcgraph.plumbing.plain_files import write_file
 from rangesim.errors import FileFormatError
-from rangesim.report import cloud, figures, palette, tables
-from rangesim.report.policy import visible_text
+from rangesim.report import figures, palette, point_viewer, tables
+from rangesim.report.content_security import visible_text
 from rangesim.report.template import render_page
 from rangesim.report.verdict import verdict
-from rangesim.results.run_files import Measurement, Result
+from rangesim.results.experiment_results import Measurement, Result
 from rangesim.signals import GroundTruth
 
 SCRIPTS = ("scroll.js", "viewer.js", "report.js")
@@ -32,7 +32,7 @@ def write_report(result: Result, path: Path) -> None:
     --------
     >>> from pathlib import Path
     >>> from rangesim.report import write_report
-    >>> from rangesim.results.run_files import load_result
+    >>> from rangesim.results.experiment_results import load_result
     >>> write_report(load_result("out/demo"), Path("report.html"))  # doctest: +SKIP
     """
     write_file(path, render_report(result).encode(), FileFormatError)
@@ -174,17 +174,17 @@ def _viewer_data(
 ) -> dict[str, Any]:
     """Data of the page's script: every instrument, by its camera and its light pass, and the colours of all."""
     camera_of = {m.name: number for number, group in enumerate(cameras) for m in group}
-    far = [cloud.far_limit(group) for group in cameras]
+    far = [point_viewer.far_limit(group) for group in cameras]
     return {
         "instruments": [
-            cloud.packed_measurement(m, visible_text(names[m.name]), camera_of[m.name], far[camera_of[m.name]])
+            point_viewer.packed_measurement(m, visible_text(names[m.name]), camera_of[m.name], far[camera_of[m.name]])
             for m in result.measurements
         ],
         "passes": [_pass_materials(light_pass.truth) for light_pass in result.passes],
         "errorColors": error.ravel().tolist(),
         "errorKneeM": palette.ERROR_KNEE_M,
         "errorLimitM": palette.ERROR_LIMIT_M,
-        "errorStepM": cloud.ERROR_STEP_M,
+        "errorStepM": point_viewer.ERROR_STEP_M,
         "status": list(palette.STATUS_NAMES.values()),
         "causes": palette.OUTCOME_NAMES,
         "causeColors": palette.OUTCOME_COLORS.ravel().tolist(),
@@ -196,7 +196,7 @@ def _pass_materials(truth: GroundTruth) -> dict[str, Any]:
     return {
         "materials": [visible_text(n) for n in truth.material_names],
         "materialColors": [palette.MATERIAL_COLORS.get(n, palette.NO_DATA) for n in truth.material_names],
-        "material": cloud.pack(truth.material.astype("int8")),
+        "material": point_viewer.pack(truth.material.astype("int8")),
     }
 
 

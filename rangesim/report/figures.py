@@ -13,7 +13,7 @@ from rangesim.capture import Capture
 from rangesim.decoding.range_image import RangeImage
 from rangesim.files.image_files import PNG_STRATEGY
 from rangesim.report import palette
-from rangesim.results.run_files import Measurement
+from rangesim.results.experiment_results import Measurement
 from rangesim.signals import EnergySplit, GroundTruth
 
 GAMMA = 2.2

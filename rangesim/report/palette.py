@@ -9,7 +9,7 @@ import numpy as np
 
 from rangesim.causes.cause import TITLES, Cause
 from rangesim.decoding.status import Status
-from rangesim.results.run_files import Measurement
+from rangesim.results.experiment_results import Measurement
 
 NOTHING = len(Cause)
 """Number of the class after those of `Cause`: the scene has no surface behind the pixel."""

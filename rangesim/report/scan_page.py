@@ -17,7 +17,7 @@ from rangesim.rig import Intrinsics
 from rangesim.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
-    from rangesim.results.scan_files import ScanResult
+    from rangesim.results.scan_results import ScanResult
 
 PICTURES = 3
 """Count of views, spread over the path, from which pictures of the mesh are taken: so many stand side by side."""

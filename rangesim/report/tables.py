@@ -15,10 +15,10 @@ from rangesim.experiment import Experiment
 from rangesim.report import palette
 from rangesim.report.figures import LegendEntry
 from rangesim.report.markdown_table import Table
-from rangesim.results.run_files import Measurement, PhotonsRecord
+from rangesim.results.experiment_results import Measurement, PhotonsRecord
 
 Rows = list[dict[str, Any]]
-"""Statistics per material class, one dict each, with the keys of `rangesim.results.run_files.RowRecord`."""
+"""Statistics per material class, one dict each, with the keys of `rangesim.results.experiment_results.RowRecord`."""
 
 FAILURE_HEADS = ["failed (%)", "because (% of the pixels)"]
 """Heads of the columns that say how many pixels failed, and why."""

@@ -18,7 +18,7 @@ from rangesim.report.tables import (
     seconds,
     titles,
 )
-from rangesim.results.run_files import Measurement
+from rangesim.results.experiment_results import Measurement
 
 MAIN_CAUSE = 0.1
 """Fraction of the failures from which the verdict names a cause; below, the list gets long and the causes are rare."""

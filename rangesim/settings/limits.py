@@ -46,7 +46,7 @@ class Limits:
     spp : light paths per pixel.
     depth : segments of a light path.
     photons : caustic photons of one pass.
-    passes : light-transport passes of one sensor in a moving scene: bands of rows, times samples of an exposure.
+    passes : light-transport passes of one sensor in a moving scene; also its bands of rows, and samples of an exposure.
     instruments : instruments of one experiment.
     points : vertices, or faces, of one mesh file.
     voxels : voxels of one grid in which views are fused, or the seen volume is compared with the true one.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rangesim.report import palette
-from rangesim.results.run_files import Measurement, Segmentation
+from rangesim.results.experiment_results import Measurement, Segmentation
 
 NO_ERROR = -32768
 """Value of a packed error where there is no reading or no true surface: the smallest int16."""

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from rangesim.response.base import KINDS, DenseResponse, LightPath, Math, SparseResponse
+from rangesim.response.response import KINDS, DenseResponse, LightPath, Math, SparseResponse
 from rangesim.settings.bounds import Bounds, Hertz, check_fields, whole
 
 SPEED_OF_LIGHT = 299_792_458.0
