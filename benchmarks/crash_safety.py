@@ -28,8 +28,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rangesim.errors import FileFormatError
-from rangesim.files.result_directories import verify_directory
-from rangesim.results.run_files import RESULT, read_settings
+from rangesim.files.atomic_directories import verify_directory
+from rangesim.results.experiment_results import RESULT, read_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 RUN = ["run", str(ROOT / "scenes" / "plane.xml"), "--sensor", "gray", "--sensor", "ideal-tof", "--width", "48",

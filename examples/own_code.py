@@ -35,8 +35,10 @@ class MultiFrequency(Sensor):
 
     Parameters
     ----------
-    width, height : pixels of the projector. ratio : of each period to the next finer one. periods : number of them.
-    steps : int >= 3, phase shifts. axes : "columns" suffices to triangulate; "rows" as well, to calibrate.
+    width, height : int, pixels of the projector.
+    ratio : float, ratio of each period to the next finer one. periods : int, number of periods.
+    steps : int >= 3, number of phase shifts.
+    axes : "columns" suffices to triangulate; calibration needs "rows" as well.
     """
 
     width: int = 1280
@@ -49,7 +51,7 @@ class MultiFrequency(Sensor):
     type_name: ClassVar[str] = "multi-frequency"
 
     def periods_px(self, axis: str) -> list[float]:
-        """Projector pixels, coarse to fine."""
+        """Periods along an axis, projector pixels, coarse to fine."""
         size = self.width if axis == "columns" else self.height
         return [size / self.ratio**i for i in range(self.periods)]
 
@@ -93,11 +95,11 @@ class MultiFrequency(Sensor):
 
 @dataclass(frozen=True)
 class TemporalUnwrapping(Decoder):
-    """The coarsest phase says where a pixel is, each finer one where more precisely.
+    """Decodes a place from the coarsest phase, and refines it by each finer one.
 
     Parameters
     ----------
-    phase : PhaseThresholds, for every period. triangulation : TriangulationLimits.
+    phase : PhaseThresholds of every period. triangulation : TriangulationLimits.
     """
 
     phase: PhaseThresholds = field(default_factory=PhaseThresholds)
@@ -119,7 +121,7 @@ class TemporalUnwrapping(Decoder):
                 place = (np.rint(place / period_px - phase.normalised) + phase.normalised) * period_px
             status[(place < 0) | (place > periods_px[0])] = Status.CODE_ERROR
             for phase in phases:
-                sigma = phase_sigma(capture, phase, sensor.steps)  # of the finest period, in the end
+                sigma = phase_sigma(capture, phase, sensor.steps)  # after the loop, that of the finest period
                 status[modulation_is_weak(capture, phase, sigma, self.phase)] = Status.LOW_SIGNAL
             coordinate[axis] = place
             if sigma is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What do my own patterns look like on an object? Projects any stack of images, in one pass.
+"""Patterns of your own on an object: any stack of images is projected in one pass.
 
 Usage: python examples/own_pattern.py [OUT_FOLDER]
 """

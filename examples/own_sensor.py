@@ -2,7 +2,7 @@
 """A sensor of your own, in one file: a range-gated camera, with its decoder.
 
 A laser sends short pulses, and the shutter opens for as long as a pulse lasts, a little later from frame to frame. A
-surface shows in two neighbouring gates, and the ratio of the two says where between them it is.
+surface appears in two neighbouring gates, and the ratio of the two gives its place between them.
 
     rangesim run tabletop --sensor examples/own_sensor.py:GatedCamera --sensor amcw --out out/gated
     rangesim decode out/gated/gated-camera/capture --sensor examples/own_sensor.py:GatedCamera --out out/gated-decoded
@@ -31,10 +31,10 @@ from rangesim.sensor import Background, Emitter, FrameContent, least_signal_for,
 
 @dataclass(frozen=True)
 class Gates(DenseResponse):
-    """Fraction of a pulse that each gate lets in: pulse and gate are boxes of one width, so it is a triangle."""
+    """Fraction of a pulse that each gate lets in. It is a triangle, because pulse and gate are boxes of one width."""
 
     delays_m: tuple[float, ...]
-    """Path lengths whose light fills a gate."""
+    """Path lengths in metres whose light fills a gate."""
     width_m: float
 
     type_name: ClassVar[str] = "gates"
@@ -54,8 +54,9 @@ class GatedCamera(Sensor):
 
     Parameters
     ----------
-    gates : int >= 2, number of gates. width_s : seconds, of pulse and gate. first_s : seconds, delay of the first gate.
-    duty : fraction of an exposure in which a gate is open.
+    gates : int >= 2, number of gates.
+    width_s : float, seconds, width of pulse and gate. first_s : float, seconds, delay of the first gate.
+    duty : float, fraction of an exposure in which a gate is open.
     """
 
     gates: int = 8
@@ -110,12 +111,12 @@ class GatedCamera(Sensor):
 
 @dataclass(frozen=True)
 class GateRatio(Decoder):
-    """Path length from the two neighbouring gates that hold most light: how it is divided says where it came from.
+    """Decodes path length from the ratio of the two neighbouring gates that hold most light.
 
     Parameters
     ----------
-    sigmas : least light in the two, in standard deviations of its noise.
-    relative_light : the same for noise-free captures, as a fraction of that in bright pixels.
+    sigmas : float, least light in the two gates, in standard deviations of its noise.
+    relative_light : float, the same for noise-free captures, as a fraction of that in bright pixels.
     """
 
     sigmas: float = 5.0
@@ -148,7 +149,7 @@ class GateRatio(Decoder):
         if background.noise_variance is None:
             return background.floor(self.relative_light)
         frame = self.content(sensor).ambient * background.ambient + background.noise_variance
-        return least_signal_for(self.sigmas**2, 1.0, 6 * frame)  # two gates, and twice the frame without the laser
+        return least_signal_for(self.sigmas**2, 1.0, 6 * frame)  # of two gates, minus twice the frame without the laser
 
     def content(self, sensor: Sensor) -> FrameContent:
         return FrameContent(signal=0.5, ambient=of_type(sensor, GatedCamera).duty)

@@ -67,7 +67,7 @@ def refusal(argument: str, family: str, given: object) -> str:
     """What to say of an argument that is no member of its family: which classes there are, and which may be meant."""
     known = members(family)
     own = {name: kind for name, kind in known.items() if kind.__module__.startswith("pcgraph.")}
-    own = {name: kind for name, kind in own.items() if not kind.__module__.startswith("pcgraph.own_files.")}
+    own = {name: kind for name, kind in own.items() if not kind.__module__.startswith("pcgraph.user_modules.")}
     classes = ", ".join(f"pcgraph.{kind.__name__}()" for kind in own.values())
     near = get_close_matches(given.lower(), own, 1) if isinstance(given, str) else []
     hint = f"; did you mean pcgraph.{own[near[0]].__name__}()?" if near else ""

@@ -39,13 +39,13 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from rangesim.point_cloud import PointCloud as PointCloud
     from rangesim.report import errors_markdown as errors_markdown
     from rangesim.report import failures_markdown as failures_markdown
-    from rangesim.results.capture_files import import_capture as import_capture
-    from rangesim.results.capture_files import load_capture as load_capture
-    from rangesim.results.capture_files import save_capture as save_capture
-    from rangesim.results.range_image_files import load_range_image as load_range_image
-    from rangesim.results.range_image_files import save_range_image as save_range_image
-    from rangesim.results.signals_files import load_signals as load_signals
-    from rangesim.results.signals_files import save_signals as save_signals
+    from rangesim.results.captures import import_capture as import_capture
+    from rangesim.results.captures import load_capture as load_capture
+    from rangesim.results.captures import save_capture as save_capture
+    from rangesim.results.range_images import load_range_image as load_range_image
+    from rangesim.results.range_images import save_range_image as save_range_image
+    from rangesim.results.saved_signals import load_signals as load_signals
+    from rangesim.results.saved_signals import save_signals as save_signals
     from rangesim.rig import Intrinsics as Intrinsics
     from rangesim.rig import Lens as Lens
     from rangesim.rig import Rig as Rig
@@ -89,16 +89,16 @@ _HOME = {
     "explain": "rangesim.causes",
     "expose": "rangesim.capture.exposure",
     "failures_markdown": "rangesim.report",
-    "import_capture": "rangesim.results.capture_files",
+    "import_capture": "rangesim.results.captures",
     "load_calibration": "rangesim.rig.calibration_files",
-    "load_capture": "rangesim.results.capture_files",
-    "load_range_image": "rangesim.results.range_image_files",
+    "load_capture": "rangesim.results.captures",
+    "load_range_image": "rangesim.results.range_images",
     "load_scene": "rangesim.scene",
-    "load_signals": "rangesim.results.signals_files",
+    "load_signals": "rangesim.results.saved_signals",
     "look_at": "rangesim.rig",
-    "save_capture": "rangesim.results.capture_files",
-    "save_range_image": "rangesim.results.range_image_files",
-    "save_signals": "rangesim.results.signals_files",
+    "save_capture": "rangesim.results.captures",
+    "save_range_image": "rangesim.results.range_images",
+    "save_signals": "rangesim.results.saved_signals",
     "scan": "rangesim.pipeline.views",
     "transport": "rangesim.instrument.transport",
 }

@@ -15,7 +15,7 @@ import msgspec
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
 from rangesim.pipeline.experiment_run import carry_out, run
-from rangesim.results.run_files import Result
+from rangesim.results.experiment_results import Result
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight
 
 ROOT = Path(__file__).resolve().parents[1]

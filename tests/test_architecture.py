@@ -167,7 +167,7 @@ def test_pcgraph_never_imports_rangesim_or_a_renderer() -> None:
 
 STOREYS = [
     "plumbing",
-    "own_files",
+    "user_modules",
     "errors",
     "cloud",
     "columns",
@@ -425,7 +425,7 @@ FUSION = {
     "joint_registration": "refine_jointly",
     "mesh_error": "SurfaceError surface_error",
     "multiway_registration": "Alignment PairFit PoseErrors align pose_errors",
-    "scan": "Scan",
+    "posed_images": "Scan",
     "sdf": "average_signed_distances reading_weights signed_distance",
     "seen_volume": "Occupancy SeenOfShape VoxelState occupancy true_occupancy voxel_states",
     "solids": "Solid attenuation_volume inside_voxels",

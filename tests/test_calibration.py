@@ -26,7 +26,7 @@ from rangesim.calibration import (
     intrinsics_from_homographies,
 )
 from rangesim.calibration.suspects import find_suspects
-from rangesim.results.capture_files import import_capture
+from rangesim.results.captures import import_capture
 from rangesim.rig import Intrinsics
 from rangesim.rig.calibration_files import load_calibration
 
@@ -592,7 +592,7 @@ def test_the_command_writes_what_calibration_reads_and_opencv_too(rendered, tmp_
 def test_a_rig_for_opencv_is_read_back_and_decodes(rendered, tmp_path):
     from rangesim.calibration.opencv_files import load_opencv, save_opencv
     from rangesim.cli import app
-    from rangesim.results.range_image_files import load_range_image
+    from rangesim.results.range_images import load_range_image
 
     captures, rig = rendered
     for name in ("rig.yml", "rig.xml"):
@@ -616,7 +616,7 @@ def test_a_rig_for_opencv_is_read_back_and_decodes(rendered, tmp_path):
 def test_a_calibration_for_opencv_may_be_in_any_unit(rendered, tmp_path):
     from rangesim.calibration.opencv_files import load_opencv, save_opencv
     from rangesim.cli import app
-    from rangesim.results.range_image_files import load_range_image
+    from rangesim.results.range_images import load_range_image
     from rangesim.rig.calibration_files import save_calibration
 
     captures, rig = rendered

@@ -266,7 +266,7 @@ def test_files_that_are_none_are_refused(calibration, tmp_path):
 
 def test_the_commands_calibrate_on_rendered_boards_and_decode_with_it(tmp_path, capsys):
     from rangesim.cli import app
-    from rangesim.results.range_image_files import load_range_image
+    from rangesim.results.range_images import load_range_image
 
     board, sensor = Checkerboard(5, 4, 0.16), AmcwToF((60e6,), waveform="square")
     camera = Intrinsics.from_fov(96, 72, 45.0)

@@ -23,7 +23,7 @@ from rangesim.electronics.detector import Detector, PhotoDetector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import read_grey, write_grey
-from rangesim.results.capture_files import SIDECAR, import_capture, load_capture
+from rangesim.results.captures import SIDECAR, import_capture, load_capture
 from rangesim.rig import Intrinsics
 from rangesim.rig.calibration_files import load_calibration, save_calibration
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
@@ -156,7 +156,7 @@ def test_failure_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytes
         raise OSError("No space left on device")
 
     save_capture(small_capture(), tmp_path / "old")
-    monkeypatch.setattr("rangesim.results.capture_files.write_json", full)
+    monkeypatch.setattr("rangesim.results.captures.write_json", full)
     for name in ("c", "not/yet/there", "old"):
         with pytest.raises(OSError, match="No space"):
             save_capture(small_capture(Detector()), tmp_path / name)

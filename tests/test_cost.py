@@ -16,7 +16,7 @@ from small_result import ROOT
 from rangesim import load_scene
 from rangesim.cli import main
 from rangesim.experiment import Experiment
-from rangesim.instrument.instrument import instrument
+from rangesim.instrument.presets import instrument
 from rangesim.motion import ConstantTwist, Motion, Timing
 from rangesim.pipeline import cost, experiment_run
 from rangesim.pipeline.cost import Cost, available_memory_bytes, estimate_cost

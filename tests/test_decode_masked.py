@@ -16,8 +16,8 @@ from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.decoding.status import Status
 from rangesim.files.image_files import write_grey
-from rangesim.results.capture_files import import_capture
-from rangesim.results.range_image_files import load_range_image
+from rangesim.results.captures import import_capture
+from rangesim.results.range_images import load_range_image
 from rangesim.sensor import Sensor
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight
 

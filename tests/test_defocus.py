@@ -16,7 +16,7 @@ from rangesim import save_capture
 from rangesim.capture.exposure import expose
 from rangesim.response import Fringes, GrayBits, Images, LightPath, NumpyMath
 from rangesim.response.defocus import MIN_HARMONIC_SIGMA, blurred_stripes
-from rangesim.results.capture_files import load_capture
+from rangesim.results.captures import load_capture
 from rangesim.rig import Intrinsics, Lens, Rig
 from rangesim.sensors import IdealToF
 from rangesim.settings.config import to_dict

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from synthetic import plane_signals, stereo_rig
 
-from rangesim import AmcwToF, Detector, decode, expose
+from rangesim import AmcwToF, Detector, compare, decode, expose
 
 ROOMS = [
     "pcgraph.plumbing",
@@ -32,9 +32,11 @@ ROOMS = [
     "rangesim.multiview",
     "rangesim.pipeline",
     "rangesim.point_cloud",
+    "rangesim.report",
     "rangesim.response",
     "rangesim.results",
     "rangesim.rig",
+    "rangesim.scene",
     "rangesim.sensor",
     "rangesim.sensors",
     "rangesim.settings",
@@ -45,17 +47,17 @@ MODULES = ["rangesim", "rangesim.errors", "rangesim.light_transport.transport_se
 """Modules outside these packages whose docstrings are run."""
 
 
-GIVEN_A_WALL = ["rangesim.capture", "rangesim.causes", "rangesim.evaluation"]
+GIVEN_A_WALL = ["rangesim.capture", "rangesim.causes", "rangesim.evaluation", "rangesim.report"]
 """Packages whose examples start from the names of `a_wall`."""
 
 
 @cache
 def a_wall() -> dict[str, Any]:
-    """Signals of a wall at 1 m, the sensor that they are of, a capture and its range image; no renderer."""
+    """Signals of a wall at 1 m, their sensor, a range image and its comparison with the truth; no renderer."""
     sensor = AmcwToF()
     signals = plane_signals(stereo_rig(64, 48, baseline_m=0.0), sensor)
-    capture = expose(signals, sensor, Detector())
-    return {"signals": signals, "sensor": sensor, "capture": capture, "image": decode(capture)}
+    image = decode(expose(signals, sensor, Detector()))
+    return {"signals": signals, "sensor": sensor, "image": image, "comparison": compare(image, signals)}
 
 
 def modules_of(room: str) -> list[str]:

@@ -13,7 +13,7 @@ from many_shapes import balls
 from synthetic import counted_return
 
 from rangesim import Scene, load_scene, transport
-from rangesim.light_transport.device import Device
+from rangesim.light_transport.camera_rays import Device
 from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.surfaces import Surfaces, surfaces_of
 

@@ -25,7 +25,7 @@ from rangesim.motion import ConstantTwist, Motion, MovingSignals, PoseTrack, Tim
 from rangesim.motion.passes import plan
 from rangesim.pipeline.experiment_run import run
 from rangesim.response import SPEED_OF_LIGHT
-from rangesim.results.run_files import load_result
+from rangesim.results.experiment_results import load_result
 from rangesim.rig import translation
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
@@ -419,7 +419,7 @@ def test_a_motion_without_a_track_is_refused() -> None:
 
 def test_a_scene_that_cannot_be_loaded_again_is_refused(matte: Scene) -> None:
     once = replace(matte, reload=None)
-    with pytest.raises(ValueError, match="which can be loaded again"):
+    with pytest.raises(ValueError, match="it is loaded again"):
         transport_moving(
             once,
             matte.rig(width=8, height=6),

@@ -96,7 +96,7 @@ def test_rays_of_the_renderer_are_those_of_the_intrinsics(distortion: tuple[floa
     import drjit as dr
     import mitsuba as mi
 
-    from rangesim.light_transport.device import Device
+    from rangesim.light_transport.camera_rays import Device
 
     lens = distorted(Intrinsics.from_fov(320, 240, 75), distortion)
     pixels = lens.pixel_centres().reshape(-1, 2)
@@ -219,7 +219,7 @@ def test_paths_through_a_lens_meet_in_focus_and_are_equally_long_there() -> None
     select_variant()
     import mitsuba as mi
 
-    from rangesim.light_transport.device import Device
+    from rangesim.light_transport.camera_rays import Device
 
     device = Device(Intrinsics.from_fov(320, 240, 60), np.eye(4), Lens(0.02, focus_m=0.8))
     rng = np.random.default_rng(0)
@@ -310,7 +310,7 @@ def test_rays_from_the_projector_s_lens_spread_as_its_blur_says() -> None:
     select_variant()
     import mitsuba as mi
 
-    from rangesim.light_transport.device import Device
+    from rangesim.light_transport.camera_rays import Device
 
     lens = Intrinsics.from_fov(1280, 800, 60)
     rig = Rig(lens, lens, projector_lens=Lens(4e-3, focus_m=0.9))

@@ -41,6 +41,7 @@ from rangesim.instrument.instrument import Instrument
 from rangesim.rig.calibration_files import load_calibration
 from rangesim.sensor import Background
 from rangesim.sensors import AmcwDecoder, StructuredLightDecoder, presets, sensor_from_dict, sensor_of
+from rangesim.sensors.coded_frames import CodedFrames, FringeFrames
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 GATED = f"{EXAMPLES / 'own_sensor.py'}:GatedCamera"
@@ -160,6 +161,43 @@ def test_options_of_bare_images_that_a_sensor_lacks_are_refused(tmp_path: Path) 
         (("--code", "amcw"), "expected 12 images for amcw-tof"),
     ):
         assert message in command("decode", tmp_path / "images", *options, "--out", tmp_path / "out", fails=True)
+
+
+# ---- Runs of frames from outside ------------------------------------------------------------------------------------
+
+
+class FineFringes(FringeFrames):
+    """A second run of fringes on an axis."""
+
+    def names(self) -> list[str]:
+        return [f"{self.axis}_fine{step}" for step in range(self.steps)]
+
+
+@dataclass(frozen=True)
+class TwoPeriods(StructuredLight):
+    """Gray code and fringes of two periods, the second a quarter of the first."""
+
+    type_name: ClassVar[str] = "two-periods"
+
+    def layout(self) -> tuple[CodedFrames, ...]:
+        runs = super().layout()
+        fine = FineFringes(self.axes[0], self.size(self.axes[0]), runs[-1].span.stop, self.period_px / 4, 3)
+        return (*runs, fine)
+
+
+def test_a_layout_of_other_runs_is_framed_named_and_decoded() -> None:
+    """By the decoder of the package, for a run decodes itself."""
+    sensor = TwoPeriods()
+    assert sensor.frame_names()[-5:] == ["columns_fine0", "columns_fine1", "columns_fine2", "white", "black"]
+    signals = plane_signals(stereo_rig(), sensor, StructuredLight())
+    exact = sensor.default_decoder.coordinates(expose(signals, sensor))
+    assert np.nanmax(np.abs(exact.column - signals.truth.projector_uv[..., 0])) < 1e-3  # type: ignore[attr-defined]
+    scatter = {}
+    for one in (sensor, StructuredLight()):
+        seen = one.default_decoder.coordinates(expose(signals, one, Detector(), 2e-4, seed=1))
+        assert seen.valid.mean() > 0.9
+        scatter[one.type_name] = np.nanstd(seen.column - exact.column)  # type: ignore[attr-defined]
+    assert scatter["two-periods"] < 0.5 * scatter["structured-light"]
 
 
 # ---- The two examples are right -------------------------------------------------------------------------------------

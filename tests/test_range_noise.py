@@ -406,7 +406,7 @@ def test_samples_that_are_no_number_are_refused(matte: Scene) -> None:
 def test_a_run_keeps_the_noise_of_its_readings_and_warns_of_it(tmp_path: Path) -> None:
     from rangesim.experiment import Experiment
     from rangesim.pipeline.experiment_run import run
-    from rangesim.results.run_files import load_result
+    from rangesim.results.experiment_results import load_result
 
     instruments = (Instrument("amcw", AmcwToF()), Instrument("ideal", IdealToF()))
     experiment = Experiment("glassware", width=96, height=72, spp=4, instruments=instruments)

@@ -12,7 +12,7 @@ import pytest
 from rangesim.capture import Capture
 from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
-from rangesim.results.capture_files import import_capture
+from rangesim.results.captures import import_capture
 from rangesim.rig import Rig
 from rangesim.rig.calibration_files import load_calibration
 from rangesim.sensors import StructuredLight

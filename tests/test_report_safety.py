@@ -21,8 +21,8 @@ from small_result import SENSORS, small_result
 
 from rangesim.errors import FileFormatError
 from rangesim.report import write_report
-from rangesim.report.policy import StyleRules
-from rangesim.results.run_files import Measurement, Result, load_result
+from rangesim.report.content_security import StyleRules
+from rangesim.results.experiment_results import Measurement, Result, load_result
 
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium found; apt-get install chromium")
 

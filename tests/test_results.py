@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 from small_result import small_experiment, small_result
+from typer.testing import CliRunner
 
 from rangesim import load_capture
+from rangesim.cli import app
 from rangesim.decoding import decode
 from rangesim.errors import FileFormatError
 from rangesim.experiment import ScanSettings, Turntable
@@ -23,9 +25,9 @@ from rangesim.pipeline.scan_run import run_scan
 from rangesim.report import render_report
 from rangesim.report.figures import map_pictures
 from rangesim.report.scan_page import render_scan_page
-from rangesim.results.decoded_files import Decoded, load_decoded, save_decoded
-from rangesim.results.run_files import Result, load_result
-from rangesim.results.scan_files import load_scan
+from rangesim.results.decoded_captures import Decoded, load_decoded, save_decoded
+from rangesim.results.experiment_results import Result, load_result
+from rangesim.results.scan_results import load_scan
 from rangesim.sensors import IdealToF
 
 
@@ -96,6 +98,15 @@ def test_a_scan_is_read_back_as_it_was(scan_directory: tuple[Any, Path]) -> None
     plain = dataclasses.replace(result, scan=dataclasses.replace(result.scan, truths=()))
     assert_equal(plain, found)
     assert (folder / "report.html").read_text() == render_scan_page(found)
+
+
+def test_the_page_of_a_scan_is_written_again_from_its_files(scan_directory: tuple[Any, Path], tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(scan_directory[1], folder)
+    before = (folder / "report.html").read_bytes()
+    (folder / "report.html").unlink()
+    assert CliRunner().invoke(app, ["report", str(folder)]).exit_code == 0
+    assert (folder / "report.html").read_bytes() == before
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import shutil
+import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -70,3 +74,21 @@ def test_a_distortion_too_small_to_bend_a_ray_is_none() -> None:
     assert Intrinsics(32, 24, 30.0, 30.0, 16.0, 12.0, (-0.1, 5e-324, 0.0, 0.0, 5e-324)).fold_radius2 == pytest.approx(
         1 / 0.3
     )
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js")
+def test_the_viewer_of_reports_has_the_rays_of_a_camera_without_distortion() -> None:
+    """`unproject` in viewer.js repeats the pinhole of `rangesim.rig.camera_model`, because it runs in a browser."""
+    viewer = (Path(__file__).parent.parent / "rangesim" / "report" / "viewer.js").read_text(encoding="utf-8")
+    start = viewer.index("function unproject(")
+    function = viewer[start : viewer.index("\n}\n", start) + 3]
+    camera = Intrinsics(6, 4, 5.0, 4.5, 2.8, 2.2)
+    settings = {"camera": [camera.fx, camera.fy, camera.cx, camera.cy], "width": 6, "nearM": 0.5, "stepM": 0.01}
+    code = f"{function}; const z = Array.from({{length: 24}}, (_, i) => i + 1);"
+    code += f"console.log(JSON.stringify(Array.from(unproject({json.dumps(settings)}, z).positions)))"
+    said = subprocess.run(["node", "-e", code], capture_output=True, text=True, check=True, timeout=60).stdout
+    depth = 0.5 + 0.01 * np.arange(24).reshape(4, 6, 1)
+    expected = (
+        camera.directions(camera.pixel_centres()) * depth * [1, -1, -1]
+    )  # there y is up, and z towards the viewer
+    np.testing.assert_allclose(np.array(json.loads(said)), expected.ravel(), atol=1e-6)

@@ -134,7 +134,7 @@ BROKEN: dict[str, tuple[str, str]] = {
     "instance.xml": (
         f'<scene version="3.0.0">{SENSOR}<shape type="shapegroup" id="g"><shape type="sphere"/></shape>'
         '<shape type="instance"><ref id="g"/></shape></scene>',
-        "put in copies",
+        "replace them by copies",
     ),
     "fog.xml": (
         f'<scene version="3.0.0">{SENSOR}<shape type="cube"><bsdf type="dielectric"/>'
@@ -415,7 +415,7 @@ def test_an_aperture_that_is_left_out_is_told(tmp_path: Path, radius: float, foc
         return SENSOR.replace('"perspective">', f'"thinlens">{numbers}')
 
     sharp, _ = rendered(tmp_path / "a.xml", lens(1e-6))
-    with pytest.warns(RangesimWarning, match=rf"aperture of {radius:g} m is left out.*focus_m={focus:g}\)"):
+    with pytest.warns(RangesimWarning, match=rf"aperture of {radius:g} m is ignored.*focus_m={focus:g}\)"):
         wide, _ = rendered(tmp_path / "b.xml", lens(radius))
     assert wide.camera == sharp.camera
 
@@ -435,7 +435,7 @@ def test_surfaces_that_the_clipping_planes_of_mitsuba_hide_are_told(
     clip = f'<sensor type="perspective"><float name="{name}" value="{at_m}"/>'
     scene = rangesim.load_scene(write(tmp_path / "plane.xml", plane.replace('<sensor type="perspective">', clip)))
     assert scene.working_distance_m == pytest.approx(1.0)
-    told = f"the camera's {name} of {at_m:g} m is left out, so it sees what that hides in Mitsuba, on 100 %"
+    told = f"the camera's {name} of {at_m:g} m is ignored, so it sees surfaces that Mitsuba hides, on 100 %"
     assert [told in str(w.message) for w in recwarn] == [True] * is_told
 
 

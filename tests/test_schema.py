@@ -15,7 +15,7 @@ from small_result import small_result
 
 from rangesim.errors import FileFormatError
 from rangesim.report import render_report
-from rangesim.results.run_files import load_result
+from rangesim.results.experiment_results import load_result
 
 Edit = Callable[[Any], object]
 

@@ -24,10 +24,10 @@ from small_result import ROOT, small_result
 import pcgraph.cli
 import rangesim.cli
 import rangesim.report
-from rangesim.files.result_directories import MANIFEST, STAGING
+from rangesim.files.atomic_directories import MANIFEST, STAGING
 from rangesim.report import render_report
-from rangesim.results.capture_files import SIDECAR
-from rangesim.results.run_files import Result
+from rangesim.results.captures import SIDECAR
+from rangesim.results.experiment_results import Result
 
 PLANE = str(ROOT / "scenes" / "plane.xml")
 TINY = ("--sensor", "ideal-tof", "--width", "32", "--height", "24", "--spp", "1", "--photons", "0")

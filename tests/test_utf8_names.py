@@ -18,10 +18,10 @@ from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment
 from rangesim.files.image_files import check_pixels, read_grey, write_grey
 from rangesim.files.utf8_names import is_utf8, utf8_name
-from rangesim.instrument.instrument import instrument
+from rangesim.instrument.presets import instrument
 from rangesim.pipeline.experiment_run import run
-from rangesim.results.capture_files import import_capture, load_capture
-from rangesim.results.run_files import load_result
+from rangesim.results.captures import import_capture, load_capture
+from rangesim.results.experiment_results import load_result
 from rangesim.sensors import IdealToF
 
 NAMES = (b"caf\xe9", b"\xff\xfe", b"scan.\xe4", "Grüße".encode("utf-16-le"))

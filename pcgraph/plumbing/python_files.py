@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A Python file of a user, run as a module; it finds the files beside it, as with `python FILE.py`.
 
-A file that PACKAGE asks for becomes the module PACKAGE.own_files.NAME, where NAME spells out the path of the file. So
-what the file defines can be pickled: another process imports that module, which runs the file.
+A file that PACKAGE asks for becomes the module PACKAGE.user_modules.NAME, where NAME spells out the path of the file.
+So what the file defines can be pickled: another process imports that module, which runs the file.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def run_python_file(path: Path, package: str) -> ModuleType:
     BaseException
         What the file raises; it is no module then, nor is what it imported from its folder.
     """
-    importlib.import_module(f"{package}.own_files")  # the package around the module
+    importlib.import_module(f"{package}.user_modules")  # the package around the module
     name, changed = _name_of(path, package), path.stat().st_mtime_ns
     spec = spec_from_file_location(name, path)
     assert spec is not None, path  # a .py file has one
@@ -75,11 +75,11 @@ def run_python_file(path: Path, package: str) -> ModuleType:
 
 
 def _name_of(path: Path, package: str) -> str:
-    return f"{package}.own_files.x{bytes(path.absolute()).hex()}"
+    return f"{package}.user_modules.x{bytes(path.absolute()).hex()}"
 
 
 class FileImporter(MetaPathFinder, Loader):
-    """Imports PACKAGE.own_files.NAME, by running the file that NAME spells out."""
+    """Imports PACKAGE.user_modules.NAME, by running the file that NAME spells out."""
 
     def __init__(self, package: str) -> None:
         self.package = package
@@ -87,7 +87,7 @@ class FileImporter(MetaPathFinder, Loader):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        return spec_from_loader(fullname, self) if fullname.startswith(f"{self.package}.own_files.x") else None
+        return spec_from_loader(fullname, self) if fullname.startswith(f"{self.package}.user_modules.x") else None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         path = Path(bytes.fromhex(spec.name.rpartition(".x")[2]).decode(errors="surrogateescape"))

@@ -23,8 +23,8 @@ DTYPES = ("uint8", "uint16", "uint32", "float32")
 BRIGHT_PERCENTILE = 99.0
 """Percentile of the lit pixels, in percent, that counts as the level of bright pixels.
 
-The 1 % above it is left for highlights of mirrors and glossy surfaces, which would otherwise set the exposure and the
-contrast thresholds of the whole image.
+The brightest 1 % is left out, because highlights of mirrors and glossy surfaces would otherwise set the exposure and
+the contrast thresholds of the whole image.
 """
 
 

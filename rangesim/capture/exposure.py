@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 TARGET_FRACTION = 0.7
 """Fraction of the saturation capacity to which automatic exposure brings the bright pixels (`bright_level`).
 
-A larger value saturates more of the brightest 1 % of the pixels; a smaller one uses less of the dynamic range. The
-value is a choice and was not optimised.
+A larger value saturates more of the brightest 1 % of the pixels; a smaller one uses less of the dynamic range. Other
+values were not measured.
 """
 
 

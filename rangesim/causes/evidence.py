@@ -33,18 +33,19 @@ if TYPE_CHECKING:
 NEAR = 2
 """Radius, in pixels, of the window around a pixel at an edge in which the same surface off the edge is looked for.
 
-A larger window may reach parts of the surface under other light; a smaller one finds fewer pixels off the edge.
+A larger window may reach parts of the surface under other light; a smaller one finds fewer pixels off the edge. Other
+values were not measured.
 """
 DIM = 0.1
 """Fraction of the direct light that a white Lambertian surface would return, below which a surface is faint.
 
-It separates glossy surfaces that reflect the light elsewhere from those that return it. It was not optimised.
+It separates glossy surfaces that reflect the light elsewhere from those that return it. Other values were not measured.
 """
 DISTURBING = 0.005
 """Fraction of indirect light in the emitter's light above which this light can shift a reading by the tolerance.
 
 With a larger fraction, errors of multipath are attributed to the resolution; with a smaller one, errors of the
-resolution are attributed to multipath.
+resolution are attributed to multipath. Other values were not measured.
 """
 MAX_PULSES_HIT = 0.9
 """Fraction of the laser pulses with a detected photon above which pile-up makes a reading worse.
@@ -54,7 +55,7 @@ It is reached at 2.3 photons per pulse. Coates' estimate has least noise at 1 to
 MOTION_FRACTION = 0.1
 """Motion during the acquisition, as a fraction of the tolerance, above which it can explain an error.
 
-Triangulation magnifies motion by distance over baseline, which is 5 or more.
+It is small because triangulation magnifies motion by the distance over the baseline, a ratio of 5 or more.
 """
 
 

@@ -13,14 +13,18 @@ from rangesim.sensor import Sensor
 from rangesim.signals import GroundTruth
 
 _CHUNK_VALUES = 32_000_000
-"""Largest number of weights of channels that are computed at once; it bounds the memory, and changes no value."""
+"""Largest count of weights that are computed at once, so that they take at most 256 MB; it changes no result."""
 FOOTPRINT_PATHS = 55
 """Number of light paths over the area of a pixel, on a Fibonacci lattice.
 
-The lattice is even along both sides of the pixel and over its area; 55 paths resolve stripes of a twentieth of a pixel.
+The lattice is even along both sides of the pixel and over its area, so that 55 paths resolve stripes of a twentieth of
+a pixel.
 """
 FOOTPRINT_STEP = 34
-"""Step of the lattice along the second side of the pixel: the Fibonacci number before `FOOTPRINT_PATHS`."""
+"""Step of the lattice along the second side of the pixel, counted in lattice points.
+
+It is the Fibonacci number before `FOOTPRINT_PATHS`, because two such numbers make the lattice even.
+"""
 
 
 def single_path_frames(sensor: Sensor, rig: Rig, truth: GroundTruth) -> np.ndarray:

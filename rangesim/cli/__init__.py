@@ -16,10 +16,12 @@ import typer
 from pcgraph.plumbing.plain_files import said
 from rangesim import __version__
 from rangesim.cli.calibrate import calibrate_command
+from rangesim.cli.compare import compare_command
 from rangesim.cli.decode import decode_command
-from rangesim.cli.results import compare_command, report_command, verify_command
+from rangesim.cli.report import report_command
 from rangesim.cli.run import run_command
 from rangesim.cli.scan import scan_command
+from rangesim.cli.verify import verify_command
 from rangesim.environment.doctor import doctor_command
 from rangesim.errors import RangesimError, RangesimWarning, one_line, sentence
 

@@ -80,9 +80,9 @@ def decode_command(
     """
     from rangesim.cli.decode_summary import likely_cause, status_fractions, summary
     from rangesim.decoding import decode
-    from rangesim.files.result_directories import check_directory
+    from rangesim.files.atomic_directories import check_directory
     from rangesim.report.figures import map_pictures
-    from rangesim.results.decoded_files import DECODED, Decoded, save_decoded
+    from rangesim.results.decoded_captures import DECODED, Decoded, save_decoded
 
     _refuse_what_would_be_ignored(context, capture, calibration)
     announce_linked_output(out, check_directory(out, DECODED, inputs=[capture]))
@@ -103,7 +103,7 @@ def decode_command(
 def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibration: Path | None) -> None:
     """Raise ValueError if an option was given that would have no effect on this input."""
     from rangesim.calibration.opencv_files import SUFFIXES
-    from rangesim.results.capture_files import SIDECAR
+    from rangesim.results.captures import SIDECAR
 
     given = {name for name in context.params if _from_command_line(context, name)}
     if (capture / SIDECAR).is_file() and (surplus := _options(ONLY_BARE_IMAGES, given)):

@@ -12,7 +12,7 @@ from rangesim.decoding.range_image import MIN_MEASURED, RangeImage
 from rangesim.decoding.status import Status
 from rangesim.errors import one_line
 from rangesim.report.palette import STATUS_NAMES
-from rangesim.results.decoded_files import Decoded
+from rangesim.results.decoded_captures import Decoded
 
 MIN_BRIGHTEST = 1 / 8
 """Brightest value of all frames, as a fraction of full scale, below which the summary reports it: the camera may have

@@ -122,7 +122,7 @@ def load_frames(folder: Path, sensor: Sensor | None, bits: int | None) -> Captur
     sensor : Sensor that took bare images; None: not known. bits : depth of their values, if less than that of the file.
     """
     from rangesim.errors import FileFormatError
-    from rangesim.results.capture_files import SIDECAR, import_capture, load_capture
+    from rangesim.results.captures import SIDECAR, import_capture, load_capture
 
     if not folder.is_dir():
         raise FileFormatError(f"{folder} is no directory; expected a capture or a folder of images.")

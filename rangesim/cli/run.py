@@ -16,7 +16,7 @@ from rangesim.files.bundled_scenes import scene_names
 if TYPE_CHECKING:
     from rangesim.experiment import Experiment
     from rangesim.instrument.instrument import Instrument
-    from rangesim.results.run_files import Result
+    from rangesim.results.experiment_results import Result
 
 
 def run_command(
@@ -120,9 +120,9 @@ def run_command(
         )
     if noise_free:
         experiment = replace(experiment, instruments=tuple(replace(i, noise=False) for i in experiment.instruments))
-    from rangesim.files.result_directories import check_directory
+    from rangesim.files.atomic_directories import check_directory
     from rangesim.pipeline import experiment_run
-    from rangesim.results.run_files import RESULT
+    from rangesim.results.experiment_results import RESULT
 
     if estimate or out is None:
         cost = experiment_run.estimate(experiment)
@@ -174,7 +174,7 @@ def _warn_of_instruments_without_points(result: Result) -> None:
 def _instruments(sensors: list[str]) -> tuple[Instrument, ...]:
     """One instrument per sensor. Sensors from files that have the same `type_name` are named by the NAME of their class
     or object instead, because the names of instruments must differ."""
-    from rangesim.instrument.instrument import instrument
+    from rangesim.instrument.presets import instrument
     from rangesim.sensors import is_file_name
 
     found = [instrument(name) for name in sensors]

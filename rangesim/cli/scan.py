@@ -15,7 +15,7 @@ from rangesim.errors import one_line
 if TYPE_CHECKING:
     from rangesim.experiment.camera_paths import CameraPath
     from rangesim.experiment.scan_settings import ScanSettings
-    from rangesim.results.scan_files import ScanResult
+    from rangesim.results.scan_results import ScanResult
 
 PATHS = ("turntable", "dome", "hand-held")
 """Names of the camera paths that need no file of poses."""
@@ -92,9 +92,9 @@ def scan_command(
     """
     if out is None and not estimate:
         raise typer.BadParameter("expected --out DIRECTORY, unless --estimate is given.", param_hint="--out")
-    from rangesim.files.result_directories import check_directory
+    from rangesim.files.atomic_directories import check_directory
     from rangesim.pipeline.scan_run import estimate_scan, run_scan
-    from rangesim.results.scan_files import SCAN
+    from rangesim.results.scan_results import SCAN
 
     given: dict[str, Any] = {"spp": spp, "width": width, "height": height, "seed": seed, "voxel_m": voxel}
     given |= {"material": material, "unit_m": unit_m}
@@ -125,7 +125,7 @@ def scan_command(
 def _settings(scene: Path | None, config: Path | None, given: dict[str, Any], sensor: str | None) -> ScanSettings:
     """The scan of a file of settings or of a scene, with the options of the command line in place of its own."""
     from rangesim.experiment.scan_settings import ScanSettings, load_scan_settings
-    from rangesim.instrument.instrument import instrument
+    from rangesim.instrument.presets import instrument
 
     if config is None and scene is None:
         raise typer.BadParameter("expected a scene or --config FILE.", param_hint="SCENE")

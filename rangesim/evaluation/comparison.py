@@ -23,8 +23,8 @@ The value is a choice. It decides what fraction of the readings is called wrong,
 EDGE_RADIUS = 2
 """Distance from a depth edge, in pixels, within which a pixel can be a flying pixel.
 
-A larger radius counts more right readings beside the edge, and lowers the rate of flying pixels. The value was not
-optimised.
+A larger radius counts more right readings beside the edge, and lowers the rate of flying pixels. Other values
+were not measured.
 """
 
 

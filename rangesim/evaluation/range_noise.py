@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 SMALL = 0.5
 """Ratio of the sampling noise to the detector's noise above which a run warns.
 
-At this ratio the sum of both is an eighth larger than the detector's noise alone.
+It was chosen because at this ratio the sum of both is an eighth larger than the detector's noise alone.
 """
 SMALL_LOSS = 0.03
 """Uncertainty of the fraction of pixels with a reading above which a run warns, as a fraction of these pixels.
@@ -47,7 +47,10 @@ Smaller differences between two sensors are rarely significant, because a materi
 ENOUGH_PIXELS = 100
 """Least number of pixels of a material on which a run warns; statistics of fewer pixels vary too much to act on."""
 NOISE_SEEDS = (SEEDS - 3, SEEDS - 2, SEEDS - 1)
-"""Seeds of the detector's noise in repeated captures: the three largest ones, which people hardly choose."""
+"""Seeds of the detector's noise in repeated captures.
+
+They are the three largest, so that the noise of a capture is hardly ever repeated.
+"""
 
 
 @dataclass(frozen=True, eq=False)

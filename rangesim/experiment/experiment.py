@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rangesim.electronics.ambient import Ambient
 from rangesim.files.settings_files import load_settings
-from rangesim.instrument.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
+from rangesim.instrument.instrument import Instrument, instrument_from_dict
+from rangesim.instrument.presets import DEFAULT_SENSORS, instrument
 from rangesim.motion import Motion
-from rangesim.motion.track import motion_from_dict
+from rangesim.motion.pose_tracks import motion_from_dict
 from rangesim.settings import limits
 from rangesim.settings.bounds import Metres, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict

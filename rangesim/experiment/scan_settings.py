@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from rangesim.electronics.ambient import Ambient
 from rangesim.experiment.camera_paths import CameraPath, Turntable
 from rangesim.files.settings_files import load_settings
-from rangesim.instrument.instrument import Instrument, instrument, instrument_from_dict
+from rangesim.instrument.instrument import Instrument, instrument_from_dict
+from rangesim.instrument.presets import instrument
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, Metres, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict

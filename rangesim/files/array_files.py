@@ -150,7 +150,7 @@ def _read(
         try:
             array: np.ndarray = np.empty(math.prod(shape), dtype=dtype)
         except MemoryError as error:
-            raise FileFormatError(f"{place} takes {size / 1e9:.1f} GB, which this machine has not free.") from error
+            raise FileFormatError(f"{place} takes {size / 1e9:.1f} GB, more than this machine has free.") from error
         view, filled = array.view(np.uint8).data, 0
         while filled < size:
             count = file.readinto(view[filled:])  # type: ignore[attr-defined]

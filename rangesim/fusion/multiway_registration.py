@@ -35,7 +35,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesim.errors import AlignmentWarning
 from rangesim.fusion.joint_registration import refine_jointly
-from rangesim.fusion.scan import Scan
+from rangesim.fusion.posed_images import Scan
 from rangesim.fusion.sdf import signed_distance
 from rangesim.geometry import icp, register
 from rangesim.rig import Array

@@ -14,7 +14,7 @@ from rangesim.decoding import decode
 from rangesim.electronics.ambient import Ambient
 from rangesim.evaluation.range_noise import sampling_draw
 from rangesim.instrument.instrument import Instrument
-from rangesim.light_transport.sampler import Sampler
+from rangesim.light_transport.samples_per_pixel import Sampler
 from rangesim.robust_scale import TO_SIGMA
 from rangesim.sensor import Sensor
 from rangesim.settings.bounds import Bounds, check_fields, whole

@@ -14,7 +14,7 @@ import numpy as np
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.motion import Timing
 from rangesim.rig import CAMERA_LENS, PROJECTOR_LENS, Intrinsics, Lens, pose
-from rangesim.sensors import Decoder, Sensor, check_sensor, is_file_name, sensor_from_dict, sensor_of
+from rangesim.sensors import Decoder, Sensor, check_sensor, is_file_name, sensor_from_dict
 from rangesim.settings.bounds import Metres, Seconds, Watts, Wavelength, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, on_top_of, shown, to_dict
 
@@ -153,34 +153,7 @@ class Instrument:
         )
 
 
-DEFAULT_SENSORS = ("gray-phase", "amcw", "ideal-tof")
-"""Presets that an experiment compares if none are given: structured light, time of flight, and the ideal ranger, which
-no time-of-flight camera can surpass."""
-
-
-def instrument(name: str, **settings: Any) -> Instrument:
-    """The instrument with the sensor that a name stands for.
-
-    Parameters
-    ----------
-    name : a preset such as "amcw", or FILE.py:NAME, see `rangesim.sensors.sensor_of`.
-    settings : fields of `Instrument` besides name and sensor.
-
-    Raises
-    ------
-    ValueError, FileFormatError
-        As `rangesim.sensors.sensor_of` and `Instrument`.
-
-    Examples
-    --------
-    >>> instrument("direct-tof", power_w=0.5).power_w
-    0.5
-    """
-    sensor = sensor_of(name)
-    return Instrument(_name_of(name, sensor), sensor, **settings)
-
-
-def _name_of(given: str, sensor: Sensor) -> str:
+def name_of(given: str, sensor: Sensor) -> str:
     """Name of an instrument that is given by its sensor only: the preset's, or the `type_name` if it is from a file."""
     return sensor.type_name if is_file_name(given) else given
 
@@ -219,7 +192,7 @@ def instrument_from_dict(table: Any, place: str, files_in: Path | None = None) -
     if given is not None:
         values["sensor"] = sensor = sensor_from_dict(given, f"{place}.sensor", files_in)
         if isinstance(given, str):
-            values.setdefault("name", _name_of(given, sensor))
+            values.setdefault("name", name_of(given, sensor))
     for key, kind, default in (
         ("detector", PhotoDetector, getattr(sensor, "default_detector", None)),
         ("decoder", Decoder, getattr(sensor, "default_decoder", None)),

@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.camera_rays import connect
 from rangesim.light_transport.cutouts import first_surface
-from rangesim.light_transport.device import connect
 from rangesim.light_transport.indirect_filter import Guides
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.loop import Lanes, PathSettings, SampleAllocation, View

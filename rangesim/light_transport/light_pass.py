@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from rangesim.light_transport.camera_rays import Device
 from rangesim.light_transport.caustics import caustic_maps, caustic_photons
-from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
 from rangesim.light_transport.indirect_filter import LightFilter
@@ -22,7 +22,7 @@ from rangesim.light_transport.kernel_launches import Launches, Progress, Report,
 from rangesim.light_transport.loop import PathSettings, Radiance, View
 from rangesim.light_transport.narrow_lobes import warn_of_narrow_lobes
 from rangesim.light_transport.photons import Photons
-from rangesim.light_transport.sampler import Sampler
+from rangesim.light_transport.samples_per_pixel import Sampler
 from rangesim.light_transport.sampling_error import MIN_FOR_HALVES, Estimate
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.transport_settings import TransportSettings

@@ -34,8 +34,8 @@ import numpy as np
 
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.ambient_light import ambient_on_ray, sampled_ambient, sampled_ambient_through_media
+from rangesim.light_transport.camera_rays import connect
 from rangesim.light_transport.caustics import Vertex, caustic_light, gather
-from rangesim.light_transport.device import connect
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
 from rangesim.light_transport.photon_maps import PhotonMaps
 from rangesim.light_transport.photons import has_delta

@@ -23,7 +23,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from rangesim.light_transport.device import Device
+from rangesim.light_transport.camera_rays import Device
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.photon_flight import trace_photon_paths
 from rangesim.light_transport.sampling import Seed, Stream, random_stream

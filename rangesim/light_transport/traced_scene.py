@@ -8,8 +8,8 @@ from typing import NamedTuple
 import mitsuba as mi
 
 from rangesim.light_transport.absorption import Absorbers, absorbers_of
+from rangesim.light_transport.camera_rays import Device
 from rangesim.light_transport.cutouts import Cutouts, cutouts_of
-from rangesim.light_transport.device import Device
 from rangesim.light_transport.scattering import Media, media_of
 from rangesim.light_transport.surfaces import Surfaces, surfaces_of
 from rangesim.rig import Rig

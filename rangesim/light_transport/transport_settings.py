@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal, TypedDict
 
-from rangesim.light_transport.sampler import Sampler
+from rangesim.light_transport.samples_per_pixel import Sampler
 from rangesim.settings.bounds import Bounds, check_fields, whole
 from rangesim.settings.config import check_keys, shown
 from rangesim.settings.seeds import check_seed

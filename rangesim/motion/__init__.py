@@ -13,8 +13,8 @@ An object moves to the right by 0.3 m/s, while patterns are projected and captur
 """
 
 from rangesim.motion.moving_signals import MovingSignals
+from rangesim.motion.pose_tracks import ConstantTwist, Motion, PoseTrack, Track
 from rangesim.motion.timing import Timing
-from rangesim.motion.track import ConstantTwist, Motion, PoseTrack, Track
 from rangesim.motion.transport_moving import transport_moving
 
 __all__ = ["ConstantTwist", "Motion", "MovingSignals", "PoseTrack", "Timing", "Track", "transport_moving"]

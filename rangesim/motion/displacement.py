@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rangesim.motion.track import Poses, apply
+from rangesim.motion.pose_tracks import Poses, apply
 from rangesim.rig import Rig
 from rangesim.signals import GroundTruth
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from rangesim.motion.pose_tracks import Motion, Poses
 from rangesim.motion.timing import Instant, Timing, Window
-from rangesim.motion.track import Motion, Poses
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
 from rangesim.settings.seeds import derived_seed

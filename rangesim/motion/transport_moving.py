@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Unpack
 
 from rangesim.motion.moving_signals import FrameStack
 from rangesim.motion.passes import plan
+from rangesim.motion.pose_tracks import Motion
 from rangesim.motion.timing import Timing
-from rangesim.motion.track import Motion
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
 from rangesim.signals import Signals
@@ -75,7 +75,7 @@ def transport_moving(
     >>> signals[sensor].motion_m.max()  # doctest: +SKIP
     """
     from rangesim.light_transport.light_pass import trace_light
-    from rangesim.light_transport.sampler import Sampler
+    from rangesim.light_transport.samples_per_pixel import Sampler
     from rangesim.light_transport.transport_settings import with_options
     from rangesim.light_transport.truncation import warn_of_truncation
     from rangesim.scene.rigid_motion import MovingScene

@@ -26,13 +26,13 @@ from rangesim.evaluation.comparison import compare
 from rangesim.evaluation.range_noise import noise_of, warn_of_sampling
 from rangesim.evaluation.reference_readings import ReferenceReadings
 from rangesim.experiment import Experiment
-from rangesim.files.result_directories import new_directory
+from rangesim.files.atomic_directories import new_directory
 from rangesim.instrument.instrument import Instrument
 from rangesim.motion import transport_moving
 from rangesim.pipeline.cost import Cost, estimate_cost
 from rangesim.pipeline.provenance import provenance
 from rangesim.pipeline.shared_passes import group_by_rig
-from rangesim.results.run_files import (
+from rangesim.results.experiment_results import (
     RESULT,
     Measurement,
     MeasurementRecord,
@@ -42,7 +42,7 @@ from rangesim.results.run_files import (
     complete_rows,
     write_result,
 )
-from rangesim.results.signals_files import LightPass
+from rangesim.results.saved_signals import LightPass
 from rangesim.settings.seeds import derived_seed
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def run(
     """Carry out an experiment and write its results, with `report.html`, to the directory `out`.
 
     The files appear when all of them are complete, and a failure leaves nothing behind. An older result in the
-    directory is replaced. Other files in it stay. See `rangesim.files.result_directories`.
+    directory is replaced. Other files in it stay. See `rangesim.files.atomic_directories`.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def run(
     Raises
     ------
     ValueError, FileFormatError, EnvironmentProblem
-        As `carry_out`, or `out` cannot take a result (see `rangesim.files.result_directories.check_directory`).
+        As `carry_out`, or `out` cannot take a result (see `rangesim.files.atomic_directories.check_directory`).
 
     Warns
     -----

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from rangesim.experiment import Experiment, experiment_to_dict
 from rangesim.instrument.instrument import Instrument
-from rangesim.results.run_files import InstrumentRecord, ResultRecord, SceneRecord, ShapeRecord
+from rangesim.results.experiment_results import InstrumentRecord, ResultRecord, SceneRecord, ShapeRecord
 from rangesim.settings.config import to_dict
 
 if TYPE_CHECKING:

@@ -18,16 +18,16 @@ import numpy as np
 from rangesim import __version__
 from rangesim.experiment.camera_paths import Viewpoint
 from rangesim.experiment.scan_settings import ScanSettings
-from rangesim.files.result_directories import new_directory
+from rangesim.files.atomic_directories import new_directory
 from rangesim.fusion.mesh_error import SurfaceError, distances_to, surface_error
 from rangesim.fusion.multiway_registration import align, check_first_pair, pose_errors
-from rangesim.fusion.scan import Scan
+from rangesim.fusion.posed_images import Scan
 from rangesim.fusion.seen_volume import occupancy
 from rangesim.fusion.truncated_average import fuse
 from rangesim.fusion.voxel_grid import VoxelGrid
 from rangesim.pipeline.scan_cost import VOXEL_SPACINGS, estimate_scan_cost
 from rangesim.pipeline.views import poses_of, rendered_views
-from rangesim.results.scan_files import SCAN, ScanResult, ShapeStatistics, write_scan
+from rangesim.results.scan_results import SCAN, ScanResult, ShapeStatistics, write_scan
 from rangesim.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def run_scan(
     """Carry out a scan and write its results, with `report.html`, to the directory `out`.
 
     The files appear when all of them are complete, and a failure leaves nothing behind. See
-    `rangesim.files.result_directories`.
+    `rangesim.files.atomic_directories`.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def run_scan(
     Raises
     ------
     ValueError, FileFormatError, EnvironmentProblem
-        As `carry_out_scan`, or `out` cannot take a result (see `rangesim.files.result_directories.check_directory`).
+        As `carry_out_scan`, or `out` cannot take a result (see `rangesim.files.atomic_directories.check_directory`).
 
     Examples
     --------

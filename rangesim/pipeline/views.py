@@ -14,7 +14,7 @@ from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
 from rangesim.experiment.camera_paths import CameraPath, PoseList, Viewpoint
-from rangesim.fusion.scan import Scan
+from rangesim.fusion.posed_images import Scan
 from rangesim.instrument.instrument import Instrument
 from rangesim.rig import Array, Rig
 from rangesim.sensor import Sensor

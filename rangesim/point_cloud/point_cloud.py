@@ -19,21 +19,21 @@ COORDINATES = ("camera", "world")
 FAR_M = 100.0
 """Largest coordinate of a camera in the world, in metres, with which points in the world are single precision.
 
-Beyond it they are double precision: neighbouring numbers of single precision are 8 µm apart at 100 m.
+Beyond it they are double precision, because neighbouring numbers of single precision are 8 µm apart at 100 m.
 """
 NORMAL_RADIUS = 2
 """Radius, in pixels, of the window of (2 r + 1)^2 pixels that a normal is fitted to.
 
-A larger window averages more noise and rounds small details off; the value was not optimised.
+A larger window averages more noise and rounds small details off. Other values were not measured.
 """
 MAX_SLOPE = 4.0
 """Largest ratio of depth step to lateral step between two pixels that count as one surface.
 
-With 4, surfaces whose normal is up to 76 degrees off the ray keep their neighbours. A larger value joins surfaces
-across depth edges.
+It is 4 so that surfaces whose normal is up to 76 degrees off the ray keep their neighbours. A larger value joins
+surfaces across depth edges.
 """
 STEP_FLOOR = 0.005
-"""Fraction of z by which neighbours of one surface may always differ, whatever the slope: it leaves room for noise."""
+"""Fraction of z by which neighbours of one surface may always differ, so that noise does not separate them."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

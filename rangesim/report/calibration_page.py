@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A calibrated rig as one self-contained HTML page: how well it is known, and what the boards have against it."""
+"""The HTML page of a calibration: the rig that was found, its uncertainty, and the boards that do not fit it."""
 
 from __future__ import annotations
 
@@ -19,33 +19,41 @@ if TYPE_CHECKING:
     from rangesim.rig import Intrinsics
 
 CELLS = (8, 6)
-"""Cells across and down an image in which corners are counted."""
-SPARSE = 0.6
-"""Of the cells: with corners in fewer, the lens is unknown where there are none."""
-WORSE = 2.0
-"""Times the median error of the boards, above which one is named."""
+"""Counts of cells across and down an image in which corners are sought; square in images of 4 : 3, as most are."""
+MIN_COVERED = 0.6
+"""Fraction of the cells with corners below which the page warns, because distortion is unknown in the other cells."""
+WORSE_FACTOR = 2.0
+"""Ratio to the median error of all boards above which a board is named as worse; other values were not measured."""
 SHOWN_WIDTH = 400
-"""Pixels of a view in the page, about."""
-LENGTH = 0.03
-"""Of the image's width: a typical error as it is drawn."""
+"""Approximate width of a view in the page, in pixels; larger images are averaged so that the page stays small."""
+ARROW_LENGTH = 0.03
+"""Length at which an error of typical size is drawn, as a fraction of the image's width, so that patterns show."""
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+"""Names of a device's parameters: pixels for the first four, OpenCV's distortion coefficients for the others."""
 
 
 def render_calibration(found: RigCalibration, names: Sequence[str], images: Sequence[np.ndarray] | None = None) -> str:
-    """The page of a calibration as HTML.
+    """HTML page of a calibration.
 
     Parameters
     ----------
-    names : of the captures, in their order. images : (h, w) each, what the camera saw; None: a blank.
+    found : RigCalibration.
+    names : name of each capture, in their order.
+    images : (h, w) image of each capture; None: the views are drawn without images.
+
+    Raises
+    ------
+    ValueError
+        The names or the images are not as many as the captures.
     """
     if len(names) != len(found.camera_views) or (images is not None and len(images) != len(names)):
-        raise ValueError(f"expected a name and an image of each of the {len(found.camera_views)} captures.")
+        raise ValueError(f"expected a name and an image for each of the {len(found.camera_views)} captures.")
     page = render_page("calibration.html.j2", context(found, [str(name) for name in names], images))
     return sealed(f"{page}<!-- {unsealed(SEAL)} -->\n".encode(), SEAL, at_end=True).decode()
 
 
 def context(found: RigCalibration, names: list[str], images: Sequence[np.ndarray] | None) -> dict[str, Any]:
-    """Everything the template shows."""
+    """Values of the variables of the template, by name."""
     camera, projector = found.rig.camera, found.rig.projector
     devices = [
         _device("camera", camera, found.camera_deviations, found.camera_views, found.camera_residuals),
@@ -76,6 +84,7 @@ def _device(
     views: Sequence[BoardView],
     residuals: Sequence[np.ndarray],
 ) -> dict[str, Any]:
+    """Parameters of a device, its coverage with corners and its errors of reprojection, as the template shows them."""
     pixels, errors = np.concatenate([view.pixels for view in views]), np.concatenate(residuals)
     rms = float(np.sqrt(np.square(errors).sum(axis=1).mean()))
     across, down = CELLS
@@ -113,22 +122,25 @@ def _device(
 
 
 def _values(device: Intrinsics) -> tuple[float, ...]:
+    """Values of `PARAMETERS` of a device."""
     return (device.fx, device.fy, device.cx, device.cy, *device.coefficients)
 
 
 def _enlargement(device: Intrinsics, rms: float) -> int:
-    """1, 2 or 5 times a power of 10, so that a typical error is `LENGTH` long."""
-    wanted = max(LENGTH * device.width / max(rms, 1e-9), 1.0)
+    """Factor by which errors are drawn enlarged: the largest of 1, 2 or 5 times a power of 10 with which an error of
+    `rms` pixels is not longer than `ARROW_LENGTH`."""
+    wanted = max(ARROW_LENGTH * device.width / max(rms, 1e-9), 1.0)
     power = 10.0 ** np.floor(np.log10(wanted))
     return int(power * max(n for n in (1, 2, 5) if n * power <= wanted))
 
 
 def _arrows(pixels: np.ndarray, errors: np.ndarray, scale: float) -> list[tuple[str, ...]]:
-    """x, y and the end of each error, enlarged."""
+    """Start and end, as text, of the arrow of each error: x and y of the corner, and x and y of the enlarged error."""
     return [tuple(f"{v:.1f}" for v in (*p, *(p + scale * e))) for p, e in zip(pixels, errors, strict=True)]
 
 
 def _boards(found: RigCalibration, names: list[str]) -> list[dict[str, Any]]:
+    """Distance, tilt and errors of each board, as the template shows them."""
     rms = np.array(
         [
             [np.sqrt(np.square(r).sum(axis=1).mean()) for r in residuals]
@@ -149,13 +161,16 @@ def _boards(found: RigCalibration, names: list[str]) -> list[dict[str, Any]]:
                 "rms": [f"{value:.3f}" for value in rms[:, k]],
                 "bars": [100 * float(value / most) for value, most in zip(rms[:, k], largest, strict=True)],
                 "worst": [f"{e.max():.2f}" for e in errors],
-                "is_worse": [bool(value > WORSE * np.median(all_)) for value, all_ in zip(rms[:, k], rms, strict=True)],
+                "is_worse": [
+                    bool(value > WORSE_FACTOR * np.median(all_)) for value, all_ in zip(rms[:, k], rms, strict=True)
+                ],
             }
         )
     return result
 
 
 def _view(found: RigCalibration, k: int, name: str, image: np.ndarray | None) -> dict[str, Any]:
+    """Image of capture k with the errors of its corners, as the template shows it."""
     camera, view = found.rig.camera, found.camera_views[k]
     picture = None
     if image is not None:
@@ -174,7 +189,7 @@ def _view(found: RigCalibration, k: int, name: str, image: np.ndarray | None) ->
 def _verdict(
     found: RigCalibration, names: list[str], devices: list[dict[str, Any]], boards: list[dict[str, Any]]
 ) -> list[tuple[str, str]]:
-    """Subjects and what is said of them."""
+    """Sentences at the top of the page: each is its subject, which is shown in bold, and the rest."""
     lines = []
     for device, deviations, said in (
         (found.rig.camera, found.camera_deviations, devices[0]),
@@ -191,12 +206,12 @@ def _verdict(
     lines.append(
         (
             "The baseline",
-            f"is {1e3 * found.baseline_m:.3f} mm, known to {1e6 * found.baseline_deviation_m:.2g} µm, if the board is "
-            "as large as was said: an error of its size is one of all lengths.",
+            f"is {1e3 * found.baseline_m:.3f} mm, known to {1e6 * found.baseline_deviation_m:.2g} µm, if the size "
+            "of the board is right: a relative error of its size is the same relative error of all lengths.",
         )
     )
     for said in devices:
-        if said["covered"] < SPARSE:
+        if said["covered"] < MIN_COVERED:
             lines.append(
                 (
                     f"The {said['name']}'s image",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report's pictures, each as a PNG in a data URI."""
+"""Pictures of the report, each as a PNG in a data URI."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from rangesim.capture import Capture
 from rangesim.decoding.range_image import RangeImage
 from rangesim.files.image_files import PNG_STRATEGY
 from rangesim.report import palette
-from rangesim.results.run_files import Measurement
+from rangesim.results.experiment_results import Measurement
 from rangesim.signals import EnergySplit, GroundTruth
 
 GAMMA = 2.2
+"""Exponent of the display, dimensionless: grey value = (linear value)^(1/gamma), approximately as in sRGB."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image to show. uri : PNG as data URI. caption : plain text beneath it."""
+    """An image to show. uri : PNG as data URI. caption : plain text below it. alt : text in place of the image."""
 
     uri: str
     caption: str
@@ -30,7 +31,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class LegendEntry:
-    """A class with its colour and its fraction of some pixels, in percent: an entry of a legend."""
+    """An entry of a legend: a class with its colour (#rrggbb) and its fraction of the pixels, in percent."""
 
     name: str
     color: str
@@ -38,17 +39,23 @@ class LegendEntry:
 
     @property
     def text(self) -> str:
-        """Percent with one digit; what is there is never 0."""
+        """Percent with one digit; small values are "< 0.1", not 0."""
         return f"{self.percent:.1f}" if self.percent >= 0.05 else "< 0.1"
 
 
 def png(image: np.ndarray, table: np.ndarray | None = None) -> str:
-    """Data URI of a PNG; parameters as of `png_bytes`."""
+    """PNG as a data URI; parameters as of `png_bytes`."""
     return "data:image/png;base64," + base64.b64encode(png_bytes(image, table)).decode("ascii")
 
 
 def png_bytes(image: np.ndarray, table: np.ndarray | None = None) -> bytes:
-    """PNG of a grey (h, w) uint8 image, or of (h, w) uint8 indices into a colour table (n, 3) uint8."""
+    """PNG file of an image.
+
+    Parameters
+    ----------
+    image : (h, w) uint8 grey values, (h, w, 3) uint8 RGB, or (h, w) uint8 indices into `table`.
+    table : (n, 3) uint8 colours, RGB; None: the image holds grey values or colours.
+    """
     from PIL import Image
 
     picture = Image.fromarray(np.ascontiguousarray(image))
@@ -60,18 +67,21 @@ def png_bytes(image: np.ndarray, table: np.ndarray | None = None) -> bytes:
 
 
 def grey(image: np.ndarray, white: float, black: float = 0.0) -> str:
-    """PNG of a linear image with display gamma; `white` is the value shown as white."""
+    """PNG, as a data URI, of a linear image (h, w) with display gamma.
+
+    white, black : values of the image that are shown as white and as black.
+    """
     fraction = (np.nan_to_num(image.astype(np.float64)) - black) / max(white - black, 1e-30)
     return png(np.rint(255 * np.clip(fraction, 0, 1) ** (1 / GAMMA)).astype(np.uint8))
 
 
 def color_map(fraction: np.ndarray, table: np.ndarray) -> str:
-    """Data URI of a PNG of values 0..1; parameters as of `_indexed`."""
+    """PNG, as a data URI, of values 0..1 in the colours of a table; parameters as of `_indexed`."""
     return png(*_indexed(fraction, table))
 
 
 def map_pictures(image: RangeImage) -> dict[str, bytes]:
-    """PNG files of the maps that a range image has: columns, rows, depth and status."""
+    """PNG files of the maps of a range image, by name: projector columns and rows if it has them, depth and status."""
     maps = {"columns": image.projector_column, "rows": image.projector_row, "depth": image.z}
     table = palette.color_table("viridis")
     pictures = {
@@ -84,13 +94,13 @@ def map_pictures(image: RangeImage) -> dict[str, bytes]:
 
 
 def _stretched(values: np.ndarray) -> np.ndarray:
-    """Values as 0..1 between their 1st and 99th percentile."""
+    """Values scaled so that their 1st percentile is 0 and their 99th is 1; both may be exceeded."""
     low, high = np.nanpercentile(values, [1, 99])
     return np.asarray((values - low) / max(high - low, 1e-12))
 
 
 def _indexed(fraction: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values 0..1 as (h, w) uint8 indices into a colour table (256, 3), and that table; NaN becomes light grey."""
+    """(h, w) uint8 indices of values 0..1 into a colour table (256, 3), and that table with light grey for NaN."""
     index = np.rint(np.clip(np.nan_to_num(fraction), 0, 1) * 254).astype(np.uint8)
     index[~np.isfinite(fraction)] = 255
     colors = table[np.rint(np.arange(256) / 254 * 255).clip(0, 255).astype(int)].copy()
@@ -99,12 +109,12 @@ def _indexed(fraction: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def color_bar(table: np.ndarray) -> str:
-    """PNG of one row, a colour table from left to right."""
+    """PNG, as a data URI, of one row that shows a colour table from left to right."""
     return png(np.arange(256, dtype=np.uint8)[None], table)
 
 
 def scene_picture(energy: EnergySplit) -> Picture:
-    """The scene in its own light, or lit by the emitter where it has none."""
+    """Picture of the scene in its own light, or in the emitter's light if it has none."""
     own = bool(energy.ambient.max() > 0)
     image = energy.ambient if own else energy.projector
     light = "in its own light" if own else "lit by the emitter (it has no light of its own)"
@@ -112,7 +122,7 @@ def scene_picture(energy: EnergySplit) -> Picture:
 
 
 def material_picture(truth: GroundTruth) -> tuple[Picture, list[LegendEntry]]:
-    """Material class per pixel, and its legend."""
+    """Picture of the material class of each pixel, and its legend."""
     classes = np.where(truth.material >= 0, truth.material, len(truth.material_names)).astype(np.uint8)
     colors = [palette.MATERIAL_COLORS.get(n, palette.NO_DATA) for n in truth.material_names]
     table = np.array([*colors, palette.NO_DATA], dtype=np.uint8)
@@ -122,24 +132,27 @@ def material_picture(truth: GroundTruth) -> tuple[Picture, list[LegendEntry]]:
 
 
 def depth_map(measurement: Measurement, limits: tuple[float, float], table: np.ndarray) -> str:
-    """PNG of the measured z."""
+    """PNG, as a data URI, of the measured depths.
+
+    limits : depths, in metres, at the ends of the colour table.
+    """
     low, high = limits
     return color_map((measurement.image.z - low) / (high - low), table)
 
 
 def error_map(measurement: Measurement, table: np.ndarray) -> str:
-    """PNG of z minus true z."""
+    """PNG, as a data URI, of the errors of depth."""
     return color_map(palette.error_fraction(measurement.image.z - measurement.truth.z), table)
 
 
 def cause_map(measurement: Measurement) -> tuple[str, list[LegendEntry]]:
-    """PNG of why pixels failed, and its legend."""
+    """PNG, as a data URI, of the causes of failed pixels, and its legend."""
     classes = palette.outcomes(measurement)
     return png(classes, palette.OUTCOME_COLORS), _legend(classes, palette.OUTCOME_NAMES, palette.OUTCOME_COLORS)
 
 
 def captured_frames(capture: Capture) -> list[Picture]:
-    """A few representative frames, all with the same white."""
+    """Pictures of a few representative frames of a capture, all with the same white."""
     names = capture.sensor.frame_names()
     chosen = [i for i in capture.sensor.representative_frames(capture.frames) if 0 <= i < len(names)]
     white = max(float(np.percentile(capture.frames[i], 99.5)) for i in chosen)
@@ -148,8 +161,10 @@ def captured_frames(capture: Capture) -> list[Picture]:
 
 
 def light_pictures(energy: EnergySplit) -> list[Picture]:
-    """Radiance by the kind of light path, all with the same white, and their fractions of the projector's light
-    seen."""
+    """Pictures of the radiance by the kind of light path, all with the same white.
+
+    The captions state the fraction of each kind in the emitter's light.
+    """
     white = _bright(energy.projector)
     total = float(energy.projector.sum())
     kinds = {
@@ -157,12 +172,12 @@ def light_pictures(energy: EnergySplit) -> list[Picture]:
         "multipath": ("by way of further surfaces", energy.multipath),
         "via mirror or glass": ("the lit surface is seen off a mirror or through glass", energy.specular),
         "caustic": ("the surface is lit off a mirror or through glass", energy.caustic),
-        "glint": ("the lamp itself is seen off a mirror or through glass", energy.glint),
+        "glint": ("the emitter itself is seen off a mirror or through glass", energy.glint),
     }
     pictures = [
         Picture(
             grey(image, white),
-            f"{name}: {meaning}; {100 * float(image.sum()) / total:.1f} % of the projector’s light in the image",
+            f"{name}: {meaning}; {100 * float(image.sum()) / total:.1f} % of the emitter’s light in the image",
             name,
         )
         for name, (meaning, image) in kinds.items()
@@ -170,17 +185,19 @@ def light_pictures(energy: EnergySplit) -> list[Picture]:
     ]
     if energy.ambient.max() > 0:
         ratio = 100 * float(energy.ambient.sum()) / total if total > 0 else float("inf")
-        text = f"ambient: every other light, before any filter; {ratio:.0f} % of as much as the emitter’s"
+        text = f"ambient: all other light, before any filter; {ratio:.0f} % of the emitter’s light"
         pictures.append(Picture(grey(energy.ambient, white), text, "ambient"))
     return pictures
 
 
 def _bright(image: np.ndarray) -> float:
+    """99th percentile of the positive values; 1 if there are none."""
     lit = image[image > 0]
     return float(np.percentile(lit, 99)) if lit.size else 1.0
 
 
 def _legend(classes: np.ndarray, names: list[str], table: np.ndarray) -> list[LegendEntry]:
+    """Entries of the classes (h, w) that occur, with names and colours by the number of the class."""
     counts = np.bincount(classes.ravel(), minlength=len(names))
     return [
         LegendEntry(name, palette.hexadecimal(table[i]), 100 * float(counts[i]) / classes.size)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colours of the report's maps, and the scales that are shared between sensors."""
+"""Colours of the report's maps, and scales that all sensors of a report share."""
 
 from __future__ import annotations
 
@@ -9,14 +9,19 @@ import numpy as np
 
 from rangesim.causes.cause import TITLES, Cause
 from rangesim.decoding.status import Status
-from rangesim.results.run_files import Measurement
+from rangesim.results.experiment_results import Measurement
 
 NOTHING = len(Cause)
-"""Class beyond `Cause`: the scene has no surface there."""
+"""Number of the class after those of `Cause`: the scene has no surface behind the pixel."""
 NO_DATA = (203, 206, 210)
+"""Colour of pixels without a value, RGB 0..255."""
 ERROR_KNEE_M = 1e-4
-"""Metres; the error scale is linear below and logarithmic beyond."""
+"""Error, in metres, below which the error scale is linear; above, it is logarithmic.
+
+With a smaller value more of the colours show errors below 0.1 mm.
+"""
 ERROR_LIMIT_M = 0.1
+"""Error, in metres, at the end of the error scale; larger errors have the same colour."""
 
 STATUS_NAMES = {
     Status.OK: "measured",
@@ -26,10 +31,13 @@ STATUS_NAMES = {
     Status.UNWRAPPING_FAILED: "phases disagree",
     Status.OUT_OF_RANGE: "out of range",
 }
+"""Text of each status where a page or the command line shows it."""
 STATUS_COLORS = np.array(
     [(231, 234, 237), (52, 104, 176), (240, 171, 0), (196, 56, 45), (125, 79, 163), (40, 44, 52)], dtype=np.uint8
 )
+"""(6, 3) uint8, colour of each status, RGB, in the order of `Status`."""
 OUTCOME_NAMES = [*(TITLES[c] for c in Cause), "nothing there"]
+"""Text of each value of `outcomes`."""
 OUTCOME_COLORS = np.array(
     [
         (236, 238, 240),  # right
@@ -51,7 +59,11 @@ OUTCOME_COLORS = np.array(
     ],
     dtype=np.uint8,
 )
-"""Colours of `outcomes`: a hue per family, told apart by lightness as well, so that few cones suffice."""
+"""(16, 3) uint8, colour of each value of `outcomes`, RGB.
+
+Each family of causes has a hue. Within a hue, the lightness differs, so that people without red or green cones can
+distinguish the causes too (tests/test_report.py measures it).
+"""
 MATERIAL_COLORS = {
     "matte": (196, 178, 150),
     "glossy": (221, 119, 60),
@@ -60,25 +72,29 @@ MATERIAL_COLORS = {
     "translucent": (150, 196, 140),
     "other": (170, 140, 180),
 }
+"""Colour of each material class, RGB 0..255."""
 
 
 @dataclass(frozen=True)
 class Tick:
-    """A label of a colour bar. place : 0..1 along it."""
+    """A label of a colour bar. place : position along the bar, 0..1. label : text."""
 
     place: float
     label: str
 
 
 def color_table(name: str) -> np.ndarray:
-    """(256, 3) uint8 of one of matplotlib's colour maps."""
+    """(256, 3) uint8 colours of one of matplotlib's colour maps, RGB."""
     from matplotlib import colormaps
 
     return np.rint(colormaps[name](np.arange(256) / 255)[:, :3] * 255).astype(np.uint8)
 
 
 def depth_limits(measurements: tuple[Measurement, ...]) -> tuple[float, float]:
-    """Metres, z of the true surfaces from near to far, without the farthest and nearest percent."""
+    """Nearest and farthest depth of the depth scale, metres, of the true surfaces of all measurements.
+
+    Half a percent of the pixels at either end is left out, and a margin is added.
+    """
     z = np.concatenate([m.truth.z[np.isfinite(m.truth.z)] for m in measurements])
     if z.size == 0:
         return 0.0, 1.0
@@ -88,7 +104,7 @@ def depth_limits(measurements: tuple[Measurement, ...]) -> tuple[float, float]:
 
 
 def depth_ticks(low: float, high: float, count: int = 5) -> list[Tick]:
-    """Round depths within the limits, in metres."""
+    """Labels at round depths between two limits in metres; about `count` of them."""
     step = 10.0 ** np.floor(np.log10(high - low))
     step = next(step * f for f in (0.1, 0.2, 0.5, 1.0, 2.0) if (high - low) / (step * f) <= count + 1)
     values = np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step
@@ -97,13 +113,13 @@ def depth_ticks(low: float, high: float, count: int = 5) -> list[Tick]:
 
 
 def error_fraction(error_m: np.ndarray) -> np.ndarray:
-    """Place on the error scale, 0..1, of signed errors in metres: 0.5 is none, 0 and 1 are the limits."""
+    """Position of signed errors, in metres, on the error scale: 0 and 1 are its ends, 0.5 is no error."""
     decades = np.arcsinh(error_m / ERROR_KNEE_M / 2) / np.arcsinh(ERROR_LIMIT_M / ERROR_KNEE_M / 2)
     return np.asarray(0.5 + 0.5 * np.clip(decades, -1, 1))
 
 
 def error_ticks() -> list[Tick]:
-    """Decades of the error scale, in millimetres."""
+    """Labels at the decades of the error scale, in millimetres."""
     values = [-100, -10, -1, 0, 1, 10, 100]
     places = error_fraction(np.array(values) / 1e3)
     signs = [f"{v:+d}".replace("-", "−") if v else "0" for v in values]
@@ -111,10 +127,11 @@ def error_ticks() -> list[Tick]:
 
 
 def outcomes(measurement: Measurement) -> np.ndarray:
-    """(h, w) uint8, `Cause` per pixel, or `NOTHING` where there is no surface; index of names and colours above."""
+    """(h, w) uint8, `Cause` of each pixel, or `NOTHING` where there is no surface; an index into `OUTCOME_NAMES` and
+    `OUTCOME_COLORS`."""
     return np.where(np.isfinite(measurement.truth.z), measurement.causes.cause, NOTHING).astype(np.uint8)
 
 
 def hexadecimal(color: np.ndarray) -> str:
-    """#rrggbb of three numbers 0..255."""
+    """Colour of three numbers 0..255 as CSS writes it, #rrggbb."""
     return "#{:02x}{:02x}{:02x}".format(*color)

@@ -1,5 +1,5 @@
 "use strict";
-// Wires the page: unpacks the data, colours clouds and label images, reads out the maps.
+// The page's script: it unpacks the data, colours point clouds and label images, and shows the values of the maps.
 
 const DATA = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
@@ -52,9 +52,10 @@ function large(one) {
   return sizes.filter((n) => n > 0.002 * points).length;
 }
 
+// Index of an error into the colours of the error scale, as in palette.error_fraction.
 function errorIndex(metres) {
-  const share = Math.asinh(metres / DATA.errorKneeM / 2) / Math.asinh(DATA.errorLimitM / DATA.errorKneeM / 2);
-  return Math.round(255 * (0.5 + 0.5 * Math.max(-1, Math.min(1, share))));
+  const position = Math.asinh(metres / DATA.errorKneeM / 2) / Math.asinh(DATA.errorLimitM / DATA.errorKneeM / 2);
+  return Math.round(255 * (0.5 + 0.5 * Math.max(-1, Math.min(1, position))));
 }
 
 const NOTHING = [203, 206, 210];
@@ -65,7 +66,7 @@ function put(rgb, i, from, k, shade) {
   rgb[3 * i + 2] = from[k + 2] * shade;
 }
 
-// Each paints pixel i of an instrument into rgb bytes.
+// Each function paints pixel i of an instrument into an array of RGB bytes.
 const PAINT = {
   intensity: (one, i, rgb) => { rgb[3 * i] = rgb[3 * i + 1] = rgb[3 * i + 2] = one.intensity[i]; },
   error: (one, i, rgb) => {
@@ -101,11 +102,11 @@ function drawLabels(canvas, one, rgb) {
   context.putImageData(image, 0, 0);
 }
 
-// The slider's altitudes: merges of all trees, highest first; logarithmic, so that coarse levels get room.
+// Altitudes of the slider: those of the merges of all trees, highest first, at logarithmic positions, so that coarse levels get room.
 class Levels {
   constructor(trees) {
     this.altitudes = trees.flatMap((t) => [...t.altitudes.subarray(t.leaves)]).filter(Number.isFinite).sort((a, b) => b - a);
-    // the highest merge of the default cut, of any tree: every tree then shows exactly its default cut
+    // the highest altitude of the merges in any tree's default cut: at this altitude every tree shows its default cut
     const done = trees.map((t) => t.leaves - t.objects).map((n, k) => n > 0 ? trees[k].altitudes[trees[k].leaves + n - 1] : 0);
     this.usual = Math.max(0, ...done.filter(Number.isFinite));
   }
@@ -204,7 +205,7 @@ class Page {
   }
 }
 
-// Names come from data: they become text, never markup.
+// Names come from the data of a result: they become text, never markup.
 function bold(text) {
   const element = document.createElement("b");
   element.textContent = text;

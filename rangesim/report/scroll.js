@@ -1,5 +1,5 @@
 "use strict";
-// Tables that are wider than the page say that they scroll.
+// Marks tables that are wider than the page, so that they show a hint that they scroll.
 
 function markScrolling() {
   for (const box of document.querySelectorAll(".scroll")) box.classList.toggle("scrolls", box.scrollWidth > box.clientWidth);

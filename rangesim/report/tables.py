@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers of the report as text: what was measured, per sensor and material."""
+"""Tables of the report: statistics of each sensor on each material, as text."""
 
 from __future__ import annotations
 
@@ -15,18 +15,27 @@ from rangesim.experiment import Experiment
 from rangesim.report import palette
 from rangesim.report.figures import LegendEntry
 from rangesim.report.markdown_table import Table
-from rangesim.results.run_files import Measurement, PhotonsRecord
+from rangesim.results.experiment_results import Measurement, PhotonsRecord
 
 Rows = list[dict[str, Any]]
+"""Statistics per material class, one dict each, with the keys of `rangesim.results.experiment_results.RowRecord`."""
 
 FAILURE_HEADS = ["failed (%)", "because (% of the pixels)"]
+"""Heads of the columns that say how many pixels failed, and why."""
 UNRELIABLE = 0.5
-"""Fraction of outliers or of missing pixels from which a sensor is called unreliable on a material."""
+"""Fraction of outliers, or of missing readings, from which a sensor is called unreliable on a material.
+
+At one half, a reading is as likely wrong as right.
+"""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the comparison. better : "low", "near zero" or "" if no value is better than another."""
+    """A column of the table of errors.
+
+    key : name of the value in a row. title, unit, meaning : text of the page. better : which value is best, "low" or
+    "near zero"; "" if no value is better than another.
+    """
 
     key: str
     title: str
@@ -42,7 +51,7 @@ COLUMNS = (
         "%",
         "fraction of the pixels that the emitter lights which have a measurement, ± what a render with "
         "very many light paths may change",
-        "",  # a wrong reading completes nothing
+        "",  # more readings are not better if they are wrong
     ),
     Column("bias_m", "bias", "mm", "mean of measured minus true z; positive is too far", "near zero"),
     Column("median_abs_m", "median error", "mm", "median of |z − true z|"),
@@ -51,11 +60,12 @@ COLUMNS = (
     Column("outlier_rate", "outliers", "%", f"fraction of the measurements off by more than {1e3 * OUTLIER_M:g} mm"),
     Column("flying_rate", "flying", "%", "fraction of the measurements at depth edges that lie on neither side"),
 )
+"""Columns of the table of errors, from left to right."""
 
 
 @dataclass(frozen=True)
 class Definition:
-    """A cause and what it means, in a sentence."""
+    """Name of a cause, and its meaning in a sentence."""
 
     name: str
     meaning: str
@@ -63,8 +73,12 @@ class Definition:
 
 @dataclass(frozen=True)
 class Cell:
-    """text; best : of the real sensors that are reliable on this material; bar : 0..1 for fractions, else None; error :
-    the uncertainty, empty if none shows, None in columns without."""
+    """A cell of the table of errors.
+
+    text : the value. best : whether it is the best one of the real sensors that are reliable on this material.
+    bar : the value as a fraction, 0..1, to be drawn as a bar; None for lengths.
+    error : uncertainty of the value by sampling; empty if it rounds to 0, None in columns without uncertainty.
+    """
 
     text: str
     best: bool = False
@@ -73,18 +87,18 @@ class Cell:
 
 
 def titles(measurements: Sequence[Measurement]) -> dict[str, str]:
-    """Title of each instrument by name; with the name added where two would share a title."""
+    """Title of each instrument, by name; the name is added where two instruments would have the same title."""
     plain = {m.name: m.capture.sensor.title for m in measurements}
     return {n: t if list(plain.values()).count(t) == 1 else f"{t}, {n}" for n, t in plain.items()}
 
 
 def is_reference(measurement: Measurement) -> bool:
-    """Whether the instrument is an ideal that nobody can buy."""
+    """Whether the instrument is ideal, so that it is a reference and no competitor."""
     return measurement.capture.sensor.is_ideal
 
 
 def missing_fraction(row: dict[str, Any]) -> float:
-    """Fraction of the lit pixels without a measurement; 0 where none is lit."""
+    """Fraction of the lit pixels without a reading; 0 if no pixel is lit."""
     return 1.0 - row["completeness"] if row["completeness"] is not None else 0.0
 
 
@@ -94,12 +108,15 @@ def is_unreliable(row: dict[str, Any]) -> bool:
 
 
 def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, list[Cell]]]]]:
-    """Per material class, "all" first: name and cells of each instrument."""
+    """Errors of each instrument per material class, "all" first.
+
+    Each entry is the material and a list with the name and the cells, one per column, of each instrument.
+    """
     table = []
     for material in materials(measurements):
         rows = {m.name: row for m in measurements for row in m.rows if row["material"] == material}
         real = [rows[m.name] for m in measurements if m.name in rows and not is_reference(m)]
-        rivals = [row for row in real if not is_unreliable(row)]  # the few pixels left of the others prove nothing
+        rivals = [row for row in real if not is_unreliable(row)]  # the few readings of the others prove nothing
         best = {c.key: _best(c, rivals) for c in COLUMNS}
         lines = [(n, [_cell(c, row, best[c.key], row in rivals) for c in COLUMNS]) for n, row in rows.items()]
         table.append((material, lines))
@@ -107,7 +124,11 @@ def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, lis
 
 
 def failure_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, str, list[LegendEntry]]]]]:
-    """Per material class, "all" first: name, failed pixels in percent, and their causes, of each instrument."""
+    """Failed pixels of each instrument per material class, "all" first.
+
+    Each entry is the material and a list with, for each instrument, its name, the failed pixels in percent, and the
+    legend of their causes.
+    """
     table = []
     for material in materials(measurements):
         rows = [(m.name, row) for m in measurements for row in m.rows if row["material"] == material]
@@ -117,8 +138,11 @@ def failure_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[t
 
 
 def noise_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, list[str], bool]]]]:
-    """Per material class, "all" first: name, noise of the detector, that of sampling and their ratio, and whether this
-    is large, of each instrument; nothing where none is known."""
+    """Noise of each instrument per material class, "all" first; empty if no instrument knows its noise.
+
+    Each entry is the material and a list with, for each instrument, its name, the texts of detector noise, sampling
+    noise and their ratio, and whether this ratio is large.
+    """
     table = []
     for material in materials(measurements):
         rows = [(m.name, row) for m in measurements for row in m.rows if row["material"] == material]
@@ -129,13 +153,13 @@ def noise_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tup
 
 
 def definitions(measurements: Sequence[Measurement]) -> list[Definition]:
-    """What the causes that occur mean, in the order of their families."""
+    """Definitions of the causes that occur in the measurements, in the order of `Cause`."""
     found = {name for m in measurements for row in m.rows for name in row["causes"]}
     return [Definition(TITLES[c], DEFINITIONS[c]) for c in Cause if c.name.lower() in found]
 
 
 def parts(row: dict[str, Any]) -> list[LegendEntry]:
-    """Causes of the failed pixels of a row, largest first."""
+    """Legend of the causes of the failed pixels of a row; the largest is first."""
     causes = [(Cause[name.upper()], fraction) for name, fraction in row["causes"].items()]
     return [
         LegendEntry(TITLES[c], palette.hexadecimal(palette.OUTCOME_COLORS[c]), 100 * fraction) for c, fraction in causes
@@ -149,11 +173,11 @@ def materials(measurements: Sequence[Measurement]) -> list[str]:
 
 
 def comparison_tables(tables: Sequence[tuple[str, Rows]]) -> list[Table]:
-    """Tables of errors, of failures and of noise, one row per material and instrument.
+    """Tables of errors, of failures and of noise, with one row per material and instrument.
 
     Parameters
     ----------
-    tables : name of each instrument, and its rows: statistics per material class.
+    tables : name of each instrument with its statistics per material class.
     """
     return [
         _table(tables, [f"{c.title} ({c.unit})" for c in COLUMNS], lambda row: [_text(c, row) for c in COLUMNS]),
@@ -168,11 +192,21 @@ def comparison_markdown(tables: Sequence[tuple[str, Rows]]) -> str:
 
 
 def errors_markdown(comparison: Comparison) -> str:
-    """Table in Markdown of the errors of one range image, one row per material class; lengths in mm, fractions in %.
+    """Markdown table of the errors of one range image, with one row per material class.
+
+    Lengths are in mm, fractions in %.
 
     Parameters
     ----------
-    comparison : Comparison, as `rangesim.compare` returns.
+    comparison : Comparison, as `rangesim.compare` returns it.
+
+    Examples
+    --------
+    `comparison` is `rangesim.compare(image, signals)`, here of a wall at 1 m:
+
+    >>> from rangesim import errors_markdown
+    >>> print(errors_markdown(comparison).splitlines()[0])
+    | material | pixels | lit | completeness | coverage | bias mm | ... | flying rate |
     """
     heads = [f.name.replace("_m", "_mm") if f.name.endswith("_m") else f.name for f in fields(ErrorStatistics)]
     rows = [[_plain(name, value) for name, value in asdict(row).items()] for row in comparison.table]
@@ -191,17 +225,26 @@ def _plain(name: str, value: Any) -> str:
 
 
 def failures_markdown(rows: Rows) -> str:
-    """Table in Markdown of the failed pixels and their causes, one row per material class; fractions in %.
+    """Markdown table of the failed pixels and their causes, with one row per material class; fractions in %.
 
     Parameters
     ----------
-    rows : as `rangesim.causes.CauseMap.fractions` returns.
+    rows : as `rangesim.causes.CauseMap.fractions` returns them.
+
+    Examples
+    --------
+    >>> from rangesim import failures_markdown
+    >>> rows = [{"material": "glossy", "failed": 0.25, "causes": {"multipath": 0.2, "low_signal": 0.05}}]
+    >>> print(failures_markdown(rows), end="")
+    | material | failed (%) | because (% of the pixels) |
+    | --- | --- | --- |
+    | glossy | 25.0 | multipath 20.0, low signal 5.0 |
     """
     return Table(["material", *FAILURE_HEADS], [[row["material"], *_failures(row)] for row in rows]).markdown()
 
 
 def _table(tables: Sequence[tuple[str, Rows]], heads: list[str], texts: Callable[[dict[str, Any]], list[str]]) -> Table:
-    """One row per material class and instrument, with the cells that `texts` makes of the statistics."""
+    """Table with one row per material class and instrument; `texts` makes the cells from the statistics."""
     lines = []
     for material in dict.fromkeys(row["material"] for _, rows in tables for row in rows):
         for name, rows in tables:
@@ -210,34 +253,36 @@ def _table(tables: Sequence[tuple[str, Rows]], heads: list[str], texts: Callable
 
 
 def _failures(row: dict[str, Any]) -> list[str]:
-    """Failed pixels in percent, and their causes."""
+    """Cells of the failed pixels, in percent, and of their causes."""
     return [_percent(row["failed"]), ", ".join(f"{p.name} {p.text}" for p in parts(row)) or "–"]
 
 
 def _noise(row: dict[str, Any]) -> list[str]:
-    """Standard deviations by the detector's noise and by sampling, millimetres."""
+    """Cells of the standard deviations by the detector's noise and by sampling, in millimetres."""
     sigmas = (row["detector_sigma_m"], row["sampling_sigma_m"])
     return ["–" if sigma is None else millimetres(sigma) for sigma in sigmas]
 
 
 def _ratio(row: dict[str, Any]) -> str:
+    """Cell of the ratio of sampling noise to detector noise."""
     ratio = noise_ratio(row)
     return f"{ratio:.2f}" if ratio else "–"
 
 
 def _percent(fraction: float | None) -> str:
+    """Text of a fraction in percent, without the sign; a dash for None."""
     return "–" if fraction is None else f"{100 * fraction:.1f}"
 
 
 def number(column: Column, value: float | None) -> str:
-    """A value in the column's unit, without it; a dash where it is not defined."""
+    """Text of a value in the unit of a column, without the unit; a dash for None."""
     if value is None:
         return "–"
     return f"{100 * value:.1f}" if column.unit == "%" else millimetres(value)
 
 
 def millimetres(metres: float) -> str:
-    """Millimetres with about three significant digits."""
+    """Text of a length in millimetres, with about three significant digits and without the unit."""
     mm = 1e3 * metres
     digits = 3 if abs(mm) < 0.0995 else 2 if abs(mm) < 9.95 else 1 if abs(mm) < 99.5 else 0
     text = f"{mm:.{digits}f}"
@@ -245,7 +290,7 @@ def millimetres(metres: float) -> str:
 
 
 def seconds(value: float | None) -> str:
-    """A duration with its unit; a dash if there is none."""
+    """Text of a duration with its unit; a dash for None."""
     if value is None:
         return "–"
     for unit, factor in (("s", 1.0), ("ms", 1e3), ("µs", 1e6)):
@@ -255,13 +300,13 @@ def seconds(value: float | None) -> str:
 
 
 def photons(per_pulse: PhotonsRecord) -> str:
-    """Photons that a laser pulse brings, in words: in the median pixel and in the brightest."""
+    """Sentence part that says how many photons per laser pulse the median and the brightest pixel detect."""
     median, largest = (_amount(value) for value in (per_pulse.median, per_pulse.largest))
     return f"{median} photons detected per pulse in the median pixel, {largest} in the brightest"
 
 
 def _amount(value: float) -> str:
-    """A number that is not negative, with about two significant digits, down to a thousandth."""
+    """Text of a number that is not negative, with about two significant digits, down to a thousandth."""
     if value < 0.001:
         return "< 0.001" if value else "0"
     digits = 3 if value < 0.0995 else 2 if value < 0.995 else 1 if value < 9.95 else 0
@@ -269,7 +314,7 @@ def _amount(value: float) -> str:
 
 
 def cost_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[str]]]:
-    """Per instrument: frames, exposure, acquisition, decoding, segmentation, points per pixel."""
+    """Costs of each instrument: its name, and texts of frames, exposure, acquisition, computing times and points."""
     table = []
     for m in measurements:
         f, times = m.metadata, m.metadata.times_s
@@ -300,6 +345,7 @@ def settings_line(experiment: Experiment, shapes: Sequence[tuple[int, ...]]) -> 
 
 
 def _best(column: Column, rows: Sequence[dict[str, Any]]) -> float | None:
+    """Best value of a column among rows; None if there are fewer than two rows, or no value is better than another."""
     values = [row[column.key] for row in rows if row[column.key] is not None]
     if len(rows) < 2 or not values or not column.better:
         return None
@@ -307,6 +353,7 @@ def _best(column: Column, rows: Sequence[dict[str, Any]]) -> float | None:
 
 
 def _cell(column: Column, row: dict[str, Any], best: float | None, rival: bool) -> Cell:
+    """Cell of a value; `rival` says whether it takes part in the choice of the best."""
     value = row[column.key]
     bar = value if column.unit == "%" else None
     best_here = rival and value is not None and value == best
@@ -314,12 +361,13 @@ def _cell(column: Column, row: dict[str, Any], best: float | None, rival: bool) 
 
 
 def _text(column: Column, row: dict[str, Any]) -> str:
-    """A value of a row in the column's unit, with its uncertainty by sampling where that is known and shows."""
+    """Text of a value in the column's unit, with its uncertainty by sampling unless that is unknown or rounds to 0."""
     return f"{number(column, row[column.key])} {_error(column, row) or ''}".rstrip()
 
 
 def _error(column: Column, row: dict[str, Any]) -> str | None:
-    """The uncertainty of a value by sampling; empty if it is not known or does not show, None in columns without."""
+    """Text of the uncertainty of a value by sampling, with ±; empty if it is unknown or rounds to 0, None in columns
+    without uncertainty."""
     key = f"{column.key}_error"
     if key not in row:
         return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the numbers say, in sentences; each is computed from the measurements and claims nothing else."""
+"""The verdict: sentences that summarise the measurements of a result, each computed from its numbers alone."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from rangesim.report.tables import (
     seconds,
     titles,
 )
-from rangesim.results.run_files import Measurement
+from rangesim.results.experiment_results import Measurement
 
 MAIN_CAUSE = 0.1
-"""Fraction of the failures from which a cause is named."""
+"""Fraction of the failures from which the verdict names a cause; below, the list gets long and the causes are rare."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A short paragraph. subject : what it is about, shown first and in bold."""
+    """A short paragraph of the verdict. subject : shown first, in bold. text : the rest."""
 
     subject: str
     text: str
 
 
 def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
-    """Accuracy and failures of each real sensor, then who is best at what."""
+    """Findings about a result: accuracy and failures of each real sensor, and then a comparison side by side."""
     names = titles(measurements)
     real = [m for m in measurements if not is_reference(m)] or list(measurements)
     findings = [Finding(names[m.name], f"{_accuracy(m.rows)}{_failures(m.rows)}{_reasons(m.rows)}") for m in real]
@@ -44,6 +44,7 @@ def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
 
 
 def _accuracy(rows: Rows) -> str:
+    """Sentences about the pixels that a sensor measured, and about its errors."""
     total = _total(rows)
     if total["median_abs_m"] is None:
         return "measured nothing."
@@ -56,7 +57,7 @@ def _accuracy(rows: Rows) -> str:
 
 
 def _failures(rows: Rows) -> str:
-    """Materials on which most readings are wrong or missing."""
+    """Sentence that lists the materials on which a sensor is unreliable; empty if there are none."""
     parts: list[str] = []
     for row in rows:
         if row["material"] != "all" and is_unreliable(row):
@@ -69,7 +70,8 @@ def _failures(rows: Rows) -> str:
 
 
 def _reasons(rows: Rows) -> str:
-    """Why readings are wrong or missing: on the materials where most are, and on the whole where there is none."""
+    """Sentence about the causes of failures on the materials where the sensor is unreliable; without such a material,
+    about those on all surfaces."""
     poor = [row for row in rows if row["material"] != "all" and is_unreliable(row)]
     named = [f"{row['material']}: {_main_causes(row)}" for row in poor if row["causes"]]
     if named:
@@ -79,21 +81,24 @@ def _reasons(rows: Rows) -> str:
 
 
 def _main_causes(row: dict[str, Any]) -> str:
-    """The most frequent causes, with their fractions of the failures."""
+    """The main causes of the failures of a row, each with its fraction of the failures."""
     fractions = [(p.percent / 100 / row["failed"], p.name) for p in parts(row)]
     main = [f"{_percent(fraction, 0)} {name}" for fraction, name in fractions if fraction >= MAIN_CAUSE]
     return ", ".join(main)
 
 
 def _best_error(real: Sequence[Measurement], names: dict[str, str]) -> str:
-    """Of the sensors that are reliable on the whole: what is left of the others proves nothing."""
+    """Sentence that ranks sensors by their median error.
+
+    Sensors that are unreliable on the whole are left out, because their few readings prove nothing.
+    """
     rows = [(_total(m.rows), names[m.name]) for m in real if not is_unreliable(_total(m.rows))]
     errors = sorted((row["median_abs_m"], name) for row, name in rows if row["median_abs_m"])
     return _ranked("Smallest median error", [(name, _mm(e)) for e, name in errors])
 
 
 def _most_right(real: Sequence[Measurement], names: dict[str, str]) -> str:
-    """Sentence that ranks sensors by right readings: one that measures everywhere, but wrong, is not complete."""
+    """Sentence that ranks sensors by their fraction of right readings; wrong readings do not count."""
     failed = [(_total(m.rows)["failed"], names[m.name]) for m in real if _total(m.rows)["failed"] is not None]
     limit = _glued(f"{1e3 * OUTLIER_M:g} mm")
     entries = [(name, f"{_percent(1.0 - f)} of the pixels") for f, name in sorted(failed)]
@@ -101,6 +106,7 @@ def _most_right(real: Sequence[Measurement], names: dict[str, str]) -> str:
 
 
 def _shortest_exposure(real: Sequence[Measurement], names: dict[str, str]) -> str:
+    """Sentence that ranks sensors by the exposure time of all their frames."""
     times = [(m.metadata.acquisition_s, m) for m in real if m.metadata.acquisition_s]
     times.sort(key=lambda pair: pair[0])
     return _ranked(
@@ -110,7 +116,10 @@ def _shortest_exposure(real: Sequence[Measurement], names: dict[str, str]) -> st
 
 
 def _ranked(what: str, entries: Sequence[tuple[str, str]]) -> str:
-    """Who is best, and by how much where there are two; nothing where the best are equal in the digits shown."""
+    """Sentence that names the best of the entries (name and value) and the next.
+
+    It is empty for fewer than two entries, and if the two best values are equal in the digits shown.
+    """
     if len(entries) < 2 or entries[0][1] == entries[1][1]:
         return ""
     (first, value), *others = entries
@@ -119,17 +128,20 @@ def _ranked(what: str, entries: Sequence[tuple[str, str]]) -> str:
 
 
 def _total(rows: Rows) -> dict[str, Any]:
+    """Statistics of all material classes together."""
     return next(row for row in rows if row["material"] == "all")
 
 
 def _percent(fraction: float | None, digits: int = 1) -> str:
+    """Text of a fraction in percent with its sign; 0 for None."""
     return _glued(f"{100 * (fraction or 0.0):.{digits}f} %")
 
 
 def _mm(metres: float) -> str:
+    """Text of a length in millimetres with its unit."""
     return _glued(f"{millimetres(metres)} mm")
 
 
 def _glued(quantity: str) -> str:
-    """Number and unit that no line break parts."""
+    """Number and unit with a no-break space between them."""
     return quantity.replace(" ", "\N{NO-BREAK SPACE}")

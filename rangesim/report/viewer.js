@@ -1,13 +1,13 @@
 "use strict";
-// Point clouds: one canvas per sensor, one view for all of them; in WebGL, or as still pictures where there is none.
+// Point clouds: one canvas per sensor and one view for all of them, in WebGL, or as still pictures without WebGL.
 
 const VERTEX = `
 attribute vec3 position; attribute vec3 color;
 uniform mat4 matrix; uniform float size; varying vec3 tint;
 void main() {
   gl_Position = matrix * vec4(position, 1.0);
-  // Many points share a pixel of the canvas. Were the nearest drawn, errors that are too near would hide the others,
-  // so points within 1 % of depth are drawn in random order.
+  // Many points share a pixel of the canvas. If the nearest were drawn, readings that are too near would hide the others.
+  // Points within 1 % of depth are therefore drawn in random order.
   float random = fract(sin(dot(position, vec3(129.898, 782.33, 377.19))) * 43758.5453);
   vec4 moved = matrix * vec4(position * (0.995 + 0.01 * random), 1.0);
   gl_Position.z = moved.z / moved.w * gl_Position.w;
@@ -22,6 +22,8 @@ const BACKGROUND = [16, 21, 29];
 const START = { yaw: -0.45, pitch: 0.22, zoom: 1, shift: [0, 0] };
 
 // Positions (3 per point; x right, y up, z towards the viewer, metres) and the pixel of each, of a depth image.
+// The camera is the pinhole of rangesim.rig.camera_model, repeated here for the browser; tests/test_rig.py compares them.
+// Distortion is left out.
 function unproject(instrument, z) {
   const [fx, fy, cx, cy] = instrument.camera, width = instrument.width;
   const count = z.reduce((n, v) => n + (v > 0), 0);
@@ -44,10 +46,10 @@ function focalOf(instrument, aspect) {
   return Math.min(2 * fy / instrument.height, aspect * 2 * fx / instrument.width);
 }
 
-// Pixels that a point at its own distance covers, on a canvas of a height.
+// Size of a point in pixels of a canvas, with which the points of a surface seen from the camera cover it.
 function pointSize(camera, focal, height) { return 1.35 * focal * height / 2 / camera[1]; }
 
-// Turn about the centre at a depth, step back, project; column-major.
+// Matrix, column by column, that turns the points about the centre at a depth, moves them back and projects them.
 function projection(view, depth, focal, aspect) {
   const { yaw, pitch, zoom, shift } = view;
   const [sy, cy, sp, cp] = [Math.sin(yaw), Math.cos(yaw), Math.sin(pitch), Math.cos(pitch)];
@@ -63,7 +65,7 @@ function projection(view, depth, focal, aspect) {
   return new Float32Array(columns);
 }
 
-// The canvas as large as it is shown; its size in pixels.
+// Sets the canvas to the size at which it is shown; returns this size in pixels.
 function fit(canvas) {
   const ratio = Math.min(window.devicePixelRatio || 1, 2);
   const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
@@ -71,7 +73,7 @@ function fit(canvas) {
   return [width, height];
 }
 
-// WebGL of a canvas with the program of the clouds; null where the browser or its driver has none.
+// WebGL context of a canvas with the program that draws clouds; null if the browser or its driver has no WebGL.
 function openWebGL(canvas) {
   const gl = canvas.getContext("webgl", { antialias: true, preserveDrawingBuffer: true });
   if (!gl) return null;
@@ -90,16 +92,16 @@ function openWebGL(canvas) {
   return { gl, program };
 }
 
-// A cloud that turns, or a still picture of it.
+// View of a cloud that turns, or a still picture of it.
 function cloudView(canvas, instrument, z, view) {
   const opened = openWebGL(canvas);
   if (opened) return new CloudView(canvas, instrument, z, view, opened);
-  const fresh = canvas.cloneNode();  // one that has tried WebGL may refuse to be drawn on otherwise
+  const fresh = canvas.cloneNode();  // a canvas that was asked for WebGL may refuse a 2D context
   canvas.replaceWith(fresh);
   return new StillView(fresh, instrument, z, view);
 }
 
-// A cloud from where the view starts, drawn without WebGL.
+// Still picture of a cloud from the first place of the view, drawn without WebGL.
 class StillView {
   constructor(canvas, instrument, z, view) {
     Object.assign(this, { canvas, view, instrument }, unproject(instrument, z));

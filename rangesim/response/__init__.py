@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Responses: the weights with which sensors count light paths. `rangesim.response.base` has the interface."""
+"""Responses: the weights with which sensors count light paths. `rangesim.response.response` has the interface."""
 
-from rangesim.response.base import (
+from rangesim.response.path_lengths import SPEED_OF_LIGHT, FirstReturn, LengthSplit, Phasor, TransientHistogram
+from rangesim.response.patterns import Fringes, GrayBits, Images
+from rangesim.response.response import (
     CAUSTIC,
     DIRECT,
     GLINT,
@@ -15,8 +17,6 @@ from rangesim.response.base import (
     Response,
     SparseResponse,
 )
-from rangesim.response.lengths import SPEED_OF_LIGHT, FirstReturn, LengthSplit, Phasor, TransientHistogram
-from rangesim.response.patterns import Fringes, GrayBits, Images
 
 __all__ = [
     "CAUSTIC",

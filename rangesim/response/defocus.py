@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from rangesim.response.base import Math
+    from rangesim.response.response import Math
 
 ROOT_HALF = 0.5**0.5
 """1 / sqrt(2), dimensionless: the Gaussian's integral up to x is 0.5 + 0.5 erf(x ROOT_HALF / sigma)."""

@@ -10,8 +10,8 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from rangesim.response.base import DenseResponse, LightPath, Math
 from rangesim.response.defocus import BlurredImage, blurred_stripes, fringe_contrast
+from rangesim.response.response import DenseResponse, LightPath, Math
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, check_fields
 from rangesim.settings.config import shown

@@ -3,9 +3,9 @@
 
 | kind | class | writer | loader |
 | --- | --- | --- | --- |
-| a run | `run_files.Result` | `write_result` | `load_result` |
-| a scan | `scan_files.ScanResult` | `write_scan` | `load_scan` |
-| a decoded capture | `decoded_files.Decoded` | `save_decoded` | `load_decoded` |
+| a run | `experiment_results.Result` | `write_result` | `load_result` |
+| a scan | `scan_results.ScanResult` | `write_scan` | `load_scan` |
+| a decoded capture | `decoded_captures.Decoded` | `save_decoded` | `load_decoded` |
 | a capture | `rangesim.capture.Capture` | `save_capture` | `load_capture`, `import_capture` |
 | a range image | `rangesim.decoding.range_image.RangeImage` | `save_range_image` | `load_range_image` |
 | signals | `rangesim.signals.StillSignals` | `save_signals` | `load_signals` |

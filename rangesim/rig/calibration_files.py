@@ -90,6 +90,15 @@ def save_calibration(rig: Rig, path: str | Path) -> None:
 
     The key "seal" holds the SHA-256 of the file. After a correction by hand it no longer matches, and no command
     overwrites the file any more.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> rig = Rig(Intrinsics.from_fov(640, 480, 50.0), Intrinsics.from_fov(1280, 800, 60.0))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save_calibration(rig, f"{folder}/rig.json")
+    ...     load_calibration(f"{folder}/rig.json") == rig
+    True
     """
     text = json.dumps({**to_dict(rig), "seal": unsealed(SEAL)}, indent=1) + "\n"
     write_file(Path(path), sealed(text.encode(), SEAL, at_end=True), FileFormatError, make_parents=True)

@@ -222,7 +222,7 @@ def check_rigid(T: NDArray[np.floating[Any]], name: str) -> None:
         if T.ndim > 2:
             first = int(np.argmin(is_rigid))
             name, T = f"{name}[{first}]", T[first]
-        raise ValueError(f"expected {name} to be rigid (a rotation and metres of translation), got {T.tolist()}.")
+        raise ValueError(f"expected {name} to be rigid (a rotation and a translation in metres), got {T.tolist()}.")
 
 
 def is_same_pose(first: np.ndarray, second: np.ndarray) -> bool:
@@ -258,7 +258,9 @@ def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0
     z = t - o
     x = np.cross(z, u)
     if np.linalg.norm(z) == 0 or np.linalg.norm(x) == 0:
-        raise ValueError(f"expected target {t.tolist()} apart from origin {o.tolist()} and not along up {u.tolist()}.")
+        raise ValueError(
+            f"expected target {t.tolist()} to differ from origin {o.tolist()}, and not to lie along up {u.tolist()}."
+        )
     z, x = z / np.linalg.norm(z), x / np.linalg.norm(x)
     result = np.eye(4)
     result[:3] = np.stack([x, np.cross(z, x), z, o], axis=1)

@@ -65,7 +65,7 @@ def warn_of_aperture(sensor: Any, camera: Intrinsics, distance_m: float, label: 
     blur = 2 * radius * camera.fx / min(focus, distance_m)  # pixels, at infinity
     if blur > MAX_BLUR_PX:
         warn(
-            f"{label}: the camera's aperture of {radius:g} m is left out, so the image is sharp everywhere; state it "
+            f"{label}: the camera's aperture of {radius:g} m is ignored, so the image is sharp everywhere; state it "
             f"in the rig: camera_lens=Lens(aperture_radius_m={radius:g}, focus_m={focus:g})."
         )
 
@@ -79,8 +79,8 @@ def warn_of_clipping(sensor: Any, z: np.ndarray, label: str) -> None:
     for name, at, hidden in (("near_clip", near, z < near), ("far_clip", far, z > far)):
         if hidden.any() and not np.isclose(at, UNSTATED_CLIP[name]):
             warn(
-                f"{label}: the camera's {name} of {at:g} m is left out, so it sees what that hides in Mitsuba, on "
-                f"{100 * hidden.mean():.0f} % of its image; take these surfaces out of the scene."
+                f"{label}: the camera's {name} of {at:g} m is ignored, so it sees surfaces that Mitsuba hides, on "
+                f"{100 * hidden.mean():.0f} % of its image; remove these surfaces from the scene."
             )
 
 

@@ -121,11 +121,9 @@ def load_scene(
     label = "the scene dictionary" if isinstance(source, Mapping) else str(source)
     if not _is_mesh(source):
         if material is not None:
-            raise ValueError(f"a material can be chosen for a bare mesh alone, but {label} names its own materials.")
+            raise ValueError(f"only a bare mesh can be given a material, but {label} names its own materials.")
         if unit_m is not None:
-            raise ValueError(
-                f"a unit can be chosen for a bare mesh alone; scale the shapes of {label} to metres instead."
-            )
+            raise ValueError(f"only a bare mesh can be given a unit; scale the shapes of {label} to metres instead.")
     if unit_m is not None:
         check_number("unit_m", unit_m, Bounds("positive and finite metres per unit", 1e-9, 1e6))
     select_variant(variant)
@@ -135,7 +133,7 @@ def load_scene(
     loaded, ids, classes, origin_m = instantiate(advises=True)
     _check(loaded, ids, sensor, label)
     if chosen is None and (n := len(loaded.sensors())) > 1:
-        warn(f"{label} has {n} sensors, and the first becomes the camera; Python's load_scene(sensor=) takes another.")
+        warn(f"{label} has {n} sensors, and the first becomes the camera; load_scene(sensor=N) takes another.")
     warn_of_emitters_behind_glass(loaded, label)
     repeat_normals(loaded)
     camera, T_camera = camera_of(loaded.sensors()[sensor], label)

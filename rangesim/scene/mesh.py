@@ -64,7 +64,7 @@ def scene_around_mesh(path: Path, material: str, unit_m: float, folder: Path, ad
     if path.suffix.lower() in Y_UP_SUFFIXES:
         vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]
     if not (np.abs(vertices) <= MAX_COORDINATE_M).all():
-        raise FileFormatError(f"expected {path} within {MAX_COORDINATE_M:g} metres; what is its unit? See unit_m.")
+        raise FileFormatError(f"expected {path} within {MAX_COORDINATE_M:g} metres; state its unit with unit_m.")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = float(np.linalg.norm(high - low))
     if not size > 0:

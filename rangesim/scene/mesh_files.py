@@ -110,7 +110,7 @@ def _unpacked(content: bytes, index: int) -> tuple[int, np.ndarray]:
     if index:
         (meshes,) = struct.unpack_from("<I", content, len(content) - 4)
         if not 0 < index < meshes:
-            raise ValueError(f"it has {meshes} meshes, but number {index} was asked for, from 0")
+            raise ValueError(f"expected a shape_index from 0 to {meshes - 1}, got {index}")
         place = 4 + 8 * (meshes - index) if version == 4 else 4 * (meshes - index + 1)
         if place > len(content):
             raise ValueError("it ends early")

@@ -58,7 +58,7 @@ def check_type(name: str, label: str) -> None:
         return
     raise FileFormatError(
         f"{label}: expected types of plugins that come with Mitsuba or are registered in Python, got "
-        f"{shown(name)}{nearest(name, shipped_types())}; a scene may bring no library of its own."
+        f"{shown(name)}{nearest(name, shipped_types())}; a scene must not bring a library of its own."
     )
 
 
@@ -101,7 +101,7 @@ def ids_of_shapes(state: Any, label: str) -> set[str]:
         kind, name = node.props.plugin_name(), node.props.id()
         if kind in COMPOSITES:
             raise FileFormatError(
-                f"{label}: shapes of type {kind!r} are not supported; put in copies of the shapes they hold."
+                f"{label}: shapes of type {kind!r} are not supported; replace them by copies of their shapes."
             )
         if not name or name.startswith("_arg_"):
             name = f"{kind}_{index}"

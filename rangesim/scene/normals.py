@@ -18,7 +18,8 @@ import numpy as np
 EPSILON = float(np.finfo(np.float32).eps)
 """Relative spacing of numbers in single precision, 1.2e-7."""
 UNKNOWN = (1.0, 0.0, 0.0)
-"""Unit normal of a vertex whose faces have no area or cancel each other; Mitsuba takes the same."""
+"""Unit normal of a vertex whose faces have no area or cancel each other; it is the one that
+Mitsuba uses, so that such a vertex is shaded as in Mitsuba."""
 
 
 def repeat_normals(scene: Any) -> Any:

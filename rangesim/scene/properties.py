@@ -309,14 +309,14 @@ def _problem_of_medium(state: Any, node: Any) -> str:
         return ""
     for key in NOT_OF_MEDIA:
         if key in node.props:
-            return f"expected albedo and sigma_t, in 1/m, which Mitsuba reads, got {key}"
+            return f"expected albedo and sigma_t, in 1/m, which Mitsuba reads; it ignores {key}"
     for key in ("sigma_t", "albedo"):
         value = node.props.get(key)
         if isinstance(value, mi.Properties.ResolvedReference):
             inside = state.nodes[value.index()].props
             value = inside.get("value") if inside.plugin_name() == "constvolume" else None
         if len(set(_numbers(value))) > 1 or (hasattr(value, "is_uniform") and not value.is_uniform()):
-            return f"expected {key} to be one number, that at the sensor's wavelength, got several colours"
+            return f"expected {key} to be one number, the value at the sensor's wavelength, got several colours"
     return ""
 
 

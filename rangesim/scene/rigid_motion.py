@@ -41,7 +41,7 @@ class MovingScene:
         for name in names:
             if not ({f"{name}.to_world", f"{name}.vertex_positions"} & set(parameters.keys())):
                 (shape,) = (s for s in scene.mitsuba.shapes() if s.id() == name)
-                raise ValueError(f"expected a mesh or a shape with a pose, but {name!r} is a {shape.class_name()}.")
+                raise ValueError(f"expected a mesh or a shape with a to_world, but {name!r} is a {shape.class_name()}.")
 
     def at(self, transforms: Mapping[str, np.ndarray]) -> Scene:
         """The scene with some shapes moved.
@@ -82,7 +82,7 @@ class MovingScene:
 
     def _load(self) -> Scene:
         if self.scene.reload is None:
-            raise ValueError("expected a scene of load_scene, which can be loaded again, to move shapes in.")
+            raise ValueError("expected a scene that load_scene has made: to move its shapes, it is loaded again.")
         self._moved = replace(self.scene, mitsuba=self.scene.reload())
         self._parameters = mi.traverse(self._moved.mitsuba)
         for name in self.names:

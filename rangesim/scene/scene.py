@@ -16,7 +16,7 @@ from rangesim.settings.bounds import Bounds, check_number, whole
 BASELINE = Bounds("a positive baseline in metres", 1e-9, 1e6)
 """Bounds of the distance between camera and projector, metres."""
 PROJECTOR_PIXELS = (1280, 800)
-"""Default width and height of a projector in pixels, as of a common WXGA projector."""
+"""Default width and height of a projector in pixels: WXGA, a common format."""
 
 
 @dataclass(frozen=True)

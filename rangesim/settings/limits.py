@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How large an input may be: one table of limits, checked before memory is allocated.
+"""Limits of the sizes of inputs: one table, checked before memory is allocated.
 
-The limits keep a typing error or a hostile file from taking the machine down; they are far above what a sensor
-has. Whoever needs more raises them, in Python
+The limits are far above the sizes of real sensors. They keep a typing error or a hostile file from taking the machine
+down. A larger limit can be set for a command, `RANGESIM_LIMITS="pixels=1e9,bins=1e5" rangesim run ...`, or in Python
+for a block. docs/limits.md lists all limits.
 
-    with limits.raised(pixels=10**9):
-        ...
-
-or for a command, `RANGESIM_LIMITS="pixels=1e9,bins=1e5" rangesim run ...`. docs/limits.md lists them.
+Examples
+--------
+>>> with raised(bins=100_000):
+...     current().bins
+100000
+>>> current().bins
+65536
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ from functools import lru_cache
 from rangesim.settings.config import check_keys, shown
 
 VARIABLE = "RANGESIM_LIMITS"
-"""Environment variable with limits for the whole process, such as "pixels=1e9,bins=1e5"."""
+"""Name of the environment variable with limits for the whole process, such as "pixels=1e9,bins=1e5"."""
 
 
 @dataclass(frozen=True)
@@ -32,25 +36,25 @@ class Limits:
 
     Parameters
     ----------
-    pixels : of one image: camera, projector, film, texture, or image file.
+    pixels : pixels of one image: camera, projector, film, texture or image file.
     projector : pixels along one side of a projector that shows coded patterns.
-    frames : of one capture.
-    bins : of one time-of-flight histogram; with a pulse, the finer bins of the light transport count.
+    frames : frames of one capture.
+    bins : bins of one time-of-flight histogram; with a pulse, the finer bins of the light transport count.
     steps : phase shifts of a fringe pattern.
     frequencies : modulation frequencies of one sensor.
-    wraps : candidates that phase unwrapping compares: the longest path searched over the shortest wavelength.
+    wraps : candidates of phase unwrapping: the longest path that is searched, divided by the shortest wavelength.
     spp : light paths per pixel.
     depth : segments of a light path.
-    photons : caustic photons of a pass.
-    passes : light-transport passes of one sensor in a scene that moves; bands and samples of its exposures.
-    instruments : of one experiment.
+    photons : caustic photons of one pass.
+    passes : light-transport passes of one sensor in a moving scene; also its bands of rows, and samples of an exposure.
+    instruments : instruments of one experiment.
     points : vertices, or faces, of one mesh file.
-    voxels : of one grid that views are fused in, or seen and true volume are compared on.
-    shapes : of one scene.
-    memory : bytes that a run may take by its estimate; unless it is set, what the machine has available.
-    bytes : of the arrays that one file holds once it is decompressed.
+    voxels : voxels of one grid in which views are fused, or the seen volume is compared with the true one.
+    shapes : shapes of one scene.
+    memory : bytes that a run may need by its estimate; unless it is set, the memory available counts.
+    bytes : bytes of the arrays of one file after decompression.
     text : bytes of one JSON, TOML or XML file.
-    nesting : levels of JSON, TOML, XML and scene dictionaries.
+    nesting : nested levels of JSON, TOML, XML and scene dictionaries.
     """
 
     pixels: int = 100_000_000
@@ -78,18 +82,18 @@ _raised: ContextVar[Limits | None] = ContextVar("limits", default=None)
 
 
 def current() -> Limits:
-    """The limits in force here: those of `raised`, else of the environment, else the defaults."""
+    """The limits that apply now: those that `raised` has set, else those of the environment, else the defaults."""
     return _raised.get() or _of_environment(os.environ.get(VARIABLE, ""))
 
 
 @contextmanager
 def raised(**limits: int) -> Iterator[None]:
-    """Set limits while the block runs, in this thread (or task); the others stay.
+    """Set some limits while the block runs, in this thread (or asyncio task).
 
     Raises
     ------
     ValueError
-        An unknown limit, or one that is no whole number of at least 1.
+        A limit is unknown, or its value is not a whole number of at least 1.
     """
     token = _raised.set(_with(current(), limits, "limits"))
     try:
@@ -99,9 +103,13 @@ def raised(**limits: int) -> Iterator[None]:
 
 
 def check(name: str, value: int, what: str, error: type[Exception] = ValueError) -> None:
-    """Raise `error` if `value`, the size of `what`, is beyond the limit `name`.
+    """Raise an error if a size is above a limit.
 
-    what : names the thing and its unit, such as "pixels of an image".
+    Parameters
+    ----------
+    name : name of the limit. value : the size.
+    what : unit and thing, for the message, such as "pixels of an image".
+    error : type of the error.
     """
     most = getattr(current(), name)
     if value > most:

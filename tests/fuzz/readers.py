@@ -202,19 +202,19 @@ def _tof_calibration(path: Path, _: Arguments) -> Any:
 
 
 def _result(path: Path, _: Arguments) -> Any:
-    from rangesim.results.run_files import load_result
+    from rangesim.results.experiment_results import load_result
 
     return load_result(path)
 
 
 def _scan(path: Path, _: Arguments) -> Any:
-    from rangesim.results.scan_files import load_scan
+    from rangesim.results.scan_results import load_scan
 
     return load_scan(path)
 
 
 def _decoded_record(path: Path, _: Arguments) -> Any:
-    from rangesim.results.decoded_files import load_decoded
+    from rangesim.results.decoded_captures import load_decoded
 
     return load_decoded(path)
 

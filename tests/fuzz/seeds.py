@@ -99,7 +99,7 @@ def decoded() -> Seeds:
     from synthetic import plane_signals, stereo_rig
 
     from rangesim import IdealToF, decode, expose
-    from rangesim.results.decoded_files import Decoded, save_decoded
+    from rangesim.results.decoded_captures import Decoded, save_decoded
 
     capture = expose(plane_signals(stereo_rig(12, 8), IdealToF()), IdealToF())
     of_capture = Decoded(decode(capture), capture.sensor, capture.rig, {"ok": 1.0}, None)

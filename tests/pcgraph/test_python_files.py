@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-import pcgraph.own_files  # noqa: F401  (the package around the modules of files)
+import pcgraph.user_modules  # noqa: F401  (the package around the modules of files)
 from pcgraph.plumbing.python_files import run_python_file
 
 

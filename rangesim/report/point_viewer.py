@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements packed for the viewer in the browser: small integers, deflated, base64."""
+"""Measurements packed for the viewer in the browser: arrays of small integers, deflated, in base64."""
 
 from __future__ import annotations
 
@@ -11,18 +11,24 @@ from typing import Any
 import numpy as np
 
 from rangesim.report import palette
-from rangesim.results.run_files import Measurement, Segmentation
+from rangesim.results.experiment_results import Measurement, Segmentation
 
 NO_ERROR = -32768
+"""Value of a packed error where there is no reading or no true surface: the smallest int16."""
 ERROR_STEP_M = 1e-5
+"""Unit of packed errors, in metres, chosen so that int16 reaches 0.33 m, which is more than the error scale shows."""
 DEFLATE_LEVEL = 4
-"""The default, 6, makes a page of 7 MB 1 % smaller, in twice the time."""
-FAR = 1.5
-"""Points beyond this multiple of the farthest true depth are not drawn."""
+"""Level of zlib's compression. Its default, 6, makes a page of 7 MB 1 % smaller, in twice the time."""
+FAR_FACTOR = 1.5
+"""Multiple of the farthest true depth, beyond which points are not drawn.
+
+They are readings of mirrors and of wrong periods, far behind the scene. With a larger ratio more of them are drawn, and
+all depths are packed in coarser steps; other values were not measured.
+"""
 
 
 def pack(array: np.ndarray) -> str:
-    """Base64 of the deflated bytes of an array, little-endian, row by row."""
+    """Base64 text of the deflated bytes of an array, little-endian, row by row."""
     little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
     return base64.b64encode(zlib.compress(little.tobytes(), DEFLATE_LEVEL)).decode("ascii")
 
@@ -32,13 +38,16 @@ def packed_measurement(m: Measurement, title: str, view: int, far_m: float) -> d
 
     Parameters
     ----------
+    title : name of the instrument in the page.
     view : number of the camera, from 0; instruments of the same number share their pixels.
-    far_m : metres, z from which points are not drawn.
+    far_m : metres, depth from which points are not drawn.
 
     Returns
     -------
-    z : uint16, 0 for none, else near_m + (value - 1) step_m. error : int16, in 10 µm, clipped.
-    intensity, status, cause : uint8. supervoxel : uint16 or uint32, 0 for none, else index + 1.
+    z : uint16, 0 without a point, else z = nearM + (value - 1) * stepM.
+    error : int16, in units of `ERROR_STEP_M`, clipped; `NO_ERROR` where it is not known.
+    intensity, status, cause : uint8.
+    segmentation : supervoxels as uint16 or uint32, 0 without a point, else index + 1; and their tree. None: no points.
     """
     camera = m.image.camera
     assert camera is not None  # every measurement of an experiment has its rig
@@ -66,12 +75,13 @@ def packed_measurement(m: Measurement, title: str, view: int, far_m: float) -> d
 
 
 def far_limit(measurements: Sequence[Measurement]) -> float:
-    """Metres, z from which no points of these measurements, which share a camera, are drawn."""
+    """Depth, in metres, from which points are not drawn, for measurements that share a camera."""
     depths = [float(np.nanmax(m.truth.z)) for m in measurements if np.isfinite(m.truth.z).any()]
-    return FAR * max(depths, default=1.0)
+    return FAR_FACTOR * max(depths, default=1.0)
 
 
 def _error(m: Measurement) -> np.ndarray:
+    """(h, w) int16 errors of z, as `packed_measurement` says."""
     error = m.image.z - m.truth.z
     known = np.isfinite(error)
     steps = np.clip(np.rint(np.where(known, error, 0) / ERROR_STEP_M), -32767, 32767)
@@ -79,13 +89,17 @@ def _error(m: Measurement) -> np.ndarray:
 
 
 def _intensity(m: Measurement) -> np.ndarray:
+    """(h, w) uint8 intensity for display, with gamma 2.2; the 98th percentile of the readings is white."""
     value = np.nan_to_num(m.image.intensity)
     white = float(np.percentile(value[m.image.valid], 98)) if m.image.valid.any() else 1.0
     return np.rint(255 * np.clip(value / max(white, 1e-30), 0, 1) ** (1 / 2.2)).astype(np.uint8)
 
 
 def _packed_tree(s: Segmentation) -> dict[str, Any]:
-    """Supervoxels, the tree in ascending order (so that its first k merges are a cut), and a colour per node."""
+    """Supervoxels and their tree for the viewer, with a colour for each node.
+
+    The altitudes ascend, so that the first k merges of the tree are a cut.
+    """
     leaves = (len(s.parents) + 1) // 2
     sizes = np.bincount(s.supervoxels[s.supervoxels >= 0], minlength=leaves)
     wide = leaves >= 65535
@@ -101,7 +115,12 @@ def _packed_tree(s: Segmentation) -> dict[str, Any]:
 
 
 def _colors(parents: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """(k, 3) uint8: a node has the colour of its largest child, so refining a cut recolours only what splits off."""
+    """(k, 3) uint8 colour of each node: that of its largest child, so that a finer cut recolours small parts only.
+
+    Parameters
+    ----------
+    parents : (k,) int, parent of each node; the leaves come first. sizes : number of pixels of each leaf.
+    """
     leaves, nodes = len(sizes), len(parents)
     total, largest, chief = np.zeros(nodes, np.int64), np.zeros(nodes, np.int64), np.arange(nodes)
     total[:leaves] = sizes
@@ -114,7 +133,7 @@ def _colors(parents: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 
 
 def _distinct(count: int) -> np.ndarray:
-    """(count, 3) uint8, colours whose neighbours in the list are far apart in hue."""
+    """(count, 3) uint8 colours, RGB; neighbours in the list differ much in hue."""
     from matplotlib.colors import hsv_to_rgb
 
     i = np.arange(count)

@@ -8,11 +8,11 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from rangesim.response.base import KINDS, DenseResponse, LightPath, Math, SparseResponse
+from rangesim.response.response import KINDS, DenseResponse, LightPath, Math, SparseResponse
 from rangesim.settings.bounds import Bounds, Hertz, check_fields, whole
 
 SPEED_OF_LIGHT = 299_792_458.0
-"""Speed of light in vacuum, metres per second, exact by the definition of the metre."""
+"""Speed of light in vacuum, metres per second; exact since 1983, because it defines the metre."""
 StartLength = Annotated[float, Bounds("a length in metres", -1e6, 1e6)]
 """Path length at which the first bin begins, metres; negative where bins begin before the pulse."""
 BinLength = Annotated[float, Bounds("positive and finite", 1e-8, 1e6)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No file of the user is ever lost, and a directory is whole or not there: laws of `result_directories`."""
+"""No file of the user is ever lost, and a directory is whole or not there: laws of `atomic_directories`."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pcgraph.plumbing.plain_files import write_file
-from rangesim.files import result_directories
-from rangesim.files.result_directories import (
+from rangesim.files import atomic_directories
+from rangesim.files.atomic_directories import (
     MANIFEST,
     STAGING,
     DirectoryKind,
@@ -232,7 +232,7 @@ def test_links_to_directories_are_written_through(tmp_path: Path, monkeypatch: p
 
 def test_a_place_that_never_comes_into_being_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As in /proc, where making a directory says that there is none; it was once tried for ever."""
-    monkeypatch.setattr(result_directories, "_ATTEMPTS", 20)
+    monkeypatch.setattr(atomic_directories, "_ATTEMPTS", 20)
 
     def vanishes(path: Path, *_: object, **__: object) -> None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
@@ -355,13 +355,13 @@ def steps_of_a_replacement(tmp_path: Path) -> int:
     with pytest.MonkeyPatch.context() as patch:
         publish(tmp_path / "count", OLD)
         before_each_change(patch, lambda: calls.append(None))
-        patch.setattr(result_directories._Staging, "release", end_of_process)
+        patch.setattr(atomic_directories._Staging, "release", end_of_process)
         publish(tmp_path / "count", NEW)
-    result_directories._claims.clear()
+    atomic_directories._claims.clear()
     return len(calls)
 
 
-def end_of_process(claim: result_directories._Staging) -> None:
+def end_of_process(claim: atomic_directories._Staging) -> None:
     """What is left to do for a claim whose process is killed: the system closes its files."""
     if claim.handle is not None:
         os.close(claim.handle)
@@ -378,10 +378,10 @@ def test_a_process_that_dies_at_any_step_leaves_the_old_or_the_new(tmp_path: Pat
         target = shutil.copytree(tmp_path / "before", tmp_path / f"n{step}")
         with pytest.MonkeyPatch.context() as patch:
             count_down(patch, step, Stop)
-            patch.setattr(result_directories._Staging, "release", end_of_process)
+            patch.setattr(atomic_directories._Staging, "release", end_of_process)
             with pytest.raises(Stop):
                 publish(target, NEW)
-        result_directories._claims.clear()
+        atomic_directories._claims.clear()
         recover(target, Refused)
         assert is_whole(target)
         found = {k: v for k, v in contents(target).items() if not k.startswith(STAGING)}
@@ -416,7 +416,7 @@ def test_a_disk_that_fails_at_any_step_leaves_the_old_or_the_new(tmp_path: Path)
 def test_a_killed_process_leaves_staging_that_the_next_one_clears(tmp_path: Path) -> None:
     code = (
         "import os, signal, sys; from pathlib import Path\n"
-        "from rangesim.files.result_directories import DirectoryKind, new_directory\n"
+        "from rangesim.files.atomic_directories import DirectoryKind, new_directory\n"
         "kind = DirectoryKind('test-kind', 'sidecar.json', OSError)\n"
         "with new_directory(sys.argv[1], kind) as folder:\n"
         "    (folder / 'half').write_text('x')\n"
@@ -445,11 +445,11 @@ def test_abandon_waits_for_a_replacement_and_clears_the_rest(tmp_path: Path) -> 
     thread = threading.Thread(target=work)
     thread.start()
     assert entered.wait(10)
-    assert result_directories.abandon()
+    assert atomic_directories.abandon()
     assert list(tmp_path.iterdir()) == []
     ended.set()
     thread.join(10)
-    assert not result_directories.abandon()
+    assert not atomic_directories.abandon()
 
 
 def test_work_that_goes_on_while_it_is_abandoned_leaves_nothing(tmp_path: Path) -> None:
@@ -469,7 +469,7 @@ def test_work_that_goes_on_while_it_is_abandoned_leaves_nothing(tmp_path: Path) 
         thread = threading.Thread(target=work, args=(entered,))
         thread.start()
         assert entered.wait(10)
-        assert result_directories.abandon()
+        assert atomic_directories.abandon()
         thread.join(20)
         assert list(tmp_path.iterdir()) == []
 
@@ -540,7 +540,7 @@ def test_any_sequence_keeps_what_is_the_users(tmp_path_factory: pytest.TempPathF
 def in_another_process(code: str, *arguments: object) -> subprocess.Popen[str]:
     """A process that has the module's names, KIND and `publish` at hand."""
     lines = (
-        "import json, os, sys; from pathlib import Path\nfrom rangesim.files.result_directories import *\n"
+        "import json, os, sys; from pathlib import Path\nfrom rangesim.files.atomic_directories import *\n"
         "KIND = DirectoryKind('test-kind', 'sidecar.json', OSError)\n"
         "def fill(folder, name):\n"
         "    (folder / 'sidecar.json').write_text(json.dumps({'format': 'test-kind'}))\n"

@@ -12,7 +12,7 @@ import numpy as np
 
 from rangesim.light_transport.scattering import Media, Medium
 from rangesim.rig import Intrinsics, Lens, Rig
-from rangesim.rig.camera_model import Distorted, distort, undistort
+from rangesim.rig.camera_model import CameraModel, appears, distort, project, unproject
 
 MAX_REPROJECTION_PX = 1e-2
 """Largest error, in pixels, with which the ray found for a pixel may project back onto it. Where it is larger, the
@@ -52,6 +52,7 @@ class Device:
 
     Attributes
     ----------
+    model : CameraModel of a lens with distortion, as `rangesim.rig.camera_model` takes it; None for a pinhole.
     has_lens : bool, whether rays start on a lens of finite size, so that `sample_ray` needs a sample of it.
     """
 
@@ -63,10 +64,11 @@ class Device:
         self.x, self.y, self.z, self.centre = (
             mi.Vector3f(*map(opaque, T_world_device[:3, column])) for column in range(4)
         )
-        self.distortion = None
+        self.model: CameraModel | None = None
         if any(intrinsics.distortion):
-            self.distortion = [opaque(k) for k in intrinsics.coefficients]
-            self.fold_radius2 = opaque(min(intrinsics.fold_radius2, MAX_RADIUS2))
+            coefficients = [opaque(k) for k in intrinsics.coefficients]
+            fold_radius2 = opaque(min(intrinsics.fold_radius2, MAX_RADIUS2))
+            self.model = CameraModel(self.f.x, self.f.y, self.c.x, self.c.y, coefficients, fold_radius2)
         self.has_lens = lens.focus_m is not None
         if lens.focus_m is not None:
             self.aperture, self.focus = opaque(lens.aperture_radius_m), opaque(lens.focus_m)
@@ -128,13 +130,9 @@ class Device:
 
     def _undistorted(self, pixel: mi.Point2f) -> tuple[mi.Point2f, mi.Bool | None]:
         """Image-plane coordinates x/z and y/z of pixel coordinates, and whether they exist (None: everywhere)."""
-        p = (pixel - self.c) / self.f
-        if self.distortion is None:
-            return p, None
-        x, y = undistort(self.distortion, p.x, p.y)
-        image, exists = self._distorted(x, y)
-        off = dr.norm(mi.Vector2f(image.x - p.x, image.y - p.y) * self.f)
-        exists &= off <= MAX_REPROJECTION_PX
+        if self.model is None:
+            return (pixel - self.c) / self.f, None
+        x, y, exists = unproject(self.model, pixel.x, pixel.y, MAX_REPROJECTION_PX)
         return dr.select(exists, mi.Point2f(x, y), 0), exists
 
     # ---- From points to pixels ---------------------------------------------------------------------------
@@ -144,16 +142,10 @@ class Device:
         d = mi.Vector3f(point) - self.centre
         z = dr.dot(d, self.z)
         p = mi.Point2f(dr.dot(d, self.x), dr.dot(d, self.y)) / z
-        if self.distortion is not None:
-            image, appears = self._distorted(p.x, p.y)
-            p = dr.select(appears, mi.Point2f(image.x, image.y), dr.nan)
-        return p * self.f + self.c, z
-
-    def _distorted(self, x: mi.Float, y: mi.Float) -> tuple[Distorted, mi.Bool]:
-        """The image of the ray (x, y, 1), and whether it lies where the image is not folded."""
-        assert self.distortion is not None
-        image = distort(self.distortion, x, y)
-        return image, (x * x + y * y < self.fold_radius2) & (image.jacobian > 0)
+        if self.model is None:
+            return p * self.f + self.c, z
+        u, v, is_shown = project(self.model, p.x, p.y)
+        return dr.select(is_shown, mi.Point2f(u, v), dr.nan), z
 
     # ---- How bright, how sharp ---------------------------------------------------------------------------
 
@@ -172,12 +164,11 @@ class Device:
         Every pixel of a projector sends out the same power, so its irradiance there is multiplied by this factor. It is
         the Python number 1 without distortion, and 0 where the lens sends no light.
         """
-        if self.distortion is None:
+        if self.model is None:
             return 1.0
-        image, appears = self._distorted(
-            dr.dot(direction, self.x) / dr.dot(direction, self.z), dr.dot(direction, self.y) / dr.dot(direction, self.z)
-        )
-        return dr.select(appears, image.jacobian, 0)
+        x, y = (dr.dot(direction, axis) / dr.dot(direction, self.z) for axis in (self.x, self.y))
+        image = distort(self.model.coefficients, x, y)
+        return dr.select(appears(self.model, x, y, image), image.jacobian, 0)
 
     def blur_px(self, z: mi.Float) -> mi.Float | None:
         """Standard deviation, in pixels, of the disc over which the image spreads a point at depth z; None: sharp.
@@ -234,7 +225,7 @@ def connect(
     to_projector /= distance
     in_image = (uv.x >= 0) & (uv.x < projector.size.x) & (uv.y >= 0) & (uv.y < projector.size.y) & (z > 0)
     geometry = dr.rcp(dr.square(z) * -dr.dot(projector.z, to_projector))
-    if projector.distortion is not None:
+    if projector.model is not None:
         geometry *= projector.pixel_density(-to_projector)
     if projector.vignetting is not None:
         geometry *= projector.relative_illumination(-to_projector)

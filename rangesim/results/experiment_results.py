@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes and reads the result of an experiment: the directory that `rangesim run` writes.
 
-DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
+DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.atomic_directories`
     experiment.json      resolved settings, versions, and the pass that each instrument shares
     pass_1.npz           energy split and ground truth of each light-transport pass
     comparison.md        statistics of all instruments
@@ -33,7 +33,7 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.files.array_files import write_arrays
-from rangesim.files.result_directories import DirectoryKind, recover
+from rangesim.files.atomic_directories import DirectoryKind, recover
 from rangesim.files.schema import (
     ArraySpec,
     Count,
@@ -48,9 +48,9 @@ from rangesim.files.schema import (
     read_record,
     write_record,
 )
-from rangesim.results.capture_files import load_capture, write_capture
-from rangesim.results.range_image_files import load_range_image, save_range_image
-from rangesim.results.signals_files import LightPass, read_pass, write_pass
+from rangesim.results.captures import load_capture, write_capture
+from rangesim.results.range_images import load_range_image, save_range_image
+from rangesim.results.saved_signals import LightPass, read_pass, write_pass
 from rangesim.rig import Rig
 from rangesim.settings.config import ShortRepr, from_dict, shown
 from rangesim.signals import ALL, GroundTruth

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes and reads a decoded capture: the directory that `rangesim decode` writes.
 
-DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
+DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.atomic_directories`
     decoded.json         sensor, rig, fraction of the pixels by status, likely cause if few pixels have a reading
     range.npz            range image
     cloud.ply            points, metres, camera coordinates; missing if there are none
@@ -18,9 +18,9 @@ from typing import Any, Literal
 from rangesim import __version__
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
-from rangesim.files.result_directories import DirectoryKind, new_directory, recover
+from rangesim.files.atomic_directories import DirectoryKind, new_directory, recover
 from rangesim.files.schema import Fraction, Record, read_record, write_record
-from rangesim.results.range_image_files import load_range_image, save_range_image
+from rangesim.results.range_images import load_range_image, save_range_image
 from rangesim.rig import Rig
 from rangesim.sensors import Sensor, sensor_from_dict
 from rangesim.settings.config import ShortRepr, to_dict

@@ -15,8 +15,8 @@ from rangesim.capture import DTYPES, Capture
 from rangesim.electronics.ambient import Ambient
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.errors import FileFormatError
+from rangesim.files.atomic_directories import DirectoryKind, new_directory, recover, write_manifest
 from rangesim.files.image_files import SUFFIXES, read_stack, write_grey
-from rangesim.files.result_directories import DirectoryKind, new_directory, recover, write_manifest
 from rangesim.files.schema import write_json
 from rangesim.files.text_files import read_json
 from rangesim.rig import Rig

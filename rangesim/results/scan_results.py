@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes and reads the result of a scan: the directory that `rangesim scan` writes.
 
-DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
+DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.atomic_directories`
     scan.json            resolved settings, versions, statistics of the surface, the shapes and the views
     mesh.ply             the fused surface, metres, world coordinates
     poses.json           T_world_camera (n, 4, 4) of the views: the poses used for the fusion, and the true ones
@@ -23,7 +23,7 @@ import numpy as np
 from rangesim.errors import FileFormatError
 from rangesim.experiment.scan_settings import ScanSettings, scan_settings_from_dict, scan_settings_to_dict
 from rangesim.files.array_files import write_arrays
-from rangesim.files.result_directories import DirectoryKind, recover
+from rangesim.files.atomic_directories import DirectoryKind, recover
 from rangesim.files.schema import (
     MAX_METRES,
     ArraySpec,
@@ -42,11 +42,11 @@ from rangesim.files.schema import (
 from rangesim.files.text_files import read_json
 from rangesim.fusion.mesh_error import SurfaceError
 from rangesim.fusion.multiway_registration import PoseErrors, pose_errors
-from rangesim.fusion.scan import Scan
+from rangesim.fusion.posed_images import Scan
 from rangesim.fusion.seen_volume import Occupancy, SeenOfShape, VoxelState
 from rangesim.fusion.truncated_average import FusedSurface
 from rangesim.fusion.voxel_grid import VoxelGrid
-from rangesim.results.range_image_files import load_range_image, save_range_image
+from rangesim.results.range_images import load_range_image, save_range_image
 from rangesim.settings.config import ShortRepr, from_dict, shown, to_dict
 from rangesim.triangle_mesh import TriangleMesh
 

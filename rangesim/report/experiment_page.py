@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A result becomes one self-contained HTML file."""
+"""The report of an experiment's result: one HTML file that needs no other file and no network."""
 
 from __future__ import annotations
 
@@ -9,29 +9,37 @@ from typing import Any
 
 from pcgraph.plumbing.plain_files import write_file
 from rangesim.errors import FileFormatError
-from rangesim.report import cloud, figures, palette, tables
-from rangesim.report.policy import visible_text
+from rangesim.report import figures, palette, point_viewer, tables
+from rangesim.report.content_security import visible_text
 from rangesim.report.template import render_page
 from rangesim.report.verdict import verdict
-from rangesim.results.run_files import Measurement, Result
+from rangesim.results.experiment_results import Measurement, Result
 from rangesim.signals import GroundTruth
 
 SCRIPTS = ("scroll.js", "viewer.js", "report.js")
+"""Files of the page's JavaScript, in the order in which they use each other."""
 
 
 def write_report(result: Result, path: Path) -> None:
-    """Write the report of a result; the file appears when it is complete.
+    """Write the report of a result to a file, which appears only when it is complete.
 
     Raises
     ------
     FileFormatError
-        The place cannot be written.
+        The file cannot be written.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from rangesim.report import write_report
+    >>> from rangesim.results.experiment_results import load_result
+    >>> write_report(load_result("out/demo"), Path("report.html"))  # doctest: +SKIP
     """
     write_file(path, render_report(result).encode(), FileFormatError)
 
 
 def render_report(result: Result) -> str:
-    """The report of a result as HTML."""
+    """HTML page of the report of a result."""
     return render_page("report.html.j2", context(result), SCRIPTS)
 
 
@@ -105,6 +113,7 @@ def _camera(result: Result, group: Sequence[Measurement]) -> dict[str, Any]:
 
 
 def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -> dict[str, Any]:
+    """Maps of depth, of error and of causes of one instrument, with the legend of the causes."""
     causes, legend = figures.cause_map(m)
     return {
         "name": m.name,
@@ -116,6 +125,7 @@ def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -
 
 
 def _frames(m: Measurement) -> dict[str, Any]:
+    """Representative frames of one instrument, and how they were taken."""
     f = m.metadata
     taken = f"{f.frames} frame{'s' * (f.frames != 1)}"
     if f.exposure_s is not None:
@@ -134,6 +144,7 @@ def _frames(m: Measurement) -> dict[str, Any]:
 
 
 def _light(result: Result, number: int) -> dict[str, Any]:
+    """Pictures of the light of pass `number` (from 0) by the kind of light path, and its emitter."""
     of_pass = [m for m in result.measurements if m.light_pass == number + 1]
     rig = of_pass[0].capture.rig
     assert rig is not None
@@ -146,6 +157,7 @@ def _light(result: Result, number: int) -> dict[str, Any]:
 
 
 def _transport(result: Result, names: dict[str, str]) -> list[dict[str, str]]:
+    """Per transport pass: its instruments, the number of their frames, and the time that it took."""
     times = result.info.times_s
     return [
         {
@@ -162,17 +174,17 @@ def _viewer_data(
 ) -> dict[str, Any]:
     """Data of the page's script: every instrument, by its camera and its light pass, and the colours of all."""
     camera_of = {m.name: number for number, group in enumerate(cameras) for m in group}
-    far = [cloud.far_limit(group) for group in cameras]
+    far = [point_viewer.far_limit(group) for group in cameras]
     return {
         "instruments": [
-            cloud.packed_measurement(m, visible_text(names[m.name]), camera_of[m.name], far[camera_of[m.name]])
+            point_viewer.packed_measurement(m, visible_text(names[m.name]), camera_of[m.name], far[camera_of[m.name]])
             for m in result.measurements
         ],
         "passes": [_pass_materials(light_pass.truth) for light_pass in result.passes],
         "errorColors": error.ravel().tolist(),
         "errorKneeM": palette.ERROR_KNEE_M,
         "errorLimitM": palette.ERROR_LIMIT_M,
-        "errorStepM": cloud.ERROR_STEP_M,
+        "errorStepM": point_viewer.ERROR_STEP_M,
         "status": list(palette.STATUS_NAMES.values()),
         "causes": palette.OUTCOME_NAMES,
         "causeColors": palette.OUTCOME_COLORS.ravel().tolist(),
@@ -184,12 +196,12 @@ def _pass_materials(truth: GroundTruth) -> dict[str, Any]:
     return {
         "materials": [visible_text(n) for n in truth.material_names],
         "materialColors": [palette.MATERIAL_COLORS.get(n, palette.NO_DATA) for n in truth.material_names],
-        "material": cloud.pack(truth.material.astype("int8")),
+        "material": point_viewer.pack(truth.material.astype("int8")),
     }
 
 
 def _flat(data: Any, prefix: str = "") -> list[tuple[str, str]]:
-    """Dotted names and values of nested settings, in order."""
+    """Dotted names of nested settings with their values, in their order."""
     if isinstance(data, dict):
         return [pair for key, value in data.items() for pair in _flat(value, f"{prefix}.{key}" if prefix else key)]
     if isinstance(data, list) and data and isinstance(data[0], dict):

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`rangesim report`: the page of a result, again from its files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rangesim.errors import one_line
+
+
+def report_command(
+    result: Annotated[
+        Path, typer.Argument(help="A directory that `rangesim run` or `rangesim scan` wrote.", show_default=False)
+    ],
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A sensor of your own that the result contains, as FILE.py:NAME. The file is run. Repeat the option "
+            "for several sensors.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Write report.html again from the files of a result or of a scan.
+
+    Example:
+
+      rangesim report out/tabletop
+    """
+    from rangesim.files.atomic_directories import replace_listed_file
+    from rangesim.report import render_report
+    from rangesim.report.scan_page import render_scan_page
+    from rangesim.results.experiment_results import RESULT, load_result, read_settings
+    from rangesim.results.scan_results import SCAN, load_scan
+    from rangesim.sensors import sensor_of
+
+    for name in sensor or ():
+        sensor_of(name)  # from then on the sensor's class is known by its type_name
+    if (result / SCAN.sidecar).is_file():
+        kind, render = SCAN, lambda: render_scan_page(load_scan(result))
+    else:
+        read_settings(result)  # a clear error if the directory holds no result
+        kind, render = RESULT, lambda: render_report(load_result(result))
+    replace_listed_file(result, "report.html", lambda: render().encode(), kind)
+    typer.echo(one_line(result / "report.html"))
