@@ -37,13 +37,18 @@ ROOMS = [
     "rangesim.results",
     "rangesim.rig",
     "rangesim.scene",
-    "rangesim.sensor",
     "rangesim.sensors",
     "rangesim.settings",
     "rangesim.signals",
 ]
 """Packages whose docstrings are run, all of their modules."""
-MODULES = ["rangesim", "rangesim.errors", "rangesim.light_transport.transport_settings", "rangesim.triangle_mesh"]
+MODULES = [
+    "rangesim",
+    "rangesim.errors",
+    "rangesim.light_transport.transport_settings",
+    "rangesim.sensor",
+    "rangesim.triangle_mesh",
+]
 """Modules outside these packages whose docstrings are run."""
 
 
