@@ -11,17 +11,29 @@ from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.robust_scale import sigma_from_median
 
+OUTSIDE_TURNS = 0.005
+"""Least distance of a phase from its Gray cell, in turns, at which it lies outside. It allows for rounding: 0.08 pixels
+of a period of 16."""
+
+FAR_TURNS = 0.125
+"""Least distance of a phase from its Gray cell, in turns, at which it lies far outside: the eighth of a period that
+`refine_by_phase` grants."""
+
 MAX_FAR_FRACTION = 0.2
-"""Largest fraction of pixels whose phase may lie more than an eighth of a period outside their Gray cell. If phase and
-code have nothing to do with each other, a quarter of the pixels lie there by chance."""
+"""Largest fraction of pixels whose phase may lie far outside their Gray cell. If phase and code have nothing to do with
+each other, a quarter of the pixels lie there by chance."""
 
 MIN_ONE_SIDED_FRACTION = 0.02
 """Least fraction of pixels outside their Gray cell, on one side more than on the other, from which on the fringes count
 as shifted. Noise puts pixels outside on both sides alike."""
 
 MIN_OFFSET_PX = 0.25
-"""Least shift of the fringes that is reported, in projector pixels. Half a pixel is the most frequent mistake: the
-cosine starts at the edge of the first pixel instead of its centre, or the other way round."""
+"""Least shift of the fringes that is reported, in projector pixels: half of the half pixel by which fringes are shifted
+whose cosine starts at the edge of the first pixel instead of its centre."""
+
+MIN_CONCENTRATION = 0.8
+"""Least length of the mean vector of phase minus cell, as a fraction of that of an even distribution over a cell, at
+which the fringes are said to be shifted as one. By chance it is near 0."""
 
 MAX_LEVEL_ERROR = 0.03
 """Largest distance of the mean of the fringes from the middle between black and white, as a fraction of white - black.
@@ -97,14 +109,15 @@ def fringe_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, pe
     phase = phase_of(frames.reshape(len(frames), -1)[:, used])
     off = _wrapped(phase.normalised - gray.coordinate.ravel()[used] / np.float32(period_px))
     half = gray.cell_px / (2 * period_px)
-    far = float((np.abs(off) > half + 0.125).mean())
-    above, below = float((off > half + 0.005).mean()), float((off < -half - 0.005).mean())
+    far = float((np.abs(off) > half + FAR_TURNS).mean())
+    edge = half + OUTSIDE_TURNS
+    above, below = float((off > edge).mean()), float((off < -edge).mean())
     mean, resultant = _circular_mean(off)
     offset_px = mean * period_px
     one_sided = max(above, below) > MIN_ONE_SIDED_FRACTION + 3 * min(above, below) and abs(offset_px) > MIN_OFFSET_PX
     if far <= MAX_FAR_FRACTION and not one_sided:
         return None
-    outside = 100 * float((np.abs(off) > half + 0.005).mean())
+    outside = 100 * float((np.abs(off) > edge).mean())
     text = f"the fringes along {axis} contradict the Gray code at {outside:.0f} % of the pixels"
     swing = float(np.median(2 * phase.modulation / seen.contrast.values.ravel()[used]))
     if swing < MIN_SWING:
@@ -114,7 +127,7 @@ def fringe_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, pe
         )
     if far > MAX_FAR_FRACTION and _direction(gray, refined, frames) < 0:
         return f"{text}: they seem to be shifted in the other direction, so check the order of their frames."
-    if resultant > 0.8 * np.sinc(2 * half):
+    if resultant > MIN_CONCENTRATION * np.sinc(2 * half):
         return (
             f"{text}: they seem to start {abs(offset_px):.1f} projector pixels too {'early' if mean > 0 else 'late'}, "
             "so check where their cosine starts (half a pixel: at the first pixel's centre, not its edge), "
