@@ -30,7 +30,7 @@ class VoxelGrid:
     Raises
     ------
     ValueError
-        A number out of its range, or more voxels than `rangesim.limits` allows.
+        A number out of its range, or more voxels than `rangesim.settings.limits` allows.
 
     Examples
     --------

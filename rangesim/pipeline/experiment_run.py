@@ -7,9 +7,7 @@ through the stages of `measure`: capture, range image, noise, comparison, causes
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,6 +30,7 @@ from rangesim.motion import transport_moving
 from rangesim.pipeline.cost import Cost, estimate_cost
 from rangesim.pipeline.provenance import provenance
 from rangesim.pipeline.shared_passes import group_by_rig
+from rangesim.pipeline.stages import Progress, timed, unwatched
 from rangesim.results.experiment_results import (
     RESULT,
     Measurement,
@@ -54,8 +53,6 @@ if TYPE_CHECKING:
     from rangesim.scene import Scene
     from rangesim.signals import Signals
 
-Progress = Callable[[str, float], None]
-"""Function that is called with the name of the stage and the fraction of the whole work done, 0..1."""
 _TRANSPORT_FRACTION = 0.7
 """Fraction of the progress of a pass that is shown when its light is traced; the rest is for its instruments. It
 changes the progress bar and nothing else."""
@@ -99,7 +96,7 @@ def run(
     from rangesim.report.tables import comparison_markdown
 
     with new_directory(out, RESULT, inputs=[experiment.scene]) as folder:
-        result = _computed(experiment, progress or _unwatched, scene, announce)
+        result = _computed(experiment, progress or unwatched, scene, announce)
         if progress:
             progress("Writing the report", 0.97)
         tables = comparison_markdown([(m.name, m.rows) for m in result.measurements])
@@ -143,7 +140,7 @@ def carry_out(
     >>> result = carry_out(Experiment("matte", width=160, height=120))  # doctest: +SKIP
     >>> result.measurements[0].image.valid.mean()  # fraction of pixels with a reading  # doctest: +SKIP
     """
-    result = _computed(experiment, progress or _unwatched, scene, announce)
+    result = _computed(experiment, progress or unwatched, scene, announce)
     _warn(result)
     return result
 
@@ -195,7 +192,7 @@ def _computed(
         stage = f"Tracing light, pass {number} of {len(groups)} ({', '.join(i.name for i in instruments)})"
         begin, end = (_fraction(number, len(groups), of_pass) for of_pass in (0.0, 1.0))
         tell(stage, begin)
-        told = None if tell is _unwatched else partial(report_part, partial(tell, stage), begin, end - begin)
+        told = None if tell is unwatched else partial(report_part, partial(tell, stage), begin, end - begin)
         with timed(times, f"transport_{number}"):
             signals = _trace(experiment, scene, rig, instruments, told)
         passes.append(LightPass.of(signals))
@@ -331,18 +328,6 @@ def acquisition(
 
 def _photons_record(photons: np.ndarray) -> PhotonsRecord:
     return PhotonsRecord(median=float(np.median(photons)), largest=float(photons.max()))
-
-
-def _unwatched(stage: str, fraction: float) -> None:
-    """Ignore the progress, for a caller that does not ask for it."""
-
-
-@contextmanager
-def timed(times: dict[str, float], stage: str) -> Iterator[None]:
-    """Add the seconds that the block takes to `times[stage]`."""
-    start = time.monotonic()
-    yield
-    times[stage] = times.get(stage, 0.0) + time.monotonic() - start
 
 
 def _trace(

@@ -7,9 +7,7 @@
 from __future__ import annotations
 
 import platform
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +24,7 @@ from rangesim.fusion.seen_volume import occupancy
 from rangesim.fusion.truncated_average import fuse
 from rangesim.fusion.voxel_grid import VoxelGrid
 from rangesim.pipeline.scan_cost import VOXEL_SPACINGS, estimate_scan_cost
+from rangesim.pipeline.stages import Progress, timed, unwatched
 from rangesim.pipeline.views import poses_of, rendered_views
 from rangesim.results.scan_results import SCAN, ScanResult, ShapeStatistics, write_scan
 from rangesim.triangle_mesh import TriangleMesh
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
     from rangesim.pipeline.cost import Cost
     from rangesim.scene import Scene
 
-Progress = Callable[[str, float], None]
-"""Function that is called with the name of the stage and the fraction of the whole work done, 0..1."""
 MAX_COMPARED_VOXELS = 1_000_000
 """Largest number of voxels of the grid on which the seen and the true volume are compared. The voxels of this grid are
 larger than those of the fusion where there would be more. Time and memory of the comparison grow with this number."""
@@ -82,7 +79,7 @@ def run_scan(
 
     with new_directory(out, SCAN, inputs=[settings.scene]) as folder:
         result = carry_out_scan(settings, progress, scene, announce)
-        tell = progress or _unwatched
+        tell = progress or unwatched
         tell("Writing the results", 0.93)
         write_scan(result, folder, {"report.html": render_scan_page(result).encode()})
     return result
@@ -129,9 +126,9 @@ def carry_out_scan(
     from rangesim.scene import load_scene
     from rangesim.scene.triangles import true_surfaces
 
-    tell, times = progress or _unwatched, dict[str, float]()
+    tell, times = progress or unwatched, dict[str, float]()
     tell("Loading the scene", 0.0)
-    with _timed(times, "load"):
+    with timed(times, "load"):
         scene = scene or load_scene(settings.scene, material=settings.material, unit_m=settings.unit_m)
         if settings.ambient is not None:
             settings.ambient.check_emitters(scene.has_ambient)
@@ -143,7 +140,7 @@ def carry_out_scan(
         announce(cost)
     poses = poses_of(settings.path, Viewpoint(rig.T_world_camera, scene.working_distance_m))
     registration_seed = settings.seed & REGISTRATION_SEEDS
-    with _timed(times, "views"):
+    with timed(times, "views"):
         images, truths = [], []
         for number, (image, truth) in enumerate(
             rendered_views(
@@ -161,18 +158,18 @@ def carry_out_scan(
     views, found = Scan(tuple(images), tuple(truths), poses), None
     if settings.registration == "unknown":
         tell("Finding poses", 0.66)
-        with _timed(times, "registration"):
+        with timed(times, "registration"):
             first = np.stack([poses[0]] * len(poses))
             views = align(views.with_poses(first), seed=registration_seed).scan
         found = pose_errors(views.poses, poses)
     tell("Fusing", 0.8)
-    with _timed(times, "fusion"):
+    with timed(times, "fusion"):
         fused = fuse(
             views.images, settings.voxel_m or _voxel_m(views), truncation_m=settings.truncation_m,
             weights=settings.weights, min_weight=settings.min_weight,
         )  # fmt: skip
     tell("Comparing with the truth", 0.85)
-    with _timed(times, "comparison"):
+    with timed(times, "comparison"):
         errors = errors_by_shape(fused.mesh, surfaces, fused.voxel_m)
         things = _things(surfaces)
         around = np.concatenate([surfaces[name].vertices for name in things])
@@ -229,15 +226,3 @@ def _things(surfaces: Mapping[str, TriangleMesh]) -> tuple[str, ...]:
     sizes = {name: float(np.linalg.norm(np.ptp(m.vertices, axis=0))) for name, m in surfaces.items()}
     largest = max(sizes.values())
     return tuple(n for n, size in sizes.items() if size <= BACKGROUND * largest) or tuple(surfaces)
-
-
-def _unwatched(stage: str, fraction: float) -> None:
-    """Ignore the progress, for a caller that does not ask for it."""
-
-
-@contextmanager
-def _timed(times: dict[str, float], stage: str) -> Iterator[None]:
-    """Set `times[stage]` to the seconds that the block takes."""
-    start = time.monotonic()
-    yield
-    times[stage] = time.monotonic() - start
