@@ -257,7 +257,7 @@ class Evidence:
 
     @cached_property
     def coarse(self) -> np.ndarray:
-        """Whether the reading of the straight path to the surface alone has half of the error or more, or is missing."""
+        """Whether the reading of the straight path to the surface alone is missing, or has half of the error."""
         return self._wrong(self._read(single_path_frames(self.capture.sensor, self.signals.rig, self.truth)))
 
     @cached_property
