@@ -463,9 +463,9 @@ def test_a_run_that_measures_nothing_advises_what_the_scene_allows(
 @pytest.mark.parametrize(
     ("sensor", "change", "told"),
     [
-        ("amcw", "", "ambient-swamped: Enough projector light"),
+        ("amcw", "", "ambient-swamped: The emitter's light sufficed"),
         ("gray-phase", "power_w = 1000.0\n", "glint or saturated: The detector saturated"),
-        ("direct-tof", "", "ambient-swamped: Enough projector light"),
+        ("direct-tof", "", "ambient-swamped: The emitter's light sufficed"),
     ],
 )
 def test_a_run_that_measures_nothing_for_another_reason_than_distance_says_which(
@@ -490,7 +490,7 @@ def test_a_run_that_measures_nothing_for_another_reason_than_distance_says_which
         main()
     said = capsys.readouterr().err
     assert end.value.code == 0, said
-    assert f"measured no pixel at all, most of all by {told}" in said
+    assert f"measured no pixel at all; the most frequent cause is {told}" in said
     assert "metres" not in said
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rangesim compare`: tables of results that are already on the disk."""
+"""The command `rangesim compare`, which prints tables of results that are already on the disk."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from rangesim.cli.images import (
     load_frames,
     sensor_of_images,
 )
-from rangesim.cli.progress import say_where
+from rangesim.cli.progress import announce_linked_output
 
 if TYPE_CHECKING:
     from rangesim.capture import Capture
@@ -85,7 +85,7 @@ def decode_command(
     from rangesim.results.decoded_captures import DECODED, Decoded, save_decoded
 
     _refuse_what_would_be_ignored(context, capture, calibration)
-    say_where(out, check_directory(out, DECODED, inputs=[capture]))
+    announce_linked_output(out, check_directory(out, DECODED, inputs=[capture]))
     taken_with = sensor_of_images(sensor, code, projector, axes, period, steps)
     loaded = load_frames(capture, taken_with, bits)
     if taken_with is not None and type(loaded.sensor) is not type(taken_with):

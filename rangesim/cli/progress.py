@@ -42,20 +42,20 @@ def progress_bar() -> Iterator[Callable[[str, float], None] | None]:
         yield lambda stage, fraction: bar.update(task, description=escape(one_line(stage)), completed=fraction)
 
 
-def announce(cost: Cost) -> None:
+def announce_cost(cost: Cost) -> None:
     """Print a line with the estimated cost, if the work takes long or needs much memory."""
     if cost.is_large:
         typer.echo(f"rangesim: this takes {cost}.", err=True)
 
 
-def say_where(out: Path, target: Path) -> None:
+def announce_linked_output(out: Path, target: Path) -> None:
     """Print a line if `out` is a link to another directory, `target`, where the results go."""
     if out.is_symlink():
         typer.echo(f"rangesim: {one_line(out)} is a link; the results go to {one_line(target)}.", err=True)
 
 
 @contextmanager
-def light_left_out_in_a_line() -> Iterator[None]:
+def one_truncation_warning() -> Iterator[None]:
     """Print one truncation warning after the block: that of the pass that left out the most light."""
     left_out: list[TruncationWarning] = []
     show_others: Callable[..., None] = warnings.showwarning

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rangesim report`: the page of a result, again from its files."""
+"""The command `rangesim report`, which writes the page of a result again from its files."""
 
 from __future__ import annotations
 

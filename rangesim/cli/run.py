@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rangesim.cli.progress import announce, light_left_out_in_a_line, progress_bar, say_where
+from rangesim.cli.progress import announce_cost, announce_linked_output, one_truncation_warning, progress_bar
 from rangesim.errors import one_line
 from rangesim.files.bundled_scenes import scene_names
 
@@ -130,14 +130,14 @@ def run_command(
         cost.check_memory()
         return
     target = check_directory(out, RESULT, inputs=[experiment.scene])
-    say_where(out, target)
-    with light_left_out_in_a_line(), progress_bar() as progress:
-        result = experiment_run.run(experiment, out, progress, announce=announce)
-    _say_what_measured_nothing(result)
+    announce_linked_output(out, target)
+    with one_truncation_warning(), progress_bar() as progress:
+        result = experiment_run.run(experiment, out, progress, announce=announce_cost)
+    _warn_of_instruments_without_points(result)
     typer.echo(one_line(out / "report.html"))
 
 
-def _say_what_measured_nothing(result: Result) -> None:
+def _warn_of_instruments_without_points(result: Result) -> None:
     """Print a line on stderr for the instruments that have no point at all.
 
     Instruments whose pixels fail by the same most frequent cause share a line. Where this cause is low signal or a
@@ -158,7 +158,7 @@ def _say_what_measured_nothing(result: Result) -> None:
     for cause, names in blind.items():
         start = f"rangesim: {one_line(', '.join(names))} measured no pixel at all"
         if cause:
-            typer.echo(f"{start}, most of all by {TITLES[cause]}: {DEFINITIONS[cause]}", err=True)
+            typer.echo(f"{start}; the most frequent cause is {TITLES[cause]}: {DEFINITIONS[cause]}", err=True)
             continue
         is_mesh = Path(result.experiment.scene).suffix.lower() in MESH_SUFFIXES
         advice = (

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rangesim.cli.progress import announce, light_left_out_in_a_line, progress_bar, say_where
+from rangesim.cli.progress import announce_cost, announce_linked_output, one_truncation_warning, progress_bar
 from rangesim.errors import one_line
 
 if TYPE_CHECKING:
@@ -115,9 +115,9 @@ def scan_command(
         cost.check_memory()
         return
     target = check_directory(out, SCAN, inputs=[settings.scene])
-    say_where(out, target)
-    with light_left_out_in_a_line(), progress_bar() as progress:
-        result = run_scan(settings, out, progress, announce=announce)
+    announce_linked_output(out, target)
+    with one_truncation_warning(), progress_bar() as progress:
+        result = run_scan(settings, out, progress, announce=announce_cost)
     typer.echo(_table(result))
     typer.echo(one_line(out / "report.html"))
 

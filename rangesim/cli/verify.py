@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rangesim verify`: a directory against its manifest."""
+"""The command `rangesim verify`, which compares a directory with its manifest."""
 
 from __future__ import annotations
 

@@ -233,7 +233,7 @@ def measure(
     times: dict[str, float] = {}
     moves = signals.motion_m is not None
     with timed(times, "exposure"):
-        detector = _in_time(instrument) if moves else instrument.detector_in_use
+        detector = _detector_within_frame_period(instrument) if moves else instrument.detector_in_use
         exposure = exposed(signals, instrument.sensor, detector, instrument.exposure_s, seed, ambient)
     capture, photons = exposure.capture, exposure.photons_per_pulse()
     if instrument.exposure_s is None:
@@ -271,7 +271,7 @@ def measure(
     )
 
 
-def _in_time(instrument: Instrument) -> PhotoDetector | None:
+def _detector_within_frame_period(instrument: Instrument) -> PhotoDetector | None:
     """The instrument's detector, with its automatic exposure limited to the time between two frames."""
     period_s = instrument.timing.frame_period_s
     detector = instrument.detector_in_use
