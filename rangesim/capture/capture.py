@@ -36,10 +36,10 @@ def bright_level(values: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class ClippingThresholds:
-    """Thresholds by which `clip_level` tells that the largest value in an image is the level where the camera clips.
+    """Thresholds by which `clip_level` decides whether the largest value in an image is the level where a camera clips.
 
-    With the defaults, images of which 5 to 50 % of the pixels clip are told from patterns of one brightness
-    (`tests/test_decode_summary.py`). How far each may be changed was not measured.
+    The defaults distinguish images in which 5 to 50 % of the pixels clip from patterns of one brightness
+    (`tests/test_decode_summary.py`). Other values were not measured.
 
     levels : number of levels below the largest value that are compared with it, each 1/256 of that value wide.
     min_fraction : least fraction of the pixels that are at the largest value; fewer are single highlights.
@@ -63,8 +63,8 @@ def clip_level(brightest: np.ndarray, max_dn: int) -> int:
     """The digital number at which a camera clips: `max_dn`, or a lower one at which many pixels pile up.
 
     Video levels end at 235 of 255; other images end where a converter or a raw developer cuts them off. In such an
-    image the numbers of pixels continue up to the largest value, and many pixels are at that value. An image of two
-    values has no pixels below the largest one, and fringes have no such pile at their peaks: neither is clipped.
+    image, many pixels have the largest value, and a few have each of the values just below it. An image of two values
+    has none just below, and fringes do not have many more at their peaks: neither is clipped.
 
     Parameters
     ----------
@@ -164,6 +164,7 @@ class Capture(ShortRepr):
 
     @property
     def _max_dn(self) -> int:
+        """Largest digital number of the detector, or of the type of the frames if the detector is unknown."""
         return self.detector.max_dn if self.detector else int(np.iinfo(self.frames.dtype).max)
 
     def saturated(self, frames: np.ndarray) -> np.ndarray:
@@ -178,6 +179,7 @@ class Capture(ShortRepr):
 
     @cached_property
     def _clip_level(self) -> int:
+        """Digital number at which an unknown camera clips, see `clip_level`."""
         return clip_level(self.frames.max(axis=0), self._max_dn)
 
     def noise(self, frame: np.ndarray) -> np.ndarray | None:

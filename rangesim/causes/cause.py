@@ -113,6 +113,7 @@ class CauseMap(ShortRepr):
 
 
 def _row(material: str, causes: np.ndarray) -> dict[str, Any]:
+    """Entry of `CauseMap.fractions` for a material class, from the causes (n,) of its pixels."""
     counts = np.bincount(causes, minlength=len(Cause))
     found = sorted((c for c in Cause if c and counts[c]), key=lambda c: -counts[c])
     fractions = {c.name.lower(): float(counts[c] / causes.size) for c in found}

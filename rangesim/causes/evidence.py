@@ -111,7 +111,7 @@ class Evidence:
     def optical(self) -> np.ndarray:
         """Whether optics is to blame: without noise, ambient light and saturation the pixel fails as well, or has at
         least half of its error."""
-        return self._wrong(self._of_failed_pixels(self.readings.projector_alone))
+        return self._wrong(self._of_failed_pixels(self.readings.emitter_alone))
 
     @cached_property
     def saturated(self) -> np.ndarray:
@@ -257,13 +257,13 @@ class Evidence:
 
     @cached_property
     def coarse(self) -> np.ndarray:
-        """Whether the straight path to the surface, alone, is read with half of the error or more, or not at all."""
+        """Whether the reading of the straight path to the surface alone is missing, or has half of the error."""
         return self._wrong(self._read(single_path_frames(self.capture.sensor, self.signals.rig, self.truth)))
 
     @cached_property
     def blurred(self) -> np.ndarray:
-        """Whether straight paths to one plane over the whole area of the pixel are read with half of the error or more,
-        or not at all; asked only where other light disturbs the pixel too."""
+        """Whether the reading of straight paths to the whole area of the pixel, on its tangent plane, has half of the
+        error or more, or is missing; it is computed only where other light disturbs the pixel too."""
         rig, spread = self.signals.rig, self._may_blur
         if not spread.any():
             return spread

@@ -36,7 +36,7 @@ class ErrorStatistics:
     ----------
     material : str, class of the first surface behind the pixel, or "all".
     pixels : int, number of pixels with a true depth.
-    lit : int, number of those pixels that the projector sees; the others lie in its shadow or beside its image.
+    lit : int, number of those pixels that the emitter lights; the others lie in its shadow or outside its field.
     completeness : fraction of the lit pixels that have a reading.
     coverage : fraction of all pixels that have a reading.
     bias_m : mean of z - true z, metres, over all pixels with a reading, lit or not.
@@ -156,6 +156,7 @@ def _statistics(
     flying: np.ndarray,
     outlier_m: float,
 ) -> ErrorStatistics:
+    """Statistics of the pixels `mask` (h, w) bool, which are those of the material class `name`."""
     measured = mask & np.isfinite(error)
     lit, at_edge = mask & visible, measured & edge
     e = error[measured]
@@ -178,6 +179,7 @@ def _statistics(
 
 
 def _fraction(part: np.ndarray, whole: np.ndarray) -> float:
+    """Number of pixels of one mask over that of another; NaN if the second is empty."""
     total = int(whole.sum())
     return float(part.sum() / total) if total else math.nan
 

@@ -57,9 +57,9 @@ They are the three largest, so that the noise of a capture is hardly ever repeat
 class Repeats:
     """Pixels for which the same decoder has no reading, in a range image and in repeated captures; (h, w) bool each.
 
-    whole : in the range image itself, of all samples.
-    again : of all samples, with other noise of the detector.
-    halves : of each half of the samples, with other noise of the detector.
+    whole : pixels without a reading in the range image itself.
+    again : the same in a capture of all samples with other noise of the detector.
+    halves : the same in captures of each half of the samples, with other noise of the detector.
     """
 
     whole: np.ndarray
@@ -69,8 +69,8 @@ class Repeats:
     def completeness_error(self, mask: np.ndarray) -> float | None:
         """Bound on the change of the fraction of pixels with a reading if very many samples were taken.
 
-        For a pixel that has a reading with half of the samples and none with all of them, or the other way round,
-        sampling decides. More samples may change as many pixels again, and most of them in one direction. The larger
+        If a pixel has a reading with half of the samples and none with all of them, or the other way round, sampling
+        decides about it. More samples may change as many pixels again, and most of them in one direction. The larger
         of the two fractions is taken therefore, summed over both halves. Twice the number of pixels that the detector's
         noise alone changes is subtracted, and the standard error of the counts is added, which matters where pixels
         are few.

@@ -69,8 +69,8 @@ class ReferenceReadings:
         return above, below
 
     @cached_property
-    def projector_alone(self) -> np.ndarray:
-        """Depths in the projector's light alone: without noise, ambient light and the vignetting of the lens."""
+    def emitter_alone(self) -> np.ndarray:
+        """Depths in the emitter's light alone: without noise, ambient light and the vignetting of the lens."""
         moves = self.signals.motion_m is not None
         if not (moves or self.signals.energy.ambient.any() or self.signals.rig.camera_lens.vignetting):
             return self.noise_free

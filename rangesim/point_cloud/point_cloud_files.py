@@ -69,6 +69,7 @@ def _table(cloud: PointCloud, pcd: bool) -> np.ndarray:
 
 
 def _ply_bytes(cloud: PointCloud) -> bytes:
+    """Content of a PLY file of a cloud."""
     table = _table(cloud, pcd=False)
     assert table.dtype.fields is not None
     lines = ["ply", "format binary_little_endian 1.0", f"comment coordinates {cloud.coordinates}, metres"]
@@ -78,6 +79,7 @@ def _ply_bytes(cloud: PointCloud) -> bytes:
 
 
 def _pcd_bytes(cloud: PointCloud) -> bytes:
+    """Content of a PCD file of a cloud."""
     table = _table(cloud, pcd=True)
     shape = cloud.points.shape[:-1]
     height, width = shape if len(shape) == 2 else (1, shape[0])
