@@ -74,7 +74,7 @@ class MultiFrequency(Sensor):
             raise ValueError(f"expected a projector of {self.width} x {self.height} pixels, got {width} x {height}.")
 
     @property
-    def emitter(self) -> Emitter:
+    def default_emitter(self) -> Emitter:
         return Emitter((self.width, self.height))
 
     @property
@@ -146,7 +146,7 @@ class TemporalUnwrapping(Decoder):
 def main() -> None:
     sensor = MultiFrequency()
     scene = load_scene("matte")
-    size, baseline_m = sensor.emitter
+    size, baseline_m = sensor.default_emitter
     signals = transport(scene, scene.rig(baseline_m, size, width=320, height=240), [sensor], spp=16)
     image = decode(expose(signals, sensor, sensor.default_detector))
     for row in compare(image, signals.truth).rows():

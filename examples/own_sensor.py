@@ -82,7 +82,7 @@ class GatedCamera(Sensor):
         return [*(f"gate{i}" for i in range(self.gates)), "laser_off"]
 
     @property
-    def emitter(self) -> Emitter:
+    def default_emitter(self) -> Emitter:
         return Emitter(baseline_m=0.03)
 
     @property
@@ -158,7 +158,7 @@ class GateRatio(Decoder):
 def main() -> None:
     sensor = GatedCamera()
     scene = load_scene("matte")
-    size, baseline_m = sensor.emitter
+    size, baseline_m = sensor.default_emitter
     signals = transport(scene, scene.rig(baseline_m, size, width=320, height=240), [sensor], spp=16)
     image = decode(expose(signals, sensor, sensor.default_detector))
     for row in compare(image, signals.truth).rows():

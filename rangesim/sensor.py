@@ -48,8 +48,9 @@ class Emitter(NamedTuple):
 class Sensor(Named, ABC):
     """A measuring principle: the responses to light paths that it reads, and the frames that it makes of them.
 
-    A sensor holds no geometry (that is the `Rig`), no electronics (`PhotoDetector`) and no thresholds (`Decoder`), but
-    it names the ones it comes with. Subclasses are frozen dataclasses.
+    A sensor holds no geometry (that is the `Rig`), no electronics (`PhotoDetector`) and no thresholds (`Decoder`). It
+    names the ones it comes with, as `default_emitter`, `default_detector` and `default_decoder`; an `Instrument` can
+    have others. Subclasses are frozen dataclasses.
 
     Examples
     --------
@@ -112,8 +113,8 @@ class Sensor(Named, ABC):
 
     @property
     @abstractmethod
-    def emitter(self) -> Emitter:
-        """The emitter it comes with."""
+    def default_emitter(self) -> Emitter:
+        """The emitter that it comes with, for instruments that do not state their own."""
 
     @property
     @abstractmethod

@@ -201,7 +201,7 @@ def calibrate_rig(
         views.append(view)
         projector_views.append(seen)
     check_views(board, views, coefficients, names)
-    size = captures[0].sensor.emitter.size
+    size = captures[0].sensor.default_emitter.size
     assert size is not None
     height, width = captures[0].frames.shape[1:]
     camera, T_camera_board, camera_noise = first_camera(board, views, width, height, coefficients, names)
@@ -260,7 +260,7 @@ def _rms(residuals: tuple[Array, ...]) -> float:
 
 def _views(board: Board, capture: Capture) -> tuple[BoardView, BoardView]:
     """The board as the camera sees it, and as the projector would see it."""
-    if capture.sensor.emitter.size is None:
+    if capture.sensor.default_emitter.size is None:
         raise ValueError(f"expected a capture of a sensor with a projector, got one of {capture.sensor.type_name}.")
     view = board.find(capture.sensor.white_image(capture.frames))
     decoded = capture.sensor.default_decoder.coordinates(capture)

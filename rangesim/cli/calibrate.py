@@ -112,7 +112,7 @@ def calibrate_command(
     axes = ALL_AXES if sensor is None or projector is not None else None
     taken_with = sensor_of_images(sensor, code, projector, axes, period, steps)
     taken = [load_frames(path, taken_with, bits) for path in captures]
-    of_tof = any(capture.sensor.emitter.size is None for capture in taken)  # its light shows no pattern
+    of_tof = any(capture.sensor.default_emitter.size is None for capture in taken)  # its light shows no pattern
     if of_tof != (out.suffix.lower() == TOF_SUFFIX):
         raise ValueError(
             f"expected --out to end in {TOF_SUFFIX} for captures by time of flight, and for no others, got "

@@ -136,7 +136,7 @@ def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: flo
         from rangesim.calibration.opencv_files import load_opencv
 
         return replace(capture, rig=load_opencv(calibration, 1.0 if unit_m is None else unit_m))
-    size = capture.sensor.emitter.size
+    size = capture.sensor.default_emitter.size
     return replace(capture, rig=load_calibration(calibration, size, code_step, 1e-3 if unit_m is None else unit_m))
 
 

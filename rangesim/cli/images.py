@@ -83,9 +83,9 @@ def sensor_of_images(
         sensor = _own_sensor(own)
     else:
         sensor, axes = sensor_of(code or IMAGES_PRESET, files_in=None), axes or ALL_AXES
-        if projector is None and (sensor.emitter.size is not None or code is None):
+        if projector is None and (sensor.default_emitter.size is not None or code is None):
             return None
-    size = sensor.emitter.size if projector is None else _size(projector)
+    size = sensor.default_emitter.size if projector is None else _size(projector)
     if size is not None and (projector is not None or axes is not None):
         sensor = sensor.for_projector(*size, None if axes is None else [axis.strip() for axis in axes.split(",")])
     given = {name: value for name, value in (("period_px", period), ("steps", steps)) if value is not None}

@@ -136,7 +136,7 @@ class Instrument:
         ----------
         width, height : size of the scene's camera, pixels, if the instrument does not state one.
         """
-        size, baseline_m = self.sensor.emitter
+        size, baseline_m = self.sensor.default_emitter
         if (self.width, self.height) != (None, None):
             width, height = self.width, self.height
         rig = scene.rig(

@@ -127,7 +127,7 @@ class AmcwToF(Sensor):
         return [f"{f / 1e6:g}MHz_{tap}deg" for f in self.modulation_hz for tap in TAPS_DEG]
 
     @property
-    def emitter(self) -> Emitter:
+    def default_emitter(self) -> Emitter:
         return Emitter(baseline_m=TOF_BASELINE_M)
 
     @property

@@ -135,7 +135,7 @@ class DirectToF(Sensor):
         return [f"bin{b:04d}" for b in range(self.bins)]
 
     @property
-    def emitter(self) -> Emitter:
+    def default_emitter(self) -> Emitter:
         return Emitter(baseline_m=TOF_BASELINE_M)
 
     @property

@@ -45,7 +45,7 @@ class IdealToF(Sensor):
         return ["radiance", "radiance_x_length"]
 
     @property
-    def emitter(self) -> Emitter:
+    def default_emitter(self) -> Emitter:
         return Emitter(baseline_m=TOF_BASELINE_M)
 
     @property

@@ -137,7 +137,7 @@ class StructuredLight(Sensor):
         return replace(self, projector_width=width, projector_height=height, axes=coded)  # type: ignore[arg-type]
 
     @property
-    def emitter(self) -> Emitter:
+    def default_emitter(self) -> Emitter:
         return Emitter((self.projector_width, self.projector_height))
 
     @property
