@@ -10,12 +10,12 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import msgspec
-
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
 from rangesim.pipeline.experiment_run import carry_out, run
 from rangesim.results.experiment_results import Result
+from rangesim.rig import translation
+from rangesim.scene import load_scene
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -45,26 +45,12 @@ def small_result() -> Path:
 
 @cache
 def result_of_two_cameras() -> Result:
-    """Two instruments that see the tabletop by cameras of different sizes, each in its own pass."""
-    found = []
-    for name, width, height in (("ideal", 96, 72), ("amcw", 64, 36)):
-        instruments = (Instrument(name, SENSORS[name]),)
-        found.append(carry_out(replace(small_experiment(), instruments=instruments, width=width, height=height)))
-    first, second = found
-    (other,), (record,) = second.measurements, second.info.instruments
-    info = msgspec.structs.replace(
-        first.info,
-        experiment={
-            **first.info.experiment,
-            "instrument": [*first.info.experiment["instrument"], *second.info.experiment["instrument"]],
-        },
-        passes=2,
-        instruments=[*first.info.instruments, msgspec.structs.replace(record, light_pass=2)],
-        times_s={**first.info.times_s, "transport_2": second.info.times_s["transport_1"]},
+    """Two instruments that see the tabletop by cameras of different sizes in different places."""
+    experiment = small_experiment()
+    scene = load_scene(experiment.scene)
+    T = scene.rig(0.03).T_world_camera @ translation(0.1, 0.0, 0.15)
+    instruments = (
+        Instrument("ideal", SENSORS["ideal"], width=96, height=72),
+        Instrument("amcw", SENSORS["amcw"], width=64, height=36, T_world_camera=T),
     )
-    return Result(
-        replace(first.experiment, instruments=(*first.experiment.instruments, *second.experiment.instruments)),
-        (*first.measurements, replace(other, light_pass=2)),
-        (*first.passes, *second.passes),
-        info,
-    )
+    return carry_out(replace(experiment, instruments=instruments), scene=scene)
