@@ -205,7 +205,7 @@ def _write_bad_files(folder: Path) -> None:
     [
         (["run", "none.xml"], "none.xml does not exist"),
         (["run", "tabeltop"], "did you mean 'tabletop'"),
-        (["run", "broken.xml"], "broken.xml is no scene Mitsuba can load"),
+        (["run", "broken.xml"], "broken.xml is no scene that Mitsuba can load"),
         (["run", "blind.xml"], "perspective sensor, got none"),
         (["run", "points.ply"], "which has no faces"),
         (["run", PLANE, "--spp", "-3"], "spp .* at least 1, got -3"),

@@ -114,7 +114,7 @@ def test_a_mesh_in_millimetres(tmp_path: Path) -> None:
 
 
 BROKEN: dict[str, tuple[str, str]] = {
-    "broken.xml": ("<scene version='3.0.0'><shape", "no scene Mitsuba can load"),
+    "broken.xml": ("<scene version='3.0.0'><shape", "no scene that Mitsuba can load"),
     "no_sensor.xml": ('<scene version="3.0.0"><shape type="sphere"/></scene>', "a perspective sensor, got none"),
     "empty.xml": (f'<scene version="3.0.0">{SENSOR}</scene>', "at least one shape"),
     "unknown.xml": (f'<scene version="3.0.0">{SENSOR}<shape type="spheer"/></scene>', "spheer"),

@@ -3,8 +3,8 @@
 
 A body that refracts light (`dielectric`, `roughdielectric`) may be filled with a medium that absorbs and does not
 scatter. Light that runs a distance d inside keeps the fraction exp(-sigma_a d). The ray stays straight there, so a path
-needs one more number: the absorption coefficient along its ray. At the surface of such a body, the side to which light
-leaves decides on the next coefficient, as in Mitsuba's `volpath`. Light that leaves against the normal gets the
+needs one more number: the absorption coefficient along its ray. At the surface of such a body, the side on which light
+leaves decides which coefficient is next, as in Mitsuba's `volpath`. Light that leaves against the normal gets the
 coefficient of the interior medium; light that leaves along the normal gets that of the exterior medium. All other
 surfaces do not change the coefficient.
 """
@@ -43,7 +43,7 @@ class Absorbers:
     def transmittance(self, sigma_a: mi.Float, distance: mi.Float, inside: Medium | None = None) -> mi.Float:
         """Fraction of the light that is left after a distance in metres.
 
-        It is 1 in a medium `inside` the absorbing body that scatters, because such a medium has its own extinction.
+        It is 1 where the medium along the ray, `inside`, scatters, because such a medium has its own extinction.
         """
         if inside is not None:
             sigma_a = dr.select(inside.sigma_t > 0, 0, sigma_a)
@@ -70,8 +70,8 @@ def absorbers_of(scene: mi.Scene) -> Absorbers | None:
 def _sides(shape: mi.Shape) -> tuple[float, float]:
     """Absorption coefficients inside and outside of a shape, 1/m.
 
-    A medium inside that scatters is left to `rangesim.light_transport.scattering`. If the scene says nothing about what
-    lies around such a medium, the coefficient along the ray stays as it is.
+    If the medium inside scatters, `rangesim.light_transport.scattering` handles it. If the scene says nothing about
+    what lies around such a medium, the coefficient along the ray stays as it is.
     """
     if not shape.is_medium_transition():
         return UNCHANGED, UNCHANGED

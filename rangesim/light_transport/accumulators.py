@@ -41,9 +41,9 @@ class Accumulators:
 
     Parameters
     ----------
-    responses : what is summed up.
+    responses : the responses whose channels are summed up.
     pixels : number of pixels.
-    keeps_apart : whether smooth light has sums of its own. There are two `parts` then: all other light, and that.
+    keeps_apart : whether smooth light has sums of its own. There are then two `parts`: other light, and smooth light.
     """
 
     def __init__(self, responses: Sequence[Response], pixels: int, keeps_apart: bool = False) -> None:
@@ -102,8 +102,8 @@ class Accumulators:
         return result
 
     def pending(self) -> list[mi.Float]:
-        """The buffers that a launch has added to. They must be evaluated together with its loop: else the loop runs a
-        second time for them."""
+        """The buffers that a launch has added to. They must be evaluated together with the loop of the launch: else
+        the loop runs a second time for them."""
         return list(self.bins.values())
 
     def store(self, channels: list[list[mi.Float]], places: slice | np.ndarray) -> None:

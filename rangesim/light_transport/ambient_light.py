@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ambient light: light of the scene's own emitters, such as the sun, the sky and luminaires.
 
-Two ways find it: a ray of a camera path that meets an emitter by chance, and a direction sampled towards an emitter.
+It is found in two ways: a ray of a camera path meets an emitter by chance; a direction is sampled towards an emitter.
 Multiple importance sampling weights the two against each other (Veach 1997), so that no light is counted twice.
 """
 
@@ -46,7 +46,7 @@ def sampled_ambient(
     xi: mi.Point2f,
     active: mi.Bool,
 ) -> mi.Float:
-    """Radiance (W/m2/sr) of one sampled emitter of the scene that the surface `si` reflects, with its weight.
+    """Radiance (W/m2/sr) that the surface `si` reflects from one sampled emitter of the scene, with its weight.
 
     `ray_state` is the state of the ray that met `si`; `xi` is uniform in the unit square.
     """

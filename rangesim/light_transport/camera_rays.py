@@ -41,8 +41,8 @@ class PrimaryRay(NamedTuple):
 class Device:
     """A camera or a projector of the rig as kernels see it: intrinsics, centre and axes.
 
-    All numbers are opaque to the kernel cache. Distortion, a finite lens and vignetting add code to the kernel; without
-    them it is the kernel of a pinhole.
+    All numbers are opaque to the kernel cache: other numbers need no other kernel. Distortion, a finite lens and
+    vignetting add code to the kernel; without them it is the kernel of a pinhole.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class Device:
 
     @classmethod
     def camera(cls, rig: Rig) -> Device:
-        """The rig's camera. The exposure applies its vignetting, because signals are radiance."""
+        """The rig's camera without its vignetting: signals are radiance, and the exposure applies the vignetting."""
         return cls(rig.camera, rig.T_world_camera, replace(rig.camera_lens, vignetting=0.0))
 
     @classmethod

@@ -71,9 +71,10 @@ def caustic_maps(photons: Photons | None, rig: Rig, radius_m: float | None) -> P
 
 
 def gathering_radius(rig: Rig, photons_per_pixel: float, fixed_m: float | None = None) -> GatheringRadius:
-    """Radius within which photons of the first map are gathered, wide enough for `PHOTONS_PER_DISC` within the bounds.
+    """Radius within which photons of the first map are gathered.
 
-    With `fixed_m` it is this number of metres everywhere.
+    It is wide enough for `PHOTONS_PER_DISC` photons, as far as its bounds allow. With `fixed_m` it is this number of
+    metres everywhere.
     """
     of_projector = min(np.sqrt(PHOTONS_PER_DISC / (np.pi * photons_per_pixel)), MAX_RADIUS_PROJECTOR_PX)
     low, high = (pixels / rig.camera.fx for pixels in (MIN_RADIUS_CAMERA_PX, MAX_RADIUS_CAMERA_PX))
@@ -149,7 +150,7 @@ def caustic_light(
     brought: CausticLight,
     place: mi.UInt32,
 ) -> tuple[list[list[mi.Float]], mi.Float]:
-    """Channels with the light of the photons around a vertex added, and the radiance (W/m2/sr) that the camera gets.
+    """Add the light of the photons around a vertex; returns the channels and the radiance (W/m2/sr) at the camera.
 
     `place` is the index of the lane's pixel among those of the accumulators.
     """
@@ -159,8 +160,9 @@ def caustic_light(
         flight = maps.flight(brought.photon, found)
         wi, wo = vertex.si.wi, vertex.si.to_local(-flight.direction)
         value = vertex.bsdf.eval(mi.BSDFContext(), vertex.si, wo, found)
-        # Photons count flux per area, so the geometric cosine is in them already; the BSDF counts that to the shading
-        # normal (Veach 1997, 5.3). Where a photon landed beside an edge, its own facet is the one that counts
+        # Photons count flux per area, which contains the geometric cosine already; the value of the BSDF contains the
+        # cosine to the shading normal (Veach 1997, 5.3). If a photon landed beside an edge, the cosine is that to its
+        # own facet
         seen, lit = dr.dot(vertex.si.to_world(wi), vertex.si.n), -dr.dot(flight.direction, vertex.si.n)
         cosine = dr.maximum(flight.cosine, dr.abs(lit) / MAX_COSINE_RATIO)
         on_one_side = seen * lit * wi.z * wo.z > 0  # for both normals, or for neither

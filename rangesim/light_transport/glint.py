@@ -5,11 +5,12 @@ The lens is a disc as large as its aperture. A camera path of delta interactions
 radiance. Where the whole of a pixel sees the lens, that is 10^4 times the radiance of a lit wall, so a highlight much
 finer than a pixel matters. Random paths of the pass would mostly miss it. Three steps find it:
 
-1. Pixels are chosen behind whose centre, or a neighbour's centre, there is a delta surface.
-2. A few probing paths of each tell how near to the lens its paths come, and how far they spread.
+1. A pixel is chosen if there is a delta surface behind its centre or behind the centre of a neighbour.
+2. A few probing paths of each chosen pixel tell how near to the lens its paths come, and how far they spread.
 3. Pixels whose paths come near the lens get thousands of paths.
 
-The lens is not seen through a medium that scatters: its boundary ends a path. It is seen through glass that absorbs.
+The lens is not seen through a medium that scatters, because the boundary of the medium ends a path. The lens is seen
+through glass that absorbs.
 """
 
 from __future__ import annotations
@@ -104,7 +105,7 @@ def trace_glint(
     Parameters
     ----------
     traced, rig : TracedScene and Rig, in coordinates of the renderer.
-    responses : whose channels are returned.
+    responses : the responses whose channels are returned.
     seed : int, 0 to 2^64 - 1.
     report : called after each kernel launch.
     """
@@ -326,7 +327,7 @@ def _worth_probing(traced: TracedScene, h: int, w: int) -> np.ndarray:
 def _near_the_lens(
     view: GlintView, rig: Rig, pixel: np.ndarray, report: Callable[[], None]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The pixels out of `pixel` whose probes come near the lens, measured by how far they spread.
+    """Those of the pixels whose probes come near the lens, in comparison with how far the probes spread.
 
     Returns
     -------
@@ -352,7 +353,7 @@ def _near_the_lens(
 def _probe(
     lanes: GlintLanes, lens: LensDisc, state: ProbeState, max_iterations: mi.UInt32
 ) -> tuple[ProbeState, mi.UInt32]:
-    """The state of the probes after at most that many segments, and the number of segments that each lane took.
+    """The state of the probes after at most `max_iterations` segments, and the number of segments of each lane.
 
     Where light splits into reflection and refraction, probes take both equally often, however faint one is.
     """
@@ -370,7 +371,7 @@ def _probe(
         si = traced.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False)
         across, _, crosses = lens.crossing(ray, si)
         state.nearest = dr.select(crosses, dr.minimum(state.nearest, dr.norm(across)), state.nearest)
-        # The least step, because probes that went another way are far off and say nothing
+        # The least step counts: a probe that was reflected where others were refracted is far off and says nothing
         step = dr.norm(across - state.before)
         state.spread = dr.select(crosses, dr.minimum(state.spread, step), state.spread)
         state.before = dr.select(crosses, across, state.before)
@@ -392,7 +393,7 @@ def _probe(
 def _paths_to_the_lens(
     lanes: GlintLanes, lens: LensDisc, accumulators: Accumulators, state: GlintState, max_iterations: mi.UInt32
 ) -> tuple[GlintState, mi.UInt32]:
-    """The state of the paths after at most that many segments, and the number of segments that each lane took.
+    """The state of the paths after at most `max_iterations` segments, and the number of segments of each lane.
 
     Sparse responses are added to the accumulators.
     """

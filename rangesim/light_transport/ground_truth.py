@@ -51,7 +51,7 @@ def ground_truth(scene: Scene, traced: TracedScene, rig: Rig) -> tuple[GroundTru
     hit, reflectance = image("hit"), image("reflectance")
 
     def where_hit(name: str) -> np.ndarray:
-        """The same, NaN in pixels that see no surface."""
+        """The same as `image`, but NaN in pixels that see no surface."""
         values = image(name)
         return np.where(hit if values.ndim == 2 else hit[..., None], values, np.float32(np.nan))
 
@@ -104,7 +104,7 @@ def mean_reflectance(view: View, settings: PathSettings, rig: Rig, has_cutouts: 
 class FirstSurfaces:
     """The first surface behind the centre of each of n pixels. A dataclass, because Dr.Jit evaluates no named tuple.
 
-    hit : Bool, whether there is one. The other fields mean something only where there is.
+    hit : Bool, whether there is such a surface. The other fields are valid only there.
     index : Int32, index of its shape in the scene.
     z, range_m : Float, metres, depth, and distance from the camera.
     visible : Bool, whether the projector lights the side that the camera sees.

@@ -3,12 +3,12 @@
 
 Light that has been diffusely reflected twice comes to a matte point from a whole hemisphere. It changes little from one
 pixel to the next, but a pixel's few paths sample it badly. The mean over neighbours has the noise of many more paths,
-and a bias where the light bends within the window. Only radiance over the reflectance of the matte surface is filtered,
-so that textures stay. Only pixels of the same instance count, with similar normals and in one plane with each other.
-The weights reproduce light that is linear in place, so that the bias begins with the second derivative, in corners and
-at contacts too (local linear regression: Fan, Ann. Statist. 21, 1993; for rendered images: Bitterli et al., Computer
-Graphics Forum 35, 2016). The same weights act on every channel: a filtered pass is what a slightly blurred light would
-have given, and sensors, histograms and energy split agree.
+and a bias where the light is not linear within the window. Only radiance over the reflectance of the matte surface is
+filtered, so that textures stay. Only pixels of the same instance count, with similar normals and in one plane.
+The weights reproduce light that varies linearly over the surface. So the bias begins with the second derivative, also
+in corners and at contacts (local linear regression: Fan, Ann. Statist. 21, 1993; for rendered images: Bitterli et al.,
+Computer Graphics Forum 35, 2016). The same weights act on every channel: a filtered pass is what a slightly blurred
+light would have given, and sensors, histograms and energy split agree.
 
 The window is built from levels of 3 x 3 pixels that are 1, 3, 9 ... pixels apart, so that 9 taps for each level cover a
 square of 3^levels pixels (the "a trous" scheme: Dammertz et al., High Performance Graphics 2010).

@@ -60,7 +60,7 @@ class Launches:
 
     Parameters
     ----------
-    is_watched : whether somebody waits for reports between launches. If nobody does, and if a thread of its own handles
+    is_watched : whether somebody waits for reports between launches. If nobody does, and if a separate thread handles
         signals by ending the process, launches may be long.
 
     Attributes
@@ -150,9 +150,9 @@ class Launches:
 
 @contextmanager
 def raised_as_it_is() -> Iterator[None]:
-    """Raise the exception itself that was raised while Dr.Jit traced a loop, for example by the handler of a signal.
+    """Raise the original exception if one is raised while Dr.Jit traces a loop, for example by a signal handler.
 
-    Dr.Jit turns it into a RuntimeError.
+    Dr.Jit would turn it into a RuntimeError.
     """
     try:
         yield

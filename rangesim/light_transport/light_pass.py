@@ -182,7 +182,7 @@ class _CameraPass:
 
 
 def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Glint | None) -> EnergySplit:
-    """The energy split of a camera. Glint is added to it, and in place to the channels."""
+    """The energy split of a camera. Glint is added to it. Glint is also added to the channels, in place."""
     highlights = np.zeros((1, *radiance.direct.shape), np.float32)
     if glints:
         glints.add_to(highlights, glints.radiance[None])

@@ -83,7 +83,7 @@ class PathSettings(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene, settings: TransportSettings) -> PathSettings:
-        """The settings of the loop for a scene, out of those of a pass."""
+        """The settings of the loop for a scene, taken from the settings of a pass."""
         return cls(
             seed=Seed.of(settings.seed),
             max_depth=dr.opaque(mi.UInt32, settings.max_depth),
@@ -120,7 +120,7 @@ class SampleAllocation:
         return replace(self, pixels=self.pixels[some], samples=self.samples[some], total=self.total[some])
 
     def halves(self) -> list[SampleAllocation]:
-        """Two allocations that have every second pair of samples each, so that both fill the pixel evenly."""
+        """Two allocations. Each has every second pair of samples, so that both fill the pixel evenly."""
         pairs, odd = (self.samples + 1) >> 1, self.samples & 1
         return [
             replace(
@@ -289,7 +289,10 @@ def _store(sums: Radiance[mi.Float] | Tally[mi.Float], images: np.ndarray, place
 
 
 def _dealt(n: int) -> np.ndarray:
-    """The numbers 0..n-1 in an order of which any few are spread evenly (multiples of the golden ratio modulo n)."""
+    """The numbers 0..n-1 in an order in which any few successive ones are spread evenly over 0..n-1.
+
+    It is the order of the multiples of the golden ratio modulo n.
+    """
     step = next(k for k in range(round(0.6180339887498949 * n), 2 * n + 2) if math.gcd(k, n) == 1)
     return np.arange(n) * step % n
 
@@ -386,7 +389,7 @@ def walk(
     state: LaneState,
     max_iterations: mi.UInt32,
 ) -> tuple[LaneState, mi.UInt32]:
-    """The state of the lanes after at most that many iterations of the loop, and the number that each lane took."""
+    """The state of the lanes after at most `max_iterations` of the loop, and the number of iterations of each lane."""
     traced, maps = view
     scene, surfaces, camera, projector, media, cutouts, absorbers = traced
     n = dr.width(state.sample)
@@ -519,7 +522,7 @@ def walk(
         if dr.hint(settings.delta, mode="scalar"):
             path.depth -= dr.select(path.left_delta, mi.UInt32(1), mi.UInt32(0))
             path.chain = dr.select(crosses, path.chain, dr.select(path.left_delta, path.chain + 1, 0))
-        fraction = path.throughput * dr.square(path.ray_state.ior)  # of the light is left on the path
+        fraction = path.throughput * dr.square(path.ray_state.ior)  # this fraction of the light is left on the path
         chance = dr.select(path.depth > settings.rr_depth, dr.minimum(fraction, 0.95), 1)
         if dr.hint(settings.delta, mode="scalar"):
             chance = dr.minimum(chance, survival(path.chain, fraction))

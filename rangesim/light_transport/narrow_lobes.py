@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A warning of light that narrow lobes throw onto other surfaces, where light paths hardly find it.
+"""A warning: narrow lobes throw light onto other surfaces, where light paths rarely find it.
 
 A mirror is a delta interaction, and photons carry its light. A rough metal with an alpha of 0.01 is no delta
-interaction, nor is a polished `principled`, at any roughness. A path from the lit wall meets such a lobe by chance once
-in ten thousand times, and the sampling error knows nothing of light that no sample found. So rays of the projector are
-followed here, over lobes and delta interactions, to the surfaces that scatter them.
+interaction. A polished `principled` is none either, at any roughness. A path from the lit wall meets such a lobe by
+chance once in ten thousand times, and the sampling error knows nothing of light that no sample found. So rays of the
+projector are followed here, through lobes and delta interactions, to the surfaces that scatter them.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MAX_NAMED = 3
 
 
 class ThrownLight(NamedTuple):
-    """Fraction of the projector's light that reached a surface over a narrow lobe, by shape.
+    """Fraction of the projector's light that reached a surface by way of a narrow lobe, by shape.
 
     by : (shapes,) float64, by the shape that has the lobe, in the order of the scene's shapes.
     onto : (shapes,) float64, by the shape that the light reached.

@@ -397,7 +397,7 @@ def _row(y: Whole, z: Whole, kind: Whole, mask: int | mi.UInt32) -> Whole:
 def _occupancy(position: np.ndarray, of_map: np.ndarray, kind: np.ndarray, edge: np.ndarray) -> np.ndarray:
     """(cells * MAX_MAPS / 32,) uint32, a bit for each hash of a cell and each map.
 
-    It is set if a photon of that map lies within the radius, which is half an edge, of a point in such a cell.
+    The bit is set if some point in such a cell has a photon of that map within the radius, which is half an edge.
     """
     occupied = np.zeros(OCCUPANCY_CELLS * MAX_MAPS, dtype=bool)
     low, high = (_cells(position + offset * edge[:, None], edge) for offset in (-0.5, 0.5))

@@ -53,8 +53,8 @@ class EnergyBudget:
     emitted : power that photons were sent out with.
     direct : power that landed without a delta interaction, and is left to next-event estimation.
     stored : power that landed beyond delta interactions, and is kept as photons.
-    absorbed : power lost in delta surfaces, in media, inside glass, and to the parts that scatter of surfaces that do
-        both. Russian roulette absorbs nothing on average.
+    absorbed : power lost in delta surfaces, in media and inside glass. If a delta surface also scatters, the power that
+        it scatters counts here too. Russian roulette absorbs nothing on average.
     escaped : power that met no surface.
     truncated : power still under way after `MAX_CHAIN` surfaces.
     """

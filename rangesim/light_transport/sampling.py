@@ -44,8 +44,8 @@ def random_stream(seed: Seed, number: mi.UInt32, stream: Stream = Stream.FIRST) 
     """Random numbers that depend on the seed, the number and the stream alone, and not on the lane.
 
     The block cipher TEA mixes seed and number (Zafar, Olano, Curtis: GPU random numbers via the tiny encryption
-    algorithm, HPG 2010). It is one to one. A seed of more than 32 bits goes through it twice, and its upper half is
-    added in between, so that no two seeds give the same numbers.
+    algorithm, HPG 2010). TEA is one to one. A seed of more than 32 bits goes through TEA twice, and the upper half of
+    the seed is added in between, so that no two seeds give the same numbers.
     """
     pair = (number, seed.low) if stream is Stream.THIRD else (seed.low, number)
     once = [mi.UInt32(x) for x in mi.sample_tea_32(*pair)]
@@ -88,16 +88,17 @@ def stratified(shift: mi.Point2f, sample: mi.UInt32) -> mi.Point2f:
 def in_pairs(
     shift: mi.Point2f, lens_shift: mi.Point2f | None, sample: mi.UInt32, samples: mi.UInt32
 ) -> tuple[mi.Point2f, mi.Point2f | None]:
-    """Places of a sample in its pixel and on the lens, each in the unit square; on the lens None without `lens_shift`.
+    """Places of a sample in its pixel and on the lens, each in the unit square.
 
-    Every second sample is the one before it mirrored about the centres. If the number of samples is odd, the last one
-    is at the centres. A quantity that is linear in the place, as phase and depth are on a plane, then has no sampling
-    error: its mean is its value at the centre (antithetic variates; Hammersley and Morton, Proc. Camb. Phil. Soc. 52,
-    1956). The pairs follow the R2 sequence, with a lens the R4 sequence.
+    The place on the lens is None without `lens_shift`. Samples come in pairs: the second is the first, mirrored about
+    the centres of pixel and lens. If the number of samples is odd, the last one is at the centres. A quantity that is
+    linear in the place, as phase and depth are on a plane, then has no sampling error: its mean is its value at the
+    centre (antithetic variates; Hammersley and Morton, Proc. Camb. Phil. Soc. 52, 1956). The pairs follow the R2
+    sequence, or the R4 sequence if there is a lens.
 
     Parameters
     ----------
-    shift, lens_shift : Point2f, uniform in the unit square, of the pixel.
+    shift, lens_shift : Point2f, shift of the sequence in this pixel and on the lens, uniform in the unit square.
     sample, samples : UInt32, number of the sample, and number of samples of the pixel.
     """
     pair, mirrors = sample >> 1, (sample & 1) == 1

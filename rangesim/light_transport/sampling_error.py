@@ -63,7 +63,9 @@ class Sums:
 
 
 class Halves:
-    """Computes means, and draws of their error, from sums over samples in two halves; from one sum, means alone.
+    """Computes means and draws of their error from the sums over two halves of the samples.
+
+    If there is only one sum, it computes means alone.
 
     With means a and b over p and q samples, (a - b) sqrt(p q) / (p + q) has the variance of the mean of all.
 

@@ -110,7 +110,7 @@ class RayState:
         return replace(self, inside=inside, sigma_a=sigma_a)
 
     def reset(self, traced: TracedScene, where: mi.Bool) -> RayState:
-        """The state of light in air whose optical length is 0, on the lanes of the mask `where` a path ends."""
+        """The state of light in air whose optical length is 0, on the lanes of the mask `where`, whose paths end."""
         inside = self.inside
         if inside is not None and traced.media is not None:
             inside = inside.replaced(where, traced.media.none(dr.width(where)))

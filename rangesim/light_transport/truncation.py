@@ -4,9 +4,9 @@
 A camera path brings light at each of its vertices. Let T_k be the throughput with which paths arrive at their k-th
 vertex. It falls off geometrically after a few vertices: the ratio t = T_n / T_(n-1) at the last vertex that a pass
 looks at is the mean albedo times the chance to meet another surface. (The ratio of throughputs is used because the
-ratio of the light itself swings: surfaces that the projector lights and surfaces that these light in turn most often
-face each other.) The throughput of all later vertices is T_n t / (1 - t). They are taken to be lit, per throughput, as
-vertices after the first are on average:
+ratio of the light itself swings from vertex to vertex: directly lit surfaces mostly face indirectly lit ones.) The
+throughput of all later vertices is T_n t / (1 - t). Per throughput, they are assumed to get as much light as vertices 2
+to n get on average:
 
     left out = T_n t / (1 - t) * (light at vertices 2..n) / (T_2 + ... + T_n)
 
@@ -48,7 +48,8 @@ class Tally(Generic[Array]):
 
     first : throughput at the first vertex that scatters.
     further : throughput at all later vertices up to the last, added up.
-    before_last, last : throughput at the last vertex but one at which a pass looks for the projector, and at the last.
+    before_last, last : throughput at the last but one and at the last of the vertices at which a pass looks for the
+        projector.
     indirect : W/m2/sr, radiance that the projector brings at vertices after the first.
     cut : throughput of paths that ended because a chain of delta interactions was too long.
     """

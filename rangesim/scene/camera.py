@@ -25,7 +25,7 @@ nothing shows; a larger value would hide blur that widens edges."""
 def camera_of(sensor: Any, label: str) -> tuple[Intrinsics, np.ndarray]:
     """Intrinsics and T_world_camera (4, 4) of a `perspective` or `thinlens` sensor, taken as a pinhole.
 
-    If the film has a crop window, that is the image.
+    If the film has a crop window, this window is the image.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def warn_of_aperture(sensor: Any, camera: Intrinsics, distance_m: float, label: 
 
 
 def warn_of_clipping(sensor: Any, z: np.ndarray, label: str) -> None:
-    """Warn if near_clip or far_clip of the sensor would hide surfaces in Mitsuba: here the camera sees them.
+    """Warn if near_clip or far_clip of the sensor would hide surfaces in Mitsuba, because our camera sees them.
 
     z : (n,) depths of the surfaces that some rays of the camera meet first, metres; NaN where they meet none.
     """

@@ -204,7 +204,7 @@ def _instantiate(
             reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
             # A BSDF written in Python, such as the retroreflector, adds its traceback
             reason = re.sub(r"Traceback \(most recent call last\): .* (?=\w+Error: )", "", reason)
-            raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
+            raise FileFormatError(f"{label} is no scene that Mitsuba can load: {reason}") from error
     warn_of_colours(coloured, label)
     warn_of_coarse_transform(transform, label)
     warn_of_coarse_mesh(mesh, label)
@@ -228,7 +228,7 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, names: Utf
     try:
         fillers = check_xml(path, _SearchPaths(resolver), IGNORED_ELEMENTS)
     except FileFormatError as error:
-        raise FileFormatError(f"{path} is no scene Mitsuba can load: {error}") from error
+        raise FileFormatError(f"{path} is no scene that Mitsuba can load: {error}") from error
     try:
         return mi.parser.parse_file(config, str(names.of(path)), **fillers)
     except RuntimeError as error:
@@ -251,7 +251,7 @@ class _SearchPaths:
         return Path(str(self.paths.resolve(name)))
 
     def within(self, folder: str, beside: Path) -> _SearchPaths:
-        """These paths with a folder in front: the one beside the file, or else the one found by these paths."""
+        """Search paths with a folder before these ones: the folder beside the file, or else the one that they find."""
         near, paths = beside.parent / folder, mi.FileResolver(self.paths)
         paths.prepend(str(near if os.path.exists(near) else self.resolve(folder)))
         return _SearchPaths(paths)
@@ -304,7 +304,7 @@ def _is_mesh(source: Source) -> bool:
 
 
 def _looks_elsewhere(scene: Any, sensor: int, place: np.ndarray, label: str) -> bool:
-    """Whether a camera is so much farther from the origin than from what it sees that this is far away as well."""
+    """Whether a camera is much farther from the origin than from what it sees, so that both are far from the origin."""
     camera, T_camera = camera_of(scene.sensors()[sensor], label)
     return bool(np.linalg.norm(place) > AS_FAR * _median_depth(scene, camera, T_camera))
 

@@ -109,9 +109,10 @@ def inside_out(scene: Any, place: np.ndarray, directions: np.ndarray) -> tuple[s
 
     Returns
     -------
-    None if there is no such shape; else its id and a side. The side is "interior" if most rays that first meet the
-    shape outside of all bodies leave its interior medium there, so that its normals point inwards. It is "exterior" if
-    most of them come from its exterior medium, although they started in air.
+    None if there is no such shape; else its id and a side. Only rays count that are inside no body when they first meet
+    the shape. The side is "interior" if most of them seem to leave the interior medium of the shape: its normals then
+    point inwards. The side is "exterior" if most of them seem to come from its exterior medium, although they started
+    in air.
     """
     filled, around = (
         [s for s in scene.shapes() if m(s) is not None and medium_numbers(m(s))[0] > 0]

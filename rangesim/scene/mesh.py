@@ -104,7 +104,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     check_file(path, FileFormatError)
 
     class Beside(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
-        """Finds the files that a mesh refers to, which must be plain files beside it or below."""
+        """Finds the files that a mesh refers to: plain files in the folder of the mesh or below."""
 
         def get(self, name: str) -> bytes:
             check_file(Path(self.parent) / name.strip(), FileFormatError)

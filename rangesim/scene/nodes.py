@@ -45,9 +45,9 @@ def shipped_types() -> frozenset[str]:
 def check_type(name: str, label: str) -> None:
     """Raise FileFormatError on a plugin type for which Mitsuba would run a library that a scene brings along.
 
-    Mitsuba loads `plugins/NAME.so` from the first search path that has it. Accepted are the plugins that come with
-    Mitsuba, provided that `OF_MITSUBA` is the first search path, and plain names for which no search path has a
-    library. The latter are registered in Python, or Mitsuba refuses them.
+    Mitsuba loads `plugins/NAME.so` from the first search path that has it. Two kinds of types are accepted: plugins
+    that come with Mitsuba, provided that `OF_MITSUBA` is the first search path; and plain names for which no search
+    path has a library. A plugin of the second kind is registered in Python, or Mitsuba refuses it.
     """
     if name in shipped_types():
         return
@@ -143,7 +143,7 @@ def check_camera(state: Any, node: Any, label: str) -> None:
 
 
 def replace_ignored_plugins(state: Any) -> None:
-    """Replace integrators, films, samplers and filters that Mitsuba does not have by some of its own.
+    """Replace integrators, films, samplers and filters that Mitsuba does not have by some that it has.
 
     A scene of a renderer built on Mitsuba, such as mitransient, has such plugins. They are ignored anyway; only the
     size of the film is kept.

@@ -71,8 +71,8 @@ def move_to_origin(state: Any, origin_m: np.ndarray, label: str) -> None:
             is_placed = isinstance(value, mi.Emitter) and not _is_infinite(value)
             if isinstance(value, mi.Sensor) or is_placed or (isinstance(value, mi.BSDF) and _has_grid(value)):
                 raise FileFormatError(
-                    f"expected emitters, sensors and grids of {label}, whose camera is far from the origin, as "
-                    "dictionaries, got a loaded object; give its dictionary."
+                    f"expected emitters, sensors and grids of {label} as dictionaries, because its camera is far from "
+                    "the origin, got a loaded object; give its dictionary."
                 )
         if "position" in node.props and node.type == mi.ObjectType.Emitter:
             node.props["position"] = mi.ScalarPoint3d(*(np.array(node.props["position"]) - origin_m))
@@ -105,7 +105,7 @@ class Rounding(NamedTuple):
 
 
 def coarsest_mesh(state: Any, scene: Any) -> Rounding | None:
-    """The mesh from a file whose vertices near the renderer's origin have the largest rounding; None without meshes.
+    """Of the meshes from files, the one whose vertices near the renderer's origin are rounded most; None without any.
 
     Mitsuba reads vertices in single precision, whatever precision the file has, and before it applies `to_world`.
 
@@ -129,7 +129,7 @@ def coarsest_transform(state: Any) -> Rounding | None:
     """The `to_world` of a parsed scene that was made in single precision and has the largest rounding.
 
     None if no rounding is larger than `COARSE_M`. The scene must not have been moved yet. Rotation and scale show which
-    precision was used: their digits fill single, but not double precision.
+    precision was used: it was single if all their numbers fit single precision, and some do not fit half precision.
     """
     found = []
     for node in state.nodes:

@@ -12,8 +12,8 @@ nested BSDF (Portsmouth, Raab, Belcour, Liu, The Minimal Retroreflective Microfa
 roughness `alpha` of the nested BSDF sets the observation angle: most light returns within a few times alpha radians.
 
 Real sheeting returns less of the light that comes in at an angle. The exponent `falloff` p >= 0, default 0, describes
-this: the lobe is multiplied by (cos theta_i cos theta_o)^(p / 2), which is reciprocal and at most 1. On the axis of the
-lobe it is cos^p of the entrance angle.
+this: the lobe is multiplied by (cos theta_i cos theta_o)^(p / 2). This factor is reciprocal and at most 1. On the axis
+of the lobe it is cos^p of the entrance angle.
 """
 
 from __future__ import annotations

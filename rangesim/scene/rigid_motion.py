@@ -46,7 +46,7 @@ class MovingScene:
     def at(self, transforms: Mapping[str, np.ndarray]) -> Scene:
         """The scene with some shapes moved.
 
-        The next call moves the same copy again, so use the returned scene before that.
+        The next call moves the same copy again, so finish your work with the returned scene before the next call.
 
         Parameters
         ----------

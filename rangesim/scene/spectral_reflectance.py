@@ -67,7 +67,7 @@ def coloured_materials(state: Any) -> list[str]:
 
 
 def warn_of_colours(names: list[str], label: str) -> None:
-    """Warn once about the BSDFs of these names, whose reflectances are colours; no names: no warning."""
+    """Warn once about the BSDFs of these names, whose reflectances are colours. Without names there is no warning."""
     if names:
         listed = ", ".join(names[:MAX_NAMED]) + (" ..." if len(names) > MAX_NAMED else "")
         warn(
@@ -77,7 +77,7 @@ def warn_of_colours(names: list[str], label: str) -> None:
 
 
 def warn_of_emitters_behind_glass(scene: Any, label: str) -> None:
-    """Warn once if a scene has emitters without extent, and glass or holes through which light paths miss them."""
+    """Warn once if a scene has emitters without extent, and glass or holes: light paths through these miss them."""
     without_extent = mi.EmitterFlags.DeltaPosition.value | mi.EmitterFlags.DeltaDirection.value
     if any(e.flags() & without_extent for e in scene.emitters()) and any(map(_hides_emitters, scene.shapes())):
         warn(
