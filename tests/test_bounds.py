@@ -262,7 +262,14 @@ def test_numbers_are_no_bools(name: str) -> None:
 
 MODULES = (
     *("electronics.ambient", "electronics.detector", "electronics.spad", "experiment.experiment"),
-    *("instrument.instrument", "motion.timing", "motion.pose_tracks", "response.path_lengths", "response.patterns", "rig.rig"),
+    *(
+        "instrument.instrument",
+        "motion.timing",
+        "motion.pose_tracks",
+        "response.path_lengths",
+        "response.patterns",
+        "rig.rig",
+    ),
     *("sensors.structured_light", "sensors.amcw", "sensors.direct_tof", "sensors.ideal_tof"),
     *("decoding.gray", "decoding.phase_shift", "decoding.triangulation"),
 )
