@@ -466,8 +466,9 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
         freedom = len(a) - FUNDAMENTAL_PARAMETERS
         if apart > DIFFERENT_F and consensus.is_as_likely(*costs, freedom, noise_px, rounding):
             raise ValueError(
-                f"expected points with one fundamental matrix, got {len(a)} pairs that two such matrices explain within their "
-                "noise: the points lie on a surface that contains both centres, or are few; add points at other depths."
+                f"expected points with one fundamental matrix, got {len(a)} pairs that two such matrices explain within "
+                "their noise: the points lie on a surface that contains both centres, or are few; add points at other "
+                "depths."
             )
     _refuse_open_epipole(a, b, from_a, from_b, found, scale, max(noise, rounding))
     in_tangent = found.covariance(max(noise * scale, 1e-300))
@@ -716,7 +717,7 @@ def fit_relative_pose(
         if consensus.is_as_likely(other.cost, best.cost, freedom, noise_px, rounding):
             angle = np.degrees(_angle(other.state[:3, :3] @ best.state[:3, :3].T))
             raise ValueError(
-                f"expected points with one relative pose, got two poses that explain them within their noise, "
+                "expected points with one relative pose, got two poses that explain them within their noise, "
                 f"{angle:.1f} degrees apart: they lie on a plane, or are few; add points off it."
             )
     consensus.refuse_misfit(best.cost, freedom, noise_px, "a relative pose")
