@@ -9,7 +9,7 @@ of the two readings is a draw of the sampling error of the reading, whatever the
 
 The error that the detector makes is the difference between a reading with noise and the reading without.
 
-Pixels that have a reading in one half of the samples only tell how uncertain the fraction of missing readings is.
+Pixels that have a reading in only one half of the samples show how uncertain the fraction of missing readings is.
 """
 
 from __future__ import annotations
@@ -70,10 +70,10 @@ class Repeats:
         """Bound on the change of the fraction of pixels with a reading if very many samples were taken.
 
         For a pixel that has a reading with half of the samples and none with all of them, or the other way round,
-        sampling decides. More samples may change as many pixels again, and most of them in one direction. The larger
-        of the two fractions is taken therefore, summed over both halves. Twice the number of pixels that the detector's
-        noise alone changes is subtracted, and the standard error of the counts is added, which matters where pixels
-        are few.
+        sampling decides. More samples may change as many pixels again, and most of them in one direction. Therefore the
+        larger of the two fractions is taken, summed over both halves. Twice the number of pixels that the detector's
+        noise alone changes is subtracted, and the standard error of the counts is added, which matters where pixels are
+        few.
 
         Parameters
         ----------
