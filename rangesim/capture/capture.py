@@ -38,15 +38,15 @@ def bright_level(values: np.ndarray) -> float:
 class ClippingThresholds:
     """Thresholds by which `clip_level` tells that the largest value in an image is the level where the camera clips.
 
-    With the defaults, images of which 5 to 50 % of the pixels clip are told from patterns of one brightness
+    With the defaults, images in which 5 to 50 % of the pixels clip are distinguished from patterns of one brightness
     (`tests/test_decode_summary.py`). How far each may be changed was not measured.
 
     levels : number of levels below the largest value that are compared with it, each 1/256 of that value wide.
     min_fraction : least fraction of the pixels that are at the largest value; fewer are single highlights.
-    min_peak : least ratio of their number to the mean number of pixels in one of the `levels` below; a smaller value
-        takes the peaks of fringes for clipping.
-    min_tail : least ratio of the number of pixels in all `levels` below to their number; an image of few grey levels
-        (black and white, for example) has no pixels there, and does not clip.
+    min_peak : least ratio of the number of these pixels to the mean number of pixels in one of the `levels` below; a
+    smaller value takes the peaks of fringes for clipping.
+    min_tail : least ratio of the number of pixels in all `levels` below to the number at the largest value; an image of
+        few grey levels (black and white, for example) has no pixels there, and does not clip.
     """
 
     levels: int = 16
@@ -64,7 +64,7 @@ def clip_level(brightest: np.ndarray, max_dn: int) -> int:
 
     Video levels end at 235 of 255; other images end where a converter or a raw developer cuts them off. In such an
     image the numbers of pixels continue up to the largest value, and many pixels are at that value. An image of two
-    values has no pixels below the largest one, and fringes have no such pile at their peaks: neither is clipped.
+    values has no pixels just below the largest one, and fringes have no such pile at their peaks: neither is clipped.
 
     Parameters
     ----------
@@ -108,7 +108,8 @@ class Capture(ShortRepr):
     Raises
     ------
     ValueError
-        The frames are not as many as the sensor takes, differ from the rig's camera in size, or have another type.
+        The number of frames is not that of the sensor, or the frames differ from the rig's camera in size, or have
+        another type.
 
     Examples
     --------
