@@ -427,7 +427,7 @@ def test_a_surface_through_both_centres_is_refused() -> None:
     a, b = project(FIRST, X), project(SECOND, X)
     with pytest.raises(ValueError, match="depend on each other"):
         fit_fundamental(a, b)
-    with pytest.raises(ValueError, match="that two explain within their noise"):
+    with pytest.raises(ValueError, match="that two such matrices explain within their noise"):
         fit_fundamental(a + random.normal(0, 0.5, a.shape), b + random.normal(0, 0.5, b.shape))
 
 

@@ -24,7 +24,7 @@ EDGE_POINTS = 64
 """Number of points on the edge of a disc, from whose polygon the centroid of the disc's image is computed. The two
 centroids are equal to rounding, as long as the distortion of the lens hardly bends one side of the polygon."""
 INK_REFLECTANCE = 0.05
-"""Reflectance of the ink of a rendered board, a fraction, like black print. More leaves less contrast at the
+"""Reflectance of the ink of a rendered board, a fraction, like black print. A higher value leaves less contrast at the
 corners."""
 BOARD_REFLECTANCE = 0.8
 """Reflectance of a rendered board beside the ink, a fraction, like white paper."""
@@ -249,7 +249,7 @@ class Checkerboard(Board):
 
 @dataclass(frozen=True)
 class CharucoBoard(Board):
-    """A chessboard with ArUco markers in its white squares, of which a view of a part is enough.
+    """A chessboard with ArUco markers in its white squares; a view of a part of the board is enough.
 
     The markers say which corner is which.
 
@@ -326,8 +326,8 @@ class CircleGrid(Board):
     """A grid of discs, whose points are the centres of the discs.
 
     The centroid of the image of a disc is not the image of its centre (Heikkilae: "Geometric camera calibration using
-    circular control points", PAMI 2000). `seen_points` returns the position on the board that the centroid is the image
-    of, and calibration uses it. Corners have no such error.
+    circular control points", PAMI 2000). `seen_points` returns the position on the board whose image is the centroid,
+    and calibration uses it. Corners have no such error.
 
     columns, rows : numbers of discs. distance_m : distance between the centres of neighbours, metres. diameter_m :
     diameter of a disc, metres.
@@ -363,7 +363,7 @@ class CircleGrid(Board):
         return 1
 
     def seen_points(self, camera: Intrinsics, T_camera_board: ArrayLike) -> Array:
-        """(columns * rows, 3) float64, the positions on the board of which the centroids of the discs are images,
+        """(columns * rows, 3) float64, the positions on the board whose images are the centroids of the discs,
         metres.
 
         The centroid is that of a polygon of `EDGE_POINTS` points on the edge of the disc, projected through the lens.
@@ -400,7 +400,7 @@ class CircleGrid(Board):
 
 
 def _refined(image: NDArray[np.uint8], corners: Any, reach: float) -> tuple[Array, NDArray[np.bool_]]:
-    """(n, 2) float64, corners with subpixel accuracy, and (n,) bool, whether a window half as wide finds the same.
+    """(n, 2) float64, corners with subpixel accuracy, and (n,) bool, whether a window half as wide agrees.
 
     A corner is the point where the gradients around it meet (Foerstner 1987). If the narrow window finds another point,
     the wide window has another edge in it, for example of a shadow, of the projected light, or of a finger, which draws

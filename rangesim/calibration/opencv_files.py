@@ -145,7 +145,7 @@ def _entries(name: str, device: Intrinsics) -> dict[str, Any]:
 
 
 def _write(path: str | Path, entries: dict[str, Any]) -> None:
-    """Write numbers and matrices to a file of OpenCV, with a seal by which `rangesim calibrate` knows its own files."""
+    """Write numbers and matrices to a file of OpenCV, with a seal by which `rangesim calibrate` recognises it."""
     import cv2
 
     path = Path(path)

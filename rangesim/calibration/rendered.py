@@ -61,7 +61,7 @@ def render_set(
     tilt_deg : float, degrees, largest tilt about each of the board's axes.
     margin_px : float, pixels, least distance of the board's points from the edges of both images.
     spp : int, number of light paths per pixel. seed : int, of poses, light paths and noise.
-    progress : function that is called with the number of captures made; None: none.
+    progress : function that is called with the number of captures made; None: no function is called.
 
     Raises
     ------

@@ -41,7 +41,8 @@ error of a homography falls only with the root of their number."""
 
 REACH = 0.9
 """Distance around a corner up to which decoded pixels are taken, as a fraction of the distance between neighbouring
-corners in the image. A larger one takes more pixels, on which the lenses' distortion is less a homography's."""
+corners in the image. A larger distance takes more pixels, over which the lenses' distortion is less like a
+homography."""
 
 MAX_GAP_RAD = 2.8
 """Largest gap between the directions of the decoded pixels around a corner, radians; half a turn is 3.14. Two white
@@ -70,7 +71,7 @@ class RigCalibration:
     camera_rms_px, projector_rms_px : float, pixels, root mean square of the reprojection errors over all points.
     camera_views, projector_views : k BoardView, the points that were seen.
     suspects : points whose error is beyond all noise when each view is weighed by its own scatter, the worst first.
-        They still weigh on the result.
+        They still took part in the calibration.
     """
 
     rig: Rig
@@ -98,12 +99,12 @@ def projector_view(view: BoardView, decoded: Coordinates, spacing_px: float) -> 
     view : BoardView of the camera.
     decoded : `ProjectorCoordinates` of the same capture, with columns and rows.
     spacing_px : float, camera pixels between neighbouring corners, about. Decoded pixels are taken up to `REACH` of it
-        around each corner, where the lenses' distortion must be nearly a homography's.
+        around each corner, where the lenses' distortion must be nearly a homography.
 
     Raises
     ------
     ValueError
-        The decoded coordinates are not those of a projector, or of one axis alone.
+        The decoder returned no projector coordinates, or those of one axis alone.
     """
     if not isinstance(decoded, ProjectorCoordinates):
         raise ValueError("expected a sensor that decodes projector coordinates, got path lengths.")
@@ -155,7 +156,8 @@ def _seen_through(here: Array, there: Array, corner: Array) -> Array | None:
 def _surrounds(offsets: Array) -> bool:
     """Whether points (n, 2) lie around 0: no gap between their directions is as wide as `MAX_GAP_RAD`.
 
-    The pixels of two white squares that meet at a corner do, where the black ones send too little light back.
+    The pixels of the two white squares that meet at a corner lie around it, even if the black squares send too little
+    light back.
     """
     angles = np.sort(np.arctan2(offsets[:, 1], offsets[:, 0]))
     return float(np.diff(angles, append=angles[0] + 2 * np.pi).max()) < MAX_GAP_RAD
@@ -167,11 +169,11 @@ def calibrate_rig(
     """Calibration of a camera and a projector from coded light on a board, each capture with the board in another pose.
 
     The corners are found in the white images of the captures, and the projector's coordinates are decoded. The rig of a
-    capture is not looked at. Then each device is calibrated by itself, and at last everything together by
-    `bundle.adjust`, the errors of each device weighed by its noise.
+    capture is not used. Then each device is calibrated by itself. Finally `bundle.adjust` calibrates everything
+    together, with the errors of each device weighed by its noise.
 
-    `RangesimWarning` for points that do not fit (`RigCalibration.suspects`), and for a lens that is unknown in a corner
-    of its image, or folds there.
+    A `RangesimWarning` tells of points that do not fit (`RigCalibration.suspects`), and of a lens that is unknown in a
+    corner of its image, or folds there.
 
     Parameters
     ----------
@@ -182,8 +184,8 @@ def calibrate_rig(
     Raises
     ------
     ValueError
-        A capture is of another sensor or size; a board is not found (the message says which); there are fewer than
-        three, or one twice; or the views do not determine the rig.
+        A capture is of another sensor or size; a board is not found (the message says which); there are fewer than two
+        captures, or two of the same pose; or the views do not determine the rig.
     """
     names = [f"capture {k}" for k in range(len(captures))] if names is None else [str(name) for name in names]
     if len(names) != len(captures):

@@ -102,7 +102,7 @@ def triangle_harmonics(n: int) -> Array:
 
 
 def wiggling(phase: ArrayLike, harmonics: ArrayLike, taps: int = len(TAPS_DEG)) -> Array:
-    """(...) float64, phase that evenly spaced taps measure minus the true one, in periods.
+    """(...) float64, phase measured by evenly spaced taps, minus the true phase, in periods.
 
     The equation is in the docstring of this module. It is exact for the given harmonics. To first order in them, the
     error is the sum over n of (a_(nN+1) - a_(nN-1)) sin(n N phi) / (2 pi a_1).
@@ -259,7 +259,8 @@ class ToFCalibration:
         return np.asarray(_series(_waves(self.sensor, self.orders), np.asarray(length_m, np.float64)) @ coefficients)
 
     def correct(self, image: RangeImage) -> RangeImage:
-        """Range image with z and range corrected for wiggling and offsets. Apply it once to an image of this rig.
+        """Range image with z and range corrected for wiggling and offsets. Apply it only once to each image of this
+        rig.
 
         Pixels that saw no target, and readings beyond the path lengths of the targets, are refused with
         `Status.OUT_OF_RANGE`, because nothing is known of their error.

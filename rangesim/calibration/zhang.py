@@ -4,7 +4,7 @@
 Z. Zhang: "A flexible new technique for camera calibration", PAMI 2000. A view of a plane maps the two circular points
 of the plane to points of the image of the absolute conic, omega = K^-T K^-1. This gives two linear equations. Without
 skew, omega has 4 degrees of freedom, so that two views determine it; with skew it has 5 and needs three views. Boards
-that are parallel to each other, or all straight in front, do not determine it and raise an error.
+that are parallel to each other, or all straight in front of the camera, do not determine omega and raise an error.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from rangesim.geometry.reprojection import LENS, POSE, by_lens
 from rangesim.rig import Intrinsics
 
 MIN_VIEWS = 2
-"""Smallest number of views for a camera without skew, a count: each view has two equations for 4 unknowns. With skew it
-is one more (Zhang 2000, section 3.1)."""
+"""Smallest number of views for a camera without skew, a count: each view gives two equations for 4 unknowns. With skew,
+one more view is needed (Zhang 2000, section 3.1)."""
 MIN_CONIC_RATIO = 1e-4
 """Smallest ratio of the second smallest singular value of the conic's equations to the largest. Below it, the views
 leave a second solution: within the noise, the boards are parallel to each other."""
 MIN_APART_DEG = 1.0
 """Smallest value of the largest angle between two boards, degrees; below it all boards count as parallel. Measured with
-a noise of 0.05 px: boards that are parallel are found within 0.1 degrees, boards turned at random by up to 5 degrees at
-4.8 degrees or more."""
+a noise of 0.05 px: for parallel boards, the largest angle found is within 0.1 degrees; for boards turned at random by
+up to 5 degrees, it is 4.8 degrees or more."""
 MAX_CENTRED_VIEWS = 5
 """Largest number of views for which a second start, with the principal point in the middle of the image, is tried.
 Measured with 3 views tilted by 10 degrees: with one start, 1 of 40 sets ended in a wrong minimum."""
@@ -49,8 +49,9 @@ MAX_CORNER_PX = 5.0
 as unknown there, and the result comes with a warning."""
 SEEN_POINT_ROUNDS = 2
 """Number of adjustments after the first, a count, for boards whose points are not detected where they are
-(`CircleGrid`). Each one uses the positions that the camera found last would detect. Measured with 8 views of 7 x 5
-discs without noise: fx is off by 0.28 px without them, by 3e-4 px after one and by 1.5e-5 px after two."""
+(`CircleGrid`). Each one uses the positions that the camera of the adjustment before it would detect. Measured with 8
+views of 7 x 5 discs without noise: fx is off by 0.28 px without them, by 3e-4 px after one and by 1.5e-5 px after
+two."""
 BORDER_POINTS = 9
 """Number of points along each side of an image, at which the ray through the lens must exist. More points find shorter
 gaps. The corners, which are farthest from the centre, are always among them."""
@@ -405,7 +406,7 @@ def judged(found: Minimum[Bundle], observations: Sequence[Observation], may_warn
 def _check_corners(device: Intrinsics, covariance: Array, name: str, may_warn: bool) -> None:
     """Warn if a lens folds within its image, or is unknown in a corner of it.
 
-    covariance : of the parameters of the lens. name : of the device. may_warn : whether to warn at all.
+    covariance : covariance of the parameters of the lens. name : name of the device. may_warn : whether to warn at all.
     """
     s = np.linspace(0, 1, BORDER_POINTS)
     zero, one = np.zeros_like(s), np.ones_like(s)

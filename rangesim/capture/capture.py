@@ -43,10 +43,10 @@ class ClippingThresholds:
 
     levels : number of levels below the largest value that are compared with it, each 1/256 of that value wide.
     min_fraction : least fraction of the pixels that are at the largest value; fewer are single highlights.
-    min_peak : least ratio of their number to the mean number of pixels in one of the `levels` below; a smaller value
-        takes the peaks of fringes for clipping.
-    min_tail : least ratio of the number of pixels in all `levels` below to their number; an image of few grey levels
-        (black and white, for example) has no pixels there, and does not clip.
+    min_peak : least ratio of the number of these pixels to the mean number of pixels in one of the `levels` below; a
+    smaller value takes the peaks of fringes for clipping.
+    min_tail : least ratio of the number of pixels in all `levels` below to the number at the largest value; an image of
+        few grey levels (black and white, for example) has no pixels there, and does not clip.
     """
 
     levels: int = 16
@@ -108,7 +108,8 @@ class Capture(ShortRepr):
     Raises
     ------
     ValueError
-        The frames are not as many as the sensor takes, differ from the rig's camera in size, or have another type.
+        The number of frames is not that of the sensor, or the frames differ from the rig's camera in size, or have
+        another type.
 
     Examples
     --------

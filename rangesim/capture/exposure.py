@@ -47,8 +47,8 @@ def expose(
         frames are float32 radiance in W/m2/sr and contain the ambient light without a filter. The frames of an ideal
         sensor (`Sensor.is_ideal`) are always noise-free.
     exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`.
-    seed : int from 0 to 2^64 - 1, seed of the noise. Every frame has a random stream of its own, with a SpadDetector
-        every image row; the same seed gives the same bytes on any number of threads.
+    seed : int from 0 to 2^64 - 1, seed of the noise. Every frame has its own random stream (with a SpadDetector, every
+    image row has one); the same seed gives the same bytes on any number of threads.
     ambient : Ambient, kind and strength of the light of the scene's own emitters; the detector's band
         (`band_width_m`) then decides how much of it counts. None: unknown; the detector's `ambient_transmission`
         decides. Another ambient light needs no new transport pass.
@@ -98,7 +98,7 @@ class Exposure(ShortRepr):
     def warn_of_overexposure(self, name: str) -> None:
         """Warn if the detector's shortest exposure, which was chosen automatically, saturates the bright pixels.
 
-        name : of the instrument.
+        name : name of the instrument.
 
         Warns
         -----

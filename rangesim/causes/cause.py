@@ -58,7 +58,7 @@ DEFINITIONS = {
     Cause.AMBIENT: "The emitter's light sufficed, but ambient light filled the detector or added too much noise.",
     Cause.RANGE_AMBIGUITY: "The distance lies beyond the unambiguous range, or a wrong period was chosen.",
     Cause.RESOLUTION: "Neither stray light nor noise is to blame: code, bins or baseline are too coarse for the depth.",
-    Cause.PILE_UP: "So many pulses brought photons that the first ones hid the others; less light would be read.",
+    Cause.PILE_UP: "So many pulses brought photons that the first ones hid the others; less light would be read right.",
 }
 """Meaning of each cause, in a sentence; tables of docs/causes.md and of reports show it."""
 

@@ -115,14 +115,14 @@ class Evidence:
 
     @cached_property
     def saturated(self) -> np.ndarray:
-        """Whether some frame is saturated, or no pulse was left, and this made the decoder refuse the pixel or err."""
+        """Whether some frame is saturated, or the pulses ran out, and so the decoder refused the pixel or erred."""
         full = self.capture.saturated(self.capture.frames) | (self.image.status == Status.SATURATED)
         return full & (self.missing | ~self.optical)
 
     @cached_property
     def piled_up(self) -> np.ndarray:
-        """Whether more than `MAX_PULSES_HIT` of the pulses brought a photon, or the decoder found no pulse left though
-        no counter is full."""
+        """Whether more than `MAX_PULSES_HIT` of the pulses brought a photon, or the decoder found that the pulses ran
+        out although no counter is full."""
         detector, capture = self.capture.detector, self.capture
         if not isinstance(detector, SpadDetector) or not detector.pile_up:
             return np.zeros(self.truth.z.shape, dtype=bool)
@@ -331,8 +331,8 @@ class Evidence:
 def error_off_edge(
     where: np.ndarray, error: np.ndarray, edge: np.ndarray, z: np.ndarray, instance: np.ndarray, tolerance_m: float
 ) -> np.ndarray:
-    """(n,) float64 median error, in metres, of the same surface off the edge around each of n pixels; NaN if it is
-    nowhere in the window of `NEAR`.
+    """(n,) float64 median error, in metres, of the same surface off the edge around each of n pixels; NaN if this
+    surface is nowhere in the window of `NEAR`.
 
     Parameters
     ----------

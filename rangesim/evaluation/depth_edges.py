@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth edges: places where neighbouring pixels see two surfaces, one before the other."""
+"""Depth edges: places where neighbouring pixels see two surfaces, one in front of the other."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ of the two readings is a draw of the sampling error of the reading, whatever the
 
 The error that the detector makes is the difference between a reading with noise and the reading without.
 
-Pixels that have a reading in one half of the samples only tell how uncertain the fraction of missing readings is.
+Pixels that have a reading in only one half of the samples show how uncertain the fraction of missing readings is.
 """
 
 from __future__ import annotations

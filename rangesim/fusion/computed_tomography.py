@@ -154,7 +154,7 @@ def filtered_back_projection(sinogram: Sinogram, filter_name: str = "ramp") -> n
     """Attenuation that has these projections, on the sinogram's grid: (nx, ny, nz) float64, 1/m.
 
     Each slice is computed by scikit-image's `iradon` with linear interpolation between pixels. Values in air scatter
-    about 0 and may be negative. Edges are blurred by about a voxel, and ring.
+    about 0 and may be negative. Edges are blurred by about a voxel, and show ringing.
 
     Parameters
     ----------

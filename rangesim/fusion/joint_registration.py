@@ -33,14 +33,15 @@ BORDER_PX = 3
 """Distance in pixels from a border or a failed pixel within which readings are not used, because normals and
 interpolated depths are wrong there."""
 MIN_COSINE = 0.3
-"""Smallest cosine (a ratio) of the angle between the normals of two partners, and of the angle of incidence. It is that
-of 73 degrees, because readings beyond are inaccurate, and partners beyond lie on different surfaces."""
+"""Smallest cosine (a ratio) of the angle between the normals of two partners, and of the angle of incidence. It is the
+cosine of 73 degrees, because readings at larger angles of incidence are inaccurate, and partners with a larger angle
+between them lie on different surfaces."""
 TUKEY = 4.685
 """Standard deviations beyond which a residual has the weight 0: the standard value, which gives 95 % efficiency for
 normally distributed errors (Holland, Welsch 1977)."""
 MAX_ROUNDS = 30
-"""Largest number of Gauss-Newton steps. The fit normally ends earlier, see `CONVERGED`; the count is limited so that
-poses which go to and fro end, too."""
+"""Largest number of Gauss-Newton steps. The fit normally ends earlier, see `CONVERGED`; the count is limited so that a
+fit whose poses go to and fro ends, too."""
 CONVERGED = 1e-7
 """Largest entry of a step at which the fit ends: radians, and metres as a fraction of the size of the scene. It is
 chosen far below the errors of the poses, so a larger value would save a step or two."""
@@ -88,7 +89,7 @@ def refine_jointly(images: Sequence[RangeImage], poses: Array, reach_m: float, s
     images : the views; their own poses are not used.
     poses : (n, 4, 4), metres, T_world_camera, first guess.
     reach_m : metres, largest distance between the surfaces of two views under the first guess.
-    seed : of the random readings that are fitted; the same seed gives the same poses.
+    seed : seed of the random readings that are fitted; the same seed gives the same poses.
 
     Raises
     ------

@@ -61,7 +61,7 @@ def surface_error(
     threshold_m : metres, distance up to which the measured surface counts as right (precision), and the true surface as
         found (recall).
     samples : number of points on each surface.
-    seed : of the random points; the same seed gives the same points.
+    seed : seed of the random points; the same seed gives the same points.
 
     Raises
     ------

@@ -44,25 +44,25 @@ from rangesim.settings.bounds import whole as whole_number
 from rangesim.settings.config import ShortRepr, shown
 
 POINTS_PER_VIEW = 4000
-"""Number of points of each view that are registered, about, if no spacing is given. More take longer, and fewer lose
-the small features from which a pose can be told."""
+"""Approximate number of points of each view that are registered, if no spacing is given. More points take longer; with
+fewer, the small features that determine a pose are lost."""
 MIN_POINTS = 200
 """Smallest number of points of a view, because fewer rarely show enough of a shape to find its pose."""
 DOMINANT_FRACTION = 0.5
-"""Fraction of a view's points from which on a plane is removed. It has to be the majority: a smaller plane does not
-keep the rest from being registered."""
+"""A plane is removed if it has at least this fraction of a view's points. It has to be the majority: a smaller plane
+does not prevent the registration of the rest."""
 MAX_PLANES = 3
 """Largest number of planes that are removed from a view: a corner of a room has three. A view with more dominant planes
 than that has no object left."""
 MAX_STEPS_BACK = 3
-"""Number of views before a view that it may be registered to. More could bridge a longer gap, but each failed
+"""Number of views before a view to which this view may be registered. More could bridge a longer gap, but each failed
 registration takes seconds (docs/fusion.md)."""
 MIN_OVERLAP = 0.3
 """Smallest fraction of the smaller view's points that lie on the other view, for a pair in the chain. It is a little
 below the third that `align` asks for, so that views taken as asked are not refused."""
 NEAR_SPACINGS = 6.0
-"""Distance within which points of two views belong to one surface, when the chain places the views, in spacings of the
-points. It is large because errors add up along the chain."""
+"""Distance, in spacings of the points, within which points of two views belong to one surface when the chain places the
+views. It is large because errors add up along the chain."""
 MIN_LOOP_OVERLAP = 0.5
 """Smallest overlap of a loop, as a fraction like `MIN_OVERLAP`. Pairs with less overlap pull each other's borders
 together, and add little, because the chain holds the views already."""
@@ -71,8 +71,8 @@ MAX_DISAGREEMENT_SPACINGS = 2.0
 points. A larger limit keeps wrong loops; a smaller one leaves out good ones, because ICP is exact to a fraction of the
 spacing only."""
 THROUGH_SPACINGS = 4.0
-"""Distance by which a point has to be in front of another view's surface to contradict it, in spacings of the points,
-besides 1 % of the depth. It is large because readings are noisy and poses have errors."""
+"""Distance, in spacings of the points, by which a point has to be in front of another view's surface to contradict it.
+To this, 1 % of the depth is added. It is large because readings are noisy and poses have errors."""
 MAX_CONTRADICTION = 0.15
 """Largest fraction of a view's points that another view may look through. It is not zero because edges and ghosts are
 looked through, too; a wrong pose makes it large."""
@@ -110,7 +110,7 @@ class Alignment(ShortRepr):
     """Result of `align`: the views of a scan with their poses.
 
     scan : the views with the poses that were found. The first view keeps its pose, which defines the world.
-    pairs : the pairs of views that the poses follow from.
+    pairs : the pairs of views from which the poses follow.
     spacing_m : metres, distance between the points that were registered.
     unchecked : numbers of the views that are in no loop: their pose follows from a single pair, which nothing confirms.
     """
@@ -137,7 +137,7 @@ def align(scan: Scan, spacing_m: float | None = None, *, seed: int = 0) -> Align
     ----------
     scan : the views in order.
     spacing_m : metres, distance between the points that are registered; None: a view has about 4000 points.
-    seed : of the random samples; the same seed gives the same poses, up to the rounding of Open3D's parallel sums.
+    seed : seed of the random samples; the same seed gives the same poses, up to the rounding of Open3D's parallel sums.
 
     Raises
     ------
@@ -343,7 +343,7 @@ def _why(reasons: dict[int, str]) -> str:
     """Message that a view fits none of the views before it, with the reason for the nearest of them.
 
     reasons : message of the failed registration by number of the view, the nearest view first. The advice after a
-    message's semicolon is left out, as it holds for two clouds alone.
+    message's semicolon is left out, because it only holds for a single pair of clouds.
     """
     (nearest, reason), *others = reasons.items()
     what = reason.partition("; ")[0].rstrip(".")

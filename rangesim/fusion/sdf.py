@@ -17,12 +17,12 @@ building complex models from range images", SIGGRAPH 1996; Newcombe et al.: "Kin
     r_i = min(1, (t - sdf_i(X)) / (t - h))
 
 A view says nothing about points more than t behind its surface, because they are hidden. The ramp r is that of Bylow
-et al. ("Real-time camera tracking and 3D reconstruction using signed distance functions", RSS 2013). It decreases the
-weight from one voxel h behind the surface on. Without it, a view would push the far side of an object outward near its
-silhouette, although it does not see the far side. Points more than t in front of the surface are free and count as -t.
-So views that look through a ghost of another view outvote it.
+et al. ("Real-time camera tracking and 3D reconstruction using signed distance functions", RSS 2013). The weight
+decreases from one voxel h behind the surface on. Without the ramp, a view would push the far side of an object outward
+near its silhouette, although it does not see the far side. Points more than t in front of the surface are free and
+count as -t. So views that look through a ghost of another view outvote it.
 
-`rangesim.fusion.fuse` computes the same on sparse blocks of voxels and is tested against this module, which is good
+`rangesim.fusion.fuse` computes the same on sparse blocks of voxels and is tested against this module, which is meant
 for small grids.
 """
 
@@ -49,11 +49,11 @@ MAX_DEPTH_STEP = 0.02
 interpolated only between such pixels, because values between the two sides of an edge lie on neither surface. A smaller
 step interpolates less on slanted surfaces."""
 MEDIAN_READINGS = 20_000
-"""Number of readings of a view from which the median weight is taken, about. More would cost time alone: the median of
-20 000 readings is known to a percent of their spread."""
+"""Approximate number of readings of a view from which the median weight is taken. More would only cost time: the median
+of 20 000 readings is known to a percent of their spread."""
 MIN_INCIDENCE_COSINE = 0.1
-"""Smallest cosine of the angle of incidence, no unit: readings beyond 84 degrees get the weight 0, because small errors
-of pixel or depth are large errors of the surface there."""
+"""Smallest cosine of the angle of incidence, no unit: readings beyond 84 degrees get the weight 0, because there, small
+errors of pixel or depth cause large errors of the surface."""
 
 
 def signed_distance(

@@ -24,12 +24,12 @@ from rangesim.triangle_mesh import TriangleMesh
 SAMPLES = 20_000
 """Number of points on the true surface of each shape; the seen fraction then has a standard error of 0.4 % at most."""
 MAX_SLANT_TOLERANCES = 4.0
-"""Largest difference of depth between a reading and a slanted face that it still belongs to, in multiples of
-`tolerance_m`. At 75 degrees of incidence, it is a distance of one tolerance to the face's plane. A larger value would
-count readings of other surfaces, a smaller one fewer slanted faces."""
+"""Largest difference of depth, in multiples of `tolerance_m`, at which a reading still belongs to a slanted face. At 75
+degrees of incidence, this is a distance of one tolerance from the face's plane. A larger value would count readings of
+other surfaces, a smaller one fewer slanted faces."""
 MIN_VIEW_COSINE = 0.05
-"""Smallest cosine of the angle of incidence, no unit, at which a view may see a surface: up to 87 degrees. Beyond, a
-pixel covers so much of a face that its reading says nothing of a single place."""
+"""Smallest cosine of the angle of incidence, no unit, at which a view may see a surface: up to 87 degrees. At a larger
+angle, a pixel covers so much of a face that its reading says nothing about a single place."""
 VOXELS_AT_ONCE = 1 << 21
 """Number of voxels that are compared with the views in one step, so that a step needs some hundred megabytes."""
 
@@ -109,7 +109,7 @@ def occupancy(
         closed shapes overlap, the later one counts.
     grid : voxels on which views and shapes are compared.
     tolerance_m : metres, distance within which a reading belongs to a surface; None: a voxel.
-    seed : of the random points on surfaces; the same seed gives the same points.
+    seed : seed of the random points on surfaces; the same seed gives the same points.
 
     Raises
     ------

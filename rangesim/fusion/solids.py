@@ -160,7 +160,8 @@ def outermost_first(solids: Sequence[Solid]) -> list[Solid]:
 
 
 def steps_of_attenuation(solids: Sequence[Solid]) -> list[float]:
-    """Step of attenuation at the surface of each solid, in 1/m: its own less that of the solid around it, or of air.
+    """Step of attenuation at the surface of each solid, in 1/m: its own attenuation minus that of the solid around it,
+    or of air.
 
     The line integral of the attenuation is the sum over the solids of this step times the chord through the solid.
     """

@@ -42,15 +42,15 @@ BLOCK = 8
 empty voxels, smaller ones need more entries in the hash table."""
 TILE = 8
 """Pixels along the edge of a tile. The farthest reading of each tile tells quickly which blocks are hidden. The value
-changes time alone."""
+changes only the time."""
 MAX_BLOCKS = 1 << 21
 """Largest count of blocks along an axis, so that three indices of 21 bits fit into one integer of 63 bits."""
 TRUNCATION_VOXELS = 3.0
 """Default truncation distance in voxels. Smaller ones cut off the noise of readings, which makes the surface rougher;
 larger ones spoil thin walls that are seen from both sides."""
 SPACING_STEP = 7
-"""Step in pixels between the readings whose median depth gives the distance between readings. More readings would cost
-time alone, because the check of `voxel_m` is a coarse one."""
+"""Step in pixels between the readings whose median depth gives the distance between readings. More readings would only
+cost time, because the check of `voxel_m` is a coarse one."""
 WIDE_TRUNCATION_VOXELS = 8.0
 """Truncation distance in voxels beyond which blocks are searched around fewer points, so that the search stays short;
 the search radius is then larger by their distance, so no block is missed."""
@@ -100,7 +100,7 @@ def fuse(
     The formula and its sources stand in `rangesim.fusion.sdf`. Wrong readings on glass and mirrors differ from view to
     view: they are faint, or no other view confirms them, or other views look through them. So their weight stays below
     `min_weight`, and the mesh has holes there. If many views have the same wrong reading, such as a table seen through
-    glass, it becomes a surface like any other.
+    glass, this reading becomes a surface like any other.
 
     Parameters
     ----------

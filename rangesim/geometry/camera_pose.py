@@ -37,7 +37,7 @@ POSE_PARAMETERS = 6
 """Number of parameters of a pose: three of the rotation and three of the translation."""
 
 MAX_PLANAR_FRACTION = 1e-3
-"""Ratio of the third principal extent of the points to the first up to which they are also treated as a plane. The
+"""Largest ratio of the third principal extent of the points to the first at which they are also treated as a plane. The
 solver for planes then adds starts, and the other solvers still run, so that a larger value costs only time and a
 smaller one may miss the second tilt of a target that is not quite flat."""
 
@@ -50,8 +50,8 @@ TRIPLES = 20
 solvers fail and noise spoils the first triples."""
 
 STARTS = 6
-"""Number of different starts from which the reprojection error is minimised: the best by that error. P3P has up to four
-solutions and a plane two, so that six leave room for both."""
+"""Number of different starts from which the reprojection error is minimised: those with the smallest error. P3P has up
+to four solutions and a plane two, so that six leave room for both."""
 
 SAME_POSE = 1e-3
 """Difference in radians, and as a ratio to the distance, up to which two minima are one and the same pose, because

@@ -19,7 +19,7 @@ from rangesim.rig import Intrinsics, Rig
 
 MAX_ITERATIONS = 20
 """Largest number of iterations for the projector coordinate that was not decoded. It matters only through the lens
-distortion, so that a few iterations usually converge; the limit ends those of pixels that never do."""
+distortion, so that a few iterations usually suffice; the limit ends the iterations of pixels that never converge."""
 
 CONVERGED_PX = 1e-4
 """Largest change of that coordinate, in projector pixels, at which the iterations end. A smaller change does not
@@ -64,9 +64,9 @@ def triangulate_coordinates(
 
     Let a = R^T d be the camera ray d and b = -R^T t the camera centre, both in projector coordinates. The point at
     depth z has the inverse depth w = 1 / z and projects to x_p = (a_x + w b_x) / (a_z + w b_z): a point of the epipolar
-    line through a and b. The column x_p and the row y_p each give one linear equation for w, that of a ray that meets a
-    plane. If both are given, they are first moved to the nearest place on the epipolar line, in projector pixels,
-    where the two equations agree. This is the maximum likelihood for errors of the same size in column and row.
+    line through a and b. The column x_p and the row y_p each give one linear equation for w: the equation of a ray that
+    meets a plane. If both are given, they are first moved to the nearest place on the epipolar line, in projector
+    pixels, where the two equations agree. This is the maximum likelihood for errors of the same size in column and row.
 
     The relative error is z / |dx_p/dw| with dx_p/dw = f (b_x - x_p b_z) / (a_z + w b_z), both axes added in quadrature,
     without the lens distortion.
@@ -166,7 +166,7 @@ def _complete(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Both projector pixel coordinates (u, v), and the largest change of the one that was not decoded, in pixels.
 
-    That one is found by projecting `point` (3, n), in projector coordinates.
+    The coordinate that was not decoded is found by projecting `point` (3, n), in projector coordinates.
     """
     old = u if columns_missing else v
     new = projector.project(point.T)[:, 0 if columns_missing else 1]

@@ -32,8 +32,8 @@ planes and rotations it is only nominal, because a fundamental matrix fits their
 parameters says: at a level of 1e-3, up to five times as many passed (measured)."""
 
 MAX_ROUNDS = 20
-"""Largest number of times that a model is fitted and its inliers are chosen again. Sets that stay or return end sooner,
-so this is only a bound for sets that keep changing."""
+"""Largest number of times that a model is fitted and its inliers are chosen again. A set that stays the same or comes
+back ends the rounds sooner, so this bound is only for sets that keep changing."""
 
 MAX_EXCESS = 3.0
 """Largest ratio of the residuals to the stated noise. Nobody measured it: three times leaves room for a noise that is
@@ -65,7 +65,7 @@ def inlier_threshold(noise_px: float, dimensions: int) -> float:
     Parameters
     ----------
     noise_px : standard deviation of one coordinate.
-    dimensions : number of coordinates that the error is the length of.
+    dimensions : number of coordinates of the vector whose length is the error.
     """
     return float(noise_px * np.sqrt(special.chdtri(dimensions, 1.0 - INLIER_PROBABILITY)))
 
@@ -77,7 +77,7 @@ def consistent_set(
     error: Callable[[Model], Array],
     least: int,
 ) -> tuple[Model, np.ndarray]:
-    """A model and its (n,) bool inliers that agree: the fit to the inliers has these inliers.
+    """A model and its (n,) bool inliers: the model fitted to these inliers has exactly these inliers.
 
     Model and inliers are found in turns until the set of inliers no longer changes.
 
@@ -103,9 +103,9 @@ def consistent_set(
 def agree_by_chance(agreeing: int, total: int, minimal: int, probability: float) -> bool:
     """Whether `agreeing` of `total` correspondences are no more than the best model of wrong correspondences has.
 
-    A model through a minimal set of `minimal` correspondences fits these exactly. It fits each other, wrong one by
-    accident with the given probability. Noise alone lets C(total, minimal) P(at least agreeing - minimal) such models
-    be expected over all minimal sets. If that number exceeds `SIGNIFICANCE`, the agreement may be chance.
+    A model through a minimal set of `minimal` correspondences fits these exactly. It fits each of the other, wrong ones
+    by accident with the given probability. With noise alone, one expects C(total, minimal) P(at least agreeing -
+    minimal) such models over all minimal sets. If that number exceeds `SIGNIFICANCE`, the agreement may be chance.
     """
     if agreeing <= minimal:
         return True

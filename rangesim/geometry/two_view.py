@@ -68,45 +68,45 @@ ROTATION_PARAMETERS = 3
 
 MIN_IMAGE_EXTENT = 0.05
 """Least size of image coordinates by which `_checked_F` scales F. F may be given for pixels or for coordinates in units
-of the focal length, so that the size is guessed from F itself, between this value (a lens of about 6 degrees in units
-of its focal length) and `MAX_IMAGE_EXTENT`."""
+of the focal length, so the size is guessed from F itself. The guess lies between this value (a lens of about 6 degrees
+in units of its focal length) and `MAX_IMAGE_EXTENT`."""
 
 MAX_IMAGE_EXTENT = 1e5
 """Largest size of image coordinates, in pixels, by which `_checked_F` scales F, because no image is larger; see
 `MIN_IMAGE_EXTENT`."""
 
 SINGLE_ROUNDING = 1e-6
-"""Ratio of the border of F to its upper left block up to which the border is rounding. It is the relative error of a
-few operations in single precision, because other programs may have computed F in it."""
+"""Largest ratio of the border of F to its upper left block at which the border is only rounding. It is the relative
+error of a few operations in single precision, because other programs may have computed F in single precision."""
 
 MIN_SECOND_SINGULAR = 1e-12
 """Ratio of the second singular value of F to the first below which F has rank 1, so that it is refused. It lies well
 above the rounding of double precision, 2e-16."""
 
 MAX_THIRD_SINGULAR = 1e-6
-"""Ratio of the third singular value of F to the first up to which F has rank 2. It is the rounding of single precision,
-because other programs may have computed F in it."""
+"""Largest ratio of the third singular value of F to the first at which F has rank 2. It is the rounding of single
+precision, because other programs may have computed F in single precision."""
 
 MAX_ESSENTIAL_ERROR = 1e-3
-"""Largest ratio, to the first singular value of an essential matrix, of the difference of the first two and of the
-third. It is so large because other programs may have estimated the matrix without this constraint or written it with
-four digits; the nearest essential matrix is then used."""
+"""Largest error of the singular values of an essential matrix, as a ratio to the first one. It bounds the difference of
+the first two, and the third. It is so large because other programs may have estimated the matrix without this
+constraint or written it with four digits; the nearest essential matrix is then used."""
 
 MAX_OFF_PLANE_LINES = 5
-"""Number of points off a plane along whose lines other epipoles are tried: those with the largest parallax, because
-their lines are known best. Each costs 90 evaluations of all pairs."""
+"""Number of points off a plane whose lines are searched for other epipoles: the points with the largest parallax,
+because their lines are known best. Each point costs 90 evaluations of all pairs."""
 
 EPIPOLES_PER_LINE = 90
 """Number of epipoles tried along such a line: one every 2 degrees of its directions in normalised coordinates, so that
 none of the families of F falls between two of them. The time grows with the number."""
 
 DIFFERENT_F = 0.02
-"""Difference of an entry of F, as a ratio to the norm of F in normalised coordinates, from which on two minima are
+"""Smallest difference of an entry of F, as a ratio to the norm of F in normalised coordinates, at which two minima are
 different matrices. Descents that end in the same minimum differ far less."""
 
 MAX_STANDARD_DEVIATION = 0.3
 """Largest standard deviation of F, as a ratio to its norm in normalised coordinates. At a ratio of 1, F is unknown;
-beyond a third, the noise determines F rather than the points. Nobody measured a closer limit."""
+beyond a third, the noise determines F more than the points do. Nobody measured a closer limit."""
 
 
 # ------------------------------------------------------------------------------------------- from cameras
@@ -164,8 +164,8 @@ def centred_cameras(p: Array, q: Array) -> tuple[Array, Array, Array]:
 
 SHIFT_ROUNDING = 64 * float(np.finfo(np.float64).eps)
 """Rounding of the last column of a camera matrix, as a ratio to the distance from the origin to the camera. It is 64
-times the rounding unit of double precision: that of the column as given and of the operations that move it. A larger
-value takes cameras at map coordinates that stand close together for one."""
+times the rounding unit of double precision. This covers the rounding of the column as given and of the operations that
+move it. With a larger value, two cameras that stand close together at map coordinates count as one."""
 
 
 def essential_from_pose(T_second_first: ArrayLike) -> Array:
@@ -466,8 +466,9 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
         freedom = len(a) - FUNDAMENTAL_PARAMETERS
         if apart > DIFFERENT_F and consensus.is_as_likely(*costs, freedom, noise_px, rounding):
             raise ValueError(
-                f"expected points with one fundamental matrix, got {len(a)} pairs that two explain within their noise: "
-                "the points lie on a surface that contains both centres, or are few; add points at other depths."
+                f"expected points with one fundamental matrix, got {len(a)} pairs that two such matrices explain within "
+                "their noise: the points lie on a surface that contains both centres, or are few; add points at "
+                "other depths."
             )
     _refuse_open_epipole(a, b, from_a, from_b, found, scale, max(noise, rounding))
     in_tangent = found.covariance(max(noise * scale, 1e-300))
@@ -716,8 +717,8 @@ def fit_relative_pose(
         if consensus.is_as_likely(other.cost, best.cost, freedom, noise_px, rounding):
             angle = np.degrees(_angle(other.state[:3, :3] @ best.state[:3, :3].T))
             raise ValueError(
-                f"expected points with one relative pose, got two that explain them within their noise, {angle:.1f} "
-                "degrees apart: they lie on a plane, or are few; add points off it."
+                "expected points with one relative pose, got two poses that explain them within their noise, "
+                f"{angle:.1f} degrees apart: they lie on a plane, or are few; add points off it."
             )
     consensus.refuse_misfit(best.cost, freedom, noise_px, "a relative pose")
     noise = best.noise(RELATIVE_POSE_PARAMETERS) if noise_px is None else noise_px
@@ -798,14 +799,14 @@ _DEPENDENT = (
 )
 MIN_IN_FRONT = 0.75
 """Least fraction of the points that must lie in front of both cameras. The others may be so far away that noise puts
-them beyond infinity, which is behind the cameras. Below half another of the four poses has more points in front; nobody
-measured a closer value."""
+them beyond infinity, which is behind the cameras. Below a half, another of the four poses has more points in front.
+Nobody measured a closer value."""
 
 
 def _refuse_homography(a: Array, b: Array, cost: float, parameters: int, noise_px: float | None) -> None:
     """Raise ValueError if a homography explains the pairs a, b (n, 2) within their noise.
 
-    The full model, which does too, has that number of `parameters` and the sum of squares `cost` in px^2.
+    The full model explains them too. It has that number of `parameters` and the sum of squares `cost` in px^2.
     """
     n, rounding = len(a), consensus.rounding_of(np.concatenate([a, b]))
     simple = homography_error(a, b), 2 * n - HOMOGRAPHY_PARAMETERS
@@ -872,7 +873,7 @@ def _refuse_open_epipole(
 def _refuse_rotation(a: Array, b: Array, K_first: Array, K_second: Array, cost: float, noise_px: float | None) -> None:
     """Raise ValueError if a rotation alone explains the pairs a, b (n, 2) within their noise.
 
-    The relative pose, which does too, has the sum of squares `cost` in px^2.
+    The relative pose explains them too, with the sum of squares `cost` in px^2.
     """
     n, rounding = len(a), consensus.rounding_of(np.concatenate([a, b]))
     simple = rotation_homography_error(a, b, K_first, K_second), 2 * n - ROTATION_PARAMETERS
@@ -1088,7 +1089,7 @@ def _starting_poses(a: Array, b: Array, K_first: Array, K_second: Array) -> list
     found.sort(key=lambda E: float(np.nansum(np.minimum(_sampson(E, ha, hb)[0] ** 2, 1e-2))))
     starts: list[Array] = []
     for E in found:
-        T = _poses_of(E)[0]  # the solver's E is essential to some digits only, which suffices for a start
+        T = _poses_of(E)[0]  # the solver's E is accurate to a few digits only, which is enough for a start
         if all(
             np.abs(essential_from_pose(T) - s * essential_from_pose(other)).max() > DIFFERENT_E
             for other in starts

@@ -6,8 +6,8 @@ them: it minimises d^2(x, x^) + d^2(x', x'^) subject to x'^^T F x^ = 0, which is
 Gaussian noise in both views. The linear and the midpoint method are simpler and never better; they are here for
 comparison.
 
-Hartley, Sturm: "Triangulation", CVIU 1997, find the minimum over all epipolar lines by the roots of a polynomial.
-Lindstrom: "Triangulation made easy", CVPR 2010, finds it by a few steps of a quadratic equation, hundreds of times as
+Hartley and Sturm ("Triangulation", CVIU 1997) find the minimum over all epipolar lines by the roots of a polynomial.
+Lindstrom ("Triangulation made easy", CVPR 2010) finds it by a few steps of a quadratic equation, hundreds of times as
 fast. Both find the same minimum except for points near an epipole, where there are several. There a search over all
 epipolar lines decides.
 
@@ -45,12 +45,12 @@ MAX_CORRECTION_STEPS = 20
 the search over all epipolar lines."""
 
 PARALLEL_RAD = 1e-12
-"""Angle between two rays, in radians, up to which they are parallel. It is far above rounding, 1e-16, and a billionth
-of a pixel for a focal length of 1000 px, so that no measured pixels distinguish it from 0."""
+"""Angle between two rays, in radians, up to which they are parallel. It is far above rounding, 1e-16, and corresponds
+to a billionth of a pixel for a focal length of 1000 px, so that no measured pixels distinguish it from 0."""
 
 UNIFORM_ANGLES = 64
 """Number of angles that the search samples evenly over all epipolar lines. It need not be large, because narrow minima
-lie near the two zeros, which are sampled apart."""
+lie near the two zeros (of the distance in either view), which are sampled separately."""
 
 ANGLES_BESIDE_ZERO = 40
 """Number of angles that the search samples on either side of each zero, from 1e-8 to 1.5 rad in geometric steps of a

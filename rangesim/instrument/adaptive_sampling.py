@@ -53,7 +53,8 @@ class AdaptiveSampling(Sampler):
     ----------
     instruments : instruments whose detectors, exposures and decoders give the readings and the detectors' noise.
     max_spp : int >= 1, largest number of samples of a pixel.
-    fraction : positive, largest ratio of the standard deviation of a reading by sampling to that by the detector.
+    fraction : positive, largest ratio of the standard deviation of a reading that sampling causes to the one that the
+    detector causes.
     ambient : Ambient, as for `rangesim.expose`.
 
     Raises

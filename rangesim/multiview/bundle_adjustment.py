@@ -65,22 +65,22 @@ MAX_ROTATION_DEVIATION = 0.3
 """Largest standard deviation of a rotation, radians. Beyond about 17 degrees the covariance, which is linear in the
 rotation, means little, and the pose counts as undetermined."""
 MAX_RELATIVE_DEVIATION = 0.5
-"""Largest standard deviation of a point over its distance from the nearest camera, a ratio. From half of the distance
-on, two standard deviations reach the camera, and the point has no depth."""
+"""Largest standard deviation of a point over its distance from the nearest camera, a ratio. If it is half of the
+distance or more, two standard deviations reach the camera, and the point has no depth."""
 ONE_PLACE = 1e-6
-"""Extent of the start's cameras over the median distance of the points, a ratio. Below it the cameras count as being in
-one place. It only has to exceed rounding: what noise leaves open is found after the descent."""
+"""Smallest extent of the start's cameras over the median distance of the points, a ratio. Below it, the cameras count
+as being in one place. It only has to exceed rounding: what noise leaves open is found after the descent."""
 MIN_IMAGES = 2
-"""Smallest number of images, and of images that see a point, a count: two, because one image has no depth."""
+"""Smallest number of images, and of images that see a point, a count: two, because one image gives no depth."""
 MAX_SHAPE_DEVIATION = 0.5
 """Largest standard deviation of the median point over the extent of the points, a ratio. A shape that is known less
 well is refused: its errors would be as large as half of the shape."""
 SHAPE_SAMPLE = 200
-"""Number of points whose joint covariance gives the deviation of the shape, about. Its matrix has three rows for each;
-twice the points take eight times the time."""
+"""Approximate number of points whose joint covariance gives the deviation of the shape. The covariance matrix has three
+rows for each point; twice the points take eight times the time."""
 TESTED_OBSERVATIONS = 30_000
-"""Number of observations, about, in the F test against cameras that only rotate. It bounds the time of the test; fewer
-observations make it weaker for cameras that hardly move."""
+"""Approximate number of observations in the F test against cameras that only rotate. It bounds the time of the test;
+fewer observations make it weaker for cameras that hardly move."""
 ROTATION_ROUNDS = 10
 """Number of rounds that find rotations and mean directions in turns, a count. They give the start of a descent.
 Measured with 3 scenes of 12 images, rotations off by 0.02 rad: without a round the descent takes 3 steps, after 1 to 30
@@ -98,7 +98,7 @@ class ReliefTest:
     """The thresholds of the search for a shape of another depth that explains the same images."""
 
     max_relief: float = 0.1
-    """Median depth of the shape over its distance from the cameras, a ratio. A deeper shape shows its depth by
+    """Largest median depth of the shape over its distance from the cameras, a ratio. A deeper shape shows its depth by
     perspective and is not tested."""
     max_turn_rad: float = float(np.radians(20))
     """Largest angle between a camera's direction and the mean direction, radians. Where a camera turns more, the turns
@@ -508,8 +508,8 @@ def _refuse_other_relief(
     Without perspective and under small turns w, the images only show the product of w and depth (the bas-relief
     ambiguity: Belhumeur, Kriegman, Yuille, IJCV 1999). The sum of squares then has a long curved valley. Noise makes
     minima in it, and at such a minimum the covariance looks good although the valley goes on. So new descents start
-    from shapes of other depth. Where one ends with a sum of squares that is larger by r noise^2, its points may be away
-    by `max_deviations` times sqrt(r) stated deviations, not more. Only flat scenes that are seen from nearly one
+    from shapes of other depth. Where a descent ends with a sum of squares that is larger by r noise^2, its points may
+    lie at most `max_deviations` times sqrt(r) stated deviations away. Only flat scenes that are seen from nearly one
     direction are tested.
     """
     known = np.isfinite(found.points).all(axis=1)

@@ -132,8 +132,8 @@ class OrthographicFactorisation:
     noise_px : standard deviation of a pixel's coordinate.
 
     Without perspective, a shape and the shape with all depths of the opposite sign look alike (Necker reversal), so
-    `reversed` is an equally good solution. In this one, the first image that is turned has R[0, 2] > 0, a positive
-    angle about the vertical axis; if it is turned about the horizontal axis alone, it has R[1, 2] > 0.
+    `reversed` is an equally good solution. In the solution that is returned, the first image that is turned has R[0, 2]
+    > 0, a positive angle about the vertical axis; if it is turned about the horizontal axis alone, it has R[1, 2] > 0.
 
     Examples
     --------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Structure from motion of a shape that deforms: each image combines K basis shapes with other coefficients.
+"""Structure from motion of a shape that deforms: each image combines K basis shapes with its own coefficients.
 
     x_ij = P R_i (B_0j + sum_k c_ik B_kj) + t_i,    k = 1 ... K - 1,    P = [1 0 0; 0 1 0]
 
@@ -19,8 +19,8 @@ coefficients and 9 K^2 entries, minus 3 + K (K - 1) of gauge: 240 equations for 
 finds G, R_i and c_i at once, as a non-rigid shape of 3 K virtual points, which are the columns of the decomposition. It
 takes some milliseconds for each of several starts, and the first start is the best rigid shape. If observations are
 missing, the decomposition at rank 3 K has wrong minima, with 10 images more often than not. Then the points themselves
-take the place of the virtual points, and a rigid factorisation is the start. The result is the best one so far as soon
-as a start agrees with it.
+take the place of the virtual points, and a rigid factorisation is the start. The search ends as soon as a start agrees
+with the best result so far, and returns this result.
 
 Some inputs do not determine the result: fewer images than the rank needs, fewer basis shapes in the tracks than asked
 for, images that do not turn. These raise an error. A rigid motion of the whole shape and a deformation that looks the
@@ -61,7 +61,7 @@ from rangesim.multiview.tracks import Tracks
 from rangesim.settings.config import shown
 
 STARTS = 20
-"""Largest number of starts of the metric upgrade, a count; if no two agree by then, it raises an error. Measured with
+"""Largest number of starts of the metric upgrade, a count; if no two of them agree, an error is raised. Measured with
 24 sets of 50 points in 10 images at K = 4, half of them with 10 % missing: 3 to 7 starts are needed."""
 START_STEPS = 120
 """Largest number of steps from each start, a count. A start need not converge, because the best one goes on from there;
@@ -71,7 +71,7 @@ START_TURN_RAD = 0.3
 radians. Smaller turns end in the same minimum again; larger ones are no better than random rotations."""
 SAME_SHAPE_COST = 1e-4
 """Relative difference of the sums of squares of two starts, a ratio, below which they agree. It is larger than 1e-9,
-from which on a descent from a start counts as ended."""
+the relative decrease at which a descent from a start counts as ended."""
 MAX_SHAPE_DEVIATION = 0.5
 """Largest standard deviation of the median coordinate over the extent of the mean shape, a ratio. A shape that is known
 less well is refused: its errors would be as large as half of the shape."""
@@ -133,7 +133,7 @@ def count_unknowns(n_images: int, n_points: int, n_basis: int, *, has_scale: boo
     Raises
     ------
     ValueError
-        A number is not an integer from 1 on.
+        A number is not an integer of 1 or more.
 
     Examples
     --------
@@ -257,10 +257,10 @@ def adjust_nonrigid(
     Parameters
     ----------
     tracks, n_basis, noise_px, seed : see `factorise_nonrigid`.
-    prior : a `TemporalPrior`, or "estimated". This takes `shape_bend_px` from the factorisation: the root mean square
-        of the second differences, over the half of the points that the tracks determine best, times sqrt((n_images - 2)
-        / (K - 1)). The factor is there because K - 1 basis shapes make all n_images - 2 second differences of a point,
-        so that these are not independent.
+    prior : a `TemporalPrior`, or "estimated". The estimated prior takes `shape_bend_px` from the factorisation: the
+        root mean square of the second differences, over the half of the points that the tracks determine best, times
+        sqrt((n_images - 2) / (K - 1)). The factor is there because K - 1 basis shapes make all n_images - 2 second
+        differences of a point, so that these are not independent.
 
     Raises
     ------

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Least squares for images without perspective of a shape, rigid or deforming.
+"""Least squares for images, without perspective, of a rigid or a deforming shape.
 
     x_ij = s_i P R_i (B_0j + sum_k c_ik B_kj) + t_i,    P = [1 0 0; 0 1 0]
 
 Each image i has a rotation R_i, a translation t_i in pixels, K - 1 coefficients c_i and, under weak perspective, a
 scale s_i; s_i = 1 is orthographic. Each point j has K basis shapes B_kj, and K = 1 is a rigid body. The model is linear
 in the points. So after each step of the images, the points are set to those that fit best (variable projection: Golub,
-Pereyra 1973). It then converges from farther away (Okatani, Yoshida, Deguchi: "Efficient algorithm for low-rank matrix
-factorization with missing components", ICCV 2011).
+Pereyra 1973). The descent then converges from farther away (Okatani, Yoshida, Deguchi: "Efficient algorithm for
+low-rank matrix factorization with missing components", ICCV 2011).
 
 Used by: `factorisation` and `nonrigid` of `rangesim.multiview`; no other module of rangesim.
 """

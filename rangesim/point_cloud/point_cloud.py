@@ -45,8 +45,8 @@ class PointCloud(ShortRepr):
     points : (h, w, 3) or (n, 3) float32, metres, in `coordinates`; NaN where there is no point. They are float64 in
         world coordinates if the camera is more than `FAR_M` from the origin.
     coordinates : "camera" (OpenCV: x right, y down, z forward) or "world".
-    normals : (..., 3) float32, unit vectors towards the camera, in `coordinates`; NaN where unknown; 0 instead in what
-        `finite` returns. None: not known.
+    normals : (..., 3) float32, unit vectors towards the camera, in `coordinates`; NaN where unknown, but 0 in the
+    result of `finite`. None: not known.
     intensity : (...) float32, in the units of the capture's frames. None: not known.
     colors : (..., 3) uint8, RGB. None: not known.
     confidence : (...) float32 in 0..1, see `RangeImage`. None: not known.
@@ -117,7 +117,7 @@ class PointCloud(ShortRepr):
 
     def to_open3d(self) -> Any:
         """`open3d.geometry.PointCloud` of the finite points, with normals and colours; where the cloud has no colours,
-        they are grey by its intensity."""
+        its intensity gives grey values."""
         import open3d
 
         finite = self.finite()

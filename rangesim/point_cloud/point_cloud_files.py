@@ -30,7 +30,7 @@ def save_point_cloud(cloud: PointCloud, path: str | Path) -> None:
     Raises
     ------
     ValueError
-        The suffix is another, or the cloud has no finite point.
+        The path has another suffix, or the cloud has no finite point.
     FileFormatError
         The place cannot be written.
     """
