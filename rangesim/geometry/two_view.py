@@ -466,8 +466,8 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
         freedom = len(a) - FUNDAMENTAL_PARAMETERS
         if apart > DIFFERENT_F and consensus.is_as_likely(*costs, freedom, noise_px, rounding):
             raise ValueError(
-                f"expected points with one fundamental matrix, got {len(a)} pairs that two such matrices explain within "
-                "their noise: the points lie on a surface that contains both centres, or are few; add points at "
+                f"expected points with one fundamental matrix, got {len(a)} pairs that two such matrices explain "
+                "within their noise: the points lie on a surface that contains both centres, or are few; add points at "
                 "other depths."
             )
     _refuse_open_epipole(a, b, from_a, from_b, found, scale, max(noise, rounding))
