@@ -74,7 +74,7 @@ JSON_DAMAGES: list[tuple[str, Edit, str]] = [
     ("experiment.json", lambda d: d["times_s"].pop("transport_2"), r"expected the time transport_2"),
     ("lines/comparison.json", put("rows.0.completeness", 1.5), r"expected float <= 1.0, at rows\[0\].completeness"),
     ("lines/comparison.json", put("rows.0.causes.evil", 0.1), r"unknown cause 'evil'"),
-    ("lines/comparison.json", put("rows.0.failed", 0.0), r"to add up to what failed"),
+    ("lines/comparison.json", put("rows.0.failed", 0.0), r"to add up to the fraction that failed"),
     ("lines/comparison.json", lambda d: d["rows"].pop(), r"one row per material, and one 'all'"),
     ("lines/comparison.json", lambda d: d["rows"].append(d["rows"][0]), r"one row per material"),
     ("lines/measurement.json", put("pixels", 0), r"expected sensor, frames and pixels of the capture"),

@@ -44,7 +44,7 @@ class ClippingThresholds:
     levels : number of levels below the largest value that are compared with it, each 1/256 of that value wide.
     min_fraction : least fraction of the pixels that are at the largest value; fewer are single highlights.
     min_peak : least ratio of the number of these pixels to the mean number of pixels in one of the `levels` below; a
-    smaller value takes the peaks of fringes for clipping.
+        smaller value takes the peaks of fringes for clipping.
     min_tail : least ratio of the number of pixels in all `levels` below to the number at the largest value; an image of
         few grey levels (black and white, for example) has no pixels there, and does not clip.
     """

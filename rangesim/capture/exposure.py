@@ -48,7 +48,7 @@ def expose(
         sensor (`Sensor.is_ideal`) are always noise-free.
     exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`.
     seed : int from 0 to 2^64 - 1, seed of the noise. Every frame has its own random stream (with a SpadDetector, every
-    image row has one); the same seed gives the same bytes on any number of threads.
+        image row has one); the same seed gives the same bytes on any number of threads.
     ambient : Ambient, kind and strength of the light of the scene's own emitters; the detector's band
         (`band_width_m`) then decides how much of it counts. None: unknown; the detector's `ambient_transmission`
         decides. Another ambient light needs no new transport pass.

@@ -73,8 +73,8 @@ def calibrate_command(
 
     Ten to twenty poses all over the image, tilted by 20 to 40 degrees in different directions, make a good calibration.
 
-    Captures by a modulated time-of-flight camera whose lens is known calibrate the errors of its ranges, to a file
-    .npz. The board should stand at twenty distances or more, large in the image.
+    With captures of a modulated time-of-flight camera whose lens is known, the command calibrates the errors of its
+    ranges and writes a .npz file. The board should stand at twenty distances or more, large in the image.
 
     Examples:
 

@@ -56,7 +56,7 @@ StepsOption = Annotated[
     typer.Option("--steps", help="For bare images with fringes: phase steps per axis.", show_default="the sensor's"),
 ]
 BitsOption = Annotated[
-    int | None, typer.Option("--bits", help="For bare images: depth, if less than the file's, such as 12.")
+    int | None, typer.Option("--bits", help="For bare images: bits of a value, if fewer than the file's, such as 12.")
 ]
 
 
@@ -100,7 +100,7 @@ def _own_sensor(name: str) -> Sensor:
     from rangesim.settings.config import shown
 
     if not is_file_name(name):
-        raise ValueError(f"expected --sensor as FILE.py:NAME, got {shown(name)}; a capture says itself what took it.")
+        raise ValueError(f"expected --sensor as FILE.py:NAME, got {shown(name)}; a capture itself names its sensor.")
     return sensor_of(name)
 
 
@@ -119,7 +119,8 @@ def load_frames(folder: Path, sensor: Sensor | None, bits: int | None) -> Captur
 
     Parameters
     ----------
-    sensor : Sensor that took bare images; None: not known. bits : depth of their values, if less than that of the file.
+    sensor : Sensor that took bare images; None: not known. bits : bits of their values, if fewer than those of the
+        file.
     """
     from rangesim.errors import FileFormatError
     from rangesim.results.captures import SIDECAR, import_capture, load_capture

@@ -141,7 +141,7 @@ def _settings(scene: Path | None, config: Path | None, given: dict[str, Any], se
 def _path(before: CameraPath, name: str | None, views: int | None) -> CameraPath:
     """The camera path that the options ask for.
 
-    before : the path of the settings. name : of a path, or a .json file of poses; None: the path of the settings.
+    before : the path of the settings. name : name of a path, or a .json file of poses; None: the path of the settings.
     views : number of views; None: as the path says.
     """
     from rangesim.experiment.camera_paths import CameraPath, PoseList
@@ -150,7 +150,7 @@ def _path(before: CameraPath, name: str | None, views: int | None) -> CameraPath
 
     if name is not None and name.endswith(".json"):
         if views is not None:
-            raise ValueError("expected --views without a list of poses, which has its own number.")
+            raise ValueError("expected no --views with a list of poses, which has its own number of views.")
         data = read_json(Path(name))
         if isinstance(data, dict) and "T_world_camera" not in data:
             raise ValueError(f"{name}: expected a list of poses, or the key 'T_world_camera', got {shown(list(data))}.")
@@ -166,7 +166,7 @@ def _path(before: CameraPath, name: str | None, views: int | None) -> CameraPath
     if views is None:
         return chosen
     if isinstance(chosen, PoseList):
-        raise ValueError("expected --views without a list of poses, which has its own number.")
+        raise ValueError("expected no --views with a list of poses, which has its own number of views.")
     return replace(chosen, views=views)  # type: ignore[type-var]
 
 

@@ -104,7 +104,7 @@ class Turntable(CameraPath):
     start_deg : azimuth of the first view, degrees, counted from x towards y.
     sweep_deg : difference of azimuth between the first and the last view, degrees; 360 for a full turn.
 
-    `centre_m`, `distance_m` and `elevation_deg` of None are those of the scene's camera.
+    Where `centre_m`, `distance_m` or `elevation_deg` is None, the value of the scene's camera is taken.
 
     Examples
     --------
@@ -194,7 +194,7 @@ class HandHeld(CameraPath):
     rise_deg : degrees by which the elevation rises above and falls below `elevation_deg`.
     shake_m : standard deviation of the position along each axis, metres.
     shake_deg : standard deviation of aim and roll, degrees.
-    seed : of the random motions, 0 to 2^64 - 1. The same seed gives the same poses.
+    seed : seed of the random motions, 0 to 2^64 - 1. The same seed gives the same poses.
 
     Examples
     --------

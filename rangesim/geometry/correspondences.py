@@ -133,7 +133,8 @@ def covariance_of_unit_norm(matrix: Array, linear_map: Array, covariance: Array)
     """(9, 9) float64 covariance of L m / |L m|, the linear image of a matrix scaled to unit norm.
 
     m is the row-major vector of the matrix (3, 3), L the linear map (9, 9) and C the covariance (9, 9) of m. The result
-    is J L C L^T J^T, where J = (I - u u^T) / |L m| with u = L m / |L m| removes the scale. So u is a null vector of it.
+    is J L C L^T J^T, where J = (I - u u^T) / |L m| with u = L m / |L m| removes the scale. So u is a null vector of
+    this covariance.
     """
     vector = linear_map @ matrix.ravel()
     norm = np.linalg.norm(vector)

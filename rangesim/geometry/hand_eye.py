@@ -5,8 +5,8 @@ The camera sees a target in n poses of the robot. If the camera is on the grippe
 T_camera_target = T_base_target is the same in all poses. If it stands beside the robot and the target is on the gripper
 (eye to hand), T_gripper_base X T_camera_target = T_gripper_target is the same. Between two poses this gives
 A X = X B. The start is that of Park, Martin: "Robot sensor calibration: solving AX = XB on the Euclidean group", 1994;
-then all residuals are minimised together. OpenCV 4 has `calibrateHandEye`, but the Python interface of OpenCV 5 does
-not, so it is written here.
+then all residuals are minimised together. The Python interface of OpenCV 4 has `calibrateHandEye`, but that of OpenCV 5
+does not, so the method is written here.
 
 Used by: no other module of rangesim; it is for users alone.
 """
@@ -29,11 +29,13 @@ of the axis. It leaves 10 degrees for the noise; a smaller value would waste mot
 
 MIN_TURN_RAD = 1e-6
 """Root-mean-square rotation about an axis, in radians, up to which the robot did not turn about it at all. It is far
-above rounding, 1e-16, and far below the repeatability of any robot, so that poses without noise are judged by it."""
+above rounding, 1e-16, and far below the repeatability of any robot, so that only poses without noise are judged by
+it."""
 
 MIN_TURN_OVER_NOISE = 5.0
-"""Ratio of the rotation about the second axis to the noise of the rotation vectors below which poses are refused. Five
-standard deviations are hardly noise alone; a smaller ratio lets the place along the axis be guessed from noise."""
+"""Smallest ratio of the rotation about the second axis to the noise of the rotation vectors; with a smaller one, poses
+are refused. Noise alone hardly reaches five standard deviations; with a smaller limit, the position along the axis
+would be guessed from noise."""
 
 DERIVATIVE_STEP = 1e-6
 """Step of the numerical derivatives, in radians or metres. Chosen so that, with central differences of numbers about 1,
@@ -43,8 +45,8 @@ MIN_NOISE = 1e-12
 """Least noise, in radians or metres, that residuals are weighted by, so that exact poses do not divide by 0."""
 
 REWEIGHTINGS = 3
-"""Number of times that the residuals are minimised; before each but the first, rotations and translations are weighted
-anew by their own noise. More change little, because the noise hardly depends on the weights."""
+"""Number of times that the residuals are minimised; before each time but the first, rotations and translations are
+weighted anew by their own noise. More times change little, because the noise hardly depends on the weights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +57,8 @@ class HandEye:
     ----------
     T_mount_camera : (4, 4) float64, maps camera coordinates to the coordinates of the mount, metres. The mount is the
         gripper for `eye_in_hand` and the robot's base for `eye_to_hand`.
-    T_other_target : (4, 4) float64, maps target coordinates to those of the other one: the robot's base for
-        `eye_in_hand` and the gripper for `eye_to_hand`, metres.
+    T_other_target : (4, 4) float64, maps target coordinates to those of the part that is not the mount: the robot's
+        base for `eye_in_hand` and the gripper for `eye_to_hand`, metres.
     rotation_rms_rad, translation_rms_m : root mean square, per axis, of the differences between the n poses of the
         target, which should all be equal.
     covariance : (12, 12) float64, covariance of (rotation vector applied after R, rad; translation, metres) of

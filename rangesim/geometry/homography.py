@@ -139,13 +139,13 @@ def fit_homography(
         sum |x' - H x|^2. "both" for noise of the same size in both images. It minimises
         sum e^T (I + A A^T)^-1 e with e = x' - H x and A = d(H x)/dx, which is Sampson's first-order form of the
         reprojection error (HZ 4.2.6).
-    noise_px : standard deviation of one coordinate; None estimates it from the residuals, which takes five pairs.
+    noise_px : standard deviation of one coordinate; None estimates it from the residuals, which needs five pairs.
 
     Raises
     ------
     ValueError
-        `homography_dlt` refuses the pairs; or all points but one lie on a line within their noise; or the residuals
-        are over three times the stated noise.
+        `homography_dlt` refuses the pairs; or all points, or all but one, lie on a line within their noise; or the
+        residuals are over three times the stated noise.
 
     Examples
     --------
@@ -423,7 +423,7 @@ def _maximum_likelihood(start: Array, a: Array, b: Array, second_per_first: floa
 
     Parameters
     ----------
-    second_per_first : size of a pixel of the second image over that of the first, in normalised coordinates.
+    second_per_first : size of a pixel of the second image divided by that of the first, in normalised coordinates.
     """
     ratio = 1 / second_per_first
 

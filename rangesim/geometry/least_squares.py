@@ -23,8 +23,8 @@ State = TypeVar("State")
 Look = TypeVar("Look", bound="Descent")
 
 MAX_STEPS = 100
-"""Largest number of steps of a descent. A descent from a good start converges in far fewer; the limit ends those from a
-bad start, which are then judged by their cost."""
+"""Largest number of steps of a descent. A descent from a good start converges in far fewer; the limit ends descents
+from a bad start, which are then judged by their cost."""
 
 CONVERGED = 1e-12
 """Relative decrease of the cost, as a ratio, at which a descent has converged. It lies a little above what double
@@ -33,7 +33,8 @@ minimum."""
 
 START_DAMPING = 1e-6
 """Damping of the first step, as a ratio to the diagonal of J^T J. It is small because starts are good (Madsen, Nielsen,
-Tingleff 2004, section 3.2): nearly a Gauss-Newton step. From a bad start the damping grows until a step succeeds."""
+Tingleff 2004, section 3.2): the first step is nearly a Gauss-Newton step. From a bad start the damping grows until a
+step succeeds."""
 
 MAX_DAMPING = 1e12
 """Damping at which a descent gives up, as a ratio to the diagonal of J^T J: steps are then below rounding, so that no
@@ -106,7 +107,7 @@ class Minimum(Generic[State]):
 class Descent(Protocol):
     """The quadratic model of a sum of squares about a state, from which a descent takes its steps.
 
-    `Minimum` is the dense one; `rangesim.multiview.schur_complement` has a sparse one.
+    `Minimum` is the dense model; `rangesim.multiview.schur_complement` has a sparse one.
     """
 
     @property

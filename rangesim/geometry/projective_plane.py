@@ -29,13 +29,13 @@ only if the map is an affinity."""
 LAST_DIGITS = 1e-15
 """Ratio up to which a number is the rounding of a few operations, because double precision has 16 digits. A homogeneous
 coordinate below this fraction of the largest counts as 0, and lines that differ by less than this angle in radians
-count as parallel. A larger value takes lines that meet far away for parallel ones; a smaller one lets rounding decide
+count as parallel. With a larger value, lines that meet far away count as parallel; with a smaller one, rounding decides
 where parallel lines meet."""
 
 MIN_SINGULAR_RATIO = 1e-14
-"""Ratio of the smallest to the largest singular value of a 3 x 3 matrix, its rows and columns at one size, up to which
-it counts as singular. It is 45 times the rounding unit of double precision, so that a matrix that only rounding keeps
-from being singular is refused. A larger value refuses strong but valid perspective."""
+"""Largest ratio of the smallest to the largest singular value at which a 3 x 3 matrix counts as singular, after its
+rows and columns are scaled to one size. It is 45 times the rounding unit of double precision. So a matrix is refused
+that differs from a singular one only by rounding. A larger value refuses strong but valid perspective."""
 
 
 def homogeneous(points: ArrayLike) -> Array:

@@ -34,31 +34,32 @@ partner by chance: on a randomly sampled surface their fraction is 0.5^(d^2) at 
 finds partners on other surfaces."""
 
 FINAL_SPACINGS = 1.5
-"""Distance of partners, in spacings, in the last steps of ICP. The smaller it is, the less points beyond the border of
-the other cloud pull. On a randomly sampled surface 21 % of the points have no partner at 1.5 spacings, and half of them
-at 1."""
+"""Distance of partners, in spacings, in the last steps of ICP. The smaller it is, the weaker is the pull of points
+beyond the border of the other cloud. On a randomly sampled surface 21 % of the points have no partner at 1.5 spacings,
+and half of them at 1."""
 
 START_SPACINGS = 12.0
-"""Distance of partners, in spacings, in the first steps of `icp` by default: about how far the first guess may be off.
-Chosen as three halvings above `FINAL_SPACINGS`; a larger value reaches farther, but pulls clouds that overlap only in
-part over each other."""
+"""Distance of partners, in spacings, in the first steps of `icp` by default: the first guess may be off by about this
+distance. Chosen as three halvings above `FINAL_SPACINGS`; a larger value reaches farther, but pulls clouds that overlap
+only in part over each other."""
 
 NORMAL_NEIGHBOURS = 20
-"""Number of neighbours from which the normal of a point is estimated. More average more noise, but round off edges, as
-in any estimate of normals; either half of a cloud uses half as many, which reach as far."""
+"""Number of neighbours from which the normal of a point is estimated. With more neighbours, more noise is averaged, but
+edges are rounded off, as in any estimate of normals. Either half of a cloud uses half as many neighbours, which reach
+as far."""
 
 MIN_CONSTRAINT = 3e-3
-"""Ratio of the smallest eigenvalue of the normal equations to the largest below which the surfaces can slide. Measured:
-at most 0.0019 for planes, spheres, cylinders, cones and roofs of 600 and 2500 points with noise up to their spacing;
-0.0008 to 0.012 for tables with things on them, 0.2 for a box."""
+"""Ratio of the smallest to the largest eigenvalue of the normal equations, below which the surfaces can slide.
+Measured: at most 0.0019 for planes, spheres, cylinders, cones and roofs of 600 and 2500 points with noise up to their
+spacing; 0.0008 to 0.012 for tables with things on them, 0.2 for a box."""
 
 FEATURE_SPACINGS = 5.0
 """Edge of the voxels for features and for the samples of RANSAC, in spacings. A voxel then holds about 25 points of a
 regularly sampled surface, 5 of a random one, so that noise averages; larger voxels lose small shapes."""
 
 MIN_FEATURE_FRACTION = 0.02
-"""Least edge of these voxels, as a fraction of the extent of the target. So there are a few thousand voxels at most,
-which suffice and take little time."""
+"""Least edge of these voxels, as a fraction of the extent of the target. So there are at most a few thousand voxels,
+which are enough and take little time."""
 
 ATTEMPTS = 4
 """Number of times that RANSAC runs, each time with its own seed, because one run can miss the pose. The time grows with
@@ -84,16 +85,17 @@ SLIDE_SPACINGS = 6.0
 there with the same reach, so that steps twice as long would leave gaps."""
 
 MAX_SLIDES = 6
-"""Largest number of such steps to either side, because each takes one run of ICP. If the reach needs more, the steps
-become longer."""
+"""Largest number of such steps to either side, because each takes one run of ICP. If these steps do not cover the
+reach, they become longer."""
 
 SLID_POINTS = 800
 """Number of points of the source that are slid. With 800 instead of 3000 points `icp` takes 1.5 times the time that it
 takes without this test, and the same poses are found (measured)."""
 
 NEARLY_BEST = 0.95
-"""Ratio of an agreement to the best one from which on another pose fits as well. Nobody measured it: a larger ratio
-misses symmetric shapes whose noise makes one pose better by chance, a smaller one refuses sound results."""
+"""Smallest ratio of an agreement to the best one at which another pose fits as well. Nobody measured the value: a
+larger ratio misses symmetric shapes whose noise makes one pose better by chance; a smaller one refuses sound
+results."""
 
 
 @dataclass(frozen=True, eq=False)

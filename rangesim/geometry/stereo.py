@@ -33,15 +33,15 @@ MIN_ACROSS = 1e-3
 no direction for the common axis. The value hardly matters, because such cameras exceed `MAX_GROWTH` long before."""
 
 BORDER_POINTS = 33
-"""Number of points per side of an image whose rays say how far the rectified image reaches. There are enough so that a
-border that distortion bends between two of them is cut off by no more than a fraction of a pixel."""
+"""Number of points per side of an image whose rays say how far the rectified image reaches. Distortion bends the border
+between two points; with so many points, at most a fraction of a pixel is cut off there."""
 
 STEPS_PER_PIXEL = 16
 """Number of steps per pixel in OpenCV's disparities, which are integers with four fractional bits (source:
 StereoSGBM)."""
 
 DISPARITY_MULTIPLE = 16
-"""Number of pixels of which the range of disparities must be a multiple; source: OpenCV's StereoSGBM,
+"""The range of disparities must be a multiple of this number of pixels; source: OpenCV's StereoSGBM,
 numDisparities."""
 
 
@@ -175,7 +175,7 @@ def rectify(first: Intrinsics, second: Intrinsics, T_second_first: ArrayLike) ->
     The common x axis is the baseline, from the first to the second camera. The common z axis is the mean of both
     optical axes, made orthogonal to the baseline. So the first camera becomes the left one: if it stands on the right
     or below, the rectified images are turned by 180 or 90 degrees. The focal length is the mean of all four. The
-    rectified image holds the whole fields of view of both cameras.
+    rectified image holds the whole field of view of each camera.
 
     Parameters
     ----------

@@ -228,8 +228,8 @@ def triangulate_optimal(
 ) -> TriangulatedPoints:
     """Points whose images are nearest to the measured pixels.
 
-    `correct_pixels` moves the pixels so that their rays meet exactly; the points are where they meet. Parameters and
-    errors are those of `triangulate_linear`.
+    `correct_pixels` moves the pixels so that their rays meet exactly; the points are where these rays meet. Parameters
+    and errors are those of `triangulate_linear`.
 
     Examples
     --------
@@ -356,7 +356,8 @@ def _checked(
 def _judged(p: Array, q: Array, x: Array, y: Array, X: Array, origin: Array) -> TriangulatedPoints:
     """Points X (n, 3) moved by the origin (3,), with the reprojection errors against the pixels x, y (n, 2).
 
-    Points that are not finite, as far away as where parallel rays meet, or not in front of both cameras are NaN.
+    Points that are not finite, that are as far away as the meeting point of parallel rays, or that are not in front of
+    both cameras become NaN.
     """
     points, error = np.full(X.shape, np.nan), np.full(len(X), np.nan)
     finite = np.asarray(np.isfinite(X).all(axis=-1))

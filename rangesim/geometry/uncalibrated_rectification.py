@@ -28,9 +28,9 @@ MIN_PAIRS = 3
 determine them."""
 
 MIN_CORNER_SCALE = 0.2
-"""Least scale of the projective part at a corner of the image, as a ratio to its scale in the middle; its inverse is
-the largest one. Near an epipole the scale goes to 0 or infinity and the image is torn. Five times is strong but usable;
-a smaller ratio accepts epipoles nearer to the image."""
+"""Least scale of the projective part at a corner of the image, as a ratio to its scale in the middle; the inverse of
+this value is the largest ratio allowed. Near an epipole the scale goes to 0 or infinity and the image is torn. Five
+times is strong but usable; a smaller ratio accepts epipoles nearer to the image."""
 
 MAX_GROWTH = 4.0
 """Largest ratio of the pixels of a rectified image to those of the original, the same as in `stereo`. A poorly known F

@@ -54,7 +54,7 @@ class AdaptiveSampling(Sampler):
     instruments : instruments whose detectors, exposures and decoders give the readings and the detectors' noise.
     max_spp : int >= 1, largest number of samples of a pixel.
     fraction : positive, largest ratio of the standard deviation of a reading that sampling causes to the one that the
-    detector causes.
+        detector causes.
     ambient : Ambient, as for `rangesim.expose`.
 
     Raises

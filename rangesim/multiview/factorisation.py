@@ -426,7 +426,7 @@ def factorise_orthographic(
     ValueError
         The tracks are refused by `factorise_affine`, or there are fewer than three images, because two leave a family
         of shapes (Ullman 1979). Or the images turn too little, or about the viewing direction alone, so that the depths
-        stay open: half the depth and twice the turn look the same but for the square of the turn.
+        stay open: half the depth under twice the turn looks the same, except for terms of the square of the turn.
 
     Examples
     --------

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Incremental structure from motion: cameras and points from tracks alone, one image after another.
 
-1. It starts with a pair of images that share many points and see them from different sides. `find_relative_pose` finds
-   their poses.
+1. The method starts with a pair of images that share many points and see them from different sides.
+   `find_relative_pose` finds their poses.
 2. The points of the pair are triangulated. The image that sees most of the known points comes next: `find_camera_pose`
    finds its pose, and its new points are triangulated. This is repeated for the other images.
 3. Bundle adjustment runs each time the number of images has grown by a fifth. Observations with a large reprojection
@@ -48,7 +48,7 @@ MAX_PAIRS = 12
 parallax. Nobody measured the value."""
 WIDE_RAD = np.radians(10)
 """Angle between the two rays of a point, radians, above which a wider angle makes a pair no better. The depth deviation
-falls as the inverse of the angle, but matches become rarer; nobody measured the value."""
+is inversely proportional to the angle, but at wide angles matches become rarer. Nobody measured the value."""
 ADJUSTMENT_GROWTH = 1.2
 """Growth of the number of images, a ratio, after which all of them are adjusted again. Measured with 5 scenes of 16
 views, 5 or 20 % of the observations wrong: 1.0 to 3.0 end at the same result, and 1.2 takes 0.6 to 0.8 times the time
@@ -197,7 +197,8 @@ def _first_pair(tracks: Tracks, camera: Intrinsics, noise_px: float, seed: int) 
     dense = ideal.dense()
 
     def promise(pair: tuple[int, int]) -> float:
-        """Number of shared points, times a measure from 0 to 1 of how far their pixels are apart."""
+        """Number of shared points, times a measure from 0 to 1 of the distance between their pixels in the two
+        images."""
         i, j = pair
         apart = np.linalg.norm(dense[i] - dense[j], axis=1)
         return float(shared[i, j] * min(np.nanmedian(apart) / (2 * WIDE_RAD * camera.fx), 1.0))

@@ -9,7 +9,8 @@ glass take longer, mostly to compile). They are timed by the processor time of t
 machine does not count: the estimate is for a machine with idle cores.
 
 The constants below were set by hand so that estimates keep to that factor. A docstring states a measurement where there
-is one. Larger constants announce more runs as long or large; smaller ones refuse fewer runs for their memory.
+is one. With larger constants, more runs are announced as long or large; with smaller ones, fewer runs are refused
+because of their memory.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ TRIANGLES = 4.0
 VIEW_PIXEL_S = 4e-6
 """Seconds per pixel of each view. Measured: 2e-6 for decoding, 1e-6 for fusion, 1e-6 for the file."""
 TRIANGLE_S = 3e-6
-"""Seconds per triangle and shape that it is compared with. Measured on two cores: 1.3e-6 on `plane`, 3.6e-6 on
+"""Seconds per triangle, for each shape with which it is compared. Measured on two cores: 1.3e-6 on `plane`, 3.6e-6 on
 `matte`."""
 ALIGNED_VIEW_S = 6.0
 """Seconds per view to find its pose. Measured with the pairs below: 44 to 180 s of processor time in all for 12 views,

@@ -35,8 +35,9 @@ if TYPE_CHECKING:
     from rangesim.scene import Scene
 
 MAX_COMPARED_VOXELS = 1_000_000
-"""Largest number of voxels of the grid on which the seen and the true volume are compared. The voxels of this grid are
-larger than those of the fusion where there would be more. Time and memory of the comparison grow with this number."""
+"""Largest number of voxels of the grid on which the seen and the true volume are compared. If voxels of the size of the
+fusion's would be more than that, the voxels of this grid are larger. Time and memory of the comparison grow with this
+number."""
 BACKGROUND = 0.3
 """Ratio of the size of a shape to that of the largest shape, above which the shape is background, such as a table or a
 wall. Statistics of what was seen leave background out, as long as there are other shapes."""

@@ -46,7 +46,7 @@ class PointCloud(ShortRepr):
         world coordinates if the camera is more than `FAR_M` from the origin.
     coordinates : "camera" (OpenCV: x right, y down, z forward) or "world".
     normals : (..., 3) float32, unit vectors towards the camera, in `coordinates`; NaN where unknown, but 0 in the
-    result of `finite`. None: not known.
+        result of `finite`. None: not known.
     intensity : (...) float32, in the units of the capture's frames. None: not known.
     colors : (..., 3) uint8, RGB. None: not known.
     confidence : (...) float32 in 0..1, see `RangeImage`. None: not known.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rangesim.rig import Intrinsics
 
 CELLS = (8, 6)
-"""Counts of cells across and down an image in which corners are sought; square in images of 4 : 3, as most are."""
+"""Counts of cells across and down an image in which corners are sought; the cells are square in images of 4 : 3."""
 MIN_COVERED = 0.6
 """Fraction of the cells with corners below which the page warns, because distortion is unknown in the other cells."""
 WORSE_FACTOR = 2.0
@@ -44,7 +44,7 @@ def render_calibration(found: RigCalibration, names: Sequence[str], images: Sequ
     Raises
     ------
     ValueError
-        The names or the images are not as many as the captures.
+        The number of names or of images is not that of the captures.
     """
     if len(names) != len(found.camera_views) or (images is not None and len(images) != len(names)):
         raise ValueError(f"expected a name and an image for each of the {len(found.camera_views)} captures.")

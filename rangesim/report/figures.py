@@ -94,7 +94,7 @@ def map_pictures(image: RangeImage) -> dict[str, bytes]:
 
 
 def _stretched(values: np.ndarray) -> np.ndarray:
-    """Values scaled so that their 1st percentile is 0 and their 99th is 1; both may be exceeded."""
+    """Values scaled so that their 1st percentile is 0 and their 99th is 1; some values lie outside 0..1."""
     low, high = np.nanpercentile(values, [1, 99])
     return np.asarray((values - low) / max(high - low, 1e-12))
 

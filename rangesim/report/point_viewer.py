@@ -22,8 +22,8 @@ DEFLATE_LEVEL = 4
 FAR_FACTOR = 1.5
 """Multiple of the farthest true depth, beyond which points are not drawn.
 
-They are readings of mirrors and of wrong periods, far behind the scene. With a larger ratio more of them are drawn, and
-all depths are packed in coarser steps; other values were not measured.
+Such points are readings of mirrors and of wrong periods, far behind the scene. With a larger ratio more of them are
+drawn, and all depths are packed in coarser steps; other values were not measured.
 """
 
 
@@ -115,7 +115,8 @@ def _packed_tree(s: Segmentation) -> dict[str, Any]:
 
 
 def _colors(parents: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """(k, 3) uint8 colour of each node: that of its largest child, so that a finer cut recolours small parts only.
+    """(k, 3) uint8 colour of each node: that of its largest child, so that a finer cut changes the colours of small
+    parts only.
 
     Parameters
     ----------

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from rangesim.results.scan_results import ScanResult
 
 PICTURES = 3
-"""Count of views, spread over the path, from which pictures of the mesh are taken: so many stand side by side."""
+"""Count of views, spread over the path, from which pictures of the mesh are taken: that many pictures stand side by
+side."""
 WIDTH_PX = 480
 """Width of the pictures in pixels; larger ones make a larger page."""
 SAMPLES = 20_000

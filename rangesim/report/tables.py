@@ -23,7 +23,7 @@ Rows = list[dict[str, Any]]
 FAILURE_HEADS = ["failed (%)", "because (% of the pixels)"]
 """Heads of the columns that say how many pixels failed, and why."""
 UNRELIABLE = 0.5
-"""Fraction of outliers, or of missing readings, from which a sensor is called unreliable on a material.
+"""Smallest fraction of outliers, or of missing readings, at which a sensor is called unreliable on a material.
 
 At one half, a reading is as likely wrong as right.
 """
@@ -49,7 +49,7 @@ COLUMNS = (
         "completeness",
         "complete",
         "%",
-        "fraction of the pixels that the emitter lights which have a measurement, ± what a render with "
+        "of the pixels that the emitter lights, the fraction with a measurement; ± is what a render with "
         "very many light paths may change",
         "",  # more readings are not better if they are wrong
     ),

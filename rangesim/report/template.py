@@ -14,7 +14,7 @@ from rangesim.report.content_security import StyleRules, content_policy, visible
 
 
 def render_page(template: str, values: Mapping[str, Any], scripts: Sequence[str] = ("scroll.js",)) -> str:
-    """HTML page that a template of this package makes of values.
+    """HTML page made from a template of this package and the values of its variables.
 
     Every page also gets the style sheet (`css`), the scripts (`script`), the rules that the template adds to the style
     sheet (`rules`) and the function that writes the page's security policy (`content_policy`).

@@ -21,7 +21,7 @@ from rangesim.report.tables import (
 from rangesim.results.experiment_results import Measurement
 
 MAIN_CAUSE = 0.1
-"""Fraction of the failures from which the verdict names a cause; below, the list gets long and the causes are rare."""
+"""Smallest fraction of the failures at which the verdict names a cause; causes below it are rare and many."""
 
 
 @dataclass(frozen=True)

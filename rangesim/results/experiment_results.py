@@ -349,7 +349,9 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
         if unknown := set(row.causes) - valid:
             raise FileFormatError(f"{path}: unknown cause {shown(min(unknown))} of {shown(row.material)}.")
         if abs(sum(row.causes.values()) - (row.failed or 0)) > 1e-6:
-            raise FileFormatError(f"{path}: expected the causes of {shown(row.material)} to add up to what failed.")
+            raise FileFormatError(
+                f"{path}: expected the causes of {shown(row.material)} to add up to the fraction that failed."
+            )
     return [msgspec.to_builtins(row) for row in record.rows]
 
 

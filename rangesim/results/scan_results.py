@@ -133,7 +133,7 @@ class ScanRecord(Record, frozen=True, kw_only=True):
     """The contents of `scan.json`.
 
     grid : the voxel grid on which the seen and the true volume are compared.
-    tolerance_m : distance up to which a reading counts as on the surface, metres.
+    tolerance_m : largest distance from the surface at which a reading counts as lying on it, metres.
     """
 
     format: Literal["rangesim-scan"] = "rangesim-scan"
