@@ -105,7 +105,7 @@ class Sensor(Named, ABC):
 
         Parameters
         ----------
-        single_tap : whether pixels have one charge store alone, so that frames which could share an exposure do not.
+        single_tap : whether pixels have only one charge store, so that each frame needs an exposure of its own.
         """
         return 1
 
@@ -119,11 +119,11 @@ class Sensor(Named, ABC):
     @property
     @abstractmethod
     def default_decoder(self) -> Decoder:
-        """The decoder it comes with."""
+        """The decoder that the sensor comes with."""
 
     @property
     def default_detector(self) -> PhotoDetector | None:
-        """The detector it comes with, by default an industrial camera; None: frames have no noise."""
+        """The detector that the sensor comes with, by default an industrial camera; None: frames have no noise."""
         return Detector()
 
     @property
@@ -164,7 +164,7 @@ class Sensor(Named, ABC):
     # ---- Meaning of its readings -------------------------------------------------------------------------------------
 
     def white_image(self, frames: np.ndarray) -> np.ndarray:
-        """(h, w) image as of even light, in which calibration finds boards; by default the mean of the frames.
+        """(h, w) image as if under even light, in which calibration finds boards; by default the mean of the frames.
 
         Parameters
         ----------
@@ -257,8 +257,8 @@ class FrameContent(NamedTuple):
 class Decoder(Named, ABC):
     """Makes range images of captures, in two steps: `coordinates` reads the frames, `decode` adds the geometry.
 
-    Subclasses are frozen dataclasses; their fields are thresholds. A decoder may look at as many pixels around each as
-    it likes.
+    Subclasses are frozen dataclasses; their fields are thresholds. For each pixel, a decoder may look at as many pixels
+    around it as it likes.
 
     Examples
     --------
@@ -278,12 +278,12 @@ class Decoder(Named, ABC):
     """Class of the sensors whose captures it takes."""
 
     def check(self, sensor: Sensor) -> None:
-        """Raise ValueError if it takes no captures of the sensor."""
+        """Raise ValueError if this decoder takes no captures of the sensor."""
         of_type(sensor, self.reads)
 
     @abstractmethod
     def coordinates(self, capture: Capture) -> Coordinates:
-        """Readings before any geometry: `ProjectorCoordinates` or `PathLengths`. The rig is not looked at.
+        """Readings before any geometry: `ProjectorCoordinates` or `PathLengths`. The rig is not used.
 
         Raises
         ------
@@ -305,7 +305,7 @@ class Decoder(Named, ABC):
 
     @abstractmethod
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        """(h, w) float64, least light of the emitter at full power that the thresholds take, in `background.unit`."""
+        """(h, w) float64, least light of the emitter at full power that the thresholds accept, in `background.unit`."""
 
     def content(self, sensor: Sensor) -> FrameContent:
         """Light and dark current in the frame that decides about a reading, on average over the patterns."""
@@ -337,8 +337,8 @@ def of_type(sensor: Sensor, kind: type[S]) -> S:
 def least_signal_for(sigmas2: float, signal: float, noise_variance: np.ndarray) -> np.ndarray:
     """(h, w) float64, electrons, least S with S^2 = `sigmas2` (`signal` S + `noise_variance`).
 
-    A threshold of t standard deviations (`sigmas2` is t^2) against the shot noise of a fraction `signal` of the light
-    itself and against all other noise leads to this equation, a quadratic with one positive root.
+    S is the light that equals t standard deviations (`sigmas2` is t^2) of the noise: the shot noise of the fraction
+    `signal` of S, and all other noise. The equation is a quadratic with one positive root.
 
     Parameters
     ----------

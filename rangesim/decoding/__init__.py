@@ -22,13 +22,13 @@ def decode(capture: Capture, decoder: Decoder | None = None) -> RangeImage:
     Parameters
     ----------
     capture : Capture, simulated or real.
-    decoder : Decoder; None: the one its sensor comes with, with the default thresholds.
+    decoder : Decoder; None: the decoder that the sensor comes with, with the default thresholds.
 
     Raises
     ------
     ValueError
-        The argument is no capture, or one of a sensor that the decoder does not know; or the decoder returned something
-        other than a range image of it.
+        The argument is no capture, or a capture of a sensor that the decoder does not know; or the decoder returned
+        something other than a range image of the capture.
 
     Examples
     --------

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of one projector axis and the code they decode to, as Gray code and fringes share them.
+"""Frames of one projector axis, and the code that they decode to: what Gray code and fringes have in common.
 
-Both also check whether the frames contradict their code. A pixel alone may be wrong for many reasons, so the checks
-look at many at once: a capture that is read as what it is not (another start or direction of the fringes, another order
-of the frames) contradicts itself nearly everywhere. Each check returns one sentence with the likely cause, or None.
+Gray code and fringes also check whether the frames contradict their code. A single pixel may be wrong for many reasons,
+so the checks look at many pixels at once: a capture that is read wrongly (another start or direction of the fringes,
+another order of the frames) contradicts itself nearly everywhere. Each check returns one sentence with the likely
+cause, or None.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ class AxisFrames(NamedTuple):
 class AxisCode:
     """Decoded projector coordinate along one axis.
 
-    coordinate : (h, w) float32, projector pixels. Of Gray code alone it is the centre of a cell, or the edge between
-        two cells where the camera pixel lies on it.
+    coordinate : (h, w) float32, projector pixels. With Gray code alone it is the centre of a cell; where the camera
+        pixel lies on the edge between two cells, it is the edge.
     status : (h, w) uint8, `Status`.
     cell_px : int, size of a Gray cell, projector pixels (1, or more where fringes follow).
     sigma_px : (h, w) float32, standard deviation of `coordinate`, projector pixels; None: not known.

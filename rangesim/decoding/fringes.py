@@ -61,14 +61,14 @@ def refine_by_phase(
     """Sub-pixel coordinate: of all places with the phase of the fringes, the one nearest to the Gray coordinate.
 
     Gray cells are half a period at most, so the right place lies at most a quarter of a period off the centre of its
-    cell. An eighth more is granted to noise and to camera pixels across the edge of a cell. Farther off, code and phase
-    contradict each other (`CODE_ERROR`).
+    cell. An eighth of a period more is allowed for noise and for camera pixels across the edge of a cell. If the place
+    lies farther off, code and phase contradict each other (`CODE_ERROR`).
 
     Parameters
     ----------
     seen : frames (N, h, w), the fringes of the axis. gray : code of the same axis.
     period_px : float, projector pixels.
-    least_swing : (h, w) float, least difference of the brightest and the darkest fringe, in the capture's units.
+    least_swing : (h, w) float, least difference between the brightest and the darkest fringe, in the capture's units.
     """
     capture, frames = seen.capture, seen.frames
     coordinate, status = np.empty_like(gray.coordinate), gray.status.copy()
@@ -80,7 +80,7 @@ def refine_by_phase(
         coordinate[rows] = (periods + phase.normalised) * np.float32(period_px)
         ok = refused == Status.OK
         contradiction = np.abs(coordinate[rows] - whole) > gray.cell_px / 2 + period_px / 8
-        washed_out = 2 * phase.modulation < least_swing[rows]  # as those seen by interreflection alone
+        washed_out = 2 * phase.modulation < least_swing[rows]  # like fringes that are seen by interreflection alone
         refused[ok & contradiction] = Status.CODE_ERROR
         refused[ok & (modulation_is_weak(capture, phase, sigma, thresholds) | washed_out)] = Status.LOW_SIGNAL
         refused[ok & capture.saturated(frames[:, rows])] = Status.SATURATED
@@ -95,7 +95,8 @@ def refine_by_phase(
 def fringe_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, period_px: float) -> str | None:
     """A sentence if the fringes contradict the Gray code as a whole; None if they agree.
 
-    The place of the phase minus the centre of its Gray cell must be centred, and within half a cell.
+    The differences between the place that the phase tells and the centre of its Gray cell must lie around zero, and
+    within half a cell.
 
     Parameters
     ----------
@@ -139,8 +140,8 @@ def fringe_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, pe
 def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> str | None:
     """A sentence if the fringes contradict white and black as a whole; None if they agree.
 
-    Light adds up, that of interreflection too, so the mean of the fringes is the middle between white and black at
-    every phase. A frame that is missing or there twice moves it at some phases, a gamma at all of them.
+    Light adds up, also the light of interreflection. So the mean of the fringes is the middle between white and black
+    at every phase. A frame that is missing or there twice moves this mean at some phases, a gamma at all phases.
 
     Parameters
     ----------

@@ -183,8 +183,8 @@ def binary_of_gray(gray: np.ndarray) -> np.ndarray:
 def pair_contradiction(seen: AxisFrames) -> str | None:
     """A sentence if patterns and inverses do not add up to white + black; None if they do.
 
-    A pair adds up at any blur and any interreflection, for light adds up. Two frames that are no pair do so at half of
-    the pixels.
+    A pair adds up to white + black at any blur and any interreflection, because light adds up. Two frames that are no
+    pair do so at half of the pixels only.
 
     Parameters
     ----------
@@ -218,9 +218,9 @@ def pair_contradiction(seen: AxisFrames) -> str | None:
 def binary_contradiction(seen: AxisFrames, gray: AxisCode) -> str | None:
     """A sentence if the patterns look like plain binary numbers; None if they look like Gray code.
 
-    Neighbouring pixels see neighbouring cells. Plain binary numbers that are read as Gray code lie farther apart. Gray
-    code whose frames are in another order may lie farther apart too, but it lies nearest when read in that order: then
-    the result is None.
+    Neighbouring pixels see neighbouring cells. If plain binary numbers are read as Gray code, the codes of neighbours
+    lie farther apart. If the frames of a Gray code are in another order, they may lie farther apart too, but they lie
+    nearest when read in that order: then the result is None.
 
     Parameters
     ----------
@@ -251,8 +251,8 @@ def binary_contradiction(seen: AxisFrames, gray: AxisCode) -> str | None:
 def order_contradiction(seen: AxisFrames, gray: AxisCode) -> str | None:
     """A sentence if the bits of the Gray code seem to be in another order, inverted or repeated; None if not.
 
-    Neighbouring pixels see neighbouring cells. Other orders are tried; where one brings nearly all neighbours that it
-    moves nearer to each other, the frames were in that order.
+    Neighbouring pixels see neighbouring cells. The function tries other orders. Each changes the distance of some
+    neighbours; if an order brings nearly all of these nearer to each other, the frames were in that order.
 
     Parameters
     ----------
@@ -308,7 +308,7 @@ def _better_order(across: np.ndarray, words: np.ndarray, bits: list[str]) -> str
 def _coarse_step(words: np.ndarray, n_bits: int) -> int | None:
     """Least number of finest bits to leave out so that half of the neighbours with Gray words (2, n) see one cell.
 
-    Bits that are finer than the camera's pixels do not tell neighbours. None if less than three bits would be left.
+    Bits that are finer than the camera's pixels do not show neighbours. None if fewer than three bits would be left.
     """
     first, second = binary_of_gray(words)
     for step in range(n_bits - 2):

@@ -15,9 +15,10 @@ def find_peak(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Place, height and background of the strongest peak of each histogram, each (n,) float64.
 
-    The place is in bins from the start of the first bin (the centre of bin b is b + 0.5). The background is the sum of
-    the counts under the window of the peak that do not belong to it, the height is the sum of the others. If the first
-    or the last bin cuts the peak off, the place is that of the whole Gaussian, which may lie outside the histogram.
+    The place is in bins from the start of the first bin (the centre of bin b is b + 0.5). Of the counts in the window
+    of the peak, the height is the sum of those that belong to the peak, the background the sum of the others. If the
+    first or the last bin cuts the peak off, the place is that of the whole Gaussian, which may lie outside the
+    histogram.
 
     Parameters
     ----------
@@ -59,7 +60,8 @@ def coates(counts: np.ndarray, pulses: int) -> np.ndarray:
     """(k, ...) float64, counts without pile-up, from histograms of the first photon of each of `pulses` pulses.
 
     A bin that leaves m pulses without a photon is too large by the fraction 1 / (2 m) at most, on average. Its variance
-    is pulses^2 f / m, f the fraction of the pulses before it that it took. A bin that leaves no pulse is a lower bound.
+    is pulses^2 f / m, where f is the fraction that the bin took of the pulses that were left before it. The count of a
+    bin that leaves no pulse is a lower bound.
 
     Parameters
     ----------
@@ -110,8 +112,9 @@ def pulses_left(counts: np.ndarray, place: np.ndarray, pulses: int, sigma_bins: 
 def runs_out(left: np.ndarray, pulses: int) -> np.ndarray:
     """(n,) bool, where too few of the pulses are left by the end of a peak's window for its place to be known.
 
-    Too few are fewer than `MIN_PULSES_LEFT`, or fewer than half of all if there are fewer than twice as many. With as
-    many left, a bin of the window is 5 % too large at most, on average.
+    Too few means fewer than `MIN_PULSES_LEFT`. If there are fewer than 2 `MIN_PULSES_LEFT` pulses in all, it means
+    fewer than half of them. With `MIN_PULSES_LEFT` pulses left, a bin of the window is 5 % too large at most, on
+    average.
 
     Parameters
     ----------
@@ -129,8 +132,9 @@ def runs_out(left: np.ndarray, pulses: int) -> np.ndarray:
 def place_sigma(peak: np.ndarray, background: np.ndarray, bins: int, sigma_bins: float, is_cyclic: bool) -> np.ndarray:
     """(...) float64, bins, standard deviation of the place of a peak by the shot noise of the counts, without pile-up.
 
-    The place is the centroid of the window. The counts of the pulse scatter it by their own spread, those of the
-    background by that of an even distribution over the window. It is infinite where there is no peak.
+    The place is the centroid of the window. The counts of the pulse scatter the place by the spread of the pulse, the
+    counts of the background by the spread of an even distribution over the window. The standard deviation is infinite
+    where there is no peak.
 
     Parameters
     ----------

@@ -85,8 +85,9 @@ def measure_peaks(  # type: ignore[no-untyped-def]
 def whole_peak(centroid, low, high, sigma):  # type: ignore[no-untyped-def]
     """Place of a Gaussian pulse whose part between `low` and `high` has this centroid; all in bins, sigma > 0.
 
-    The mean of a normal distribution that is cut off grows with the mean of the whole one, at the rate variance of the
-    part over sigma^2. Newton's method uses that rate. A pulse farther outside than `MAX_OUTSIDE` is placed there.
+    If a normal distribution is cut off, the mean of the part grows with the mean of the whole, at the rate (variance of
+    the part) / sigma^2. Newton's method uses that rate. A pulse farther outside than `MAX_OUTSIDE` is placed at
+    `MAX_OUTSIDE`.
     """
     first, last = low - MAX_OUTSIDE * sigma, high + MAX_OUTSIDE * sigma
     place = centroid

@@ -17,10 +17,10 @@ from rangesim.rig import Rig
 def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
     """(...) float64, ranges in metres along camera rays at which the path emitter -> point -> camera has this length.
 
-    With the unit ray d and the emitter's centre b (camera coordinates) the length is l = r + |r d - b|. Squaring
-    (l - r)^2 = r^2 - 2 r d.b + b^2 leaves r linear: r = (l^2 - b^2) / (2 (l - d.b)), where the ray meets the ellipsoid
-    with foci at camera and emitter. The range is NaN where the length is not larger than the baseline |b|: then no such
-    point exists.
+    With the unit ray d and the emitter's centre b (camera coordinates) the length is l = r + |r d - b|. Squaring (l -
+    r)^2 = r^2 - 2 r d.b + b^2 leaves a linear equation: r = (l^2 - b^2) / (2 (l - d.b)). There the ray meets the
+    ellipsoid with foci at camera and emitter. The range is NaN where the length is not larger than the baseline |b|:
+    then no such point exists.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ class PhaseThresholds:
         check_fields(self)
 
     def least_signal(self, steps: int, visibility: float, content: FrameContent, background: Background) -> np.ndarray:
-        """(h, w) float64, least light S of the emitter at full power that the phase takes, in the background's unit.
+        """(h, w) float64, least light S of the emitter at full power that a phase needs, in the background's unit.
 
         With a modulation of `visibility` times S, sigma = sqrt(2 / steps) noise / (visibility S), see `phase_sigma`.
 

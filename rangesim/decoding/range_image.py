@@ -29,10 +29,10 @@ class RangeImage(ShortRepr):
     ----------
     z : (h, w) float32, metres, along the optical axis of the camera; NaN where `status` is not OK.
     range_m : (h, w) float32, metres, Euclidean distance from the camera centre; NaN likewise.
-    confidence : (h, w) float32 in 0..1, strength of the useful signal as a fraction of the largest that the capture can
-        hold, or, if it is noise-free, does hold. The signal is white - black of structured light, twice the modulation
-        amplitude of AMCW, the counts in the peak of direct time of flight (as a fraction of the highest peak), and the
-        radiance of the ideal sensor.
+    confidence : (h, w) float32 in 0..1, strength of the useful signal as a fraction of the largest signal that the
+        capture can hold; for a noise-free capture, of the largest that it holds. The signal is white - black of
+        structured light, twice the modulation amplitude of AMCW, the counts in the peak of direct time of flight (as a
+        fraction of the highest peak), and the radiance of the ideal sensor.
     status : (h, w) uint8, values of `Status`.
     intensity : (h, w) float32, mean signal in the capture's units, for colouring points.
     camera : Intrinsics, or None for an uncalibrated capture, whose z is all NaN.

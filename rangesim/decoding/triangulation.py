@@ -40,8 +40,8 @@ class TriangulationLimits:
     epipolar_tolerance_px : float, projector pixels; where both axes are coded, pixels whose column and row miss the
         epipolar line by more get `CODE_ERROR`.
     max_relative_error : float, the working range: pixels where half a projector pixel of error would shift the depth by
-        a larger fraction get `OUT_OF_RANGE`. With parallel axes z may be at most 2 f b max_relative_error, f the
-        projector's focal length in pixels, b the baseline; light planes along the baseline measure nothing.
+        a larger fraction get `OUT_OF_RANGE`. With parallel axes z may be at most 2 f b max_relative_error, where f is
+        the projector's focal length in pixels and b the baseline. Light planes along the baseline measure nothing.
 
     Examples
     --------
@@ -66,8 +66,8 @@ class ProjectorCoordinates(Coordinates):
     column_sigma_px, row_sigma_px : (h, w) float32, projector pixels, standard deviations of `column` and `row`; NaN
         where `status` is not OK. None: not known, as for fringes of an unknown detector.
     limits : TriangulationLimits that `range_image` applies.
-    is_doubted : whether the decoder has warned that the capture contradicts its code. Then rays that meet behind a
-        device have their cause, and `range_image` does not warn of them.
+    is_doubted : whether the decoder has warned that the capture contradicts its code. Then the cause of rays that meet
+        behind a device is known, and `range_image` does not warn of them.
 
     Examples
     --------
@@ -97,7 +97,7 @@ class ProjectorCoordinates(Coordinates):
     def range_image(self, rig: Rig | None) -> RangeImage:
         """Range image of these coordinates, triangulated.
 
-        `RangesimWarning` if many rays meet behind a device.
+        It warns (`RangesimWarning`) if many rays meet behind a device.
 
         Parameters
         ----------

@@ -123,8 +123,8 @@ class WhiteLed(Illuminant):
     """Light of a white LED: a blue diode under phosphor, about 4100 K.
 
     The spectrum is a sum of two Gaussians with two widths each (Jin et al. 2013). They were fitted to the CIE 15:2018
-    illuminant LED-B3 from 380 to 780 nm: rms error 2 % of the peak, luminous efficacy right to 1 %. Above 780 nm only
-    the tail of the fit is left. A real LED emits next to nothing there, too.
+    illuminant LED-B3 from 380 to 780 nm. The rms error is 2 % of the peak, and the luminous efficacy is right to 1 %.
+    Above 780 nm only the tail of the fit is left. A real LED emits next to nothing there, too.
     """
 
     _PARTS = ((0.942, 448.1, 8.73, 8.88), (1.0, 589.7, 76.1, 59.3))
@@ -148,7 +148,7 @@ class Ambient:
     Parameters
     ----------
     illuminant : "sun" (ASTM G173), "tungsten" (black body of `temperature_k`), or "led" (white, with phosphor). Take
-        "led" for fluorescent tubes: they emit as little near infrared.
+        "led" for fluorescent tubes too: they emit as little near infrared as a white LED.
     illuminance_lux : float, lux, on a surface that receives `scene_irradiance_w_m2` in the scene.
     irradiance_w_m2 : float, W/m2, broadband irradiance on that surface. Give this or `illuminance_lux`, not both.
         Without either, radiances in the scene file are taken as broadband W/m2/sr.
@@ -185,7 +185,7 @@ class Ambient:
             raise ValueError("expected illuminance_lux or irradiance_w_m2, got both.")
 
     def check_emitters(self, scene_has_any: bool) -> None:
-        """Raise ValueError if this light is not dark and the scene has no emitters that could give it."""
+        """Raise ValueError if this light is not zero and the scene has no emitters that could give it."""
         if self.scale > 0 and not scene_has_any:
             raise ValueError(
                 "expected a scene with emitters of its own, whose light the ambient light scales, got one without any."

@@ -96,7 +96,7 @@ class PhotoDetector(Named, ABC):
         return 0.0
 
     def own_noise_e2(self, dark_e: float) -> float:
-        """Variance in electrons squared that the detector itself adds to a frame with `dark_e` dark electrons."""
+        """Variance, in electrons squared, that the detector itself adds to a frame with `dark_e` dark electrons."""
         return dark_e
 
     def noise_dn(self, dn: np.ndarray) -> np.ndarray | None:
@@ -182,7 +182,7 @@ class Detector(PhotoDetector):
     Parameters
     ----------
     wavelength_m : float, metres, wavelength of the emitter's light [lambda].
-    quantum_efficiency : float in (0, 1], fill factor and lens transmission included [eta].
+    quantum_efficiency : float in (0, 1], which includes the fill factor and the lens transmission [eta].
     full_well_e : float, electrons, saturation capacity [mu_e.sat]; it maps to the largest digital number. The well
         itself is a little deeper, so a saturated pixel reads that number in spite of its noise.
     read_noise_e : float, electrons rms, temporal dark noise [sigma_d].
@@ -195,7 +195,7 @@ class Detector(PhotoDetector):
     band_width_m : float, metres, full width of the band-pass filter around wavelength_m. It is used where the kind of
         light is stated. Inside the band, ambient light has the same losses as the emitter's light, and they are part of
         the quantum efficiency. Outside the band nothing passes. 0: no ambient light at all.
-    pixel_pitch_m : float, metres; pixels are square [sqrt A]. Nothing depends on it: it cancels, see
+    pixel_pitch_m : float, metres; pixels are square [sqrt A]. No result depends on the pitch, because it cancels, see
         `rangesim.electronics.detector`.
     min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
 

@@ -88,8 +88,8 @@ def count_first_photons(rng, radiance, pixel, pulses, counts):  # type: ignore[n
 def pulses_hit(rng, mean, pulses):  # type: ignore[no-untyped-def]
     """Number of pulses that bring at least one photon, out of `pulses` with `mean` photons each on average.
 
-    It is binomial with the probability 1 - exp(-mean). Where few photons share a pulse, all photons are drawn, and
-    those in a pulse that already has one are subtracted.
+    The number is binomial with the probability 1 - exp(-mean). Where few photons share a pulse, the function draws the
+    number of all photons, and subtracts those in a pulse that already has one.
     """
     expected = mean * pulses
     if expected * expected > SPARSE * pulses:
@@ -103,8 +103,8 @@ def _shared(rng, photons, pulses):  # type: ignore[no-untyped-def]
     """Number of photons that fall into a pulse that already has one, when each photon hits a random pulse.
 
     The method is thinning. A photon is a candidate with the probability 1 - exp(-rate), which exceeds photons / pulses,
-    so gaps between candidates are exponential. A candidate is then accepted with the probability that makes the product
-    equal to the pulses hit so far over all pulses.
+    so gaps between candidates are exponential. A candidate is then accepted with a second probability. The product of
+    both probabilities is the fraction of the pulses that are hit so far.
     """
     shared, number = 0, 1  # the first photon, number 0, finds all pulses empty
     rate = 2 * photons / pulses if photons < 0.75 * pulses else math.inf
@@ -168,7 +168,7 @@ def _count_at(u, mean):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy")
 def _search(w, mean, count):  # type: ignore[no-untyped-def]
-    """The Poisson quantile at the normal deviate w, searched from `count` on, up and down."""
+    """The Poisson quantile at the normal deviate w. The search starts at `count` and goes up or down."""
     while _is_below(count, w, mean):
         count += 1
     while count > 0 and not _is_below(count - 1, w, mean):
@@ -178,7 +178,7 @@ def _search(w, mean, count):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy")
 def _is_below(count, w, mean):  # type: ignore[no-untyped-def]
-    """Whether P(N <= count) <= Phi(w). Both are compared as tails on the side of w, which keep their precision."""
+    """Whether P(N <= count) <= Phi(w). Both are compared as tails on the side of w, because small tails are precise."""
     tail, total = 0.5 * math.erfc(abs(w) * math.sqrt(0.5)), 0.0
     if w < 0:
         probability = _probability(count, mean)

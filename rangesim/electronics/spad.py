@@ -109,8 +109,8 @@ class SpadDetector(PhotoDetector):
     def photons_per_pulse(self, radiance: np.ndarray, gate: Gate | None, rig: Rig) -> np.ndarray:
         """Mean number of photons that a pixel detects per laser pulse: (h, w) float64.
 
-        Ambient light and dark counts are included, and each photon counts even with `pile_up`. With `pile_up`, the
-        fraction of pulses that add a count to the histogram is 1 - exp(-photons).
+        Ambient light and dark counts are included. All photons of a pulse count here, even with `pile_up`. With
+        `pile_up`, the fraction of pulses that add a count to the histogram is 1 - exp(-photons).
         """
         gate = _counting(gate)
         pixel = self._pixel(gate, rig, gate.period_s)  # an exposure of one pulse

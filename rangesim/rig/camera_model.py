@@ -88,8 +88,8 @@ def distort(coefficients: Sequence[Any], x: Any, y: Any) -> Distorted:
 def undistort(coefficients: Sequence[Any], x: Any, y: Any) -> tuple[Any, Any]:
     """Undistorted coordinates of the distorted point (x, y) on the image plane, by Newton's method.
 
-    Where no ray leads to the point, the result is arbitrary. `unproject` finds out: it distorts the result again and
-    compares.
+    Where no ray leads to the point, the result is arbitrary. `unproject` detects this: it distorts the result again
+    and compares it with the point.
     """
     u, v = x, y
     for _ in range(NEWTON_STEPS):
@@ -104,17 +104,17 @@ def undistort(coefficients: Sequence[Any], x: Any, y: Any) -> tuple[Any, Any]:
 
 
 def appears(model: CameraModel, x: Any, y: Any, image: Distorted) -> Any:
-    """Whether the lens shows the ray (x, y, 1), whose distorted image is given: it lies within the fold."""
+    """Whether the lens shows the ray (x, y, 1), whose distorted image is given. The lens shows rays within the fold."""
     return (x * x + y * y < model.fold_radius2) & (image.jacobian > 0)
 
 
 def to_pixel(model: CameraModel, x: Any, y: Any) -> tuple[Any, Any]:
-    """Pixel coordinates (u, v) of a point (x, y) of the image plane; where the lens distorts, of a distorted one."""
+    """Pixel coordinates (u, v) of a point (x, y) of the image plane. If the lens distorts, give the distorted point."""
     return x * model.fx + model.cx, y * model.fy + model.cy
 
 
 def from_pixel(model: CameraModel, u: Any, v: Any) -> tuple[Any, Any]:
-    """The point (x, y) of the image plane at pixel coordinates (u, v); where the lens distorts, the distorted one."""
+    """The point (x, y) of the image plane at pixel coordinates (u, v). If the lens distorts, the point is distorted."""
     return (u - model.cx) / model.fx, (v - model.cy) / model.fy
 
 
@@ -131,8 +131,9 @@ def project(model: CameraModel, x: Any, y: Any) -> tuple[Any, Any, Any]:
 def unproject(model: CameraModel, u: Any, v: Any, tolerance_px: float) -> tuple[Any, Any, Any]:
     """The ray (x, y, 1) that a lens with distortion shows at pixel coordinates (u, v), and whether there is one.
 
-    tolerance_px : pixels by which the ray may miss (u, v) when it is projected again. Without distortion, `from_pixel`
-        gives the same in less time.
+    Without distortion, `from_pixel` gives the same in less time.
+
+    tolerance_px : pixels by which the ray may miss (u, v) when it is projected again.
     """
     target_x, target_y = from_pixel(model, u, v)
     x, y = undistort(model.coefficients, target_x, target_y)
@@ -151,10 +152,10 @@ precision."""
 
 @lru_cache(maxsize=64)  # a fit asks at every step
 def fold_radius2(coefficients: tuple[float, ...]) -> float:
-    """Squared radius on the image plane at which the radial polynomial turns round; infinity if it never does.
+    """Squared radius on the image plane at which the radial polynomial turns round: it stops growing and falls.
 
-    It is the first positive root in r^2 of d/dr r (1 + k1 r^2 + k2 r^4 + k3 r^6) = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6.
-    The image ends there: a farther point would appear at the same place as a nearer one.
+    It is the first positive root in r^2 of d/dr r (1 + k1 r^2 + k2 r^4 + k3 r^6) = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6,
+    and infinity if there is none. The image ends there: a farther point would appear at the same place as a nearer one.
     """
     k1, k2, _, _, k3 = coefficients
     slope = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])

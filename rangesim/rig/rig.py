@@ -276,8 +276,8 @@ class Lens:
     aperture_radius_m : radius of the entrance pupil (of a projector: the exit pupil), metres.
     focus_m : depth z of the plane in focus, metres. None: everything is in focus, as through a pinhole. docs/optics.md
         says what a projector out of focus does to its patterns.
-    vignetting : exponent n >= 0 of the relative illumination cos^n, where the angle is that to the optical axis: 4 is
-        the natural law, 0 an even image. The light that a projector loses by vignetting is missing from its power.
+    vignetting : exponent n >= 0 of the relative illumination cos^n of the angle to the optical axis: 4 is the natural
+        law, 0 an even image. The light that a projector loses by vignetting is missing from its power.
 
     Examples
     --------
@@ -318,8 +318,8 @@ _OLD_LENS_KEYS = {
 class Rig:
     """A camera and its emitter: their intrinsics, lenses and poses.
 
-    The emitter is called projector here, also where it shows no image: the emitter of a time-of-flight camera has
-    intrinsics too, for its field of illumination, and its pixels only serve as coordinates.
+    The emitter is called projector here, even if it shows no image. The emitter of a time-of-flight camera has
+    intrinsics too: they describe its field of illumination, and its pixels serve only as coordinates.
 
     Parameters
     ----------
@@ -393,7 +393,7 @@ class Rig:
         T_camera_other : (4, 4) float64, rigid, maps coordinates of the further camera to those of this one, metres. For
             a camera 0.1 m to the right that looks at the same point at a depth of 0.8 m, it is
             ``look_at((0.1, 0, 0), (0, 0, 0.8), (0, -1, 0))``.
-        intrinsics, lens : those of the further camera; None: the same as of this one.
+        intrinsics, lens : those of the further camera; None: those of this camera.
 
         Raises
         ------

@@ -51,9 +51,9 @@ class AmcwToF(Sensor):
     """Amplitude-modulated continuous wave camera with four taps per frequency (0, 90, 180, 270 degrees).
 
     The four taps of a pixel share the light of one exposure. The mean of tap theta is (A + contrast * B cos(phi -
-    theta)) / 4 with phi = 2 pi f l / c over the path length l (there and back); A holds white and ambient light. So the
-    taps add up to A. A pixel with two taps, which takes two exposures, collects as much in each tap as this one with
-    twice the `exposure_s`. Frames: frequency by frequency, four taps each.
+    theta)) / 4 with phi = 2 pi f l / c over the path length l (there and back); A is the white and the ambient light.
+    So the taps add up to A. A pixel with two taps, which takes two exposures, collects as much in each tap as this one
+    with twice the `exposure_s`. Frames: frequency by frequency, four taps each.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ class AmcwToF(Sensor):
         return {"amcw": cls()}
 
     def is_beyond_range(self, path_length_m: np.ndarray) -> np.ndarray:
-        """(...) bool, path lengths beyond the last wrap that is searched, which ends at `searched_m` or later."""
+        """(...) bool, whether a path ends beyond the last wrap that is searched, at `searched_m` or later."""
         longest_m = min(self.wraps * SPEED_OF_LIGHT / max(self.modulation_hz), 2 * self.unambiguous_range_m)
         return np.asarray(path_length_m > longest_m)
 
@@ -173,7 +173,7 @@ class AmcwDecoder(Decoder):
     correct_wiggling : bool; for a square waveform, True inverts the triangle correlation exactly (what a calibrated
         camera does with a look-up table), False uses the sine formula and shows the raw wiggling error, up to 0.011
         periods. Multipath adds triangles of different phase, for which neither is exact.
-    max_residual : float, turns; a frequency whose phase is farther off that of the common path length contradicts it.
+    max_residual : float, turns; a phase that is farther from the phase of the common path length contradicts it.
     max_ambiguity : float, largest misfit of the best wrap counts as a fraction of that of the second best. Above it,
         the choice between the two is a guess.
 

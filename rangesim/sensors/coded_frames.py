@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs of coded frames, of which a structured-light capture consists: Gray code, and fringes.
 
-A run codes one axis of the projector. It knows how its frames are made and named, how they decode, how much light that
-takes, and how they may contradict themselves. So a sensor with a new order of runs, or with runs of a new kind, changes
+A run codes one axis of the projector. It knows how its frames are made, named and decoded, how much light they need,
+and how they may contradict themselves. So a sensor with a new order of runs, or with runs of a new kind, overrides
 `StructuredLight.layout` alone.
 """
 
@@ -36,7 +36,7 @@ FRINGE_VISIBILITY = 0.5
 
 
 class CodeThresholds(NamedTuple):
-    """Thresholds of all kinds of runs, from which each kind takes its own."""
+    """Thresholds of all kinds of runs. Each kind takes those that it needs."""
 
     gray: GrayThresholds
     phase: PhaseThresholds
@@ -104,7 +104,7 @@ class CodedFrames(ABC):
 
     @abstractmethod
     def least_signal(self, thresholds: CodeThresholds, background: Background) -> np.ndarray:
-        """(h, w) float64, least light of the projector at full power that the thresholds take, in the background's
+        """(h, w) float64, least light of the projector at full power that the thresholds accept, in the background's
         unit."""
 
 
@@ -202,6 +202,6 @@ def _before(coarse: AxisCode | None) -> AxisCode:
     """The code that fringes refine; ValueError if there is none."""
     if coarse is None:
         raise ValueError(
-            "expected a code of the same axis before its fringes, which tell a place within a period alone."
+            "expected a code of the same axis before its fringes, because fringes tell only the place within a period."
         )
     return coarse

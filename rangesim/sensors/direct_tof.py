@@ -35,8 +35,8 @@ class DirectToF(Sensor):
     """Pulsed time of flight with a photon histogram per pixel (SPAD and TDC). Frames: the bins.
 
     The laser fires again as soon as the histogram is full, every `period_s`. So light that comes back later is counted
-    with that of a later pulse: a wall at 1.2 times the range is a ghost at 0.2 times the range. Ambient light spreads
-    evenly over the bins.
+    with the light of a later pulse: a wall at 1.2 times the range is a ghost at 0.2 times the range. Ambient light
+    spreads evenly over the bins.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class DirectToF(Sensor):
     pulse_fwhm_s : float, seconds, full width at half maximum of the Gaussian instrument response, at most half of the
         histogram; 0 for none. With a pulse, a path is shared by the two bins next to it, so that its place within a bin
         is kept. The bins of the pass are up to four times as fine where the pulse is narrow (`OVERSAMPLING`).
-    laser : "periodic", or "single-shot": light that comes back after the histogram is full is lost.
+    laser : "periodic", as described above; or "single-shot", which loses light that comes back after the last bin.
 
     Examples
     --------
@@ -169,10 +169,10 @@ class DirectToFDecoder(Decoder):
     """Decodes the path length of the strongest return of each histogram.
 
     Pile-up is undone if the detector has it (Coates 1968, see `coates`). A filter matched to the instrument response
-    finds the peak. The centroid of the counts above the background around it, re-centred once, gives the place within a
-    bin. A peak that the end of the histogram cuts off is completed to a Gaussian; where that lies outside, the reading
-    is out of range. Where the pulses run out within the window of the peak, the reading is saturated (see `runs_out`);
-    less light helps.
+    finds the peak. The centroid of the counts above the background, in a window around the peak, gives the place within
+    a bin; the window is centred on the centroid once. If the end of the histogram cuts a peak off, the decoder
+    completes it to a Gaussian. If the middle of that Gaussian lies outside, the reading is out of range. If the pulses
+    run out within the window of the peak, the reading is saturated (see `runs_out`); less light helps.
 
     Parameters
     ----------

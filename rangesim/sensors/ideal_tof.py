@@ -20,7 +20,8 @@ from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameC
 class IdealToF(Sensor):
     """Time of flight that reads the path length of the first return alone: the best that any such sensor could do.
 
-    Frames: `radiance` of the first return, W/m2/sr, and `radiance_x_length`, the same times its path length in metres.
+    Frames: `radiance` of the first return, W/m2/sr, and `radiance_x_length`, this radiance times the path length in
+    metres.
 
     Examples
     --------

@@ -41,17 +41,17 @@ def presets() -> dict[str, Sensor]:
 
 
 def _presets_of(kind: type[Sensor]) -> dict[str, Sensor]:
-    """Presets of one class; none of a class that cannot be made without settings."""
+    """Presets of one class; none if the class cannot be made without settings."""
     if "presets" in vars(kind):
         return kind.presets()
     try:
         return {kind.type_name: kind()}
-    except Exception:  # noqa: BLE001  (somebody's class, which has no default settings; naming it says why)
+    except Exception:  # noqa: BLE001  (a user's class without default settings; naming it raises the error)
         return {}
 
 
 def sensor_of(name: str, files_in: Path | None = Path()) -> Sensor:
-    """The sensor of a name: that of a preset, or FILE.py:NAME, a sensor or class of sensors in a Python file.
+    """The sensor that a name stands for: a preset, or FILE.py:NAME, a sensor or a class of sensors in a Python file.
 
     Loading a file runs it, so only name files that you trust. Its classes are known from then on, in captures and
     results too. A file that has changed is loaded again.
@@ -91,7 +91,7 @@ def sensor_of(name: str, files_in: Path | None = Path()) -> Sensor:
 def sensor_from_dict(data: Any, place: str, files_in: Path | None = None) -> Sensor:
     """The sensor of plain data: a name as for `sensor_of`, or a table whose `type` is a `type_name` or FILE.py:NAME.
 
-    A table changes settings of the class, or of the sensor where NAME is one.
+    A table changes settings of the class, or of the sensor if NAME is a sensor.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def check_sensor(sensor: Sensor) -> None:
 
 
 def _sensor_in(path: Path, attribute: str) -> Sensor:
-    """The sensor of that name in a Python file; of a class, the one with its default settings."""
+    """The sensor of that name in a Python file. If the name is a class, its sensor with the default settings."""
     found = getattr(_module(path), attribute, None)
     try:
         if isinstance(found, type) and issubclass(found, Sensor):
@@ -172,7 +172,7 @@ def _sensor_in(path: Path, attribute: str) -> Sensor:
         if isinstance(found, Sensor):
             check_sensor(found)
             return found
-    except Exception as error:  # whatever a file of somebody's raises
+    except Exception as error:  # a file of a user may raise anything
         raise FileFormatError(f"{path}: {attribute}: {type(error).__name__}: {brief(error)}") from error
     raise FileFormatError(f"{path}: expected {attribute} to be a sensor or a class of sensors, got {shown(found)}.")
 

@@ -52,7 +52,7 @@ class StructuredLight(Sensor):
     code : "gray" decodes to whole projector pixels, "gray-phase" [2]_ to fractions of a pixel. Phase shift in N steps
         finds the place within a period, Gray code finds the period. The Gray bits go to half a period or finer, so that
         a bit error at a stripe edge cannot become a period error.
-    axes : "columns" suffices to triangulate; "rows" as well gives full correspondence (calibration, checks).
+    axes : "columns" suffices to triangulate. Columns and rows give the full correspondence (calibration, checks).
     period_px : float, period of the fringes in projector pixels.
     steps : int >= 3, number of phase shifts.
 
@@ -121,8 +121,8 @@ class StructuredLight(Sensor):
     def check(self, width: int, height: int) -> None:
         if (width, height) != (self.projector_width, self.projector_height):
             raise ValueError(
-                f"expected a projector of {self.projector_width} x {self.projector_height} pixels as the sensor codes, "
-                f"got a rig whose projector has {width} x {height}."
+                f"expected a rig whose projector has the {self.projector_width} x {self.projector_height} pixels that "
+                f"the sensor codes, got {width} x {height}."
             )
 
     def frame_names(self) -> list[str]:

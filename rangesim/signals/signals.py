@@ -28,7 +28,7 @@ class EnergySplit(ShortRepr):
     direct : emitter -> surface -> camera.
     multipath : paths with two or more scattering (non-delta) surfaces.
     specular : the camera sees one lit surface in a mirror or through glass.
-    caustic : the emitter lights the surface over a mirror or through glass.
+    caustic : the emitter lights the surface by way of a mirror or through glass.
     glint : the camera sees the emitter itself, in a mirror, through glass or directly.
     ambient : light of everything but the emitter, before any filter.
     """
@@ -106,7 +106,7 @@ class Truncation:
 
     @property
     def total(self) -> float:
-        """Sum of all parts that are known, as a fraction of the emitter's light."""
+        """Sum of all parts that are known (not NaN), as a fraction of the emitter's light."""
         return float(np.nansum([self.depth, self.chains, self.photons]))
 
 
@@ -115,7 +115,7 @@ class SamplingError(ShortRepr):
     """A random draw with the statistics of the error that the sampling of light paths leaves in signals.
 
     It is half the difference between the results of two halves of the samples, scaled where the halves differ in size.
-    At each pixel it has the variance of the error, and its covariance between channels. It is not the error itself.
+    At each pixel it has the variance of the error, and the error's covariance between channels. It is not the error.
 
     channels : response -> (c, h, w) float32, W/m2/sr, error of `StillSignals.channels`.
     projector : (h, w) float32, W/m2/sr, error of `EnergySplit.projector`.
@@ -172,7 +172,7 @@ class Signals(ShortRepr, ABC):
         Raises
         ------
         ValueError
-            The pass has no signals of this sensor, or its sampling error is asked for and not known.
+            The pass has no signals of this sensor, or the sampling error is asked for but not known.
         """
 
 
@@ -188,7 +188,7 @@ class StillSignals(Signals):
     sampling: SamplingError | None = field(kw_only=True, default=None)
 
     def only(self, sensor: Sensor) -> StillSignals:
-        """The same signals without the channels that other sensors need."""
+        """The same signals without the channels that only other sensors need."""
         kept = sensor.responses()
         sampling = self.sampling
         if sampling is not None:
