@@ -11,8 +11,8 @@ Results with Dr.Jit 1.5.0 and Mitsuba 3.9.1 on x86-64 (a kernel with sin, min an
     LLVM 17, 18, 19, 22   work, with the same image
 
 x86 has no instruction for the IEEE minimum and maximum. Since version 17, LLVM uses other instructions instead (LLVM
-issue 53353). This agrees with the table. LLVM 20 and 21 were not tried; they lie between versions that work. A version newer than
-`NEWEST_TESTED` is used only if no tested one is installed, because LLVM changes its C API.
+issue 53353). This agrees with the table. LLVM 20 and 21 were not tried; they lie between versions that work. A version
+newer than `NEWEST_TESTED` is used only if no tested one is installed, because LLVM changes its C API.
 """
 
 from __future__ import annotations
