@@ -134,7 +134,7 @@ def test_a_file_in_the_way_is_left_and_the_new_result_is_kept_beside_it(tmp_path
             (tmp_path / "n" / name).parent.mkdir(exist_ok=True)
             (tmp_path / "n" / name).write_text(text)
 
-    with pytest.raises(Refused, match=r"a\.txt came or was changed .* the new result is in .*test-kind-2"):
+    with pytest.raises(Refused, match=r"a\.txt appeared or was changed .* the new result is in .*test-kind-2"):
         collide("a.txt", "edited by hand")
     assert contents(tmp_path / "n") == {
         **OLD, "a.txt": "edited by hand", **{f"test-kind-2/{n}": t for n, t in NEW.items()},
@@ -190,7 +190,7 @@ def test_what_is_no_older_result_is_refused(tmp_path: Path) -> None:
     refuse(tmp_path / "unlisted", "without a valid manifest.json")
     write(tmp_path / "nearly", {f"{STAGING}/mine.txt": "mine"})
     with (
-        pytest.raises(Refused, match="is not what rangesim keeps its work in"),
+        pytest.raises(Refused, match="is no staging directory of rangesim"),
         new_directory(tmp_path / "nearly", KIND),
     ):
         pytest.fail("entered")
@@ -604,7 +604,7 @@ def test_a_result_copied_there_while_the_work_goes_on_is_the_users(tmp_path: Pat
         if name == "old":
             publish(tmp_path / name, {"z": "z"})
         copy = partial(shutil.copytree, tmp_path / "best", tmp_path / name, dirs_exist_ok=True)
-        with pytest.raises(Refused, match="came or was changed while the work went on"):
+        with pytest.raises(Refused, match="appeared or was changed while the work went on"):
             publish_while(tmp_path / name, lambda _, copy=copy: copy())  # type: ignore[misc]
         assert contents(tmp_path / name).items() >= OLD.items()
 
@@ -685,7 +685,7 @@ def test_processes_that_meet_say_so_and_nothing_else(tmp_path: Path) -> None:
     )
     processes = [in_another_process(code, tmp_path / "deep" / "n") for _ in range(3)]
     said = "".join(process.communicate(timeout=60)[0] for process in processes)
-    assert "is not what rangesim keeps its work in" not in said
+    assert "is no staging directory of rangesim" not in said
     assert "cannot create the directory" not in said
 
 
@@ -728,7 +728,7 @@ def test_a_pipe_named_as_the_lock_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "n" / STAGING / "lock")
     code = "with new_directory(sys.argv[1], KIND): pass"
     with in_another_process(code, tmp_path / "n") as process:
-        assert "is not what rangesim keeps its work in" in process.communicate(timeout=20)[0]
+        assert "is no staging directory of rangesim" in process.communicate(timeout=20)[0]
 
 
 def test_names_as_long_as_the_file_system_takes_them(tmp_path: Path) -> None:

@@ -24,8 +24,8 @@ MAX_FAR_FRACTION = 0.2
 each other, a quarter of the pixels lie there by chance."""
 
 MIN_ONE_SIDED_FRACTION = 0.02
-"""Least fraction of pixels outside their Gray cell, on one side more than on the other, from which on the fringes count
-as shifted. Noise puts pixels outside on both sides alike."""
+"""Least fraction of pixels that lie outside their Gray cell on one side, if none do on the other, at which the fringes
+count as shifted. Noise puts pixels outside on both sides alike."""
 
 MIN_OFFSET_PX = 0.25
 """Least shift of the fringes that is reported, in projector pixels: half of the half pixel by which fringes are shifted

@@ -10,7 +10,7 @@ import numpy as np
 from pcgraph.kernel_cache import cached_njit
 
 MAX_FRACTION = 1 - 1e-6
-"""Largest fraction of the pulses before a bin that it may have taken. At 1 the logarithm of Coates' formula is
+"""Largest fraction that a bin may have taken of the pulses left before it. At 1 the logarithm of Coates' formula is
 infinite; the value here is one pulse of a million away from it."""
 
 

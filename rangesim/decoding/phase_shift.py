@@ -13,7 +13,7 @@ from rangesim.sensor import Background, FrameContent, Threshold, least_signal_fo
 from rangesim.settings.bounds import Bounds, check_fields
 
 MIN_MODULATION = 1e-20
-"""Modulation, in the units of the capture, that stands for none in the standard deviation of a phase: so small that the
+"""Modulation, in the units of the capture, that replaces zero in the standard deviation of a phase: so small that the
 phase is refused, and large enough for products with the result to stay finite in float32."""
 
 

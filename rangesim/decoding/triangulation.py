@@ -27,8 +27,8 @@ MAX_BEHIND_FRACTION = 0.2
 few do by interreflection; with a mirrored image or an inverted calibration most do."""
 
 MIN_BEHIND_PX = 10.0
-"""Distance in projector pixels to a coordinate that would make the rays parallel, from which on they meet clearly
-behind a device. With less, the point may be far away in front, and noise has moved it behind."""
+"""Least distance, in projector pixels, of a coordinate from the one that would make the rays parallel, at which they
+meet clearly behind a device. With less, the point may be far away in front, and noise has moved it behind."""
 
 
 @dataclass(frozen=True)

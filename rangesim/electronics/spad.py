@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 MAX_MEAN = 1e9
-"""Largest expected photon count of a bin that is drawn; larger ones are drawn with this one. It changes nothing, as a
+"""Largest expected photon count with which a bin is drawn; it replaces larger ones. It changes nothing, because a
 counter holds at most 65535 and saturates far below."""
 
 

@@ -55,7 +55,7 @@ class Check:
     """A check of the machine, printed as one line.
 
     name : short name. ok : whether it succeeded. detail : the finding. fix : advice if it failed. required : whether
-    rangesim cannot work without it; otherwise it lacks only some ability.
+    rangesim cannot work without it; if not required, a failure means that only some ability is missing.
 
     Examples
     --------
@@ -92,7 +92,7 @@ def run_checks() -> list[Check]:
 
 
 def doctor_command() -> None:
-    """Check this machine: Python, LLVM, Mitsuba, CUDA, Open3D, fonts. One line each with the fix.
+    """Check this machine: Python, LLVM, Mitsuba, CUDA, Open3D, fonts. Prints one line for each, with the fix.
 
     The exit status is 1 if something that rangesim needs is missing.
     """
@@ -104,7 +104,7 @@ def doctor_command() -> None:
 
 
 def find_browser() -> str | None:
-    """Path of Chromium or a relative of it, which can render a report; None if there is none."""
+    """Path of Chromium or of a browser built on it, which can render a report; None if there is none."""
     return next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
@@ -149,7 +149,7 @@ def _check_browser() -> Check:
 
 
 def _try_in_process(code: str, environment: Mapping[str, str] | None = None) -> tuple[bool, str]:
-    """Whether code runs to its end in a new Python process, and its output, or its error on one line."""
+    """Whether code runs to its end in a new Python process, and its output; if it fails, its error on one line."""
     command = [sys.executable, "-c", code]
     try:
         run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S)

@@ -10,9 +10,9 @@ Results with Dr.Jit 1.5.0 and Mitsuba 3.9.1 on x86-64 (a kernel with sin, min an
     LLVM 15, 16           abort: "Cannot select: fminimum"
     LLVM 17, 18, 19, 22   work, with the same image
 
-x86 has no instruction for the IEEE minimum and maximum, and LLVM expands them since version 17 (LLVM issue 53353). This
-agrees with the table. LLVM 20 and 21 were not tried; they lie between versions that work. A version newer than
-`NEWEST_TESTED` is used only if no tested one is installed, because LLVM changes its C API.
+x86 has no instruction for the IEEE minimum and maximum. Since version 17, LLVM uses other instructions instead (LLVM
+issue 53353). This agrees with the table. LLVM 20 and 21 were not tried; they lie between versions that work. A version
+newer than `NEWEST_TESTED` is used only if no tested one is installed, because LLVM changes its C API.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class LlvmLibrary:
 
     @property
     def rank(self) -> tuple[bool, tuple[int, ...]]:
-        """Sort key with which the best library is the largest: the newest tested version, then untested newer ones."""
+        """Sort key. The best library has the largest: the newest tested version first, then untested newer ones."""
         return self.version < (NEWEST_TESTED + 1,), self.version
 
     def __str__(self) -> str:
@@ -173,7 +173,7 @@ def _libraries_of_linker() -> list[LlvmLibrary]:
 
 
 def _version_of(path: Path) -> tuple[int, ...]:
-    """Version of a library: from the name of the file, else of the link to it, else from the library itself."""
+    """Version of a library: from the name of the file, else from the name of the link to it, else from the library."""
     file = path.resolve()
     matches = filter(None, (_NAME.fullmatch(name) for name in (file.name, path.name)))
     named = (match["before"] or match["after"] for match in matches)

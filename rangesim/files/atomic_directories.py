@@ -5,11 +5,11 @@ Every command and every `save` of rangesim that writes a directory does so here,
 files do so in `pcgraph.plumbing.plain_files`.
 
 1. Work goes on in a hidden staging directory, `STAGING`, inside the directory that is asked for. A lock says that the
-   work is alive. What a killed process left is cleared, or its replacement completed, by the next one.
+   work is alive. If a process was killed, the next process clears what it left, or completes its replacement.
 2. A finished directory holds a manifest with size and SHA-256 of each of its files. What the manifest does not list, or
    lists with another content, belongs to the user: it is never moved, overwritten or removed.
-3. The new files take the place of the old ones by renames that a journal describes. Once the journal is on the disk the
-   new result stands: whoever looks next carries it out to the end. Before that, the old one stands.
+3. The new files take the place of the old ones by renames that a journal describes. Once the journal is on the disk,
+   the new result is valid: the next process that looks carries out the rest. Before that, the old result is valid.
 4. Files and directories are flushed to the disk before they take a place.
 
 Only the standard library and `pcgraph.plumbing` are imported: commands check their output before they load the rest.
@@ -124,7 +124,7 @@ def check_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence
         if target.is_dir():
             if _is_claimed(target):
                 raise kind.error(f"another process is writing to {named}; wait for it, or name another place.")
-            if not (target / STAGING).exists():  # what a killed process left there is looked at once it is cleared
+            if not (target / STAGING).exists():  # else they are checked after the clearing
                 _check_contents(named, target, kind, inputs)
     except OSError as problem:
         place = f" ({os.fsdecode(problem.filename)})" if problem.filename else ""
@@ -336,12 +336,12 @@ class _Staging:
             self.path.mkdir(exist_ok=True)
             if not _is_staging(self.path):
                 if os.path.lexists(self.path):
-                    raise kind.error(f"{self.path} is not what rangesim keeps its work in; move it away.")
+                    raise kind.error(f"{self.path} is no staging directory of rangesim; move it away.")
                 return False
             self.handle = _lock(self.path)
         except FileNotFoundError:  # its owner has just removed it
             return False
-        except FileExistsError:  # a file is in the way, or a directory was that its owner has just removed
+        except FileExistsError:  # in the way is a file, or was a directory that its owner has just removed
             if any(
                 os.path.lexists(path) and not path.is_dir() for path in (self.path, self.target, *self.target.parents)
             ):
@@ -391,10 +391,10 @@ class _Staging:
             if obstacle is not None:
                 kept = self._set_aside(kind)
                 raise kind.error(
-                    f"{named / obstacle} came or was changed while the work went on; it was left as it is, and the new "
-                    f"result is in {kept}."
+                    f"{named / obstacle} appeared or was changed while the work went on; it was left as it is, and the "
+                    f"new result is in {kept}."
                 )
-            for name in old:  # what may fail, fails before
+            for name in old:  # before the journal, because this may fail
                 _make_plain_parents(self.path, f"{_OLD}/{name}")
             replace_file(self.path / _JOURNAL, _json({"retire": old, "place": names}))
             try:
@@ -462,7 +462,7 @@ def _clear(staging: Path) -> None:
 
 
 def _dissolve(staging: Path) -> None:
-    """Remove a staging directory whose lock is held. The lock goes last, so that nobody takes the rest for foreign."""
+    """Remove a staging directory whose lock is held. The lock goes last, so that the rest never looks foreign."""
     with suppress(OSError):  # the next one clears it
         _clear(staging)
         if os.listdir(staging) == [_LOCK]:
@@ -471,7 +471,7 @@ def _dissolve(staging: Path) -> None:
 
 
 def _forget_claims() -> None:
-    """Forget the claims in a forked child: they are its parent's."""
+    """Forget the claims in a forked child: they belong to its parent."""
     global _claims_lock
     _claims_lock = threading.RLock()
     for claim in _claims.values():
@@ -509,7 +509,7 @@ def _carry_out(target: Path) -> None:
                 if problem.errno != errno.EXDEV:
                     raise
                 (target / name).unlink()  # something is mounted below the target
-    for name in sorted(waiting, key=lambda n: (n == MANIFEST, n)):  # without it, no directory of ours is complete
+    for name in sorted(waiting, key=lambda n: (n == MANIFEST, n)):  # the manifest last: it completes the directory
         if not _is_reached_plainly(staging, f"{_NEW}/{name}"):
             raise OSError(errno.ELOOP, "a link in the staging directory", str(staging / _NEW / name))
         _make_plain_parents(target, name)
@@ -680,7 +680,7 @@ def _is_staging(path: Path) -> bool:
     """Whether a directory with the name of a staging directory is one: it holds a lock, or nothing.
 
     Its owner may make or remove it meanwhile, and another process may make the next one. So it counts as foreign only
-    if several looks in a row say so.
+    if several checks in a row say so.
     """
     lock = path / _LOCK
     for _ in range(5):
@@ -766,7 +766,7 @@ def _move_to_free_place(source: Path, place: Path) -> None:
     try:
         os.link(source, place, follow_symlinks=False)
     except FileExistsError:
-        if not os.path.samefile(source, place):  # the same: killed between the two calls
+        if not os.path.samefile(source, place):  # the same file: a process was killed before `unlink`
             raise
     except OSError:  # a file system without hard links
         if os.path.lexists(place):
@@ -791,7 +791,7 @@ def _flush_tree(folder: Path) -> None:
 
 
 def _lock(staging: Path, seconds: float = 0.0) -> int | None:
-    """Return an open handle that holds the lock of a staging directory; None if a living process holds it that long.
+    """Return an open handle with the lock of a staging directory; None if a living process keeps it that long.
 
     Raise FileNotFoundError if the directory is removed meanwhile.
     """

@@ -46,7 +46,7 @@ the search from reading the pixels."""
 
 
 class _OtherFormatError(OSError):
-    """A file is of no format that Pillow reads here."""
+    """The format of a file is none of those that Pillow reads here."""
 
 
 def write_grey(path: Path, image: np.ndarray) -> None:
@@ -104,8 +104,8 @@ def is_coloured(path: Path) -> bool:
 def check_pixels(path: Path) -> None:
     """Raise FileFormatError if an image file is damaged, or states more pixels or bytes than the limits allow.
 
-    Mitsuba will decode the file afterwards, and its libpng crashed on some damaged files. Only the stated size is
-    checked of Radiance files, float maps and Targa files. A file of a further format that `read_grey` does not read is
+    Mitsuba will decode the file afterwards, and its libpng crashed on some damaged files. Of Radiance files, float maps
+    and Targa files, only the stated size is checked. Files of other formats that `read_grey` does not read are
     accepted.
     """
     check_file(path, FileFormatError)

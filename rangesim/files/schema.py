@@ -129,12 +129,12 @@ def read_checked_arrays(path: Path, specs: Mapping[str, ArraySpec], sizes: dict[
     Parameters
     ----------
     specs : the requirements by name of array; the file may hold no other arrays.
-    sizes : the numbers that letters in shapes stand for, at least h and w. Letters that are new are added to it.
+    sizes : the numbers that letters in shapes stand for, at least h and w. New letters are added to `sizes`.
 
     Raises
     ------
     FileFormatError
-        The file is missing or broken, lacks an array, has one too many, or has one that does not meet its spec.
+        The file is missing or broken, lacks an array, has an array too many, or has one that does not meet its spec.
     """
     if not path.is_file():
         raise FileFormatError(f"{path} is missing.")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """JSON, TOML and XML files, read within the limits of their size and of their nesting.
 
-The parsers of all three formats are recursive, and that of Mitsuba ends the process when the stack is full. Therefore
-the depth is checked first.
+The parsers of all three formats are recursive, and the parser of Mitsuba ends the process when the stack is full.
+Therefore the depth is checked first.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class SearchPaths(Protocol):
         """Path of the file with a name; it need not exist."""
 
     def within(self, folder: str, beside: Path) -> SearchPaths:
-        """These paths with a folder in front, as `<path value="folder"/>` in the file `beside` states."""
+        """Search paths with a folder before these ones, as `<path value="folder"/>` in the file `beside` states."""
 
 
 def check_xml(path: str | Path, search: SearchPaths | None = None, ignored: tuple[str, ...] = ()) -> dict[str, str]:
@@ -136,9 +136,12 @@ class _Xml:
         self.needed: set[str] = set()  # parameters without a default in other elements
 
     def read(self, path: Path, depth: int, within: tuple[Path, ...], search: SearchPaths | None) -> None:
-        """Check a file that the files `within` include, `depth` levels deep. Paths that it adds hold in it alone."""
+        """Check a file that the files `within` include, `depth` levels deep.
+
+        Search paths that it adds are valid only in this file and in those that it includes.
+        """
         check_file(path, FileFormatError)
-        real = path.resolve()  # relative includes, however, start from `path`
+        real = path.resolve()  # used only to find rings: relative includes start from `path`
         if real in within:
             raise FileFormatError(f"{path} includes itself.")
         try:
@@ -190,7 +193,7 @@ class _Xml:
             raise FileFormatError(f"{path} is no valid XML: {brief(error)}.") from error
 
     def note_parameters(self, name: str, attributes: Mapping[str, str]) -> None:
-        """Note the parameters of an element that have no default, as needed or, in an ignored element, with a value."""
+        """Note the parameters of an element that have no default: as needed, or with a value if they are ignored."""
         missing = {match for text in attributes.values() for match in _PARAMETER.findall(text)} - set(self.defaults)
         if any(element in self.ignored for element in self.open):
             self.fillers |= dict.fromkeys(missing, "false" if name == "boolean" else "1")

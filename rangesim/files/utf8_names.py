@@ -44,7 +44,7 @@ class Utf8Names:
         self._names: dict[str, str] = {}
 
     def of(self, path: Path) -> Path:
-        """A path in UTF-8 of the same file or directory: the path itself if it and what it leads to are UTF-8.
+        """A path in UTF-8 of the same file or directory: the path itself if it and its real path are UTF-8.
 
         The neighbours of a file are neighbours of the returned path too, unless the file's own name is not UTF-8.
         """
@@ -104,7 +104,7 @@ def utf8_name(path: Path) -> Iterator[str]:
 
 
 def _place() -> str:
-    """A folder for temporary files whose name is UTF-8: the user's if possible."""
+    """A folder for temporary files whose name is UTF-8: the user's own if possible."""
     users = tempfile.gettempdir()
     for place in (users, *PLACES):
         if is_utf8(os.path.abspath(place)) and os.access(place, os.W_OK):

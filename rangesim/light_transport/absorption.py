@@ -24,7 +24,7 @@ ENDLESS_M = 1e30
 """Length in metres of a ray that meets no surface. It stands for infinity, because infinity times a coefficient of 0
 would be NaN."""
 UNCHANGED = -1.0
-"""Coefficient, in 1/m, of surfaces that bound no absorbing medium: the one along the ray stays. It is negative, so that
+"""Coefficient, in 1/m, of surfaces that bound no absorbing medium: that along the ray stays. It is negative, so that
 no real coefficient is the same."""
 
 

@@ -13,7 +13,7 @@ from rangesim.scene.materials import holes
 
 MAX_CUTOUTS = 8
 """Number of holes in a row through which a camera ray is followed to the first surface, so that the time per pixel is
-bounded. If there are more, the ground truth names the sheet of a hole."""
+bounded. If there are more, the ground truth shows a surface at one of its holes."""
 
 
 class Cutouts:

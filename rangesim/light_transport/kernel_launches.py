@@ -25,8 +25,8 @@ LAUNCH_S = 1.0
 """Duration in seconds at which the size of launches aims. It is short, because Ctrl-C waits for a launch; the shorter
 it is, the more time goes into the start of kernels."""
 UNWATCHED_LAUNCH_S = 20.0
-"""The same in seconds where nobody waits for a launch, because no progress is reported, and a thread of its own handles
-signals by ending the process."""
+"""The same duration, in seconds, where nobody waits for a launch, because no progress is reported and a separate thread
+handles signals by ending the process."""
 MAX_OVERRUN = 1.5
 """Largest ratio of the iterations of a launch to those that fit into its duration. Lanes that have not finished then go
 on in the next launch, so that one slow lane cannot make a launch long."""

@@ -147,7 +147,7 @@ class Radiance(Generic[Array]):
     caustic: Array
     ambient: Array
     smooth_caustic: Array
-    """Caustics gathered over wide circles, which are smooth therefore; `caustic` has the others."""
+    """Caustics that were gathered over wide circles and are therefore smooth; `caustic` has the others."""
 
 
 class PathSums(NamedTuple):

@@ -52,8 +52,8 @@ OCCUPANCY_CELLS = 1 << 18
 """Number of places per level in the table that says where photons may be, a power of two. At 2 MiB it fits into caches;
 a smaller table has more false hits, because more cells share a place."""
 PRIMES = (73856093, 19349663, 83492791)
-"""Factors of the spatial hash of a cell's coordinates (Teschner et al. 2003). They are added up here: combined by
-exclusive or, as in the paper, opposite cells would share a place."""
+"""Factors of the spatial hash of a cell's coordinates (Teschner et al. 2003). The products are added up here. The paper
+combines them by exclusive or; opposite cells would then share a place."""
 CLASS_PRIME = 50331653
 """Factor of the class in the same hash, see `_hash`; dimensionless."""
 ROW_FACTORS = (0x9E3779B3, 0x85EBCA75)

@@ -17,7 +17,7 @@ precision rounds coordinates of up to kilometres by less."""
 def displacement(truth: GroundTruth, rig: Rig, start: Poses, end: Poses) -> np.ndarray:
     """Distance that the surface point behind each pixel moves, in camera coordinates: (h, w) float32, metres.
 
-    It is 0 where no surface is.
+    It is 0 where there is no surface.
 
     Parameters
     ----------

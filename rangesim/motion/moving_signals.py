@@ -44,7 +44,7 @@ class MovingSignals(Signals):
     def frames(self, sensor: Sensor, ambient_transmission: float = 1.0, sampling_errors: float = 0.0) -> np.ndarray:
         if sensor != self.sensor:
             raise ValueError(
-                f"expected {self.sensor}, as the signals are the frames of this sensor alone, got {sensor}."
+                f"expected {self.sensor}, because the signals are the frames of this sensor alone, got {sensor}."
             )
         lit = self.lit
         if sampling_errors:
@@ -120,8 +120,8 @@ class FrameStack:
 def _ambient_gain(sensor: Sensor) -> np.ndarray:
     """Fraction of the ambient light that each frame receives: (k,) float32.
 
-    Frames are affine in ambient light, so the frames of one pixel with an ambient radiance of 1 and no other light
-    give it.
+    Frames are affine in ambient light. So the fraction is the frames of one pixel with an ambient radiance of 1 and no
+    other light.
     """
     dark = [np.zeros((r.channels, 1, 1), dtype=np.float32) for r in sensor.responses()]
     return sensor.frames(dark, np.zeros((1, 1), np.float32), np.ones((1, 1), np.float32))[:, 0, 0]

@@ -186,7 +186,7 @@ class Motion:
     Raises
     ------
     ValueError
-        Objects that are no mapping, or a track that is no `Track`.
+        `objects` is no mapping, or a track is no `Track`.
 
     Examples
     --------

@@ -45,7 +45,7 @@ def transport_moving(
     timings : sensor -> Timing, the times of its frames.
     motion : Motion, the tracks of objects and rig.
     settings : TransportSettings of each pass; None: the defaults. AdaptiveSampling is refused: passes would sample the
-        same surface differently, and it would differ from frame to frame.
+        same surface differently, and its noise would differ from frame to frame.
     progress : function that is called with the fraction done, 0..1.
     options : single fields that replace those of `settings`, such as spp=64 or seed=1.
 
@@ -53,11 +53,11 @@ def transport_moving(
     -------
     dict
         sensor -> Signals for `rangesim.expose`. `truth`, `energy` and `rig` are those at the middle of the sensor's
-        acquisition, `Timing.reference_s`; so is the pose of a point cloud. `motion_m` is a distance for each pixel: the
-        largest distance, in camera coordinates, between a surface point at an exposure of the pixel and the same point
-        at that middle. It covers the point that the pixel sees at the middle and the points that it sees at its
-        exposures, such as those of an object that passes by. Where a shadow passes, it is the distance of the fastest
-        object. It is None if one pass serves all exposures of the sensor.
+        acquisition, `Timing.reference_s`. The pose of a point cloud is also that of the middle. For each pixel,
+        `motion_m` is the largest distance, in camera coordinates, between a surface point at an exposure of the pixel
+        and the same point at that middle. It covers the point that the pixel sees at the middle and the points that it
+        sees at its exposures, such as those of an object that passes by. Where a shadow passes, it is the distance of
+        the fastest object. It is None if one pass serves all exposures of the sensor.
 
     Raises
     ------

@@ -29,10 +29,10 @@ are within 5e-4 of the exact stripes; a larger value is worse for the edge, a sm
 def blurred_stripes(x: Any, period: float, sigma: Any, m: Math) -> Any:
     """Value at x of stripes (a quarter dark, half bright, a quarter dark) blurred by a Gaussian.
 
-    Below `MIN_HARMONIC_SIGMA` the value is that of the nearest edge, an error function; neglected is the next edge,
-    less than the Gaussian's tail Q(0.25 / MIN_HARMONIC_SIGMA). Above, it is the mean and the harmonics k = 1, 3, 5 of
-    the square wave, each times exp(-2 (pi k sigma / P)^2); neglected is the seventh, less than
-    2 / (7 pi) exp(-98 (pi MIN_HARMONIC_SIGMA)^2).
+    If sigma / P is below `MIN_HARMONIC_SIGMA`, the value is that of the nearest edge, an error function. It neglects
+    the next edge, which is less than the Gaussian's tail Q(0.25 / MIN_HARMONIC_SIGMA). Above, the value is the mean and
+    the harmonics k = 1, 3, 5 of the square wave, each times exp(-2 (pi k sigma / P)^2). It neglects the seventh
+    harmonic, which is less than 2 / (7 pi) exp(-98 (pi MIN_HARMONIC_SIGMA)^2).
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ COPIES = 9
 class BlurredImage:
     """A pattern with Gaussian-blurred copies of it; outside the pattern it is dark.
 
-    A blur of at most `MAX_READ_SIGMA_PX` is computed while reading, exactly but for the Gaussian's tails beyond the
+    A blur of at most `MAX_READ_SIGMA_PX` is computed while reading, exactly except for the Gaussian's tails beyond the
     neighbouring pixels. A stronger blur is split in two: reading adds MAX_READ_SIGMA_PX, and the copies hold the rest,
     so that the variances of both together are MAX_READ_SIGMA_PX^2 times 1, 2, 4 ... 256 (sigma 0.5 to 8 pixels). A
     still stronger blur reads the last copy. Between two copies the value is interpolated linearly in the variance: by
@@ -115,8 +115,8 @@ class BlurredImage:
 def _taps(x: Any, size: int, sigma: Any, m: Math) -> list[tuple[Any, Any]]:
     """Pairs of index and weight for the three pixels around `x` along one axis of the image.
 
-    A weight is the part of the Gaussian that falls on the pixel and, for the two outer ones, beyond; it is 0 outside
-    the image.
+    A weight is the part of the Gaussian that falls on the pixel; for the two outer pixels, also the part that falls
+    beyond them. It is 0 outside the image.
     """
     pixel = m.floor(x)
     scale = ROOT_HALF / m.select(sigma > MIN_SIGMA, sigma, MIN_SIGMA)

@@ -95,8 +95,8 @@ class TransientHistogram(SparseResponse):
     channels : number of bins.
     period_m : path length between two pulses, metres, at least that of all bins. Lengths that differ by a multiple of
         it fall into the same bin, as light of successive pulses does. None: one single pulse.
-    is_shared : whether a path is shared between the two bins whose centres are nearest, in proportion to how near they
-        are (linear binning). This keeps the mean length, whatever the width of the bins.
+    is_shared : whether a path is shared between the two bins whose centres are nearest; the nearer bin gets more, in
+        linear proportion (linear binning). This keeps the mean length, whatever the width of the bins.
 
     Raises
     ------
@@ -131,7 +131,7 @@ class TransientHistogram(SparseResponse):
     def bin_weights(self, path: LightPath, m: Math) -> list[tuple[Any, Any]]:
         if not self.is_shared:
             return super().bin_weights(path, m)
-        start_m = self.start_m - self.width_m / 2  # whole numbers then are bin centres: n is that of bin n - 1
+        start_m = self.start_m - self.width_m / 2  # a whole number n is then the centre of bin n - 1
         place = _place(path, m, start_m, self.width_m, self.channels, self.period_m)
         upper = m.floor(place)
         lower, weight = upper - 1, place - upper
@@ -205,7 +205,7 @@ def _place(path: LightPath, m: Math, start_m: float, width_m: float, bins: int, 
         return place
     period = float(bins) if _fills(period_m, width_m, bins) else period_m / width_m
     place = place - period * m.floor(place * (1 / period))
-    return m.select((place < 0) | (place >= period), 0.0, place)  # rounding can leave it just outside
+    return m.select((place < 0) | (place >= period), 0.0, place)  # rounding can leave the place just outside
 
 
 def _fills(period_m: float, width_m: float, bins: int) -> bool:

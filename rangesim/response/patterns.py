@@ -110,8 +110,8 @@ class Fringes(DenseResponse):
 class Images(DenseResponse):
     """Arbitrary patterns, read at the projector pixel that the light left.
 
-    Two stacks with the same pixels are equal, also after pickling, so sensors that show them share their channels. Out
-    of focus, the patterns are read from blurred copies.
+    Two stacks with the same pixels are equal, also after pickling, so sensors that show them share their channels. If
+    the projector is out of focus, the patterns are read from blurred copies.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ class Images(DenseResponse):
 
     @cached_property
     def _digest(self) -> str:
-        """SHA-256 of the shape and the pixels: the same in every process, unlike `hash` of bytes."""
+        """SHA-256 of the shape and the pixels. It is the same in every process; `hash` of bytes is not."""
         digest = hashlib.sha256(repr(self.patterns.shape).encode())
         digest.update(self.patterns.data)
         return digest.hexdigest()

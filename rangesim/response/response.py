@@ -7,8 +7,8 @@ and brings the radiance w to a pixel. A `DenseResponse` adds w * r_c(u, v, l) to
 own: an inverse pattern is the white image minus the pattern, and four taps are made of two phasor components and the
 mean. A sensor therefore declares the smallest basis, and builds its frames from that.
 
-Each formula is written once, with the functions of `Math`. NumPy evaluates it for tests and pattern images, the
-renderer for every light path.
+Each formula is written once, with the functions of `Math`. NumPy evaluates it for tests and pattern images, and the
+renderer evaluates it for every light path.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class LightPath(NamedTuple):
 
 
 class Math(Protocol):
-    """The functions of arrays that a response may use."""
+    """The functions on arrays that a response may use."""
 
     def cos(self, x: Any) -> Any: ...
     def sin(self, x: Any) -> Any: ...
@@ -102,7 +102,7 @@ class Response(Named, ABC):
     """Number of channels of a dense response, of bins of a sparse one."""
 
     def check(self, width: int, height: int) -> None:
-        """Raise ValueError if a projector of width x height pixels cannot show this response. Most fit any."""
+        """Raise ValueError if a projector of width x height pixels cannot show this response. Most fit all sizes."""
 
 
 class DenseResponse(Response):

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 SAME_PLACE = 1e-5
 """Largest difference of two poses, in metres and radians, that count as the same place. Poses that were computed along
-different ways differ by rounding, about 1e-16; 10 um is less than anybody can adjust a device."""
+different ways differ by rounding, about 1e-16; nobody can adjust a device to 10 um."""
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R R^T - I|, dimensionless, of a matrix that counts as a rotation. A matrix written with five
 decimals is off by at most 2e-5 and passes; a scale of 1.0001 does not."""

@@ -31,8 +31,8 @@ BLACK = -1
 """Index of the frame without light of the projector: the last one, as in OpenCV."""
 
 MIN_CONTRAST = 0.02
-"""Least difference by which black is brighter than white, as a fraction of full scale, at the pixels that are counted
-to see whether the two are exchanged. Noise alone makes black a little brighter in half of the dark pixels."""
+"""Least difference by which black is brighter than white, as a fraction of full scale, at a pixel that counts as a sign
+that the two frames are exchanged. Noise alone makes black a little brighter in half of the dark pixels."""
 
 MAX_ACROSS = 0.25
 """Largest ratio of the baseline across the stripes of an axis to that along them, at which the axis is said to tell no

@@ -2,7 +2,8 @@
 """Strict conversion between frozen dataclasses and plain data (TOML, JSON).
 
 Every setting of the package is a frozen dataclass, and files of settings are read and written through this module only.
-It refuses unknown keys and names the nearest valid one, checks the types of values, and reads back equal what it wrote.
+It refuses unknown keys and names the nearest valid one, and checks the types of values. What it reads back is equal to
+what it wrote.
 
 Examples
 --------
@@ -98,8 +99,8 @@ def _hints(cls: type) -> dict[str, Any]:
 def on_top_of(default: Any, table: Any) -> Any:
     """A default value as plain data, updated with the entries of a table.
 
-    The table is returned unchanged if the default is no dataclass or has another `type`, and so is anything that is no
-    table.
+    The table is returned unchanged if the default is no dataclass or has another `type`. A value that is no table is
+    returned unchanged too.
     """
     if not isinstance(table, Mapping) or not dataclasses.is_dataclass(default) or isinstance(default, type):
         return table
@@ -146,7 +147,7 @@ def _required(field: dataclasses.Field[Any]) -> bool:
 
 
 def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
-    """The class to make: `cls`, or the member of its family that the key `type` names. The key is removed."""
+    """The class to make: `cls`, or the member of its family that the key `type` names. Removes the key."""
     if not issubclass(cls, Named):
         return cls
     own = getattr(cls, "type_name", None)
@@ -160,7 +161,7 @@ def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
 
 
 class Named:
-    """Base of a family of classes that files name by their `type_name`, such as sensors, detectors or responses.
+    """Base of a family of classes such as sensors, detectors or responses. Files name each class by its `type_name`.
 
     The base of a family derives from `Named` and sets ``known = {}``. Every subclass with a `type_name` then joins the
     family when it is defined, also one from outside the package. If the same lines are run again, as in a notebook, the

@@ -46,12 +46,12 @@ class Limits:
     spp : light paths per pixel.
     depth : segments of a light path.
     photons : caustic photons of one pass.
-    passes : light-transport passes of one sensor in a moving scene; also its bands of rows, and samples of an exposure.
+    passes : light-transport passes of one sensor in a moving scene; also bands of rows, and samples of an exposure.
     instruments : instruments of one experiment.
     points : vertices, or faces, of one mesh file.
     voxels : voxels of one grid in which views are fused, or the seen volume is compared with the true one.
     shapes : shapes of one scene.
-    memory : bytes that a run may need by its estimate; unless it is set, the memory available counts.
+    memory : bytes that a run may need by its estimate; unless it is set, the available memory is the limit.
     bytes : bytes of the arrays of one file after decompression.
     text : bytes of one JSON, TOML or XML file.
     nesting : nested levels of JSON, TOML, XML and scene dictionaries.
@@ -82,7 +82,7 @@ _raised: ContextVar[Limits | None] = ContextVar("limits", default=None)
 
 
 def current() -> Limits:
-    """The limits that apply now: those that `raised` has set, else those of the environment, else the defaults."""
+    """The limits that apply now: those that `raised` has set, else those of `RANGESIM_LIMITS`, else the defaults."""
     return _raised.get() or _of_environment(os.environ.get(VARIABLE, ""))
 
 
