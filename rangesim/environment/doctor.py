@@ -54,8 +54,8 @@ _FONT_FIX = "pip install --force-reinstall matplotlib, which brings DejaVu Sans"
 class Check:
     """A check of the machine, printed as one line.
 
-    name : short name. ok : whether it succeeded. detail : the finding. fix : advice if it failed. required : whether
-    rangesim cannot work without it; otherwise it lacks only some ability.
+    name : short name. ok : whether it succeeded. detail : the finding. fix : advice if it failed. required : True if
+    rangesim cannot work when the check fails; False if rangesim then lacks only one ability.
 
     Examples
     --------
@@ -92,7 +92,7 @@ def run_checks() -> list[Check]:
 
 
 def doctor_command() -> None:
-    """Check this machine: Python, LLVM, Mitsuba, CUDA, Open3D, fonts. One line each with the fix.
+    """Check this machine: Python, LLVM, Mitsuba, CUDA, Open3D, fonts. Each check prints one line, with the fix.
 
     The exit status is 1 if something that rangesim needs is missing.
     """
@@ -149,7 +149,7 @@ def _check_browser() -> Check:
 
 
 def _try_in_process(code: str, environment: Mapping[str, str] | None = None) -> tuple[bool, str]:
-    """Whether code runs to its end in a new Python process, and its output, or its error on one line."""
+    """Run code in a new Python process. Return whether it ran to its end, and its output or its error, on one line."""
     command = [sys.executable, "-c", code]
     try:
         run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S)

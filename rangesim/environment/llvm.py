@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Choice of the LLVM shared library that Dr.Jit compiles kernels with.
 
-Dr.Jit loads libLLVM when it is imported. If that is too old, the process ends at the first kernel without an exception.
-Therefore the version is read from file names, without loading anything, and a version known to fail is never used.
+Dr.Jit loads libLLVM when it is imported. If that library is too old, the process ends at the first kernel without an
+exception. Therefore this module reads the version from file names, without loading anything into this process, and
+never uses a version that is known to fail.
 
 Results with Dr.Jit 1.5.0 and Mitsuba 3.9.1 on x86-64 (a kernel with sin, min and max, then a Cornell box):
 
@@ -10,9 +11,10 @@ Results with Dr.Jit 1.5.0 and Mitsuba 3.9.1 on x86-64 (a kernel with sin, min an
     LLVM 15, 16           abort: "Cannot select: fminimum"
     LLVM 17, 18, 19, 22   work, with the same image
 
-x86 has no instruction for the IEEE minimum and maximum, and LLVM expands them since version 17 (LLVM issue 53353). This
-agrees with the table. LLVM 20 and 21 were not tried; they lie between versions that work. A version newer than
-`NEWEST_TESTED` is used only if no tested one is installed, because LLVM changes its C API.
+x86 has no instruction for the IEEE minimum and maximum. Since version 17, LLVM replaces each of them by several
+instructions that x86 has (LLVM issue 53353). This agrees with the table. LLVM 20 and 21 were not tried; they lie
+between versions that work. A version newer than `NEWEST_TESTED` is used only if no tested one is installed, because
+LLVM changes its C API.
 """
 
 from __future__ import annotations
@@ -173,7 +175,7 @@ def _libraries_of_linker() -> list[LlvmLibrary]:
 
 
 def _version_of(path: Path) -> tuple[int, ...]:
-    """Version of a library: from the name of the file, else of the link to it, else from the library itself."""
+    """Version of a library: from the name of the file, else from the name of the link to it, else from the library."""
     file = path.resolve()
     matches = filter(None, (_NAME.fullmatch(name) for name in (file.name, path.name)))
     named = (match["before"] or match["after"] for match in matches)
@@ -182,9 +184,9 @@ def _version_of(path: Path) -> tuple[int, ...]:
 
 
 def _ask(path: Path) -> str:
-    """The version that the library itself reports; empty if it does not.
+    """The version that the library itself reports; empty if it reports none.
 
-    It is loaded in another process, so that a crash does no harm.
+    The library is loaded in another process, so that a crash does no harm here.
     """
     try:
         command = [sys.executable, "-c", _ASK, str(path)]

@@ -25,7 +25,7 @@ from rangesim.settings import limits
 from rangesim.settings.config import shown
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]
-"""A count, at most 2^53: from there on, JSON readers with double precision skip integers."""
+"""A count, at most 2^53: JSON readers with double precision cannot hold every integer above it."""
 Photons = Annotated[float, msgspec.Meta(ge=0, le=1e300)]
 """A mean count of photons; the upper bound only excludes infinity."""
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -134,7 +134,8 @@ def read_checked_arrays(path: Path, specs: Mapping[str, ArraySpec], sizes: dict[
     Raises
     ------
     FileFormatError
-        The file is missing or broken, lacks an array, has one too many, or has one that does not meet its spec.
+        The file is missing or broken, lacks an array, has an array too many, or has an array that does not meet its
+        spec.
     """
     if not path.is_file():
         raise FileFormatError(f"{path} is missing.")

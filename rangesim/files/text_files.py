@@ -99,14 +99,14 @@ class SearchPaths(Protocol):
         """Path of the file with a name; it need not exist."""
 
     def within(self, folder: str, beside: Path) -> SearchPaths:
-        """These paths with a folder in front, as `<path value="folder"/>` in the file `beside` states."""
+        """These paths with one more folder, searched first: that of `<path value="folder"/>` in the file `beside`."""
 
 
 def check_xml(path: str | Path, search: SearchPaths | None = None, ignored: tuple[str, ...] = ()) -> dict[str, str]:
-    """Check an XML file and the files that it includes, and return values for parameters that need none.
+    """Check an XML file and the files that it includes. Return arbitrary values for the parameters that nobody uses.
 
-    These are the parameters (`$name`) without a default that occur only inside ignored elements. Mitsuba asks for a
-    value all the same, so they get an arbitrary one.
+    These are the parameters (`$name`) without a default that occur only inside ignored elements. Mitsuba refuses a file
+    in which a parameter has no value, even there.
 
     Parameters
     ----------
@@ -136,7 +136,10 @@ class _Xml:
         self.needed: set[str] = set()  # parameters without a default in other elements
 
     def read(self, path: Path, depth: int, within: tuple[Path, ...], search: SearchPaths | None) -> None:
-        """Check a file that the files `within` include, `depth` levels deep. Paths that it adds hold in it alone."""
+        """Check a file that the files `within` include, `depth` levels deep.
+
+        Search paths that the file adds are used for this file alone.
+        """
         check_file(path, FileFormatError)
         real = path.resolve()  # relative includes, however, start from `path`
         if real in within:
@@ -190,7 +193,7 @@ class _Xml:
             raise FileFormatError(f"{path} is no valid XML: {brief(error)}.") from error
 
     def note_parameters(self, name: str, attributes: Mapping[str, str]) -> None:
-        """Note the parameters of an element that have no default, as needed or, in an ignored element, with a value."""
+        """Note each parameter without a default in an element: in `needed`, or in `fillers` if it is ignored."""
         missing = {match for text in attributes.values() for match in _PARAMETER.findall(text)} - set(self.defaults)
         if any(element in self.ignored for element in self.open):
             self.fillers |= dict.fromkeys(missing, "false" if name == "boolean" else "1")

@@ -2,7 +2,8 @@
 """Strict conversion between frozen dataclasses and plain data (TOML, JSON).
 
 Every setting of the package is a frozen dataclass, and files of settings are read and written through this module only.
-It refuses unknown keys and names the nearest valid one, checks the types of values, and reads back equal what it wrote.
+It refuses an unknown key and names the nearest valid one. It checks the types of values. A file that it wrote gives
+equal settings when it is read again.
 
 Examples
 --------
@@ -98,8 +99,8 @@ def _hints(cls: type) -> dict[str, Any]:
 def on_top_of(default: Any, table: Any) -> Any:
     """A default value as plain data, updated with the entries of a table.
 
-    The table is returned unchanged if the default is no dataclass or has another `type`, and so is anything that is no
-    table.
+    The function returns the table unchanged if the default is no dataclass or has another `type`. It also returns
+    unchanged anything that is no table.
     """
     if not isinstance(table, Mapping) or not dataclasses.is_dataclass(default) or isinstance(default, type):
         return table
@@ -123,8 +124,8 @@ def brief(error: BaseException) -> str:
 
 
 MAX_REASON = 200
-"""Number of characters of a library's message that are repeated: two lines of a terminal. Some libraries quote whole
-files."""
+"""Largest number of characters that are quoted of a library's message: two lines of a terminal. Some libraries put
+whole files into their messages."""
 
 
 def check_keys(given: Mapping[str, Any], valid: typing.Iterable[str], place: str) -> None:
@@ -163,8 +164,8 @@ class Named:
     """Base of a family of classes that files name by their `type_name`, such as sensors, detectors or responses.
 
     The base of a family derives from `Named` and sets ``known = {}``. Every subclass with a `type_name` then joins the
-    family when it is defined, also one from outside the package. If the same lines are run again, as in a notebook, the
-    new class replaces the older one.
+    family when it is defined, also a subclass from outside the package. If the same lines are run again, as in a
+    notebook, the new class replaces the older one.
 
     Examples
     --------

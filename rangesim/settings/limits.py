@@ -39,19 +39,20 @@ class Limits:
     pixels : pixels of one image: camera, projector, film, texture or image file.
     projector : pixels along one side of a projector that shows coded patterns.
     frames : frames of one capture.
-    bins : bins of one time-of-flight histogram; with a pulse, the finer bins of the light transport count.
+    bins : bins of one time-of-flight histogram; if the light transport uses finer bins for a short pulse, those.
     steps : phase shifts of a fringe pattern.
     frequencies : modulation frequencies of one sensor.
     wraps : candidates of phase unwrapping: the longest path that is searched, divided by the shortest wavelength.
     spp : light paths per pixel.
     depth : segments of a light path.
     photons : caustic photons of one pass.
-    passes : light-transport passes of one sensor in a moving scene; also its bands of rows, and samples of an exposure.
+    passes : light-transport passes of one sensor in a moving scene; also the bands of rows of one image, the samples of
+    one exposure, and the views of one scan.
     instruments : instruments of one experiment.
     points : vertices, or faces, of one mesh file.
     voxels : voxels of one grid in which views are fused, or the seen volume is compared with the true one.
     shapes : shapes of one scene.
-    memory : bytes that a run may need by its estimate; unless it is set, the memory available counts.
+    memory : bytes that a run may need according to its estimate; if it is not set, the memory available is the limit.
     bytes : bytes of the arrays of one file after decompression.
     text : bytes of one JSON, TOML or XML file.
     nesting : nested levels of JSON, TOML, XML and scene dictionaries.
@@ -108,7 +109,7 @@ def check(name: str, value: int, what: str, error: type[Exception] = ValueError)
     Parameters
     ----------
     name : name of the limit. value : the size.
-    what : unit and thing, for the message, such as "pixels of an image".
+    what : what is counted, for the message, such as "pixels of an image".
     error : type of the error.
     """
     most = getattr(current(), name)
