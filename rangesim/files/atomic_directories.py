@@ -797,7 +797,8 @@ def _flush_tree(folder: Path) -> None:
 def _lock(staging: Path, seconds: float = 0.0) -> int | None:
     """Return an open handle that holds the lock of a staging directory.
 
-    Return None if a living process holds the lock for all of `seconds`. Raise FileNotFoundError if the directory is removed meanwhile.
+    Return None if a living process holds the lock for all of `seconds`. Raise FileNotFoundError if the directory is
+    removed meanwhile.
     """
     until = time.monotonic() + seconds
     while True:
