@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ambient light by kind and strength: how much of it passes a sensor's band-pass filter.
 
-A transport pass stores the light of the scene's own emitters separately (`Signals.energy.ambient`). That light has no
-spectrum and the units of the scene file. `Ambient` states its spectrum (an illuminant) and its strength. Light is
-linear, so both are factors on the finished pass:
+A transport pass stores the light of the scene's own emitters separately (`Signals.energy.ambient`). The pass knows no
+spectrum of that light, and gives it in the units of the scene file. `Ambient` states its spectrum (an illuminant) and
+its strength. Light is linear, so both are factors on the finished pass:
 
     ambient radiance behind the filter = energy.ambient * scale * fraction
 
@@ -77,7 +77,7 @@ class Illuminant(ABC):
 
 
 class Sun(Illuminant):
-    """Light of sun and sky, ASTM G173-03 global (`rangesim.electronics.sunlight`); broadband is 280 to 4000 nm."""
+    """Light of sun and sky, ASTM G173-03 global (`rangesim.electronics.sunlight`); "broadband" means 280 to 4000 nm."""
 
     def below(self, wavelength_nm: np.ndarray) -> np.ndarray:
         if np.min(wavelength_nm) < EDGES_NM[0] or np.max(wavelength_nm) > EDGES_NM[-1]:
@@ -91,7 +91,7 @@ class Sun(Illuminant):
 
 @dataclass(frozen=True)
 class Tungsten(Illuminant):
-    """Light of a black body, which a tungsten filament resembles closely; broadband is all wavelengths.
+    """Light of a black body, which a tungsten filament resembles closely; "broadband" means all wavelengths.
 
     temperature_k : float, kelvins; 2856 is CIE illuminant A, a halogen bulb has about 3000.
     """
@@ -123,8 +123,8 @@ class WhiteLed(Illuminant):
     """Light of a white LED: a blue diode under phosphor, about 4100 K.
 
     The spectrum is a sum of two Gaussians with two widths each (Jin et al. 2013). They were fitted to the CIE 15:2018
-    illuminant LED-B3 from 380 to 780 nm: rms error 2 % of the peak, luminous efficacy right to 1 %. Above 780 nm only
-    the tail of the fit is left. A real LED emits next to nothing there, too.
+    illuminant LED-B3 from 380 to 780 nm: the rms error is 2 % of the peak, and the luminous efficacy is right to 1 %.
+    Above 780 nm only the tail of the fit is left. A real LED emits next to nothing there, too.
     """
 
     _PARTS = ((0.942, 448.1, 8.73, 8.88), (1.0, 589.7, 76.1, 59.3))
@@ -148,7 +148,7 @@ class Ambient:
     Parameters
     ----------
     illuminant : "sun" (ASTM G173), "tungsten" (black body of `temperature_k`), or "led" (white, with phosphor). Take
-        "led" for fluorescent tubes: they emit as little near infrared.
+        "led" for fluorescent tubes too: they emit as little near infrared as a white LED.
     illuminance_lux : float, lux, on a surface that receives `scene_irradiance_w_m2` in the scene.
     irradiance_w_m2 : float, W/m2, broadband irradiance on that surface. Give this or `illuminance_lux`, not both.
         Without either, radiances in the scene file are taken as broadband W/m2/sr.

@@ -26,7 +26,7 @@ SMALL_MEAN = 4.0
 larger ones (tests/test_shot_noise.py). Below it only a few probabilities have to be added up."""
 MAX_DEVIATE = 4.0
 """Standard deviations: largest |w| for which the bound of the expansion's error holds (tests/test_shot_noise.py). One
-draw in 16 000 is beyond, and is then decided by the cumulative probability."""
+draw in 16 000 is beyond; the cumulative probability then decides it."""
 SUMMED = 8
 """Count of terms of the cumulative probability that are always added, because a loop without a branch is faster. At the
 largest mean that they serve (4 photons), 2 % of the draws need more terms."""
@@ -103,8 +103,8 @@ def _shared(rng, photons, pulses):  # type: ignore[no-untyped-def]
     """Number of photons that fall into a pulse that already has one, when each photon hits a random pulse.
 
     The method is thinning. A photon is a candidate with the probability 1 - exp(-rate), which exceeds photons / pulses,
-    so gaps between candidates are exponential. A candidate is then accepted with the probability that makes the product
-    equal to the pulses hit so far over all pulses.
+    so the gaps between candidates follow an exponential distribution. A candidate is then accepted with a second
+    probability. The product of the two probabilities is the number of pulses hit so far divided by that of all pulses.
     """
     shared, number = 0, 1  # the first photon, number 0, finds all pulses empty
     rate = 2 * photons / pulses if photons < 0.75 * pulses else math.inf
@@ -178,7 +178,7 @@ def _search(w, mean, count):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy")
 def _is_below(count, w, mean):  # type: ignore[no-untyped-def]
-    """Whether P(N <= count) <= Phi(w). Both are compared as tails on the side of w, which keep their precision."""
+    """Whether P(N <= count) <= Phi(w). The function compares the tails on the side of w, which keep their precision."""
     tail, total = 0.5 * math.erfc(abs(w) * math.sqrt(0.5)), 0.0
     if w < 0:
         probability = _probability(count, mean)

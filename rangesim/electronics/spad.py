@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 
 MAX_MEAN = 1e9
-"""Largest expected photon count of a bin that is drawn; larger ones are drawn with this one. It changes nothing, as a
-counter holds at most 65535 and saturates far below."""
+"""Largest expected photon count of a bin with which its count is drawn; it replaces larger ones. This changes no
+result, because a counter holds at most 65535 and saturates far below this value."""
 
 
 class CountingPixel(NamedTuple):
@@ -98,7 +98,8 @@ class SpadDetector(PhotoDetector):
         return max(1, round(exposure_s / _counting(gate).period_s))
 
     def ambient_fraction(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
-        """Factor on the scene's ambient light for the part that passes the filter while photons are counted."""
+        """Factor by which the scene's ambient light is multiplied: its part that passes the filter while photons are
+        counted."""
         gate = _counting(gate)
         return super().ambient_fraction(gate, ambient) * gate.open_s / gate.period_s
 

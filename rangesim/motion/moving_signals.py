@@ -57,7 +57,7 @@ class MovingSignals(Signals):
 
 
 class FrameStack:
-    """Accumulator for the frames of one sensor; each pass adds its part, and is not kept.
+    """Accumulator for the frames of one sensor; it adds the part of each pass, and does not keep the pass.
 
     Parameters
     ----------
@@ -120,8 +120,8 @@ class FrameStack:
 def _ambient_gain(sensor: Sensor) -> np.ndarray:
     """Fraction of the ambient light that each frame receives: (k,) float32.
 
-    Frames are affine in ambient light, so the frames of one pixel with an ambient radiance of 1 and no other light
-    give it.
+    A frame depends linearly on ambient light. So the fraction is the frame of a pixel that has an ambient radiance of 1
+    and no other light.
     """
     dark = [np.zeros((r.channels, 1, 1), dtype=np.float32) for r in sensor.responses()]
     return sensor.frames(dark, np.zeros((1, 1), np.float32), np.ones((1, 1), np.float32))[:, 0, 0]

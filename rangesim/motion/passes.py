@@ -38,7 +38,7 @@ class Pass:
     poses : places of everything that moves.
     window : part of the image that is rendered.
     contributions : frames that this pass gives light to; none if it is the middle of an acquisition only.
-    reference_of : sensors that have the middle of their acquisition here.
+    reference_of : sensors whose acquisition has its middle at the time of this pass.
     """
 
     poses: Poses
@@ -104,7 +104,7 @@ def plan(rig: Rig, timings: Mapping[Sensor, Timing], motion: Motion) -> list[Pas
 
 
 def _joined(instants: Sequence[Instant], motion: Motion) -> list[Instant]:
-    """The same instants, with those merged between which nothing moves.
+    """The same instants, but instants between which nothing moves are merged.
 
     Instants of the same window are merged by adding their fractions. Then neighbouring bands are merged to one window.
     """

@@ -58,7 +58,8 @@ class Timing:
     frame_period_s : float >= 0, seconds from one exposure to the next.
     line_period_s : float >= 0, seconds from one line to the next as the camera reads them. 0: all lines at once (global
         shutter). The emitter lights its whole field for every line. So a line period makes a rolling shutter, not a
-        scanning beam: a beam would light one line at a time with its full power, and without the multipath of others.
+        scanning beam: a beam would light one line at a time with its full power, and without the multipath of the other
+        lines.
     lines : "rows" from top to bottom, or "columns" from left to right.
     bands : int >= 1, number of bands of lines (fewer if there are fewer lines), if lines are read one by one. Each band
         is a pass of its own, rendered at the time of its middle line.

@@ -45,7 +45,7 @@ def transport_moving(
     timings : sensor -> Timing, the times of its frames.
     motion : Motion, the tracks of objects and rig.
     settings : TransportSettings of each pass; None: the defaults. AdaptiveSampling is refused: passes would sample the
-        same surface differently, and it would differ from frame to frame.
+        same surface differently, and the surface would look different from frame to frame.
     progress : function that is called with the fraction done, 0..1.
     options : single fields that replace those of `settings`, such as spp=64 or seed=1.
 
@@ -57,7 +57,7 @@ def transport_moving(
         largest distance, in camera coordinates, between a surface point at an exposure of the pixel and the same point
         at that middle. It covers the point that the pixel sees at the middle and the points that it sees at its
         exposures, such as those of an object that passes by. Where a shadow passes, it is the distance of the fastest
-        object. It is None if one pass serves all exposures of the sensor.
+        object. `motion_m` is None if one pass serves all exposures of the sensor.
 
     Raises
     ------

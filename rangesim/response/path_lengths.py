@@ -131,7 +131,7 @@ class TransientHistogram(SparseResponse):
     def bin_weights(self, path: LightPath, m: Math) -> list[tuple[Any, Any]]:
         if not self.is_shared:
             return super().bin_weights(path, m)
-        start_m = self.start_m - self.width_m / 2  # whole numbers then are bin centres: n is that of bin n - 1
+        start_m = self.start_m - self.width_m / 2  # whole numbers are then bin centres: n is the centre of bin n - 1
         place = _place(path, m, start_m, self.width_m, self.channels, self.period_m)
         upper = m.floor(place)
         lower, weight = upper - 1, place - upper

@@ -47,7 +47,7 @@ class Limits:
     depth : segments of a light path.
     photons : caustic photons of one pass.
     passes : light-transport passes of one sensor in a moving scene; also the bands of rows of one image, the samples of
-    one exposure, and the views of one scan.
+        one exposure, and the views of one scan.
     instruments : instruments of one experiment.
     points : vertices, or faces, of one mesh file.
     voxels : voxels of one grid in which views are fused, or the seen volume is compared with the true one.
