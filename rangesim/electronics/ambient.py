@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ambient light by kind and strength: how much of it passes a sensor's band-pass filter.
 
-A transport pass stores the light of the scene's own emitters separately (`Signals.energy.ambient`). That light has no
-spectrum and the units of the scene file. `Ambient` states its spectrum (an illuminant) and its strength. Light is
-linear, so both are factors on the finished pass:
+A transport pass stores the light of the scene's own emitters separately (`Signals.energy.ambient`). The pass knows no
+spectrum of that light, and gives it in the units of the scene file. `Ambient` states its spectrum (an illuminant) and
+its strength. Light is linear, so both are factors on the finished pass:
 
     ambient radiance behind the filter = energy.ambient * scale * fraction
 
@@ -77,7 +77,7 @@ class Illuminant(ABC):
 
 
 class Sun(Illuminant):
-    """Light of sun and sky, ASTM G173-03 global (`rangesim.electronics.sunlight`); broadband is 280 to 4000 nm."""
+    """Light of sun and sky, ASTM G173-03 global (`rangesim.electronics.sunlight`); "broadband" means 280 to 4000 nm."""
 
     def below(self, wavelength_nm: np.ndarray) -> np.ndarray:
         if np.min(wavelength_nm) < EDGES_NM[0] or np.max(wavelength_nm) > EDGES_NM[-1]:
@@ -91,7 +91,7 @@ class Sun(Illuminant):
 
 @dataclass(frozen=True)
 class Tungsten(Illuminant):
-    """Light of a black body, which a tungsten filament resembles closely; broadband is all wavelengths.
+    """Light of a black body, which a tungsten filament resembles closely; "broadband" means all wavelengths.
 
     temperature_k : float, kelvins; 2856 is CIE illuminant A, a halogen bulb has about 3000.
     """

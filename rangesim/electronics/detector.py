@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detectors, which turn radiance into digital numbers: the base class, and linear image sensors after EMVA 1288.
+"""Detectors, which turn radiance into digital numbers: the base class, and linear image sensors as defined by EMVA
+1288.
 
 A camera with entrance pupil radius a and focal length f turns the radiance L into the irradiance E = L pi (a/f)^2 on a
-pixel. On its area A and in the exposure time t, that is E A t lambda / (h c) photons. With f = fx sqrt(A) the pixel
-pitch cancels: photons = L pi a^2 / (fx fy) t lambda / (h c), which is radiance times etendue. The fall-off towards the
-image corners belongs to the rig (`Lens.vignetting`) and is part of the radiance already.
+pixel. A pixel of the area A then receives E A t lambda / (h c) photons in the exposure time t. With f = fx sqrt(A) the
+pixel pitch cancels: photons = L pi a^2 / (fx fy) t lambda / (h c), which is radiance times etendue. The fall-off
+towards the image corners belongs to the rig (`Lens.vignetting`) and is part of the radiance already.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ Bits = Annotated[int, Bounds("a number of bits", 1, 16)]
 """Resolution of an analogue-to-digital converter or a counter, 1 to 16 bits, because digital numbers are stored as
 uint8 or uint16."""
 BandWidth = Annotated[float, Bounds("0 or positive", 1e-12, 2e-2, or_zero=True)]
-"""Full width of a band-pass filter in metres; at most twice the longest wavelength, as the band ends above 0 m."""
+"""Full width of a band-pass filter in metres; at most twice the longest wavelength, because the lower end of the band
+must be above 0 m."""
 
 
 class Gate(NamedTuple):
@@ -114,7 +116,8 @@ class PhotoDetector(Named, ABC):
         return None
 
     def ambient_fraction(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
-        """Factor on the scene's ambient light for the part that passes the filter and is counted.
+        """Factor by which the scene's ambient light is multiplied: the part of it that passes the filter and is
+        counted.
 
         ambient : spectrum and strength of that light; the filter's band then decides the factor. None: they are not
             known, and the factor is `ambient_transmission`.
@@ -155,7 +158,8 @@ class LinearPixel(NamedTuple):
 
     electrons_per_radiance : electrons per W/m2/sr.
     dark_e : electrons of the dark current.
-    max_mean_e : electrons, largest expected number that is drawn; the pixel is saturated there, whatever its noise.
+    max_mean_e : electrons, largest expected number for which noise is drawn; the pixel is then saturated, whatever its
+        noise.
     read_noise_e : electrons rms.
     gain_dn_e : digital numbers per electron.
     offset_dn, max_dn : digital numbers, black level and largest number.
@@ -177,7 +181,7 @@ def streams(seed: int, n: int) -> list[np.random.Generator]:
 
 @dataclass(frozen=True)
 class Detector(PhotoDetector):
-    """Linear image sensor after EMVA Standard 1288, release 4.0 Linear (symbols of the standard in brackets).
+    """Linear image sensor as in EMVA Standard 1288, release 4.0 Linear (symbols of the standard in brackets).
 
     Parameters
     ----------

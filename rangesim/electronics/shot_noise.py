@@ -26,7 +26,7 @@ SMALL_MEAN = 4.0
 larger ones (tests/test_shot_noise.py). Below it only a few probabilities have to be added up."""
 MAX_DEVIATE = 4.0
 """Standard deviations: largest |w| for which the bound of the expansion's error holds (tests/test_shot_noise.py). One
-draw in 16 000 is beyond, and is then decided by the cumulative probability."""
+draw in 16 000 is beyond; the cumulative probability then decides it."""
 SUMMED = 8
 """Count of terms of the cumulative probability that are always added, because a loop without a branch is faster. At the
 largest mean that they serve (4 photons), 2 % of the draws need more terms."""

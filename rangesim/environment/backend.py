@@ -63,7 +63,7 @@ def images_can_be_read() -> Iterator[None]:
     """Let Dr.Jit have two threads while the block runs, if it has only one, as on a machine with a single core.
 
     With one thread, Mitsuba 3.9 waits forever for an OpenEXR file (its issue 21). The second thread is removed
-    afterwards, because two threads that spin on one core make a light-transport pass a tenth slower.
+    afterwards, because two threads that wait in busy loops on one core make a light-transport pass a tenth slower.
     """
     threads = dr.thread_count()
     if threads > 1:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Choice of the LLVM shared library that Dr.Jit compiles kernels with.
 
-Dr.Jit loads libLLVM when it is imported. If that is too old, the process ends at the first kernel without an exception.
-Therefore the version is read from file names, without loading anything, and a version known to fail is never used.
+Dr.Jit loads libLLVM when it is imported. If that library is too old, the process ends at the first kernel without an
+exception. Therefore this module reads the version from file names, without loading anything into this process, and
+never uses a version that is known to fail.
 
 Results with Dr.Jit 1.5.0 and Mitsuba 3.9.1 on x86-64 (a kernel with sin, min and max, then a Cornell box):
 
@@ -182,9 +183,9 @@ def _version_of(path: Path) -> tuple[int, ...]:
 
 
 def _ask(path: Path) -> str:
-    """The version that the library itself reports; empty if it does not.
+    """The version that the library itself reports; empty if it reports none.
 
-    It is loaded in another process, so that a crash does no harm.
+    The library is loaded in another process, so that a crash does no harm here.
     """
     try:
         command = [sys.executable, "-c", _ASK, str(path)]

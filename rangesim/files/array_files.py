@@ -29,8 +29,8 @@ Check = Callable[[str, str, tuple[int, ...], "np.dtype[Any]"], None]
 KINDS = "biufcSU"
 """Kinds of NumPy types that are read: numbers and text of fixed size, but no objects."""
 MAX_ARRAYS = 1000
-"""Largest number of arrays in a file. Files of this package have some tens; without a limit, the directory of a hostile
-file could fill the memory."""
+"""Largest number of arrays in a file. Files of this package have some tens of arrays; without a limit, the list of
+contents of a hostile file could fill the memory."""
 COMPRESSION_LEVEL = 1
 """Level of deflate, 1 to 9. The lower digits of measured arrays are noise. In a test, the default level 6 took twice
 as long and made files 2 % smaller."""
@@ -77,7 +77,7 @@ def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], seal: str |
 def read_arrays(
     path: str | Path, names: Iterable[str] | None = None, check: Check | None = None
 ) -> dict[str, np.ndarray]:
-    """Arrays by name of a .npz file that `numpy.savez` or `numpy.savez_compressed` may have written.
+    """The arrays of a .npz file, by their names. `numpy.savez` or `numpy.savez_compressed` may have written the file.
 
     Nothing is unpickled. The sizes stated in the file are checked against the limit `bytes` first; an array whose size
     differs from the stated one is refused.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Directories that appear whole or not at all, and never cost a user a file.
+"""Directories that appear whole or not at all; writing them never destroys a file of the user.
 
 Every command and every `save` of rangesim that writes a directory does so here, by four rules; those that write single
 files do so in `pcgraph.plumbing.plain_files`.
@@ -48,7 +48,8 @@ MANIFEST_FORMAT = "rangesim-manifest"
 MANIFEST_VERSION = 1
 """Version of the manifest's format; a manifest of another version is refused."""
 MAX_MANIFEST_BYTES = 64 << 20
-"""Bytes of the largest manifest that is read. A file takes some 150 of them, so these are over 400 000 files."""
+"""Bytes of the largest manifest that is read. Each listed file takes some 150 bytes, so this is enough for over 400 000
+files."""
 _JOURNAL, _LOCK, _WORK, _NEW, _OLD, _DOOMED = "journal.json", "lock", "work", "new", "old", "doomed"
 _ATTEMPTS = 1000
 """Attempts, about a millisecond apart, to claim a directory that another process removes at the same moment. If all
@@ -60,7 +61,7 @@ class DirectoryKind:
     """A kind of directory that this project writes.
 
     format : name of the kind in the manifest and in the sidecar. sidecar : name of the JSON file with the settings.
-    error : exception, with one sentence, that says why a directory of this kind cannot be written.
+    error : type of the exception whose message says, in one sentence, why a directory of this kind cannot be written.
 
     Examples
     --------
@@ -136,9 +137,9 @@ def check_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence
 def new_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence[str | Path] = ()) -> Iterator[Path]:
     """Yield a directory to fill; its files move to `directory` when the block ends well, and are removed if it fails.
 
-    An older result of the same kind stays until then, and is replaced then. Files that are not in its manifest stay. If
-    a file of the user stands in the way when the block ends, the new result is kept in a directory inside, which the
-    error names.
+    An older result of the same kind stays until the block ends well, and is then replaced. Files that are not in its
+    manifest stay. If a file of the user stands in the way when the block ends, the new result is kept in a directory
+    inside `directory`, and the error names that directory.
 
     Raises
     ------
@@ -189,7 +190,7 @@ def replace_listed_file(directory: str | Path, name: str, make: Callable[[], byt
             if os.path.lexists(path) and not (is_plain_file(path) and _digest(path) in files.get(name, [])):
                 raise kind.error(f"{path} was changed since rangesim wrote it; move it away first.")
             new = Digest(len(content), hashlib.sha256(content).hexdigest())
-            # Both contents are ours while one takes the place of the other
+            # The manifest lists the old and the new content while the new one replaces the old one
             replace_file(folder / MANIFEST, _manifest(kind, files | {name: [*files.get(name, []), new]}))
             replace_file(path, content)
             replace_file(folder / MANIFEST, _manifest(kind, files | {name: [new]}))
@@ -255,8 +256,8 @@ def recover(directory: str | Path, error: type[Exception]) -> None:
     if not is_plain_file(staging / _JOURNAL) or not _is_staging(staging):
         return
     try:
-        handle = _lock(staging, seconds=5.0)  # a living process is done with its renames in that time
-    except FileNotFoundError:  # it is done
+        handle = _lock(staging, seconds=5.0)  # a living process needs less time for its renames
+    except FileNotFoundError:  # that process has finished
         return
     except OSError as problem:
         raise error(f"cannot read {staging}: {why(problem)}.") from problem
@@ -498,7 +499,7 @@ def _carry_out(target: Path) -> None:
     retire, place = _read_journal(staging / _JOURNAL)
     waiting = {name for name in place if os.path.lexists(staging / _NEW / name)}
     for name, digests in retire.items():
-        gone = name in place and name not in waiting  # the new one stands there already
+        gone = name in place and name not in waiting  # the new file is there already
         if gone or os.path.lexists(staging / _OLD / name) or not os.path.lexists(target / name):
             continue
         if _is_as_listed(target, name, {name: digests}):
@@ -793,7 +794,8 @@ def _flush_tree(folder: Path) -> None:
 def _lock(staging: Path, seconds: float = 0.0) -> int | None:
     """Return an open handle with the lock of a staging directory; None if a living process keeps it that long.
 
-    Raise FileNotFoundError if the directory is removed meanwhile.
+    Return None if a living process holds the lock for all of `seconds`. Raise FileNotFoundError if the directory is
+    removed meanwhile.
     """
     until = time.monotonic() + seconds
     while True:
@@ -815,7 +817,7 @@ def _lock(staging: Path, seconds: float = 0.0) -> int | None:
 
 
 def _is_claimed(target: Path) -> bool:
-    """Whether a living process writes to a directory; nothing is made to find out."""
+    """Whether a living process writes to a directory; this check creates no file."""
     path = target / STAGING / _LOCK
     if fcntl is None or not is_plain_file(path):
         return False

@@ -25,7 +25,7 @@ from rangesim.settings import limits
 from rangesim.settings.config import shown
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]
-"""A count, at most 2^53: from there on, JSON readers with double precision skip integers."""
+"""A count, at most 2^53: JSON readers with double precision cannot hold every integer above it."""
 Photons = Annotated[float, msgspec.Meta(ge=0, le=1e300)]
 """A mean count of photons; the upper bound only excludes infinity."""
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]

@@ -103,10 +103,10 @@ class SearchPaths(Protocol):
 
 
 def check_xml(path: str | Path, search: SearchPaths | None = None, ignored: tuple[str, ...] = ()) -> dict[str, str]:
-    """Check an XML file and the files that it includes, and return values for parameters that need none.
+    """Check an XML file and the files that it includes. Return arbitrary values for the parameters that nobody uses.
 
-    These are the parameters (`$name`) without a default that occur only inside ignored elements. Mitsuba asks for a
-    value all the same, so they get an arbitrary one.
+    These are the parameters (`$name`) without a default that occur only inside ignored elements. Mitsuba refuses a file
+    in which a parameter has no value, even there.
 
     Parameters
     ----------

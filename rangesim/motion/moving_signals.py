@@ -57,7 +57,7 @@ class MovingSignals(Signals):
 
 
 class FrameStack:
-    """Accumulator for the frames of one sensor; each pass adds its part, and is not kept.
+    """Accumulator for the frames of one sensor; it adds the part of each pass, and does not keep the pass.
 
     Parameters
     ----------

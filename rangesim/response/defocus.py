@@ -19,11 +19,12 @@ if TYPE_CHECKING:
 ROOT_HALF = 0.5**0.5
 """1 / sqrt(2), dimensionless: the Gaussian's integral up to x is 0.5 + 0.5 erf(x ROOT_HALF / sigma)."""
 MIN_SIGMA = 1e-5
-"""Smallest sigma, in periods or pixels, so that a point exactly on an edge does not divide 0 by 0. It is far below what
-shows: an edge is then a step."""
+"""Smallest sigma, in periods or pixels: it keeps the formula from dividing 0 by 0 at a point exactly on an edge. It is
+so small that the edge still looks like a step."""
 MIN_HARMONIC_SIGMA = 0.075
-"""Sigma in periods from which on `blurred_stripes` sums harmonics instead of taking the nearest edge. Here both forms
-are within 5e-4 of the exact stripes; a larger value is worse for the edge, a smaller one for the harmonics."""
+"""Sigma in periods from which on `blurred_stripes` sums harmonics instead of taking the nearest edge. At this value
+both forms are within 5e-4 of the exact stripes; above it the form with the edge would be less exact, below it the
+harmonics."""
 
 
 def blurred_stripes(x: Any, period: float, sigma: Any, m: Math) -> Any:
@@ -55,18 +56,20 @@ def fringe_contrast(period: float, sigma: Any, m: Math) -> Any:
     """Factor by which blur and pixels lower the contrast of sinusoidal fringes with the period P.
 
     The blur contributes exp(-2 pi^2 sigma^2 / P^2). The pixels contribute sinc(1 / P), because each shows the value at
-    its centre over its whole width (zero-order hold); the harmonics of these steps, about one period per pixel, are
-    neglected.
+    its centre over its whole width (zero-order hold); the function neglects the harmonics of these steps, which have
+    about one period per pixel.
     """
     spread = sigma * (1 / period)
     return m.exp(-2 * np.pi**2 * spread * spread) * float(np.sinc(1 / period))
 
 
 MAX_READ_SIGMA_PX = 0.5
-"""Blur, as a sigma in pixels, that reading the nine nearest pixels adds; stronger blur is in the copies. At 0.5, less
-than 2.3 % (Q(2)) of the Gaussian lies beyond the neighbouring pixels; a larger value would need more than nine."""
+"""Blur, as a sigma in pixels, that the reader adds when it reads the nine nearest pixels; stronger blur is in the
+copies. At 0.5, less than 2.3 % (Q(2)) of the Gaussian lies beyond the neighbouring pixels; a larger value would need
+more than nine."""
 VARIANCE_RATIO = 2.0
-"""Ratio of the variances of two successive copies. A smaller one interpolates more closely and needs more copies."""
+"""Ratio of the variances of two successive copies. A smaller ratio makes the interpolation more exact and needs more
+copies."""
 COPIES = 9
 """Number of copies of a pattern: with the ratio 2 they reach a sigma of 8 pixels, and take 36 bytes per pixel."""
 
@@ -77,8 +80,8 @@ class BlurredImage:
     A blur of at most `MAX_READ_SIGMA_PX` is computed while reading, exactly except for the Gaussian's tails beyond the
     neighbouring pixels. A stronger blur is split in two: reading adds MAX_READ_SIGMA_PX, and the copies hold the rest,
     so that the variances of both together are MAX_READ_SIGMA_PX^2 times 1, 2, 4 ... 256 (sigma 0.5 to 8 pixels). A
-    still stronger blur reads the last copy. Between two copies the value is interpolated linearly in the variance: by
-    the heat equation it is linear there for small steps.
+    still stronger blur reads the last copy. Between two copies the value is interpolated linearly in the variance: a
+    blur obeys the heat equation, so for small steps the value is linear in the variance.
 
     Parameters
     ----------
@@ -131,8 +134,8 @@ def _taps(x: Any, size: int, sigma: Any, m: Math) -> list[tuple[Any, Any]]:
 def _smooth(image: np.ndarray, variance: float) -> np.ndarray:
     """The image blurred by a Gaussian of the given variance, pixels^2.
 
-    The taps of the filter have the Gaussian's frequency response up to half a cycle per pixel. Taps that sample the
-    Gaussian itself would have neither its variance nor its response where it is narrower than a pixel.
+    The weights of the filter have the Gaussian's frequency response up to half a cycle per pixel. Weights that are
+    samples of the Gaussian itself would have neither its variance nor its response if it is narrower than a pixel.
     """
     from scipy.ndimage import correlate1d
 

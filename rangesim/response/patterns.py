@@ -121,7 +121,7 @@ class Images(DenseResponse):
     Raises
     ------
     ValueError
-        `patterns` is no such array, has no pixels, or has some that are not finite.
+        `patterns` is no such array, has no pixels, or has pixels that are not finite.
 
     Examples
     --------

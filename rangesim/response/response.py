@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The interface of a response: the weight with which a sensor counts one light path.
 
-A range sensor is a linear functional of light paths. A path leaves the projector at (u, v), has the optical length l,
-and brings the radiance w to a pixel. A `DenseResponse` adds w * r_c(u, v, l) to each of its channels c; a
-`SparseResponse` adds w to one of many bins. A frame that a sensor can compute from other frames needs no channel of its
-own: an inverse pattern is the white image minus the pattern, and four taps are made of two phasor components and the
-mean. A sensor therefore declares the smallest basis, and builds its frames from that.
+A range sensor adds up light paths, each with a weight (a linear functional). A path leaves the projector at (u, v), has
+the optical length l, and brings the radiance w to a pixel. A `DenseResponse` adds w * r_c(u, v, l) to each of its
+channels c; a `SparseResponse` adds w to one of many bins. A frame that a sensor can compute from other frames needs no
+channel of its own: an inverse pattern is the white image minus the pattern, and four taps are made of two phasor
+components and the mean. A sensor therefore declares as few channels as possible, and computes its frames from them.
 
 Each formula is written once, with the functions of `Math`. NumPy evaluates it for tests and pattern images, and the
 renderer evaluates it for every light path.
@@ -99,7 +99,7 @@ class Response(Named, ABC):
     """Name in files of signals; a response without one can be used, but not saved."""
 
     channels: int
-    """Number of channels of a dense response, of bins of a sparse one."""
+    """Number of channels of a dense response, or of bins of a sparse response."""
 
     def check(self, width: int, height: int) -> None:
         """Raise ValueError if a projector of width x height pixels cannot show this response. Most fit all sizes."""

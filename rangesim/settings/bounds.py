@@ -46,8 +46,8 @@ class Bounds:
     low, high : the smallest and the largest allowed number.
     or_zero : whether 0 is allowed too, although it lies outside the interval.
     limit : name of the entry of `rangesim.settings.limits` that is the upper bound; "": none.
-    kind : `int` if only whole numbers are allowed. `check_number` reads it; on the field of a dataclass, the type in
-        its annotation decides instead.
+    kind : `int` if only whole numbers are allowed. Only `check_number` reads it; for a field of a dataclass, the type
+        in the field's annotation decides.
 
     Examples
     --------
@@ -90,7 +90,7 @@ def whole(low: int, limit: str = "") -> Bounds:
 
 MAX_COORDINATE_M = 1e7
 """Largest coordinate of the world, in metres: the Earth's radius is 6.4e6 m, so coordinates of maps and of the globe
-fit. Double precision still resolves 2 nm there; a larger value would lose that."""
+fit. At this distance from the origin, double precision still resolves 2 nm; farther away it would not."""
 Metres = Annotated[float, Bounds("positive and finite", 1e-9, MAX_COORDINATE_M)]
 """A length in metres, from 1 nm."""
 Watts = Annotated[float, Bounds("positive and finite", 1e-12, 1e9)]

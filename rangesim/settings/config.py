@@ -124,8 +124,8 @@ def brief(error: BaseException) -> str:
 
 
 MAX_REASON = 200
-"""Number of characters of a library's message that are repeated: two lines of a terminal. Some libraries quote whole
-files."""
+"""Largest number of characters that are quoted of a library's message: two lines of a terminal. Some libraries put
+whole files into their messages."""
 
 
 def check_keys(given: Mapping[str, Any], valid: typing.Iterable[str], place: str) -> None:
@@ -164,8 +164,8 @@ class Named:
     """Base of a family of classes such as sensors, detectors or responses. Files name each class by its `type_name`.
 
     The base of a family derives from `Named` and sets ``known = {}``. Every subclass with a `type_name` then joins the
-    family when it is defined, also one from outside the package. If the same lines are run again, as in a notebook, the
-    new class replaces the older one.
+    family when it is defined, also a subclass from outside the package. If the same lines are run again, as in a
+    notebook, the new class replaces the older one.
 
     Examples
     --------

@@ -39,7 +39,7 @@ class Limits:
     pixels : pixels of one image: camera, projector, film, texture or image file.
     projector : pixels along one side of a projector that shows coded patterns.
     frames : frames of one capture.
-    bins : bins of one time-of-flight histogram; with a pulse, the finer bins of the light transport count.
+    bins : bins of one time-of-flight histogram; if the light transport uses finer bins for a short pulse, those.
     steps : phase shifts of a fringe pattern.
     frequencies : modulation frequencies of one sensor.
     wraps : candidates of phase unwrapping: the longest path that is searched, divided by the shortest wavelength.
@@ -108,7 +108,7 @@ def check(name: str, value: int, what: str, error: type[Exception] = ValueError)
     Parameters
     ----------
     name : name of the limit. value : the size.
-    what : unit and thing, for the message, such as "pixels of an image".
+    what : what is counted, for the message, such as "pixels of an image".
     error : type of the error.
     """
     most = getattr(current(), name)

@@ -37,7 +37,7 @@ def check_seed(seed: Any, name: str = "seed") -> int:
 def derived_seed(seed: int, *key: int) -> int:
     """A further seed, different for every seed and key, for example one per view of a scan.
 
-    A seed below 2^32 gives a seed below 2^32, any other seed one of 64 bits.
+    A seed below 2^32 gives a seed below 2^32. Any other seed gives a seed of 64 bits.
 
     key : whole numbers of 32 bits.
 

@@ -16,7 +16,7 @@ from rangesim.settings.config import ShortRepr
 ALL = "all"
 """Name of the row for all material classes together, in tables and mappings by class."""
 NO_SAMPLING_ERROR = "expected signals whose sampling error is known: those of a pass of at least 3 samples per pixel."
-"""Message of the ValueError where a sampling error is asked for and not known."""
+"""Message of the ValueError for a caller who asks for a sampling error that is not known."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -83,7 +83,7 @@ class GroundTruth(ShortRepr):
 
 @dataclass(frozen=True)
 class Truncation:
-    """Estimate of the emitter's light that a pass left out, by the limit that ended the light paths.
+    """Estimate of the emitter's light that a pass left out, split by the limit that ended the light paths.
 
     Each field is a fraction of all the emitter's light in the image, including what is left out and excluding glint.
     See `rangesim.light_transport.truncation`.
@@ -112,7 +112,7 @@ class Truncation:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SamplingError(ShortRepr):
-    """A random draw with the statistics of the error that the sampling of light paths leaves in signals.
+    """Random numbers with the same statistics as the error that the sampling of light paths leaves in signals.
 
     It is half the difference between the results of two halves of the samples, scaled where the halves differ in size.
     At each pixel it has the variance of the error, and the error's covariance between channels. It is not the error.
@@ -135,7 +135,7 @@ class Signals(ShortRepr, ABC):
     energy : EnergySplit, radiance by the kind of light path.
     truth : GroundTruth, the first surface behind each pixel.
     motion_m : (h, w) float32, metres, distance that the surface behind a pixel moves while its frames are taken, see
-        `rangesim.motion`; None: nothing moves.
+        `rangesim.motion`; None if nothing moves.
     truncation : Truncation, estimate of the light that is left out; None: not known.
 
     Examples
