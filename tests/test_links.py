@@ -30,3 +30,9 @@ def test_links_lead_somewhere(document: Path) -> None:
         linked = document.parent / name if name else document
         assert linked.exists(), target
         assert not anchor or anchor in anchors(linked), target
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_rows_of_tables_stand_on_one_line(document: Path) -> None:
+    rows = [line for line in document.read_text(encoding="utf-8").splitlines() if line.startswith("| ")]
+    assert [row for row in rows if not row.endswith("|")] == []
