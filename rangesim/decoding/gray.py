@@ -209,7 +209,7 @@ def pair_contradiction(seen: AxisFrames) -> str | None:
     pattern_name, inverse_name = seen.names[2 * worst : 2 * worst + 2]
     return (
         f"{len(unpaired)} of {len(fractions)} pairs of pattern and inverse along {seen.axis} contradict white and "
-        f"black: frames {pattern_name} and {inverse_name} do not add up to them at {100 * fractions[worst]:.0f} % "
+        f"black: frames {pattern_name} and {inverse_name} do not add up to their sum at {100 * fractions[worst]:.0f} % "
         "of the pixels: check the order of the frames, that none is missing or there twice, and that all have one "
         "exposure."
     )
@@ -243,8 +243,8 @@ def binary_contradiction(seen: AxisFrames, gray: AxisCode) -> str | None:
     if min(orders) < np.log2(np.abs(few[1] - few[0])).mean():
         return None
     return (
-        f"the bits along {seen.axis} contradict Gray code: read as plain binary numbers neighbouring pixels lie "
-        f"{2 ** as_binary.mean():.1f} cells apart, as Gray code {2 ** as_gray.mean():.1f}: check which code was shown."
+        f"the bits along {seen.axis} contradict Gray code: neighbouring pixels lie {2 ** as_gray.mean():.1f} cells "
+        f"apart as Gray code, and {2 ** as_binary.mean():.1f} as plain binary numbers: check which code was shown."
     )
 
 

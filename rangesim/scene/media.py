@@ -55,7 +55,7 @@ def why_not_traced(shape: Any) -> str | None:
     if _lobes(shape.bsdf()) != int(mi.BSDFFlags.Null):
         return _why_not_absorbing(shape.bsdf(), [m for m in (interior, exterior) if m is not None])
     if interior is None or (exterior is not None and medium_numbers(exterior)[1] > 0):
-        return "has an exterior medium that scatters, or none inside; only media inside closed shapes are traced"
+        return "has an exterior medium that scatters, or no medium inside; only media inside closed shapes are traced"
     if not medium_numbers(interior)[0] > 0:
         return "is filled with a medium of no density; expected a positive sigma_t"
     if interior.phase_function().class_name() not in ("IsotropicPhaseFunction", "HGPhaseFunction"):

@@ -154,7 +154,7 @@ def warn_of_coarse_mesh(mesh: Rounding | None, label: str) -> None:
         warn(
             f"{label}: the vertices of mesh {mesh.name!r} are so far from the origin of its file that single "
             f"precision rounds them by up to {1e3 * mesh.error_m:.2g} mm; subtract an offset in double precision where "
-            "the mesh is made, which a scene may state in the shape's to_world."
+            "the mesh is made, and state the offset in the shape's to_world."
         )
 
 
