@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decoding: captures to coordinates, and to range images. No decoder needs the scene or the renderer.
 
-The decoders are in `rangesim.sensors`; here are the steps that they are made of. docs/decoding.md
+The decoders are in `rangesim.sensors`; this package has the steps that they consist of. See docs/decoding.md.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ def decode(capture: Capture, decoder: Decoder | None = None) -> RangeImage:
     Parameters
     ----------
     capture : Capture, simulated or real.
-    decoder : Decoder; None: the one its sensor comes with, with the default thresholds.
+    decoder : Decoder; None: the decoder that the sensor comes with, with its default thresholds.
 
     Raises
     ------
     ValueError
-        The argument is no capture, or one of a sensor that the decoder does not know; or the decoder returned something
-        other than a range image of it.
+        The argument is no capture, or the decoder does not know the sensor of the capture; or the decoder returned
+        something other than a range image of the capture.
 
     Examples
     --------

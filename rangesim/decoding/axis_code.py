@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of one projector axis and the code they decode to, as Gray code and fringes share them.
+"""Frames that code one projector axis, and the code that is decoded from them; Gray code and fringes share these.
 
 Both also check whether the frames contradict their code. A pixel alone may be wrong for many reasons, so the checks
-look at many at once: a capture that is read as what it is not (another start or direction of the fringes, another order
-of the frames) contradicts itself nearly everywhere. Each check returns one sentence with the likely cause, or None.
+look at many at once: if a capture is read wrongly (with another start or direction of the fringes, or another order of
+the frames), it contradicts itself nearly everywhere. Each check returns one sentence with the likely cause, or None.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import numpy as np
 from rangesim.capture import Capture
 
 MIN_PIXELS = 200
-"""Least number of pixels on which a check concludes anything. A fraction of 200 pixels has a standard error of at most
-3.5 %, below what the checks compare."""
+"""Least number of pixels from which a check draws a conclusion. A fraction of 200 pixels has a standard error of at
+most 3.5 %, below what the checks compare."""
 
 MAX_PIXELS = 200_000
 """Largest number of pixels that a check looks at, evenly spread over the image. It bounds the time for large images;
-the standard error of a fraction of so many is 0.1 % at most."""
+the standard error of a fraction of that many pixels is 0.1 % at most."""
 
 
 class Contrast(NamedTuple):
@@ -55,8 +55,8 @@ class AxisFrames(NamedTuple):
 class AxisCode:
     """Decoded projector coordinate along one axis.
 
-    coordinate : (h, w) float32, projector pixels. Of Gray code alone it is the centre of a cell, or the edge between
-        two cells where the camera pixel lies on it.
+    coordinate : (h, w) float32, projector pixels. With Gray code alone it is the centre of a cell, or the edge between
+        two cells if the camera pixel lies on that edge.
     status : (h, w) uint8, `Status`.
     cell_px : int, size of a Gray cell, projector pixels (1, or more where fringes follow).
     sigma_px : (h, w) float32, standard deviation of `coordinate`, projector pixels; None: not known.

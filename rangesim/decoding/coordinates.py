@@ -2,8 +2,8 @@
 """Coordinates: the first result of a decoder, before any geometry.
 
 A decoder works in two steps. The first one reads the frames alone: it gives projector coordinates or path lengths, with
-their standard deviations. The second one is geometry, and needs a rig: it makes a range image of them. Calibration
-needs the first step, for it is what finds the rig.
+their standard deviations. The second one is geometry, and needs a rig: it makes a range image of these. Calibration
+uses the first step only, because it has no rig yet: it finds the rig.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Coordinates(ShortRepr, ABC):
         """
 
     def _keep_valid(self, name: str, dtype: type[np.floating]) -> None:
-        """Set NaN in the array of that name, where there is one, wherever `status` is not OK."""
+        """Set the array of that name, if there is one, to NaN wherever `status` is not OK."""
         values = getattr(self, name)
         if values is not None:
             valid_values = np.where(self.valid, values, np.float32(np.nan))

@@ -12,47 +12,48 @@ from rangesim.decoding.status import Status
 from rangesim.robust_scale import sigma_from_median
 
 OUTSIDE_TURNS = 0.005
-"""Least distance of a phase from its Gray cell, in turns, at which it lies outside. It allows for rounding: 0.08 pixels
-of a period of 16."""
+"""Least distance of a phase from its Gray cell, in turns, at which the phase counts as outside. It allows for rounding:
+with a period of 16 pixels it is 0.08 pixels."""
 
 FAR_TURNS = 0.125
-"""Least distance of a phase from its Gray cell, in turns, at which it lies far outside: the eighth of a period that
-`refine_by_phase` grants."""
+"""Least distance of a phase from its Gray cell, in turns, at which the phase counts as far outside: the eighth of a
+period that `refine_by_phase` allows."""
 
 MAX_FAR_FRACTION = 0.2
 """Largest fraction of pixels whose phase may lie far outside their Gray cell. If phase and code have nothing to do with
 each other, a quarter of the pixels lie there by chance."""
 
 MIN_ONE_SIDED_FRACTION = 0.02
-"""Least fraction of pixels outside their Gray cell, on one side more than on the other, from which on the fringes count
+"""Least difference between the fractions of pixels on the two sides outside their Gray cell, at which the fringes count
 as shifted. Noise puts pixels outside on both sides alike."""
 
 MIN_OFFSET_PX = 0.25
-"""Least shift of the fringes that is reported, in projector pixels: half of the half pixel by which fringes are shifted
-whose cosine starts at the edge of the first pixel instead of its centre."""
+"""Least shift of the fringes that is reported, in projector pixels: a quarter of a pixel. If the cosine starts at the
+edge of the first pixel instead of its centre, the shift is half a pixel, twice as much."""
 
 MIN_CONCENTRATION = 0.8
-"""Least length of the mean vector of phase minus cell, as a fraction of that of an even distribution over a cell, at
-which the fringes are said to be shifted as one. By chance it is near 0."""
+"""Least length of a mean vector, at which all fringes count as shifted by the same amount. Each pixel has a unit vector
+whose angle is its phase minus its cell; the length is a fraction of that for an even distribution over a cell. For
+unrelated phases it is near 0."""
 
 MAX_LEVEL_ERROR = 0.03
 """Largest distance of the mean of the fringes from the middle between black and white, as a fraction of white - black.
 A larger one allows a stronger gamma."""
 
 PHASE_BINS = 8
-"""Number of parts into which a period is divided, to see at which phases the mean of the fringes is off. A missing
-frame of N shows at some phases alone; more parts hold fewer pixels each."""
+"""Number of parts into which a period is divided, to see at which phases the mean of the fringes is off. One missing
+frame of N shows at some phases only; if there were more parts, each would hold fewer pixels."""
 
 MIN_CELLS = 8
-"""Least number of Gray cells in view on which a frame counts as black or white everywhere. Where fewer are in view, a
-sound frame may look so."""
+"""Least number of Gray cells in view for the check whether a frame is black or white everywhere. If fewer cells are in
+view, a correct frame may look like that."""
 
 MIN_SWING = 0.35
-"""Least swing of fringes that the camera resolves, as a fraction of white - black: 1 in focus, and above this value out
-of focus too where the period is wider than a few pixels of the camera."""
+"""Least swing of fringes that the camera resolves, as a fraction of white - black. In focus the swing is 1. Out of
+focus it is still above this value if the period is wider than a few pixels of the camera."""
 
 MEDIAN_ERROR = 1.253
-"""Standard error of a median over that of a mean, of normal values: sqrt(pi / 2)."""
+"""Ratio of the standard error of a median to that of a mean, for normally distributed values: sqrt(pi / 2)."""
 
 
 def refine_by_phase(
@@ -61,8 +62,8 @@ def refine_by_phase(
     """Sub-pixel coordinate: of all places with the phase of the fringes, the one nearest to the Gray coordinate.
 
     Gray cells are half a period at most, so the right place lies at most a quarter of a period off the centre of its
-    cell. An eighth more is granted to noise and to camera pixels across the edge of a cell. Farther off, code and phase
-    contradict each other (`CODE_ERROR`).
+    cell. An eighth more is allowed for noise, and for camera pixels that lie across the edge of a cell. Farther off,
+    code and phase contradict each other (`CODE_ERROR`).
 
     Parameters
     ----------
@@ -80,7 +81,7 @@ def refine_by_phase(
         coordinate[rows] = (periods + phase.normalised) * np.float32(period_px)
         ok = refused == Status.OK
         contradiction = np.abs(coordinate[rows] - whole) > gray.cell_px / 2 + period_px / 8
-        washed_out = 2 * phase.modulation < least_swing[rows]  # as those seen by interreflection alone
+        washed_out = 2 * phase.modulation < least_swing[rows]  # as if the pixel sees them by interreflection only
         refused[ok & contradiction] = Status.CODE_ERROR
         refused[ok & (modulation_is_weak(capture, phase, sigma, thresholds) | washed_out)] = Status.LOW_SIGNAL
         refused[ok & capture.saturated(frames[:, rows])] = Status.SATURATED
@@ -95,7 +96,8 @@ def refine_by_phase(
 def fringe_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, period_px: float) -> str | None:
     """A sentence if the fringes contradict the Gray code as a whole; None if they agree.
 
-    The place of the phase minus the centre of its Gray cell must be centred, and within half a cell.
+    The differences between the place of a phase and the centre of its Gray cell must lie within half a cell, and must
+    be centred on 0.
 
     Parameters
     ----------
@@ -140,7 +142,7 @@ def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> 
     """A sentence if the fringes contradict white and black as a whole; None if they agree.
 
     Light adds up, that of interreflection too, so the mean of the fringes is the middle between white and black at
-    every phase. A frame that is missing or there twice moves it at some phases, a gamma at all of them.
+    every phase. A missing or repeated frame moves this mean at some phases, a gamma moves it at all phases.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ def find_peak(
     ----------
     histogram : (k, n) float32 or float64, counts, one histogram per column.
     sigma_bins : float, bins, standard deviation of the pulse.
-    is_cyclic : whether a window goes on at the other end.
+    is_cyclic : whether a window that passes one end of the histogram goes on at the other end.
 
     Examples
     --------
@@ -59,7 +59,8 @@ def coates(counts: np.ndarray, pulses: int) -> np.ndarray:
     """(k, ...) float64, counts without pile-up, from histograms of the first photon of each of `pulses` pulses.
 
     A bin that leaves m pulses without a photon is too large by the fraction 1 / (2 m) at most, on average. Its variance
-    is pulses^2 f / m, f the fraction of the pulses before it that it took. A bin that leaves no pulse is a lower bound.
+    is pulses^2 f / m, where f is the fraction that the bin took of the pulses left before it. The value of a bin that
+    leaves no pulse is a lower bound.
 
     Parameters
     ----------
@@ -108,7 +109,7 @@ def pulses_left(counts: np.ndarray, place: np.ndarray, pulses: int, sigma_bins: 
 
 
 def runs_out(left: np.ndarray, pulses: int) -> np.ndarray:
-    """(n,) bool, where too few of the pulses are left by the end of a peak's window for its place to be known.
+    """(n,) bool, where so few of the pulses are left by the end of a peak's window that its place is not known.
 
     Too few are fewer than `MIN_PULSES_LEFT`, or fewer than half of all if there are fewer than twice as many. With as
     many left, a bin of the window is 5 % too large at most, on average.
@@ -129,8 +130,9 @@ def runs_out(left: np.ndarray, pulses: int) -> np.ndarray:
 def place_sigma(peak: np.ndarray, background: np.ndarray, bins: int, sigma_bins: float, is_cyclic: bool) -> np.ndarray:
     """(...) float64, bins, standard deviation of the place of a peak by the shot noise of the counts, without pile-up.
 
-    The place is the centroid of the window. The counts of the pulse scatter it by their own spread, those of the
-    background by that of an even distribution over the window. It is infinite where there is no peak.
+    The place is the centroid of the window. The counts of the pulse scatter it by the width of the pulse. The counts of
+    the background scatter it by the width of an even distribution over the window. The result is infinite where there
+    is no peak.
 
     Parameters
     ----------

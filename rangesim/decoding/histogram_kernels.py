@@ -10,13 +10,13 @@ import numpy as np
 from pcgraph.kernel_cache import cached_njit
 
 MAX_FRACTION = 1 - 1e-6
-"""Largest fraction of the pulses before a bin that it may have taken. At 1 the logarithm of Coates' formula is
-infinite; the value here is one pulse of a million away from it."""
+"""Largest fraction that a bin may have taken of the pulses left before it. At 1 the logarithm of Coates' formula is
+infinite; the value here is less than 1 by one pulse of a million."""
 
 
 MAX_OUTSIDE = 3.0
-"""Largest distance of a pulse's middle from the bins that show its flank, in standard deviations of the pulse. Farther
-out, less than 0.2 % of the pulse would be in them, so that noise alone decides its place."""
+"""Largest distance of a pulse's middle from the bins that show its flank, in standard deviations of the pulse. If the
+middle is farther out, less than 0.2 % of the pulse is in the bins, and noise alone would decide its place."""
 
 MAX_STEPS = 50
 """Largest number of Newton steps to the place of a pulse that is cut off. A few usually suffice; the limit ends those
@@ -27,8 +27,8 @@ MIN_RATE = 1e-3
 a pulse far outside, would make the step grow without bound."""
 
 CONVERGED = 1e-6
-"""Largest step, in standard deviations of the pulse, at which its place counts as found. Noise is larger by far: that
-of a million counts is a thousandth."""
+"""Largest step, in standard deviations of the pulse, at which its place counts as found. The noise is much larger: with
+a million counts it is a thousandth."""
 
 
 @cached_njit(nogil=True, error_model="numpy")
@@ -85,8 +85,9 @@ def measure_peaks(  # type: ignore[no-untyped-def]
 def whole_peak(centroid, low, high, sigma):  # type: ignore[no-untyped-def]
     """Place of a Gaussian pulse whose part between `low` and `high` has this centroid; all in bins, sigma > 0.
 
-    The mean of a normal distribution that is cut off grows with the mean of the whole one, at the rate variance of the
-    part over sigma^2. Newton's method uses that rate. A pulse farther outside than `MAX_OUTSIDE` is placed there.
+    The mean of a normal distribution that is cut off grows with the mean of the whole one. The rate of this growth is
+    the variance of the part divided by sigma^2. Newton's method uses that rate. A pulse farther outside than
+    `MAX_OUTSIDE` is placed there.
     """
     first, last = low - MAX_OUTSIDE * sigma, high + MAX_OUTSIDE * sigma
     place = centroid

@@ -18,9 +18,9 @@ def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Ri
     """(...) float64, ranges in metres along camera rays at which the path emitter -> point -> camera has this length.
 
     With the unit ray d and the emitter's centre b (camera coordinates) the length is l = r + |r d - b|. Squaring
-    (l - r)^2 = r^2 - 2 r d.b + b^2 leaves r linear: r = (l^2 - b^2) / (2 (l - d.b)), where the ray meets the ellipsoid
-    with foci at camera and emitter. The range is NaN where the length is not larger than the baseline |b|: then no such
-    point exists.
+    (l - r)^2 = r^2 - 2 r d.b + b^2 leaves an equation that is linear in r: r = (l^2 - b^2) / (2 (l - d.b)), where the
+    ray meets the ellipsoid with foci at camera and emitter. The range is NaN where the length is not larger than the
+    baseline |b|: then no such point exists.
 
     Parameters
     ----------
@@ -51,8 +51,8 @@ class PathLengths(Coordinates):
     Parameters
     ----------
     length_m : (h, w) float64, metres; NaN where `status` is not OK.
-    sigma_m : (h, w) float32, metres, standard deviation of `length_m` by the noise of the frames; NaN where `status` is
-        not OK. None: not known, as for noise-free captures and unknown detectors.
+    sigma_m : (h, w) float32, metres, standard deviation of `length_m` that the noise of the frames causes; NaN where
+        `status` is not OK. None: not known, as for noise-free captures and unknown detectors.
 
     Examples
     --------

@@ -13,8 +13,8 @@ from rangesim.sensor import Background, FrameContent, Threshold, least_signal_fo
 from rangesim.settings.bounds import Bounds, check_fields
 
 MIN_MODULATION = 1e-20
-"""Modulation, in the units of the capture, that stands for none in the standard deviation of a phase: so small that the
-phase is refused, and large enough for products with the result to stay finite in float32."""
+"""Modulation, in the units of the capture, that replaces 0 when the standard deviation of a phase is computed. It is so
+small that the phase is refused, and so large that products with the result stay finite in float32."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,8 @@ class PhaseThresholds:
         check_fields(self)
 
     def least_signal(self, steps: int, visibility: float, content: FrameContent, background: Background) -> np.ndarray:
-        """(h, w) float64, least light S of the emitter at full power that the phase takes, in the background's unit.
+        """(h, w) float64, least light S of the emitter at full power with which a phase is accepted, in the
+        background's unit.
 
         With a modulation of `visibility` times S, sigma = sqrt(2 / steps) noise / (visibility S), see `phase_sigma`.
 
@@ -62,7 +63,7 @@ class PhaseThresholds:
 class Phase:
     """Phase of fringes or taps, I = mean + modulation cos(phase - shift).
 
-    normalised : (h, w) float32 in [0, 1), the phase in turns, over 2 pi.
+    normalised : (h, w) float32 in [0, 1), the phase in turns, which is the phase in radians divided by 2 pi.
     modulation, mean : (h, w) float32, in the units of the capture.
     """
 

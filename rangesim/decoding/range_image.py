@@ -29,19 +29,19 @@ class RangeImage(ShortRepr):
     ----------
     z : (h, w) float32, metres, along the optical axis of the camera; NaN where `status` is not OK.
     range_m : (h, w) float32, metres, Euclidean distance from the camera centre; NaN likewise.
-    confidence : (h, w) float32 in 0..1, strength of the useful signal as a fraction of the largest that the capture can
-        hold, or, if it is noise-free, does hold. The signal is white - black of structured light, twice the modulation
-        amplitude of AMCW, the counts in the peak of direct time of flight (as a fraction of the highest peak), and the
-        radiance of the ideal sensor.
+    confidence : (h, w) float32 in 0..1, strength of the useful signal as a fraction of the largest signal that the
+        capture can hold; if the capture is noise-free, of the largest one that it does hold. The signal is white -
+        black of structured light, twice the modulation amplitude of AMCW, the counts in the peak of direct time of
+        flight (as a fraction of the highest peak), and the radiance of the ideal sensor.
     status : (h, w) uint8, values of `Status`.
     intensity : (h, w) float32, mean signal in the capture's units, for colouring points.
     camera : Intrinsics, or None for an uncalibrated capture, whose z is all NaN.
     T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres; None as `camera`.
     projector_column, projector_row : (h, w) float32, decoded projector pixel coordinates (pixel centres at
         integer + 0.5), NaN where not decoded; None for sensors without a code along that axis.
-    sampling_sigma_m : (h, w) float32, metres, standard deviation of a simulated z by the sampling of light paths. It is
-        estimated from one pair of draws for each pixel, so take medians over many pixels. NaN where there is no
-        reading, infinite where sampling decides whether there is one. None: not known, see
+    sampling_sigma_m : (h, w) float32, metres, standard deviation of a simulated z that the sampling of light paths
+        causes. It is estimated from one pair of draws for each pixel, so take medians over many pixels. NaN where there
+        is no reading, infinite where sampling decides whether there is one. None: not known, see
         `rangesim.evaluation.range_noise`.
     decoder : Decoder that made it; None: not known.
 

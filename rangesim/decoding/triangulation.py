@@ -23,12 +23,13 @@ COORDINATE_ERROR_PX = 0.5
 largest error of a sound Gray code, which decodes to whole pixels. Phase shift is finer."""
 
 MAX_BEHIND_FRACTION = 0.2
-"""Largest fraction of the decoded pixels whose rays may meet clearly behind a device before the capture is doubted. A
-few do by interreflection; with a mirrored image or an inverted calibration most do."""
+"""Largest fraction of the decoded pixels whose rays may meet clearly behind a device before the capture is doubted.
+Interreflection makes a few rays do so; with a mirrored image or an inverted calibration most rays do."""
 
 MIN_BEHIND_PX = 10.0
-"""Distance in projector pixels to a coordinate that would make the rays parallel, from which on they meet clearly
-behind a device. With less, the point may be far away in front, and noise has moved it behind."""
+"""Least distance, in projector pixels, of a coordinate to the one that would make the rays parallel, at which rays
+count as meeting clearly behind a device. At a smaller distance the point may be far away in front, and noise has moved
+it behind."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,8 @@ class ProjectorCoordinates(Coordinates):
     column_sigma_px, row_sigma_px : (h, w) float32, projector pixels, standard deviations of `column` and `row`; NaN
         where `status` is not OK. None: not known, as for fringes of an unknown detector.
     limits : TriangulationLimits that `range_image` applies.
-    is_doubted : whether the decoder has warned that the capture contradicts its code. Then rays that meet behind a
-        device have their cause, and `range_image` does not warn of them.
+    is_doubted : whether the decoder has warned that the capture contradicts its code. Then the cause of rays that meet
+        behind a device is known, and `range_image` does not warn of them.
 
     Examples
     --------

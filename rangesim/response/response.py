@@ -102,8 +102,7 @@ class Response(Named, ABC):
     """Number of channels of a dense response, or of bins of a sparse response."""
 
     def check(self, width: int, height: int) -> None:
-        """Raise ValueError if a projector of width x height pixels cannot show this response. Most responses fit every
-        projector."""
+        """Raise ValueError if a projector of width x height pixels cannot show this response; most can be shown."""
 
 
 class DenseResponse(Response):
