@@ -4,7 +4,7 @@
 A new sensor is one file with two frozen dataclasses. The `Sensor` says which responses to light paths it reads, and
 which frames it makes of them. The `Decoder` says what the frames mean: projector coordinates or path lengths, and then
 a range image. The sensors that come with the package are in `rangesim.sensors`; `examples/own_sensor.py` and
-`examples/own_code.py` are two from outside."""
+`examples/own_code.py` are two that do not belong to the package."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ of the noise; 1e6 times the noise refuses everything."""
 
 
 class Emitter(NamedTuple):
-    """The emitter that a sensor comes with, where an instrument does not say otherwise.
+    """The emitter that a sensor comes with, for an instrument that states no other.
 
     size : (width, height) of the projector in pixels; None: that of the camera, for light without a pattern.
     baseline_m : metres from camera to emitter; None: a fifth of the working distance.
@@ -48,9 +48,9 @@ class Emitter(NamedTuple):
 class Sensor(Named, ABC):
     """A measuring principle: the responses to light paths that it reads, and the frames that it makes of them.
 
-    A sensor holds no geometry (that is the `Rig`), no electronics (`PhotoDetector`) and no thresholds (`Decoder`). It
-    names the ones it comes with, as `default_emitter`, `default_detector` and `default_decoder`; an `Instrument` can
-    have others. Subclasses are frozen dataclasses.
+    A sensor holds no geometry (that is in the `Rig`), no electronics (`PhotoDetector`) and no thresholds (`Decoder`).
+    It only names defaults: `default_emitter`, `default_detector` and `default_decoder`; an `Instrument` can have
+    others. Subclasses are frozen dataclasses.
 
     Examples
     --------
@@ -76,7 +76,7 @@ class Sensor(Named, ABC):
 
     @abstractmethod
     def responses(self) -> tuple[Response, ...]:
-        """Linear functionals of light paths that the transport pass has to accumulate; equal ones at each call."""
+        """Weights of light paths that the transport pass has to sum up; each call must return equal ones."""
 
     @abstractmethod
     def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
@@ -105,7 +105,8 @@ class Sensor(Named, ABC):
 
         Parameters
         ----------
-        single_tap : whether pixels have one charge store alone, so that frames which could share an exposure do not.
+        single_tap : whether pixels have only one charge store, so that frames that could share an exposure do not share
+            it.
         """
         return 1
 
@@ -114,16 +115,16 @@ class Sensor(Named, ABC):
     @property
     @abstractmethod
     def default_emitter(self) -> Emitter:
-        """The emitter that it comes with, for instruments that do not state their own."""
+        """The emitter that this sensor comes with, for instruments that do not state their own."""
 
     @property
     @abstractmethod
     def default_decoder(self) -> Decoder:
-        """The decoder it comes with."""
+        """The decoder that this sensor comes with."""
 
     @property
     def default_detector(self) -> PhotoDetector | None:
-        """The detector it comes with, by default an industrial camera; None: frames have no noise."""
+        """The detector that this sensor comes with, by default an industrial camera; None: frames have no noise."""
         return Detector()
 
     @property
@@ -164,7 +165,7 @@ class Sensor(Named, ABC):
     # ---- Meaning of its readings -------------------------------------------------------------------------------------
 
     def white_image(self, frames: np.ndarray) -> np.ndarray:
-        """(h, w) image as of even light, in which calibration finds boards; by default the mean of the frames.
+        """(h, w) image as under even light, in which calibration finds boards; by default the mean of the frames.
 
         Parameters
         ----------
@@ -173,7 +174,8 @@ class Sensor(Named, ABC):
         return np.asarray(frames.mean(axis=0))
 
     def is_beyond_range(self, path_length_m: np.ndarray) -> np.ndarray:
-        """(...) bool, where a path of that length (metres) is taken for another, or not seen at all."""
+        """(...) bool, where the sensor mistakes a path of that length (metres) for another, or does not see it at
+        all."""
         return np.zeros(np.shape(path_length_m), dtype=bool)
 
     @property
@@ -257,8 +259,8 @@ class FrameContent(NamedTuple):
 class Decoder(Named, ABC):
     """Makes range images of captures, in two steps: `coordinates` reads the frames, `decode` adds the geometry.
 
-    Subclasses are frozen dataclasses; their fields are thresholds. A decoder may look at as many pixels around each as
-    it likes.
+    Subclasses are frozen dataclasses; their fields are thresholds. A decoder may look at any number of pixels around
+    each pixel.
 
     Examples
     --------
@@ -275,15 +277,15 @@ class Decoder(Named, ABC):
     type_name: ClassVar[str]
     """Name in configuration files."""
     reads: ClassVar[type[Sensor]] = Sensor  # type: ignore[type-abstract]
-    """Class of the sensors whose captures it takes."""
+    """Class of the sensors whose captures this decoder accepts."""
 
     def check(self, sensor: Sensor) -> None:
-        """Raise ValueError if it takes no captures of the sensor."""
+        """Raise ValueError if this decoder does not accept captures of the sensor."""
         of_type(sensor, self.reads)
 
     @abstractmethod
     def coordinates(self, capture: Capture) -> Coordinates:
-        """Readings before any geometry: `ProjectorCoordinates` or `PathLengths`. The rig is not looked at.
+        """Readings before any geometry: `ProjectorCoordinates` or `PathLengths`. This method does not use the rig.
 
         Raises
         ------
@@ -305,14 +307,15 @@ class Decoder(Named, ABC):
 
     @abstractmethod
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        """(h, w) float64, least light of the emitter at full power that the thresholds take, in `background.unit`."""
+        """(h, w) float64, least light of the emitter at full power that the thresholds accept, in `background.unit`."""
 
     def content(self, sensor: Sensor) -> FrameContent:
         """Light and dark current in the frame that decides about a reading, on average over the patterns."""
         return FrameContent()
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
-        """Mistake in taking the capture that `image` points to, as a clause; None if this decoder knows none.
+        """A mistake of the person who took the capture, as `image` suggests it, in a clause; None if this decoder knows
+        none.
 
         `rangesim decode` shows it, and adds the causes that do not depend on the measuring principle.
         """
@@ -337,8 +340,8 @@ def of_type(sensor: Sensor, kind: type[S]) -> S:
 def least_signal_for(sigmas2: float, signal: float, noise_variance: np.ndarray) -> np.ndarray:
     """(h, w) float64, electrons, least S with S^2 = `sigmas2` (`signal` S + `noise_variance`).
 
-    A threshold of t standard deviations (`sigmas2` is t^2) against the shot noise of a fraction `signal` of the light
-    itself and against all other noise leads to this equation, a quadratic with one positive root.
+    The signal S must be t standard deviations of the noise (`sigmas2` is t^2). The noise is the shot noise of the
+    fraction `signal` of the light itself, and all other noise. This gives a quadratic equation with one positive root.
 
     Parameters
     ----------

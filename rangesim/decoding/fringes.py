@@ -24,8 +24,8 @@ MAX_FAR_FRACTION = 0.2
 each other, a quarter of the pixels lie there by chance."""
 
 MIN_ONE_SIDED_FRACTION = 0.02
-"""Least difference between the fractions of pixels on the two sides outside their Gray cell, at which the fringes count
-as shifted. Noise puts pixels outside on both sides alike."""
+"""Fringes count as shifted if the fraction of pixels beyond one side of their Gray cell is larger than three times that
+beyond the other side, plus this number. Noise puts as many pixels beyond one side as beyond the other."""
 
 MIN_OFFSET_PX = 0.25
 """Least shift of the fringes that is reported, in projector pixels: a quarter of a pixel. If the cosine starts at the

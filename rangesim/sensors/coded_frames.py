@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs of coded frames, of which a structured-light capture consists: Gray code, and fringes.
 
-A run codes one axis of the projector. It knows how its frames are made and named, how they decode, how much light that
-takes, and how they may contradict themselves. So a sensor with a new order of runs, or with runs of a new kind, changes
-`StructuredLight.layout` alone.
+A run codes one axis of the projector. It knows how its frames are made and named, how they are decoded, how much light
+the decoding needs, and how the frames may contradict each other. So a sensor with a new order of runs, or with runs of
+a new kind, only overrides `StructuredLight.layout`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from rangesim.response import DenseResponse, Fringes, GrayBits
 from rangesim.sensor import Background, FrameContent, least_signal_for
 
 AXES = ("columns", "rows")
-"""Axes of a projector that a code may follow; the index of one is that of the projector coordinate."""
+"""Axes of a projector that a code may follow; the index of an axis here is the index of its projector coordinate."""
 
 FRINGE_VISIBILITY = 0.5
 """Amplitude of a fringe as a fraction of the light at full power: fringes go from 0 to 1."""
@@ -104,7 +104,7 @@ class CodedFrames(ABC):
 
     @abstractmethod
     def least_signal(self, thresholds: CodeThresholds, background: Background) -> np.ndarray:
-        """(h, w) float64, least light of the projector at full power that the thresholds take, in the background's
+        """(h, w) float64, least light of the projector at full power that the thresholds accept, in the background's
         unit."""
 
 
@@ -152,7 +152,9 @@ class GrayFrames(CodedFrames):
     def least_signal(self, thresholds: CodeThresholds, background: Background) -> np.ndarray:
         if background.noise_variance is None:
             return background.floor(thresholds.gray.relative_contrast)
-        noise_variance = 2 * (background.ambient + background.noise_variance)  # white - black is of two frames
+        noise_variance = 2 * (
+            background.ambient + background.noise_variance
+        )  # white - black has the noise of two frames
         return least_signal_for(thresholds.gray.contrast_sigmas**2, 1.0, noise_variance)
 
 

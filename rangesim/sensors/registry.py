@@ -16,7 +16,7 @@ from rangesim.sensor import Decoder, Sensor
 from rangesim.settings.config import brief, from_dict, nearest, shown, to_dict
 
 IMAGES_PRESET = "gray"
-"""Preset of the sensor that took a folder of bare images if nobody names one: the code of OpenCV's GrayCodePattern."""
+"""Preset of the sensor for a folder of bare images if the user names none: the code of OpenCV's GrayCodePattern."""
 
 _SEPARATOR = ".py:"
 """Mark between the two parts of FILE.py:NAME."""
@@ -26,7 +26,7 @@ _FRAME_NAME = re.compile(r"[\w.+-]+")
 
 
 def presets() -> dict[str, Sensor]:
-    """Sensors of all classes that are loaded, by the names that stand for them on the command line.
+    """Sensors of all classes that are loaded, by their names on the command line.
 
     Examples
     --------
@@ -58,7 +58,7 @@ def sensor_of(name: str, files_in: Path | None = Path()) -> Sensor:
 
     Parameters
     ----------
-    name : name of a preset, or FILE.py:NAME. files_in : folder from which a relative FILE counts; None: no file is
+    name : name of a preset, or FILE.py:NAME. files_in : folder to which a relative FILE refers; None: no file is
         loaded.
 
     Raises
@@ -96,7 +96,7 @@ def sensor_from_dict(data: Any, place: str, files_in: Path | None = None) -> Sen
     Parameters
     ----------
     data : str, or mapping of settings. place : name of the place in the file, for messages.
-    files_in : as for `sensor_of`; the default loads no file, for what is read back from captures and results.
+    files_in : as for `sensor_of`; the default loads no file, as is right for data from captures and results.
 
     Raises
     ------
@@ -141,7 +141,7 @@ def is_file_name(name: str) -> bool:
 def check_sensor(sensor: Sensor) -> None:
     """Raise ValueError if a user's own sensor breaks a rule that all sensors keep.
 
-    The rules are those of files and records: a `type_name`, frozen dataclasses, and frame names that files can have.
+    Files and records need these rules: a `type_name`, frozen dataclasses, and frame names that can be names of files.
 
     Examples
     --------
@@ -164,7 +164,7 @@ def check_sensor(sensor: Sensor) -> None:
 
 
 def _sensor_in(path: Path, attribute: str) -> Sensor:
-    """The sensor of that name in a Python file; of a class, the one with its default settings."""
+    """The sensor of that name in a Python file; if the name is that of a class, an instance with default settings."""
     found = getattr(_module(path), attribute, None)
     try:
         if isinstance(found, type) and issubclass(found, Sensor):
@@ -172,7 +172,7 @@ def _sensor_in(path: Path, attribute: str) -> Sensor:
         if isinstance(found, Sensor):
             check_sensor(found)
             return found
-    except Exception as error:  # whatever a file of somebody's raises
+    except Exception as error:  # whatever a user's file raises
         raise FileFormatError(f"{path}: {attribute}: {type(error).__name__}: {brief(error)}") from error
     raise FileFormatError(f"{path}: expected {attribute} to be a sensor or a class of sensors, got {shown(found)}.")
 

@@ -31,12 +31,12 @@ BLACK = -1
 """Index of the frame without light of the projector: the last one, as in OpenCV."""
 
 MIN_CONTRAST = 0.02
-"""Least difference by which black is brighter than white, as a fraction of full scale, at the pixels that are counted
-to see whether the two are exchanged. Noise alone makes black a little brighter in half of the dark pixels."""
+"""Least difference by which black is brighter than white, as a fraction of full scale, at a pixel that counts as a sign
+that the two are exchanged. Noise alone makes black a little brighter in half of the dark pixels."""
 
 MAX_ACROSS = 0.25
-"""Largest ratio of the baseline across the stripes of an axis to that along them, at which the axis is said to tell no
-depth: depth is then at least four times as uncertain as with the other axis."""
+"""Largest ratio of the baseline across the stripes of an axis to the baseline along them, at which the axis counts as
+useless for depth: depth is then at least four times as uncertain as with the other axis."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class StructuredLight(Sensor):
     ----------
     projector_width, projector_height : int, pixels of the projector.
     code : "gray" decodes to whole projector pixels, "gray-phase" [2]_ to fractions of a pixel. Phase shift in N steps
-        finds the place within a period, Gray code finds the period. The Gray bits go to half a period or finer, so that
-        a bit error at a stripe edge cannot become a period error.
+        finds the place within a period, Gray code finds the period. The finest Gray bit has cells of half a period or
+        less, so that a bit error at a stripe edge cannot become a period error.
     axes : "columns" suffices to triangulate; "rows" as well gives full correspondence (calibration, checks).
     period_px : float, period of the fringes in projector pixels.
     steps : int >= 3, number of phase shifts.
@@ -93,7 +93,7 @@ class StructuredLight(Sensor):
     def layout(self) -> tuple[CodedFrames, ...]:
         """The runs of coded frames before white and black, in order.
 
-        A subclass may return runs of other kinds: the frames, their names and their decoding follow.
+        A subclass may return runs of other kinds; these decide on the frames, their names and their decoding.
         """
         runs: list[CodedFrames] = []
         start = 0
@@ -273,7 +273,8 @@ def _first_failure(statuses: list[np.ndarray]) -> np.ndarray:
 
 
 def _axis_along_baseline(image: RangeImage, axes: Sequence[str], rig: Rig | None) -> str | None:
-    """The only coded axis, if the baseline runs along its stripes and most decoded pixels are out of range for that."""
+    """The only coded axis, if the baseline runs along its stripes and most decoded pixels are out of range for this
+    reason."""
     if rig is None or len(axes) != 1:
         return None
     decoded = np.isin(image.status, [Status.OK, Status.OUT_OF_RANGE])
