@@ -174,8 +174,7 @@ class Sensor(Named, ABC):
         return np.asarray(frames.mean(axis=0))
 
     def is_beyond_range(self, path_length_m: np.ndarray) -> np.ndarray:
-        """(...) bool, where the sensor mistakes a path of that length (metres) for another, or does not see it at
-        all."""
+        """(...) bool, where the sensor mistakes a path of that length (metres) for another, or does not see it."""
         return np.zeros(np.shape(path_length_m), dtype=bool)
 
     @property
@@ -314,8 +313,7 @@ class Decoder(Named, ABC):
         return FrameContent()
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
-        """A mistake of the person who took the capture, as `image` suggests it, in a clause; None if this decoder knows
-        none.
+        """A clause with a likely mistake in how the capture was taken, judged by `image`; None if none is known.
 
         `rangesim decode` shows it, and adds the causes that do not depend on the measuring principle.
         """

@@ -152,9 +152,7 @@ class GrayFrames(CodedFrames):
     def least_signal(self, thresholds: CodeThresholds, background: Background) -> np.ndarray:
         if background.noise_variance is None:
             return background.floor(thresholds.gray.relative_contrast)
-        noise_variance = 2 * (
-            background.ambient + background.noise_variance
-        )  # white - black has the noise of two frames
+        noise_variance = 2 * (background.ambient + background.noise_variance)  # white - black: the noise of two frames
         return least_signal_for(thresholds.gray.contrast_sigmas**2, 1.0, noise_variance)
 
 
