@@ -88,8 +88,8 @@ def load_calibration(
 def save_calibration(rig: Rig, path: str | Path) -> None:
     """Write a rig as JSON; `load_calibration` reads it back equal.
 
-    The key "seal" holds the SHA-256 of the file. After a correction by hand it no longer matches, and no command
-    overwrites the file any more.
+    The key "seal" holds the SHA-256 of the file. If you correct the file by hand, the hash no longer matches, and no
+    command overwrites the file any more.
 
     Examples
     --------

@@ -19,8 +19,9 @@ import numpy as np
 
 NEWTON_STEPS = 12
 """Number of Newton steps of `undistort`. For k1 = -0.3, k2 = 0.1 the fourth step reaches double precision over a field
-of view of 80 degrees. Next to a fold each step only halves the error: for k1 = -0.45, 12 steps reach it up to 0.1 % of
-the radius from the fold. More steps would find rays for a thinner rim along the fold, in proportion slower."""
+of view of 80 degrees. Next to a fold each step only halves the error: for k1 = -0.45, 12 steps reach double precision
+everywhere except in a rim along the fold of 0.1 % of the radius. With more steps this rim would be thinner, and the
+time longer in proportion."""
 
 
 class CameraModel(NamedTuple):
@@ -109,12 +110,12 @@ def appears(model: CameraModel, x: Any, y: Any, image: Distorted) -> Any:
 
 
 def to_pixel(model: CameraModel, x: Any, y: Any) -> tuple[Any, Any]:
-    """Pixel coordinates (u, v) of a point (x, y) of the image plane; where the lens distorts, of a distorted one."""
+    """Pixel coordinates (u, v) of a point (x, y) of the image plane; if the lens distorts, of the distorted point."""
     return x * model.fx + model.cx, y * model.fy + model.cy
 
 
 def from_pixel(model: CameraModel, u: Any, v: Any) -> tuple[Any, Any]:
-    """The point (x, y) of the image plane at pixel coordinates (u, v); where the lens distorts, the distorted one."""
+    """The point (x, y) of the image plane at pixel coordinates (u, v); if the lens distorts, the distorted point."""
     return (u - model.cx) / model.fx, (v - model.cy) / model.fy
 
 
@@ -149,9 +150,9 @@ NEGLIGIBLE = 1e-100
 precision."""
 
 
-@lru_cache(maxsize=64)  # a fit asks at every step
+@lru_cache(maxsize=64)  # a fit calls this at every step
 def fold_radius2(coefficients: tuple[float, ...]) -> float:
-    """Squared radius on the image plane at which the radial polynomial turns round; infinity if it never does.
+    """Squared radius on the image plane at which the radial polynomial stops growing; infinity if it always grows.
 
     It is the first positive root in r^2 of d/dr r (1 + k1 r^2 + k2 r^4 + k3 r^6) = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6.
     The image ends there: a farther point would appear at the same place as a nearer one.

@@ -34,14 +34,15 @@ Array = NDArray[np.float64]
 """An array of float64."""
 
 SAME_PLACE = 1e-5
-"""Largest difference of two poses, in metres and radians, that count as the same place. Poses that were computed along
-different ways differ by rounding, about 1e-16; 10 um is less than anybody can adjust a device."""
+"""Largest difference of two poses, in metres and radians, that count as the same place. Poses that were computed in
+different ways differ by rounding, about 1e-16; nobody can adjust a device as finely as 10 um."""
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R R^T - I|, dimensionless, of a matrix that counts as a rotation. A matrix written with five
 decimals is off by at most 2e-5 and passes; a scale of 1.0001 does not."""
 RESIDUAL_PX = 1e-3
 """Pixels by which a ray may miss its pixel when it is projected again; if it misses by more, the pixel has no ray.
-Newton's method ends far below this where the lens model has an inverse, and far above where it has none."""
+After Newton's method the miss is far below this value where the lens model has an inverse, and far above it
+elsewhere."""
 FocalLength = Annotated[float, Bounds("positive and finite", 1e-3, 1e9)]
 """A focal length in pixels."""
 PrincipalPoint = Annotated[float, Bounds("a pixel coordinate", -1e9, 1e9)]
@@ -131,7 +132,7 @@ class Intrinsics:
     def normalise(self, pixels: ArrayLike) -> Array:
         """(..., 2) float64, undistorted coordinates x/z, y/z on the image plane of pixel coordinates (..., 2).
 
-        NaN where the distortion has no inverse, that is beyond the radius at which its polynomial turns round.
+        NaN where the distortion has no inverse, that is beyond the radius at which its polynomial stops growing.
         """
         pixels = np.asarray(pixels, dtype=np.float64)
         u, v = pixels[..., 0], pixels[..., 1]
@@ -146,7 +147,7 @@ class Intrinsics:
     def project(self, points: ArrayLike) -> Array:
         """(..., 2) float64, pixel coordinates of points (..., 3) in coordinates of this device, metres.
 
-        NaN behind the device, and beyond the radius at which the distortion turns round.
+        NaN behind the device, and beyond the radius at which the polynomial of the distortion stops growing.
         """
         points = np.asarray(points, dtype=np.float64)
         z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
@@ -318,8 +319,8 @@ _OLD_LENS_KEYS = {
 class Rig:
     """A camera and its emitter: their intrinsics, lenses and poses.
 
-    The emitter is called projector here, also where it shows no image: the emitter of a time-of-flight camera has
-    intrinsics too, for its field of illumination, and its pixels only serve as coordinates.
+    The emitter is called projector here, even if it shows no image: the emitter of a time-of-flight camera has
+    intrinsics too, which describe its field of illumination, and its pixels only serve as coordinates.
 
     Parameters
     ----------

@@ -20,8 +20,8 @@ NEAR_M = 10.0
 """Largest coordinate of a camera, in metres, at which the renderer keeps the origin of the file. Mitsuba starts rays
 0.09 mm * (1 + c) off a surface with coordinates up to c metres, which is 1 mm here, and rounds coordinates to 1 um."""
 AS_FAR = 2.0
-"""Smallest ratio of two distances of the camera, that to the origin and that to what it sees, at which what it sees
-counts as far from the origin too. At 2, it is at least half as far from the origin as the camera."""
+"""Smallest ratio of the camera's distance from the origin to its distance from what it sees, at which what it sees
+counts as far from the origin too. With 2, what it sees is at least half as far from the origin as the camera."""
 COARSE_M = 1e-4
 """Smallest rounding of vertices or places, in metres, that causes a warning: 0.1 mm, which good
 sensors can measure."""
@@ -105,7 +105,8 @@ class Rounding(NamedTuple):
 
 
 def coarsest_mesh(state: Any, scene: Any) -> Rounding | None:
-    """Of the meshes from files, the one whose vertices near the renderer's origin are rounded most; None without any.
+    """The mesh from a file whose vertices near the renderer's origin have the largest rounding; None without such a
+    mesh.
 
     Mitsuba reads vertices in single precision, whatever precision the file has, and before it applies `to_world`.
 
