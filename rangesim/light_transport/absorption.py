@@ -2,11 +2,11 @@
 """Absorption inside glass, water and clear plastics, by Beer and Lambert's law.
 
 A body that refracts light (`dielectric`, `roughdielectric`) may be filled with a medium that absorbs and does not
-scatter. Light that runs a distance d inside keeps the fraction exp(-sigma_a d). The ray stays straight there, so a path
-needs one more number: the absorption coefficient along its ray. At the surface of such a body, the side on which light
-leaves decides which coefficient is next, as in Mitsuba's `volpath`. Light that leaves against the normal gets the
-coefficient of the interior medium; light that leaves along the normal gets that of the exterior medium. All other
-surfaces do not change the coefficient.
+scatter. Of light that travels a distance d inside, the fraction exp(-sigma_a d) is left. The ray stays straight there,
+so a path needs one more number: the absorption coefficient along its ray. At the surface of such a body, the side on
+which light leaves the surface decides which coefficient comes next, as in Mitsuba's `volpath`. Light that leaves
+against the normal gets the coefficient of the interior medium; light that leaves along the normal gets that of the
+exterior medium. All other surfaces do not change the coefficient.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ ENDLESS_M = 1e30
 """Length in metres of a ray that meets no surface. It stands for infinity, because infinity times a coefficient of 0
 would be NaN."""
 UNCHANGED = -1.0
-"""Coefficient, in 1/m, of surfaces that bound no absorbing medium: the one along the ray stays. It is negative, so that
-no real coefficient is the same."""
+"""Stands for the coefficient, in 1/m, of surfaces that bound no absorbing medium: the coefficient along the ray stays.
+It is negative, so that it differs from every real coefficient."""
 
 
 class Absorbers:
@@ -81,5 +81,5 @@ def _sides(shape: mi.Shape) -> tuple[float, float]:
 
 
 def _sigma_a(medium: mi.Medium | None, untold: float) -> float:
-    """Absorption coefficient of a medium, 1/m; `untold` if there is none."""
+    """Absorption coefficient of a medium, 1/m; `untold` if there is no medium."""
     return untold if medium is None else medium_numbers(medium)[0]
