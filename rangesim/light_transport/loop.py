@@ -73,7 +73,7 @@ class PathSettings(NamedTuple):
     delta : whether some surface of the scene has a delta interaction.
     ambient : whether the scene has light of its own.
     samples_ambient : whether directions to that light are sampled. For uniform surroundings, samples of the BSDF alone
-        give the least noise.
+        are best.
     """
 
     seed: Seed

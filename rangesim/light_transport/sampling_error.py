@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Means over samples, and the error of these means.
 
-Samples are taken in two halves. Half the difference of their means has the variance of the error of the mean of all.
+Samples are taken in two halves. Half the difference of their means has the same variance as the error of the mean of
+all samples.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from rangesim.signals import SamplingError
 BYTES_PER_LANE = 512
 """Memory per lane besides its channels, in bytes, an upper bound from which the size of tiles follows."""
 MIN_FOR_HALVES = 3
-"""Smallest number of samples per pixel that can be dealt into halves, because samples come in pairs: two and one."""
+"""Smallest number of samples per pixel that can be divided into halves: samples come in pairs, so the halves are a pair
+and a single sample."""
 SMOOTH = [i for i, field in enumerate(fields(Radiance)) if field.name in ("multipath", "smooth_caustic")]
 """Indices of the kinds of light that neighbouring pixels may share, in the order of the fields of `Radiance`."""
 
@@ -67,7 +69,7 @@ class Halves:
 
     If there is only one sum, it computes means alone.
 
-    With means a and b over p and q samples, (a - b) sqrt(p q) / (p + q) has the variance of the mean of all.
+    With means a and b over p and q samples, (a - b) sqrt(p q) / (p + q) has the variance of the mean of all samples.
 
     Parameters
     ----------
@@ -140,7 +142,7 @@ class Estimate:
         self.rounds = 0
 
     def sample(self, pixels: np.ndarray, samples: np.ndarray, report: Report) -> None:
-        """Take more samples of some pixels, of which all have had equally many.
+        """Take more samples of some pixels. All of these pixels must have had the same number of samples.
 
         Parameters
         ----------
