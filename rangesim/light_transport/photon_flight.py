@@ -122,7 +122,7 @@ def _chain(
         scatters = hit & can_be_vertex(bsdf)
         mirrors = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
 
-        # ---- It lands: beyond a delta surface it goes into the photon map; else its light is left out --
+        # ---- It lands: in the photon map, if beyond a delta surface; else next-event estimation counts it
         direct += dr.select(hit & ~mirrors & (chain == 0), flux, 0)
         mixed = scatters & mirrors & (chain > 0)
         lands = owner(scatters, chain).photons & (~mixed | (rng.next_float32() < LANDING_FRACTION))
