@@ -177,6 +177,6 @@ def test_an_axis_along_the_baseline_is_named(axis: str, other: str, baseline: li
         capture = expose(plane_signals(rig, sensor), sensor, Detector(bits=8), exposure_s=4e-4)
         bare = replace(capture, frames=capture.frames.astype(np.uint8), detector=None, rig=None)
         text, info = decoded(bare, tmp_path / coded, "--calibration", str(tmp_path / "rig.json"))
-        said = f"{axis} tell no depth here, for camera and projector stand apart along them: code {other}"
+        said = f"{axis} give no depth here, because camera and projector stand apart along them: code {other}"
         assert (said in text) == is_named
         assert info["likely_cause"] == (said if is_named else None)

@@ -128,14 +128,14 @@ def fringe_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, pe
             "fine for the camera, or out of focus; take a longer one."
         )
     if far > MAX_FAR_FRACTION and _direction(gray, refined, frames) < 0:
-        return f"{text}: they seem to be shifted in the other direction, so check the order of their frames."
+        return f"{text}: they seem to be shifted in the opposite direction, so check the order of their frames."
     if resultant > MIN_CONCENTRATION * np.sinc(2 * half):
         return (
             f"{text}: they seem to start {abs(offset_px):.1f} projector pixels too {'early' if mean > 0 else 'late'}, "
             "so check where their cosine starts (half a pixel: at the first pixel's centre, not its edge), "
             "and whether something moved between the frames."
         )
-    return f"{text}, as if by chance: check the period, the steps, the order of the frames and the code."
+    return f"{text}, as many as chance alone would give: check the period, the steps, the order of the frames and the code."
 
 
 def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> str | None:
@@ -170,7 +170,7 @@ def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> 
     return (
         f"the fringes along {axis} contradict white and black: their mean lies at {mean:.0f} % of the way from black "
         "to white, expected 50 % at every phase: check that projector and camera are linear (no gamma, automatic "
-        "exposure, no clipping) and that no frame is missing or there twice."
+        "exposure, no clipping) and that no frame is missing or repeated."
     )
 
 

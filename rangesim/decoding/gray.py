@@ -211,7 +211,7 @@ def pair_contradiction(seen: AxisFrames) -> str | None:
     return (
         f"{len(unpaired)} of {len(fractions)} pairs of pattern and inverse along {seen.axis} contradict white and "
         f"black: frames {pattern_name} and {inverse_name} do not add up to them at {100 * fractions[worst]:.0f} % "
-        "of the pixels: check the order of the frames, that none is missing or there twice, and that all have one "
+        "of the pixels: check the order of the frames, that none is missing or repeated, and that all have one "
         "exposure."
     )
 

@@ -162,6 +162,6 @@ def behind_contradiction(behind_px: np.ndarray) -> str | None:
         return None
     return (
         f"{100 * fraction:.0f} % of the decoded rays meet behind camera or projector, where nothing is, so the depth "
-        "of the others is doubtful: check that no image is mirrored, that T_camera_projector is not its inverse, and "
-        "that the axes and their order are those shown."
+        "of the others is doubtful: check that no image is mirrored, that T_camera_projector is not inverted, and "
+        "that the axes and their order are those that the projector showed."
     )

@@ -97,7 +97,7 @@ def warn_of_narrow_lobes(traced: TracedScene, names: list[str]) -> None:
     lit, lobes = _named(names, thrown.onto), _named(names, thrown.by)
     warn(
         f"about {thrown.onto.sum():.1%} of the projector's light reaches {lit} over narrow lobes of {lobes}, where "
-        f"light paths find little of it: readings there are more wrong than their noise says; make {lobes} smooth "
+        f"light paths find little of it: readings there have larger errors than their noise shows; make {lobes} smooth "
         f"(conductor, dielectric) or rougher than alpha {MAX_NARROW_ALPHA:g}."
     )
 

@@ -89,7 +89,7 @@ def warn_of_truncation(truncation: Truncation | None, max_depth: int, of: str, s
     """Warn if a pass left out more than `MAX_LEFT_OUT`; `of` names the camera, if there are several."""
     if truncation is None or truncation.total <= MAX_LEFT_OUT:
         return
-    why = f"a max_depth of {max_depth} ends light paths early; a larger one brings it"
+    why = f"a max_depth of {max_depth} ends light paths early; a larger one includes this light"
     if not truncation.depth > truncation.chains + truncation.photons:
         why = f"it meets more than {MAX_CHAIN} surfaces of glass and mirrors in a row"
     text = f"about {truncation.total:.0%} of the projector's light is left out{of}: {why}."

@@ -202,6 +202,6 @@ def _before(coarse: AxisCode | None) -> AxisCode:
     """The code that fringes refine; ValueError if there is none."""
     if coarse is None:
         raise ValueError(
-            "expected a code of the same axis before its fringes, which tell a place within a period alone."
+            "expected a code of the same axis before its fringes, which only give the place within a period."
         )
     return coarse

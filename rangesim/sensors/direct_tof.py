@@ -169,17 +169,17 @@ class DirectToF(Sensor):
 class DirectToFDecoder(Decoder):
     """Decodes the path length of the strongest return of each histogram.
 
-    Pile-up is undone if the detector has it (Coates 1968, see `coates`). A filter matched to the instrument response
-    finds the peak. The centroid of the counts above the background around it, re-centred once, gives the place within a
-    bin. A peak that the end of the histogram cuts off is completed to a Gaussian; where that lies outside, the reading
-    is out of range. Where the pulses run out within the window of the peak, the reading is saturated (see `runs_out`);
-    less light helps.
+    If the detector piles up, the decoder corrects the counts (Coates 1968, see `coates`). A filter matched to the
+    instrument response finds the peak. The centroid of the counts above the background around it, re-centred once,
+    gives the place within a bin. A peak that the end of the histogram cuts off is completed to a Gaussian; if the
+    middle of this Gaussian lies outside, the reading is out of range. If too few pulses are left within the window of
+    the peak (see `runs_out`), the reading is saturated; less light then helps.
 
     Parameters
     ----------
     peak_sigmas, min_counts : float, least height of a peak over the background, in standard deviations of the counts in
         its window, and in counts.
-    relative_peak : float, least peak as a fraction of the bright ones of the image, for noise-free captures.
+    relative_peak : float, least peak as a fraction of the bright peaks of the image, for noise-free captures.
 
     Examples
     --------

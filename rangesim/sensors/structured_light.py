@@ -260,7 +260,7 @@ class StructuredLightDecoder(Decoder):
             )
         if axis := _axis_along_baseline(image, of_type(capture.sensor, StructuredLight).axes, capture.rig):
             other = "rows" if axis == "columns" else "columns"
-            return f"{axis} tell no depth here, for camera and projector stand apart along them: code {other}"
+            return f"{axis} give no depth here, because camera and projector stand apart along them: code {other}"
         return None
 
 
