@@ -135,7 +135,7 @@ def fringe_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, pe
             "so check where their cosine starts (half a pixel: at the first pixel's centre, not its edge), "
             "and whether something moved between the frames."
         )
-    return f"{text}, as many as chance alone would give: check the period, the steps, the order of the frames and the code."
+    return f"{text}, about as many as by chance: check the period, the steps, the order of the frames and the code."
 
 
 def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> str | None:
