@@ -392,8 +392,8 @@ class _Staging:
             if obstacle is not None:
                 kept = self._set_aside(kind)
                 raise kind.error(
-                    f"{named / obstacle} came or was changed while the work went on; rangesim left it as it is, and the "
-                    f"new result is in {kept}."
+                    f"{named / obstacle} came or was changed while the work went on; rangesim left it as it is, and "
+                    f"the new result is in {kept}."
                 )
             for name in old:  # whatever may fail must fail before the journal is written
                 _make_plain_parents(self.path, f"{_OLD}/{name}")

@@ -53,7 +53,7 @@ class Sums:
         is_whole = len(pixels) == self.shape[0] * self.shape[1]
         for response, values in zip(accumulators.responses, accumulators.images(), strict=True):
             for part, of_part in zip((self.channels, self.smooth), values, strict=False):
-                if response not in part and is_whole:  # a copy only where a view would keep the other part in memory
+                if response not in part and is_whole:  # a copy only if a view would keep the other part in memory
                     is_own = of_part.base is None or (len(values) == 1 and of_part.flags.writeable)
                     whole = of_part if is_own else of_part.copy()
                     part[response] = whole.reshape(-1, *self.shape)
@@ -117,7 +117,7 @@ class Estimate:
     rig : Rig, whose camera takes the image.
     responses : the responses whose channels are summed up.
     keeps_apart : whether smooth light has sums of its own, so that neighbours can share it.
-    has_halves : whether samples are dealt into halves. Every pixel then needs `MIN_FOR_HALVES` samples at once.
+    has_halves : whether samples are divided into halves. Every pixel then needs `MIN_FOR_HALVES` samples at once.
     memory_bytes : largest size of the renderer's arrays.
     launches : Launches, which remember how much work fits into a launch.
     """
@@ -179,7 +179,7 @@ class Estimate:
 
         Parameters
         ----------
-        shared : LightFilter of the smooth light that is kept apart; None if none is.
+        shared : LightFilter of the smooth light that is kept apart; None if no light is kept apart.
         responses : the responses whose channels are returned; more samples may be taken afterwards. None returns all
             channels and uses up the sums.
         """

@@ -88,8 +88,8 @@ class Truncation:
     Each field is a fraction of all the emitter's light in the image, including what is left out and excluding glint.
     See `rangesim.light_transport.truncation`.
 
-    depth : light of paths with more scattering surfaces than `max_depth` allows. NaN where `max_depth` is 2 or less,
-        which asks for direct light alone.
+    depth : light of paths with more scattering surfaces than `max_depth` allows. NaN if `max_depth` is 2 or less,
+        because such a pass computes direct light only.
     chains : light of camera paths with more delta interactions in a row than allowed.
     photons : light of photons with more delta interactions in a row than allowed.
 
@@ -114,9 +114,9 @@ class Truncation:
 class SamplingError(ShortRepr):
     """Random numbers with the same statistics as the error that the sampling of light paths leaves in signals.
 
-    The samples are taken in two halves, and this is half the difference between the results of the two, scaled if the
-    halves differ in size. At each pixel it has the same variance as the error, and the same covariance between
-    channels. It is not the error itself.
+    The samples are taken in two halves. The numbers are half the difference between the results of the two halves,
+    scaled if these differ in size. At each pixel they have the same variance as the error, and the same covariance
+    between channels. They are not the error itself.
 
     channels : response -> (c, h, w) float32, W/m2/sr, error of `StillSignals.channels`.
     projector : (h, w) float32, W/m2/sr, error of `EnergySplit.projector`.
