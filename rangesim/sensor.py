@@ -4,7 +4,7 @@
 A new sensor is one file with two frozen dataclasses. The `Sensor` says which responses to light paths it reads, and
 which frames it makes of them. The `Decoder` says what the frames mean: projector coordinates or path lengths, and then
 a range image. The sensors that come with the package are in `rangesim.sensors`; `examples/own_sensor.py` and
-`examples/own_code.py` are two from outside."""
+`examples/own_code.py` are two that do not belong to the package."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ of the noise; 1e6 times the noise refuses everything."""
 
 
 class Emitter(NamedTuple):
-    """The emitter that a sensor comes with, where an instrument does not say otherwise.
+    """The emitter that a sensor comes with, for an instrument that states no other.
 
     size : (width, height) of the projector in pixels; None: that of the camera, for light without a pattern.
     baseline_m : metres from camera to emitter; None: a fifth of the working distance.
@@ -48,9 +48,9 @@ class Emitter(NamedTuple):
 class Sensor(Named, ABC):
     """A measuring principle: the responses to light paths that it reads, and the frames that it makes of them.
 
-    A sensor holds no geometry (that is the `Rig`), no electronics (`PhotoDetector`) and no thresholds (`Decoder`). It
-    names the ones it comes with, as `default_emitter`, `default_detector` and `default_decoder`; an `Instrument` can
-    have others. Subclasses are frozen dataclasses.
+    A sensor holds no geometry (that is in the `Rig`), no electronics (`PhotoDetector`) and no thresholds (`Decoder`).
+    It only names defaults: `default_emitter`, `default_detector` and `default_decoder`; an `Instrument` can have
+    others. Subclasses are frozen dataclasses.
 
     Examples
     --------
@@ -76,7 +76,7 @@ class Sensor(Named, ABC):
 
     @abstractmethod
     def responses(self) -> tuple[Response, ...]:
-        """Linear functionals of light paths that the transport pass has to accumulate; equal ones at each call."""
+        """Weights of light paths that the transport pass has to sum up; each call must return equal ones."""
 
     @abstractmethod
     def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
@@ -114,7 +114,7 @@ class Sensor(Named, ABC):
     @property
     @abstractmethod
     def default_emitter(self) -> Emitter:
-        """The emitter that it comes with, for instruments that do not state their own."""
+        """The emitter that this sensor comes with, for instruments that do not state their own."""
 
     @property
     @abstractmethod
@@ -173,7 +173,7 @@ class Sensor(Named, ABC):
         return np.asarray(frames.mean(axis=0))
 
     def is_beyond_range(self, path_length_m: np.ndarray) -> np.ndarray:
-        """(...) bool, where a path of that length (metres) is taken for another, or not seen at all."""
+        """(...) bool, where the sensor mistakes a path of that length (metres) for another, or does not see it."""
         return np.zeros(np.shape(path_length_m), dtype=bool)
 
     @property
@@ -275,7 +275,7 @@ class Decoder(Named, ABC):
     type_name: ClassVar[str]
     """Name in configuration files."""
     reads: ClassVar[type[Sensor]] = Sensor  # type: ignore[type-abstract]
-    """Class of the sensors whose captures it takes."""
+    """Class of the sensors whose captures this decoder accepts."""
 
     def check(self, sensor: Sensor) -> None:
         """Raise ValueError if this decoder takes no captures of the sensor."""
@@ -312,7 +312,7 @@ class Decoder(Named, ABC):
         return FrameContent()
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
-        """Mistake in taking the capture that `image` points to, as a clause; None if this decoder knows none.
+        """A clause with a likely mistake in how the capture was taken, judged by `image`; None if none is known.
 
         `rangesim decode` shows it, and adds the causes that do not depend on the measuring principle.
         """

@@ -74,7 +74,7 @@ def test_run_says_in_one_line_what_light_it_leaves_out(command: Command, tmp_pat
     assert answer.status == 0
     assert re.fullmatch(
         r"rangesim: about \d+% of the projector's light is left out: a max_depth of 4 ends light paths early; "
-        r"a larger one brings it\.\n",
+        r"a larger one includes this light\.\n",
         answer.err,
     )
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decoding: captures to coordinates, and to range images. No decoder needs the scene or the renderer.
 
-The decoders are in `rangesim.sensors`; here are the steps that they are made of. docs/decoding.md
+The decoders are in `rangesim.sensors`; this package has the steps that they consist of. See docs/decoding.md.
 """
 
 from __future__ import annotations

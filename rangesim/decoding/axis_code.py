@@ -17,12 +17,12 @@ import numpy as np
 from rangesim.capture import Capture
 
 MIN_PIXELS = 200
-"""Least number of pixels on which a check concludes anything. A fraction of 200 pixels has a standard error of at most
-3.5 %, below what the checks compare."""
+"""Least number of pixels from which a check draws a conclusion. A fraction of 200 pixels has a standard error of at
+most 3.5 %, below what the checks compare."""
 
 MAX_PIXELS = 200_000
 """Largest number of pixels that a check looks at, evenly spread over the image. It bounds the time for large images;
-the standard error of a fraction of so many is 0.1 % at most."""
+the standard error of a fraction of that many pixels is 0.1 % at most."""
 
 
 class Contrast(NamedTuple):

@@ -12,12 +12,12 @@ from rangesim.decoding.status import Status
 from rangesim.robust_scale import sigma_from_median
 
 OUTSIDE_TURNS = 0.005
-"""Least distance of a phase from its Gray cell, in turns, at which it lies outside. It allows for rounding: 0.08 pixels
-of a period of 16."""
+"""Least distance of a phase from its Gray cell, in turns, at which the phase counts as outside. It allows for rounding:
+with a period of 16 pixels it is 0.08 pixels."""
 
 FAR_TURNS = 0.125
-"""Least distance of a phase from its Gray cell, in turns, at which it lies far outside: the eighth of a period that
-`refine_by_phase` grants."""
+"""Least distance of a phase from its Gray cell, in turns, at which the phase counts as far outside: the eighth of a
+period that `refine_by_phase` allows."""
 
 MAX_FAR_FRACTION = 0.2
 """Largest fraction of pixels whose phase may lie far outside their Gray cell. If phase and code have nothing to do with
@@ -28,31 +28,32 @@ MIN_ONE_SIDED_FRACTION = 0.02
 count as shifted. Noise puts pixels outside on both sides alike."""
 
 MIN_OFFSET_PX = 0.25
-"""Least shift of the fringes that is reported, in projector pixels: half of the half pixel by which fringes are shifted
-whose cosine starts at the edge of the first pixel instead of its centre."""
+"""Least shift of the fringes that is reported, in projector pixels: a quarter of a pixel. If the cosine starts at the
+edge of the first pixel instead of its centre, the shift is half a pixel, twice as much."""
 
 MIN_CONCENTRATION = 0.8
-"""Least length of the mean vector of phase minus cell, as a fraction of that of an even distribution over a cell, at
-which the fringes are said to be shifted as one. By chance it is near 0."""
+"""Least length of a mean vector, at which all fringes count as shifted by the same amount. Each pixel has a unit vector
+whose angle is its phase minus its cell; the length is a fraction of that for an even distribution over a cell. For
+unrelated phases it is near 0."""
 
 MAX_LEVEL_ERROR = 0.03
 """Largest distance of the mean of the fringes from the middle between black and white, as a fraction of white - black.
 A larger one allows a stronger gamma."""
 
 PHASE_BINS = 8
-"""Number of parts into which a period is divided, to see at which phases the mean of the fringes is off. A missing
-frame of N shows at some phases alone; more parts hold fewer pixels each."""
+"""Number of parts into which a period is divided, to see at which phases the mean of the fringes is off. One missing
+frame of N shows at some phases only; if there were more parts, each would hold fewer pixels."""
 
 MIN_CELLS = 8
-"""Least number of Gray cells in view on which a frame counts as black or white everywhere. Where fewer are in view, a
-sound frame may look so."""
+"""Least number of Gray cells in view for the check whether a frame is black or white everywhere. If fewer cells are in
+view, a correct frame may look like that."""
 
 MIN_SWING = 0.35
-"""Least swing of fringes that the camera resolves, as a fraction of white - black: 1 in focus, and above this value out
-of focus too where the period is wider than a few pixels of the camera."""
+"""Least swing of fringes that the camera resolves, as a fraction of white - black. In focus the swing is 1. Out of
+focus it is still above this value if the period is wider than a few pixels of the camera."""
 
 MEDIAN_ERROR = 1.253
-"""Standard error of a median over that of a mean, of normal values: sqrt(pi / 2)."""
+"""Ratio of the standard error of a median to that of a mean, for normally distributed values: sqrt(pi / 2)."""
 
 
 def refine_by_phase(
@@ -127,14 +128,14 @@ def fringe_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, pe
             "fine for the camera, or out of focus; take a longer one."
         )
     if far > MAX_FAR_FRACTION and _direction(gray, refined, frames) < 0:
-        return f"{text}: they seem to be shifted in the other direction, so check the order of their frames."
+        return f"{text}: they seem to be shifted in the opposite direction, so check the order of their frames."
     if resultant > MIN_CONCENTRATION * np.sinc(2 * half):
         return (
             f"{text}: they seem to start {abs(offset_px):.1f} projector pixels too {'early' if mean > 0 else 'late'}, "
             "so check where their cosine starts (half a pixel: at the first pixel's centre, not its edge), "
             "and whether something moved between the frames."
         )
-    return f"{text}, as if by chance: check the period, the steps, the order of the frames and the code."
+    return f"{text}, about as many as by chance: check the period, the steps, the order of the frames and the code."
 
 
 def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> str | None:
@@ -169,7 +170,7 @@ def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> 
     return (
         f"the fringes along {axis} contradict white and black: their mean lies at {mean:.0f} % of the way from black "
         "to white, expected 50 % at every phase: check that projector and camera are linear (no gamma, automatic "
-        "exposure, no clipping) and that no frame is missing or there twice."
+        "exposure, no clipping) and that no frame is missing or repeated."
     )
 
 

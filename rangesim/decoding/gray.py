@@ -20,32 +20,32 @@ CELL_SIGMA = 12**-0.5
 """Standard deviation of a place that is known to lie in a cell, in cells: that of an even distribution."""
 
 MAX_UNPAIRED_FRACTION = 0.2
-"""Largest fraction of the pixels at which a pattern and its inverse may miss white + black. Of two patterns that are no
-pair, half of the pixels do."""
+"""Largest fraction of the pixels at which the sum of a pattern and its inverse may differ from white + black. If two
+patterns are no pair, it differs at half of the pixels."""
 
 MIN_UNPAIRED = 0.75
-"""Least distance by which a pattern and its inverse miss white + black, as a fraction of white - black. Where both are
-lit or both are dark they miss it by 1; a gamma brings them to 0.56 at most."""
+"""Least difference between white + black and the sum of a pattern and its inverse that counts, as a fraction of white -
+black. Where both are lit or both are dark, the difference is 1; a gamma makes a difference of 0.56 at most."""
 
 MAX_PAIRS = 50_000
-"""Largest number of pairs of neighbouring pixels, across and down each, that every other order of the frames is tried
-on. It bounds the time, which grows with the number of orders."""
+"""Largest number of pairs of neighbouring pixels, across and also down the image, on which other orders of the frames
+are tried. It bounds the time, which grows with the number of orders."""
 
 MIN_STEPS = 100
-"""Least number of pairs of neighbouring pixels in different cells on which a check of their order concludes
-anything."""
+"""Least number of pairs of neighbouring pixels in different cells from which a check of the order draws a
+conclusion."""
 
 MAX_FARTHER_OCTAVES = 0.3
 """Largest mean distance by which neighbours may lie farther apart when read as Gray code than when read as plain binary
-numbers, in powers of two. Plain binary read as Gray code has about 1."""
+numbers, in powers of two. For plain binary numbers that are read as Gray code, this distance is about 1."""
 
 MAX_NEARER_FRACTION = 0.8
-"""Largest fraction of neighbours that another order of the frames may bring nearer to each other, of those that it
-brings to half or twice their distance. If that order is the right one, it brings nearly all nearer."""
+"""Largest fraction of neighbours that another order of the frames may bring nearer to each other. Only neighbours count
+whose distance it halves or doubles. If that order is the right one, it brings nearly all of them nearer."""
 
 MIN_REPEATED_FRACTION = 0.9
-"""Least fraction of the changes of one bit, from pixel to pixel, that another bit has too if both are the same frame.
-In Gray code that is seen sharply, no two bits change together."""
+"""Least fraction of the changes of one bit, from pixel to pixel, at which another bit changes too if both bits come
+from the same frame. In Gray code that the camera sees sharply, no two bits change together."""
 
 MIN_ALONE_FRACTION = 0.3
 """Least fraction of these changes at which no third bit changes, if both bits are the same frame. At a step of the
@@ -54,10 +54,10 @@ scene other bits change too."""
 
 @dataclass(frozen=True)
 class GrayThresholds:
-    """Least differences of frames that count.
+    """Least differences between frames that a decoder accepts.
 
-    Where the detector is known, they are multiples of the noise; in digital captures of an unknown detector, fractions
-    of full scale, as OpenCV's; in noise-free captures, fractions of brightness.
+    If the detector is known, they are multiples of the noise. In digital captures of an unknown detector they are
+    fractions of full scale, as in OpenCV. In noise-free captures they are fractions of the brightness.
 
     Parameters
     ----------
@@ -65,10 +65,11 @@ class GrayThresholds:
         difference.
     contrast_of_scale, bit_of_scale : float, the same as fractions of full scale, for digital captures of unknown
         detectors.
-    relative_contrast : float, least white - black of noise-free captures, as a fraction of that of the bright pixels.
+    relative_contrast : float, least white - black of noise-free captures, as a fraction of white - black at the bright
+        pixels.
     relative_bit : float, least pattern - inverse as a fraction of the pixel's white - black, unless the detector is
-        unknown. Pixels in shadow that see the patterns by interreflection alone show fine stripes fainter than that, at
-        whatever exposure.
+        unknown. Pixels in shadow see the patterns only by interreflection, and their fine stripes are fainter than that
+        at every exposure.
 
     Examples
     --------
@@ -104,9 +105,9 @@ def direct_contrast(capture: Capture, white: np.ndarray, black: np.ndarray, thre
 def decode_gray(seen: AxisFrames, shift: int, size: int, thresholds: GrayThresholds) -> AxisCode:
     """Projector coordinate of each pixel from Gray bits.
 
-    A bit is the sign of pattern - inverse; it is uncertain where the difference drowns in noise. A pixel on the edge of
-    a stripe has one uncertain bit, which does no harm if flipping it leads to a neighbouring cell: then the edge
-    between the two is returned. Anything else is refused.
+    A bit is the sign of pattern - inverse; it is uncertain where the noise is larger than the difference. A pixel on
+    the edge of a stripe has one uncertain bit, which does no harm if a flip of it leads to a neighbouring cell: the
+    function then returns the edge between the two cells. It refuses all other pixels with uncertain bits.
 
     Parameters
     ----------
@@ -285,7 +286,7 @@ def _that_differ(pairs: list[np.ndarray]) -> np.ndarray:
 
 
 def _better_order(across: np.ndarray, words: np.ndarray, bits: list[str]) -> str | None:
-    """The fault of the frames whose removal brings neighbours nearest together; None if none brings them nearer.
+    """The fault of the frames whose correction brings neighbours nearest together; None if no correction does.
 
     Parameters
     ----------
@@ -306,7 +307,7 @@ def _better_order(across: np.ndarray, words: np.ndarray, bits: list[str]) -> str
 
 
 def _coarse_step(words: np.ndarray, n_bits: int) -> int | None:
-    """Least number of finest bits to leave out so that half of the neighbours with Gray words (2, n) see one cell.
+    """Least number of finest bits to leave out so that half of the neighbours with Gray words (2, n) see the same cell.
 
     Bits that are finer than the camera's pixels do not show neighbours. None if fewer than three bits would be left.
     """

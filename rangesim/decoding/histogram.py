@@ -24,7 +24,7 @@ def find_peak(
     ----------
     histogram : (k, n) float32 or float64, counts, one histogram per column.
     sigma_bins : float, bins, standard deviation of the pulse.
-    is_cyclic : whether a window goes on at the other end.
+    is_cyclic : whether a window that passes one end of the histogram goes on at the other end.
 
     Examples
     --------
@@ -110,7 +110,7 @@ def pulses_left(counts: np.ndarray, place: np.ndarray, pulses: int, sigma_bins: 
 
 
 def runs_out(left: np.ndarray, pulses: int) -> np.ndarray:
-    """(n,) bool, where too few of the pulses are left by the end of a peak's window for its place to be known.
+    """(n,) bool, where so few of the pulses are left by the end of a peak's window that its place is not known.
 
     Too few means fewer than `MIN_PULSES_LEFT`. If there are fewer than 2 `MIN_PULSES_LEFT` pulses in all, it means
     fewer than half of them. With `MIN_PULSES_LEFT` pulses left, a bin of the window is 5 % too large at most, on

@@ -15,8 +15,8 @@ infinite; the value here is one pulse of a million away from it."""
 
 
 MAX_OUTSIDE = 3.0
-"""Largest distance of a pulse's middle from the bins that show its flank, in standard deviations of the pulse. Farther
-out, less than 0.2 % of the pulse would be in them, so that noise alone decides its place."""
+"""Largest distance of a pulse's middle from the bins that show its flank, in standard deviations of the pulse. If the
+middle is farther out, less than 0.2 % of the pulse is in the bins, and noise alone would decide its place."""
 
 MAX_STEPS = 50
 """Largest number of Newton steps to the place of a pulse that is cut off. A few usually suffice; the limit ends those
@@ -27,8 +27,8 @@ MIN_RATE = 1e-3
 a pulse far outside, would make the step grow without bound."""
 
 CONVERGED = 1e-6
-"""Largest step, in standard deviations of the pulse, at which its place counts as found. Noise is larger by far: that
-of a million counts is a thousandth."""
+"""Largest step, in standard deviations of the pulse, at which its place counts as found. The noise is much larger: with
+a million counts it is a thousandth."""
 
 
 @cached_njit(nogil=True, error_model="numpy")

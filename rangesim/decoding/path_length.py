@@ -51,8 +51,8 @@ class PathLengths(Coordinates):
     Parameters
     ----------
     length_m : (h, w) float64, metres; NaN where `status` is not OK.
-    sigma_m : (h, w) float32, metres, standard deviation of `length_m` by the noise of the frames; NaN where `status` is
-        not OK. None: not known, as for noise-free captures and unknown detectors.
+    sigma_m : (h, w) float32, metres, standard deviation of `length_m` that the noise of the frames causes; NaN where
+        `status` is not OK. None: not known, as for noise-free captures and unknown detectors.
 
     Examples
     --------

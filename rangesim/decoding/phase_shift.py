@@ -62,7 +62,7 @@ class PhaseThresholds:
 class Phase:
     """Phase of fringes or taps, I = mean + modulation cos(phase - shift).
 
-    normalised : (h, w) float32 in [0, 1), the phase in turns, over 2 pi.
+    normalised : (h, w) float32 in [0, 1), the phase in turns, which is the phase in radians divided by 2 pi.
     modulation, mean : (h, w) float32, in the units of the capture.
     """
 

@@ -21,7 +21,8 @@ class Unwrapped:
 
     length_m : (h, w) float64, metres, there and back.
     residual : (h, w) float64, largest misfit of any frequency's phase, in turns, 0 to 0.5.
-    ambiguity : (h, w) float64 in 0..1, root of the least cost over the second least; 0 if there is no second.
+    ambiguity : (h, w) float64 in 0..1, square root of the ratio of the least cost to the second least; 0 if there is no
+        second.
     weight : (h, w) float64, sum of the weights of all frequencies: the inverse variance of `length_m`, in their scale.
     """
 
@@ -36,9 +37,9 @@ def unwrap(
 ) -> Unwrapped:
     """Path length that agrees best with the phases of all frequencies.
 
-    Every wrap count of the highest frequency gives a candidate. The other frequencies take the wrap nearest to it. The
-    candidate with the least weighted sum of squared differences between the lengths of all frequencies wins, and the
-    result is the weighted mean of its lengths.
+    Every wrap count of the highest frequency gives a candidate. Each other frequency takes the wrap count whose length
+    is nearest to it. The candidate with the least weighted sum of squared differences between the lengths of all
+    frequencies wins, and the result is the weighted mean of its lengths.
 
     Parameters
     ----------

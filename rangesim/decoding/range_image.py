@@ -39,9 +39,9 @@ class RangeImage(ShortRepr):
     T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres; None as `camera`.
     projector_column, projector_row : (h, w) float32, decoded projector pixel coordinates (pixel centres at
         integer + 0.5), NaN where not decoded; None for sensors without a code along that axis.
-    sampling_sigma_m : (h, w) float32, metres, standard deviation of a simulated z by the sampling of light paths. It is
-        estimated from one pair of draws for each pixel, so take medians over many pixels. NaN where there is no
-        reading, infinite where sampling decides whether there is one. None: not known, see
+    sampling_sigma_m : (h, w) float32, metres, standard deviation of a simulated z that the sampling of light paths
+        causes. It is estimated from one pair of draws for each pixel, so take medians over many pixels. NaN where there
+        is no reading, infinite where sampling decides whether there is one. None: not known, see
         `rangesim.evaluation.range_noise`.
     decoder : Decoder that made it; None: not known.
 

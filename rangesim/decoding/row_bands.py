@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 BAND_ROWS = 32
-"""Number of rows in a band. With 1280 float32 values each, an array of a band takes 160 kB, so that the few of a
-decoder fit a core's cache; fewer rows would spend more time on calls."""
+"""Number of rows in a band. With 1280 float32 values each, an array of a band takes 160 kB, so that the few arrays of a
+decoder fit into a core's cache; with fewer rows, more time would go into calls."""
 
 
 def bands(height: int) -> Iterator[slice]:

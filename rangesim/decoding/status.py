@@ -7,7 +7,7 @@ from enum import IntEnum
 
 
 class Status(IntEnum):
-    """Outcome of a decoder for one pixel. With every value but `OK`, the range image has NaN there.
+    """Outcome of a decoder for one pixel. If the value is not `OK`, the range image has NaN at the pixel.
 
     Examples
     --------
@@ -27,4 +27,4 @@ class Status(IntEnum):
     UNWRAPPING_FAILED = 4
     """The phases of several frequencies do not agree on one distance."""
     OUT_OF_RANGE = 5
-    """The decoded distance is one that the sensor cannot measure: behind it, or beyond its limits."""
+    """The sensor cannot measure the decoded distance: it lies behind the sensor, or beyond its limits."""

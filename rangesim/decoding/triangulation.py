@@ -23,8 +23,8 @@ COORDINATE_ERROR_PX = 0.5
 largest error of a sound Gray code, which decodes to whole pixels. Phase shift is finer."""
 
 MAX_BEHIND_FRACTION = 0.2
-"""Largest fraction of the decoded pixels whose rays may meet clearly behind a device before the capture is doubted. A
-few do by interreflection; with a mirrored image or an inverted calibration most do."""
+"""Largest fraction of the decoded pixels whose rays may meet clearly behind a device before the capture is doubted.
+Interreflection makes a few rays do so; with a mirrored image or an inverted calibration most rays do."""
 
 MIN_BEHIND_PX = 10.0
 """Least distance, in projector pixels, of a coordinate from the one that would make the rays parallel, at which they
@@ -161,6 +161,6 @@ def behind_contradiction(behind_px: np.ndarray) -> str | None:
         return None
     return (
         f"{100 * fraction:.0f} % of the decoded rays meet behind camera or projector, where nothing is, so the depth "
-        "of the others is doubtful: check that no image is mirrored, that T_camera_projector is not its inverse, and "
-        "that the axes and their order are those shown."
+        "of the others is doubtful: check that no image is mirrored, that T_camera_projector is not inverted, and "
+        "that the axes and their order are those that the projector showed."
     )

@@ -188,7 +188,7 @@ class Ambient:
         """Raise ValueError if this light is not zero and the scene has no emitters that could give it."""
         if self.scale > 0 and not scene_has_any:
             raise ValueError(
-                "expected a scene with emitters of its own, whose light the ambient light scales, got one without any."
+                "expected a scene with emitters of its own, because `ambient` scales their light, got one without any."
             )
 
     @cached_property

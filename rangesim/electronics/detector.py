@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detectors, which turn radiance into digital numbers: the base class, and linear image sensors as defined by EMVA
-1288.
+"""Detectors, which turn radiance into digital numbers: the base class, and linear image sensors of EMVA 1288.
 
 A camera with entrance pupil radius a and focal length f turns the radiance L into the irradiance E = L pi (a/f)^2 on a
 pixel. A pixel of the area A then receives E A t lambda / (h c) photons in the exposure time t. With f = fx sqrt(A) the
@@ -116,8 +115,7 @@ class PhotoDetector(Named, ABC):
         return None
 
     def ambient_fraction(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
-        """Factor by which the scene's ambient light is multiplied: the part of it that passes the filter and is
-        counted.
+        """Factor on the scene's ambient light: the part of it that passes the filter and is counted.
 
         ambient : spectrum and strength of that light; the filter's band then decides the factor. None: they are not
             known, and the factor is `ambient_transmission`.

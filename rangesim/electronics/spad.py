@@ -98,8 +98,7 @@ class SpadDetector(PhotoDetector):
         return max(1, round(exposure_s / _counting(gate).period_s))
 
     def ambient_fraction(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
-        """Factor by which the scene's ambient light is multiplied: its part that passes the filter while photons are
-        counted."""
+        """Factor on the scene's ambient light: its part that passes the filter while photons are counted."""
         gate = _counting(gate)
         return super().ambient_fraction(gate, ambient) * gate.open_s / gate.period_s
 

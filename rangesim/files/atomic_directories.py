@@ -112,7 +112,7 @@ def check_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence
     """
     named = Path(directory)
     if named.parts[:1] == ("~",) or named.name.startswith("--"):
-        kind_of_name = "an option" if named.name.startswith("--") else "a home directory, which the shell alone expands"
+        kind_of_name = "an option" if named.name.startswith("--") else "a home directory, which only a shell expands"
         raise kind.error(f"{named} looks like {kind_of_name}; name another place, or ./{named}.")
     try:
         if named.is_symlink() and not named.exists():
@@ -316,7 +316,7 @@ class _Staging:
                         break
                     time.sleep(0.001)
                 else:
-                    raise kind.error(f"{named} cannot be made, or is gone as soon as it is made; name another place.")
+                    raise kind.error(f"{named} cannot be made, or somebody removes it at once; name another place.")
                 if claim.handle is None:
                     raise kind.error(f"another process is writing to {named}; wait for it, or name another place.")
                 _carry_out(target)

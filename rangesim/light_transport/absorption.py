@@ -2,11 +2,11 @@
 """Absorption inside glass, water and clear plastics, by Beer and Lambert's law.
 
 A body that refracts light (`dielectric`, `roughdielectric`) may be filled with a medium that absorbs and does not
-scatter. Light that runs a distance d inside keeps the fraction exp(-sigma_a d). The ray stays straight there, so a path
-needs one more number: the absorption coefficient along its ray. At the surface of such a body, the side on which light
-leaves decides which coefficient is next, as in Mitsuba's `volpath`. Light that leaves against the normal gets the
-coefficient of the interior medium; light that leaves along the normal gets that of the exterior medium. All other
-surfaces do not change the coefficient.
+scatter. Of light that travels a distance d inside, the fraction exp(-sigma_a d) is left. The ray stays straight there,
+so a path needs one more number: the absorption coefficient along its ray. At the surface of such a body, the side on
+which light leaves the surface decides which coefficient comes next, as in Mitsuba's `volpath`. Light that leaves
+against the normal gets the coefficient of the interior medium; light that leaves along the normal gets that of the
+exterior medium. All other surfaces do not change the coefficient.
 """
 
 from __future__ import annotations
@@ -81,5 +81,5 @@ def _sides(shape: mi.Shape) -> tuple[float, float]:
 
 
 def _sigma_a(medium: mi.Medium | None, untold: float) -> float:
-    """Absorption coefficient of a medium, 1/m; `untold` if there is none."""
+    """Absorption coefficient of a medium, 1/m; `untold` if there is no medium."""
     return untold if medium is None else medium_numbers(medium)[0]

@@ -102,8 +102,8 @@ class Accumulators:
         return result
 
     def pending(self) -> list[mi.Float]:
-        """The buffers that a launch has added to. They must be evaluated together with the loop of the launch: else
-        the loop runs a second time for them."""
+        """The buffers that a launch has added to. They must be evaluated together with the loop of the launch;
+        otherwise the loop runs a second time for them."""
         return list(self.bins.values())
 
     def store(self, channels: list[list[mi.Float]], places: slice | np.ndarray) -> None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ambient light: light of the scene's own emitters, such as the sun, the sky and luminaires.
 
-It is found in two ways: a ray of a camera path meets an emitter by chance; a direction is sampled towards an emitter.
-Multiple importance sampling weights the two against each other (Veach 1997), so that no light is counted twice.
+A pass finds it in two ways: a ray of a camera path meets an emitter by chance, or the pass draws a direction towards an
+emitter. Multiple importance sampling gives each way a weight (Veach 1997), so that no light is counted twice.
 """
 
 from __future__ import annotations
@@ -70,10 +70,10 @@ def sampled_ambient_through_media(
     xi: mi.Point2f,
     active: mi.Bool,
 ) -> mi.Float:
-    """The same as `sampled_ambient`, also through media, and also at scattering events inside them.
+    """The same as `sampled_ambient`, but also through media that scatter, and also at scattering events inside them.
 
-    Emitters of finite size are not sampled at such events, nor through boundaries: camera paths meet them by chance
-    there, and would count them twice.
+    At such events, and through boundaries, the function draws no directions to emitters of finite size: camera paths
+    meet these by chance, so their light would be counted twice.
 
     Parameters
     ----------

@@ -16,8 +16,8 @@ from rangesim.rig.camera_model import CameraModel, appears, distort, project, un
 
 MAX_REPROJECTION_PX = 1e-2
 """Largest error, in pixels, with which the ray found for a pixel may project back onto it. Where it is larger, the
-distortion has no inverse in single precision, and the pixel has no ray. A larger bound lets rays through beside the
-fold of a lens model; a smaller one comes near the rounding of single precision."""
+distortion has no inverse in single precision, and the pixel has no ray. With a larger bound, wrong rays beside the fold
+of a lens model would pass; a smaller one comes near the rounding of single precision."""
 MAX_RADIUS2 = 1e30
 """Stands for an infinite squared radius on the plane z = 1, dimensionless, because single precision ends at 3e38."""
 
@@ -26,8 +26,8 @@ class PrimaryRay(NamedTuple):
     """Rays that leave a device.
 
     origin, direction : Point3f and Vector3f, world, metres and unit.
-    path_offset : Float, metres, to be added to path lengths that count from `origin`. All paths through a lens to a
-        point in focus are optically as long as the one through its centre.
+    path_offset : Float, metres, to be added to path lengths that are measured from `origin`. All paths through a lens
+        to a point in focus are optically as long as the one through its centre.
     exists : Bool, false where the distortion has no inverse, so that the lens sends no ray; the direction is then that
         of the axis. None: true everywhere.
     """
@@ -41,8 +41,8 @@ class PrimaryRay(NamedTuple):
 class Device:
     """A camera or a projector of the rig as kernels see it: intrinsics, centre and axes.
 
-    All numbers are opaque to the kernel cache: other numbers need no other kernel. Distortion, a finite lens and
-    vignetting add code to the kernel; without them it is the kernel of a pinhole.
+    The kernel cache does not see the numbers (they are opaque): other numbers need no new kernel. Distortion, a finite
+    lens and vignetting add code to the kernel; without them it is the kernel of a pinhole.
 
     Parameters
     ----------
@@ -212,8 +212,8 @@ def connect(
     """Straight connection of the point `si` to the projector, through `media` if there are any.
 
     All projector pixels have the same power. With E the irradiance at z = 1 m on the axis, the radiant intensity is
-    E / cos^3. Irradiance falls as cos^2 / z^2, which leaves E / (z^2 cos). The lens multiplies E by the density of its
-    pixels and by its relative illumination.
+    E / cos^3. The irradiance on a surface that faces the projector is this times cos^2 / z^2, which is E / (z^2 cos).
+    The lens multiplies E by the density of its pixels and by its relative illumination.
 
     Parameters
     ----------

@@ -26,8 +26,8 @@ from rangesim.rig import Rig
 
 PHOTONS_PER_DISC = 400
 """Number of photons of all maps within the radius of the first map, where light is neither spread nor focused; the
-radius is chosen by it. An estimate from n photons has a relative noise of about 1 / sqrt(n); more photons per disc blur
-more."""
+radius is chosen so that there are this many. An estimate from n photons has a relative noise of about 1 / sqrt(n); more
+photons need a larger radius, which blurs more."""
 MAX_RADIUS_PROJECTOR_PX = 3.0
 """Largest radius of the first map, in projector pixels at the distance of the point, so that the blur stays finer than
 the stripes of structured light."""
@@ -38,14 +38,16 @@ MAX_RADIUS_CAMERA_PX = 3.0
 """Largest radius of the first map, in camera pixels at the distance of the point, so that the image of a caustic stays
 sharp."""
 MAX_COSINE_RATIO = 4.0
-"""Largest ratio of a photon's cosine to the facet at the vertex to its cosine to the facet on which it landed. Radiance
-is divided by the latter, so that without a bound a facet seen edge-on would bring light without a bound."""
+"""Largest ratio of two cosines of a photon's direction: that to the facet at the vertex, and that to the facet on which
+the photon landed. Radiance is divided by the second cosine. Without this bound, a facet that photons meet edge-on would
+bring any amount of light."""
 
 
 def caustic_photons(
     traced: TracedScene, rig: Rig, settings: TransportSettings, spp: int, report: Callable[[], None] = lambda: None
 ) -> Photons | None:
-    """Photons for a pass of any camera; None if none are asked for, no surface has a delta interaction, or none landed.
+    """Photons for a pass of any camera; None if the caller wants none, no surface has a delta interaction, or none
+    landed.
 
     Parameters
     ----------
@@ -83,7 +85,7 @@ def gathering_radius(rig: Rig, photons_per_pixel: float, fixed_m: float | None =
 
 
 class CausticLight(NamedTuple):
-    """Light of the photons around a vertex.
+    """Light that the photons around a vertex bring.
 
     photon : UInt32, index of the photon that stands for all.
     irradiance : Float, W/m2, of all photons together.
@@ -122,8 +124,8 @@ def gather(
     ----------
     sample : UInt32, number of the sample in its pixel, which chooses the map.
     xi : three Floats, uniform in 0..1.
-    chance : Float, uniform in 0..1; a level is gathered if this is below its `chance`. Neighbouring lanes share the
-        number, so that they skip a level together.
+    chance : Float, uniform in 0..1; a level of photons is gathered if this number is below the `chance` of the level.
+        Neighbouring lanes share the number, so that they skip a level together.
     """
     photon, irradiance = dr.zeros(mi.UInt32, dr.width(sample)), dr.zeros(mi.Float, dr.width(sample))
     pick, is_wide = mi.Float(xi[2]), dr.full(mi.Bool, False, dr.width(sample))

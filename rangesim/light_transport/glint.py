@@ -2,7 +2,7 @@
 """Glint: the camera sees the projector's lens itself, in a mirror, through glass or directly.
 
 The lens is a disc as large as its aperture. A camera path of delta interactions alone that meets it brings its full
-radiance. Where the whole of a pixel sees the lens, that is 10^4 times the radiance of a lit wall, so a highlight much
+radiance. A pixel that sees nothing but the lens has 10^4 times the radiance of a lit wall, so even a highlight much
 finer than a pixel matters. Random paths of the pass would mostly miss it. Three steps find it:
 
 1. A pixel is chosen if there is a delta surface behind its centre or behind the centre of a neighbour.
@@ -39,12 +39,12 @@ from rangesim.response import GLINT, LightPath, Response
 from rangesim.rig import Rig
 
 PROBES = 32
-"""Number of probing paths per pixel. It is small, because all pixels around glass and mirrors are probed; the fewer
-probes, the more lenses are missed."""
+"""Number of probing paths per pixel. It is small, because all pixels around glass and mirrors are probed. With fewer
+probes, more images of the lens are missed."""
 NEAR_SPREADS = 1.5
-"""A pixel is near the lens if a probe passes the edge of the lens at less than this distance, in spreads. The spread is
-the least distance between the places at which successive probes cross the plane of the lens. A larger value sends paths
-to pixels that do not see the lens."""
+"""A pixel counts as near the lens if a probe passes the edge of the lens at less than this number of spreads. The
+spread is the least distance between the places at which successive probes cross the plane of the lens. A larger value
+sends paths to pixels that do not see the lens."""
 UNKNOWN_SPREAD = 8.0
 """Spread, in radii of the lens, of pixels whose spread is not measured because only one probe crossed the plane of the
 lens."""

@@ -102,7 +102,8 @@ def mean_reflectance(view: View, settings: PathSettings, rig: Rig, has_cutouts: 
 
 @dataclass
 class FirstSurfaces:
-    """The first surface behind the centre of each of n pixels. A dataclass, because Dr.Jit evaluates no named tuple.
+    """The first surface behind the centre of each of n pixels. It is a dataclass, because Dr.Jit does not evaluate
+    named tuples.
 
     hit : Bool, whether there is such a surface. The other fields are valid only there.
     index : Int32, index of its shape in the scene.

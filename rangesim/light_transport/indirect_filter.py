@@ -4,11 +4,11 @@
 Light that has been diffusely reflected twice comes to a matte point from a whole hemisphere. It changes little from one
 pixel to the next, but a pixel's few paths sample it badly. The mean over neighbours has the noise of many more paths,
 and a bias where the light is not linear within the window. Only radiance over the reflectance of the matte surface is
-filtered, so that textures stay. Only pixels of the same instance count, with similar normals and in one plane.
-The weights reproduce light that varies linearly over the surface. So the bias begins with the second derivative, also
-in corners and at contacts (local linear regression: Fan, Ann. Statist. 21, 1993; for rendered images: Bitterli et al.,
-Computer Graphics Forum 35, 2016). The same weights act on every channel: a filtered pass is what a slightly blurred
-light would have given, and sensors, histograms and energy split agree.
+filtered, so that textures stay. Only pixels of the same instance share light, and only if their normals are similar and
+they lie in one plane. The weights reproduce exactly light that varies linearly over the surface. So only the second
+derivative causes a bias, also in corners and at contacts (local linear regression: Fan, Ann. Statist. 21, 1993; for
+rendered images: Bitterli et al., Computer Graphics Forum 35, 2016). The same weights act on every channel: a filtered
+pass is the pass of a slightly blurred light, and sensors, histograms and energy split agree.
 
 The window is built from levels of 3 x 3 pixels that are 1, 3, 9 ... pixels apart, so that 9 taps for each level cover a
 square of 3^levels pixels (the "a trous" scheme: Dammertz et al., High Performance Graphics 2010).
@@ -34,18 +34,18 @@ REACH_PX = 3**LEVELS // 2
 """Largest distance, in pixels along an axis, over which pixels share light; it follows from the levels."""
 MIN_NORMAL_COSINE = 0.9
 """Smallest cosine between the normals of two pixels that share light (26 degrees), so that none is shared around edges.
-A larger one would stop the filter on curved surfaces."""
+With a larger cosine, pixels on curved surfaces would share no light."""
 MAX_PLANE_SINE = 0.3
 """Largest sine of the angle between a pixel's surface and the line to a neighbour that shares light with it (17
 degrees), so that none is shared between surfaces that lie behind each other."""
 MIN_JUMP = 0.02
 """Distance of a neighbour from a pixel's tangent plane, as a fraction of the distance from the camera, above which the
-pixel counts as mixed: it sees an edge and something behind, and lends no light to others. A smaller value would stop
-the filter on curved surfaces; a larger one would spread light across edges."""
+pixel counts as mixed: it sees an edge and something behind, and lends no light to others. With a smaller value, pixels
+on curved surfaces would share no light; with a larger one, light would spread across edges."""
 RIDGE = 0.05
 """Fraction of the weight times the squared step that is added to the second moments of the regression, because a window
-of a single row or column would divide by zero otherwise. A larger fraction draws one-sided windows towards the plain
-mean."""
+of a single row or column would divide by zero otherwise. A larger fraction makes the result of one-sided windows more
+like a plain mean."""
 CHANNELS_AT_ONCE = 32
 """Number of channels that are filtered together, so that a few rows of pixels of all of them fit into the caches."""
 ROWS_AT_ONCE = 16
@@ -199,8 +199,8 @@ def _weigh(start, stop, step, instance, position, normal, mixed, weights):  # ty
 def _of_radiance(first: NDArray[np.float32], last: NDArray[np.float32], reflectance: NDArray[np.float32]) -> None:
     """Change weights for radiance over reflectance into weights for radiance, in place.
 
-    At the first level they are divided by the reflectance of the neighbour, at the last multiplied by that of the
-    pixel.
+    At the first level the function divides them by the reflectance of the neighbour; at the last level it multiplies
+    them by the reflectance of the pixel.
     """
     h, w = reflectance.shape
     for k in range(9):

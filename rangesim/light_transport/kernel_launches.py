@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernel launches of bounded time.
 
-A running kernel cannot be stopped, and Python handles a signal (Ctrl-C) only after it. So work is cut into launches of
-less than a second, and each launch is waited for. The time that launches take decides where the work is cut, and
-nothing else: the results are the same bytes, however it is cut.
+A running kernel cannot be stopped, and Python handles a signal (Ctrl-C) only after it. So this module cuts work into
+launches of less than a second, and waits for each launch. The time that launches take decides where the work is cut,
+and nothing else: the results are the same bytes, however it is cut.
 
-Compiling a kernel is one more stretch without signals: a tenth of a second to a few seconds, once per machine.
+While a kernel is compiled, no signal is handled either: this takes a tenth of a second to a few seconds, once per
+machine.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ import numpy as np
 from pcgraph.plumbing import interrupts
 
 LAUNCH_S = 1.0
-"""Duration in seconds at which the size of launches aims. It is short, because Ctrl-C waits for a launch; the shorter
-it is, the more time goes into the start of kernels."""
+"""Duration in seconds that a launch should have. It is short, because Ctrl-C waits for a launch. If it were shorter,
+more time would go into the start of kernels."""
 UNWATCHED_LAUNCH_S = 20.0
 """The same duration, in seconds, where nobody waits for a launch, because no progress is reported and a separate thread
 handles signals by ending the process."""
@@ -31,14 +32,14 @@ MAX_OVERRUN = 1.5
 """Largest ratio of the iterations of a launch to those that fit into its duration. Lanes that have not finished then go
 on in the next launch, so that one slow lane cannot make a launch long."""
 FIRST_UNITS = 1 << 21
-"""Work of a first launch, in iterations of a loop, rays or photons, chosen before any time was measured. If it is too
-large for a slow machine, Ctrl-C waits longer once."""
+"""Work of a first launch, in iterations of a loop, rays or photons, for which no time has been measured yet. If it is
+too large for a slow machine, Ctrl-C waits longer, but only once."""
 MAX_STRETCH = 2.0
-"""Largest ratio by which launches become longer where the kernel takes long to be made (thousands of shapes), because
-each launch makes it again."""
+"""Largest ratio by which launches become longer if it takes long to make the kernel (thousands of shapes), because each
+launch makes the kernel again."""
 LANES_TOGETHER = 16
-"""Number of lanes per vector of the widest processors. They are counted together, because a vector is at work as long
-as one of its lanes is."""
+"""Number of lanes per vector of the widest processors. The lanes of a vector are counted together, because a vector
+works as long as one of its lanes does."""
 MIN_AT_WORK = 256
 """Smallest number of lanes that is assumed when a launch's iterations are chosen: fewer lanes take as long as this
 many."""

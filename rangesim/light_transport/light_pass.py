@@ -40,17 +40,17 @@ MATTE_SPP = 16
 """Samples per pixel for pixels that share their indirect light, if no sampler decides. Sharing averages over many
 pixels, so these need fewer samples than others."""
 OTHER_SPP = 64
-"""Samples per pixel for all other pixels, if no sampler decides. Twice as many would lower the noise by a factor of 1.4
-and take twice the time."""
+"""Samples per pixel for all other pixels, if no sampler decides. With twice as many, the noise would be lower by a
+factor of 1.4, and the time twice as long."""
 PATHS_FRACTION = 0.95
-"""Fraction of the progress that is reported when all samples are taken. The rest is for the filter and the sums. It
-changes the progress bar and nothing else."""
+"""Fraction of the work that the progress bar shows as done when all samples are taken. The rest is for the filter and
+the sums. The value changes the progress bar and nothing else."""
 RAYS_TO_MEDIA = 16
-"""Number of columns, and of rows, of the rays that look for media on the wrong side of their boundary. A body that none
-of these 256 rays meets, because it covers less than one of the cells between them, may be missed."""
+"""Number of columns, and of rows, of the rays that look for media on the wrong side of their boundary. These 256 rays
+may miss a body that covers less than one of the cells between them."""
 TEXTURE_SAMPLES = 64
-"""Largest number of samples per pixel over which the reflectance of a texture is averaged. More samples change a mean
-over a pixel little, because they are spread evenly, and take longer."""
+"""Largest number of samples per pixel over which the reflectance of a texture is averaged. More samples take longer and
+change a mean over a pixel little, because samples are spread evenly."""
 
 
 @raised_as_it_is()

@@ -2,9 +2,9 @@
 """The path loop: one pass of light paths serves every pattern, frequency and bin.
 
 One lane owns one pixel and traces its samples one after the other. Where a path ends, the lane starts the next sample
-in the same iteration of the loop. Three things follow. No lane idles while its neighbours finish. Every channel is a
-register instead of a film. Each sum is made by one thread in one order, so the same seed gives the same bytes, whatever
-the number of threads.
+in the same iteration of the loop. This has three advantages. No lane waits while its neighbours finish. Every channel
+is a number in a register instead of an image in memory. Each sum is made by one thread in one order, so the same seed
+gives the same bytes, whatever the number of threads.
 
 The loop runs in launches of bounded time (`rangesim.light_transport.kernel_launches`). A launch takes some of the lanes
 and moves each of them on by a bounded number of iterations. `LaneState` holds everything that a lane has done, so
@@ -14,11 +14,12 @@ A path has two limits. `max_depth` counts the surfaces that scatter it. Delta in
 holes) scatter nothing; a limit of their own counts them in a row (`rangesim.light_transport.specular_chain`).
 
 Inside a translucent object an iteration of the loop is a scattering event instead of a surface. A stay inside counts as
-one surface towards the depth, however often it scatters (`rangesim.light_transport.scattering`). Inside glass that
-absorbs, a segment of length d keeps the fraction exp(-sigma_a d) of the light (`rangesim.light_transport.absorption`).
+one surface towards the depth, however often light scatters there (`rangesim.light_transport.scattering`). Inside glass
+that absorbs, a segment of length d keeps the fraction exp(-sigma_a d) of the light
+(`rangesim.light_transport.absorption`).
 
 The loop carries out two of the three strategies that bring the projector's light to the camera: next-event estimation,
-and the gathering of caustic photons. `rangesim.light_transport.strategies` says which paths each strategy owns.
+and the gathering of caustic photons. `rangesim.light_transport.strategies` says which paths belong to which strategy.
 """
 
 from __future__ import annotations
@@ -52,11 +53,11 @@ from rangesim.scene import Scene
 
 NEIGHBOURS = 256
 """Number of pixels in a row that share a launch. A launch takes such runs from all over the image, so that launches
-take about equally long. Longer runs spread less evenly; runs shorter than a vector of the processor (16 lanes) would
-put pixels into one vector whose paths differ."""
+take about equally long. Longer runs would be spread less evenly. With runs shorter than a vector of the processor (16
+lanes), one vector would hold pixels whose paths differ."""
 ITERATIONS_PER_SAMPLE = 2
-"""Number of iterations of the loop per sample that is assumed before any were counted. Only the first launch is chosen
-by it; later ones go by the count."""
+"""Number of iterations of the loop per sample that is assumed before any were counted. Only the size of the first
+launch depends on it; the size of later ones depends on the count."""
 GOLDEN_STEP = 2654435769
 """Step of a sequence of fractions of 2^32: 2^32 divided by the golden ratio, because its multiples modulo 2^32 are
 spread evenly, however many there are."""
@@ -65,13 +66,14 @@ Array = TypeVar("Array")
 
 
 class PathSettings(NamedTuple):
-    """Settings of the loop. Numbers are opaque to the kernel cache; the flags shape the kernel.
+    """Settings of the loop. The kernel cache does not see the numbers (they are opaque); the flags decide which code
+    the kernel has.
 
     seed : Seed. max_depth, rr_depth : UInt32, see `TransportSettings`.
     delta : whether some surface of the scene has a delta interaction.
     ambient : whether the scene has light of its own.
-    samples_ambient : whether directions to that light are sampled. Uniform surroundings are found best by samples of
-        the BSDF alone.
+    samples_ambient : whether directions to that light are sampled. For uniform surroundings, samples of the BSDF alone
+        are best.
     """
 
     seed: Seed
@@ -100,7 +102,7 @@ class SampleAllocation:
 
     pixels : (n,) int, flat indices in the whole image.
     samples : (n,) uint32, number of samples to be taken of each pixel.
-    total : (n,) uint32, number of samples of each pixel all in all, those taken at other times included.
+    total : (n,) uint32, number of all samples of each pixel, including those that are taken at other times.
     irradiance : W/m2, irradiance that the projector makes at z = 1 m.
     first : int, number of the first of the samples among all samples of a pixel.
     stride : int, difference between the numbers of successive pairs of samples.
@@ -189,7 +191,7 @@ class PathState:
     is_first : Bool, whether the path has met no vertex so far (`rangesim.light_transport.strategies`).
     via_delta : Bool, whether it has met a delta interaction so far, holes aside.
     left_delta : Bool, whether the ray leaves a delta interaction.
-    unsampled : Bool, whether no other strategy than this ray finds the ambient light that it meets: it leaves the
+    unsampled : Bool, whether only this ray can find the ambient light that it meets. This is so if it leaves the
         camera, a delta interaction or an event inside a medium.
     pdf : Float, 1/sr, density of the BSDF sample that made the ray.
     events : UInt32, scattering events inside media and crossed boundaries so far; None in scenes without media.
@@ -216,8 +218,8 @@ class LaneState:
     """Everything that an iteration of the loop changes in a lane; `start` makes it, `walk` changes it.
 
     Dr.Jit carries it through the loop as one structure. Its classes are dataclasses, and not frozen, because Dr.Jit
-    does not look into named tuples. A field that the loop of a scene would never change is None instead: Dr.Jit would
-    trace the loop a second time for it.
+    does not look into named tuples. A field that the loop of a scene would never change is None instead, because such a
+    field makes Dr.Jit trace the loop a second time.
 
     sample : UInt32, samples of the pixel that are finished.
     channels : per response its dense channels, Float each (`Accumulators.zeros`).
@@ -232,7 +234,7 @@ class LaneState:
 
 
 class View(NamedTuple):
-    """Everything that the lanes look into: the scene with its devices, and photon maps (None: no photons)."""
+    """Everything that the lanes read: the scene with its devices, and the photon maps (None: no photons)."""
 
     traced: TracedScene
     maps: PhotonMaps | None = None
@@ -430,7 +432,7 @@ def walk(
                 path.ray_state.inside, path.ray_state.previous, ray.d, si, hit, rng.next_float32()
             )
         at_surface = hit & ~scatters
-        # The surface counts towards the depth if it scatters the path; the next direction will tell
+        # The surface counts towards the depth if it scatters the path; this is known with the next direction
         if dr.hint(media is not None, mode="scalar"):
             arrives = ~(crosses | (scatters & path.scattered_inside))
             path.depth += dr.select(arrives, mi.UInt32(1), mi.UInt32(0))
@@ -548,7 +550,7 @@ def walk(
         path.ray_state = path.ray_state.entering(traced, si, wo, at_surface, crosses)
 
         # ---- Or next sample --------------------------------------------------------------------------
-        # At the last surface only its own emission matters, so it is met for ambient light alone
+        # A path meets its last surface only for the light that this surface emits itself, which is ambient light
         last = settings.max_depth if settings.ambient else settings.max_depth - 1
         goes_on = path.depth < last
         if dr.hint(media is not None, mode="scalar"):

@@ -2,9 +2,10 @@
 """A warning: narrow lobes throw light onto other surfaces, where light paths rarely find it.
 
 A mirror is a delta interaction, and photons carry its light. A rough metal with an alpha of 0.01 is no delta
-interaction. A polished `principled` is none either, at any roughness. A path from the lit wall meets such a lobe by
-chance once in ten thousand times, and the sampling error knows nothing of light that no sample found. So rays of the
-projector are followed here, through lobes and delta interactions, to the surfaces that scatter them.
+interaction. A polished `principled` BSDF is no delta interaction either, at any roughness. A path from the lit wall
+meets such a lobe by chance once in ten thousand times, and the sampling error does not contain light that no sample
+found. So rays of the projector are followed here, through lobes and delta interactions, to the surfaces that scatter
+them.
 """
 
 from __future__ import annotations
@@ -22,16 +23,16 @@ from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.scene.materials import MAX_NARROW_ALPHA, has_narrow_lobe
 
 RAYS = (128, 128)
-"""Columns and rows of the grid of rays over the projector's pixels, so that the smallest surface that is found is about
-one cell of the grid; the time is in proportion to the number of cells."""
+"""Columns and rows of the grid of rays over the projector's pixels. The smallest surface that the rays find is about as
+large as one cell of the grid; the time is in proportion to the number of cells."""
 MAX_SURFACES = 8
 """Number of surfaces over which a ray is followed, so that its time is bounded; a hollow glass has four."""
 MIN_THROWN = 0.005
 """Fraction of the projector's light, thrown onto other surfaces by narrow lobes, above which a pass warns. A smaller
 value would warn of light that changes few readings."""
 MIN_NAMED = 0.1
-"""Fraction of the thrown light that a shape throws or receives, above which the warning names it, so that it names
-causes and not bystanders."""
+"""Fraction of the thrown light that a shape throws or receives, above which the warning names the shape. So it names
+only shapes that matter."""
 MAX_NAMED = 3
 """Largest count of shapes that the warning names, so that it stays one sentence."""
 

@@ -17,7 +17,8 @@ from rangesim.light_transport.traced_scene import TracedScene
 
 LANDING_FRACTION = 0.75
 """Fraction of the photons that land on a surface which both scatters and mirrors (polished plastic); the others go on
-as delta interactions. Both kinds get the inverse weight, so the fraction changes noise and no mean."""
+as delta interactions. The photons of both kinds are divided by their fraction, so its value changes the noise, but no
+mean."""
 
 
 class PhotonDeposit(NamedTuple):
@@ -121,7 +122,7 @@ def _chain(
         scatters = hit & can_be_vertex(bsdf)
         mirrors = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
 
-        # ---- It lands: the photon map owns it beyond a delta surface, else next-event estimation does -
+        # ---- It lands: in the photon map, if beyond a delta surface; else next-event estimation counts it
         direct += dr.select(hit & ~mirrors & (chain == 0), flux, 0)
         mixed = scatters & mirrors & (chain > 0)
         lands = owner(scatters, chain).photons & (~mixed | (rng.next_float32() < LANDING_FRACTION))
@@ -140,7 +141,7 @@ def _chain(
         goes_on &= (remains > 0) & is_delta(bs)
         chance = survival(chain, remains / emitted)
         goes_on &= rng.next_float32() < chance
-        remains = dr.select(goes_on, remains / chance, 0)  # roulette absorbs nothing on average
+        remains = dr.select(goes_on, remains / chance, 0)  # Russian roulette absorbs nothing on average
         absorbed += dr.select(hit & ~(~mirrors & (chain == 0)), flux - remains - dr.select(lands, landing_flux, 0), 0)
         flux = dr.select(active, remains, flux)
         chain += dr.select(goes_on & ~crosses, mi.UInt32(1), mi.UInt32(0))

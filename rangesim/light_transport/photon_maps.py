@@ -3,15 +3,15 @@
 
 Density estimation follows Jensen ("Realistic Image Synthesis Using Photon Mapping", 2001), with many small maps instead
 of one large one. Sample s of a pixel looks into map s mod n, and the radii of the maps shrink as in probabilistic
-progressive photon mapping (Knaus and Zwicker 2011, eq. 15; their alpha is our `ALPHA`). So a sample pays for a few
-photons only, and the pixel as a whole sees all of them.
+progressive photon mapping (Knaus and Zwicker 2011, eq. 15; their alpha is our `ALPHA`). So each sample looks at few
+photons only, and all samples of a pixel together look at all photons.
 
 The radius of a gather depends on the place (`GatheringRadius`). A grid has cells of one size, so photons are sorted by
 the radius at their place into classes, `CLASSES_PER_OCTAVE` for each factor of two, and a point looks into the cells of
 its own class. Photons near a border between two classes are in the cells of both.
 
-Photons are sorted into `LEVELS` by the light that they bring, compared with the projector's direct light. Few photons
-carry faint light, so it is gathered over larger radii; and little depends on it, so fewer vertices gather it.
+Photons are sorted into `LEVELS` by the light that they bring, compared with the projector's direct light. Faint light
+has few photons, so it is gathered over larger radii. Results depend little on it, so fewer vertices gather it.
 
 At a vertex, one photon within the radius is chosen with a chance in proportion to its weight (reservoir sampling). It
 stands for all of them. So BSDF and sensor responses are evaluated once per vertex, however many photons are near.
@@ -30,24 +30,25 @@ from rangesim.light_transport.photons import Photons
 from rangesim.light_transport.sampling import aligned
 
 ALPHA = 2 / 3
-"""Number that says how fast the radii of successive maps shrink, dimensionless, alpha of Knaus and Zwicker (2011). The
-noise of n maps falls as n^(-alpha / 2) and their bias as n^(alpha - 1). It is chosen so that both fall alike; at 1
-radii would not shrink, and the blur would stay."""
+"""Dimensionless number (alpha of Knaus and Zwicker 2011) that decides how fast the radii of successive maps shrink. The
+noise of n maps falls as n^(-alpha / 2) and their bias as n^(alpha - 1). With this value both fall equally fast; with 1
+the radii would not shrink, and the blur would stay."""
 MAX_MAPS = 64
 """Largest number of photon maps. With more samples per pixel than this, several samples share a map. The number of maps
 is a multiple of 32, because `_occupancy` keeps a bit for each in words of 32."""
 CLASSES_PER_OCTAVE = 4
-"""Number of classes of radii per factor of two. It is chosen small, because photons near a border between two classes
-are stored twice; fewer classes would have cells larger than their radii need."""
+"""Number of classes of radii per factor of two. It is small, because photons near a border between two classes are
+stored twice. With fewer classes, cells would be larger than their radii need."""
 STEEPEST = 1 / 12
 """Largest ratio of the radius of the brightest level to the distance from a device. The radius of the faintest level is
 six times as large, so it is half the distance at most."""
 FLATNESS = 0.3
 """Largest distance of a photon from the tangent plane, as a fraction of the radius. Photons farther off lie on another
-surface. A smaller value loses photons on curved surfaces; a larger one takes light from beyond edges."""
+surface. With a smaller value, photons on curved surfaces are lost; with a larger one, light from beyond edges is
+counted."""
 MAX_LOOKED_AT = 16
-"""Number of photons that a gather looks at, so that the time per vertex is bounded. Where n times as many are near, it
-looks at every n-th photon and counts it n times; a larger number makes less noise in bright caustics."""
+"""Number of photons that a gather looks at, so that the time per vertex is bounded. If n times as many are near, it
+looks at every n-th photon and counts it n times. A larger number makes less noise in bright caustics."""
 OCCUPANCY_CELLS = 1 << 18
 """Number of places per level in the table that says where photons may be, a power of two. At 2 MiB it fits into caches;
 a smaller table has more false hits, because more cells share a place."""
@@ -64,8 +65,8 @@ ROUNDING = 1e-4
 """Relative error, a fraction of a radius, for which classes allow, so that rounding in single precision (6e-8 per
 operation) puts no photon into a wrong class."""
 TYPICAL_QUANTILE = 0.05
-"""Quantile of the ratios of radius to distance from the camera that decides whether a level is wide. It is low, so that
-a level counts as wide only if nearly all of its photons are gathered over wide circles."""
+"""Quantile of the ratios of radius to distance from the camera. A level of photons counts as wide if this quantile is
+above the limit. The quantile is low, so nearly all photons of such a level are gathered over wide circles."""
 FOLD = 1024
 """Number of cells along x after which a row turns back on itself, so that the table stays small in a large scene.
 Places 1024 or more cells apart may then share an entry, which costs time."""
@@ -103,13 +104,13 @@ class GatheringRadius:
     """Radius within which photons of the brightest level are gathered around a point, in the first map.
 
     It is the distance from the projector times an angle, within two bounds that are the distance from the camera times
-    an angle. Distances are straight ones. Light that came a long way round, off a mirror, has spread and is fainter
-    than direct light would be, so a level with a larger radius holds it.
+    an angle. Distances are straight ones. Light that came a long way, by a mirror, has spread and is fainter than
+    direct light would be. So its photons belong to a level with a larger radius.
 
     projector : radians. A value above `STEEPEST` counts as `STEEPEST`.
     camera : smallest and largest angle, radians, likewise capped.
     projector_at, camera_at : (3,) float, metres, world, centres of the two.
-    fixed_m : metres, the radius everywhere, in place of all this; None: not used.
+    fixed_m : metres; the radius is then this everywhere, and the other fields are not used. None: they are used.
     """
 
     projector: float
@@ -195,7 +196,7 @@ class PhotonMaps:
     def __init__(self, photons: Photons, radius: GatheringRadius, irradiance: float, wide: float = np.inf) -> None:
         maps = photons.maps
         at_photons = np.maximum(radius.at(photons.position), MIN_M)
-        # Decided for a whole level: else light would be smooth on one side of a line and not on the other
+        # One decision for each level; else light would count as smooth on one side of a line and not on the other
         from_camera = np.linalg.norm(photons.position - radius.camera_at, axis=1)
         typical = float(np.quantile(at_photons / np.maximum(from_camera, MIN_M), TYPICAL_QUANTILE))
         self.is_wide = [typical * one.radius >= wide for one in LEVELS]

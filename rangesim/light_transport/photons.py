@@ -3,14 +3,14 @@
 scatters.
 
 A photon leaves the projector through a pixel, follows delta interactions alone (dielectric, conductor, thin
-dielectric, hole), and lands on the first surface that scatters. Next-event estimation owns the light that lands without
-any delta interaction, so such a photon ends at once (`rangesim.light_transport.strategies`). The medium of a
-translucent object weakens photons by the light that it scatters out of their way; that scattered light is not followed.
-Glass that absorbs weakens them on their way inside (`rangesim.light_transport.absorption`).
+dielectric, hole), and lands on the first surface that scatters. Light that lands without any delta interaction belongs
+to next-event estimation, so such a photon ends at once (`rangesim.light_transport.strategies`). The medium of a
+translucent object scatters light out of the way of photons and so weakens them; the photons do not follow that
+scattered light. Glass that absorbs weakens them on their way inside (`rangesim.light_transport.absorption`).
 
 Most photons are sent through projector pixels whose light meets a delta surface first. A pre-pass with one ray per
 pixel finds these pixels; their neighbours count as well. A small fraction of the photons goes through all other pixels,
-so that the estimate has no bias where something is finer than a pixel.
+so that the estimate has no bias where a surface is finer than a pixel.
 """
 
 from __future__ import annotations
@@ -33,13 +33,14 @@ from rangesim.scene.media import is_boundary
 
 DEFENSIVE_FRACTION = 0.05
 """Fraction of the photons that go through pixels where the pre-pass found no delta surface, so that surfaces finer than
-a pixel get some. Any fraction above 0 has the same mean; a larger one takes photons from the pixels that need them."""
+a pixel get some. Any fraction above 0 gives the same mean light; a larger one takes photons from the pixels that need
+them."""
 SURFACES_PER_PHOTON = 2
 """Number of surfaces per photon that is assumed when the size of a launch is chosen. Launches adapt to the time they
 take, so that a wrong number costs little."""
 SUMMED_TOGETHER = 1 << 16
-"""Number of photons per block whose power is added up first. A launch holds whole blocks, so that the sum does not
-depend on how photons are cut into launches."""
+"""Number of photons per block. The powers within a block are added first. A launch holds whole blocks, so the sum does
+not depend on how photons are cut into launches."""
 MAX_AT_ONCE = 1 << 20
 """Largest number of photons of a launch, so that NumPy's work on them between launches is short as well."""
 BYTES_PER_PHOTON = 128

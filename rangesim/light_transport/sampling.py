@@ -41,11 +41,11 @@ class Stream(Enum):
 
 
 def random_stream(seed: Seed, number: mi.UInt32, stream: Stream = Stream.FIRST) -> mi.PCG32:
-    """Random numbers that depend on the seed, the number and the stream alone, and not on the lane.
+    """Random numbers that depend only on the seed, the number and the stream, and not on the lane.
 
     The block cipher TEA mixes seed and number (Zafar, Olano, Curtis: GPU random numbers via the tiny encryption
-    algorithm, HPG 2010). TEA is one to one. A seed of more than 32 bits goes through TEA twice, and the upper half of
-    the seed is added in between, so that no two seeds give the same numbers.
+    algorithm, HPG 2010). TEA maps no two inputs to the same output. A seed of more than 32 bits goes through TEA twice,
+    and the upper half of the seed is added in between, so that no two seeds give the same numbers.
     """
     pair = (number, seed.low) if stream is Stream.THIRD else (seed.low, number)
     once = [mi.UInt32(x) for x in mi.sample_tea_32(*pair)]
@@ -63,7 +63,7 @@ class Continued:
     """A stream of random numbers for a loop that carries its state alone.
 
     Dr.Jit traces a loop twice if the loop carries something that it never changes, such as the increment of a PCG32.
-    That takes seconds where there are thousands of shapes. Dr.Jit does not look into this class, so the loop does not
+    With thousands of shapes, that takes seconds. Dr.Jit does not look into this class, so the loop does not
     carry the increment.
     """
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Means over samples, and the error of these means.
 
-Samples are taken in two halves. Half the difference of their means has the variance of the error of the mean of all.
+Samples are taken in two halves. Half the difference of their means has the same variance as the error of the mean of
+all samples.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from rangesim.signals import SamplingError
 BYTES_PER_LANE = 512
 """Memory per lane besides its channels, in bytes, an upper bound from which the size of tiles follows."""
 MIN_FOR_HALVES = 3
-"""Smallest number of samples per pixel that can be dealt into halves, because samples come in pairs: two and one."""
+"""Smallest number of samples per pixel that can be divided into halves: samples come in pairs, so the halves are a pair
+and a single sample."""
 SMOOTH = [i for i, field in enumerate(fields(Radiance)) if field.name in ("multipath", "smooth_caustic")]
 """Indices of the kinds of light that neighbouring pixels may share, in the order of the fields of `Radiance`."""
 
@@ -51,7 +53,7 @@ class Sums:
         is_whole = len(pixels) == self.shape[0] * self.shape[1]
         for response, values in zip(accumulators.responses, accumulators.images(), strict=True):
             for part, of_part in zip((self.channels, self.smooth), values, strict=False):
-                if response not in part and is_whole:  # a copy only where a view would keep the other part in memory
+                if response not in part and is_whole:  # a copy only if a view would keep the other part in memory
                     is_own = of_part.base is None or (len(values) == 1 and of_part.flags.writeable)
                     whole = of_part if is_own else of_part.copy()
                     part[response] = whole.reshape(-1, *self.shape)
@@ -67,7 +69,7 @@ class Halves:
 
     If there is only one sum, it computes means alone.
 
-    With means a and b over p and q samples, (a - b) sqrt(p q) / (p + q) has the variance of the mean of all.
+    With means a and b over p and q samples, (a - b) sqrt(p q) / (p + q) has the variance of the mean of all samples.
 
     Parameters
     ----------
@@ -115,7 +117,7 @@ class Estimate:
     rig : Rig, whose camera takes the image.
     responses : the responses whose channels are summed up.
     keeps_apart : whether smooth light has sums of its own, so that neighbours can share it.
-    has_halves : whether samples are dealt into halves. Every pixel then needs `MIN_FOR_HALVES` samples at once.
+    has_halves : whether samples are divided into halves. Every pixel then needs `MIN_FOR_HALVES` samples at once.
     memory_bytes : largest size of the renderer's arrays.
     launches : Launches, which remember how much work fits into a launch.
     """
@@ -140,7 +142,7 @@ class Estimate:
         self.rounds = 0
 
     def sample(self, pixels: np.ndarray, samples: np.ndarray, report: Report) -> None:
-        """Take more samples of some pixels, of which all have had equally many.
+        """Take more samples of some pixels. All of these pixels must have had the same number of samples.
 
         Parameters
         ----------
@@ -177,7 +179,7 @@ class Estimate:
 
         Parameters
         ----------
-        shared : LightFilter of the smooth light that is kept apart; None if none is.
+        shared : LightFilter of the smooth light that is kept apart; None if no light is kept apart.
         responses : the responses whose channels are returned; more samples may be taken afterwards. None returns all
             channels and uses up the sums.
         """

@@ -22,7 +22,7 @@ from rangesim.scene.media import is_boundary, medium_numbers
 
 MAX_EVENTS = 1 << 14
 """Number of scattering events and crossed boundaries per path after which it is cut off, so that its time is bounded.
-In whole milk a walk takes some 4000 events to a throughput of `ROULETTE_BELOW`."""
+In whole milk, the throughput of a walk falls to `ROULETTE_BELOW` after some 4000 events."""
 ROULETTE_BELOW = 0.2
 """Throughput, a fraction of the light, below which Russian roulette may end a walk inside a medium, so that walks end
 in time. A smaller fraction makes less noise and longer walks."""
@@ -69,7 +69,7 @@ class Medium:
 
         `direction` is the one before; `xi` is uniform in the unit square.
         """
-        g = dr.select(dr.abs(self.g) < 1e-3, 1e-3, self.g)  # the inverse would be 0 / 0 at g = 0
+        g = dr.select(dr.abs(self.g) < 1e-3, 1e-3, self.g)  # the inverse function would be 0 / 0 at g = 0
         way = (1 - dr.square(g)) / (1 - g + 2 * g * xi.x)
         cosine = dr.clip((1 + dr.square(g) - dr.square(way)) / (2 * g), -1, 1)
         cosine = dr.select(dr.abs(self.g) < 1e-3, 1 - 2 * xi.x, cosine)

@@ -5,9 +5,9 @@ Delta interactions scatter nothing, so they do not count towards `max_depth`. Th
 of surfaces in a row. Photons, camera paths and glint share the limit, and walk with the same `RayState`.
 
 Mitsuba's `spawn_ray` starts rays a little off a surface, along its normal: about 0.1 mm at 1 m. So an oblique ray runs
-beside its true line, by a twentieth of a projector pixel or more, and mirrors and glass pass the error on. A ray that
-started on its true line would miss faces beside edges. So the ray is left where it is, and the point where it ends is
-corrected (`corrected_point`).
+beside its true line, at a distance of a twentieth of a projector pixel or more, and mirrors and glass pass the error
+on. If a ray started on its true line, it would miss faces beside edges. So this module leaves the ray where it is, and
+corrects the point where it ends (`corrected_point`).
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ from rangesim.light_transport.traced_scene import TracedScene
 
 MAX_CHAIN = 128
 """Number of delta interactions in a row after which light is cut off, so that time is bounded. A pane has two faces, a
-hollow glass four. Of photons into a brilliant of n = 2.4, 0.2 % are cut off (5.8 % were measured at a limit of 16)."""
+hollow glass four. Of the photons that enter a cut diamond of n = 2.4, 0.2 % are cut off (with a limit of 16, it was 5.8
+%)."""
 ROULETTE_AFTER = 8
-"""Number of delta interactions in a row after which Russian roulette may end the light, so that it adds no noise to
-light through a few panes or two hollow glasses. A larger number takes more time among metals."""
+"""Number of delta interactions in a row after which Russian roulette may end the light, so that light through a few
+panes or two hollow glasses gets no noise from it. With a larger number, scenes with metals take more time."""
 CLEARANCE = 0.1
 """Distance at which rays start from a delta surface, as a fraction of Mitsuba's own: 0.009 mm at 1 m. Glass thinner
 than this distance loses its far face; a smaller fraction comes near the rounding of single precision."""
 MIN_COSINE = 0.05
-"""Smallest cosine of the angle between ray and normal at which a point is corrected, because at more grazing incidence
-the corrected point may be far off."""
+"""Smallest cosine of the angle between ray and normal at which a point is corrected, because at a flatter angle the
+corrected point may be far off."""
 
 
 @dataclass
@@ -70,7 +71,8 @@ class RayState:
         )
 
     def length_to(self, point: mi.Point3f, hit: mi.Bool) -> mi.Float:
-        """Optical length up to the point that the ray meets, in metres; on lanes without a `hit` up to its start.
+        """Optical length up to the point that the ray meets, in metres; on lanes without a `hit`, up to the start of
+        the ray.
 
         `si.t` would be wrong, because rays start off the surface.
         """
@@ -137,9 +139,10 @@ def corrected_point(si: mi.SurfaceInteraction3f, origin: mi.Point3f, direction: 
 
 
 def spawn_specular_ray(si: mi.SurfaceInteraction3f, met: mi.Point3f, direction: mi.Vector3f) -> mi.Ray3f:
-    """The ray that leaves a delta surface in a direction, closer to it than Mitsuba's.
+    """The ray that leaves a delta surface in a direction; it starts closer to the surface than Mitsuba's.
 
-    `met` is the point where the ray before met the surface, not corrected, so that it lies on the safe side of edges.
+    `met` is the point where the previous ray met the surface. It is not corrected, so that it lies on the safe side of
+    edges.
     """
     ray = si.spawn_ray(direction)
     ray.o = met + CLEARANCE * (ray.o - si.p)

@@ -6,7 +6,7 @@ medium. Between vertices, light runs along segments and through delta interactio
 holes), which send it on in single directions.
 
 Three strategies bring the projector's light to the camera. They partition all light paths: each path belongs to one of
-them, so that no light is counted twice and none is left out. `owner` says to which one.
+them, so that no light is counted twice and none is left out. `owner` says which strategy a path belongs to.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def owner(has_vertex: mi.Bool, delta_interactions: mi.UInt32 | int) -> Owner:
     Parameters
     ----------
     has_vertex : Bool, whether the path has any vertex.
-    delta_interactions : UInt32, number of delta interactions between the projector and the vertex next to it. It does
-        not count where there is no vertex.
+    delta_interactions : UInt32, number of delta interactions between the projector and the vertex next to it. It has no
+        meaning where there is no vertex.
 
     Examples
     --------

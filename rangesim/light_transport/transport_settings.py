@@ -25,14 +25,14 @@ class TransportSettings:
     Parameters
     ----------
     spp : int >= 1, number of samples (camera paths) per pixel; or a Sampler such as AdaptiveSampling, which takes 8
-        samples and then up to 64, until the renderer's noise in the readings of its instruments is small against the
-        noise of their detectors. "auto" is AdaptiveSampling for the sensors of the pass with their default detectors.
-        For bare responses, and without `sampling_error`, "auto" is 16 samples where pixels share their indirect light,
-        and 64 elsewhere.
-    max_depth : int >= 1, largest number of segments of a path between surfaces that scatter it, the last segment to the
-        light included. 2 means direct light only, as in Mitsuba. Delta interactions (glass, mirrors, thin panes, coats,
-        holes) do not count. They have a limit of their own, `rangesim.light_transport.specular_chain.MAX_CHAIN` in a
-        row.
+        samples and then up to 64, until the renderer's noise in the readings of its instruments is small compared with
+        the noise of their detectors. "auto" is AdaptiveSampling for the sensors of the pass with their default
+        detectors. For bare responses, and without `sampling_error`, "auto" is 16 samples where pixels share their
+        indirect light, and 64 elsewhere.
+    max_depth : int >= 1, largest number of segments of a path between surfaces that scatter it, including the last
+        segment to the light. 2 means direct light only, as in Mitsuba. Delta interactions (glass, mirrors, thin panes,
+        coats, holes) do not count. They have a limit of their own, `rangesim.light_transport.specular_chain.MAX_CHAIN`
+        in a row.
     rr_depth : int >= 1, number of surfaces that scatter after which Russian roulette may end a path.
     seed : int, 0 to 2^64 - 1. The same seed gives the same bytes for any number of threads and any memory budget.
     photons : int >= 0, number of caustic photons, which bring the projector's light through glass and off mirrors, see

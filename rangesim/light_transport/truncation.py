@@ -3,15 +3,15 @@
 
 A camera path brings light at each of its vertices. Let T_k be the throughput with which paths arrive at their k-th
 vertex. It falls off geometrically after a few vertices: the ratio t = T_n / T_(n-1) at the last vertex that a pass
-looks at is the mean albedo times the chance to meet another surface. (The ratio of throughputs is used because the
-ratio of the light itself swings from vertex to vertex: directly lit surfaces mostly face indirectly lit ones.) The
-throughput of all later vertices is T_n t / (1 - t). Per throughput, they are assumed to get as much light as vertices 2
-to n get on average:
+looks at is the mean albedo times the chance to meet another surface. (The estimate uses the ratio of throughputs,
+because the ratio of the light itself goes up and down from vertex to vertex: directly lit surfaces mostly face
+indirectly lit ones.) The throughput of all later vertices is T_n t / (1 - t). The estimate assumes that these vertices
+get as much light per throughput as vertices 2 to n get on average:
 
     left out = T_n t / (1 - t) * (light at vertices 2..n) / (T_2 + ... + T_n)
 
-Chains of delta interactions that are cut off are taken to carry light as bright as all other paths, and photons that
-are cut off are taken to land where the other photons do.
+For chains of delta interactions that are cut off, it assumes light as bright as that of all other paths. For photons
+that are cut off, it assumes that they would land where the other photons do.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def warn_of_truncation(truncation: Truncation | None, max_depth: int, of: str, s
     """Warn if a pass left out more than `MAX_LEFT_OUT`; `of` names the camera, if there are several."""
     if truncation is None or truncation.total <= MAX_LEFT_OUT:
         return
-    why = f"a max_depth of {max_depth} ends light paths early; a larger one brings it"
+    why = f"a max_depth of {max_depth} ends light paths early; a larger one includes this light"
     if not truncation.depth > truncation.chains + truncation.photons:
         why = f"it meets more than {MAX_CHAIN} surfaces of glass and mirrors in a row"
     text = f"about {truncation.total:.0%} of the projector's light is left out{of}: {why}."

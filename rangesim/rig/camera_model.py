@@ -19,8 +19,9 @@ import numpy as np
 
 NEWTON_STEPS = 12
 """Number of Newton steps of `undistort`. For k1 = -0.3, k2 = 0.1 the fourth step reaches double precision over a field
-of view of 80 degrees. Next to a fold each step only halves the error: for k1 = -0.45, 12 steps reach it up to 0.1 % of
-the radius from the fold. More steps would find rays for a thinner rim along the fold, in proportion slower."""
+of view of 80 degrees. Next to a fold each step only halves the error: for k1 = -0.45, 12 steps reach double precision
+everywhere except in a rim along the fold of 0.1 % of the radius. With more steps this rim would be thinner, and the
+time longer in proportion."""
 
 
 class CameraModel(NamedTuple):
@@ -150,7 +151,7 @@ NEGLIGIBLE = 1e-100
 precision."""
 
 
-@lru_cache(maxsize=64)  # a fit asks at every step
+@lru_cache(maxsize=64)  # a fit calls this at every step
 def fold_radius2(coefficients: tuple[float, ...]) -> float:
     """Squared radius on the image plane at which the radial polynomial turns round: it stops growing and falls.
 

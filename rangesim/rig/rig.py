@@ -41,7 +41,8 @@ ROTATION_TOLERANCE = 1e-4
 decimals is off by at most 2e-5 and passes; a scale of 1.0001 does not."""
 RESIDUAL_PX = 1e-3
 """Pixels by which a ray may miss its pixel when it is projected again; if it misses by more, the pixel has no ray.
-Newton's method ends far below this where the lens model has an inverse, and far above where it has none."""
+After Newton's method the miss is far below this value where the lens model has an inverse, and far above it
+elsewhere."""
 FocalLength = Annotated[float, Bounds("positive and finite", 1e-3, 1e9)]
 """A focal length in pixels."""
 PrincipalPoint = Annotated[float, Bounds("a pixel coordinate", -1e9, 1e9)]
@@ -131,7 +132,7 @@ class Intrinsics:
     def normalise(self, pixels: ArrayLike) -> Array:
         """(..., 2) float64, undistorted coordinates x/z, y/z on the image plane of pixel coordinates (..., 2).
 
-        NaN where the distortion has no inverse, that is beyond the radius at which its polynomial turns round.
+        NaN where the distortion has no inverse, that is beyond the radius at which its polynomial stops growing.
         """
         pixels = np.asarray(pixels, dtype=np.float64)
         u, v = pixels[..., 0], pixels[..., 1]
@@ -146,7 +147,7 @@ class Intrinsics:
     def project(self, points: ArrayLike) -> Array:
         """(..., 2) float64, pixel coordinates of points (..., 3) in coordinates of this device, metres.
 
-        NaN behind the device, and beyond the radius at which the distortion turns round.
+        NaN behind the device, and beyond the radius at which the polynomial of the distortion stops growing.
         """
         points = np.asarray(points, dtype=np.float64)
         z = np.where(points[..., 2] > 0, points[..., 2], np.nan)

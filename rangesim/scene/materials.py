@@ -26,13 +26,13 @@ MAX_POLISHED_ALPHA = 0.05
 
 MAX_NARROW_ALPHA = 0.03
 """Largest microfacet roughness alpha, dimensionless, of a narrow lobe. Its solid angle, about pi (2 alpha)^2, is then
-at most a five-hundredth of a hemisphere, so light paths that start elsewhere hardly ever meet it."""
+at most a five-hundredth of a hemisphere, so a light path in a random direction hardly ever lies in the lobe."""
 
 ALL_COMPONENTS = 0xFFFFFFFF
 """Mask of all components of a BSDF, as in `mitsuba.BSDFContext`."""
 
 _TEXTURE_PARTS = re.compile(r"(\.color[01])*(\.value|\.data)?$")
-"""End of the name of a parameter that only says which part of a texture it is."""
+"""End of a parameter's name, which only says which part of a texture the parameter is."""
 _ALPHAS = ("alpha", "alpha_u", "alpha_v")
 """Names of the parameters that hold a microfacet roughness."""
 

@@ -17,15 +17,15 @@ _OBLIQUE = np.array(
     ]
 )
 DIRECTIONS = _OBLIQUE / np.linalg.norm(_OBLIQUE, axis=1, keepdims=True)
-"""(7, 3) float64, unit vectors to all sides. None is along an axis, because edges of shapes often are, and a ray that
-meets an edge may be counted wrongly. Seven is odd, so a majority exists."""
+"""(7, 3) float64, unit vectors in all directions. None is along an axis: edges of shapes often lie along axes, and a
+ray that meets an edge may be counted wrongly. Seven is odd, so a majority exists."""
 MAX_SURFACES = 64
 """Number of surfaces along a ray after which the search for enclosing bodies stops; surfaces beyond are ignored. A
 larger number costs time only where a ray crosses more surfaces."""
 
 
 def is_boundary(shape: Any) -> bool:
-    """Whether the shape is a boundary of matched index (BSDF `null`) that is filled with a medium."""
+    """Whether the shape is filled with a medium and does not refract at its boundary (matched index, BSDF `null`)."""
     has_interior = bool(shape.is_medium_transition()) and shape.interior_medium() is not None
     return has_interior and _lobes(shape.bsdf()) == int(mi.BSDFFlags.Null)
 

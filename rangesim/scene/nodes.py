@@ -33,7 +33,7 @@ _OBJECTS = ("Any", "Object", "Reference", "ResolvedReference")
 _LIBRARIES = (".so", ".dylib", ".dll")
 """Suffixes of shared libraries on Linux, macOS and Windows."""
 _PLAIN_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,99}")
-"""Names of plugins that cannot be part of a path."""
+"""Pattern of plugin names that are plain words and cannot contain a path."""
 
 
 @lru_cache(maxsize=1)

@@ -27,7 +27,7 @@ def repeat_normals(scene: Any) -> Any:
 
     Normals from a file stay. They are told apart by their values: the normals of a mesh count as Mitsuba's if all of
     them agree with the sums computed here, up to rounding. A mesh whose faces cancel at every vertex (a sheet with
-    faces on both sides) keeps its normals, because nothing tells where they came from.
+    faces on both sides) keeps its normals, because nothing shows where they came from.
     """
     for shape in scene.shapes():
         parameters = mi.traverse(shape) if shape.is_mesh() else {}

@@ -105,7 +105,8 @@ class Rounding(NamedTuple):
 
 
 def coarsest_mesh(state: Any, scene: Any) -> Rounding | None:
-    """Of the meshes from files, the one whose vertices near the renderer's origin are rounded most; None without any.
+    """The mesh from a file whose vertices near the renderer's origin have the largest rounding; None without such a
+    mesh.
 
     Mitsuba reads vertices in single precision, whatever precision the file has, and before it applies `to_world`.
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks of the properties in a scene, on its parsed nodes, before Mitsuba makes objects of them.
 
-Mitsuba accepts most numbers unchecked. A reflectance of 2 or a radius of NaN then shows, if at all, as odd light.
+Mitsuba accepts most numbers unchecked. With a reflectance of 2 or a radius of NaN the light is then wrong, and the user
+may not notice.
 """
 
 from __future__ import annotations
@@ -69,8 +70,8 @@ COLOURS = ("value", "color", "color0", "color1", "filename", "bitmap", "data")
 """Properties of a texture that hold its values. They have the bounds of the property that the texture is for."""
 ENTRIES_PER_SHAPE = 20
 """Mean count of entries per allowed shape (limit `shapes`) above which a scene dictionary is refused. Usual shapes have
-fewer, their BSDF included. A dictionary that contains another one many times over, in many levels, has more and would
-take up the memory."""
+fewer, their BSDF included. A dictionary that contains another one many times, in many levels, has more entries and
+would fill the memory."""
 NOT_OF_MEDIA = ("sigma_a", "sigma_s", "material")
 """Properties of media in other renderers, which Mitsuba 3.9 silently ignores."""
 BITMAP_SOURCES = ("filename", "bitmap", "data")

@@ -41,7 +41,8 @@ class Scene:
         `origin_m`.
     instances : one per shape, in the order of `mitsuba.shapes()`.
     camera, T_world_camera : intrinsics and pose (4, 4), metres, of the sensor in the scene file.
-    working_distance_m : float, median depth that the camera sees, metres; the default baseline and vergence follow it.
+    working_distance_m : float, median depth that the camera sees, metres; the default baseline and the angle between
+        camera and projector are computed from it.
     has_cutouts : bool, whether light passes some surface unchanged (`mask`, `null`).
     has_matte_textures : bool, whether the reflectance of some matte surface varies over it.
     source : Path of the file that the scene was loaded from; None for a dictionary.

@@ -32,8 +32,8 @@ COLOUR_OF = {
 }
 """Property with the colour of a BSDF, by its type; `sensor_reflectance` replaces it."""
 GREY = 0.02
-"""Largest difference between the channels (0 to 1) of a colour that counts as grey: five steps of 8 bits, as the eye
-hardly sees. At 0, rounding of greys would cause warnings."""
+"""Largest difference between the channels (0 to 1) of a colour that counts as grey: five of the 256 steps of 8 bits,
+which the eye hardly sees. At 0, rounding of greys would cause warnings."""
 MAX_NAMED = 3
 """Number of materials that a warning names, so that it stays one readable sentence."""
 
@@ -77,7 +77,8 @@ def warn_of_colours(names: list[str], label: str) -> None:
 
 
 def warn_of_emitters_behind_glass(scene: Any, label: str) -> None:
-    """Warn once if a scene has emitters without extent, and glass or holes: light paths through these miss them."""
+    """Warn once if a scene has emitters without extent, and glass or holes: light paths through those miss the
+    emitters."""
     without_extent = mi.EmitterFlags.DeltaPosition.value | mi.EmitterFlags.DeltaDirection.value
     if any(e.flags() & without_extent for e in scene.emitters()) and any(map(_hides_emitters, scene.shapes())):
         warn(

@@ -14,7 +14,7 @@ from rangesim.triangle_mesh import TriangleMesh
 
 SEGMENTS = 256
 """Number of segments of a full circle. With 256, the triangles of a sphere of radius 0.1 m are at most 8 um inside it:
-r (1 - cos(pi / 256)). More segments take memory and time in proportion to their square."""
+r (1 - cos(pi / 256)). Memory and time grow with the square of the number of segments."""
 
 
 def true_surfaces(scene: Scene) -> dict[str, TriangleMesh]:

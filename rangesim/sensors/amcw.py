@@ -24,7 +24,7 @@ from rangesim.settings.bounds import HERTZ, Bounds, Hertz, check_fields, check_n
 
 MAX_RANGE_M = 100.0
 """Largest range, metres, that phase unwrapping searches, even if the frequencies are unambiguous farther out. The time
-of the search grows with it, and the emitter of such a camera does not reach as far."""
+of the search grows with this range, and the emitter of such a camera does not reach as far."""
 
 TAPS_DEG = (0, 90, 180, 270)
 """Delays of the taps of each frequency, in degrees of its phase: quarter turns, as in nearly all such cameras. `frames`
@@ -35,15 +35,16 @@ TAP_FRACTION = 1 / len(TAPS_DEG)
 and lose none."""
 
 WEIGHT_HZ = 1e8
-"""Modulation frequency, hertz, in whose units the weights of phase unwrapping are. It is a typical one, so that a phase
-with a standard deviation of one radian has a weight near 1. Any other value scales all weights alike."""
+"""Modulation frequency, hertz, that sets the unit of the weights of phase unwrapping. It is a typical frequency, so a
+phase with a standard deviation of one radian has a weight near 1. Any other value scales all weights alike."""
 
 RADIAN_M = SPEED_OF_LIGHT / (2 * math.pi * WEIGHT_HZ)
-"""Path length, metres, over which the phase of `WEIGHT_HZ` grows by one radian. It follows from the speed of light."""
+"""Path length, metres, over which the phase of `WEIGHT_HZ` grows by one radian; the speed of light determines it."""
 
 RELATIVE_SIGNAL = 1e-4
-"""Light of noise-free captures that counts as none, as a fraction of that of the bright pixels: far below what any
-detector tells from noise. A larger value lets causes report low signal where a noise-free capture is read."""
+"""Light of noise-free captures that counts as none, as a fraction of that of the bright pixels: it is far below what
+any detector distinguishes from noise. With a larger value, the causes would say "low signal" at pixels where a
+noise-free capture has a reading."""
 
 
 @dataclass(frozen=True)

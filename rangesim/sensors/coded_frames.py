@@ -29,7 +29,7 @@ from rangesim.response import DenseResponse, Fringes, GrayBits
 from rangesim.sensor import Background, FrameContent, least_signal_for
 
 AXES = ("columns", "rows")
-"""Axes of a projector that a code may follow; the index of one is that of the projector coordinate."""
+"""Axes of a projector that a code may follow; the index of an axis here is the index of its projector coordinate."""
 
 FRINGE_VISIBILITY = 0.5
 """Amplitude of a fringe as a fraction of the light at full power: fringes go from 0 to 1."""
@@ -152,7 +152,7 @@ class GrayFrames(CodedFrames):
     def least_signal(self, thresholds: CodeThresholds, background: Background) -> np.ndarray:
         if background.noise_variance is None:
             return background.floor(thresholds.gray.relative_contrast)
-        noise_variance = 2 * (background.ambient + background.noise_variance)  # white - black is of two frames
+        noise_variance = 2 * (background.ambient + background.noise_variance)  # white - black: the noise of two frames
         return least_signal_for(thresholds.gray.contrast_sigmas**2, 1.0, noise_variance)
 
 

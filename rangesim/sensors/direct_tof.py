@@ -21,13 +21,14 @@ from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 OVERSAMPLING = (1, 2, 4)
-"""Numbers of bins of the transport pass per bin of a sensor with a pulse. The first one is taken that makes the
-standard deviation of the pulse at least one bin of the pass, else the last. Narrower bins cost memory alone."""
+"""Numbers of bins of the transport pass per bin of a sensor with a pulse. The sensor takes the first number with which
+the standard deviation of the pulse is at least one bin of the pass, or else the last number. Narrower bins would only
+cost memory."""
 
 SHARED_VARIANCE = 1 / 6
-"""Mean variance, in bins squared, of light that two bins share: t (1 - t) of a path at the fraction t of the way
-between their centres, on average over t. The blur by the pulse is smaller by as much, so that the sum has the pulse's
-variance."""
+"""Mean variance, in bins squared, of light that two bins share. A path at the fraction t of the way between their
+centres has the variance t (1 - t); this is the mean over t. The variance of the blur is made smaller by this value, so
+that the sum is the variance of the pulse."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +179,7 @@ class DirectToFDecoder(Decoder):
     ----------
     peak_sigmas, min_counts : float, least height of a peak over the background, in standard deviations of the counts in
         its window, and in counts.
-    relative_peak : float, least peak as a fraction of the bright ones of the image, for noise-free captures.
+    relative_peak : float, least peak as a fraction of the bright peaks of the image, for noise-free captures.
 
     Examples
     --------

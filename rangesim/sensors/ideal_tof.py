@@ -18,7 +18,7 @@ from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameC
 
 @dataclass(frozen=True)
 class IdealToF(Sensor):
-    """Time of flight that reads the path length of the first return alone: the best that any such sensor could do.
+    """Time of flight that reads only the path length of the first return: the best that any such sensor could do.
 
     Frames: `radiance` of the first return, W/m2/sr, and `radiance_x_length`, this radiance times the path length in
     metres.

@@ -16,7 +16,7 @@ from rangesim.sensor import Decoder, Sensor
 from rangesim.settings.config import brief, from_dict, nearest, shown, to_dict
 
 IMAGES_PRESET = "gray"
-"""Preset of the sensor that took a folder of bare images if nobody names one: the code of OpenCV's GrayCodePattern."""
+"""Preset of the sensor for a folder of bare images if the user names none: the code of OpenCV's GrayCodePattern."""
 
 _SEPARATOR = ".py:"
 """Mark between the two parts of FILE.py:NAME."""
@@ -26,7 +26,7 @@ _FRAME_NAME = re.compile(r"[\w.+-]+")
 
 
 def presets() -> dict[str, Sensor]:
-    """Sensors of all classes that are loaded, by the names that stand for them on the command line.
+    """Sensors of all classes that are loaded, by their names on the command line.
 
     Examples
     --------
@@ -58,7 +58,7 @@ def sensor_of(name: str, files_in: Path | None = Path()) -> Sensor:
 
     Parameters
     ----------
-    name : name of a preset, or FILE.py:NAME. files_in : folder from which a relative FILE counts; None: no file is
+    name : name of a preset, or FILE.py:NAME. files_in : folder to which a relative FILE refers; None: no file is
         loaded.
 
     Raises
@@ -96,7 +96,7 @@ def sensor_from_dict(data: Any, place: str, files_in: Path | None = None) -> Sen
     Parameters
     ----------
     data : str, or mapping of settings. place : name of the place in the file, for messages.
-    files_in : as for `sensor_of`; the default loads no file, for what is read back from captures and results.
+    files_in : as for `sensor_of`; the default loads no file, as is right for data from captures and results.
 
     Raises
     ------
@@ -141,7 +141,7 @@ def is_file_name(name: str) -> bool:
 def check_sensor(sensor: Sensor) -> None:
     """Raise ValueError if a user's own sensor breaks a rule that all sensors keep.
 
-    The rules are those of files and records: a `type_name`, frozen dataclasses, and frame names that files can have.
+    Files and records need these rules: a `type_name`, frozen dataclasses, and frame names that can be names of files.
 
     Examples
     --------

@@ -35,8 +35,8 @@ MIN_CONTRAST = 0.02
 that the two frames are exchanged. Noise alone makes black a little brighter in half of the dark pixels."""
 
 MAX_ACROSS = 0.25
-"""Largest ratio of the baseline across the stripes of an axis to that along them, at which the axis is said to tell no
-depth: depth is then at least four times as uncertain as with the other axis."""
+"""Largest ratio of the baseline across the stripes of an axis to the baseline along them, at which the axis counts as
+useless for depth: depth is then at least four times as uncertain as with the other axis."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class StructuredLight(Sensor):
     def layout(self) -> tuple[CodedFrames, ...]:
         """The runs of coded frames before white and black, in order.
 
-        A subclass may return runs of other kinds: the frames, their names and their decoding follow.
+        A subclass may return runs of other kinds; these decide on the frames, their names and their decoding.
         """
         runs: list[CodedFrames] = []
         start = 0
@@ -273,7 +273,8 @@ def _first_failure(statuses: list[np.ndarray]) -> np.ndarray:
 
 
 def _axis_along_baseline(image: RangeImage, axes: Sequence[str], rig: Rig | None) -> str | None:
-    """The only coded axis, if the baseline runs along its stripes and most decoded pixels are out of range for that."""
+    """The only coded axis, if the baseline runs along its stripes and most decoded pixels are out of range for this
+    reason."""
     if rig is None or len(axes) != 1:
         return None
     decoded = np.isin(image.status, [Status.OK, Status.OUT_OF_RANGE])

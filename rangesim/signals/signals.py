@@ -88,8 +88,8 @@ class Truncation:
     Each field is a fraction of all the emitter's light in the image, including what is left out and excluding glint.
     See `rangesim.light_transport.truncation`.
 
-    depth : light of paths with more scattering surfaces than `max_depth` allows. NaN where `max_depth` is 2 or less,
-        which asks for direct light alone.
+    depth : light of paths with more scattering surfaces than `max_depth` allows. NaN if `max_depth` is 2 or less,
+        because such a pass computes direct light only.
     chains : light of camera paths with more delta interactions in a row than allowed.
     photons : light of photons with more delta interactions in a row than allowed.
 
