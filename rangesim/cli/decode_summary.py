@@ -19,8 +19,8 @@ MIN_BRIGHTEST = 1 / 8
 three bits less than its files, or the exposure may be too short."""
 
 MAX_BASELINE_M = 10.0
-"""Baseline in metres beyond which the calibration is probably in millimetres. A rig on a desk or a robot is smaller,
-and few have a baseline of less than 10 mm, which such a file would give as 10 m."""
+"""Baseline in metres beyond which the calibration is probably in millimetres. A rig on a desk or a robot is smaller.
+Few rigs have a baseline of less than 10 mm, which a file in millimetres would give as 10 m."""
 
 
 def status_fractions(image: RangeImage) -> dict[str, float]:
@@ -30,7 +30,7 @@ def status_fractions(image: RangeImage) -> dict[str, float]:
 
 
 def likely_cause(image: RangeImage, capture: Capture) -> str | None:
-    """A clause that says why little was measured, or what is wrong with what was; None if nothing points to a cause.
+    """A clause that says why few pixels are measured, or what is wrong with the measured ones; None: no cause found.
 
     The decoder knows the causes that depend on the measuring principle, see `Decoder.likely_cause`.
     """

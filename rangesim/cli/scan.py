@@ -123,7 +123,7 @@ def scan_command(
 
 
 def _settings(scene: Path | None, config: Path | None, given: dict[str, Any], sensor: str | None) -> ScanSettings:
-    """The scan of a file of settings or of a scene, with the options of the command line in place of its own."""
+    """The scan of a file of settings or of a scene. Options of the command line replace the settings of the file."""
     from rangesim.experiment.scan_settings import ScanSettings, load_scan_settings
     from rangesim.instrument.presets import instrument
 
@@ -141,8 +141,8 @@ def _settings(scene: Path | None, config: Path | None, given: dict[str, Any], se
 def _path(before: CameraPath, name: str | None, views: int | None) -> CameraPath:
     """The camera path that the options ask for.
 
-    before : the path of the settings. name : of a path, or a .json file of poses; None: the path of the settings.
-    views : number of views; None: as the path says.
+    before : the path of the settings. name : name of a path, or of a .json file of poses; None: the path of the
+    settings. views : number of views; None: as the path says.
     """
     from rangesim.experiment.camera_paths import CameraPath, PoseList
     from rangesim.files.text_files import read_json
@@ -150,7 +150,7 @@ def _path(before: CameraPath, name: str | None, views: int | None) -> CameraPath
 
     if name is not None and name.endswith(".json"):
         if views is not None:
-            raise ValueError("expected --views without a list of poses, which has its own number.")
+            raise ValueError("expected no --views with a list of poses, which has its own number of views.")
         data = read_json(Path(name))
         if isinstance(data, dict) and "T_world_camera" not in data:
             raise ValueError(f"{name}: expected a list of poses, or the key 'T_world_camera', got {shown(list(data))}.")
@@ -160,13 +160,13 @@ def _path(before: CameraPath, name: str | None, views: int | None) -> CameraPath
             raise ValueError(f"{name}: {error}") from error
     if name is not None and name not in PATHS:
         raise ValueError(
-            f"expected --path out of {', '.join(PATHS)} or a .json file, got {name!r}{nearest(name, PATHS)}."
+            f"expected --path to be one of {', '.join(PATHS)} or a .json file, got {name!r}{nearest(name, PATHS)}."
         )
     chosen = before if name in (None, before.type_name) else CameraPath.known[name]()
     if views is None:
         return chosen
     if isinstance(chosen, PoseList):
-        raise ValueError("expected --views without a list of poses, which has its own number.")
+        raise ValueError("expected no --views with a list of poses, which has its own number of views.")
     return replace(chosen, views=views)  # type: ignore[type-var]
 
 
