@@ -44,7 +44,7 @@ class LegendEntry:
 
 
 def png(image: np.ndarray, table: np.ndarray | None = None) -> str:
-    """PNG as a data URI; parameters as of `png_bytes`."""
+    """PNG as a data URI; the parameters are those of `png_bytes`."""
     return "data:image/png;base64," + base64.b64encode(png_bytes(image, table)).decode("ascii")
 
 
@@ -76,7 +76,7 @@ def grey(image: np.ndarray, white: float, black: float = 0.0) -> str:
 
 
 def color_map(fraction: np.ndarray, table: np.ndarray) -> str:
-    """PNG, as a data URI, of values 0..1 in the colours of a table; parameters as of `_indexed`."""
+    """PNG, as a data URI, of values 0..1 in the colours of a table, see `_indexed`."""
     return png(*_indexed(fraction, table))
 
 
@@ -94,7 +94,7 @@ def map_pictures(image: RangeImage) -> dict[str, bytes]:
 
 
 def _stretched(values: np.ndarray) -> np.ndarray:
-    """Values scaled so that their 1st percentile is 0 and their 99th is 1; both may be exceeded."""
+    """Values scaled so that their 1st percentile is 0 and their 99th is 1; some values lie below 0 or above 1."""
     low, high = np.nanpercentile(values, [1, 99])
     return np.asarray((values - low) / max(high - low, 1e-12))
 

@@ -22,8 +22,8 @@ DEFLATE_LEVEL = 4
 FAR_FACTOR = 1.5
 """Multiple of the farthest true depth, beyond which points are not drawn.
 
-They are readings of mirrors and of wrong periods, far behind the scene. With a larger ratio more of them are drawn, and
-all depths are packed in coarser steps; other values were not measured.
+The points beyond are readings of mirrors and of wrong periods, far behind the scene. With a larger ratio the viewer
+draws more of them, and all depths are packed in coarser steps. No other value was tried.
 """
 
 

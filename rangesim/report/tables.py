@@ -23,7 +23,7 @@ Rows = list[dict[str, Any]]
 FAILURE_HEADS = ["failed (%)", "because (% of the pixels)"]
 """Heads of the columns that say how many pixels failed, and why."""
 UNRELIABLE = 0.5
-"""Fraction of outliers, or of missing readings, from which a sensor is called unreliable on a material.
+"""From this fraction of outliers or of missing readings on, the report calls a sensor unreliable on a material.
 
 At one half, a reading is as likely wrong as right.
 """
@@ -87,7 +87,7 @@ class Cell:
 
 
 def titles(measurements: Sequence[Measurement]) -> dict[str, str]:
-    """Title of each instrument, by name; the name is added where two instruments would have the same title."""
+    """Title of each instrument, by name. If two instruments would have the same title, their names are added to it."""
     plain = {m.name: m.capture.sensor.title for m in measurements}
     return {n: t if list(plain.values()).count(t) == 1 else f"{t}, {n}" for n, t in plain.items()}
 

@@ -21,7 +21,7 @@ from rangesim.report.tables import (
 from rangesim.results.experiment_results import Measurement
 
 MAIN_CAUSE = 0.1
-"""Fraction of the failures from which the verdict names a cause; below, the list gets long and the causes are rare."""
+"""The verdict names a cause from this fraction of the failures on. Rarer causes would only make the list long."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ def _failures(rows: Rows) -> str:
 
 
 def _reasons(rows: Rows) -> str:
-    """Sentence about the causes of failures on the materials where the sensor is unreliable; without such a material,
-    about those on all surfaces."""
+    """Sentence about the causes of failures on the materials where the sensor is unreliable. If there is no such
+    material, it is about the failures on all surfaces."""
     poor = [row for row in rows if row["material"] != "all" and is_unreliable(row)]
     named = [f"{row['material']}: {_main_causes(row)}" for row in poor if row["causes"]]
     if named:
@@ -98,7 +98,7 @@ def _best_error(real: Sequence[Measurement], names: dict[str, str]) -> str:
 
 
 def _most_right(real: Sequence[Measurement], names: dict[str, str]) -> str:
-    """Sentence that ranks sensors by their fraction of right readings; wrong readings do not count."""
+    """Sentence that ranks sensors by their fraction of correct readings; wrong readings do not count."""
     failed = [(_total(m.rows)["failed"], names[m.name]) for m in real if _total(m.rows)["failed"] is not None]
     limit = _glued(f"{1e3 * OUTLIER_M:g} mm")
     entries = [(name, f"{_percent(1.0 - f)} of the pixels") for f, name in sorted(failed)]
