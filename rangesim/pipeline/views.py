@@ -64,7 +64,7 @@ def scan(
     Raises
     ------
     ValueError
-        A pose is not rigid, or as `rangesim.transport`, `rangesim.expose` and `rangesim.decode`.
+        A pose is not rigid, or `rangesim.transport`, `rangesim.expose` or `rangesim.decode` refuses an argument.
 
     Examples
     --------
