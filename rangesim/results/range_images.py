@@ -58,8 +58,8 @@ def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> R
     Raises
     ------
     FileFormatError
-        The file is missing or broken, or the class of its decoder is not loaded, for example one from a file of the
-        user's.
+        The file is missing or broken, or the class of its decoder is not loaded, for example a class from a file of
+        the user.
 
     Examples
     --------
