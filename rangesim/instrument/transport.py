@@ -67,8 +67,8 @@ def transport(
     Returns
     -------
     StillSignals
-        A list of them, one for each camera, if a list of rigs is given. Cameras do not share random numbers. The first
-        camera gets the same bytes as alone, if its pixels take the same number of samples.
+        If a list of rigs is given: a list of them, one for each camera. Cameras do not share random numbers. The first
+        camera gets the same bytes as in a pass alone, if its pixels take the same number of samples there.
 
     Raises
     ------
@@ -98,8 +98,8 @@ def transport(
 def _with_sampler(settings: TransportSettings, sensors: Sequence[Sensor | Response]) -> TransportSettings:
     """The settings, with `AdaptiveSampling` for these sensors in place of spp="auto".
 
-    They stay as they are if a bare response is among the sensors, because no reading tells how many samples it needs,
-    or if the sampling error is not estimated.
+    The settings stay as they are if a bare response is among the sensors, because it has no reading that tells how
+    many samples it needs. They also stay if the sampling error is not estimated.
     """
     readers = [sensor for sensor in sensors if isinstance(sensor, Sensor)] if isinstance(sensors, Sequence) else []
     if settings.spp != "auto" or not settings.sampling_error or not readers or len(readers) < len(sensors):
