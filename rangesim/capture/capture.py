@@ -41,12 +41,14 @@ class ClippingThresholds:
     The defaults distinguish images in which 5 to 50 % of the pixels clip from patterns of one brightness
     (`tests/test_decode_summary.py`). Other values were not measured.
 
-    levels : number of levels below the largest value that are compared with it, each 1/256 of that value wide.
-    min_fraction : least fraction of the pixels that are at the largest value; fewer are single highlights.
-    min_peak : least ratio of their number to the mean number of pixels in one of the `levels` below; a smaller value
-        takes the peaks of fringes for clipping.
-    min_tail : least ratio of the number of pixels in all `levels` below to their number; an image of few grey levels
-        (black and white, for example) has no pixels there, and does not clip.
+    Call the pixels with the largest value the top. The image clips if all three ratios reach their least values:
+
+    levels : number of levels just below the largest value, each 1/256 of that value wide.
+    min_fraction : least fraction of the pixels in the top; fewer are single highlights.
+    min_peak : least ratio of the top to the mean number of pixels in one of the `levels`; a smaller value takes the
+        peaks of fringes for clipping.
+    min_tail : least ratio of the number of pixels in all `levels` to the top; an image of few grey levels (black and
+        white, for example) has no pixels there, and does not clip.
     """
 
     levels: int = 16
@@ -62,9 +64,10 @@ CLIPPING = ClippingThresholds()
 def clip_level(brightest: np.ndarray, max_dn: int) -> int:
     """The digital number at which a camera clips: `max_dn`, or a lower one at which many pixels pile up.
 
-    Video levels end at 235 of 255; other images end where a converter or a raw developer cuts them off. In such an
-    image, many pixels have the largest value, and a few have each of the values just below it. An image of two values
-    has none just below, and fringes do not have many more at their peaks: neither is clipped.
+    The values of video end at 235 of 255; other images end where a converter or a raw developer cuts them off. In such
+    an image, many pixels have the largest value, and a few have each of the values just below it. An image of two
+    values has no pixel just below the largest value. Fringes have not many more pixels at their peaks than just below.
+    Neither of the two counts as clipped.
 
     Parameters
     ----------
@@ -82,7 +85,7 @@ def clip_level(brightest: np.ndarray, max_dn: int) -> int:
 
 
 def _masked_in_all(frames: np.ndarray) -> np.ndarray:
-    """Frames (k, h, w); a pixel of float32 frames that is not finite in one frame is NaN in all of them."""
+    """The frames (k, h, w). If a pixel of float32 frames is not finite in one frame, it becomes NaN in all frames."""
     if np.issubdtype(frames.dtype, np.integer):
         return frames
     masked = np.zeros(frames.shape[1:], dtype=bool)
@@ -99,7 +102,7 @@ class Capture(ShortRepr):
     ----------
     frames : (k, h, w) uint8, uint16 or uint32 digital numbers; or float32 radiance (W/m2/sr) of a noise-free
         capture. A pixel that is not finite in one frame becomes NaN in all frames: it is masked, and has no reading.
-    sensor : Sensor, the measuring principle the frames were taken with.
+    sensor : Sensor, the measuring principle with which the frames were taken.
     rig : Rig; None: the capture is not calibrated.
     detector : PhotoDetector; None: unknown (a real capture), or the capture is noise-free.
     exposure_s : float, seconds per frame; NaN if unknown.
@@ -108,7 +111,8 @@ class Capture(ShortRepr):
     Raises
     ------
     ValueError
-        The frames are not as many as the sensor takes, differ from the rig's camera in size, or have another type.
+        The number of frames is not that of the sensor, or the frames have another size than the rig's camera or another
+        type than those above.
 
     Examples
     --------
@@ -157,7 +161,7 @@ class Capture(ShortRepr):
 
     @property
     def full_scale(self) -> float:
-        """Largest signal above the black level that a frame can hold; the level of the bright pixels if noise-free."""
+        """Largest signal above the black level that a frame can hold; if noise-free, the level of the bright pixels."""
         if not self.is_digital:
             return bright_level(self.frames.max(axis=0)) or 1.0
         return self._max_dn - self.black_level

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exposure of signals: the capture that a camera would deliver of them."""
+"""Exposure: the capture that a camera would make of the light in signals."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ def expose(
         frames are float32 radiance in W/m2/sr and contain the ambient light without a filter. The frames of an ideal
         sensor (`Sensor.is_ideal`) are always noise-free.
     exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`.
-    seed : int from 0 to 2^64 - 1, seed of the noise. Every frame has a random stream of its own, with a SpadDetector
-        every image row; the same seed gives the same bytes on any number of threads.
+    seed : int from 0 to 2^64 - 1, seed of the noise. Every frame has a random stream of its own (with a SpadDetector,
+        every image row has one). The same seed gives the same bytes on any number of threads.
     ambient : Ambient, kind and strength of the light of the scene's own emitters; the detector's band
-        (`band_width_m`) then decides how much of it counts. None: unknown; the detector's `ambient_transmission`
-        decides. Another ambient light needs no new transport pass.
+        (`band_width_m`) then decides how much of this light reaches it. None: unknown; then the detector's
+        `ambient_transmission` decides. Another ambient light needs no new transport pass.
 
     Raises
     ------
@@ -98,7 +98,7 @@ class Exposure(ShortRepr):
     def warn_of_overexposure(self, name: str) -> None:
         """Warn if the detector's shortest exposure, which was chosen automatically, saturates the bright pixels.
 
-        name : of the instrument.
+        name : name of the instrument.
 
         Warns
         -----
@@ -127,7 +127,7 @@ def exposed(
     seed: int = 0,
     ambient: Ambient | None = None,
 ) -> Exposure:
-    """Capture of `sensor` with the light that it was exposed from; parameters and errors as of `expose`."""
+    """Capture of `sensor` with the light that it was exposed from; parameters and errors are those of `expose`."""
     if detector is not None and not isinstance(detector, PhotoDetector):
         raise ValueError(f"expected a Detector, a SpadDetector or None, got {detector!r}.")
     seed = check_seed(seed)
