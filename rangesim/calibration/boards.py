@@ -3,7 +3,7 @@
 
 The frame of a board has its origin at the first point, x along a row of points, y along a column and z into the board.
 A camera straight in front of the board has the same axes. Pixel centres are at integer + 0.5. OpenCV, which finds the
-points, has them at integers; only this module adds the difference.
+points, has pixel centres at integers; only this module adds the difference.
 """
 
 from __future__ import annotations
@@ -21,23 +21,25 @@ from rangesim.settings.bounds import Bounds, check_fields, whole
 Array = NDArray[np.float64]
 
 EDGE_POINTS = 64
-"""Number of points on the edge of a disc, from whose polygon the centroid of the disc's image is computed. The two
-centroids are equal to rounding, as long as the distortion of the lens hardly bends one side of the polygon."""
+"""Number of points on the edge of a disc. Their polygon gives the centroid of the disc's image. The centroids of
+polygon and disc are equal to rounding, as long as the distortion of the lens hardly bends one side of the polygon."""
 INK_REFLECTANCE = 0.05
-"""Reflectance of the ink of a rendered board, a fraction, like black print. More leaves less contrast at the
+"""Reflectance of the ink of a rendered board, a fraction, like black print. A larger value leaves less contrast at the
 corners."""
 BOARD_REFLECTANCE = 0.8
 """Reflectance of a rendered board beside the ink, a fraction, like white paper."""
 MIN_MOVE_PX = 0.15
-"""Smallest limit, in pixels, on how far a corner may move when the search window is half as wide. Measured in 36
-rendered views: good corners move by at most 0.14 px, and corners beside the edge of the light by 3.5 to 4.1 px."""
+"""Smallest value, in pixels, of the limit on how far a corner may move when the search window becomes half as wide.
+Measured in 36 rendered views: good corners move by at most 0.14 px, and corners beside the edge of the light by 3.5 to
+4.1 px."""
 MAX_MOVE_RATIO = 8.0
 """Limit on the same move, as a multiple of the median move of all corners of the view, if that is larger than
 `MIN_MOVE_PX`. In a blurred or noisy view all corners move more."""
 Count = Annotated[int, whole(2)]
 """A number of points along a side of a board, at least two: one row has no second direction."""
 Length = Annotated[float, Bounds("positive metres", 1e-6, 1e3)]
-"""A length on a board, metres, from a micrometre to a kilometre. A number beyond is in another unit by mistake."""
+"""A length on a board, metres, from a micrometre to a kilometre. A number outside these bounds is in another unit by
+mistake."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +251,7 @@ class Checkerboard(Board):
 
 @dataclass(frozen=True)
 class CharucoBoard(Board):
-    """A chessboard with ArUco markers in its white squares, of which a view of a part is enough.
+    """A chessboard with ArUco markers in its white squares. A view of a part of the board is enough.
 
     The markers say which corner is which.
 
@@ -326,8 +328,8 @@ class CircleGrid(Board):
     """A grid of discs, whose points are the centres of the discs.
 
     The centroid of the image of a disc is not the image of its centre (Heikkilae: "Geometric camera calibration using
-    circular control points", PAMI 2000). `seen_points` returns the position on the board that the centroid is the image
-    of, and calibration uses it. Corners have no such error.
+    circular control points", PAMI 2000). `seen_points` returns the position on the board whose image is the
+    centroid, and calibration uses this position. Corners have no such error.
 
     columns, rows : numbers of discs. distance_m : distance between the centres of neighbours, metres. diameter_m :
     diameter of a disc, metres.
@@ -363,8 +365,7 @@ class CircleGrid(Board):
         return 1
 
     def seen_points(self, camera: Intrinsics, T_camera_board: ArrayLike) -> Array:
-        """(columns * rows, 3) float64, the positions on the board of which the centroids of the discs are images,
-        metres.
+        """(columns * rows, 3) float64, metres, the positions on the board whose images are the centroids of the discs.
 
         The centroid is that of a polygon of `EDGE_POINTS` points on the edge of the disc, projected through the lens.
         NaN for a disc that is not in front of the camera as a whole.
@@ -374,7 +375,7 @@ class CircleGrid(Board):
         around = np.stack([np.cos(angle), np.sin(angle), np.zeros(EDGE_POINTS)], axis=-1)
         edge = self.points[:, None] + 0.5 * self.diameter_m * around
         image = camera.project(edge @ T[:3, :3].T + T[:3, 3])
-        about = image - image.mean(axis=1, keepdims=True)  # small numbers lose less to rounding
+        about = image - image.mean(axis=1, keepdims=True)  # rounding loses less of small numbers
         following = np.roll(about, -1, axis=1)
         area = about[..., 0] * following[..., 1] - about[..., 1] * following[..., 0]
         middle = ((about + following) * area[..., None]).sum(axis=1) / (3 * area.sum(axis=1))[:, None]

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration of a camera and a projector together, from coded light on a board.
 
-The projector is treated as a camera. Around a corner of the board in the camera's image, the decoded projector
-coordinates are a homography of the camera's pixels, and that homography maps the corner into the projector's image
-(Moreno, Taubin: "Simple, accurate, and robust projector-camera calibration", 3DIMPVT 2012). No single decoded pixel
-would do, because corners of a checkerboard lie where black meets white.
+The calibration treats the projector as a camera. Around a corner of the board in the camera's image, the decoded
+projector coordinates are a homography of the camera's pixels, and that homography maps the corner into the projector's
+image (Moreno, Taubin: "Simple, accurate, and robust projector-camera calibration", 3DIMPVT 2012). No single decoded
+pixel would do, because corners of a checkerboard lie where black meets white.
 
-Any sensor takes part whose decoder returns `ProjectorCoordinates` of both axes.
+Any sensor can take part if its decoder returns `ProjectorCoordinates` of both axes.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from rangesim.rig import Rig
 from rangesim.robust_scale import sigma_from_median
 
 MIN_AROUND = 24
-"""Least number of decoded pixels around a corner for a homography. It has 8 parameters and takes two coordinates of
-each pixel, so that this is six times what it needs."""
+"""Least number of decoded pixels around a corner for a homography. A homography has 8 parameters, and each pixel gives
+two coordinates, so this is six times the number that it needs."""
 
 MAX_AROUND = 600
 """Largest number of decoded pixels around a corner that its homography takes, evenly spread. It bounds the time; the
@@ -41,7 +41,7 @@ error of a homography falls only with the root of their number."""
 
 REACH = 0.9
 """Distance around a corner up to which decoded pixels are taken, as a fraction of the distance between neighbouring
-corners in the image. A larger one takes more pixels, on which the lenses' distortion is less a homography's."""
+corners in the image. A larger one takes more pixels, over which a homography fits the lenses' distortion less well."""
 
 MAX_GAP_RAD = 2.8
 """Largest gap between the directions of the decoded pixels around a corner, radians; half a turn is 3.14. Two white
@@ -52,7 +52,7 @@ RAYLEIGH_MEDIAN = 1.1774
 
 OUTLIER = 4.0
 """Distance in robust standard deviations beyond which a decoded pixel is left out. Normal errors reach it once in 3000
-pixels (a Rayleigh distribution), so that nearly all that are left out are wrong codes."""
+pixels (a Rayleigh distribution), so nearly all pixels that are left out have wrong codes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,14 +63,14 @@ class RigCalibration:
     ----------
     rig : Rig, at the world's origin; its lenses have five coefficients of distortion.
     camera_deviations, projector_deviations : (9,) float64, standard deviations of fx, fy, cx, cy in pixels and of k1,
-        k2, p1, p2, k3; 0 for those that were held.
+        k2, p1, p2, k3; 0 for coefficients that are not free.
     baseline_m, baseline_deviation_m : float, distance of the two centres and its standard deviation, metres.
     T_camera_board : (k, 4, 4) float64, maps coordinates of the board in each pose to the camera's, metres.
     camera_residuals, projector_residuals : k arrays (m, 2) float64, pixels, projected minus seen.
     camera_rms_px, projector_rms_px : float, pixels, root mean square of the reprojection errors over all points.
     camera_views, projector_views : k BoardView, the points that were seen.
-    suspects : points whose error is beyond all noise when each view is weighed by its own scatter, the worst first.
-        They still weigh on the result.
+    suspects : points whose error is larger than noise explains, when each view is weighed by its own scatter; the worst
+        first. The result still includes these points.
     """
 
     rig: Rig
@@ -97,13 +97,13 @@ def projector_view(view: BoardView, decoded: Coordinates, spacing_px: float) -> 
     ----------
     view : BoardView of the camera.
     decoded : `ProjectorCoordinates` of the same capture, with columns and rows.
-    spacing_px : float, camera pixels between neighbouring corners, about. Decoded pixels are taken up to `REACH` of it
-        around each corner, where the lenses' distortion must be nearly a homography's.
+    spacing_px : float, camera pixels between neighbouring corners, roughly. Decoded pixels are taken up to `REACH`
+        times this distance around each corner. There a homography must nearly fit the lenses' distortion.
 
     Raises
     ------
     ValueError
-        The decoded coordinates are not those of a projector, or of one axis alone.
+        The decoded coordinates are not those of a projector, or they are those of one axis alone.
     """
     if not isinstance(decoded, ProjectorCoordinates):
         raise ValueError("expected a sensor that decodes projector coordinates, got path lengths.")
@@ -155,7 +155,7 @@ def _seen_through(here: Array, there: Array, corner: Array) -> Array | None:
 def _surrounds(offsets: Array) -> bool:
     """Whether points (n, 2) lie around 0: no gap between their directions is as wide as `MAX_GAP_RAD`.
 
-    The pixels of two white squares that meet at a corner do, where the black ones send too little light back.
+    The pixels of two white squares that meet at a corner do lie around it, even if black squares reflect too little.
     """
     angles = np.sort(np.arctan2(offsets[:, 1], offsets[:, 0]))
     return float(np.diff(angles, append=angles[0] + 2 * np.pi).max()) < MAX_GAP_RAD
@@ -166,12 +166,12 @@ def calibrate_rig(
 ) -> RigCalibration:
     """Calibration of a camera and a projector from coded light on a board, each capture with the board in another pose.
 
-    The corners are found in the white images of the captures, and the projector's coordinates are decoded. The rig of a
-    capture is not looked at. Then each device is calibrated by itself, and at last everything together by
-    `bundle.adjust`, the errors of each device weighed by its noise.
+    The function finds the corners in the white images of the captures, and decodes the projector's coordinates. It does
+    not use the rig of a capture. Then it calibrates each device by itself. At last `bundle.adjust` calibrates
+    everything together, with the errors of each device divided by its noise.
 
-    `RangesimWarning` for points that do not fit (`RigCalibration.suspects`), and for a lens that is unknown in a corner
-    of its image, or folds there.
+    A `RangesimWarning` is given for points that do not fit (`RigCalibration.suspects`), and for a lens that is unknown
+    in a corner of its image, or folds there.
 
     Parameters
     ----------
@@ -182,8 +182,8 @@ def calibrate_rig(
     Raises
     ------
     ValueError
-        A capture is of another sensor or size; a board is not found (the message says which); there are fewer than
-        three, or one twice; or the views do not determine the rig.
+        A capture is of another sensor or size; a board is not found (the message names the capture); there are too few
+        captures, or one occurs twice; or the views do not determine the rig.
     """
     names = [f"capture {k}" for k in range(len(captures))] if names is None else [str(name) for name in names]
     if len(names) != len(captures):

@@ -31,29 +31,29 @@ MIN_VIEWS = 2
 is one more (Zhang 2000, section 3.1)."""
 MIN_CONIC_RATIO = 1e-4
 """Smallest ratio of the second smallest singular value of the conic's equations to the largest. Below it, the views
-leave a second solution: within the noise, the boards are parallel to each other."""
+allow a second solution, because the boards are parallel to each other within the noise."""
 MIN_APART_DEG = 1.0
 """Smallest value of the largest angle between two boards, degrees; below it all boards count as parallel. Measured with
-a noise of 0.05 px: boards that are parallel are found within 0.1 degrees, boards turned at random by up to 5 degrees at
-4.8 degrees or more."""
+a noise of 0.05 px: boards that are parallel are found within 0.1 degrees of each other; boards that are turned at
+random by up to 5 degrees are found at 4.8 degrees or more."""
 MAX_CENTRED_VIEWS = 5
 """Largest number of views for which a second start, with the principal point in the middle of the image, is tried.
 Measured with 3 views tilted by 10 degrees: with one start, 1 of 40 sets ended in a wrong minimum."""
 SAME_COST_RATIO = 0.999
 """Ratio of the sums of squares of two minima, above which they count as the same minimum and the first one is taken. It
-allows for what the two descents leave when they end."""
+is not 1, because a descent ends just before its minimum."""
 MAX_FOCAL_DEVIATION = 0.1
 """Largest relative standard deviation of a focal length. Above 10 % the views count as not determining it."""
 MAX_CORNER_PX = 5.0
 """Largest standard deviation, in pixels, of the pixel of a ray through a corner of the image. Above it, the lens counts
 as unknown there, and the result comes with a warning."""
 SEEN_POINT_ROUNDS = 2
-"""Number of adjustments after the first, a count, for boards whose points are not detected where they are
-(`CircleGrid`). Each one uses the positions that the camera found last would detect. Measured with 8 views of 7 x 5
-discs without noise: fx is off by 0.28 px without them, by 3e-4 px after one and by 1.5e-5 px after two."""
+"""Number of adjustments after the first, a count, for boards whose points are detected beside their true places
+(`CircleGrid`). Each one uses the positions that the camera of the adjustment before would detect. Measured with 8 views
+of 7 x 5 discs without noise: fx is off by 0.28 px without them, by 3e-4 px after one and by 1.5e-5 px after two."""
 BORDER_POINTS = 9
-"""Number of points along each side of an image, at which the ray through the lens must exist. More points find shorter
-gaps. The corners, which are farthest from the centre, are always among them."""
+"""Number of points along each side of an image, at which a ray through the lens must exist. More points find shorter
+parts without a ray. The corners, which are farthest from the centre, are always among them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,8 +319,8 @@ def adjust_as_seen(
 ) -> tuple[Minimum[Bundle], list[Observation]]:
     """The result of `bundle.adjust`, repeated with the positions that the camera detects as the points of the board.
 
-    These positions (`Board.seen_points`) depend on the camera, so that they are known after a first adjustment. The
-    pixels of a second device come from what the first one detects, so it has the same positions.
+    These positions (`Board.seen_points`) depend on the camera, so they are known only after a first adjustment. The
+    pixels of a second device come from the points that the first one detects, so it has the same positions.
 
     Parameters
     ----------
@@ -377,7 +377,7 @@ def judged(found: Minimum[Bundle], observations: Sequence[Observation], may_warn
     Raises
     ------
     ValueError
-        There are not more coordinates than parameters, or they leave a focal length open.
+        There are not more coordinates than parameters, or the coordinates do not determine a focal length.
     """
     parameters = found.jacobian.shape[1]
     if len(found.residuals) <= parameters:
@@ -405,7 +405,7 @@ def judged(found: Minimum[Bundle], observations: Sequence[Observation], may_warn
 def _check_corners(device: Intrinsics, covariance: Array, name: str, may_warn: bool) -> None:
     """Warn if a lens folds within its image, or is unknown in a corner of it.
 
-    covariance : of the parameters of the lens. name : of the device. may_warn : whether to warn at all.
+    covariance : covariance of the lens's parameters. name : name of the device. may_warn : whether to warn at all.
     """
     s = np.linspace(0, 1, BORDER_POINTS)
     zero, one = np.zeros_like(s), np.ones_like(s)
