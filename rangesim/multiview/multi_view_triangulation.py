@@ -31,9 +31,9 @@ GAUSS_NEWTON_STEPS = 5
 """Number of Gauss-Newton steps after the linear solution. Measured with 5 cameras around 200 points at 5 m and 5 px of
 noise: one step leaves a point at most 2e-4 m from the minimum, two steps 2e-6 m, five steps 5e-12 m."""
 MAX_DROPS = 20
-"""Largest number of rounds, a count; each leaves out the worst observation of every point that still has a too large
-error. A point that still has one after the last round is NaN. More rounds only matter for points with more than 20
-wrong observations, and each costs one triangulation of such points."""
+"""Largest number of rounds. Each leaves out the worst observation of every point that still has an error above the
+limit. A point that still has such an error after the last round is NaN. More rounds only matter for points with more
+than 20 wrong observations, and each costs one triangulation of such points."""
 MAX_WRONG = 0.5
 """Largest fraction of a point's observations that may be left out; a point that needs more is NaN. With half of them
 wrong or more, the wrong ones could outvote the right ones."""
@@ -41,7 +41,7 @@ wrong or more, the wrong ones could outvote the right ones."""
 
 @dataclass(frozen=True, eq=False)
 class ManyViewPoints:
-    """The points that `triangulate_many` found, how well it knows them, and which observations agree with them.
+    """The points that `triangulate_many` found, their standard deviations, and which observations agree with them.
 
     points : (n_points, 3) float64, world, in the unit of the poses. NaN for a point that fewer than two images see,
         whose rays are parallel within the noise, that lies behind a camera that sees it, or of which too many

@@ -199,7 +199,7 @@ class Tracks:
         Raises
         ------
         ValueError
-            A number is not an integer, is out of range, or stands twice. To use an image twice, copy its pixels.
+            A number is not an integer, is out of range, or occurs twice. To use an image twice, copy its pixels.
         """
         given = np.asarray(images)
         if given.ndim != 1 or (given.size and not np.issubdtype(given.dtype, np.integer)):
