@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Multiway registration: unknown poses of the views of a scan, from pairs of views and a pose graph over all of them.
+"""Multiway registration: finds the poses of a scan's views, from pairs of views and a pose graph over all of them.
 
 1. Planes that contain more than half of a view's readings (a table, a wall) are removed, because a plane slides on
    itself.
@@ -44,18 +44,18 @@ from rangesim.settings.bounds import whole as whole_number
 from rangesim.settings.config import ShortRepr, shown
 
 POINTS_PER_VIEW = 4000
-"""Number of points of each view that are registered, about, if no spacing is given. More take longer, and fewer lose
-the small features from which a pose can be told."""
+"""Rough number of points of each view that are registered, if no spacing is given. More points take longer, and fewer
+lose the small features that determine a pose."""
 MIN_POINTS = 200
 """Smallest number of points of a view, because fewer rarely show enough of a shape to find its pose."""
 DOMINANT_FRACTION = 0.5
-"""Fraction of a view's points from which on a plane is removed. It has to be the majority: a smaller plane does not
-keep the rest from being registered."""
+"""A plane is removed if it contains at least this fraction of a view's points. It has to be the majority: with a
+smaller plane, the other points can still be registered."""
 MAX_PLANES = 3
 """Largest number of planes that are removed from a view: a corner of a room has three. A view with more dominant planes
 than that has no object left."""
 MAX_STEPS_BACK = 3
-"""Number of views before a view that it may be registered to. More could bridge a longer gap, but each failed
+"""A view may be registered to one of this many views before it. More views could bridge a longer gap, but each failed
 registration takes seconds (docs/fusion.md)."""
 MIN_OVERLAP = 0.3
 """Smallest fraction of the smaller view's points that lie on the other view, for a pair in the chain. It is a little
@@ -65,14 +65,14 @@ NEAR_SPACINGS = 6.0
 points. It is large because errors add up along the chain."""
 MIN_LOOP_OVERLAP = 0.5
 """Smallest overlap of a loop, as a fraction like `MIN_OVERLAP`. Pairs with less overlap pull each other's borders
-together, and add little, because the chain holds the views already."""
+together, and add little, because the chain already links the views."""
 MAX_DISAGREEMENT_SPACINGS = 2.0
 """Largest disagreement of a pair with the pose graph, in spacings of the points, root mean square over the pair's
 points. A larger limit keeps wrong loops; a smaller one leaves out good ones, because ICP is exact to a fraction of the
 spacing only."""
 THROUGH_SPACINGS = 4.0
-"""Distance by which a point has to be in front of another view's surface to contradict it, in spacings of the points,
-besides 1 % of the depth. It is large because readings are noisy and poses have errors."""
+"""A point contradicts another view if it is in front of that view's surface by more than this distance, in spacings of
+the points, plus 1 % of the depth. It is large because readings are noisy and poses have errors."""
 MAX_CONTRADICTION = 0.15
 """Largest fraction of a view's points that another view may look through. It is not zero because edges and ghosts are
 looked through, too; a wrong pose makes it large."""
@@ -110,7 +110,7 @@ class Alignment(ShortRepr):
     """Result of `align`: the views of a scan with their poses.
 
     scan : the views with the poses that were found. The first view keeps its pose, which defines the world.
-    pairs : the pairs of views that the poses follow from.
+    pairs : the pairs of views that give the poses.
     spacing_m : metres, distance between the points that were registered.
     unchecked : numbers of the views that are in no loop: their pose follows from a single pair, which nothing confirms.
     """
@@ -129,9 +129,9 @@ class Alignment(ShortRepr):
 def align(scan: Scan, spacing_m: float | None = None, *, seed: int = 0) -> Alignment:
     """Alignment of a scan: the poses of its views, found from their readings alone.
 
-    The head of this module lists the steps. The poses of the images are not used, except the first one. Views must come
-    in the order of a walk, each overlapping the view before by a third or more. If the object turns, everything that
-    does not turn with it (a table) must be removed from the images.
+    The docstring of this module lists the steps. `align` uses no pose of the images, except the first one. Views must
+    come in the order of a walk, each overlapping the view before by a third or more. If the object turns, everything
+    that does not turn with it (a table) must be removed from the images.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ class PoseErrors(NamedTuple):
 
 
 def pose_errors(poses: ArrayLike, true_poses: ArrayLike) -> PoseErrors:
-    """Errors of poses against the true poses, whatever the axes of the two worlds are.
+    """Errors of poses against the true poses. The two may have different world coordinates.
 
     The two frames are aligned by the mean rotation of T_true T^-1 (Moakher 2002: the polar factor of the sum), and by
     the mean difference of the camera centres.
@@ -343,7 +343,7 @@ def _why(reasons: dict[int, str]) -> str:
     """Message that a view fits none of the views before it, with the reason for the nearest of them.
 
     reasons : message of the failed registration by number of the view, the nearest view first. The advice after a
-    message's semicolon is left out, as it holds for two clouds alone.
+    message's semicolon is left out, because it only helps if there are just two clouds.
     """
     (nearest, reason), *others = reasons.items()
     what = reason.partition("; ")[0].rstrip(".")

@@ -18,9 +18,9 @@ building complex models from range images", SIGGRAPH 1996; Newcombe et al.: "Kin
 
 A view says nothing about points more than t behind its surface, because they are hidden. The ramp r is that of Bylow
 et al. ("Real-time camera tracking and 3D reconstruction using signed distance functions", RSS 2013). It decreases the
-weight from one voxel h behind the surface on. Without it, a view would push the far side of an object outward near its
-silhouette, although it does not see the far side. Points more than t in front of the surface are free and count as -t.
-So views that look through a ghost of another view outvote it.
+weight from one voxel h behind the surface on. Without the ramp, a view would push the far side of an object outward
+near its silhouette, although the view does not see the far side. Points more than t in front of the surface are free
+and count as -t. So views that look through a ghost of another view outvote it.
 
 `rangesim.fusion.fuse` computes the same on sparse blocks of voxels and is tested against this module, which is good
 for small grids.
@@ -49,8 +49,8 @@ MAX_DEPTH_STEP = 0.02
 interpolated only between such pixels, because values between the two sides of an edge lie on neither surface. A smaller
 step interpolates less on slanted surfaces."""
 MEDIAN_READINGS = 20_000
-"""Number of readings of a view from which the median weight is taken, about. More would cost time alone: the median of
-20 000 readings is known to a percent of their spread."""
+"""Rough number of readings of a view from which the median weight is computed. More would only cost time: 20 000
+readings give the median to a percent of their spread."""
 MIN_INCIDENCE_COSINE = 0.1
 """Smallest cosine of the angle of incidence, no unit: readings beyond 84 degrees get the weight 0, because small errors
 of pixel or depth are large errors of the surface there."""
@@ -142,7 +142,7 @@ def reading_weights(image: RangeImage, weighting: Weighting = "confidence") -> n
         The standard deviation of photon counts makes the inverse variance of a reading proportional to the confidence.
         In time of flight, the standard deviation grows with z. In triangulation it grows with z^2, and there the
         confidence has a factor 1 / z^2 of its own. The cosine is the weight of Curless and Levoy (1996) for slanted
-        surfaces. Readings without a normal have no neighbours, as ghosts and flying pixels do; they get 0.
+        surfaces. Readings without a normal, such as ghosts and flying pixels, have no neighbours; they get 0.
 
     Only ratios of weights matter: `fuse` divides them by the median of all views and limits them to 1.
 
@@ -204,7 +204,7 @@ def average_signed_distances(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weighted truncated average D of the signed distances of several views, at the centres of a grid.
 
-    The formula stands at the head of this module.
+    The formula is in the docstring of this module.
 
     Parameters
     ----------
