@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth from projector coordinates: where a camera ray meets the projector's light plane, or comes nearest to its ray.
+"""Depth from projector coordinates: the point where a camera ray meets a light plane or a ray of the projector.
 
 The ray of a camera pixel is exact, because the pixel is the place where its light was measured. The projector
 coordinate decoded there has an error. So the optimal triangulation of camera and projector moves only the projector
 coordinate, to the nearest place on the epipolar line of the ray. The optimal triangulation of two cameras
-(`two_view_triangulation`) moves the pixels in both views; here it would give the depth of a ray that was not measured.
+(`two_view_triangulation`) moves the pixels in both views; here this would give the depth of another ray than that of
+the pixel.
 
 Used by: rangesim.decoding.triangulation.
 """
@@ -18,8 +19,8 @@ import numpy as np
 from rangesim.rig import Intrinsics, Rig
 
 MAX_ITERATIONS = 20
-"""Largest number of iterations for the projector coordinate that was not decoded. It matters only through the lens
-distortion, so that a few iterations usually converge; the limit ends those of pixels that never do."""
+"""Largest number of iterations that find the projector coordinate that was not decoded. This coordinate only matters
+for the lens distortion, so a few iterations usually converge. The limit ends those of pixels that never converge."""
 
 CONVERGED_PX = 1e-4
 """Largest change of that coordinate, in projector pixels, at which the iterations end. A smaller change does not
@@ -37,8 +38,8 @@ class ProjectorTriangulation:
         one axis was decoded.
     relative_error : (n,) float64, error of z, as a fraction of z, that an error of one projector pixel causes:
         |dz / dx_p| / z, in 1 / px.
-    behind_px : (n,) float64, where the rays meet behind a device, the approximate distance in projector pixels from the
-        coordinate to one that would make them parallel; 0 elsewhere.
+    behind_px : (n,) float64. If the rays meet behind a device: roughly the distance, in projector pixels, from the
+        coordinate to one that would make the rays parallel. Else 0.
 
     Examples
     --------
@@ -64,9 +65,10 @@ def triangulate_coordinates(
 
     Let a = R^T d be the camera ray d and b = -R^T t the camera centre, both in projector coordinates. The point at
     depth z has the inverse depth w = 1 / z and projects to x_p = (a_x + w b_x) / (a_z + w b_z): a point of the epipolar
-    line through a and b. The column x_p and the row y_p each give one linear equation for w, that of a ray that meets a
-    plane. If both are given, they are first moved to the nearest place on the epipolar line, in projector pixels,
-    where the two equations agree. This is the maximum likelihood for errors of the same size in column and row.
+    line through a and b. The column x_p and the row y_p each give one linear equation for w: the ray meets the
+    plane of the column or row. If both are given, the function first moves them to the nearest place on the epipolar
+    line, in projector pixels. There the two equations agree. This is the maximum likelihood for errors of the same size
+    in column and row.
 
     The relative error is z / |dx_p/dw| with dx_p/dw = f (b_x - x_p b_z) / (a_z + w b_z), both axes added in quadrature,
     without the lens distortion.
@@ -166,7 +168,7 @@ def _complete(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Both projector pixel coordinates (u, v), and the largest change of the one that was not decoded, in pixels.
 
-    That one is found by projecting `point` (3, n), in projector coordinates.
+    The one that was not decoded comes from the projection of `point` (3, n), in projector coordinates.
     """
     old = u if columns_missing else v
     new = projector.project(point.T)[:, 0 if columns_missing else 1]

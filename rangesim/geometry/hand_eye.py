@@ -2,8 +2,8 @@
 """Hand-eye calibration: the pose of a camera on a robot's gripper, or beside the robot, from A X = X B.
 
 The camera sees a target in n poses of the robot. If the camera is on the gripper (eye in hand), T_base_gripper X
-T_camera_target = T_base_target is the same in all poses. If it stands beside the robot and the target is on the gripper
-(eye to hand), T_gripper_base X T_camera_target = T_gripper_target is the same. Between two poses this gives
+T_camera_target = T_base_target is the same in all poses. If the camera stands beside the robot and the target is on the
+gripper (eye to hand), T_gripper_base X T_camera_target = T_gripper_target is the same. Between two poses this gives
 A X = X B. The start is that of Park, Martin: "Robot sensor calibration: solving AX = XB on the Euclidean group", 1994;
 then all residuals are minimised together. OpenCV 4 has `calibrateHandEye`, but the Python interface of OpenCV 5 does
 not, so it is written here.
@@ -24,16 +24,16 @@ from rangesim.geometry.least_squares import minimise
 from rangesim.rig import pose
 
 MAX_TURN_RAD = np.radians(170)
-"""Largest rotation, in radians, of the motions that the start uses, because near 180 degrees noise flips the direction
-of the axis. It leaves 10 degrees for the noise; a smaller value would waste motions."""
+"""Largest rotation, in radians, of the motions that the start uses. Near 180 degrees, noise flips the direction of the
+axis. The value leaves 10 degrees for the noise; a smaller one would waste motions."""
 
 MIN_TURN_RAD = 1e-6
 """Root-mean-square rotation about an axis, in radians, up to which the robot did not turn about it at all. It is far
-above rounding, 1e-16, and far below the repeatability of any robot, so that poses without noise are judged by it."""
+above rounding, 1e-16, and far below the repeatability of any robot, so it only decides for poses without noise."""
 
 MIN_TURN_OVER_NOISE = 5.0
 """Ratio of the rotation about the second axis to the noise of the rotation vectors below which poses are refused. Five
-standard deviations are hardly noise alone; a smaller ratio lets the place along the axis be guessed from noise."""
+standard deviations are hardly noise alone; with a smaller ratio, noise would decide the place along the axis."""
 
 DERIVATIVE_STEP = 1e-6
 """Step of the numerical derivatives, in radians or metres. Chosen so that, with central differences of numbers about 1,
@@ -43,8 +43,8 @@ MIN_NOISE = 1e-12
 """Least noise, in radians or metres, that residuals are weighted by, so that exact poses do not divide by 0."""
 
 REWEIGHTINGS = 3
-"""Number of times that the residuals are minimised; before each but the first, rotations and translations are weighted
-anew by their own noise. More change little, because the noise hardly depends on the weights."""
+"""Number of times that the residuals are minimised. Before each time but the first, rotations and translations get new
+weights from their own noise. More times change little, because the noise hardly depends on the weights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +55,8 @@ class HandEye:
     ----------
     T_mount_camera : (4, 4) float64, maps camera coordinates to the coordinates of the mount, metres. The mount is the
         gripper for `eye_in_hand` and the robot's base for `eye_to_hand`.
-    T_other_target : (4, 4) float64, maps target coordinates to those of the other one: the robot's base for
-        `eye_in_hand` and the gripper for `eye_to_hand`, metres.
+    T_other_target : (4, 4) float64, metres, maps target coordinates to those of the body that does not carry the
+        camera: the robot's base for `eye_in_hand`, the gripper for `eye_to_hand`.
     rotation_rms_rad, translation_rms_m : root mean square, per axis, of the differences between the n poses of the
         target, which should all be equal.
     covariance : (12, 12) float64, covariance of (rotation vector applied after R, rad; translation, metres) of

@@ -23,8 +23,8 @@ State = TypeVar("State")
 Look = TypeVar("Look", bound="Descent")
 
 MAX_STEPS = 100
-"""Largest number of steps of a descent. A descent from a good start converges in far fewer; the limit ends those from a
-bad start, which are then judged by their cost."""
+"""Largest number of steps of a descent. A descent from a good start needs far fewer. The limit ends those from a bad
+start; the caller then judges them by their cost."""
 
 CONVERGED = 1e-12
 """Relative decrease of the cost, as a ratio, at which a descent has converged. It lies a little above what double
@@ -51,7 +51,7 @@ degeneracy is found; a larger value also refuses weakly determined parameters.""
 
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[State]):
-    """A state at which a sum of squares is evaluated or least, with the residuals and their derivatives there.
+    """A state, for example that of the least sum of squares, with the residuals and their derivatives there.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ class Minimum(Generic[State]):
 class Descent(Protocol):
     """The quadratic model of a sum of squares about a state, from which a descent takes its steps.
 
-    `Minimum` is the dense one; `rangesim.multiview.schur_complement` has a sparse one.
+    `Minimum` is the dense model; `rangesim.multiview.schur_complement` has a sparse one.
     """
 
     @property

@@ -25,7 +25,7 @@ from rangesim.rig import pose
 from rangesim.robust_scale import sigma_from_median
 
 MIN_POINTS = 20
-"""Least number of different points of a cloud: as many as `NORMAL_NEIGHBOURS`, so that every normal has all its
+"""Least number of different points of a cloud. It is equal to `NORMAL_NEIGHBOURS`, so that every normal has all its
 neighbours."""
 
 PARTNER_SPACINGS = 3.0
@@ -34,18 +34,18 @@ partner by chance: on a randomly sampled surface their fraction is 0.5^(d^2) at 
 finds partners on other surfaces."""
 
 FINAL_SPACINGS = 1.5
-"""Distance of partners, in spacings, in the last steps of ICP. The smaller it is, the less points beyond the border of
-the other cloud pull. On a randomly sampled surface 21 % of the points have no partner at 1.5 spacings, and half of them
-at 1."""
+"""Distance of partners, in spacings, in the last steps of ICP. With a smaller distance, points beyond the
+border of the other cloud pull less. On a randomly sampled surface 21 % of the points have no partner at 1.5 spacings,
+and half of them at 1."""
 
 START_SPACINGS = 12.0
-"""Distance of partners, in spacings, in the first steps of `icp` by default: about how far the first guess may be off.
-Chosen as three halvings above `FINAL_SPACINGS`; a larger value reaches farther, but pulls clouds that overlap only in
-part over each other."""
+"""Default distance of partners, in spacings, in the first steps of `icp`: roughly the largest error of the first guess.
+It is three halvings above `FINAL_SPACINGS`. A larger value reaches farther, but pulls clouds that overlap only in part
+over each other."""
 
 NORMAL_NEIGHBOURS = 20
-"""Number of neighbours from which the normal of a point is estimated. More average more noise, but round off edges, as
-in any estimate of normals; either half of a cloud uses half as many, which reach as far."""
+"""Number of neighbours from which the normal of a point is estimated. More neighbours average more noise, but
+round off edges. Each half of a cloud uses half as many neighbours, which reach as far."""
 
 MIN_CONSTRAINT = 3e-3
 """Ratio of the smallest eigenvalue of the normal equations to the largest below which the surfaces can slide. Measured:
@@ -75,13 +75,13 @@ ten times as dense as the target with noise above the target's spacing; -0.1 to 
 askew and for parts 5 or 10 % off in scale."""
 
 FAR_EXTENTS = 5.0
-"""Distance of a cloud from the origin, as a ratio to its extent, beyond which it is moved to the origin before it is
-solved. At 5 extents a turn of 0.2 rad about the origin moves a cloud by its whole extent, so that steps of ICP are
-neither small nor exact. Nearer clouds stay where they are, so that their results stay the same to the last digit."""
+"""Distance of a cloud from the origin, as a ratio to its extent, beyond which the cloud is moved to the origin before
+the registration. At 5 extents a turn of 0.2 rad about the origin moves a cloud by its whole extent, so steps of ICP are
+neither small nor exact. Nearer clouds are not moved, so that their results stay the same to the last digit."""
 
 SLIDE_SPACINGS = 6.0
 """Step, in spacings, by which a result of `icp` is slid along the surface to look for other poses. ICP then starts
-there with the same reach, so that steps twice as long would leave gaps."""
+there with the same reach; steps twice as long would leave gaps."""
 
 MAX_SLIDES = 6
 """Largest number of such steps to either side, because each takes one run of ICP. If the reach needs more, the steps
@@ -92,8 +92,9 @@ SLID_POINTS = 800
 takes without this test, and the same poses are found (measured)."""
 
 NEARLY_BEST = 0.95
-"""Ratio of an agreement to the best one from which on another pose fits as well. Nobody measured it: a larger ratio
-misses symmetric shapes whose noise makes one pose better by chance, a smaller one refuses sound results."""
+"""If the ratio of a pose's agreement to the best one reaches this value, the pose counts as fitting as well. Other
+values were not measured: a larger one misses symmetric shapes whose noise makes one pose better by chance, a smaller
+one refuses sound results."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +111,8 @@ class Registration:
     constraint : ratio of the smallest to the largest eigenvalue of the normal equations, with turns in units of the
         size of the cloud. A small ratio means that the surfaces can slide on each other.
     agreement : mean over all source points of 1 - (d / spacing)^2, but at least -1, where d is the distance from the
-        partner along its normal; a point without a partner counts 0. So a pose with two surfaces beside each other
-        counts less than one that leaves them apart. Poses are compared by it.
+        partner along its normal; a point without a partner counts 0. So a pose that puts two surfaces beside each
+        other has a smaller agreement than one that leaves them apart. The best pose is the one with the largest value.
 
     Examples
     --------
@@ -147,7 +148,8 @@ def icp(
     agreement counts: a large distance reaches far, but pulls clouds that overlap only in part over each other. The
     result is then slid along the surface. If it fits as well there, as with one rib of many, it is refused.
 
-    The clouds may lie far from the origin, as map coordinates do: they are then solved about their middles.
+    The clouds may lie far from the origin, as map coordinates do. The function then works with the origin in their
+    middles.
 
     Parameters
     ----------

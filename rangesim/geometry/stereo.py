@@ -29,12 +29,13 @@ it is exceeded where both cameras turn inwards by more than 25 degrees, or both 
 straight across the baseline (measured). The ratio grows without limit from there, and so does the distortion."""
 
 MIN_ACROSS = 1e-3
-"""Least part, across the baseline, of the sum of both optical axes (unit vectors), as a ratio to 1. Below it there is
-no direction for the common axis. The value hardly matters, because such cameras exceed `MAX_GROWTH` long before."""
+"""Least length of the part of the sum of both optical axes (unit vectors) that is orthogonal to the baseline. Below it
+there is no direction for the common axis. The value hardly matters, because such cameras exceed `MAX_GROWTH` long
+before."""
 
 BORDER_POINTS = 33
-"""Number of points per side of an image whose rays say how far the rectified image reaches. There are enough so that a
-border that distortion bends between two of them is cut off by no more than a fraction of a pixel."""
+"""Number of points per side of an image whose rays give the size of the rectified image. Distortion bends the border
+between two of them; with this number, the image loses no more than a fraction of a pixel there."""
 
 STEPS_PER_PIXEL = 16
 """Number of steps per pixel in OpenCV's disparities, which are integers with four fractional bits (source:
@@ -81,7 +82,7 @@ class ParallelCameras:
     def depth(self, disparity_px: ArrayLike) -> Array:
         """Depths z = f b / d in metres, float64, for disparities d in pixels; NaN where d is not positive.
 
-        The point of such a disparity lies at infinity or behind the cameras.
+        A point with d <= 0 lies at infinity or behind the cameras.
         """
         return self._over(disparity_px)
 
@@ -174,8 +175,8 @@ def rectify(first: Intrinsics, second: Intrinsics, T_second_first: ArrayLike) ->
 
     The common x axis is the baseline, from the first to the second camera. The common z axis is the mean of both
     optical axes, made orthogonal to the baseline. So the first camera becomes the left one: if it stands on the right
-    or below, the rectified images are turned by 180 or 90 degrees. The focal length is the mean of all four. The
-    rectified image holds the whole fields of view of both cameras.
+    or below, the rectified images are turned by 180 or 90 degrees. The focal length is the mean of the four focal
+    lengths (two of each camera). The rectified image holds the whole fields of view of both cameras.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ Source: Hartley, Zisserman: "Multiple View Geometry in Computer Vision", 2nd edi
 
 Pixels are those of a pinhole: remove lens distortion first (`camera_matrix.ideal_pixels`).
 
-Degenerate pairs of views raise ValueError. They are found by the noise of the data
+Degenerate pairs of views raise ValueError. The functions recognise them by the noise of the data
 (`consensus.simpler_model_suffices`):
 
 - Points of one plane, a camera that only rotates, and the same view twice are mapped by a homography, which is
@@ -68,8 +68,8 @@ ROTATION_PARAMETERS = 3
 
 MIN_IMAGE_EXTENT = 0.05
 """Least size of image coordinates by which `_checked_F` scales F. F may be given for pixels or for coordinates in units
-of the focal length, so that the size is guessed from F itself, between this value (a lens of about 6 degrees in units
-of its focal length) and `MAX_IMAGE_EXTENT`."""
+of the focal length, so the function estimates the size from F itself, between this value (a lens of about 6 degrees in
+units of its focal length) and `MAX_IMAGE_EXTENT`."""
 
 MAX_IMAGE_EXTENT = 1e5
 """Largest size of image coordinates, in pixels, by which `_checked_F` scales F, because no image is larger; see
@@ -106,7 +106,7 @@ different matrices. Descents that end in the same minimum differ far less."""
 
 MAX_STANDARD_DEVIATION = 0.3
 """Largest standard deviation of F, as a ratio to its norm in normalised coordinates. At a ratio of 1, F is unknown;
-beyond a third, the noise determines F rather than the points. Nobody measured a closer limit."""
+beyond a third, the noise determines F more than the points do. Closer limits were not measured."""
 
 
 # ------------------------------------------------------------------------------------------- from cameras
@@ -164,8 +164,8 @@ def centred_cameras(p: Array, q: Array) -> tuple[Array, Array, Array]:
 
 SHIFT_ROUNDING = 64 * float(np.finfo(np.float64).eps)
 """Rounding of the last column of a camera matrix, as a ratio to the distance from the origin to the camera. It is 64
-times the rounding unit of double precision: that of the column as given and of the operations that move it. A larger
-value takes cameras at map coordinates that stand close together for one."""
+times the rounding unit of double precision: that of the column as given and of the operations that move it. With a
+larger value, cameras at map coordinates that stand close together would count as one."""
 
 
 def essential_from_pose(T_second_first: ArrayLike) -> Array:
@@ -672,9 +672,9 @@ def fit_relative_pose(
     Raises
     ------
     ValueError
-        There are fewer than six different pairs; a rotation alone (or the same view twice) or a plane explains them
-        within their noise; two poses explain them; no pose has them in front of both cameras; or the residuals are over
-        three times the stated noise.
+        There are fewer than six different pairs; a rotation alone (or the same view twice) or a plane explains the
+        pairs within their noise; two poses explain them; no pose has the points in front of both cameras; or the
+        residuals are over three times the stated noise.
 
     Examples
     --------
@@ -798,14 +798,14 @@ _DEPENDENT = (
 )
 MIN_IN_FRONT = 0.75
 """Least fraction of the points that must lie in front of both cameras. The others may be so far away that noise puts
-them beyond infinity, which is behind the cameras. Below half another of the four poses has more points in front; nobody
-measured a closer value."""
+them beyond infinity, which is behind the cameras. Below one half, another of the four poses has more points in front.
+Closer values were not measured."""
 
 
 def _refuse_homography(a: Array, b: Array, cost: float, parameters: int, noise_px: float | None) -> None:
     """Raise ValueError if a homography explains the pairs a, b (n, 2) within their noise.
 
-    The full model, which does too, has that number of `parameters` and the sum of squares `cost` in px^2.
+    The full model, which also explains them, has that number of `parameters` and the sum of squares `cost` in px^2.
     """
     n, rounding = len(a), consensus.rounding_of(np.concatenate([a, b]))
     simple = homography_error(a, b), 2 * n - HOMOGRAPHY_PARAMETERS
@@ -828,8 +828,8 @@ def _refuse_open_epipole(
 
     A plane with the homography H is consistent with F = [e']_x H for any e'. A pair off the plane puts e' on the line
     (H x) x x'. One such line leaves a family of F, and so do several lines that noise does not distinguish. The
-    curvature at one minimum does not show this, because it takes the noise of the plane's points for parallax. So e' is
-    moved along these lines, and the sum of squares of all pairs says which F of the family they admit.
+    curvature at one minimum does not show this, because there the noise of the plane's points looks like parallax. So
+    the function moves e' along these lines, and the sum of squares of all pairs shows which F of the family fit.
 
     Parameters
     ----------
@@ -872,7 +872,7 @@ def _refuse_open_epipole(
 def _refuse_rotation(a: Array, b: Array, K_first: Array, K_second: Array, cost: float, noise_px: float | None) -> None:
     """Raise ValueError if a rotation alone explains the pairs a, b (n, 2) within their noise.
 
-    The relative pose, which does too, has the sum of squares `cost` in px^2.
+    The relative pose, which also explains them, has the sum of squares `cost` in px^2.
     """
     n, rounding = len(a), consensus.rounding_of(np.concatenate([a, b]))
     simple = rotation_homography_error(a, b, K_first, K_second), 2 * n - ROTATION_PARAMETERS
@@ -888,8 +888,8 @@ def _refuse_plane_with_outliers(a: Array, b: Array, inliers: np.ndarray, noise_p
     """Raise ValueError if the pairs that agree with F but not with the largest plane may do so by chance.
 
     A plane and any two pairs off it determine some F, even if these pairs are wrong (Chum, Werner, Matas: "Two-view
-    geometry estimation unaffected by a dominant plane", CVPR 2005). So the pairs off the plane that agree with F are
-    counted, and their number is compared with chance.
+    geometry estimation unaffected by a dominant plane", CVPR 2005). So the function counts
+    the pairs off the plane that agree with F, and compares their number with chance.
     """
     off = ~largest_plane(a, b, 2 * noise_px)  # twice the noise, so that no noisy point of the plane counts as off it
     threshold = consensus.inlier_threshold(noise_px, 1)
