@@ -501,7 +501,7 @@ def _checked(captures: Sequence[Capture], true_range_m: Sequence[Any], names: Se
 
 
 def _at_origin(rig: Rig | None) -> Rig:
-    """The rig moved to the world's origin, because between captures the camera may move and not the targets."""
+    """The rig moved to the world's origin, because the camera may move between captures too, not only the target."""
     assert rig is not None
     return replace(rig, T_world_camera=np.eye(4))
 

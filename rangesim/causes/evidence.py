@@ -45,7 +45,7 @@ DISTURBING = 0.005
 """Fraction of indirect light in the emitter's light above which this light can shift a reading by the tolerance.
 
 With a larger fraction, the rules blame the resolution for errors that multipath made; with a smaller one, they blame
-multipath for errors that the resolution made. No other value was tried.
+multipath for errors that the resolution made. Other values were not measured.
 """
 MAX_PULSES_HIT = 0.9
 """Fraction of the laser pulses with a detected photon above which pile-up makes a reading worse.

@@ -24,8 +24,8 @@ states it.
 EDGE_RADIUS = 2
 """Distance from a depth edge, in pixels, within which a pixel can be a flying pixel.
 
-A larger radius counts more correct readings beside the edge, and so lowers the rate of flying pixels. No other value
-was tried.
+A larger radius counts more correct readings beside the edge, and so lowers the rate of flying pixels. Other
+values were not measured.
 """
 
 

@@ -9,7 +9,7 @@ EDGE_FRACTION = 0.02
 """Least difference of the true depths of neighbouring pixels across a depth edge, as a fraction of the nearer depth.
 
 The difference must also exceed a tolerance in metres. A smaller fraction takes inclined surfaces for edges; a larger
-one misses objects that stand close in front of a wall. No other value was tried.
+one misses objects that stand close in front of a wall. Other values were not measured.
 """
 
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Multiway registration: finds the poses of a scan's views, from pairs of views and a pose graph over all of them.
 
-1. Planes that contain more than half of a view's readings (a table, a wall) are removed, because a plane slides on
-   itself.
+1. Planes that contain more than half of a view's readings (a table, a wall) are removed, because a plane can
+   slide on itself, so that it fits in many poses.
 2. Chain: each view is registered to the view before it, without a first guess (`rangesim.geometry.register`). If that
    fails, the two views before that one are tried.
-3. Loops: every other pair of views that overlaps according to the chain is refined by `rangesim.geometry.icp`. A pair
-   that ends far from the chain has found another surface, and is left out.
+3. Loops: every other pair of views that overlaps according to the chain is refined by `rangesim.geometry.icp`. If
+   the pose of a pair ends far from the chain, the pair fits a wrong surface and is left out.
 4. Pose graph: the poses that fit all pairs best, each weighted with its information matrix (Choi, Zhou, Koltun: "Robust
    reconstruction of indoor scenes", CVPR 2015; Open3D's `global_optimization`):
 

@@ -23,7 +23,8 @@ CELLS = (8, 6)
 MIN_COVERED = 0.6
 """Fraction of the cells with corners below which the page warns, because distortion is unknown in the other cells."""
 WORSE_FACTOR = 2.0
-"""The page names a board as worse above this multiple of the median error of all boards; no other value was tried."""
+"""The page names a board as worse above this multiple of the median error of all boards; other values were not
+measured."""
 SHOWN_WIDTH = 400
 """Approximate width of a view in the page, in pixels; larger images are averaged so that the page stays small."""
 ARROW_LENGTH = 0.03

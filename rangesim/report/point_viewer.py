@@ -23,7 +23,7 @@ FAR_FACTOR = 1.5
 """Multiple of the farthest true depth, beyond which points are not drawn.
 
 The points beyond are readings of mirrors and of wrong periods, far behind the scene. With a larger ratio the viewer
-draws more of them, and all depths are packed in coarser steps. No other value was tried.
+draws more of them, and all depths are packed in coarser steps. Other values were not measured.
 """
 
 
