@@ -633,13 +633,13 @@ def test_a_calibration_for_opencv_may_be_in_any_unit(rendered, tmp_path):
         app([*arguments, "--unit", str(unit), "--out", str(tmp_path / str(k))], standalone_mode=False)
         z = load_range_image(tmp_path / str(k) / "range.npz").z
         assert np.allclose(z, expected, atol=1e-5, equal_nan=True)
-        with pytest.raises(ValueError, match=r"--code-step with --calibration FILE\.xml of procam"):
+        with pytest.raises(ValueError, match=r"--code-step only with --calibration FILE\.xml of procam"):
             app([*arguments, "--code-step", "2", "--out", str(tmp_path / "no")], standalone_mode=False)
     with pytest.raises(ValueError, match="unit_m"):
         load_opencv(place, 0.0)
     save_calibration(rig, tmp_path / "rig.json")
     arguments = ["decode", str(tmp_path / "capture"), "--calibration", str(tmp_path / "rig.json")]
-    with pytest.raises(ValueError, match=r"FILE\.yml with --unit; others are in metres"):
+    with pytest.raises(ValueError, match=r"FILE\.yml with --unit; other files are in metres"):
         app([*arguments, "--unit", "0.001", "--out", str(tmp_path / "no")], standalone_mode=False)
 
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras and rigs calibrated by views of a board, rendered or real; names load on first use. docs/calibration.md."""
+"""Calibrates cameras and rigs from views of a board, rendered or real. Names load when first used.
+docs/calibration.md."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 
 The frame of a board has its origin at the first point, x along a row of points, y along a column and z into the board.
 A camera straight in front of the board has the same axes. Pixel centres are at integer + 0.5. OpenCV, which finds the
-points, has them at integers; only this module adds the difference.
+points, has pixel centres at integers; only this module adds the difference.
 """
 
 from __future__ import annotations
@@ -21,23 +21,25 @@ from rangesim.settings.bounds import Bounds, check_fields, whole
 Array = NDArray[np.float64]
 
 EDGE_POINTS = 64
-"""Number of points on the edge of a disc, from whose polygon the centroid of the disc's image is computed. The two
-centroids are equal to rounding, as long as the distortion of the lens hardly bends one side of the polygon."""
+"""Number of points on the edge of a disc. Their polygon gives the centroid of the disc's image. The centroids of
+polygon and disc are equal to rounding, as long as the distortion of the lens hardly bends one side of the polygon."""
 INK_REFLECTANCE = 0.05
 """Reflectance of the ink of a rendered board, a fraction, like black print. A higher value leaves less contrast at the
 corners."""
 BOARD_REFLECTANCE = 0.8
 """Reflectance of a rendered board beside the ink, a fraction, like white paper."""
 MIN_MOVE_PX = 0.15
-"""Smallest limit, in pixels, on how far a corner may move when the search window is half as wide. Measured in 36
-rendered views: good corners move by at most 0.14 px, and corners beside the edge of the light by 3.5 to 4.1 px."""
+"""Smallest value, in pixels, of the limit on how far a corner may move when the search window becomes half as wide.
+Measured in 36 rendered views: good corners move by at most 0.14 px, and corners beside the edge of the light by 3.5 to
+4.1 px."""
 MAX_MOVE_RATIO = 8.0
 """Limit on the same move, as a multiple of the median move of all corners of the view, if that is larger than
 `MIN_MOVE_PX`. In a blurred or noisy view all corners move more."""
 Count = Annotated[int, whole(2)]
 """A number of points along a side of a board, at least two: one row has no second direction."""
 Length = Annotated[float, Bounds("positive metres", 1e-6, 1e3)]
-"""A length on a board, metres, from a micrometre to a kilometre. A number beyond is in another unit by mistake."""
+"""A length on a board, metres, from a micrometre to a kilometre. A number outside these bounds is in another unit by
+mistake."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,7 +376,7 @@ class CircleGrid(Board):
         around = np.stack([np.cos(angle), np.sin(angle), np.zeros(EDGE_POINTS)], axis=-1)
         edge = self.points[:, None] + 0.5 * self.diameter_m * around
         image = camera.project(edge @ T[:3, :3].T + T[:3, 3])
-        about = image - image.mean(axis=1, keepdims=True)  # small numbers lose less to rounding
+        about = image - image.mean(axis=1, keepdims=True)  # rounding loses less of small numbers
         following = np.roll(about, -1, axis=1)
         area = about[..., 0] * following[..., 1] - about[..., 1] * following[..., 0]
         middle = ((about + following) * area[..., None]).sum(axis=1) / (3 * area.sum(axis=1))[:, None]

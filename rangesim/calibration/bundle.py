@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bundle adjustment of one or two devices that see the same boards.
 
-It minimises the reprojection errors through the lens, with its distortion, over the lenses, the poses of the boards and
-the pose of the second device at once. The Jacobians have closed forms, and the inverse of J^T J at the minimum is the
-covariance (Triggs et al. 2000: "Bundle adjustment - a modern synthesis"). A projector is a device like a camera: its
-pixels of a point come from the decoded coordinates.
+It finds the lenses, the poses of the boards and the pose of the second device together, so that the reprojection errors
+through the lenses, with their distortion, are smallest. The Jacobians have closed forms, and the inverse of J^T J at
+the minimum is the covariance (Triggs et al. 2000: "Bundle adjustment - a modern synthesis"). A projector is a device
+like a camera: its pixels of a point come from the decoded coordinates.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Observation:
     view : number of the pose of the board.
     points : (m, 3) float64, board coordinates, metres.
     pixels : (m, 2) float64, (x, y) with pixel centres at integer + 0.5.
-    noise_px : standard deviation of a pixel's coordinate, by which the errors are divided. It only matters if the
-        devices or the views differ in it.
+    noise_px : standard deviation of a pixel's coordinate; the errors are divided by it. It only matters if it differs
+        between the devices or the views.
 
     Examples
     --------
@@ -86,15 +86,15 @@ def adjust(start: Bundle, observations: Sequence[Observation], coefficients: int
 
     Parameters
     ----------
-    start : lenses and poses to start from.
+    start : lenses and poses that the descent starts from.
     observations : what the devices see.
     coefficients : number of free coefficients of distortion, in the order k1, k2, p1, p2, k3; the others stay.
 
     Returns
     -------
     The minimum, with its residuals divided by `noise_px`. The parameters of its Jacobian and of its covariance are the
-    free ones of each lens, then the six of T_second_first if there are two devices, then the six of each board. The six
-    are a rotation vector, radians, and a translation, metres, both applied after the pose.
+    free ones of each lens, then the six of T_second_first if there are two devices, then the six of each board. Each
+    six are a rotation vector, radians, and a translation, metres, both applied after the pose.
 
     Examples
     --------
@@ -157,7 +157,7 @@ def reweighted(start: Bundle, observations: Sequence[Observation], coefficients:
     """The bundle from repeated adjustments that weigh each view of each device by the scatter of its own residuals.
 
     In plain least squares, one view that contradicts the others spreads its errors over all views. Here the errors stay
-    with this view, so that it can be found.
+    with this view, so a caller can find it.
     """
     bundle = start
     for _ in range(REWEIGHTINGS):

@@ -28,7 +28,7 @@ files that are something else."""
 
 
 def save_opencv(rig: Rig, path: str | Path) -> None:
-    """Write a rig for OpenCV, with pixel centres at integers and X_projector = R X_camera + T in metres.
+    """Write a rig for OpenCV, with pixel centres at integers, and R and T of X_projector = R X_camera + T in metres.
 
     The keys are camera_width, camera_height, camera_matrix (3, 3) and camera_distortion (1, 5) with k1, k2, p1, p2, k3;
     the same for the projector; R (3, 3) and T (3, 1); and the essential matrix E (3, 3) and the fundamental matrix F

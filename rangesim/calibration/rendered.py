@@ -18,11 +18,12 @@ from rangesim.sensor import Sensor
 
 TRIES = 10000
 """Largest number of random poses that are tried until both devices see the whole board. With `default_rig` and a board
-of 9 x 6 corners about one in four is seen, and a try takes about a millisecond, so that this ends after 10 seconds."""
+of 9 x 6 corners they see about one in four, and a try takes about a millisecond, so the search ends after 10
+seconds."""
 
 FILLS = (0.45, 0.8)
-"""Width of the board as a fraction of the camera's image, the least and the largest over the poses. A narrower board
-says less about the lenses; a wider one leaves no room for tilts and for the edges of the image."""
+"""Smallest and largest width of the board over the poses, as a fraction of the width of the camera's image. A narrower
+board says less about the lenses; a wider one leaves no room for tilts and for the edges of the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +67,7 @@ def render_set(
     Raises
     ------
     ValueError
-        No pose is seen by both as a whole: they look at different places, or the margin is too wide.
+        Camera and projector see the whole board in no pose: they look at different places, or the margin is too wide.
 
     Examples
     --------
@@ -104,7 +105,7 @@ def _pose(board: Board, rig: Rig, tilt_deg: float, margin_px: float, random: np.
         if _is_seen(board, rig.camera, T, margin_px) and _is_seen(board, rig.projector, at_projector, margin_px):
             return T
     raise ValueError(
-        f"expected a pose of the board that camera and projector see as a whole, found none in {TRIES}; turn them to "
+        f"expected a pose of the board that camera and projector see as a whole, found none in {TRIES}; turn both to "
         "one place, take a smaller margin_px or less tilt."
     )
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration of a camera and a projector together, from coded light on a board.
 
-The projector is treated as a camera. Around a corner of the board in the camera's image, the decoded projector
-coordinates are a homography of the camera's pixels, and that homography maps the corner into the projector's image
-(Moreno, Taubin: "Simple, accurate, and robust projector-camera calibration", 3DIMPVT 2012). No single decoded pixel
-would do, because corners of a checkerboard lie where black meets white.
+The calibration treats the projector as a camera. Around a corner of the board in the camera's image, the decoded
+projector coordinates are a homography of the camera's pixels, and that homography maps the corner into the projector's
+image (Moreno, Taubin: "Simple, accurate, and robust projector-camera calibration", 3DIMPVT 2012). No single decoded
+pixel would do, because corners of a checkerboard lie where black meets white.
 
-Any sensor takes part whose decoder returns `ProjectorCoordinates` of both axes.
+Any sensor can take part if its decoder returns `ProjectorCoordinates` of both axes.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from rangesim.rig import Rig
 from rangesim.robust_scale import sigma_from_median
 
 MIN_AROUND = 24
-"""Least number of decoded pixels around a corner for a homography. It has 8 parameters and takes two coordinates of
-each pixel, so that this is six times what it needs."""
+"""Least number of decoded pixels around a corner for a homography. A homography has 8 parameters, and each pixel gives
+two coordinates, so this is six times the number that it needs."""
 
 MAX_AROUND = 600
 """Largest number of decoded pixels around a corner that its homography takes, evenly spread. It bounds the time; the
@@ -53,7 +53,7 @@ RAYLEIGH_MEDIAN = 1.1774
 
 OUTLIER = 4.0
 """Distance in robust standard deviations beyond which a decoded pixel is left out. Normal errors reach it once in 3000
-pixels (a Rayleigh distribution), so that nearly all that are left out are wrong codes."""
+pixels (a Rayleigh distribution), so nearly all pixels that are left out have wrong codes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class RigCalibration:
     ----------
     rig : Rig, at the world's origin; its lenses have five coefficients of distortion.
     camera_deviations, projector_deviations : (9,) float64, standard deviations of fx, fy, cx, cy in pixels and of k1,
-        k2, p1, p2, k3; 0 for those that were held.
+        k2, p1, p2, k3; 0 for coefficients that are not free.
     baseline_m, baseline_deviation_m : float, distance of the two centres and its standard deviation, metres.
     T_camera_board : (k, 4, 4) float64, maps coordinates of the board in each pose to the camera's, metres.
     camera_residuals, projector_residuals : k arrays (m, 2) float64, pixels, projected minus seen.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points that do not fit a calibration by more than noise explains, and distortion that a calibration leaves out."""
+"""Points whose errors in a calibration are larger than noise explains, and distortion that a calibration leaves out."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ MAX_SIGMAS = 6.0
 """Largest error of a point, as a multiple of the robust standard deviation of a coordinate. Gaussian noise exceeds it
 once in 10^8 points."""
 MIN_ERROR_PX = 0.1
-"""Error below which no point is suspect, pixels, however little noise there is, because so small an error hardly moves
+"""Error in pixels below which no point is suspect, even if there is less noise, because so small an error hardly moves
 a calibration."""
 MAX_NOISE_RATIO = 1.5
-"""Largest noise of a bundle of two devices over the noise of each device alone, a ratio. Above it, some views of the
+"""Largest ratio of the noise of a bundle of two devices to the noise of each device alone. Above it, some views of the
 two devices contradict each other, even if no single point is suspect."""
 DEVICES = ("camera", "projector")
 """Names of the devices of a rig, by their number in `Observation.device`."""
@@ -35,7 +35,7 @@ MAX_SHIFT_SIGMAS = 2.0
 """Largest shift of a focal length or a principal point by distortion that is left out, in stated standard deviations.
 Beyond two, the stated deviations do not describe the errors."""
 ROUNDING_PX = 1e-6
-"""Residual below which a point fits exactly, pixels: only rounding is left. It keeps exact points from being tested
+"""Residual below which a point fits exactly, pixels: only rounding is left. So exact points are not tested
 against a noise of 0."""
 
 
@@ -62,15 +62,15 @@ def find_suspects(
 ) -> tuple[Suspect, ...]:
     """The points whose error is larger than noise explains, the worst first.
 
-    Such a point may be a corner taken for another one, or drawn away by an edge beside it. Or the board moved while it
-    was captured, or an image has another size. One bad view spreads its errors over other views. So if any point is
-    suspect, all are judged by the errors of `reweighted`, where the errors stay with the bad view.
+    Such a point may be a corner that was mistaken for another one, or that an edge beside it drew away. Or the board
+    moved while it was captured, or an image has another size. One bad view spreads its errors over other views. So if
+    any point is suspect, the function judges all points by the errors of `reweighted`, which stay with the bad view.
 
     Parameters
     ----------
     bundle : the result of least squares.
     observations, views : what the devices see, and the view of each observation.
-    noise : noise of a coordinate from the residuals, over the stated noise, a ratio.
+    noise : ratio of the noise of a coordinate, from the residuals, to the stated noise.
     coefficients : number of free coefficients of distortion.
     """
     residuals = [bundle.project(seen) - seen.pixels for seen in observations]
@@ -134,10 +134,10 @@ def suspects_told(
 
 
 def _missing_distortion(found: Minimum[Bundle], full: Minimum[Bundle], coefficients: int) -> str | None:
-    """The text of a warning if `found` leaves out distortion that changes its cameras; None if it does not.
+    """The text of a warning if `found` leaves out distortion that changes its cameras; else None.
 
-    It does if all coefficients of distortion (`full`) explain its residuals significantly better, and move a focal
-    length or a principal point by more than `MAX_SHIFT_SIGMAS`.
+    It leaves such distortion out if all coefficients (`full`) explain the residuals significantly better, and move a
+    focal length or a principal point by more than `MAX_SHIFT_SIGMAS`.
     """
     n = len(found.residuals)
     (simple, k), (fuller, more) = ((minimum.cost, minimum.jacobian.shape[1]) for minimum in (found, full))

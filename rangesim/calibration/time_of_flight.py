@@ -2,8 +2,8 @@
 """Calibration of a modulated time-of-flight camera by targets at known range: wiggling, and an offset for each pixel.
 
 The correlation of source and reference is a periodic function of the phase phi = 2 pi f l / c with the harmonics
-a_1, a_2, ...; N taps, 2 pi / N apart, cannot tell harmonic n N + 1 from the first, nor n N - 1 from the first turned
-the other way. What they measure is
+a_1, a_2, ... A camera has N taps, 2 pi / N apart. They cannot distinguish harmonic n N + 1 from the first one, nor
+harmonic n N - 1 from the first one with the opposite sign of its phase. They measure
 
     arg( sum over k = 1 mod N of a_k e^(i k phi) + sum over k = -1 mod N of a_k e^(-i k phi) ),
 
@@ -11,7 +11,7 @@ which differs from phi by a function of period 2 pi / N, the wiggling (Godbaz, C
 ameliorating non-linear phase and amplitude responses in AMCW lidar", Remote Sensing 2012). `wiggling` is that closed
 form for known harmonics. `calibrate_tof` finds the correction from targets, as a series of sines over the path length
 that is read, together with the delay of each pixel (Lindner, Kolb: "Lateral and depth calibration of PMD-distance
-sensors", ISVC 2006; they took splines, which do not use the period).
+sensors", ISVC 2006; those authors took splines, which do not use the period).
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ N_ORDERS = 4
 wiggling of square waves; more need more targets."""
 
 ROUNDS = 5
-"""Number of rounds in which the targets are weighed by their noise and outliers are left out. Each round takes the
-noise that the round before found."""
+"""Number of rounds of the fit. Each round weighs the targets by the noise that the round before found, and leaves
+outliers out."""
 
 OUTLIER = 5.0
-"""Distance in robust standard deviations of its image beyond which a reading is left out: it is a flying pixel, or its
-light came by other ways. Normal noise reaches it once in two million readings."""
+"""Distance, in robust standard deviations of its image, beyond which a reading is left out: it is a flying pixel, or
+its light also came on other ways. Normal noise reaches it once in two million readings."""
 
 SERIES_REST = 0.02
-"""Largest part of the wiggling, as a fraction, that the orders beyond those of the series may leave: 1.9 % for square
-waves, see `N_ORDERS`. It counts as noise of the targets, so that they are not taken for outliers."""
+"""Largest fraction of the wiggling that may be left, because the series has no higher orders: 1.9 % for square waves,
+see `N_ORDERS`. It counts as noise of the targets, so that they do not count as outliers."""
 
 MAX_DEVIATION = 1.0
 """Largest standard deviation of the correction, as a multiple of the noise of a reading. With a larger one, the targets
@@ -111,7 +111,7 @@ def wiggling(phase: ArrayLike, harmonics: ArrayLike, taps: int = len(TAPS_DEG)) 
     ----------
     phase : (...) float, true phase in periods, l f / c.
     harmonics : (k,) float, a_1 .. a_k of an even correlation, a_1 positive.
-    taps : int, N, 3 or more; two cannot tell a direction.
+    taps : int, N, 3 or more; two taps cannot tell the sign of a phase.
 
     Examples
     --------
@@ -187,8 +187,8 @@ def board_range(board: Board, camera: Intrinsics, T_camera_board: ArrayLike) -> 
 def find_board_ranges(board: Board, captures: Sequence[Capture], names: Sequence[str] | None = None) -> list[Array]:
     """Range of the board in each capture by a calibrated camera: arrays (h, w) float64, metres, NaN beside the board.
 
-    The board is found in the white image of the capture, and its pose from its corners and the camera of the rig. So no
-    stage that moves the board is needed.
+    The function finds the board in the white image of the capture, and the board's pose from its corners and the camera
+    of the rig. So you need no stage that moves the board by known steps.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def find_board_ranges(board: Board, captures: Sequence[Capture], names: Sequence
     Raises
     ------
     ValueError
-        A capture has no rig, or no board is found in it; the message says which.
+        A capture has no rig, or no board is found in it; the message names the capture.
     """
     ranges = []
     for name, capture in zip(_named(names, len(captures)), captures, strict=True):
@@ -226,7 +226,8 @@ class ToFCalibration:
     orders : k integers, orders of the wiggling.
     cosines_m, sines_m : (f, k) float64, metres of path length, by frequency and order.
     offset_m : (h, w) float64, metres of path length; NaN at pixels that saw no target.
-    shortest_m, longest_m : float, metres, path lengths of the nearest and the farthest target; nothing is known beyond.
+    shortest_m, longest_m : float, metres, path lengths of the nearest and the farthest target; outside them the errors
+        are not known.
     noise_m : float, metres, standard deviation of a path length about the correction, typical of the targets.
     """
 
@@ -254,7 +255,7 @@ class ToFCalibration:
             )
 
     def wiggling_m(self, length_m: ArrayLike) -> Array:
-        """(...) float64, metres by which path lengths that were read are too long, apart from the pixels' offsets."""
+        """(...) float64, metres by which path lengths that were read are too long, without the pixels' offsets."""
         coefficients = np.concatenate([self.cosines_m.ravel(), self.sines_m.ravel()])
         return np.asarray(_series(_waves(self.sensor, self.orders), np.asarray(length_m, np.float64)) @ coefficients)
 
@@ -388,11 +389,12 @@ def calibrate_tof(
 
     Parameters
     ----------
-    captures : two or more Captures of one `AmcwToF`, all with one rig (wherever it stands), of matte targets that light
-        reaches by one way: walls or boards at many distances. Distances that lie evenly over a period of the wiggling
-        (c / 8 f of range for four taps) or more determine it best.
+    captures : two or more Captures of one `AmcwToF`, all with one rig (it may stand in different places), of matte
+        targets that the light reaches only on the straight way: walls or boards at many distances. Distances that lie
+        evenly over a period of the wiggling (c / 8 f of range for four taps) or more determine it best.
     true_range_m : (h, w) float each, metres from the camera centre; NaN beside the target. See `board_range`.
-    decoder : Decoder of the readings; None: the sensor's own, with `correct_wiggling` off, so that nothing is presumed.
+    decoder : Decoder of the readings; None: the sensor's own, with `correct_wiggling` off, so that it assumes no
+        waveform.
     orders : different integers, orders of the wiggling; None: the first `N_ORDERS` multiples of the number of taps.
         Other orders appear where pixels are not linear.
     names : names of the captures, for messages; None: their numbers.
@@ -476,7 +478,7 @@ def _named(names: Sequence[str] | None, n: int) -> list[str]:
 
 
 def _checked(captures: Sequence[Capture], true_range_m: Sequence[Any], names: Sequence[str]) -> tuple[AmcwToF, Rig]:
-    """The sensor and the rig, at the world's origin, that all captures share; ValueError if they share none."""
+    """The sensor and the rig, moved to the world's origin, that all captures share; ValueError if they share none."""
     if len(captures) < 2 or len(captures) != len(true_range_m):
         raise ValueError(
             f"expected captures of two or more targets and the range of each, got {len(captures)} and "
@@ -500,7 +502,7 @@ def _checked(captures: Sequence[Capture], true_range_m: Sequence[Any], names: Se
 
 
 def _at_origin(rig: Rig | None) -> Rig:
-    """The rig moved to the world's origin. The camera may move as well as the targets."""
+    """The rig moved to the world's origin, because the camera may move between captures too, not only the target."""
     assert rig is not None
     return replace(rig, T_world_camera=np.eye(4))
 
@@ -520,7 +522,7 @@ def _series(waves: Array, length_m: Array) -> Array:
 class _Fit:
     """Result of the fit, all in metres of path length.
 
-    coefficients : (c,) of the series. offset : (n_pixels,); NaN at pixels without readings.
+    coefficients : (c,), coefficients of the series. offset : (n_pixels,); NaN at pixels without readings.
     shortest, longest : path lengths of the readings that count. noise : standard deviation of a reading.
     deviation : largest standard deviation of the correction between shortest and longest.
     """
@@ -536,8 +538,8 @@ class _Fit:
 def _fit(readings: list[_Readings], waves: Array, n_pixels: int) -> _Fit:
     """The series and the offsets with the least squared error.
 
-    The offsets are eliminated: the means over the targets are subtracted from each pixel's errors and series, so that
-    the normal equations hold the few coefficients alone.
+    It eliminates the offsets: it subtracts the means over the targets from each pixel's errors and series. So the
+    normal equations hold only the few coefficients.
 
     Parameters
     ----------
@@ -570,7 +572,7 @@ def _fit(readings: list[_Readings], waves: Array, n_pixels: int) -> _Fit:
         over = np.full((len(readings), n_pixels), np.nan)
         for row, r in zip(over, readings, strict=True):
             row[r.pixel] = r.off - _series(waves, r.length) @ coefficients
-        middle = np.full(n_pixels, np.nan)  # no outlier moves a pixel's median
+        middle = np.full(n_pixels, np.nan)  # an outlier hardly moves the median
         middle[seen] = np.nanmedian(over[:, seen], axis=0)
         for k, r in enumerate(readings):
             residual = over[k, r.pixel] - middle[r.pixel]

@@ -31,7 +31,7 @@ MIN_VIEWS = 2
 one more view is needed (Zhang 2000, section 3.1)."""
 MIN_CONIC_RATIO = 1e-4
 """Smallest ratio of the second smallest singular value of the conic's equations to the largest. Below it, the views
-leave a second solution: within the noise, the boards are parallel to each other."""
+allow a second solution, because the boards are parallel to each other within the noise."""
 MIN_APART_DEG = 1.0
 """Smallest value of the largest angle between two boards, degrees; below it all boards count as parallel. Measured with
 a noise of 0.05 px: for parallel boards, the largest angle found is within 0.1 degrees; for boards turned at random by
@@ -41,7 +41,7 @@ MAX_CENTRED_VIEWS = 5
 Measured with 3 views tilted by 10 degrees: with one start, 1 of 40 sets ended in a wrong minimum."""
 SAME_COST_RATIO = 0.999
 """Ratio of the sums of squares of two minima, above which they count as the same minimum and the first one is taken. It
-allows for what the two descents leave when they end."""
+is not 1, because a descent ends just before its minimum."""
 MAX_FOCAL_DEVIATION = 0.1
 """Largest relative standard deviation of a focal length. Above 10 % the views count as not determining it."""
 MAX_CORNER_PX = 5.0
@@ -53,8 +53,8 @@ SEEN_POINT_ROUNDS = 2
 views of 7 x 5 discs without noise: fx is off by 0.28 px without them, by 3e-4 px after one and by 1.5e-5 px after
 two."""
 BORDER_POINTS = 9
-"""Number of points along each side of an image, at which the ray through the lens must exist. More points find shorter
-gaps. The corners, which are farthest from the centre, are always among them."""
+"""Number of points along each side of an image, at which a ray through the lens must exist. More points find shorter
+parts without a ray. The corners, which are farthest from the centre, are always among them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,8 +320,8 @@ def adjust_as_seen(
 ) -> tuple[Minimum[Bundle], list[Observation]]:
     """The result of `bundle.adjust`, repeated with the positions that the camera detects as the points of the board.
 
-    These positions (`Board.seen_points`) depend on the camera, so that they are known after a first adjustment. The
-    pixels of a second device come from what the first one detects, so it has the same positions.
+    These positions (`Board.seen_points`) depend on the camera, so they are known only after a first adjustment. The
+    pixels of a second device come from the points that the first one detects, so it has the same positions.
 
     Parameters
     ----------
@@ -378,7 +378,7 @@ def judged(found: Minimum[Bundle], observations: Sequence[Observation], may_warn
     Raises
     ------
     ValueError
-        There are not more coordinates than parameters, or they leave a focal length open.
+        There are not more coordinates than parameters, or the coordinates do not determine a focal length.
     """
     parameters = found.jacobian.shape[1]
     if len(found.residuals) <= parameters:

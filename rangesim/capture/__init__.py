@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Captures: the frames that a camera delivers, and how they are exposed from signals."""
+"""Captures: the frames that a camera delivers, and the exposure that makes them from signals."""
 
 from rangesim.capture.capture import (
     BRIGHT_PERCENTILE,

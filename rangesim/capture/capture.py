@@ -62,9 +62,10 @@ CLIPPING = ClippingThresholds()
 def clip_level(brightest: np.ndarray, max_dn: int) -> int:
     """The digital number at which a camera clips: `max_dn`, or a lower one at which many pixels pile up.
 
-    Video levels end at 235 of 255; other images end where a converter or a raw developer cuts them off. In such an
-    image, many pixels have the largest value, and a few have each of the values just below it. An image of two values
-    has none just below, and fringes do not have many more at their peaks: neither is clipped.
+    The values of video end at 235 of 255; other images end where a converter or a raw developer cuts them off. In such
+    an image, many pixels have the largest value, and a few have each of the values just below it. An image of two
+    values has no pixel just below the largest value. Fringes have not many more pixels at their peaks than just below.
+    Neither of the two counts as clipped.
 
     Parameters
     ----------
@@ -82,7 +83,7 @@ def clip_level(brightest: np.ndarray, max_dn: int) -> int:
 
 
 def _masked_in_all(frames: np.ndarray) -> np.ndarray:
-    """Frames (k, h, w); a pixel of float32 frames that is not finite in one frame is NaN in all of them."""
+    """The frames (k, h, w). If a pixel of float32 frames is not finite in one frame, it becomes NaN in all frames."""
     if np.issubdtype(frames.dtype, np.integer):
         return frames
     masked = np.zeros(frames.shape[1:], dtype=bool)
@@ -99,7 +100,7 @@ class Capture(ShortRepr):
     ----------
     frames : (k, h, w) uint8, uint16 or uint32 digital numbers; or float32 radiance (W/m2/sr) of a noise-free
         capture. A pixel that is not finite in one frame becomes NaN in all frames: it is masked, and has no reading.
-    sensor : Sensor, the measuring principle the frames were taken with.
+    sensor : Sensor, the measuring principle with which the frames were taken.
     rig : Rig; None: the capture is not calibrated.
     detector : PhotoDetector; None: unknown (a real capture), or the capture is noise-free.
     exposure_s : float, seconds per frame; NaN if unknown.
@@ -158,7 +159,7 @@ class Capture(ShortRepr):
 
     @property
     def full_scale(self) -> float:
-        """Largest signal above the black level that a frame can hold; the level of the bright pixels if noise-free."""
+        """Largest signal above the black level that a frame can hold; if noise-free, the level of the bright pixels."""
         if not self.is_digital:
             return bright_level(self.frames.max(axis=0)) or 1.0
         return self._max_dn - self.black_level

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exposure of signals: the capture that a camera would deliver of them."""
+"""Exposure: the capture that a camera would make of the light in signals."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def expose(
     seed : int from 0 to 2^64 - 1, seed of the noise. Every frame has its own random stream (with a SpadDetector, every
         image row has one); the same seed gives the same bytes on any number of threads.
     ambient : Ambient, kind and strength of the light of the scene's own emitters; the detector's band
-        (`band_width_m`) then decides how much of it counts. None: unknown; the detector's `ambient_transmission`
-        decides. Another ambient light needs no new transport pass.
+        (`band_width_m`) then decides how much of this light reaches it. None: unknown; then the detector's
+        `ambient_transmission` decides. Another ambient light needs no new transport pass.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def exposed(
     seed: int = 0,
     ambient: Ambient | None = None,
 ) -> Exposure:
-    """Capture of `sensor` with the light that it was exposed from; parameters and errors as of `expose`."""
+    """Capture of `sensor` with the light that it was exposed from; parameters and errors are those of `expose`."""
     if detector is not None and not isinstance(detector, PhotoDetector):
         raise ValueError(f"expected a Detector, a SpadDetector or None, got {detector!r}.")
     seed = check_seed(seed)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Why a pixel has no reading, or a wrong one. Definitions and test scenes: docs/causes.md."""
+"""Finds why a pixel has no reading, or a wrong one. docs/causes.md has the definitions and the test scenes."""
 
 from rangesim.causes.cause import Cause, CauseMap
 from rangesim.causes.rules import explain

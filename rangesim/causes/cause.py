@@ -60,7 +60,7 @@ DEFINITIONS = {
     Cause.RESOLUTION: "Neither stray light nor noise is to blame: code, bins or baseline are too coarse for the depth.",
     Cause.PILE_UP: "So many pulses brought photons that the first ones hid the others; less light would be read right.",
 }
-"""Meaning of each cause, in a sentence; tables of docs/causes.md and of reports show it."""
+"""Meaning of each cause, in one sentence, which the tables of docs/causes.md and of reports show."""
 
 TITLES = {
     Cause.NONE: "right",

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rangesim.signals import Signals
 
 NEAR = 2
-"""Radius, in pixels, of the window around a pixel at an edge in which the same surface off the edge is looked for.
+"""Radius, in pixels, of the window around a pixel at an edge; the same surface off the edge is sought in this window.
 
 A larger window may reach parts of the surface under other light; a smaller one finds fewer pixels off the edge. Other
 values were not measured.
@@ -44,18 +44,18 @@ It separates glossy surfaces that reflect the light elsewhere from those that re
 DISTURBING = 0.005
 """Fraction of indirect light in the emitter's light above which this light can shift a reading by the tolerance.
 
-With a larger fraction, errors of multipath are attributed to the resolution; with a smaller one, errors of the
-resolution are attributed to multipath. Other values were not measured.
+With a larger fraction, the rules blame the resolution for errors that multipath made; with a smaller one, they blame
+multipath for errors that the resolution made. Other values were not measured.
 """
 MAX_PULSES_HIT = 0.9
 """Fraction of the laser pulses with a detected photon above which pile-up makes a reading worse.
 
-It is reached at 2.3 photons per pulse. Coates' estimate has least noise at 1 to 2 photons per pulse.
+A pixel reaches it at 2.3 photons per pulse. The noise of Coates' estimate is least at 1 to 2 photons per pulse.
 """
 MOTION_FRACTION = 0.1
 """Motion during the acquisition, as a fraction of the tolerance, above which it can explain an error.
 
-It is small because triangulation magnifies motion by the distance over the baseline, a ratio of 5 or more.
+It is small because triangulation multiplies motion by the ratio of distance to baseline, which is 5 or more.
 """
 
 
@@ -109,7 +109,7 @@ class Evidence:
 
     @cached_property
     def optical(self) -> np.ndarray:
-        """Whether optics is to blame: without noise, ambient light and saturation the pixel fails as well, or has at
+        """Whether optics is to blame: even without noise, ambient light and saturation, the pixel fails or keeps at
         least half of its error."""
         return self._wrong(self._of_failed_pixels(self.readings.emitter_alone))
 
@@ -144,7 +144,7 @@ class Evidence:
 
     @cached_property
     def unlit(self) -> np.ndarray:
-        """Whether the pixel is in shadow, and has no lit part that brings most of its light and enough of it."""
+        """Whether the pixel is in shadow, and has no lit part from which most of its light and enough light comes."""
         return self.in_shadow & ~(self.enough & self.mostly(DIRECT))
 
     @cached_property
@@ -159,8 +159,8 @@ class Evidence:
 
     @cached_property
     def merely_inclined(self) -> np.ndarray:
-        """Whether the apparent edge is one steep surface, which would be read right over the whole pixel without the
-        light that disturbs it."""
+        """Whether the apparent edge is one steep surface, which the sensor would read correctly over the whole pixel
+        without the light that disturbs it."""
         return self.inclined & self._may_blur & ~self.blurred
 
     @cached_property
@@ -181,8 +181,8 @@ class Evidence:
 
     @cached_property
     def fails_off_edge(self) -> np.ndarray:
-        """Whether the same surface has at least half of the error around the pixel, off the edge: then the edge is not
-        to blame."""
+        """Whether pixels nearby on the same surface, but off the edge, have at least half of the error: then the edge
+        is not to blame."""
         result, where = np.zeros(self.failed.shape, dtype=bool), self.failed & self.at_edge
         error = np.where(self.missing, np.inf, np.abs(self.error))
         around = error_off_edge(where, error, self.at_edge, self.truth.z, self.truth.instance, self.tolerance_m)
@@ -257,7 +257,7 @@ class Evidence:
 
     @cached_property
     def coarse(self) -> np.ndarray:
-        """Whether the reading of the straight path to the surface alone is missing, or has half of the error."""
+        """Whether the reading of the straight path alone is missing, or still has half of the error or more."""
         return self._wrong(self._read(single_path_frames(self.capture.sensor, self.signals.rig, self.truth)))
 
     @cached_property
@@ -278,7 +278,7 @@ class Evidence:
 
     @cached_property
     def beyond_range(self) -> np.ndarray:
-        """Whether a time-of-flight sensor takes the path length for another, or has no bin for it."""
+        """Whether a time-of-flight sensor confuses the path length with another one, or has no bin for it."""
         length = self.truth.range_m[self.failed] + np.linalg.norm(self._in_projector, axis=-1)
         return self._of_failed(self.capture.sensor.is_beyond_range(length))
 

@@ -24,8 +24,8 @@ class LightBudget:
     Radiances are in W/m2/sr, before the camera's lens.
 
     signal : radiance of the emitter's light at full power.
-    needed : least signal that the decoder accepts, in the ambient light of the capture.
-    needed_in_the_dark : least signal that the decoder accepts without ambient light.
+    needed : smallest signal that the decoder accepts in the ambient light of the capture.
+    needed_in_the_dark : smallest signal that the decoder accepts without ambient light.
     ambient_fraction : fraction (0..1) of the variance of the noise that ambient light makes.
     """
 
@@ -45,7 +45,7 @@ def light_budget(signals: Signals, capture: Capture, decoder: Decoder) -> LightB
     ambient = signals.energy.ambient.astype(np.float64)
     if capture.detector is None and capture.ambient is not None:
         ambient *= capture.ambient.scale
-    lens = np.maximum(signals.rig.camera_illumination, np.finfo(np.float32).tiny)  # what vignetting leaves
+    lens = np.maximum(signals.rig.camera_illumination, np.finfo(np.float32).tiny)  # fraction that vignetting leaves
     through = ambient * lens
     if capture.detector is None:
         background = Background(through, bright_level(signal * lens))

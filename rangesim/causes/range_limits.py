@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warning of surfaces that lie outside the range of a time-of-flight sensor; their true depth is known."""
+"""Warns of surfaces that lie outside the range of a time-of-flight sensor, by the true depth of the surfaces."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from rangesim.sensor import Sensor
 from rangesim.signals import GroundTruth
 
 ENOUGH = 0.01
-"""Least fraction of the lit pixels whose surface is outside the range, for a warning.
+"""Fraction of the lit pixels whose surface is outside the range, from which a warning is given.
 
-A smaller fraction warns of single pixels at the far end of a scene, which spoil no statistics.
+With a smaller fraction, single pixels at the far end of a scene would give a warning, though they spoil no statistics.
 """
 
 

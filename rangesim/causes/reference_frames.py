@@ -13,12 +13,12 @@ from rangesim.sensor import Sensor
 from rangesim.signals import GroundTruth
 
 _CHUNK_VALUES = 32_000_000
-"""Largest count of weights that are computed at once, so that they take at most 256 MB; it changes no result."""
+"""Largest number of weights that are computed at once, so that they take at most 256 MB. It changes no result."""
 FOOTPRINT_PATHS = 55
 """Number of light paths over the area of a pixel, on a Fibonacci lattice.
 
-The lattice is even along both sides of the pixel and over its area, so that 55 paths resolve stripes of a twentieth of
-a pixel.
+The points of the lattice lie evenly along both sides of the pixel and over its area, so 55 paths resolve stripes of a
+twentieth of a pixel.
 """
 FOOTPRINT_STEP = 34
 """Step of the lattice along the second side of the pixel, counted in lattice points.
@@ -31,7 +31,7 @@ def single_path_frames(sensor: Sensor, rig: Rig, truth: GroundTruth) -> np.ndarr
     """(k, h, w) float32, W/m2/sr, frames of the straight path to the true point of each pixel, with a radiance of 1.
 
     Where a reading of these frames is wrong, no other light is to blame: the distance is beyond the range of the
-    sensor, or finer than its resolution. Pixels without a surface get no light.
+    sensor, or the sensor's resolution is too coarse. Pixels without a surface get no light.
     """
     where = np.isfinite(truth.z)
     channels = _no_light(sensor, where.shape)
@@ -44,8 +44,8 @@ def footprint_frames(sensor: Sensor, rig: Rig, truth: GroundTruth, spread: np.nd
 
     In the pixels `spread`, the frames are the mean over `FOOTPRINT_PATHS` straight paths to the tangent plane of the
     surface. In the other pixels they are as in `single_path_frames`. Where a reading of these frames is wrong, the
-    pixel is too coarse for the pattern, or covers too many distances of its one surface. Where it is right, the
-    inclination of the surface alone does no harm.
+    pixel is too coarse for the pattern, or covers too many distances of its one surface. Where such a
+    reading is correct, the inclination of the surface alone does no harm.
 
     Parameters
     ----------

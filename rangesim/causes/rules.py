@@ -35,8 +35,8 @@ def explain(
 
     A pixel fails if there is a surface behind it and it has no reading, or one with an error above `tolerance_m`. The
     cause is the first thing that goes wrong on the way of the light: at the surface, at the pixel, in the detector, in
-    the decoder. It is found from the energy split and the ground truth of the signals. To tell optics from
-    electronics, the signals are decoded again without noise and without ambient light. See docs/causes.md.
+    the decoder. The function finds it from the energy split and the ground truth of the signals. To tell optics from
+    electronics, it decodes the signals again without noise and without ambient light. See docs/causes.md.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def explain(
 
 
 def causes_of(readings: ReferenceReadings, tolerance_m: float) -> CauseMap:
-    """The cause of each failed pixel, from the reference readings of a range image; errors as of `explain`."""
+    """The cause of each failed pixel, from the reference readings of a range image; raises the errors of `explain`."""
     image, capture, signals = readings.image, readings.capture, readings.signals
     shape = signals.truth.z.shape
     if image.z.shape != shape or capture.frames.shape[1:] != shape:
@@ -91,8 +91,8 @@ def rules(e: Evidence) -> list[Rule]:
     """Causes in the order in which they are tried; the first one that holds is the cause of a failed pixel.
 
     The order follows the light from the emitter to the decoder. Saturation comes first, because it hides everything
-    else. The last rule always holds, so that every failed pixel has a cause: with enough light, nothing that disturbs
-    it, and a right reading without noise, the noise is to blame.
+    else. The last rule always holds, so that every failed pixel has a cause: if there is enough light, nothing disturbs
+    it, and the reading without noise is correct, the noise is to blame.
     """
     too_dark, disturbed = ~e.enough, e.optical & e.disturbed
     dim = e.is_a("glossy") & e.faint & ~e.enough_direct  # its direct light alone would be too dark
@@ -111,7 +111,7 @@ def rules(e: Evidence) -> list[Rule]:
         (e.unlit & e.enough & e.mostly(CAUSTIC), Cause.CAUSTIC),
         (e.unlit & e.enough & e.mostly(SPECULAR), Cause.MIRRORED_GHOST),
         (e.unlit, Cause.SHADOWED),
-        # ---- Too little of it comes back
+        # ---- Too little of the emitter's light comes back
         (e.is_a("glossy") & e.faint & ~e.optical, Cause.SPECULAR_AWAY),
         (dim & (too_dark | e.missing), Cause.SPECULAR_AWAY),
         (dim, Cause.MIRRORED_GHOST),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rangesim calibrate`: captures of a board to a rig."""
+"""The command `rangesim calibrate`, which makes a rig from captures of a board."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from rangesim.rig import Intrinsics
 
 MAX_BOARD_M = 20.0
-"""Largest size of a board, metres. A larger one means that its spacing was given in millimetres: 10 corners 25 mm apart
-would make 250 m, and no board for a room is larger than 20 m."""
+"""Largest size of a board, metres. A larger one means that the user gave its spacing in millimetres: 10 corners 25 mm
+apart would then make a board of 250 m, and no board for a room is larger than 20 m."""
 
 KINDS = ("checkerboard", "charuco", "circles")
 """Names of the kinds of boards on the command line."""
@@ -108,7 +108,7 @@ def calibrate_command(
         _camera_alone(target, captures, out, coefficients, projector, report)
         return
     if sensor is not None and code is not None:
-        raise ValueError("expected either --sensor or --code.")
+        raise ValueError("expected either --sensor or --code, got both.")
     axes = ALL_AXES if sensor is None or projector is not None else None
     taken_with = sensor_of_images(sensor, code, projector, axes, period, steps)
     taken = [load_frames(path, taken_with, bits) for path in captures]
@@ -120,7 +120,7 @@ def calibrate_command(
         )
     if of_tof:
         if report is not None:
-            raise ValueError("expected --report for a camera and a projector; there is no page for time of flight yet.")
+            raise ValueError("expected --report only for a camera and a projector; time of flight has no page yet.")
         _time_of_flight(target, taken, [str(path) for path in captures], out)
         return
     found = calibrate_rig(target, taken, coefficients=coefficients, names=[str(path) for path in captures])
@@ -137,7 +137,7 @@ def calibrate_command(
 
 
 def check_places(out: Path, report: Path | None) -> None:
-    """Refuse places where a file cannot be written or would be lost, before anything is computed.
+    """Refuse places where no file can be written or where an older file would be lost, before anything is computed.
 
     Parameters
     ----------
@@ -177,7 +177,9 @@ def _camera_alone(
     from rangesim.files.image_files import read_grey
 
     if projector is not None or report is not None:
-        raise ValueError("expected folders of images with --projector and --report; images calibrate a camera alone.")
+        raise ValueError(
+            "expected folders of images with --projector or --report; single images calibrate only a camera."
+        )
     if out.suffix.lower() not in SUFFIXES:
         raise ValueError(
             f"expected --out to end in {', '.join(SUFFIXES)} for a camera alone, got {out.name!r}; for camera and "
@@ -237,7 +239,7 @@ def _board(kind: str, points: str, spacing: float, marker: float | None, diction
     if not size:
         raise ValueError(f"expected --points as COLUMNSxROWS, such as 9x6, got {shown(points)}.")
     if kind not in KINDS:
-        raise ValueError(f"expected --board out of {', '.join(KINDS)}, got {kind!r}{nearest(kind, KINDS)}.")
+        raise ValueError(f"expected --board to be one of {', '.join(KINDS)}, got {kind!r}{nearest(kind, KINDS)}.")
     columns, rows = int(size[1]), int(size[2])
     if spacing * max(columns, rows) > MAX_BOARD_M:
         raise ValueError(
@@ -246,7 +248,7 @@ def _board(kind: str, points: str, spacing: float, marker: float | None, diction
         )
     if kind == "checkerboard":
         if marker is not None:
-            raise ValueError("expected --marker with --board charuco or circles alone; a checkerboard has none.")
+            raise ValueError("expected --marker only with --board charuco or circles; a checkerboard has none.")
         return Checkerboard(columns, rows, spacing)
     if marker is None:
         raise ValueError(f"expected --marker METRES with --board {kind}.")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rangesim.decoding.range_image import RangeImage
 
 ONLY_BARE_IMAGES = ("code", "projector", "axes", "period", "steps", "bits")
-"""Options that bare images need, and that a capture with a sidecar refuses because it says the same."""
+"""Options that bare images need. A capture with a sidecar refuses them, because the sidecar says the same."""
 
 TOF_SUFFIX = ".npz"
 """Suffix of the calibrations that `rangesim calibrate` writes for time-of-flight cameras."""
@@ -64,9 +64,9 @@ def decode_command(
 ) -> None:
     """Decode a capture to maps, and with a calibration to a point cloud, without scene and renderer.
 
-    Bare images are taken in the order of their names, which must be that of the sensor's frames. By default it is
-    OpenCV's: for each axis the patterns from the coarsest to the finest, each followed by its inverse; then white and
-    black.
+    The command reads bare images in the order of their names, which must be the order of the sensor's frames. The
+    default is OpenCV's order: for each axis the patterns from the coarsest to the finest, each followed by its
+    inverse; then white and black.
 
     The command writes range.npz and pictures of the maps, and with a calibration also cloud.ply, in metres.
 
@@ -109,16 +109,16 @@ def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibra
     if (capture / SIDECAR).is_file() and (surplus := _options(ONLY_BARE_IMAGES, given)):
         raise ValueError(f"{capture} is a capture whose {SIDECAR} says how it was taken: leave out {surplus}.")
     if {"sensor", "code"} <= given:
-        raise ValueError("expected either --sensor or --code.")
+        raise ValueError("expected either --sensor or --code, got both.")
     suffix = "" if calibration is None else calibration.suffix.lower()
     if "code_step" in given and (calibration is None or suffix != ".xml" or _is_opencv(calibration)):
-        raise ValueError("expected --code-step with --calibration FILE.xml of procam-calibration alone.")
+        raise ValueError("expected --code-step only with --calibration FILE.xml of procam-calibration.")
     if "unit" in given and suffix not in SUFFIXES:
-        raise ValueError("expected --calibration FILE.xml or FILE.yml with --unit; others are in metres.")
+        raise ValueError("expected --calibration FILE.xml or FILE.yml with --unit; other files are in metres.")
 
 
 def _from_command_line(context: typer.Context, name: str) -> bool:
-    """Whether an option was given, and is not its default."""
+    """Whether the user gave an option, so that its value is not the default."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bare images on the command line: the options that say which sensor took them, and how a capture is made of them.
 
-No sensor is known by name here. A preset or a file names it, and the options change those settings that it has.
+This module knows no sensor by name. A preset or a file names the sensor, and the options change those settings that
+the sensor has.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ BitsOption = Annotated[
 def sensor_of_images(
     own: str | None, code: str | None, projector: str | None, axes: str | None, period: float | None, steps: int | None
 ) -> Sensor | None:
-    """The sensor that the options name; None if they name none whose projector has a known size.
+    """The sensor that the options name; None if they name no sensor, or one whose projector has no known size.
 
     Parameters
     ----------
@@ -73,7 +74,7 @@ def sensor_of_images(
     Raises
     ------
     ValueError
-        The options name no sensor, or settings that it does not have or refuses.
+        The options name no known sensor, or settings that the sensor does not have or refuses.
     """
     from rangesim.sensors import sensor_of
     from rangesim.sensors.registry import IMAGES_PRESET

@@ -140,7 +140,7 @@ def run_command(
 def _warn_of_instruments_without_points(result: Result) -> None:
     """Print a line on stderr for the instruments that have no point at all.
 
-    Instruments whose pixels fail by the same most frequent cause share a line. Where this cause is low signal or a
+    Instruments whose pixels most often fail by the same cause share a line. Where this cause is low signal or a
     distance that the sensor cannot read, the scene is most often not in metres, so the line says how to scale it.
     """
     from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
@@ -188,7 +188,7 @@ def _instruments(sensors: list[str]) -> tuple[Instrument, ...]:
 def _experiment(
     scene: Path | None, config: Path | None, settings: dict[str, Any], sensors: list[str] | None
 ) -> Experiment:
-    """The experiment of an experiment file or of a scene, with the options of the command line in place of its own."""
+    """The experiment of a file or of a scene. Options of the command line replace the settings of the file."""
     from rangesim.experiment import Experiment, load_experiment
 
     if config is None and scene is None:

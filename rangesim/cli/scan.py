@@ -123,7 +123,7 @@ def scan_command(
 
 
 def _settings(scene: Path | None, config: Path | None, given: dict[str, Any], sensor: str | None) -> ScanSettings:
-    """The scan of a file of settings or of a scene, with the options of the command line in place of its own."""
+    """The scan of a file of settings or of a scene. Options of the command line replace the settings of the file."""
     from rangesim.experiment.scan_settings import ScanSettings, load_scan_settings
     from rangesim.instrument.presets import instrument
 
@@ -160,7 +160,7 @@ def _path(before: CameraPath, name: str | None, views: int | None) -> CameraPath
             raise ValueError(f"{name}: {error}") from error
     if name is not None and name not in PATHS:
         raise ValueError(
-            f"expected --path out of {', '.join(PATHS)} or a .json file, got {name!r}{nearest(name, PATHS)}."
+            f"expected --path to be one of {', '.join(PATHS)} or a .json file, got {name!r}{nearest(name, PATHS)}."
         )
     chosen = before if name in (None, before.type_name) else CameraPath.known[name]()
     if views is None:

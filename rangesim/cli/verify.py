@@ -19,7 +19,8 @@ def verify_command(
 ) -> None:
     """Compare the size and SHA-256 of every file in a directory with its manifest.
 
-    Ends with status 1 if a file is missing or was changed. Files that are not rangesim's are listed and change nothing.
+    Ends with status 1 if a file is missing or was changed. Files that are not rangesim's are listed and do not
+    change the status.
 
     Example:
 

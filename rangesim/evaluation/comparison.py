@@ -18,13 +18,14 @@ from rangesim.signals import GroundTruth, Signals
 OUTLIER_M = 0.010
 """Error of a reading, in metres, above which it is an outlier and counts as failed.
 
-The value is a choice. It decides what fraction of the readings is called wrong, and every table states it.
+The value is a choice, not a measurement. It decides what fraction of the readings is called wrong, so every table
+states it.
 """
 EDGE_RADIUS = 2
 """Distance from a depth edge, in pixels, within which a pixel can be a flying pixel.
 
-A larger radius counts more right readings beside the edge, and lowers the rate of flying pixels. Other values
-were not measured.
+A larger radius counts more correct readings beside the edge, and so lowers the rate of flying pixels. Other
+values were not measured.
 """
 
 
@@ -110,7 +111,8 @@ def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = 
     Raises
     ------
     ValueError
-        Image and truth differ in size, the signals are of a camera elsewhere, or `outlier_m` is not positive.
+        Image and truth differ in size, the signals are those of a camera at another place, or `outlier_m` is not
+        positive.
 
     Examples
     --------
@@ -196,8 +198,8 @@ def _flying(z: np.ndarray, true_z: np.ndarray, outlier_m: float) -> tuple[np.nda
 
 
 def neighbours(values: np.ndarray, radius: int) -> list[np.ndarray]:
-    """Copies of the array (h, w), one shifted by each offset of a window of (2 radius + 1)^2 pixels; beyond the border,
-    its values are repeated."""
+    """Copies of the array (h, w), one for each offset of a window of (2 radius + 1)^2 pixels, shifted by it. Beyond the
+    border, the border's values are repeated."""
     padded = np.pad(values, radius, mode="edge")
     h, w = values.shape
     size = 2 * radius + 1

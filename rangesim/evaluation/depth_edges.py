@@ -9,7 +9,7 @@ EDGE_FRACTION = 0.02
 """Least difference of the true depths of neighbouring pixels across a depth edge, as a fraction of the nearer depth.
 
 The difference must also exceed a tolerance in metres. A smaller fraction takes inclined surfaces for edges; a larger
-one misses objects that lie close before a wall. Other values were not measured.
+one misses objects that stand close in front of a wall. Other values were not measured.
 """
 
 
@@ -29,5 +29,5 @@ def depth_edges(z: np.ndarray, tolerance_m: float) -> np.ndarray:
 
 
 def across(z: np.ndarray, tolerance_m: float) -> np.ndarray:
-    """Smallest depth, in metres, of a surface that is separated by a depth edge from one at depth z in front of it."""
+    """Smallest depth, in metres, that a surface behind one at depth z has if a depth edge separates the two."""
     return np.asarray(np.maximum(z * (1 + EDGE_FRACTION), z + tolerance_m))

@@ -3,9 +3,10 @@
 
 The noise of the detector is physics. The noise of sampling belongs to the renderer and should be small against it.
 
-Signals keep one draw of their sampling error (`rangesim.signals.SamplingError`). Added to the signals and subtracted
-from them, it gives the signals of each half of the samples. The decoder reads both without noise. Half the difference
-of the two readings is a draw of the sampling error of the reading, whatever the decoder does.
+Signals keep one draw of their sampling error (`rangesim.signals.SamplingError`). The signals plus this draw are the
+signals of one half of the samples; the signals minus it are those of the other half. The decoder reads both halves
+without noise. Half the difference of the two readings is a draw of the sampling error of the reading, whatever the
+decoder does.
 
 The error that the detector makes is the difference between a reading with noise and the reading without.
 
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 SMALL = 0.5
 """Ratio of the sampling noise to the detector's noise above which a run warns.
 
-It was chosen because at this ratio the sum of both is an eighth larger than the detector's noise alone.
+At this ratio, both noises together are an eighth larger than the detector's noise alone.
 """
 SMALL_LOSS = 0.03
 """Uncertainty of the fraction of pixels with a reading above which a run warns, as a fraction of these pixels.
@@ -49,13 +50,13 @@ ENOUGH_PIXELS = 100
 NOISE_SEEDS = (SEEDS - 3, SEEDS - 2, SEEDS - 1)
 """Seeds of the detector's noise in repeated captures.
 
-They are the three largest, so that the noise of a capture is hardly ever repeated.
+They are the three largest seeds, which hardly any capture has, so that its noise is not repeated.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """Pixels for which the same decoder has no reading, in a range image and in repeated captures; (h, w) bool each.
+    """Pixels without a reading by the same decoder, in a range image and in repeated captures; (h, w) bool each.
 
     whole : pixels without a reading in the range image itself.
     again : the same in a capture of all samples with other noise of the detector.
@@ -70,10 +71,10 @@ class Repeats:
         """Bound on the change of the fraction of pixels with a reading if very many samples were taken.
 
         If a pixel has a reading with half of the samples and none with all of them, or the other way round, sampling
-        decides about it. More samples may change as many pixels again, and most of them in one direction. The larger
-        of the two fractions is taken therefore, summed over both halves. Twice the number of pixels that the detector's
-        noise alone changes is subtracted, and the standard error of the counts is added, which matters where pixels
-        are few.
+        decides about it. More samples may change as many pixels again, and most of them in one direction. The function
+        therefore takes the larger of the two fractions, summed over both halves. It subtracts twice the number of
+        pixels that the detector's noise alone changes, and adds the standard error of the counts, which matters where
+        pixels are few.
 
         Parameters
         ----------
@@ -141,7 +142,7 @@ def range_noise(image: RangeImage, capture: Capture, signals: Signals) -> RangeN
 
 
 def noise_of(readings: ReferenceReadings) -> RangeNoise:
-    """Noise of a range image, from its reference readings; errors as of `range_noise`."""
+    """Noise of a range image, from its reference readings; the errors are those of `range_noise`."""
     image, capture = readings.image, readings.capture
     above, below = readings.halves
     _, sampling = _middle_and_draw(image, above, below)
@@ -161,7 +162,8 @@ def noise_of(readings: ReferenceReadings) -> RangeNoise:
 def sampling_draw(image: RangeImage, capture: Capture, signals: Signals) -> tuple[np.ndarray, np.ndarray]:
     """Mean of the noise-free depths of both halves of the samples, (h, w) float64, metres, and `RangeNoise.sampling`.
 
-    Where the sampling error is large, decoders are not linear: the mean then differs from the reading of all samples.
+    Where the sampling error is large, a decoder does not act linearly: the mean then differs from the reading of all
+    samples.
 
     Raises
     ------
@@ -184,7 +186,7 @@ def warn_of_sampling(tables: Mapping[str, Sequence[dict[str, Any]]], spp: int) -
 
     Parameters
     ----------
-    tables : by the name of each instrument, rows of statistics: each has `material`, `pixels`, `lit` and
+    tables : rows of statistics, by the name of the instrument. Each row has `material`, `pixels`, `lit` and
         `completeness`, and the values of `RangeNoise.by_material`.
     spp : largest number of samples that a pixel had.
 

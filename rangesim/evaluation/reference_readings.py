@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 class ReferenceReadings:
     """Depths that the decoder of a range image reads from other captures; each is (h, w) float32, metres.
 
-    Each is decoded when it is first used, and only once, for the noise (`range_noise.noise_of`) and for the causes of
-    failures (`rangesim.causes.rules.causes_of`) alike. The decoder warned when it made the range image, and does not
-    warn again.
+    Each is decoded when it is first used, and only once. The noise (`range_noise.noise_of`) and the causes of failures
+    (`rangesim.causes.rules.causes_of`) share it. The decoder warned when it made the range image; it does not warn
+    again.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class ReferenceReadings:
 
     @cached_property
     def halves(self) -> tuple[np.ndarray, np.ndarray]:
-        """Depths of each half of the samples, as `noise_free`.
+        """Depths of each half of the samples, without noise, in the ambient light of the capture.
 
         Raises
         ------

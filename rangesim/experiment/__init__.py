@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings of experiments and scans: what is measured, with which instruments, and along which camera path.
 
-They are frozen dataclasses that can be written to and read from TOML and JSON. Nothing is carried out here;
+They are frozen dataclasses that can be written to and read from TOML and JSON. This package carries nothing out;
 `rangesim.pipeline` does that. The settings of a sweep over experiments would be a further module here.
 """
 

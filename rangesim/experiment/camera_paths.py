@@ -19,7 +19,7 @@ from rangesim.settings.config import Named, shown, to_dict
 from rangesim.settings.seeds import check_seed
 
 Views = Annotated[int, whole(1, "passes")]
-"""Number of views. The limit is that of `passes`, because each view is a light-transport pass."""
+"""Number of views. The limit `passes` (docs/limits.md) holds for it, because each view is a light-transport pass."""
 Elevation = Annotated[float, Bounds("degrees above the horizon", -89, 89)]
 """Elevation of a camera, degrees above the horizon. It excludes 90, because there the direction up is not defined."""
 Degrees = Annotated[float, Bounds("degrees", -360, 360)]
@@ -32,13 +32,13 @@ SWINGS = 3
 standard deviation stays the same, because the sum is divided by the root of this number."""
 MAX_ELEVATION_DEG = 85.0
 """Largest elevation that a path takes from a scene's camera, or that a hand-held path reaches, degrees. A camera that
-looks straight down has no direction up, so that paths stay at least five degrees away from the vertical."""
+looks straight down has no direction up, so paths stay at least five degrees away from the vertical."""
 
 
 class Viewpoint(NamedTuple):
-    """Pose of a scene's camera and its distance to what it looks at.
+    """Pose of a scene's camera, and its distance to the point that it looks at.
 
-    A path takes its centre, distance and elevation from here where its own settings are None.
+    If a path's own centre, distance or elevation is None, the path takes it from here.
 
     T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres.
     distance_m : metres along the camera's axis.
@@ -140,7 +140,7 @@ class Turntable(CameraPath):
 class Dome(CameraPath):
     """Views spread evenly over a zone of a sphere, all looking at its centre.
 
-    The views form a Fibonacci lattice: their heights increase in equal steps, and their azimuth by the golden angle
+    The views form a Fibonacci lattice: heights increase in equal steps, azimuths in steps of the golden angle
     (Gonzalez: "Measurement of areas on a sphere using Fibonacci and latitude-longitude lattices", 2010).
 
     Parameters
@@ -252,7 +252,7 @@ class PoseList(CameraPath):
     Raises
     ------
     ValueError
-        No pose, another shape, or a matrix that is not rigid.
+        There is no pose, the array has another shape, or a matrix is not rigid.
 
     Examples
     --------
@@ -289,7 +289,7 @@ class PoseList(CameraPath):
 def _place(
     centre_m: tuple[float, float, float] | None, distance_m: float | None, viewpoint: Viewpoint | None
 ) -> tuple[Array, float]:
-    """Centre (3,) and distance of a path, metres, those of the viewpoint where they are None."""
+    """Centre (3,) and distance of a path, metres; the viewpoint gives those that are None."""
     if viewpoint is None and (centre_m is None or distance_m is None):
         raise ValueError("expected a path with centre_m and distance_m, or a viewpoint that gives them; got neither.")
     centre = viewpoint.centre_m if centre_m is None else np.asarray(centre_m)  # type: ignore[union-attr]
@@ -297,7 +297,7 @@ def _place(
 
 
 def _elevation(elevation_deg: float | None, viewpoint: Viewpoint | None) -> float:
-    """Elevation of a path in degrees, that of the viewpoint where it is None."""
+    """Elevation of a path in degrees; if it is None, that of the viewpoint."""
     if elevation_deg is not None:
         return elevation_deg
     if viewpoint is None:

@@ -33,7 +33,7 @@ class Experiment:
     ----------
     scene : path of a Mitsuba 3 XML scene or of a mesh (PLY, OBJ, GLB ...), or the name of a scene that the package
         contains, such as "tabletop".
-    material : material class of a bare mesh; None: matte. A scene has materials of its own, so it is refused there.
+    material : material class of a bare mesh; None: matte. Refused for a scene, which has materials of its own.
     unit_m : metres per unit of a bare mesh, 0.001 for millimetres; None: 1. Refused for a scene.
     width, height : size of the camera's image, pixels; None: as in the scene. The field of view is kept.
     spp : light paths per pixel. None: 8, and up to `max_spp` where the renderer's noise would not be small against
@@ -117,8 +117,8 @@ class Experiment:
 def load_experiment(path: str | Path) -> Experiment:
     """The experiment that a TOML file describes.
 
-    A relative path of the scene counts from the directory of the file. If there is no such file, the name may be that
-    of a scene that the package contains. `examples/tabletop.toml` shows the common keys.
+    A relative path of the scene counts from the directory of the TOML file. If no file has this path, it may be the
+    name of a scene that the package contains. `examples/tabletop.toml` shows the common keys.
 
     Raises
     ------

@@ -37,8 +37,8 @@ class ScanSettings:
         `rangesim.experiment.Experiment`.
     spp : light paths per pixel; None: the default of `rangesim.transport`.
     instrument : Instrument, whose camera and emitter move together.
-    path : CameraPath. What it does not state comes from the scene's camera.
-    registration : "known": the poses are those of the path. "unknown": they are found from the readings
+    path : CameraPath. The scene's camera gives what the path does not state.
+    registration : "known": the fusion uses the poses of the path. "unknown": it uses poses found from the readings
         (`rangesim.fusion.multiway_registration.align`).
     voxel_m : edge of a voxel, metres; None: 1.5 times the distance between readings.
     truncation_m, weights, min_weight : as for `rangesim.fusion.truncated_average.fuse`.
@@ -96,7 +96,7 @@ class ScanSettings:
 def load_scan_settings(file: str | Path) -> ScanSettings:
     """The scan that a TOML file describes.
 
-    The file has the fields of `ScanSettings`. `[instrument]` and `[path]` are tables; that of the path has a `type`. A
+    The file has the fields of `ScanSettings`. `[instrument]` and `[path]` are tables; `[path]` has a key `type`. A
     relative path of the scene counts from the directory of the file.
 
     Raises

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fusion of many views to one surface, its error, and the volume that the views never see (docs/fusion.md).
 
-Names are loaded when they are first used.
+Python loads each name when it is first used.
 
 Examples
 --------
-Views of a ball from six sides, computed in closed form, become a mesh that is right to a fraction of a voxel:
+Views of a ball from six sides, computed in closed form, become a mesh whose error is a fraction of a voxel:
 
 >>> import numpy as np
 >>> import trimesh

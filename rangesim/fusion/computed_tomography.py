@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Computed tomography: parallel-beam projections of solids, and their filtered back-projection.
 
-Its volumes are the dense counterpart of range data, which end at the first opaque surface. By the law of Beer and
+It measures volumes inside and out, while range data end at the first opaque surface. By the law of Beer and
 Lambert, a ray in the direction (cos a, sin a, 0) at the distance s from the axis of rotation measures
 
     I = I0 exp(-p),    p(a, s, z) = integral of mu along the ray
@@ -10,8 +10,8 @@ Lambert, a ray in the direction (cos a, sin a, 0) at the distance s from the axi
 unit. The axis is parallel to z and passes through the centre of the voxels [nx // 2, ny // 2]. s is measured along
 (-sin a, cos a). This is the convention of scikit-image, whose `iradon` filters and back-projects each slice.
 
-Scatter, and the spectrum of an X-ray tube with its beam hardening, are not simulated. In a real machine they cause
-cupping and streaks. X-rays go straight through glass and mirrors, which count by their attenuation alone.
+The module does not simulate scatter, nor the spectrum of an X-ray tube and its beam hardening. In a real machine they
+cause cupping and streaks. X-rays go straight through glass and mirrors, which count by their attenuation alone.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from rangesim.triangle_mesh import TriangleMesh
 FILTERS = ("ramp", "shepp-logan", "cosine", "hamming", "hann")
 """Names of the filters of scikit-image's `iradon`. The ramp is exact; the others have less noise and resolution."""
 RAYS_AT_ONCE = 1 << 19
-"""Count of rays that are cast in one call, so that a call needs about a hundred megabytes."""
+"""Number of rays that are cast in one call. A call then needs about a hundred megabytes."""
 MAX_SHIFTS = 8
-"""Largest number of times that a ray which meets an edge of the mesh is shifted. A shifted ray rarely meets another
-edge; the number is limited because rays through a hole in the mesh would be shifted forever."""
+"""A ray that meets an edge of the mesh is shifted; this is the largest number of shifts. A shifted ray rarely meets
+another edge. The number has a limit, because a ray through a hole in the mesh would be shifted forever."""
 SHIFT_VOXELS = 1e-3
 """Length of such a shift in voxels, chosen far above the rounding of single precision and far below the resolution."""
 MIN_COUNT = 0.5
-"""Photons that replace a count of 0, as the logarithm of 0 is infinite: half-way between none and one photon."""
+"""Number of photons that replaces a count of 0, because the logarithm of 0 is infinite: half-way between 0 and 1."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,8 +63,8 @@ class Sinogram(ShortRepr):
 def sampling_angles(grid: VoxelGrid) -> np.ndarray:
     """Angles that sample half a turn evenly: (n_angles,) float64, radians.
 
-    Their number is pi / 2 times the pixels of a row. Then the resolution at the edge of a slice is the same along the
-    edge as across it (Kak, Slaney 1988, section 5.1).
+    Their number is pi / 2 times the pixels of a row. Then, at the edge of a slice, the resolution along the edge
+    is the same as across it (Kak, Slaney 1988, section 5.1).
 
     Examples
     --------

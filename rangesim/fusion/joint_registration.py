@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint registration: the poses of many views are refined together, from all their readings at once.
 
-In the registration of two clouds that overlap in part, a point outside the overlap finds its partner on the border of
-the other cloud, and pulls the borders together. Here a point p of view i finds its partner by projection to view j
-instead (Blais, Levine 1995), where the border of the readings is known. All pairs of views are fitted in one system
-(Neugebauer 1997), point to plane:
+In the usual registration of two clouds that overlap in part, a point outside the overlap finds its partner on the
+border of the other cloud, and pulls the borders together. This module instead projects a point p of view i into view j
+to find its partner (Blais, Levine 1995). There the border of the readings is known. One system of equations fits all
+pairs of views, point to plane (Neugebauer 1997):
 
     minimise  sum over i, j, p  rho( n_j . (T_j^-1 T_i p - q_j) )
 
@@ -27,8 +27,8 @@ from rangesim.rig import Array, Intrinsics
 from rangesim.robust_scale import sigma_from_median
 
 POINTS_PER_VIEW = 4000
-"""Number of random readings of each view that are fitted: twice as many take twice the time, and make the error of a
-pose smaller by the root of two."""
+"""Number of random readings of each view that the fit uses. Twice as many take twice the time, and divide the error of
+a pose by the root of two."""
 BORDER_PX = 3
 """Distance in pixels from a border or a failed pixel within which readings are not used, because normals and
 interpolated depths are wrong there."""
@@ -44,7 +44,7 @@ MAX_ROUNDS = 30
 fit whose poses go to and fro ends, too."""
 CONVERGED = 1e-7
 """Largest entry of a step at which the fit ends: radians, and metres as a fraction of the size of the scene. It is
-chosen far below the errors of the poses, so a larger value would save a step or two."""
+far below the errors of the poses; a larger value would save only a step or two."""
 
 
 class _View(NamedTuple):
@@ -94,7 +94,7 @@ def refine_jointly(images: Sequence[RangeImage], poses: Array, reach_m: float, s
     Raises
     ------
     ValueError
-        The readings do not fix the poses: surfaces slide on each other, or a view has no partners in the others.
+        The readings do not determine the poses: surfaces slide on each other, or no other view has partners of a view.
 
     Examples
     --------

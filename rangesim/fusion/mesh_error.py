@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Error of a measured surface against the true one: accuracy, completeness, F-score, Chamfer distance.
 
-Points are sampled evenly over the area of each surface. Their distances are taken to the *triangles* of the other
-surface, not to its samples, because distances between samples are never below the spacing of the samples.
+Points are sampled evenly over the area of each surface. Their distances are those to the *triangles* of the other
+surface. Distances to its samples would be too large, because samples have a spacing.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def surface_error(
     Parameters
     ----------
     measured, truth : meshes, metres, in the same coordinates.
-    threshold_m : metres, distance up to which the measured surface counts as right (precision), and the true surface as
-        found (recall).
+    threshold_m : metres, distance up to which the measured surface counts as correct (precision), and the true surface
+        as found (recall).
     samples : number of points on each surface.
     seed : seed of the random points; the same seed gives the same points.
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Multiway registration: unknown poses of the views of a scan, from pairs of views and a pose graph over all of them.
+"""Multiway registration: finds the poses of a scan's views, from pairs of views and a pose graph over all of them.
 
-1. Planes that contain more than half of a view's readings (a table, a wall) are removed, because a plane slides on
-   itself.
+1. Planes that contain more than half of a view's readings (a table, a wall) are removed, because a plane can
+   slide on itself, so that it fits in many poses.
 2. Chain: each view is registered to the view before it, without a first guess (`rangesim.geometry.register`). If that
    fails, the two views before that one are tried.
-3. Loops: every other pair of views that overlaps according to the chain is refined by `rangesim.geometry.icp`. A pair
-   that ends far from the chain has found another surface, and is left out.
+3. Loops: every other pair of views that overlaps according to the chain is refined by `rangesim.geometry.icp`. If
+   the pose of a pair ends far from the chain, the pair fits a wrong surface and is left out.
 4. Pose graph: the poses that fit all pairs best, each weighted with its information matrix (Choi, Zhou, Koltun: "Robust
    reconstruction of indoor scenes", CVPR 2015; Open3D's `global_optimization`):
 
@@ -65,7 +65,7 @@ NEAR_SPACINGS = 6.0
 views. It is large because errors add up along the chain."""
 MIN_LOOP_OVERLAP = 0.5
 """Smallest overlap of a loop, as a fraction like `MIN_OVERLAP`. Pairs with less overlap pull each other's borders
-together, and add little, because the chain holds the views already."""
+together, and add little, because the chain already links the views."""
 MAX_DISAGREEMENT_SPACINGS = 2.0
 """Largest disagreement of a pair with the pose graph, in spacings of the points, root mean square over the pair's
 points. A larger limit keeps wrong loops; a smaller one leaves out good ones, because ICP is exact to a fraction of the
@@ -129,9 +129,9 @@ class Alignment(ShortRepr):
 def align(scan: Scan, spacing_m: float | None = None, *, seed: int = 0) -> Alignment:
     """Alignment of a scan: the poses of its views, found from their readings alone.
 
-    The head of this module lists the steps. The poses of the images are not used, except the first one. Views must come
-    in the order of a walk, each overlapping the view before by a third or more. If the object turns, everything that
-    does not turn with it (a table) must be removed from the images.
+    The docstring of this module lists the steps. `align` uses no pose of the images, except the first one. Views must
+    come in the order of a walk, each overlapping the view before by a third or more. If the object turns, everything
+    that does not turn with it (a table) must be removed from the images.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ class PoseErrors(NamedTuple):
 
 
 def pose_errors(poses: ArrayLike, true_poses: ArrayLike) -> PoseErrors:
-    """Errors of poses against the true poses, whatever the axes of the two worlds are.
+    """Errors of poses against the true poses. The two may have different world coordinates.
 
     The two frames are aligned by the mean rotation of T_true T^-1 (Moakher 2002: the polar factor of the sum), and by
     the mean difference of the camera centres.

@@ -142,7 +142,7 @@ def reading_weights(image: RangeImage, weighting: Weighting = "confidence") -> n
         The standard deviation of photon counts makes the inverse variance of a reading proportional to the confidence.
         In time of flight, the standard deviation grows with z. In triangulation it grows with z^2, and there the
         confidence has a factor 1 / z^2 of its own. The cosine is the weight of Curless and Levoy (1996) for slanted
-        surfaces. Readings without a normal have no neighbours, as ghosts and flying pixels do; they get 0.
+        surfaces. Readings without a normal, such as ghosts and flying pixels, have no neighbours; they get 0.
 
     Only ratios of weights matter: `fuse` divides them by the median of all views and limits them to 1.
 
@@ -204,7 +204,7 @@ def average_signed_distances(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weighted truncated average D of the signed distances of several views, at the centres of a grid.
 
-    The formula stands at the head of this module.
+    The formula is in the docstring of this module.
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 """Fractions of a scene's surface and volume that some views saw, by comparison with the voxelised truth.
 
 A range sensor measures the first surface on each line of sight. The space in front of it is known to be free. The space
-behind it, and with it the inside of objects, is never seen. A sensor that looks through glass takes the glass for free
+behind it, and with it the inside of objects, is never seen. A sensor that looks through glass counts the glass as free
 space.
 """
 
@@ -31,7 +31,7 @@ MIN_VIEW_COSINE = 0.05
 """Smallest cosine of the angle of incidence, no unit, at which a view may see a surface: up to 87 degrees. At a larger
 angle, a pixel covers so much of a face that its reading says nothing about a single place."""
 VOXELS_AT_ONCE = 1 << 21
-"""Number of voxels that are compared with the views in one step, so that a step needs some hundred megabytes."""
+"""Number of voxels that are compared with the views in one step. A step then needs some hundred megabytes."""
 
 
 class VoxelState(IntEnum):
@@ -55,7 +55,7 @@ class SeenOfShape:
     surface : fraction of its true area that was measured from outside, to within the tolerance.
     volume_surface : fraction of its true volume in voxels with a measured surface.
     volume_never : fraction of its true volume that was never seen.
-    volume_free : fraction of its true volume that was taken for free space. The sensor looked through it, or its
+    volume_free : fraction of its true volume that counted as free space, because the sensor looked through it or its
         readings are wrong.
     area_m2, volume_m3 : true area and volume; 0 m3 for a shape that is not closed.
     """

@@ -14,14 +14,14 @@ from rangesim.settings.config import ShortRepr, shown
 from rangesim.triangle_mesh import TriangleMesh
 
 TOUCHING = 1e-5
-"""Distance below which a point lies on a solid's surface, as a fraction of the solid's extent. It is above
+"""A point nearer to a solid's surface than this fraction of the solid's extent lies on the surface. The value is above
 the rounding of Open3D (1e-7), because points on the surface must not count as inside or outside."""
 SAMPLES = 2000
-"""Count of points on a surface, besides its vertices, by which crossings with another solid are found. A crossing that
-contains none of them is not found; twice as many points take twice the time."""
+"""Number of points on a surface, besides its vertices, that are tested to find where it crosses another solid. A
+crossing that contains none of them is not found; twice as many points take twice the time."""
 VOTES = 3
-"""Count of rays by whose majority Open3D decides whether a point is inside, because a single ray that hits an edge may
-be wrong. The count is odd so that there is always a majority."""
+"""Number of rays for each point. The majority decides whether the point is inside, because a single ray that hits an
+edge may be wrong. The count is odd so that there is always a majority."""
 POINTS_AT_ONCE = 1 << 20
 """Number of points that are tested in one call, so that they take about 12 MB."""
 
@@ -30,8 +30,8 @@ POINTS_AT_ONCE = 1 << 20
 class Solid(ShortRepr):
     """Closed surface and the matter inside it.
 
-    Where one solid contains another, the inner one counts. So a hollow ball is a ball and a smaller ball of attenuation
-    0 inside it.
+    Where one solid contains another, the inner one counts. So you describe a hollow ball as a ball with a smaller ball
+    of attenuation 0 inside it.
 
     Parameters
     ----------

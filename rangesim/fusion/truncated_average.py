@@ -52,8 +52,8 @@ SPACING_STEP = 7
 """Step in pixels between the readings whose median depth gives the distance between readings. More readings would only
 cost time, because the check of `voxel_m` is a coarse one."""
 WIDE_TRUNCATION_VOXELS = 8.0
-"""Truncation distance in voxels beyond which blocks are searched around fewer points, so that the search stays short;
-the search radius is then larger by their distance, so no block is missed."""
+"""If the truncation distance is more than this number of voxels, blocks are sought around fewer points, so that the
+search stays short. The search radius then grows by the distance of these points, so no block is missed."""
 MAX_VOXEL_FRACTION = 0.5
 """Largest edge of a voxel, as a fraction of the extent of the readings, because less than two voxels show no shape."""
 MIN_VOXEL_SPACINGS = 0.1
@@ -63,8 +63,8 @@ MIN_VIEW_FRACTION = 0.05
 """Default of `min_weight`, in typical readings, as a fraction of the number of views, see `MAX_MIN_WEIGHT`."""
 MAX_MIN_WEIGHT = 1.0
 """Largest default of `min_weight`, as a count of typical readings; 20 and more views reach it. Measured among glass and
-mirrors (docs/fusion.md, "Weights"): without a least weight, there are 741 cm2 of ghosts and 75 % of the matte surface;
-with 1, 1.7 cm2 and 69 %; with 2, none and 61 %."""
+mirrors (docs/fusion.md, "Weights"): without a least weight, the mesh has 741 cm2 of ghosts and 75 % of the matte
+surface; with a least weight of 1, 1.7 cm2 and 69 %; with 2, no ghosts and 61 %."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,7 +74,7 @@ class FusedSurface(ShortRepr):
     mesh : TriangleMesh, metres, world; normals point to the side of the cameras.
     voxel_m, truncation_m : metres, edge of a voxel and truncation distance.
     vertex_weights : (n,) float32, sum of the weights of the readings at each vertex; 1 is a typical reading.
-    min_weight : least sum of weights of the voxels that the surface was taken from.
+    min_weight : least sum of weights that a voxel of the surface has.
     voxels : number of voxels in memory.
     """
 
@@ -97,7 +97,7 @@ def fuse(
 ) -> FusedSurface:
     """Mesh of the surface that several range images show, each with its own pose `T_world_camera`.
 
-    The formula and its sources stand in `rangesim.fusion.sdf`. Wrong readings on glass and mirrors differ from view to
+    The formula and its sources are in `rangesim.fusion.sdf`. Wrong readings on glass and mirrors differ from view to
     view: they are faint, or no other view confirms them, or other views look through them. So their weight stays below
     `min_weight`, and the mesh has holes there. If many views have the same wrong reading, such as a table seen through
     glass, this reading becomes a surface like any other.
@@ -366,10 +366,10 @@ class _Blocks:
 
 
 def _points_for_blocks(points: np.ndarray, voxel_m: float, truncation_m: float) -> tuple[np.ndarray, float]:
-    """One of the points in each small cube, which need about the same blocks, and an addition to the search radius.
+    """One of the points in each small cube, and an addition to the search radius.
 
-    A cube is two voxels wide, or a quarter of the truncation distance if that is many voxels. In the second case alone,
-    the addition (metres) is above 0.
+    The points in a cube need about the same blocks. A cube is two voxels wide, or a quarter of the truncation distance
+    if that is many voxels. Only in the second case, the addition (metres) is above 0.
     """
     is_wide = truncation_m > WIDE_TRUNCATION_VOXELS * voxel_m
     if len(points) < 10_000 and not is_wide:
@@ -385,7 +385,7 @@ def _points_for_blocks(points: np.ndarray, voxel_m: float, truncation_m: float) 
 def _farthest(z: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Largest depth of the readings in each tile: (k, l) float64, metres; -infinity for a tile without readings.
 
-    Readings with a positive weight count, and the pixels next to them, from which depths may be interpolated.
+    Readings with a positive weight count. The pixels next to them count too, because depths may be interpolated there.
     """
     from scipy.ndimage import maximum_filter
 
@@ -452,9 +452,9 @@ def _add_view(  # type: ignore[no-untyped-def]
 
 @routine
 def _is_hidden(key, voxel_m, truncation_m, R, t, camera, farthest, shape):  # type: ignore[no-untyped-def]
-    """Whether no reading of a view concerns a block; False in doubtful cases.
+    """Whether no reading of a view has influence on a block; False in doubtful cases.
 
-    The block is then more than the truncation distance behind all readings near it, or outside the image. The test uses
+    Such a block is more than the truncation distance behind all readings near it, or outside the image. The test uses
     the sphere around the block.
     """
     half = (BLOCK - 1) / 2 * voxel_m

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The mathematics of 3D vision around a range sensor: planes, cameras, two views, triangulation, poses, registration.
 
-Functions take and return NumPy arrays; names load on first use. docs/geometry.md describes the modules.
+Functions take and return NumPy arrays. Names load when first used. docs/geometry.md describes the modules.
 
 Used by: rangesim.calibration, decoding, fusion and multiview.
 

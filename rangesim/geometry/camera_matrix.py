@@ -152,7 +152,7 @@ def decompose_zero_skew(P: ArrayLike) -> CameraParts:
     Raises
     ------
     ValueError
-        P is refused by `decompose`; or A12 differs from x0 y0, which means that P has skew: use `decompose`.
+        `decompose` refuses P; or A12 differs from x0 y0, which means that P has skew: use `decompose`.
 
     Examples
     --------
@@ -330,7 +330,7 @@ def _finite_camera(P: ArrayLike) -> Array:
 
 
 def _check_invertible(block: Array) -> None:
-    rows = block / np.maximum(np.linalg.norm(block, axis=-1, keepdims=True), 1e-300)  # pixels against metres
+    rows = block / np.maximum(np.linalg.norm(block, axis=-1, keepdims=True), 1e-300)  # P mixes pixels and metres
     if np.any(np.abs(np.linalg.det(rows)) <= ROUNDING**1.5):
         raise ValueError(
             "expected a finite camera, got P with a singular left 3 x 3 block: its centre lies at infinity (an "

@@ -3,8 +3,8 @@
 
 A pose has 6 parameters and each point gives two equations. Three points leave up to four poses, so four points are
 needed. A second, mirrored tilt can explain the image of a plane nearly as well (Schweighofer, Pinz: "Robust pose
-estimation from a planar target", PAMI 2006). So every pose is reported that the noise does not distinguish from the
-best one.
+estimation from a planar target", PAMI 2006). So the result names every pose that the noise does not distinguish from
+the best one.
 
 Used by: rangesim.calibration.zhang and time_of_flight; rangesim.multiview.incremental_reconstruction and
 sliding_window.
@@ -43,7 +43,7 @@ smaller one may miss the second tilt of a target that is not quite flat."""
 
 MAX_ROTATION_DEVIATION = 0.3
 """Largest standard deviation of the rotation, in radians; a pose that is known less well is refused. At 17 degrees the
-linear covariance no longer holds; nobody measured a closer limit."""
+linear covariance no longer holds. Closer limits were not measured."""
 
 TRIPLES = 20
 """Number of triples of points that P3P solves to find starts. More triples cost time and help only where the other
@@ -54,8 +54,8 @@ STARTS = 6
 to four solutions and a plane two, so that six leave room for both."""
 
 SAME_POSE = 1e-3
-"""Difference in radians, and as a ratio to the distance, up to which two minima are one and the same pose, because
-descents to one minimum end far nearer to each other."""
+"""Difference in radians, and as a ratio to the distance, up to which two minima count as the same pose. Descents to one
+minimum end much nearer to each other."""
 
 SAME_START = 0.03
 """Difference in radians, and as a ratio to the distance, up to which two starts count as one, because the descents from
@@ -72,7 +72,7 @@ class CameraPose:
     covariance : (6, 6) float64, covariance of (rotation vector applied after R, rad; t, metres).
     noise_px : standard deviation of one coordinate of a pixel, as given or estimated from the residuals.
     inliers : (n,) bool, the pairs that agree with the pose.
-    others : further poses (4, 4) that the noise does not distinguish from this one, best first; often empty.
+    others : other poses (4, 4) that the noise does not distinguish from this one, the best first; often empty.
 
     Examples
     --------

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth from projector coordinates: where a camera ray meets the projector's light plane, or comes nearest to its ray.
+"""Depth from projector coordinates: the point where a camera ray meets a light plane or a ray of the projector.
 
 The ray of a camera pixel is exact, because the pixel is the place where its light was measured. The projector
 coordinate decoded there has an error. So the optimal triangulation of camera and projector moves only the projector
 coordinate, to the nearest place on the epipolar line of the ray. The optimal triangulation of two cameras
-(`two_view_triangulation`) moves the pixels in both views; here it would give the depth of a ray that was not measured.
+(`two_view_triangulation`) moves the pixels in both views; here this would give the depth of another ray than that of
+the pixel.
 
 Used by: rangesim.decoding.triangulation.
 """
@@ -37,8 +38,8 @@ class ProjectorTriangulation:
         one axis was decoded.
     relative_error : (n,) float64, error of z, as a fraction of z, that an error of one projector pixel causes:
         |dz / dx_p| / z, in 1 / px.
-    behind_px : (n,) float64, where the rays meet behind a device, the approximate distance in projector pixels from the
-        coordinate to one that would make them parallel; 0 elsewhere.
+    behind_px : (n,) float64. If the rays meet behind a device: roughly the distance, in projector pixels, from the
+        coordinate to one that would make the rays parallel. Else 0.
 
     Examples
     --------

@@ -23,11 +23,11 @@ from rangesim.geometry.correspondences import ROUNDING, Array
 Model = TypeVar("Model")
 
 INLIER_PROBABILITY = 0.99
-"""Probability that a correct correspondence counts as an inlier, as a fraction. It sets the threshold of the error and
-was chosen as a compromise: a smaller value loses correct pairs, a larger one lets more wrong pairs in."""
+"""Probability that a correct correspondence counts as an inlier, as a fraction. It sets the threshold of the error. The
+value is a compromise: a smaller one loses correct pairs, a larger one lets more wrong pairs in."""
 
 SIGNIFICANCE = 1e-5
-"""Probability, as a fraction, with which a test may take degenerate data for sound data, or chance for a model. For
+"""Probability, as a fraction, with which a test may mistake degenerate data for sound data, or chance for a model. For
 planes and rotations it is only nominal, because a fundamental matrix fits their noise better than its number of
 parameters says: at a level of 1e-3, up to five times as many passed (measured)."""
 
@@ -36,8 +36,8 @@ MAX_ROUNDS = 20
 back ends the rounds sooner, so this bound is only for sets that keep changing."""
 
 MAX_EXCESS = 3.0
-"""Largest ratio of the residuals to the stated noise. Nobody measured it: three times leaves room for a noise that is
-stated too small, and larger residuals come from wrong pairs, which no covariance accounts for."""
+"""Largest ratio of the residuals to the stated noise. Other values were not measured. Three leaves room for a noise
+that is stated too small; larger residuals come from wrong pairs, and a covariance does not describe those."""
 
 
 def usac(threshold_px: float, seed: int) -> Any:
@@ -168,7 +168,7 @@ def simpler_model_suffices(
 def is_as_likely(cost: float, least: float, freedom: int, noise_px: float | None, rounding: float) -> bool:
     """Whether the data also fit a second model of the same kind, with a sum of squares `cost` above the best, `least`.
 
-    Two such models, for example the two poses of a plane, see different components of the noise, so that their sums of
+    Different components of the noise act on two such models, for example on the two poses of a plane. So their sums of
     squares are nearly independent. The test is chi^2 with all degrees of freedom, or F if the noise is unknown.
     """
     if noise_px is not None:
@@ -179,9 +179,9 @@ def is_as_likely(cost: float, least: float, freedom: int, noise_px: float | None
 def odds_are_open(cost: float, least: float, freedom: int, noise_px: float | None, rounding: float) -> bool:
     """Whether the posterior odds of a second model against the best one exceed `SIGNIFICANCE`.
 
-    The second model has the sum of squares `cost`, the best one `least`. The odds are exp(-(cost - least) / 2 variance)
-    if the noise is known, and (least / cost)^(freedom / 2), those of the profile likelihood, if it is unknown. This
-    holds for models that do not also estimate points in space.
+    The second model has the sum of squares `cost`, the best one `least`. If the noise is known, the odds are
+    exp(-(cost - least) / 2 variance). If it is unknown, they are (least / cost)^(freedom / 2), those of the profile
+    likelihood. This holds for models that do not also estimate points in space.
     """
     if noise_px is not None:
         log_odds = -(cost - least) / (2 * noise_px**2)
@@ -198,7 +198,7 @@ def refuse_misfit(cost: float, freedom: int, noise_px: float | None, model: str)
     ----------
     cost : sum of squares of the residuals in px^2.
     freedom : degrees of freedom: the number of residuals less that of parameters.
-    noise_px : standard deviation of a coordinate; None if it is unknown, which is never refused.
+    noise_px : standard deviation of a coordinate; None if it is unknown, and then nothing is refused.
     model : name of the model for the message.
     """
     if noise_px is None or freedom <= 0:
@@ -218,7 +218,7 @@ def spread(points: Array) -> float:
 
 
 def rounding_of(points: Array) -> float:
-    """The size in pixels up to which residuals of points (n, 2) are rounding."""
+    """The size in pixels up to which residuals of points (n, 2) count as rounding."""
     return ROUNDING * max(spread(points), float(np.abs(points).max()) * 1e-3)
 
 

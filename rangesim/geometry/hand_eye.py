@@ -2,8 +2,8 @@
 """Hand-eye calibration: the pose of a camera on a robot's gripper, or beside the robot, from A X = X B.
 
 The camera sees a target in n poses of the robot. If the camera is on the gripper (eye in hand), T_base_gripper X
-T_camera_target = T_base_target is the same in all poses. If it stands beside the robot and the target is on the gripper
-(eye to hand), T_gripper_base X T_camera_target = T_gripper_target is the same. Between two poses this gives
+T_camera_target = T_base_target is the same in all poses. If the camera stands beside the robot and the target is on the
+gripper (eye to hand), T_gripper_base X T_camera_target = T_gripper_target is the same. Between two poses this gives
 A X = X B. The start is that of Park, Martin: "Robot sensor calibration: solving AX = XB on the Euclidean group", 1994;
 then all residuals are minimised together. The Python interface of OpenCV 4 has `calibrateHandEye`, but that of OpenCV 5
 does not, so the method is written here.
@@ -24,8 +24,8 @@ from rangesim.geometry.least_squares import minimise
 from rangesim.rig import pose
 
 MAX_TURN_RAD = np.radians(170)
-"""Largest rotation, in radians, of the motions that the start uses, because near 180 degrees noise flips the direction
-of the axis. It leaves 10 degrees for the noise; a smaller value would waste motions."""
+"""Largest rotation, in radians, of the motions that the start uses. Near 180 degrees, noise flips the direction of the
+axis. The value leaves 10 degrees for the noise; a smaller one would waste motions."""
 
 MIN_TURN_RAD = 1e-6
 """Root-mean-square rotation about an axis, in radians, up to which the robot did not turn about it at all. It is far

@@ -54,8 +54,8 @@ class Homography:
     matrix : (3, 3) float64, H with Frobenius norm 1 and positive determinant.
     covariance : (9, 9) float64, covariance of the entries of `matrix`, row by row; rank 8, because its norm is fixed.
         NaN if the noise is unknown.
-    noise_px : standard deviation of one coordinate of the points, as given, or estimated from the residuals. NaN with
-        four pairs, which leave no residuals.
+    noise_px : standard deviation of one coordinate of the points, given or estimated from the residuals. NaN with four
+        pairs, because they leave no residuals.
     inliers : (n,) bool, the pairs that agree with H.
 
     Examples
@@ -135,8 +135,8 @@ def fit_homography(
     Parameters
     ----------
     first, second : (n, 2) corresponding points in pixels, n >= 4.
-    noisy : "second" for exact points `first`, such as those of a printed board. It minimises the transfer error
-        sum |x' - H x|^2. "both" for noise of the same size in both images. It minimises
+    noisy : "second" if the points `first` are exact, such as those of a printed board. It minimises the transfer error
+        sum |x' - H x|^2. "both" if both images have noise of the same size. It minimises
         sum e^T (I + A A^T)^-1 e with e = x' - H x and A = d(H x)/dx, which is Sampson's first-order form of the
         reprojection error (HZ 4.2.6).
     noise_px : standard deviation of one coordinate; None estimates it from the residuals, which needs five pairs.
@@ -430,8 +430,8 @@ def _maximum_likelihood(start: Array, a: Array, b: Array, second_per_first: floa
     def residuals(h: Array) -> tuple[Array, Array]:
         mapped, by_matrix, by_point = _transfer(h, a)
         whitening = _whitening(by_point, ratio, noisy)
-        # The derivative of the whitening is left out, as in iteratively reweighted least squares: it is multiplied by
-        # small residuals, so that it changes the path of the descent but hardly its end.
+        # The derivative of the whitening is left out, as in iteratively reweighted least squares. It is multiplied by
+        # small residuals, so it changes the path of the descent but hardly its end.
         values = (whitening @ (b - mapped)[:, :, None])[..., 0]
         return values.ravel(), -(whitening @ by_matrix @ _tangent(h)).reshape(-1, 8)
 

@@ -52,7 +52,7 @@ degeneracy is found; a larger value also refuses weakly determined parameters.""
 
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[State]):
-    """A state at which a sum of squares is evaluated or least, with the residuals and their derivatives there.
+    """A state, for example that of the least sum of squares, with the residuals and their derivatives there.
 
     Attributes
     ----------

@@ -277,11 +277,11 @@ def classify(H: ArrayLike, tolerance: float = 1e-9, extent: float = 1.0) -> Plan
     Parameters
     ----------
     H : (3, 3), x' = H x; any multiple is the same map.
-    tolerance : how far H may be from a more special kind and still count as that kind, as a fraction. H counts as an
-        affinity where the scale h31 x + h32 y + h33 changes by less than this over the region of radius `extent`. It
-        counts as a similarity where, in addition, both singular values of its upper left 2 x 2 block differ by less
-        than this, and as an isometry where they also differ from 1 by less. The default asks for exact maps; state a
-        larger tolerance for an estimated map, which has errors.
+    tolerance : fraction by which H may differ from a more special kind and still count as that kind. H counts as an
+        affinity if the scale h31 x + h32 y + h33 changes by less than this over the region of radius `extent`. It
+        counts as a similarity if, in addition, both singular values of its upper left 2 x 2 block differ by less
+        than this, and as an isometry if they also differ from 1 by less than this. The default asks for exact maps;
+        state a larger tolerance for an estimated map, which has errors.
     extent : radius about the origin of the region where the map is used, in units of the points. With it the test of
         the projective part does not depend on these units.
 
@@ -414,8 +414,8 @@ def metric_rectification(
     Raises
     ------
     ValueError
-        There are too few pairs, pairs repeat each other's directions, or no plane can have such pairs (C is not the
-        image of the dual conic of circular points).
+        There are too few pairs, some pairs have the same directions as others, or no plane can have such pairs (C is
+        not the image of the dual conic of circular points).
 
     Examples
     --------
@@ -492,7 +492,7 @@ def _sending_to_infinity(line: Array) -> Array:
         raise ValueError("expected a line, got (0, 0, 0).")
     if abs(line[2]) > ROUNDING * np.abs(line).max():
         return np.array([[1.0, 0, 0], [0, 1.0, 0], line / line[2]])
-    third = line / np.linalg.norm(line)  # the line goes through the origin: any two other rows will do
+    third = line / np.linalg.norm(line)  # the line goes through the origin: any two other rows are right
     _, _, axes = np.linalg.svd(third[None])
     return np.stack([axes[1], axes[2] * np.sign(np.linalg.det(np.stack([axes[1], axes[2], third]))), third])
 

@@ -25,7 +25,7 @@ from rangesim.rig import pose
 from rangesim.robust_scale import sigma_from_median
 
 MIN_POINTS = 20
-"""Least number of different points of a cloud: as many as `NORMAL_NEIGHBOURS`, so that every normal has all its
+"""Least number of different points of a cloud. It is equal to `NORMAL_NEIGHBOURS`, so that every normal has all its
 neighbours."""
 
 PARTNER_SPACINGS = 3.0
@@ -76,13 +76,13 @@ ten times as dense as the target with noise above the target's spacing; -0.1 to 
 askew and for parts 5 or 10 % off in scale."""
 
 FAR_EXTENTS = 5.0
-"""Distance of a cloud from the origin, as a ratio to its extent, beyond which it is moved to the origin before it is
-solved. At 5 extents a turn of 0.2 rad about the origin moves a cloud by its whole extent, so that steps of ICP are
-neither small nor exact. Nearer clouds stay where they are, so that their results stay the same to the last digit."""
+"""Distance of a cloud from the origin, as a ratio to its extent, beyond which the cloud is moved to the origin before
+the registration. At 5 extents a turn of 0.2 rad about the origin moves a cloud by its whole extent, so steps of ICP are
+neither small nor exact. Nearer clouds are not moved, so that their results stay the same to the last digit."""
 
 SLIDE_SPACINGS = 6.0
 """Step, in spacings, by which a result of `icp` is slid along the surface to look for other poses. ICP then starts
-there with the same reach, so that steps twice as long would leave gaps."""
+there with the same reach; steps twice as long would leave gaps."""
 
 MAX_SLIDES = 6
 """Largest number of such steps to either side, because each takes one run of ICP. If these steps do not cover the
@@ -112,8 +112,8 @@ class Registration:
     constraint : ratio of the smallest to the largest eigenvalue of the normal equations, with turns in units of the
         size of the cloud. A small ratio means that the surfaces can slide on each other.
     agreement : mean over all source points of 1 - (d / spacing)^2, but at least -1, where d is the distance from the
-        partner along its normal; a point without a partner counts 0. So a pose with two surfaces beside each other
-        counts less than one that leaves them apart. Poses are compared by it.
+        partner along its normal; a point without a partner counts 0. So a pose that puts two surfaces beside each
+        other has a smaller agreement than one that leaves them apart. The best pose is the one with the largest value.
 
     Examples
     --------
@@ -149,7 +149,8 @@ def icp(
     agreement counts: a large distance reaches far, but pulls clouds that overlap only in part over each other. The
     result is then slid along the surface. If it fits as well there, as with one rib of many, it is refused.
 
-    The clouds may lie far from the origin, as map coordinates do: they are then solved about their middles.
+    The clouds may lie far from the origin, as map coordinates do. The function then works with the origin in their
+    middles.
 
     Parameters
     ----------

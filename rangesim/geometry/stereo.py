@@ -29,8 +29,9 @@ it is exceeded where both cameras turn inwards by more than 25 degrees, or both 
 straight across the baseline (measured). The ratio grows without limit from there, and so does the distortion."""
 
 MIN_ACROSS = 1e-3
-"""Least part, across the baseline, of the sum of both optical axes (unit vectors), as a ratio to 1. Below it there is
-no direction for the common axis. The value hardly matters, because such cameras exceed `MAX_GROWTH` long before."""
+"""Least length of the part of the sum of both optical axes (unit vectors) that is orthogonal to the baseline. Below it
+there is no direction for the common axis. The value hardly matters, because such cameras exceed `MAX_GROWTH` long
+before."""
 
 BORDER_POINTS = 33
 """Number of points per side of an image whose rays say how far the rectified image reaches. Distortion bends the border
@@ -81,7 +82,7 @@ class ParallelCameras:
     def depth(self, disparity_px: ArrayLike) -> Array:
         """Depths z = f b / d in metres, float64, for disparities d in pixels; NaN where d is not positive.
 
-        The point of such a disparity lies at infinity or behind the cameras.
+        A point with d <= 0 lies at infinity or behind the cameras.
         """
         return self._over(disparity_px)
 

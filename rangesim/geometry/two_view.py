@@ -9,7 +9,7 @@ Source: Hartley, Zisserman: "Multiple View Geometry in Computer Vision", 2nd edi
 
 Pixels are those of a pinhole: remove lens distortion first (`camera_matrix.ideal_pixels`).
 
-Degenerate pairs of views raise ValueError. They are found by the noise of the data
+Degenerate pairs of views raise ValueError. The functions recognise them by the noise of the data
 (`consensus.simpler_model_suffices`):
 
 - Points of one plane, a camera that only rotates, and the same view twice are mapped by a homography, which is
@@ -673,9 +673,9 @@ def fit_relative_pose(
     Raises
     ------
     ValueError
-        There are fewer than six different pairs; a rotation alone (or the same view twice) or a plane explains them
-        within their noise; two poses explain them; no pose has them in front of both cameras; or the residuals are over
-        three times the stated noise.
+        There are fewer than six different pairs; a rotation alone (or the same view twice) or a plane explains the
+        pairs within their noise; two poses explain them; no pose has the points in front of both cameras; or the
+        residuals are over three times the stated noise.
 
     Examples
     --------
@@ -829,8 +829,8 @@ def _refuse_open_epipole(
 
     A plane with the homography H is consistent with F = [e']_x H for any e'. A pair off the plane puts e' on the line
     (H x) x x'. One such line leaves a family of F, and so do several lines that noise does not distinguish. The
-    curvature at one minimum does not show this, because it takes the noise of the plane's points for parallax. So e' is
-    moved along these lines, and the sum of squares of all pairs says which F of the family they admit.
+    curvature at one minimum does not show this, because there the noise of the plane's points looks like parallax. So
+    the function moves e' along these lines, and the sum of squares of all pairs shows which F of the family fit.
 
     Parameters
     ----------
@@ -889,8 +889,8 @@ def _refuse_plane_with_outliers(a: Array, b: Array, inliers: np.ndarray, noise_p
     """Raise ValueError if the pairs that agree with F but not with the largest plane may do so by chance.
 
     A plane and any two pairs off it determine some F, even if these pairs are wrong (Chum, Werner, Matas: "Two-view
-    geometry estimation unaffected by a dominant plane", CVPR 2005). So the pairs off the plane that agree with F are
-    counted, and their number is compared with chance.
+    geometry estimation unaffected by a dominant plane", CVPR 2005). So the function counts
+    the pairs off the plane that agree with F, and compares their number with chance.
     """
     off = ~largest_plane(a, b, 2 * noise_px)  # twice the noise, so that no noisy point of the plane counts as off it
     threshold = consensus.inlier_threshold(noise_px, 1)

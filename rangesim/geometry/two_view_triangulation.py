@@ -3,7 +3,7 @@
 
 The rays of two measured pixels x, x' do not meet. The optimal point is the one whose images x^, x'^ are nearest to
 them: it minimises d^2(x, x^) + d^2(x', x'^) subject to x'^^T F x^ = 0, which is the maximum likelihood for equal
-Gaussian noise in both views. The linear and the midpoint method are simpler and never better; they are here for
+Gaussian noise in both views. The linear and the midpoint method are simpler and never better; the module has them for
 comparison.
 
 Hartley and Sturm ("Triangulation", CVIU 1997) find the minimum over all epipolar lines by the roots of a polynomial.
@@ -37,12 +37,12 @@ decides. Several minima exist only where the noise is about as large as that dis
 them, a smaller one searches more often, which takes longer."""
 
 CONVERGED_CORRECTION = 1e-5
-"""Change of a correction, as a ratio to it, below which the steps end. Convergence is quadratic, so that the next step
-would change it by about the square, which is rounding."""
+"""Relative change of a correction below which the steps end. Convergence is quadratic, so the next step would change it
+by about the square of this, which is rounding."""
 
 MAX_CORRECTION_STEPS = 20
-"""Largest number of steps. Two suffice for most pixels (Lindstrom 2010); a pair that needs more than 20 is decided by
-the search over all epipolar lines."""
+"""Largest number of steps. Two suffice for most pixels (Lindstrom 2010). For a pair that needs more than 20, the search
+over all epipolar lines decides."""
 
 PARALLEL_RAD = 1e-12
 """Angle between two rays, in radians, up to which they are parallel. It is far above rounding, 1e-16, and corresponds
@@ -60,8 +60,8 @@ GOLDEN_RATIO = 0.5 * (np.sqrt(5) - 1)
 """Ratio of two successive intervals of a golden-section search, (sqrt(5) - 1) / 2."""
 
 GOLDEN_STEPS = 45
-"""Number of times that a golden section shortens an interval, by a factor of 4e-10 in all, because a minimum is flat in
-double precision below that."""
+"""Number of times that a golden section shortens an interval, by a factor of 4e-10 in all. In shorter intervals a
+minimum is flat in double precision."""
 
 PAIRS_AT_ONCE = 4096
 """Number of pairs whose angles are sampled at once, so that the memory stays at some ten megabytes per array; the
@@ -95,8 +95,8 @@ class TriangulatedPoints:
     ----------
     points : (n, 3) float64, metres, world coordinates of the camera matrices; NaN where rays are parallel or meet
         behind a camera.
-    error_px : (n,) float64, the root of d^2(x, x^) + d^2(x', x'^), pixels. `triangulate_optimal` also states it where
-        the point is NaN.
+    error_px : (n,) float64, the root of d^2(x, x^) + d^2(x', x'^), pixels. `triangulate_optimal` also gives it for
+        points that are NaN.
 
     Examples
     --------

@@ -3,9 +3,9 @@
 
 The second image is rotated about its middle until its epipole lies on the x axis, at (r, 0, w). Then
 G = [1, 0, 0; 0, 1, 0; -w / r, 0, 1] moves the epipole to infinity; about the middle G is nearly the identity. This
-determines the matching rows of the first image, but not the position of a point along its row. The three parameters of
-that position are fitted to the pairs, so that disparities are as small as possible (Hartley: "Theory and practice of
-projective rectification", IJCV 1999).
+determines the matching rows of the first image, but not the position of a point along its row. The function fits
+the three parameters of that position to the pairs, so that disparities are as small as possible (Hartley: "Theory and
+practice of projective rectification", IJCV 1999).
 
 The rows of both images then match, as `match_rows` needs them. Depths in metres need calibrated cameras (`rectify`).
 
@@ -94,7 +94,7 @@ def rectify_uncalibrated(F: ArrayLike, first: ArrayLike, second: ArrayLike, size
     ----------
     F : (3, 3), x'^T F x = 0, as `find_fundamental` returns it.
     first, second : (n, 2) pixels of the pairs that agree with F, n >= 3, not on a line. They should be those of a
-        pinhole: lens distortion is not removed and bends the rows.
+        pinhole, because this function does not remove lens distortion, which bends the rows.
     size : (width, height) of both images, pixels.
 
     Raises

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from rangesim.signals import GroundTruth, StillSignals
 
 FIRST_SPP = 8
-"""Number of samples that every pixel takes first; their scatter tells how many more are needed. With fewer samples the
-scatter is known less well; with more, pixels that need few samples take longer than they must."""
+"""Number of samples that every pixel takes first; their scatter tells how many more the pixel needs. With fewer samples
+the scatter is known less well; with more, pixels that need few samples take longer than they must."""
 FRACTION = 1 / 3
 """Largest ratio of the sampling noise to the detector's noise. At 1/3 the two together are 5 % above the detector's
 noise alone, because variances add."""
@@ -45,7 +45,7 @@ class AdaptiveSampling(Sampler):
 
     The variance of a mean is inversely proportional to the number of samples. The first samples therefore tell how many
     samples are needed (two-stage sampling: Stein, Ann. Math. Statist. 16, 1945). The noise is estimated in groups of
-    pixels, for every instrument. The instrument that needs the most samples decides.
+    pixels, for every instrument. The instrument that needs the most samples decides how many a pixel takes.
 
     An instrument without a detector has only the renderer's noise; its limit is `NEGLIGIBLE`.
 
@@ -97,7 +97,7 @@ class AdaptiveSampling(Sampler):
         for instrument in self.instruments:
             if missing := set(instrument.sensor.responses()) - set(responses):
                 raise ValueError(
-                    f"expected sensors that have {missing.pop()}, for instrument {instrument.name!r} of spp."
+                    f"expected sensors with the response {missing.pop()}, for instrument {instrument.name!r} of spp."
                 )
 
     def samples(self, truth: GroundTruth, signals_of: Callable[[Sequence[Response]], StillSignals]) -> np.ndarray:
@@ -112,7 +112,7 @@ class AdaptiveSampling(Sampler):
             )
             image = decode(capture, instrument.decoder)
             middle, sampling = sampling_draw(image, capture, signals)
-            # The difference from the middle of both draws estimates the detector's error and costs no further decoding.
+            # z less the middle of the two draws estimates the detector's error, without a further decoding.
             from_middle = (image.z - middle).astype(np.float32)
             enough = np.full(len(excess), negligible)
             if capture.is_digital:  # a group without any reading needs no further samples: its limit is infinite

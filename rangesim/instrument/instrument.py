@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rangesim.scene import Scene
 
 MAX_NAME = 100
-"""Largest number of characters of an instrument's name. The name is also that of a directory, and file systems allow
+"""Largest number of characters of an instrument's name. A directory has the same name, and file systems allow
 255 bytes."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """Names that are safe as names of directories on all systems."""
@@ -33,7 +33,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 class Instrument:
     """A sensor with its camera, emitter, detector, decoder and its place in the scene.
 
-    A field of None is taken from the sensor (emitter, detector, decoder) or from the scene (camera and its pose).
+    Where a field is None, the sensor (emitter, detector, decoder) or the scene (camera and its pose) gives the value.
 
     Parameters
     ----------
@@ -46,8 +46,8 @@ class Instrument:
     width, height : size of the image, pixels, if the scene's camera is used. Its field of view is kept. None: as the
         experiment says.
     T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres; None: the scene's camera.
-    projector : Intrinsics of the emitter; None: the size that the sensor states, with a field of view that covers the
-        camera's.
+    projector : Intrinsics of the emitter; None: the size that the sensor states, with a field of view that covers
+        that of the camera.
     T_camera_projector : (4, 4) float64, maps projector coordinates to camera coordinates, metres. None: the emitter
         stands to the right of the camera, at the distance `baseline_m`, and is turned towards the point that the
         camera looks at.

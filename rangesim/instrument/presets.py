@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Instruments by name. A ready-made instrument of a device that people own belongs here."""
+"""Instruments by name. An instrument with the numbers of a real device that people can buy belongs here."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ no time-of-flight camera can surpass."""
 
 
 def instrument(name: str, **settings: Any) -> Instrument:
-    """The instrument with the sensor that a name stands for.
+    """The instrument whose sensor has this name.
 
     Parameters
     ----------

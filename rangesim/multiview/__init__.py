@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras, points and shapes from tracks through many images. Names load when first used. See docs/multiview.md.
+"""Finds cameras, points and shapes from tracks of points through many images. See docs/multiview.md.
+
+Names load when first used.
 
 Used by: no other module of rangesim; it is for users alone, see `examples/structure_from_motion.py`.
 """

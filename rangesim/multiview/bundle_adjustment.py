@@ -7,14 +7,14 @@ Levenberg-Marquardt on the normal equations, from which the points are eliminate
 Triggs, McLauchlan, Hartley, Fitzgibbon: "Bundle adjustment - a modern synthesis", 2000). `rangesim.calibration.bundle`
 is a different adjustment: there the points lie on boards and are known.
 
-Images determine the scene up to a similarity of 7 degrees of freedom, the gauge. It is fixed by the start: the pose of
-the first image, or of the held image, stays, and so does the distance from it to the camera farthest from it. Two or
-more held images leave no freedom.
+Images determine the scene up to a similarity of 7 degrees of freedom, the gauge. The start fixes the gauge: the pose of
+the first image, or of the held image, stays as in the start. Its distance to the camera farthest from it stays too. Two
+or more held images leave no freedom.
 
 Some inputs do not determine the result: an image or a group of images that shares too few points with the others; a
 camera that only rotates, so that the points have no depth; a camera that moves so little, or sees so little
-perspective, that the shape stays open. These inputs raise an error. The covariance finds most of them. It does not find
-all, because depths can be fitted to noise, and at such depths the covariance looks good. So an F test also compares the
+perspective, that the shape stays open. These inputs raise an error. The covariance shows most of these inputs, but not
+all: a descent can fit depths to noise, and at such depths the covariance looks good. So an F test also compares the
 cameras found with cameras that only rotate.
 
 Used by: `multi_view_triangulation`, `incremental_reconstruction`, `sliding_window` and `factorisation` (its checks) of
@@ -56,11 +56,12 @@ ROUGH_STEPS = 200
 """Largest number of steps while more views are still to come, a count. Such a result need not be at the minimum,
 because the next views change it anyway."""
 CONVERGED = 1e-8
-"""Relative decrease of the cost at which a descent ends, a ratio. For a million residuals, 1e-8 of the cost is 1 % of
-the variance of one residual, so that the parameters are then within about 0.1 standard deviations of the minimum."""
+"""A descent ends when a step decreases the cost by less than this fraction. For a million residuals, 1e-8 of the cost
+is 1 % of the variance of one residual, so that the parameters are then within about 0.1 standard deviations of the
+minimum."""
 MIN_DAMPING = 1e-10
-"""Smallest damping of Levenberg-Marquardt over the diagonal of the normal equations, a ratio. It must not be 0, because
-the residuals leave parameters open, such as the gauge. Larger values slow the descent near the minimum."""
+"""Smallest ratio of the damping of Levenberg-Marquardt to the diagonal of the normal equations. It must not be 0,
+because the residuals leave parameters open, such as the gauge. Larger values slow the descent near the minimum."""
 MAX_ROTATION_DEVIATION = 0.3
 """Largest standard deviation of a rotation, radians. Beyond about 17 degrees the covariance, which is linear in the
 rotation, means little, and the pose counts as undetermined."""
@@ -73,8 +74,8 @@ as being in one place. It only has to exceed rounding: what noise leaves open is
 MIN_IMAGES = 2
 """Smallest number of images, and of images that see a point, a count: two, because one image gives no depth."""
 MAX_SHAPE_DEVIATION = 0.5
-"""Largest standard deviation of the median point over the extent of the points, a ratio. A shape that is known less
-well is refused: its errors would be as large as half of the shape."""
+"""Largest ratio of the median point's standard deviation to the extent of the points. A shape that is known less well
+is refused, because its errors would be as large as half of the shape."""
 SHAPE_SAMPLE = 200
 """Approximate number of points whose joint covariance gives the deviation of the shape. The covariance matrix has three
 rows for each point; twice the points take eight times the time."""
@@ -82,15 +83,15 @@ TESTED_OBSERVATIONS = 30_000
 """Approximate number of observations in the F test against cameras that only rotate. It bounds the time of the test;
 fewer observations make it weaker for cameras that hardly move."""
 ROTATION_ROUNDS = 10
-"""Number of rounds that find rotations and mean directions in turns, a count. They give the start of a descent.
+"""Number of rounds, each of which finds the mean directions and then the rotations. They give the start of a descent.
 Measured with 3 scenes of 12 images, rotations off by 0.02 rad: without a round the descent takes 3 steps, after 1 to 30
 rounds it takes 2, and ends at the same minimum."""
 ROTATION_STEPS = 30
 """Largest number of steps of the descent of cameras that only rotate, a count. Measured as for `ROTATION_ROUNDS`: 2 or
 3 steps are enough. It ends when a step lowers the cost by less than 1e-4 of it."""
 MAX_INLIER_DEVIATIONS = 4.0
-"""Largest error of a right observation under a robust loss, in standard deviations of the noise. Gaussian noise exceeds
-four of them in one coordinate of 16 000."""
+"""Largest error of a correct observation under a robust loss, in standard deviations of the noise. Gaussian noise
+exceeds four of them in one coordinate of 16 000."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ class ReliefTest:
     """Largest median depth of the shape over its distance from the cameras, a ratio. A deeper shape shows its depth by
     perspective and is not tested."""
     max_turn_rad: float = float(np.radians(20))
-    """Largest angle between a camera's direction and the mean direction, radians. Where a camera turns more, the turns
+    """Largest angle between a camera's direction and the mean direction, radians. If a camera turns more, the turns
     tell the depth, and the shape is not tested."""
     factors: tuple[float, ...] = (0.25, 0.5, 2.0, 4.0, 8.0, 16.0)
     """Factors on the depth from which a new descent starts. The valley of equal images is curved, so that one start
@@ -109,7 +110,7 @@ class ReliefTest:
     steps: int = 100
     """Largest number of steps of each new descent."""
     min_difference: float = 0.05
-    """Median distance of the points of two shapes over their extent, a ratio, below which they count as the same shape,
+    """Ratio of the median distance of the points of two shapes to their extent. Below it they count as the same shape,
     however small the stated deviation is."""
     max_deviations: float = 2.0
     """Largest median distance of the points of two shapes as a multiple of the stated deviation, above which the stated
@@ -129,7 +130,7 @@ class BundleAdjustment:
         that fewer than two images see.
     used : (m,) bool, whether an observation took part.
     residuals_px : (m, 2) float64, projected pixel minus seen pixel; NaN for an observation that took no part.
-    noise_px : standard deviation of a pixel's coordinate, as given, or else from the residuals.
+    noise_px : standard deviation of a pixel's coordinate: the given one, or one estimated from the residuals.
     covariance : (n_images, 6, 6) float64, covariance of a rotation vector (radians) and a translation, both applied
         after T_camera_world, in the gauge that the module describes; 0 for a held image.
     lens_deviations : (9,) float64, standard deviations of fx, fy, cx, cy (pixels), k1, k2, p1, p2, k3; 0 for a
@@ -192,7 +193,7 @@ def bundle_adjust(
     Parameters
     ----------
     tracks : observations in all images that are adjusted.
-    camera : the lens of all images; where `free` names its parameters, their start.
+    camera : the lens of all images. For parameters that `free` names, it gives the values that the descent starts from.
     T_camera_world : (n_images, 4, 4), poses to start from; they map world coordinates to those of each camera.
     points : (n_points, 3), world, points to start from, in front of the cameras that see them. A point that is NaN, or
         that fewer than two images see, is left out.
@@ -266,7 +267,7 @@ def adjusted_views(
     max_steps: int = ROUGH_STEPS,
     is_last: bool = False,
 ) -> BundleAdjustment:
-    """The result of `bundle_adjust` while more views are still to come, so that an open shape is no error yet.
+    """The result of `bundle_adjust` while more views are still to come. A shape that is still open is then no error.
 
     is_last : whether no more views follow; only then `shape_deviation` is computed, else it is NaN.
     """
@@ -414,7 +415,7 @@ def _listed(numbers: np.ndarray) -> str:
 
 
 def _freedom(some: Tracks, sizes: Sizes, held: Sequence[int]) -> int:
-    """Degrees of freedom of the residuals: number of equations minus unknowns, where the gauge is no unknown."""
+    """Degrees of freedom of the residuals: number of equations minus number of unknowns, the gauge not counted."""
     gauge = {0: 7, 1: 1}.get(len(set(held)), 0)
     cameras = POSE * (sizes.images - len(set(held)))
     return 2 * len(some) - (sizes.shared + cameras + 3 * len(np.unique(some.point)) - gauge)
@@ -620,7 +621,7 @@ def _shape_deviation(
 ) -> float:
     """Standard deviation of the median point after the best similarity, over the points' extent, for a noise of 1 px.
 
-    It takes about `SHAPE_SAMPLE` of the points. With C the covariance of lens and poses, J = dX / d(lens, poses) the
+    It uses about `SHAPE_SAMPLE` points. With C the covariance of lens and poses, J = dX / d(lens, poses) the
     response of the points, and V^-1 their covariance if the cameras are exact, cov X = J C J^T + diag(V^-1). The
     components along translation, rotation and scale of all points are then removed.
     """
@@ -732,8 +733,8 @@ LOSSES = {
 def _noise(residuals: Array, loss: str, freedom: int) -> float:
     """Standard deviation of a pixel's coordinate, from residuals (m, 2); NaN if there are no degrees of freedom.
 
-    It comes from the sum of squares, or with a robust loss from the median of the absolute values. Both are corrected
-    for the degrees of freedom.
+    The function computes it from the sum of squares, or with a robust loss from the median of the absolute values. It
+    corrects both for the degrees of freedom.
     """
     if freedom <= 0:
         return float("nan")

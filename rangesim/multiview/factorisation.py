@@ -9,12 +9,12 @@ projective reconstruction from multiple views", CVPR 2000; Hartley, Zisserman 20
 
 The singular value decomposition alone solves only the affine camera, and only if every image sees every point. So each
 function ends with a descent to the least sum of squared pixel errors over the observations, with exactly the parameters
-of its camera, and reaches the Cramer-Rao bound. The sum leaves missing observations out. Only its start needs them:
-rounds of decomposition and prediction fill them in.
+of its camera, and reaches the Cramer-Rao bound. The sum leaves missing observations out. Only the start of
+the descent needs them: rounds of decomposition and prediction fill them in.
 
 Some inputs do not determine the result: points on a plane, images that do not turn (affine) or do not move
-(projective), the same view repeated, fewer images or points than the rank needs. They raise an error, because a
-singular value is then no larger than that of noise.
+(projective), the same view repeated, fewer images or points than the rank needs. They raise an error: a singular
+value is then no larger than that of noise.
 
 Used by: `nonrigid` of `rangesim.multiview`; no other module of rangesim.
 """
@@ -56,13 +56,13 @@ DEPTH_ROUNDS = 100
 """Number of rounds that find the projective depths, before the descent. Measured with 12 scenes of 8 images and 40
 points, 30 % missing: 1 to 300 rounds end at the same minimum, and 30 to 100 take the least time."""
 RANDOM_STARTS = 4
-"""Largest number of random starts after the first one. They end as soon as one agrees with the best minimum so far.
-Measured with 25 scenes each, 30 % missing: with 8 images of 40 points no random start found a lower minimum; with 4
-images of 20 points one did in 4 scenes."""
+"""Largest number of random starts after the first one. No more follow as soon as one agrees with the best minimum so
+far. Measured with 25 scenes each, 30 % missing: with 8 images of 40 points no random start found a lower minimum; with
+4 images of 20 points one did in 4 scenes."""
 SAME_AFFINE_COST = 1e-6
-"""Relative difference of the sums of squares of two starts, a ratio, below which they found the same minimum. It must
-exceed the 1e-12 that a descent leaves when it ends. Measured in the scenes of `RANDOM_STARTS`: different minima have a
-ratio of 30 or more."""
+"""Relative difference of the sums of squares of two starts, below which they count as ended in the same minimum. It
+must exceed the relative distance from the minimum, 1e-12, at which a descent ends. Measured in the scenes of
+`RANDOM_STARTS`: different minima have a ratio of 30 or more."""
 MIN_DAMPING = 1e-12
 """Smallest damping of Levenberg-Marquardt over the diagonal of the normal equations, a ratio. It must not be 0, because
 the gauge changes no residual and would leave the equations singular."""
@@ -100,8 +100,8 @@ class AffineFactorisation:
         images.
     residuals_px : (m, 2) float64, predicted minus seen pixel; NaN for an observation that was left out.
     noise_px : standard deviation of a pixel's coordinate.
-    singular_values : (r,) float64, singular values of the predicted pixels minus t over the root of the number of
-        observations: how far each component moves the pixels, pixels.
+    singular_values : (r,) float64, pixels, singular values of the predicted pixels minus t, divided by the root of the
+        number of observations: how far each component moves the pixels.
 
     Examples
     --------
@@ -192,7 +192,7 @@ def factorise_affine(
     If every image sees every point, t_i is the mean pixel of an image, and M and X are the first `rank` components of
     the singular value decomposition. Otherwise damped Gauss-Newton steps with variable projection (Okatani, Yoshida,
     Deguchi, ICCV 2011) minimise the sum over the observations, from the decomposition with missing pixels filled in.
-    The seed is only used if this descent fails, for starts from random cameras.
+    If this descent fails, others start from random cameras; only these use the seed.
 
     Parameters
     ----------
@@ -246,9 +246,9 @@ def checked_tracks(
 ) -> tuple[Tracks, np.ndarray]:
     """The tracks of the points in at least `least_images` images, and the numbers of these points in `tracks`.
 
-    In the result the points have new numbers from 0 on. Raises ValueError if there are fewer than `images_needed`
-    images, fewer than `least_points` such points in all or in an image, or images without shared points. `purpose` is
-    named in the message.
+    In the result the points have new numbers from 0 on. The function raises ValueError if there are fewer than
+    `images_needed` images, fewer than `least_points` such points in all or in an image, or images without shared
+    points. The message names `purpose`.
     """
     if tracks.n_images < images_needed:
         raise ValueError(
@@ -364,7 +364,7 @@ def refuse_rank(values: Array, tracks: Tracks, noise: float, rows: int, columns:
     """Raise ValueError if the smallest of r singular values is no larger than a singular value of noise alone.
 
     The largest singular value of a matrix of noise exceeds noise * (sqrt(rows) + sqrt(columns) + u) with a probability
-    below exp(-u^2 / 2) (Davidson, Szarek 2001). The r - 1 larger components have used up as many rows and columns.
+    below exp(-u^2 / 2) (Davidson, Szarek 2001). The r - 1 larger components use up r - 1 rows and columns.
 
     values : (r,) singular values, descending, pixels. rows, columns : size of the matrix. why : explains the error.
     """
@@ -380,7 +380,7 @@ def refuse_rank(values: Array, tracks: Tracks, noise: float, rows: int, columns:
 
 
 def noise_of(residuals: Array, freedom: int, noise_px: float | None) -> float:
-    """Standard deviation of a residual: `noise_px`, or else from the residuals; NaN without degrees of freedom."""
+    """Standard deviation of a residual: `noise_px`; if None, estimated. NaN without degrees of freedom."""
     if noise_px is not None:
         return float(noise_px)
     return float(np.sqrt((residuals**2).sum() / freedom)) if freedom > 0 else float("nan")
@@ -472,7 +472,7 @@ def factorise_orthographic(
 
 
 def metric_upgrade(M: Array, t: Array, X: Array, has_scale: bool) -> Shapes:
-    """The rigid shape that affine cameras M (n, 2, 3), t (n, 2) and points X (p, 3) are nearest to.
+    """The rigid shape that is nearest to affine cameras M (n, 2, 3), t (n, 2) and points X (p, 3).
 
     Raises ValueError if the images do not turn in different ways.
     """
@@ -506,7 +506,7 @@ def metric_upgrade(M: Array, t: Array, X: Array, has_scale: bool) -> Shapes:
     if np.trace(Q) < 0:
         Q = -Q
     values, axes = np.linalg.eigh(Q)
-    A = axes * np.sqrt(np.maximum(values, 1e-3 * values[-1]))  # noise may make Q indefinite; a start needs no more
+    A = axes * np.sqrt(np.maximum(values, 1e-3 * values[-1]))  # noise may make Q indefinite; for a start this is enough
     rows = (M @ A).reshape(n, 2, 3)
     scale = np.sqrt(0.5 * (rows**2).sum(axis=(1, 2)))
     R = np.concatenate([rows, np.cross(rows[:, 0], rows[:, 1])[:, None] / scale[:, None, None]], axis=1)
@@ -539,8 +539,8 @@ def refuse_open_rotations(equations: NormalEquations, gauge: int, noise: float, 
 def shape_deviations(found: Descended[Shapes, NormalEquations], gauge: int) -> Array:
     """(n, p) float64, standard deviation of a coordinate of each point in each camera, for residuals of unit variance.
 
-    It is the root mean square over the three coordinates. It includes the errors of the points if the cameras are
-    exact, and the errors of the cameras, which the points follow.
+    It is the root mean square over the three coordinates. It has two parts: the errors that the points would have if
+    the cameras were exact, and the errors that the cameras pass on to the points.
 
     gauge : number of freedoms of the gauge.
     """

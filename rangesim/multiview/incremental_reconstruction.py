@@ -41,11 +41,11 @@ MIN_COMMON = 12
 """Smallest number of points that the images of the first pair share. It is larger than the five points of a relative
 pose, so that some can be wrong and the others can test the pose."""
 MIN_KNOWN_POINTS = 6
-"""Smallest number of known points that an image must see before its pose is found. A pose needs three, and a fourth to
-be unique; six leave two for wrong ones."""
+"""Smallest number of known points that an image must see before its pose is found. A pose needs three points, and a
+fourth one to be unique; with six, two may be wrong."""
 MAX_PAIRS = 12
 """Largest number of pairs tried as the first one, a count. More pairs take longer, and may find a pair with more
-parallax. Nobody measured the value."""
+parallax. Other values were not measured."""
 WIDE_RAD = np.radians(10)
 """Angle between the two rays of a point, radians, above which a wider angle makes a pair no better. The depth deviation
 is inversely proportional to the angle, but at wide angles matches become rarer. Nobody measured the value."""
@@ -54,7 +54,7 @@ ADJUSTMENT_GROWTH = 1.2
 views, 5 or 20 % of the observations wrong: 1.0 to 3.0 end at the same result, and 1.2 takes 0.6 to 0.8 times the time
 of 1.0. With 1.2 the number of adjustments grows as the logarithm of the number of images."""
 MAX_NOISE_RATIO = 1.5
-"""Largest noise found over the noise stated, a ratio; above it the result comes with a warning."""
+"""Largest ratio of the noise found to the noise stated; above it the result comes with a warning."""
 MIN_AGREEING = 0.5
 """Smallest fraction of observations that agree, among those of points in several images; below it the result comes with
 a warning, because most tracks are then wrong."""
@@ -102,7 +102,7 @@ def structure_from_motion(
     tracks : which image sees which point; at least two images that shared points link. Two images must share 12 points
         or more, and each other image must see 6 known points or more.
     camera : the lens of all images, with its distortion.
-    noise_px : standard deviation of a coordinate of a right observation. While the poses are rough, an observation
+    noise_px : standard deviation of a coordinate of a correct observation. While the poses are rough, an observation
         counts as wrong if its distance from the projection is more than three times the 99 % quantile of this noise; at
         the end, if it is more than 4 sqrt(2) noise_px.
     seed : seed of the robust estimators.
@@ -239,7 +239,7 @@ def _ray_angles(K: Array, T: Array, first: Array, second: Array) -> Array:
 def _with_next(
     tracks: Tracks, camera: Intrinsics, T: Array, X: Array, waiting: np.ndarray, noise_px: float, seed: int
 ) -> Array:
-    """The poses (n, 4, 4) with that of one more image, the one of `waiting` that sees most of the known points.
+    """The poses (n, 4, 4), with the pose of one more image: of those `waiting`, the one that sees most known points.
 
     T : (n, 4, 4), NaN for an image without a pose. X : (n_points, 3), NaN for an unknown point.
     """
@@ -294,7 +294,7 @@ def _adjusted(
 def _finished(
     tracks: Tracks, camera: Intrinsics, T: Array, noise_px: float, pair: tuple[int, int]
 ) -> StructureFromMotion:
-    """The result in the frame of the first image, after adjustments of the inliers until these stay the same."""
+    """The result in the frame of the first image. The inliers are adjusted until they stay the same."""
     T = T @ np.linalg.inv(T[0])
     centres = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
     T[:, :3, 3] /= np.linalg.norm(centres, axis=1).max()

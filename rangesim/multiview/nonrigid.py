@@ -73,11 +73,11 @@ SAME_SHAPE_COST = 1e-4
 """Relative difference of the sums of squares of two starts, a ratio, below which they agree. It is larger than 1e-9,
 the relative decrease at which a descent from a start counts as ended."""
 MAX_SHAPE_DEVIATION = 0.5
-"""Largest standard deviation of the median coordinate over the extent of the mean shape, a ratio. A shape that is known
-less well is refused: its errors would be as large as half of the shape."""
+"""Largest ratio of the median coordinate's standard deviation to the extent of the mean shape. A shape that is known
+less well is refused, because its errors would be as large as half of the shape."""
 MIN_RELATIVE_NOISE = 1e-4
-"""Smallest noise beside a prior, as a fraction of the standard deviation of all pixels. With less noise, the prior
-would be lost in the rounding of the normal equations."""
+"""Smallest noise beside a prior, as a fraction of the standard deviation of all pixels. With less noise, rounding
+of the normal equations would hide the prior."""
 
 
 class UnknownCount(NamedTuple):
@@ -89,8 +89,8 @@ class UnknownCount(NamedTuple):
     shapes : 3 K p, the coordinates of the basis shapes.
     gauge : number of freedoms that change no pixel: 3 of a rotation of the world; 3 K of a translation of each basis
         shape, which translations of the images make up for; K (K - 1) of an affinity of the coefficients, which gives
-        other deformations with the same span, and another mean; and under weak perspective K more, because there scales
-        and coefficients together are known up to any linear map.
+        other deformations with the same span, and another mean; and under weak perspective K more, because there any
+        linear map of scales and coefficients together changes no pixel.
 
     Examples
     --------
@@ -249,10 +249,10 @@ def adjust_nonrigid(
 ) -> NonRigidShape:
     """The most probable deforming shape of K basis shapes, under a prior on how it changes from image to image.
 
-    It is bundle adjustment from the result of `factorise_nonrigid`: the least sum of the squared pixel errors over the
-    noise and the squared errors of the prior. The prior helps where few images see a point: depths that the tracks
-    hardly determine then change smoothly from image to image. Points that two or more images see, but too few for the
-    factorisation, are included, too.
+    It is a bundle adjustment that starts from the result of `factorise_nonrigid`. It minimises the sum of the squared
+    pixel errors, divided by the noise, and the squared errors of the prior. The prior helps where few images see a
+    point: depths that the tracks hardly determine then change smoothly from image to image. Points that two or more
+    images see, but too few for the factorisation, are included, too.
 
     Parameters
     ----------
@@ -288,7 +288,7 @@ def adjust_nonrigid(
     noise = max(noise, MIN_RELATIVE_NOISE * float(np.std(some.pixels)))
     if is_estimated:
         found, noise = _left_wrong_minimum(some, found, noise, noise_px is None)
-        # an open shape has no second differences to estimate the prior from
+        # without a determined shape, there are no second differences that give the prior
         gauge = count_unknowns(1, 1, n_basis).gauge
         _refuse_open_shape(shape_deviations(found, gauge) * noise, _principal(found.state), noise)
     used = prior if isinstance(prior, TemporalPrior) else _estimated(found)
@@ -341,8 +341,8 @@ def _virtual(M: Array) -> Tracks:
 def _upgraded(tracks: Tracks, K: int, seed: int, has_translation: bool) -> Shapes:
     """The shapes with the least squared error, from one start after another until two agree.
 
-    The first start is the best rigid shape, and the largest deformations that explain its residuals. The other starts
-    turn its images at random.
+    The first start is the best rigid shape, with the largest deformations that explain its residuals. The other starts
+    turn the images of the first one at random.
     """
     n, p = tracks.n_images, tracks.n_points
     if has_translation:
@@ -407,8 +407,9 @@ def _estimated(found: Descended[Shapes, NormalEquations], *, has_repeats: bool =
     """The prior on second differences, estimated from the half of the points that the tracks determine best.
 
     K - 1 basis shapes make the n - 2 second differences of a point, so that only K - 1 numbers in each direction are
-    free. The sum of squares of the prior should therefore be that of K - 1 numbers of unit variance. Taken as n - 2
-    numbers, the prior would be too strong by a factor sqrt((n - 2) / (K - 1)), and pull the shape away from the tracks.
+    free. The sum of squares of the prior should therefore be that of K - 1 numbers of unit variance. If it were that
+    of n - 2 numbers, the prior would be too strong by a factor sqrt((n - 2) / (K - 1)), and would pull the shape away
+    from the tracks.
 
     has_repeats : whether this factor is applied.
     """

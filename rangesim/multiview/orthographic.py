@@ -64,9 +64,9 @@ class TemporalPrior:
     turn_step_rad : standard deviation of a component of the rotation vector between consecutive images, radians. None
         leaves the cameras free.
 
-    The prior is on the shape, with the sum over points of |sum_k (c_i-1,k - 2 c_ik + c_i+1,k) B_kj|^2. A prior on the
+    The prior acts on the shape, by the sum over points of |sum_k (c_i-1,k - 2 c_ik + c_i+1,k) B_kj|^2. A prior on the
     coefficients alone would have no effect, because their unit is free: small coefficients with a large basis make the
-    same shape. The prior is on second differences and not on first ones. A deformation that continues for some images
+    same shape. The prior acts on second differences and not on first ones. A deformation that continues for some images
     has large first differences, and a prior on these would make it smaller.
 
     Raises
@@ -107,7 +107,8 @@ def adjust(
 ) -> Descended[Shapes, NormalEquations]:
     """The descent from a start to the shapes with the least squared errors of the pixels and of the prior.
 
-    Each error is divided by its standard deviation: the pixels' by `noise_px`, the prior's by its own.
+    Each error is divided by its standard deviation: an error of a pixel by `noise_px`, an error of the prior by the
+    prior's own.
 
     has_scale, has_translation : whether the scales and the translations of the images are free.
     max_steps, converged : see `rangesim.geometry.least_squares.descend`.

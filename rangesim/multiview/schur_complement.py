@@ -243,7 +243,8 @@ class NormalEquations:
         return -(np.linalg.pinv(V, rcond=1e-12, hermitian=True) @ h[:, :, None])[:, :, 0]
 
     def response_of_points(self) -> Array:
-        """(n_points, p, k) float64, -V^-1 W^T: how the best points move with the k shared and image parameters."""
+        """(n_points, p, k) float64, -V^-1 W^T: how the best-fitting points move with the k shared and image
+        parameters."""
         sizes = self.sizes
         found = self.reduced(1e-13)
         if found is None:

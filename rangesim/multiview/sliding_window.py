@@ -5,8 +5,9 @@ The known points give the pose of each new image. Then its new points are triang
 `window` images are adjusted together with all points that they see. Older images that see these points take part as
 *anchors*: they keep all their observations, and their poses stay as they were when they left the window. So no
 observation of a point in the window is lost, and nothing has to be marginalised. The method neglects one thing: the
-poses of the anchors are uncertain themselves. Marginalisation would keep this uncertainty, but linearised at an older
-state. Mouragnon et al.: "Real time localization and 3D reconstruction", CVPR 2006, hold the older poses, too.
+poses of the anchors are uncertain themselves. Marginalisation would keep this uncertainty, but in a form that is
+linearised at an older state. Mouragnon et al.: "Real time localization and 3D reconstruction", CVPR 2006, hold the
+older poses, too.
 
 A pose is final when it leaves the window. Later images do not improve it; in an adjustment of all images
 (`bundle_adjust`) they do.
@@ -37,7 +38,7 @@ four poses (perspective-three-point)."""
 class OnlineAdjustment:
     """The poses and points that `adjust_online` found.
 
-    T_camera_world : (n_images, 4, 4), maps world coordinates to those of each camera, as it was when the image left the
+    T_camera_world : (n_images, 4, 4), maps world coordinates to those of each camera: the pose when the image left the
         window.
     T_at_arrival : (n_images, 4, 4), the pose of each image right after its arrival, before any later image. The images
         of the start were adjusted together, and have the poses found there.
@@ -64,7 +65,7 @@ def adjust_online(
     window: int = 10,
     noise_px: float = 1.0,
 ) -> OnlineAdjustment:
-    """The poses of images in the order of time, each found from the images up to it.
+    """The poses of images in the order of time. Each pose is found from its image and the earlier ones.
 
     Parameters
     ----------
@@ -169,7 +170,8 @@ def _image_of_scale(used: np.ndarray, T: Array, starting: int) -> int:
     """Index in `used` of the image whose distance from the first image of `used` keeps the scale.
 
     It is the image of the start that is farthest from the first one. If fewer than two images of the start take part,
-    it is the farthest of all images but the newest, whose position was estimated from its points alone.
+    it is the farthest of all images but the newest. The newest does not count, because only its points gave its
+    position.
     """
     of_start = int((used < starting).sum())
     end = of_start if of_start > 1 else max(len(used) - 1, 2)

@@ -53,7 +53,7 @@ pixels on two busy cores: 2 s for a whole pass, with 500 000 photons."""
 START_S = 4.0
 """Seconds per run to import the packages, load the scene and write the report. It only matters for short runs."""
 REPEATED_PASS_S = 0.3
-"""Seconds of each further pass from another place, besides its paths and photons. Nothing is compiled again. Measured:
+"""Seconds of each further pass from another place, besides its paths and photons. It compiles nothing again. Measured:
 0.02 s on `matte`, 0.5 s on `tabletop`."""
 FRAME_S = 100e-9
 """Seconds per pixel of each frame, for its noise and its file."""
@@ -63,7 +63,7 @@ BASE_BYTES = 4e8
 """Bytes that the process takes with its libraries, a scene and its kernels, before any image. Measured on `tabletop`:
 2.6e8 with everything loaded, 6.1e8 after a run of 64 x 48 pixels."""
 TRANSPORT_BYTES = 2 << 30
-"""Bytes that the tiles of the light transport stay below: the default of `TransportSettings.memory_bytes`."""
+"""Limit of the bytes that the tiles of the light transport take: the default of `TransportSettings.memory_bytes`."""
 LANE_BYTES = 512
 """Bytes of the renderer per pixel of a tile, besides 8 for each channel: the state of the loop over light paths."""
 TRUTH_BYTES = 64
@@ -74,7 +74,7 @@ their pictures."""
 PHOTON_BYTES = 200
 """Bytes per caustic photon that landed, as stated in `TransportSettings.memory_bytes`."""
 TRIAL_S = 60.0
-"""Seconds; if the constants predict a longer run, a trial of the scene is worth its time."""
+"""Seconds. If the constants predict a longer run, small passes of the scene are timed in a trial."""
 TRIAL_WIDTH = 96
 """Width of the images of a trial in pixels. With the samples below, a trial takes a few seconds; a wider image would
 measure the time per path more exactly and take longer."""
@@ -130,7 +130,7 @@ class Cost:
     def check_memory(self) -> None:
         """Raise ValueError if the run needs more memory than is available.
 
-        The limit `memory` takes the place of the available memory if it is set. If neither is known, nothing is
+        If the limit `memory` is set, it takes the place of the available memory. If neither is known, nothing is
         refused.
         """
         limit = limits.current().memory
@@ -200,7 +200,7 @@ def estimate_cost(
 
 
 def available_memory_bytes() -> int | None:
-    """Bytes of memory that this process may still take, by the machine and by its control groups; None if unknown."""
+    """Bytes of memory that the machine and the control groups leave to this process; None if unknown."""
     found = [_meminfo(), *_cgroup()]
     known = [n for n in found if n is not None]
     return min(known) if known else None
@@ -233,7 +233,7 @@ def _beside_tracing(passes: Sequence[tuple[Rig, list[Instrument]]]) -> CostBesid
 
 
 def _tracing_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int) -> float:
-    """Largest number of bytes of the arrays of a pass that exist at once, while it is traced or its frames exposed."""
+    """Bytes of the arrays of a pass that exist at once, at the peak: while it is traced or its frames are exposed."""
     at_once = 0.0
     for rig, instruments in passes:
         pixels = rig.camera.width * rig.camera.height

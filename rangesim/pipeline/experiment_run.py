@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from rangesim.signals import Signals
 
 _TRANSPORT_FRACTION = 0.7
-"""Fraction of the progress of a pass that is shown when its light is traced; the rest is for its instruments. It
+"""Fraction of a pass that the progress bar shows as done when its light is traced; the rest is for its instruments. It
 changes the progress bar and nothing else."""
 MIN_POINTS = 3
 """Smallest number of points that are segmented. Fewer points make no surface, because a plane needs three."""
@@ -113,7 +113,7 @@ def carry_out(
 ) -> Result:
     """The result of an experiment. Nothing is written.
 
-    Experiment and result can be pickled, so that this can run in another process or on another machine.
+    Experiment and result can be pickled, so this function can run in another process or on another machine.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def _computed(
     cost.check_memory()
     if announce is not None:
         announce(cost)
-    with timed(times, "compile_segmentation"):  # once per machine; the first sensor's time must not include it
+    with timed(times, "compile_segmentation"):  # kernels compile once per machine; no sensor's time includes it
         compile_kernels()
     passes, measurements = [], {}
     for number, (rig, instruments) in enumerate(groups, 1):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimates the cost of a scan before it starts: that of its light transport, as for a run, and that of the fusion."""
+"""Estimates the cost of a scan before it starts: the cost of its light transport, as for a run, and of the fusion."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ TRIANGLE_S = 3e-6
 """Seconds per triangle, for each shape with which it is compared. Measured on two cores: 1.3e-6 on `plane`, 3.6e-6 on
 `matte`."""
 ALIGNED_VIEW_S = 6.0
-"""Seconds per view to find its pose. Measured with the pairs below: 44 to 180 s of processor time in all for 12 views,
-240 s for 24."""
+"""Seconds per view to find its pose. Measured together with `ALIGNED_PAIR_S`: 44 to 180 s of processor time in all for
+12 views, 240 s for 24."""
 ALIGNED_PAIR_S = 0.3
 """Seconds per pair of views to find their poses; see `ALIGNED_VIEW_S` for the times that were measured."""
 LIBRARY_BYTES = 2e8

@@ -39,8 +39,8 @@ MAX_COMPARED_VOXELS = 1_000_000
 fusion's would be more than that, the voxels of this grid are larger. Time and memory of the comparison grow with this
 number."""
 BACKGROUND = 0.3
-"""Ratio of the size of a shape to that of the largest shape, above which the shape is background, such as a table or a
-wall. Statistics of what was seen leave background out, as long as there are other shapes."""
+"""Ratio of the size of a shape to that of the largest shape. Above it the shape is background, such as a table or a
+wall. The statistics of what the views saw leave background out, as long as there are other shapes."""
 SAMPLES = 20_000
 """Number of points sampled on each surface to measure its error. The standard error of a fraction of them, such as the
 recall, is then at most 0.5 / sqrt(20 000) = 0.35 %."""
@@ -152,7 +152,7 @@ def carry_out_scan(
             images.append(image)
             truths.append(truth)
             tell(f"View {number} of {len(poses)}", 0.05 + 0.6 * number / len(poses))
-            if number == 2 < len(poses) and settings.registration == "unknown":  # fail before the other views are taken
+            if number == 2 < len(poses) and settings.registration == "unknown":  # fail early
                 _check_readings(images)
                 check_first_pair(Scan(tuple(images)), seed=registration_seed)
     _check_readings(images)

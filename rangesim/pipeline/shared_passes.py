@@ -19,7 +19,7 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
 
     The passes are in the order in which their first instruments appear. An ideal instrument has no wavelength, so it
     joins the first pass with its camera and emitter. If something moves, each instrument has a pass of its own, because
-    its frames are taken at times of its own.
+    each takes its frames at other times.
     """
     groups: list[tuple[Rig, list[Instrument]]] = []
     for instrument in experiment.instruments:

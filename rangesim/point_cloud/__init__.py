@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds that are organised as the image they come from, with normals, and their files."""
+"""Point clouds with normals, in the rows and columns of the image that they come from, and their files."""
 
 from rangesim.point_cloud.point_cloud import (
     COORDINATES,

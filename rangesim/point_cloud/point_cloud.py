@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds with normals, organised as the image they come from."""
+"""Point clouds with normals, organised in the rows and columns of the image that they come from."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from rangesim.settings.config import ShortRepr
 COORDINATES = ("camera", "world")
 """Coordinate frames that points may be in."""
 FAR_M = 100.0
-"""Largest coordinate of a camera in the world, in metres, with which points in the world are single precision.
+"""Largest coordinate of a camera in the world, in metres, up to which points in the world have single precision.
 
-Beyond it they are double precision, because neighbouring numbers of single precision are 8 µm apart at 100 m.
+Beyond it they have double precision, because neighbouring numbers of single precision are 8 µm apart at 100 m.
 """
 NORMAL_RADIUS = 2
 """Radius, in pixels, of the window of (2 r + 1)^2 pixels that a normal is fitted to.
@@ -29,11 +29,11 @@ A larger window averages more noise and rounds small details off. Other values w
 MAX_SLOPE = 4.0
 """Largest ratio of depth step to lateral step between two pixels that count as one surface.
 
-It is 4 so that surfaces whose normal is up to 76 degrees off the ray keep their neighbours. A larger value joins
-surfaces across depth edges.
+With 4, the pixels of a surface keep their neighbours if its normal is up to 76 degrees off the ray. A larger value
+joins surfaces across depth edges.
 """
 STEP_FLOOR = 0.005
-"""Fraction of z by which neighbours of one surface may always differ, so that noise does not separate them."""
+"""Fraction of z by which the depths of neighbours on one surface may always differ, so that noise separates none."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -98,7 +98,7 @@ class PointCloud(ShortRepr):
     def finite(self) -> PointCloud:
         """The points that are finite, as a list (n, ...), row by row.
 
-        Unknown normals become 0, because one NaN spoils what many programs compute from all normals.
+        Unknown normals become 0, because many programs compute from all normals, and one NaN spoils their result.
         """
         keep = self.valid
         kept = {k: v[keep] for k, v in self.attributes().items()}
@@ -109,7 +109,7 @@ class PointCloud(ShortRepr):
     def save(self, path: str | Path) -> None:
         """Write a `.ply` file (finite points only) or a `.pcd` file (organised, with NaN).
 
-        Errors are those of `rangesim.point_cloud.point_cloud_files.save_point_cloud`.
+        It raises the errors of `rangesim.point_cloud.point_cloud_files.save_point_cloud`.
         """
         from rangesim.point_cloud.point_cloud_files import save_point_cloud
 
@@ -147,7 +147,7 @@ def organised_cloud(
     z : (h, w) float32, metres, along the optical axis; NaN where there is no reading.
     camera : Intrinsics of the image.
     T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres.
-    intensity : (h, w) float32, in the units of the capture's frames; the colours are made from it.
+    intensity : (h, w) float32, in the units of the capture's frames; the cloud's grey colours are made from it.
     confidence : (h, w) float32 in 0..1.
     coordinates : "camera" or "world", the frame of the points and normals.
 
@@ -194,8 +194,8 @@ def lattice_normals(z: np.ndarray, rays: np.ndarray, radius: int = NORMAL_RADIUS
     """(h, w, 3) float64 unit normals towards the camera, in camera coordinates, of a depth image; NaN where there is no
     surface.
 
-    On a plane n.X = 1 the inverse depth is linear in the image, 1/z = n.(x, y, 1). This is fitted by least squares to
-    the window around each pixel. Pixels across a depth step are left out, so that edges are not rounded off.
+    On a plane n.X = 1 the inverse depth is linear in the image, 1/z = n.(x, y, 1). The function fits n by least squares
+    to the window around each pixel. It leaves out pixels across a depth step, so that edges are not rounded off.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def _fit_normals(start, stop, radius, limits, z, inverse, rays, normals):  # typ
             for i in range(max(0, row - radius), min(h, row + radius + 1)):
                 for j in range(max(0, column - radius), min(w, column + radius + 1)):
                     limit = limits[i - row + radius, j - column + radius] * z[row, column]
-                    if abs(z[i, j] - z[row, column]) <= limit:  # False with NaN
+                    if abs(z[i, j] - z[row, column]) <= limit:  # False if a depth is NaN
                         dx = rays[i, j, 0] - rays[row, column, 0]
                         dy = rays[i, j, 1] - rays[row, column, 1]
                         dv = inverse[i, j] - inverse[row, column]

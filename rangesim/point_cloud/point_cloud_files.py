@@ -2,7 +2,7 @@
 """Point clouds written as binary PLY and PCD files.
 
 The fields are x, y and z, and normals, intensity, colours and confidence if the cloud has them, under the names that
-Open3D, PCL and MeshLab know. They are in single precision, except points that are in double precision. A comment line
+Open3D, PCL and MeshLab know. The numbers have single precision; points have the precision of the cloud. A comment line
 names the coordinate frame. `pcgraph.read_cloud` reads both formats.
 """
 

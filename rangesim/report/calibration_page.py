@@ -23,11 +23,12 @@ CELLS = (8, 6)
 MIN_COVERED = 0.6
 """Fraction of the cells with corners below which the page warns, because distortion is unknown in the other cells."""
 WORSE_FACTOR = 2.0
-"""Ratio to the median error of all boards above which a board is named as worse; other values were not measured."""
+"""The page names a board as worse above this multiple of the median error of all boards; other values were not
+measured."""
 SHOWN_WIDTH = 400
 """Approximate width of a view in the page, in pixels; larger images are averaged so that the page stays small."""
 ARROW_LENGTH = 0.03
-"""Length at which an error of typical size is drawn, as a fraction of the image's width, so that patterns show."""
+"""Length of the arrow of a typical error, as a fraction of the image's width, so that patterns are visible."""
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """Names of a device's parameters: pixels for the first four, OpenCV's distortion coefficients for the others."""
 
@@ -127,7 +128,7 @@ def _values(device: Intrinsics) -> tuple[float, ...]:
 
 
 def _enlargement(device: Intrinsics, rms: float) -> int:
-    """Factor by which errors are drawn enlarged: the largest of 1, 2 or 5 times a power of 10 with which an error of
+    """Factor by which the page enlarges errors: the largest one of 1, 2 or 5 times a power of 10 with which an error of
     `rms` pixels is not longer than `ARROW_LENGTH`."""
     wanted = max(ARROW_LENGTH * device.width / max(rms, 1e-9), 1.0)
     power = 10.0 ** np.floor(np.log10(wanted))
@@ -189,7 +190,7 @@ def _view(found: RigCalibration, k: int, name: str, image: np.ndarray | None) ->
 def _verdict(
     found: RigCalibration, names: list[str], devices: list[dict[str, Any]], boards: list[dict[str, Any]]
 ) -> list[tuple[str, str]]:
-    """Sentences at the top of the page: each is its subject, which is shown in bold, and the rest."""
+    """Sentences at the top of the page, each in two parts: its subject, which is shown in bold, and the rest."""
     lines = []
     for device, deviations, said in (
         (found.rig.camera, found.camera_deviations, devices[0]),

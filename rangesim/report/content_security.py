@@ -46,8 +46,8 @@ def visible_text(value: Any) -> Any:
 class StyleRules:
     """CSS classes for declarations that depend on the data, such as a colour or a width.
 
-    They are needed because the content security policy allows no style attributes. A script could set them, but a page
-    without scripts must look the same.
+    The pages need them because the content security policy allows no style attributes. A script could set the styles,
+    but a page without scripts must look the same.
 
     Examples
     --------
@@ -68,7 +68,7 @@ class StyleRules:
         Raises
         ------
         ValueError
-            They are more than properties with plain values.
+            The declarations hold more than properties with plain values.
         """
         if not _DECLARATIONS.fullmatch(declarations):
             raise ValueError(f"expected plain CSS declarations, got {declarations!r}.")

@@ -77,7 +77,7 @@ def context(result: Result) -> dict[str, Any]:
 
 
 def by_camera(measurements: Sequence[Measurement]) -> list[list[Measurement]]:
-    """Measurements in groups that share the camera and its place, so that a pixel is the same ray in all of a group.
+    """Measurements in groups. A group shares the camera and its place, so a pixel is the same ray in the whole group.
 
     The groups are in the order of their first measurements.
     """

@@ -44,7 +44,7 @@ class LegendEntry:
 
 
 def png(image: np.ndarray, table: np.ndarray | None = None) -> str:
-    """PNG as a data URI; parameters as of `png_bytes`."""
+    """PNG as a data URI; the parameters are those of `png_bytes`."""
     return "data:image/png;base64," + base64.b64encode(png_bytes(image, table)).decode("ascii")
 
 
@@ -76,7 +76,7 @@ def grey(image: np.ndarray, white: float, black: float = 0.0) -> str:
 
 
 def color_map(fraction: np.ndarray, table: np.ndarray) -> str:
-    """PNG, as a data URI, of values 0..1 in the colours of a table; parameters as of `_indexed`."""
+    """PNG, as a data URI, of values 0..1 in the colours of a table, see `_indexed`."""
     return png(*_indexed(fraction, table))
 
 

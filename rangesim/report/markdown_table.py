@@ -10,7 +10,7 @@ from typing import NamedTuple
 from rangesim.errors import visible
 
 _SPECIAL = re.compile(r"([\\`|\[]|<(?! ))")
-"""Characters that Markdown interprets; the "<" of "< 0.1" is not among them, as a space follows it."""
+"""Characters that Markdown interprets. "<" is missing, because Markdown does not interpret the "<" of "< 0.1"."""
 _BREAKS = re.compile(r"[\t\r\n]+")
 """Tabulators and line breaks, which would end a cell of a table."""
 

@@ -12,7 +12,7 @@ from rangesim.decoding.status import Status
 from rangesim.results.experiment_results import Measurement
 
 NOTHING = len(Cause)
-"""Number of the class after those of `Cause`: the scene has no surface behind the pixel."""
+"""Number of the class "the pixel sees no surface of the scene". It follows the numbers of `Cause`."""
 NO_DATA = (203, 206, 210)
 """Colour of pixels without a value, RGB 0..255."""
 ERROR_KNEE_M = 1e-4
@@ -40,7 +40,7 @@ OUTCOME_NAMES = [*(TITLES[c] for c in Cause), "nothing there"]
 """Text of each value of `outcomes`."""
 OUTCOME_COLORS = np.array(
     [
-        (236, 238, 240),  # right
+        (236, 238, 240),  # no cause: the reading is correct
         (8, 24, 100),  # geometry: blues
         (24, 84, 214),
         (135, 190, 252),
@@ -54,7 +54,7 @@ OUTCOME_COLORS = np.array(
         (126, 185, 126),
         (138, 103, 242),  # decoder: violets
         (43, 31, 76),
-        (184, 248, 176),  # pile-up: noise
+        (184, 248, 176),  # pile-up: a green, as noise
         (203, 206, 210),  # nothing there
     ],
     dtype=np.uint8,
@@ -93,7 +93,7 @@ def color_table(name: str) -> np.ndarray:
 def depth_limits(measurements: tuple[Measurement, ...]) -> tuple[float, float]:
     """Nearest and farthest depth of the depth scale, metres, of the true surfaces of all measurements.
 
-    Half a percent of the pixels at either end is left out, and a margin is added.
+    The scale leaves out half a percent of the pixels at either end, and then gets a margin.
     """
     z = np.concatenate([m.truth.z[np.isfinite(m.truth.z)] for m in measurements])
     if z.size == 0:

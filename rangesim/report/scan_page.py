@@ -25,12 +25,12 @@ side."""
 WIDTH_PX = 480
 """Width of the pictures in pixels; larger ones make a larger page."""
 SAMPLES = 20_000
-"""Number of points on the mesh whose distances from the true surface the first sentence summarises.
+"""Number of points on the mesh. The first sentence of the page summarises their distances from the true surface.
 
-The standard error of a fraction of them is below 0.4 %.
+The standard error of a fraction of these points is below 0.4 %.
 """
 NOTHING_SEEN = "does the path look at them, and are its poses T_world_camera in metres?"
-"""Question to the user where no view measured anything; the page and the command line ask it."""
+"""Question that the page and the command line ask the user if no view measured anything."""
 SEEN = (94, 147, 190)
 """Colour of surfaces that some view measured, RGB 0..255."""
 UNSEEN = (222, 122, 60)
@@ -204,7 +204,7 @@ def _slices(result: ScanResult) -> list[dict[str, str]]:
     states, truth = result.seen.states, result.seen.truth
     solid = truth >= 0
     if solid.any():
-        # Half of the solid lies on either side: the fullest slice is often the one that touches the table
+        # Half of the solid lies on either side of the slice. The fullest slice is often the one that touches the table.
         filled_to = [np.cumsum(solid.sum(axis=tuple(j for j in range(3) if j != axis))) for axis in (2, 1)]
         middle = [int(np.searchsorted(c, c[-1] / 2)) for c in filled_to]
     else:
@@ -223,7 +223,7 @@ def _slices(result: ScanResult) -> list[dict[str, str]]:
 
 
 def _open_shapes(result: ScanResult) -> list[str]:
-    """Names of the things whose surface encloses no voxel, because it is not closed or they are thin."""
+    """Names of the things whose surface encloses no voxel, because the surface is not closed or the thing is thin."""
     return [name for name, seen in result.seen.shapes.items() if np.isnan(seen.volume_surface)]
 
 

@@ -87,7 +87,7 @@ class Cell:
 
 
 def titles(measurements: Sequence[Measurement]) -> dict[str, str]:
-    """Title of each instrument, by name; the name is added where two instruments would have the same title."""
+    """Title of each instrument, by name. If two instruments would have the same title, their names are added to it."""
     plain = {m.name: m.capture.sensor.title for m in measurements}
     return {n: t if list(plain.values()).count(t) == 1 else f"{t}, {n}" for n, t in plain.items()}
 

@@ -70,8 +70,8 @@ def _failures(rows: Rows) -> str:
 
 
 def _reasons(rows: Rows) -> str:
-    """Sentence about the causes of failures on the materials where the sensor is unreliable; without such a material,
-    about those on all surfaces."""
+    """Sentence about the causes of failures on the materials where the sensor is unreliable. If there is no such
+    material, it is about the failures on all surfaces."""
     poor = [row for row in rows if row["material"] != "all" and is_unreliable(row)]
     named = [f"{row['material']}: {_main_causes(row)}" for row in poor if row["causes"]]
     if named:
@@ -98,7 +98,7 @@ def _best_error(real: Sequence[Measurement], names: dict[str, str]) -> str:
 
 
 def _most_right(real: Sequence[Measurement], names: dict[str, str]) -> str:
-    """Sentence that ranks sensors by their fraction of right readings; wrong readings do not count."""
+    """Sentence that ranks sensors by their fraction of correct readings; wrong readings do not count."""
     failed = [(_total(m.rows)["failed"], names[m.name]) for m in real if _total(m.rows)["failed"] is not None]
     limit = _glued(f"{1e3 * OUTLIER_M:g} mm")
     entries = [(name, f"{_percent(1.0 - f)} of the pixels") for f, name in sorted(failed)]

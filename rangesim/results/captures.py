@@ -69,7 +69,7 @@ def save_capture(capture: Capture, directory: str | Path) -> None:
 def write_capture(capture: Capture, folder: Path) -> None:
     """Write the files of a capture and their manifest into an empty directory.
 
-    Nothing protects the files until they are complete; `save_capture` does that.
+    This function does not protect the files while they are incomplete; `save_capture` does.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def import_capture(
 ) -> Capture:
     """A real capture from a folder with one image per frame.
 
-    The images are taken in the order of their names; numbers in the names are compared by value.
+    The images are read in the order of their names; numbers in the names are compared by value, so 2 precedes 10.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def _sidecar(capture: Capture, names: list[str]) -> dict[str, Any]:
 
 
 def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor, size: tuple[int, int] | None) -> np.ndarray:
-    """Frames (k, h, w) of a capture, in the type that it had.
+    """Frames (k, h, w) of a capture, in the type that they had when they were saved.
 
     size : width and height that the frames must have; None: any.
     """

@@ -77,7 +77,7 @@ class SceneRecord(Record, frozen=True, kw_only=True):
     """The scene that was measured.
 
     sha256 : checksum of its file; None if the scene was not loaded from a file.
-    working_distance_m : distance from the camera to what it looks at, metres.
+    working_distance_m : distance from the camera to the point that it looks at, metres.
     """
 
     name: str
@@ -143,8 +143,8 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
 class RowRecord(Record, frozen=True, kw_only=True):
     """Statistics of one material class.
 
-    Their meaning is that of `rangesim.evaluation.comparison.ErrorStatistics`, `rangesim.causes.CauseMap.fractions` and
-    `rangesim.evaluation.range_noise.RangeNoise.by_material`. None: not known.
+    `rangesim.evaluation.comparison.ErrorStatistics`, `rangesim.causes.CauseMap.fractions` and
+    `rangesim.evaluation.range_noise.RangeNoise.by_material` explain them. None: not known.
     """
 
     material: Name
@@ -186,7 +186,7 @@ _SEGMENTATION = {
     "parents": ArraySpec("int32", ("nodes",), low=0, per_pixel=2),
     "altitudes": ArraySpec("float64", ("nodes",), low=0, inf=True, per_pixel=2),
 }
-"""Type, shape and bounds of the arrays of `segmentation.npz`. A binary tree has less than two nodes per pixel."""
+"""Type, shape and bounds of the arrays of `segmentation.npz`. A binary tree has fewer than two nodes per pixel."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -196,7 +196,7 @@ class Segmentation(ShortRepr):
     supervoxels : (h, w) int32, number of the supervoxel of each pixel; -1 where there is no point.
     labels : (h, w) int32, number of the object of each pixel; -1 where there is no point, -2 for outliers.
     parents : (k,) int32, parent of each node of the tree. The supervoxels come first; the root is its own parent.
-    altitudes : (k,) float64, altitude at which each node merges; it never decreases towards the root.
+    altitudes : (k,) float64, altitude at which the children of each node merge; it never decreases towards the root.
     """
 
     supervoxels: np.ndarray
@@ -263,7 +263,7 @@ def complete_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def write_result(result: Result, folder: Path, pages: Mapping[str, bytes]) -> None:
     """Write the files of a result to an empty directory.
 
-    Nothing protects the files until they are complete; `rangesim.pipeline.experiment_run.run` does that.
+    This function does not protect the files while they are incomplete; `rangesim.pipeline.experiment_run.run` does.
 
     Parameters
     ----------

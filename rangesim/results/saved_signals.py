@@ -159,7 +159,7 @@ def read_pass(path: Path, sizes: dict[str, int]) -> LightPass:
     FileFormatError
         The file is missing or broken.
     """
-    data = read_checked_arrays(path, _PASS, dict(sizes))  # a copy: passes may see other instances
+    data = read_checked_arrays(path, _PASS, dict(sizes))  # a copy: the call adds sizes to it
     energy, truth = _energy_and_truth(path, data)
     return LightPass(energy, truth, data.get("motion_m"), _truncation(data))
 

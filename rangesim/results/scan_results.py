@@ -223,7 +223,7 @@ _ARRAYS = {
 def write_scan(result: ScanResult, folder: Path, pages: Mapping[str, bytes]) -> None:
     """Write the files of a scan to an empty directory.
 
-    Nothing protects the files until they are complete; `rangesim.pipeline.scan_run.run_scan` does that.
+    This function does not protect the files while they are incomplete; `rangesim.pipeline.scan_run.run_scan` does.
 
     Parameters
     ----------
@@ -301,7 +301,7 @@ def load_scan(directory: str | Path) -> ScanResult:
     surfaces = _surfaces(data, list(statistics.shapes), folder / "truth.npz")
     shapes = {name: _seen_of(statistics.shapes[name], name, folder / SIDECAR) for name in statistics.things}
     if data["filled"].max(initial=-1) >= len(shapes):
-        raise FileFormatError(f"{folder / 'truth.npz'}: array 'filled': expected numbers of {len(shapes)} things.")
+        raise FileFormatError(f"{folder / 'truth.npz'}: array 'filled': expected numbers below {len(shapes)}.")
     seen = Occupancy(data["states"], data["filled"], tuple(shapes), shapes, grid, record.tolerance_m)
     fused = FusedSurface(
         mesh,
@@ -350,7 +350,7 @@ def _surfaces(data: dict[str, np.ndarray], names: list[str], path: Path) -> dict
 def _seen_of(shape: ShapeStatistics, name: str, path: Path) -> SeenOfShape:
     """The fractions of a shape that the views saw, from its statistics."""
     if shape.seen is None:
-        raise FileFormatError(f"{path}: expected what the views saw of {shown(name)}, which is no background.")
+        raise FileFormatError(f"{path}: expected the values 'seen' of {shown(name)}, which is no background.")
     values = msgspec.to_builtins(shape.seen)
     return SeenOfShape(**{key: float("nan") if value is None else value for key, value in values.items()})
 
