@@ -20,8 +20,9 @@ FAR_TURNS = 0.125
 period that `refine_by_phase` allows."""
 
 MAX_FAR_FRACTION = 0.2
-"""Largest fraction of pixels whose phase may lie far outside their Gray cell. If phase and code have nothing to do with
-each other, a quarter of the pixels lie there by chance."""
+"""Largest fraction of pixels whose phase may lie far outside their Gray cell. It is below a quarter, because a quarter
+of the pixels lie there by chance if phase and code have nothing to do with each other. A smaller value would doubt
+captures that are merely noisy."""
 
 MIN_ONE_SIDED_FRACTION = 0.02
 """Least fraction of pixels that lie outside their Gray cell on one side, if none do on the other, at which the fringes
@@ -45,8 +46,8 @@ PHASE_BINS = 8
 frame of N shows at some phases only; if there were more parts, each would hold fewer pixels."""
 
 MIN_CELLS = 8
-"""Least number of Gray cells in view for the check whether a frame is black or white everywhere. If fewer cells are in
-view, a correct frame may look like that."""
+"""Least number of Gray cells in view for the check whether a frame is black or white everywhere, because a correct
+frame may look like that if fewer cells are in view. With a larger number, fewer captures would be checked."""
 
 MIN_SWING = 0.35
 """Least swing of fringes that the camera resolves, as a fraction of white - black. In focus the swing is 1. Out of

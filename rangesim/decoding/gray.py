@@ -29,7 +29,8 @@ black. Where both are lit or both are dark, the difference is 1; a gamma makes a
 
 MAX_PAIRS = 50_000
 """Largest number of pairs of neighbouring pixels, across and also down the image, on which other orders of the frames
-are tried. It bounds the time, which grows with the number of orders."""
+are tried, so that the time is bounded, which grows with the number of orders. With far fewer, too few of them would lie
+in different cells (see `MIN_STEPS`)."""
 
 MIN_STEPS = 100
 """Least number of pairs of neighbouring pixels in different cells from which a check of the order draws a
@@ -37,11 +38,13 @@ conclusion."""
 
 MAX_FARTHER_OCTAVES = 0.3
 """Largest mean distance by which neighbours may lie farther apart when read as Gray code than when read as plain binary
-numbers, in powers of two. For plain binary numbers that are read as Gray code, this distance is about 1."""
+numbers, in powers of two. For plain binary numbers that are read as Gray code, this distance is about 1. For Gray code
+whose neighbours lie one cell apart, it is at most 0, because they cannot lie nearer."""
 
 MAX_NEARER_FRACTION = 0.8
-"""Largest fraction of neighbours that another order of the frames may bring nearer to each other. Only neighbours count
-whose distance it halves or doubles. If that order is the right one, it brings nearly all of them nearer."""
+"""Largest fraction of neighbours that another order of the frames may bring nearer to each other, because the right
+order brings nearly all of them nearer. Only neighbours count whose distance the other order halves or doubles. With a
+larger value, noise at some pixels would hide a wrong order."""
 
 MIN_REPEATED_FRACTION = 0.9
 """Least fraction of the changes of one bit, from pixel to pixel, at which another bit changes too if both bits come

@@ -19,8 +19,8 @@ MAX_OUTSIDE = 3.0
 middle is farther out, less than 0.2 % of the pulse is in the bins, and noise alone would decide its place."""
 
 MAX_STEPS = 50
-"""Largest number of Newton steps to the place of a pulse that is cut off. A few usually suffice; the limit ends those
-that never converge."""
+"""Largest number of Newton steps to the place of a pulse that is cut off, so that searches end that never converge. A
+few steps usually suffice."""
 
 MIN_RATE = 1e-3
 """Least rate at which a cut-off pulse's centroid grows with its place (a ratio) in a Newton step. A smaller one, as of

@@ -23,8 +23,8 @@ COORDINATE_ERROR_PX = 0.5
 largest error of a sound Gray code, which decodes to whole pixels. Phase shift is finer."""
 
 MAX_BEHIND_FRACTION = 0.2
-"""Largest fraction of the decoded pixels whose rays may meet clearly behind a device before the capture is doubted.
-Interreflection makes a few rays do so; with a mirrored image or an inverted calibration most rays do."""
+"""Largest fraction of the decoded pixels whose rays may meet clearly behind a device before the capture is doubted,
+because interreflection makes only a few rays do so, but a mirrored image or an inverted calibration most of them."""
 
 MIN_BEHIND_PX = 10.0
 """Least distance, in projector pixels, of a coordinate from the one that would make the rays parallel, at which they
