@@ -34,7 +34,8 @@ LUMINOUS_EFFICACY = 683.0
 Kelvins = Annotated[float, Bounds("positive and finite", 300, 1e5)]
 """Temperature of a black body in kelvins, from a warm room to hotter than any light source."""
 Strength = Annotated[float, Bounds("0 or positive", 0, 1e12)]
-"""Illuminance in lux, or irradiance in W/m2."""
+"""Illuminance in lux, or irradiance in W/m2. The upper bound only excludes nonsense: sunlight on the ground has about
+1e5 lux and 1000 W/m2."""
 _VISIBLE_NM = np.arange(380.0, 781.0)
 """Wavelengths in nm, 1 nm apart, over which luminous efficacy is integrated: the visible range by CIE."""
 

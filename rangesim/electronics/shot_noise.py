@@ -31,7 +31,7 @@ SUMMED = 8
 """Count of terms of the cumulative probability that are always added, because a loop without a branch is faster. At the
 largest mean that they serve (4 photons), 2 % of the draws need more terms."""
 _RECIPROCAL = 1 / np.arange(1.0, SUMMED + 1)
-"""1, 1/2, 1/3 ... for the terms of `SUMMED`, as multiplying is faster than dividing."""
+"""1, 1/2, 1/3 ... for the terms of `SUMMED`, because multiplying is faster than dividing."""
 NEGLIGIBLE = 1e-17
 """Fraction of a sum of probabilities, so small that adding it no longer changes the sum in double precision."""
 SPARSE = 5.0
