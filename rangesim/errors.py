@@ -29,8 +29,8 @@ __all__ = [
 ]
 
 MAX_SENTENCE = 480
-"""Number of characters of a message, about six lines of a terminal; a longer message loses its middle. Files may hold
-names of a megabyte."""
+"""Largest number of characters of a message, about six lines of a terminal, so that it stays readable even if a file
+holds names of a megabyte. A longer message loses its middle."""
 
 
 class RangesimError(Exception):
