@@ -48,12 +48,12 @@ MANIFEST_FORMAT = "rangesim-manifest"
 MANIFEST_VERSION = 1
 """Version of the manifest's format; a manifest of another version is refused."""
 MAX_MANIFEST_BYTES = 64 << 20
-"""Bytes of the largest manifest that is read. Each listed file takes some 150 bytes, so this is enough for over 400 000
-files."""
+"""Bytes of the largest manifest that is read, so that a damaged or hostile one cannot fill the memory. Each listed file
+takes some 150 bytes, so this is enough for over 400 000 files."""
 _JOURNAL, _LOCK, _WORK, _NEW, _OLD, _DOOMED = "journal.json", "lock", "work", "new", "old", "doomed"
 _ATTEMPTS = 1000
-"""Attempts, about a millisecond apart, to claim a directory that another process removes at the same moment. If all
-fail, the directory counts as one that cannot be made."""
+"""Number of attempts, about a millisecond apart, to claim a directory that another process removes at the same moment.
+If all fail, which takes about a second, the directory counts as one that cannot be made."""
 
 
 @dataclass(frozen=True)
@@ -718,10 +718,11 @@ def _digest(path: Path) -> Digest:
 _hashed: dict[tuple[int, ...], Digest] = {}
 """Digests of files that this process has read, by device, inode, size, and times of modification and change."""
 SETTLED_NS = 2_000_000_000
-"""Nanoseconds since the last change of a file after which its digest is kept. A later change surely gets another time:
-the coarsest clocks of file systems tick every two seconds."""
+"""Nanoseconds since the last change of a file after which its digest is kept. A later change surely gets another time,
+because the coarsest clocks of file systems tick every two seconds."""
 MAX_HASHED = 10_000
-"""Digests that are kept; when there are more, all are forgotten."""
+"""Largest number of digests that are kept, so that memory is bounded; when there are more, all are forgotten, and the
+files are read again when they are needed."""
 
 
 def _manifest(kind: DirectoryKind, files: Mapping[str, Sequence[Digest]]) -> bytes:

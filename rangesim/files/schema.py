@@ -25,13 +25,13 @@ from rangesim.settings import limits
 from rangesim.settings.config import shown
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]
-"""A count, at most 2^53: JSON readers with double precision cannot hold every integer above it."""
+"""A count, at most 2^53, because JSON readers with double precision cannot hold every integer above it."""
 Photons = Annotated[float, msgspec.Meta(ge=0, le=1e300)]
 """A mean count of photons; the upper bound only excludes infinity."""
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
 """A fraction from 0 to 1."""
 Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
-"""A duration in seconds, at most 30 years."""
+"""A duration in seconds, at most 30 years; the upper bound only excludes nonsense."""
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
 """A positive number in whatever unit; the upper bound only excludes nonsense."""
 MAX_METRES = 1e9
@@ -40,7 +40,7 @@ damaged numbers; a wrong measurement may lie far outside the scene."""
 Metres = Annotated[float, msgspec.Meta(ge=-MAX_METRES, le=MAX_METRES)]
 """A length in metres, of either sign."""
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
-"""A name of 1 to 1000 characters."""
+"""A name of 1 to 1000 characters; see `MAX_TEXT` for the reason."""
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -180,8 +180,8 @@ def settings_of(array: np.ndarray, path: Path) -> dict[str, Any]:
 
 
 MAX_TEXT = 1000
-"""Largest number of characters of a name in an array of text, as for `Name`. NumPy stores each name of an array with as
-many characters as the longest, so one long name would make a huge array."""
+"""Largest number of characters of a name in an array of text, as for `Name`, so that one long name makes no huge array:
+NumPy stores each name of an array with as many characters as the longest."""
 
 
 def _check_header(
