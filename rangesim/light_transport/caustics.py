@@ -26,8 +26,8 @@ from rangesim.rig import Rig
 
 PHOTONS_PER_DISC = 400
 """Number of photons of all maps within the radius of the first map, where light is neither spread nor focused; the
-radius is chosen so that there are this many. An estimate from n photons has a relative noise of about 1 / sqrt(n); more
-photons need a larger radius, which blurs more."""
+radius is chosen so that there are this many. An estimate from n photons has a relative noise of about 1 / sqrt(n), so
+fewer photons make more noise. More photons need a larger radius, which blurs more."""
 MAX_RADIUS_PROJECTOR_PX = 3.0
 """Largest radius of the first map, in projector pixels at the distance of the point, so that the blur stays finer than
 the stripes of structured light."""
@@ -39,8 +39,8 @@ MAX_RADIUS_CAMERA_PX = 3.0
 sharp."""
 MAX_COSINE_RATIO = 4.0
 """Largest ratio of two cosines of a photon's direction: that to the facet at the vertex, and that to the facet on which
-the photon landed. Radiance is divided by the second cosine. Without this bound, a facet that photons meet edge-on would
-bring any amount of light."""
+the photon landed. Radiance is divided by the second cosine, so without this bound, a facet that photons meet edge-on
+would bring any amount of light. A smaller bound would darken caustics beside edges where facets meet at an angle."""
 
 
 def caustic_photons(

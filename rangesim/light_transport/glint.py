@@ -50,7 +50,7 @@ UNKNOWN_SPREAD = 8.0
 lens."""
 MIN_RADIUS_SPREADS = 0.2
 """Radius, in spreads, of the smallest disc that stands for the lens. Such a disc covers about a tenth of the pixel, so
-that enough of the pixel's paths hit it."""
+that enough of the pixel's paths hit it. A larger one may reach into pixels that do not see the lens."""
 MAX_ENLARGEMENT = 16.0
 """Largest radius, in radii of the lens, of the disc that stands for it. A larger disc is hit by more paths, but may
 reach into pixels that do not see the lens."""

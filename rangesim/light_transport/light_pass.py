@@ -37,8 +37,8 @@ from rangesim.settings.seeds import derived_seed
 from rangesim.signals import EnergySplit, StillSignals
 
 MATTE_SPP = 16
-"""Samples per pixel for pixels that share their indirect light, if no sampler decides. Sharing averages over many
-pixels, so these need fewer samples than others."""
+"""Samples per pixel for pixels that share their indirect light, if no sampler decides. They need fewer samples than
+others, because sharing averages over many pixels. With twice as many, they would take twice as long."""
 OTHER_SPP = 64
 """Samples per pixel for all other pixels, if no sampler decides. With twice as many, the noise would be lower by a
 factor of 1.4, and the time twice as long."""
@@ -47,7 +47,8 @@ PATHS_FRACTION = 0.95
 the sums. The value changes the progress bar and nothing else."""
 RAYS_TO_MEDIA = 16
 """Number of columns, and of rows, of the rays that look for media on the wrong side of their boundary. These 256 rays
-may miss a body that covers less than one of the cells between them."""
+may miss a body that covers less than one of the cells between them. More rays would find smaller bodies and take
+longer."""
 TEXTURE_SAMPLES = 64
 """Largest number of samples per pixel over which the reflectance of a texture is averaged. More samples take longer and
 change a mean over a pixel little, because samples are spread evenly."""

@@ -56,8 +56,8 @@ NEIGHBOURS = 256
 take about equally long. Longer runs would be spread less evenly. With runs shorter than a vector of the processor (16
 lanes), one vector would hold pixels whose paths differ."""
 ITERATIONS_PER_SAMPLE = 2
-"""Number of iterations of the loop per sample that is assumed before any were counted. Only the size of the first
-launch depends on it; the size of later ones depends on the count."""
+"""Number of iterations of the loop per sample that is assumed before any were counted. It need not be exact, because
+only the size of the first launch depends on it; the size of later ones depends on the count."""
 GOLDEN_STEP = 2654435769
 """Step of a sequence of fractions of 2^32: 2^32 divided by the golden ratio, because its multiples modulo 2^32 are
 spread evenly, however many there are."""

@@ -31,8 +31,8 @@ MIN_THROWN = 0.005
 """Fraction of the projector's light, thrown onto other surfaces by narrow lobes, above which a pass warns. A smaller
 value would warn of light that changes few readings."""
 MIN_NAMED = 0.1
-"""Fraction of the thrown light that a shape throws or receives, above which the warning names the shape. So it names
-only shapes that matter."""
+"""Fraction of the thrown light that a shape throws or receives, above which the warning names the shape, so that it
+names only shapes that matter."""
 MAX_NAMED = 3
 """Largest count of shapes that the warning names, so that it stays one sentence."""
 

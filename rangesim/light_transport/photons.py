@@ -40,7 +40,7 @@ SURFACES_PER_PHOTON = 2
 take, so that a wrong number costs little."""
 SUMMED_TOGETHER = 1 << 16
 """Number of photons per block. The powers within a block are added first. A launch holds whole blocks, so the sum does
-not depend on how photons are cut into launches."""
+not depend on how photons are cut into launches. With larger blocks, the shortest launch would take longer."""
 MAX_AT_ONCE = 1 << 20
 """Largest number of photons of a launch, so that NumPy's work on them between launches is short as well."""
 BYTES_PER_PHOTON = 128

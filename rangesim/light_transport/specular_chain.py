@@ -33,7 +33,7 @@ CLEARANCE = 0.1
 than this distance loses its far face; a smaller fraction comes near the rounding of single precision."""
 MIN_COSINE = 0.05
 """Smallest cosine of the angle between ray and normal at which a point is corrected, because at a flatter angle the
-corrected point may be far off."""
+corrected point may be far off. With a larger value, more points would keep Mitsuba's rounding."""
 
 
 @dataclass

@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 from rangesim.light_transport.sampling import aligned
 
 MANY = 100
-"""Number of shapes from which on branches are shared. In smaller scenes it would take longer to make their tables than
-virtual calls take."""
+"""Number of shapes from which on branches are shared, because in smaller scenes it would take longer to make their
+tables than virtual calls take."""
 MAX_FACES = 4096
 """Largest count of faces of a mesh that is copied into a joint mesh, so that copies take little memory; a scene has few
 larger meshes."""
