@@ -30,7 +30,7 @@ MAX_SLOPE = 4.0
 """Largest ratio of depth step to lateral step between two pixels that count as one surface.
 
 With 4, the pixels of a surface keep their neighbours if its normal is up to 76 degrees off the ray. A larger value
-joins surfaces across depth edges.
+joins surfaces across depth edges; with a smaller one, pixels of steep surfaces lose their neighbours.
 """
 STEP_FLOOR = 0.005
 """Fraction of z by which the depths of neighbours on one surface may always differ, so that noise separates none."""
