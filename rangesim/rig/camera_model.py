@@ -147,7 +147,7 @@ def unproject(model: CameraModel, u: Any, v: Any, tolerance_px: float) -> tuple[
 # ---- Where the image folds ------------------------------------------------------------------------------------------
 
 NEGLIGIBLE = 1e-100
-"""Magnitude below which a coefficient counts as 0: it bends no ray, and dividing by it would overflow double
+"""Magnitude below which a coefficient counts as 0, because it bends no ray, and dividing by it would overflow double
 precision."""
 
 

@@ -35,7 +35,8 @@ Array = NDArray[np.float64]
 
 SAME_PLACE = 1e-5
 """Largest difference of two poses, in metres and radians, that count as the same place. Poses that were computed along
-different ways differ by rounding, about 1e-16; nobody can adjust a device to 10 um."""
+different ways differ by rounding, about 1e-16. A pose that differs by less than 10 um is no other place either, because
+nobody can adjust a device so finely."""
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R R^T - I|, dimensionless, of a matrix that counts as a rotation. A matrix written with five
 decimals is off by at most 2e-5 and passes; a scale of 1.0001 does not."""
@@ -44,11 +45,11 @@ RESIDUAL_PX = 1e-3
 After Newton's method the miss is far below this value where the lens model has an inverse, and far above it
 elsewhere."""
 FocalLength = Annotated[float, Bounds("positive and finite", 1e-3, 1e9)]
-"""A focal length in pixels."""
+"""A focal length in pixels; the bounds only exclude nonsense."""
 PrincipalPoint = Annotated[float, Bounds("a pixel coordinate", -1e9, 1e9)]
-"""A coordinate of the principal point in pixels; it may lie outside the image."""
+"""A coordinate of the principal point in pixels; it may lie outside the image, so the bounds only exclude nonsense."""
 Coefficient = Annotated[float, Bounds("a coefficient", -1e6, 1e6)]
-"""A coefficient of distortion, dimensionless."""
+"""A coefficient of distortion, dimensionless; the bounds only exclude nonsense."""
 
 
 @dataclass(frozen=True)
