@@ -26,7 +26,8 @@ MAX_POLISHED_ALPHA = 0.05
 
 MAX_NARROW_ALPHA = 0.03
 """Largest microfacet roughness alpha, dimensionless, of a narrow lobe. Its solid angle, about pi (2 alpha)^2, is then
-at most a five-hundredth of a hemisphere, so a light path in a random direction hardly ever lies in the lobe."""
+at most a five-hundredth of a hemisphere, so a light path in a random direction hardly ever lies in the lobe. A larger
+value would also count lobes that such paths do find."""
 
 ALL_COMPONENTS = 0xFFFFFFFF
 """Mask of all components of a BSDF, as in `mitsuba.BSDFContext`."""

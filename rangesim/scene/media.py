@@ -17,11 +17,11 @@ _OBLIQUE = np.array(
     ]
 )
 DIRECTIONS = _OBLIQUE / np.linalg.norm(_OBLIQUE, axis=1, keepdims=True)
-"""(7, 3) float64, unit vectors in all directions. None is along an axis: edges of shapes often lie along axes, and a
-ray that meets an edge may be counted wrongly. Seven is odd, so a majority exists."""
+"""(7, 3) float64, unit vectors in all directions. None is along an axis, because edges of shapes often lie along axes,
+and a ray that meets an edge may be counted wrongly. Seven is odd, so a majority exists."""
 MAX_SURFACES = 64
-"""Number of surfaces along a ray after which the search for enclosing bodies stops; surfaces beyond are ignored. A
-larger number costs time only where a ray crosses more surfaces."""
+"""Number of surfaces along a ray after which the search for enclosing bodies stops, so that its time is bounded;
+surfaces beyond are ignored. A larger number costs time only where a ray crosses more surfaces."""
 
 
 def is_boundary(shape: Any) -> bool:

@@ -18,13 +18,14 @@ from rangesim.errors import FileFormatError, warn
 
 NEAR_M = 10.0
 """Largest coordinate of a camera, in metres, at which the renderer keeps the origin of the file. Mitsuba starts rays
-0.09 mm * (1 + c) off a surface with coordinates up to c metres, which is 1 mm here, and rounds coordinates to 1 um."""
+0.09 mm * (1 + c) off a surface with coordinates up to c metres, which is 1 mm here, and rounds coordinates to 1 um. A
+larger value would make both coarser; a smaller one would change the coordinates of more scenes."""
 AS_FAR = 2.0
 """Smallest ratio of the camera's distance from the origin to its distance from what it sees, at which what it sees
 counts as far from the origin too. At 2, what it sees is at least half as far from the origin as the camera."""
 COARSE_M = 1e-4
-"""Smallest rounding of vertices or places, in metres, that causes a warning: 0.1 mm, which good
-sensors can measure."""
+"""Smallest rounding of vertices or places, in metres, that causes a warning: 0.1 mm, because good sensors can measure
+so small a distance."""
 PLACED_EMITTERS = ("point", "spot", "projector")
 """Types of emitters that stand at a place in the world."""
 CAMERAS = ("perspective", "thinlens")

@@ -70,8 +70,8 @@ COLOURS = ("value", "color", "color0", "color1", "filename", "bitmap", "data")
 """Properties of a texture that hold its values. They have the bounds of the property that the texture is for."""
 ENTRIES_PER_SHAPE = 20
 """Mean count of entries per allowed shape (limit `shapes`) above which a scene dictionary is refused. Usual shapes have
-fewer, their BSDF included. A dictionary that contains another one many times, in many levels, has more entries and
-would fill the memory."""
+fewer, their BSDF included. The bound exists because a dictionary that contains another one many times, in many levels,
+has more entries and would fill the memory."""
 NOT_OF_MEDIA = ("sigma_a", "sigma_s", "material")
 """Properties of media in other renderers, which Mitsuba 3.9 silently ignores."""
 BITMAP_SOURCES = ("filename", "bitmap", "data")
