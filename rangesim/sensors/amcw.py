@@ -23,8 +23,8 @@ from rangesim.settings import limits
 from rangesim.settings.bounds import HERTZ, Bounds, Hertz, check_fields, check_number
 
 MAX_RANGE_M = 100.0
-"""Largest range, metres, that phase unwrapping searches, even if the frequencies are unambiguous farther out. The time
-of the search grows with this range, and the emitter of such a camera does not reach as far."""
+"""Largest range, metres, that phase unwrapping searches, even if the frequencies are unambiguous farther out, because
+the time of the search grows with this range, and the emitter of such a camera does not reach as far."""
 
 TAPS_DEG = (0, 90, 180, 270)
 """Delays of the taps of each frequency, in degrees of its phase: quarter turns, as in nearly all such cameras. `frames`
