@@ -94,7 +94,7 @@ fit. At this distance from the origin, double precision still resolves 2 nm; far
 Metres = Annotated[float, Bounds("positive and finite", 1e-9, MAX_COORDINATE_M)]
 """A length in metres, from 1 nm."""
 Watts = Annotated[float, Bounds("positive and finite", 1e-12, 1e9)]
-"""A radiant power in watts."""
+"""A radiant power in watts, from 1 pW to 1 GW."""
 HERTZ = Bounds("positive and finite", 1.0, 1e12)
 """Bounds of a frequency in hertz: from 1 Hz to 1 THz, which is a wavelength of 0.3 mm."""
 Hertz = Annotated[float, HERTZ]
@@ -104,7 +104,7 @@ SECONDS = Bounds("positive and finite", 1e-15, 1e6)
 Seconds = Annotated[float, SECONDS]
 """A duration in seconds."""
 Pause = Annotated[float, Bounds("0 or positive", 1e-15, 1e6, or_zero=True)]
-"""A duration in seconds that may be 0."""
+"""A duration in seconds that may be 0; if it is not, the bounds of `SECONDS` hold."""
 Wavelength = Annotated[float, Bounds("positive and finite", 1e-8, 1e-2)]
 """A wavelength of light in metres, from extreme ultraviolet (10 nm) to microwaves (10 mm)."""
 Exponent = Annotated[float, Bounds("an exponent of at least 0", 0, 100)]
@@ -114,7 +114,7 @@ Coordinate = Annotated[float, Bounds("a coordinate", -MAX_COORDINATE_M, MAX_COOR
 Fraction = Annotated[float, Bounds("a fraction", 0, 1)]
 """A fraction from 0 to 1."""
 PositiveFraction = Annotated[float, Bounds("a positive fraction", 1e-9, 1)]
-"""A fraction that something is divided by, so it may not be 0."""
+"""A fraction from 1e-9 to 1; it may not be 0, because something is divided by it."""
 
 
 def check_fields(setting: Any) -> None:

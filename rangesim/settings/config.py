@@ -124,8 +124,8 @@ def brief(error: BaseException) -> str:
 
 
 MAX_REASON = 200
-"""Largest number of characters that are quoted of a library's message: two lines of a terminal. Some libraries put
-whole files into their messages."""
+"""Largest number of characters that are quoted of a library's message: two lines of a terminal, because some libraries
+put whole files into their messages."""
 
 
 def check_keys(given: Mapping[str, Any], valid: typing.Iterable[str], place: str) -> None:
