@@ -22,19 +22,22 @@ Array = NDArray[np.float64]
 
 EDGE_POINTS = 64
 """Number of points on the edge of a disc. Their polygon gives the centroid of the disc's image. The centroids of
-polygon and disc are equal to rounding, as long as the distortion of the lens hardly bends one side of the polygon."""
+polygon and disc are equal to rounding, as long as the distortion of the lens hardly bends one side of the polygon.
+Fewer points make longer sides, which it bends more; more points take longer."""
 INK_REFLECTANCE = 0.05
 """Reflectance of the ink of a rendered board, a fraction, like black print. A higher value leaves less contrast at the
 corners."""
 BOARD_REFLECTANCE = 0.8
-"""Reflectance of a rendered board beside the ink, a fraction, like white paper."""
+"""Reflectance of a rendered board beside the ink, a fraction, like white paper. A lower value leaves less contrast at
+the corners."""
 MIN_MOVE_PX = 0.15
 """Smallest value, in pixels, of the limit on how far a corner may move when the search window becomes half as wide.
 Measured in 36 rendered views: good corners move by at most 0.14 px, and corners beside the edge of the light by 3.5 to
 4.1 px."""
 MAX_MOVE_RATIO = 8.0
 """Limit on the same move, as a multiple of the median move of all corners of the view, if that is larger than
-`MIN_MOVE_PX`. In a blurred or noisy view all corners move more."""
+`MIN_MOVE_PX`. It grows with the median, because in a blurred or noisy view all corners move more. A smaller multiple
+would leave out good corners, a larger one would keep corners that another edge draws away."""
 Count = Annotated[int, whole(2)]
 """A number of points along a side of a board, at least two: one row has no second direction."""
 Length = Annotated[float, Bounds("positive metres", 1e-6, 1e3)]

@@ -36,13 +36,13 @@ MIN_AROUND = 24
 two coordinates, so this is six times the number that it needs."""
 
 MAX_AROUND = 600
-"""Largest number of decoded pixels around a corner that its homography takes, evenly spread. It bounds the time; the
-error of a homography falls only with the root of their number."""
+"""Largest number of decoded pixels around a corner that its homography takes, evenly spread. More would take longer and
+gain little, because the error of a homography falls only with the root of their number."""
 
 REACH = 0.9
 """Distance around a corner up to which decoded pixels are taken, as a fraction of the distance between neighbouring
-corners in the image. A larger distance takes more pixels, over which the lenses' distortion is less like a
-homography."""
+corners in the image. A larger distance takes more pixels, over which the lenses' distortion is less like a homography;
+a smaller one takes fewer pixels, so that less of their noise averages out."""
 
 MAX_GAP_RAD = 2.8
 """Largest gap between the directions of the decoded pixels around a corner, radians; half a turn is 3.14. Two white

@@ -25,7 +25,8 @@ MIN_ERROR_PX = 0.1
 a calibration."""
 MAX_NOISE_RATIO = 1.5
 """Largest ratio of the noise of a bundle of two devices to the noise of each device alone. Above it, some views of the
-two devices contradict each other, even if no single point is suspect."""
+two devices contradict each other, even if no single point is suspect. A smaller ratio would cost good calibrations the
+time of further adjustments; a larger one would miss some of such views."""
 DEVICES = ("camera", "projector")
 """Names of the devices of a rig, by their number in `Observation.device`."""
 
@@ -35,8 +36,8 @@ MAX_SHIFT_SIGMAS = 2.0
 """Largest shift of a focal length or a principal point by distortion that is left out, in stated standard deviations.
 Beyond two, the stated deviations do not describe the errors."""
 ROUNDING_PX = 1e-6
-"""Residual below which a point fits exactly, pixels: only rounding is left. So exact points are not tested
-against a noise of 0."""
+"""Residual, in pixels, below which a point fits exactly, because only rounding is left. It is not 0, so that exact
+points are not tested against a noise of 0."""
 
 
 class Suspect(NamedTuple):

@@ -49,7 +49,7 @@ wiggling of square waves; more need more targets."""
 
 ROUNDS = 5
 """Number of rounds of the fit. Each round weighs the targets by the noise that the round before found, and leaves
-outliers out."""
+outliers out. After fewer rounds, outliers may still distort the fit; each round takes the time of one fit."""
 
 OUTLIER = 5.0
 """Distance, in robust standard deviations of its image, beyond which a reading is left out: it is a flying pixel, or

@@ -17,8 +17,8 @@ _CHUNK_VALUES = 32_000_000
 FOOTPRINT_PATHS = 55
 """Number of light paths over the area of a pixel, on a Fibonacci lattice.
 
-The points of the lattice lie evenly along both sides of the pixel and over its area, so 55 paths resolve stripes of a
-twentieth of a pixel.
+With 55 paths, stripes of a twentieth of a pixel are resolved, because the points of the lattice lie evenly along both
+sides of the pixel and over its area. More paths take more time.
 """
 FOOTPRINT_STEP = 34
 """Step of the lattice along the second side of the pixel, counted in lattice points.

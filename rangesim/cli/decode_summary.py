@@ -15,8 +15,9 @@ from rangesim.report.palette import STATUS_NAMES
 from rangesim.results.decoded_captures import Decoded
 
 MIN_BRIGHTEST = 1 / 8
-"""Brightest value of all frames, as a fraction of full scale, below which the summary reports it: the camera may have
-three bits less than its files, or the exposure may be too short."""
+"""Brightest value of all frames, as a fraction of full scale, below which the summary reports it, because the camera
+may have at least three bits less than its files (12 bits in files of 16 bits give 1/16), or the exposure may be too
+short. A larger fraction would blame exposures that are long enough."""
 
 MAX_BASELINE_M = 10.0
 """Baseline in metres beyond which the calibration is probably in millimetres. A rig on a desk or a robot is smaller.

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 SMALL = 0.5
 """Ratio of the sampling noise to the detector's noise above which a run warns.
 
-At this ratio, both noises together are an eighth larger than the detector's noise alone.
+At this ratio, both noises together are an eighth larger than the detector's noise alone, because variances add.
 """
 SMALL_LOSS = 0.03
 """Uncertainty of the fraction of pixels with a reading above which a run warns, as a fraction of these pixels.

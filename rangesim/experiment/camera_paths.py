@@ -23,7 +23,8 @@ Views = Annotated[int, whole(1, "passes")]
 Elevation = Annotated[float, Bounds("degrees above the horizon", -89, 89)]
 """Elevation of a camera, degrees above the horizon. It excludes 90, because there the direction up is not defined."""
 Degrees = Annotated[float, Bounds("degrees", -360, 360)]
-"""Azimuth, or difference of azimuths, in degrees."""
+"""Azimuth, or difference of azimuths, in degrees. A full turn either way is enough, because beyond it the azimuths
+repeat."""
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 """Difference of azimuth between two views of a dome, radians. With this step the views cover a sphere evenly, because
 no small number of steps comes close to a full turn."""

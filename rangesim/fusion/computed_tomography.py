@@ -35,7 +35,8 @@ from rangesim.triangle_mesh import TriangleMesh
 FILTERS = ("ramp", "shepp-logan", "cosine", "hamming", "hann")
 """Names of the filters of scikit-image's `iradon`. The ramp is exact; the others have less noise and resolution."""
 RAYS_AT_ONCE = 1 << 19
-"""Number of rays that are cast in one call. A call then needs about a hundred megabytes."""
+"""Number of rays that are cast in one call, so that a call needs about a hundred megabytes. With fewer rays, more calls
+are needed."""
 MAX_SHIFTS = 8
 """A ray that meets an edge of the mesh is shifted; this is the largest number of shifts. A shifted ray rarely meets
 another edge. The number has a limit, because a ray through a hole in the mesh would be shifted forever."""

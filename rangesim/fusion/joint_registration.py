@@ -43,8 +43,8 @@ MAX_ROUNDS = 30
 """Largest number of Gauss-Newton steps. The fit normally ends earlier, see `CONVERGED`; the count is limited so that a
 fit whose poses go to and fro ends, too."""
 CONVERGED = 1e-7
-"""Largest entry of a step at which the fit ends: radians, and metres as a fraction of the size of the scene. It is
-far below the errors of the poses; a larger value would save only a step or two."""
+"""Largest entry of a step at which the fit ends: radians, and metres as a fraction of the size of the scene. It is far
+below the errors of the poses, because a larger value would save only a step or two."""
 
 
 class _View(NamedTuple):

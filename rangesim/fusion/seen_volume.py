@@ -31,7 +31,8 @@ MIN_VIEW_COSINE = 0.05
 """Smallest cosine of the angle of incidence, no unit, at which a view may see a surface: up to 87 degrees. At a larger
 angle, a pixel covers so much of a face that its reading says nothing about a single place."""
 VOXELS_AT_ONCE = 1 << 21
-"""Number of voxels that are compared with the views in one step. A step then needs some hundred megabytes."""
+"""Number of voxels that are compared with the views in one step, so that a step needs some hundred megabytes. With
+fewer voxels, more steps are needed."""
 
 
 class VoxelState(IntEnum):

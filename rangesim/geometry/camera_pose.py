@@ -46,16 +46,16 @@ MAX_ROTATION_DEVIATION = 0.3
 linear covariance no longer holds. Closer limits were not measured."""
 
 TRIPLES = 20
-"""Number of triples of points that P3P solves to find starts. More triples cost time and help only where the other
-solvers fail and noise spoils the first triples."""
+"""Number of triples of points that P3P solves to find starts, so that there is a start even if the other solvers fail
+and noise spoils some of the triples. More triples cost time; of a few, noise may spoil all."""
 
 STARTS = 6
 """Number of different starts from which the reprojection error is minimised: those with the smallest error. P3P has up
 to four solutions and a plane two, so that six leave room for both."""
 
 SAME_POSE = 1e-3
-"""Difference in radians, and as a ratio to the distance, up to which two minima count as the same pose. Descents to one
-minimum end much nearer to each other."""
+"""Difference in radians, and as a ratio to the distance, up to which two minima count as the same pose, because
+descents to one minimum end much nearer to each other. A larger value could take two poses for one."""
 
 SAME_START = 0.03
 """Difference in radians, and as a ratio to the distance, up to which two starts count as one, because the descents from

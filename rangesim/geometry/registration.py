@@ -82,7 +82,8 @@ neither small nor exact. Nearer clouds are not moved, so that their results stay
 
 SLIDE_SPACINGS = 6.0
 """Step, in spacings, by which a result of `icp` is slid along the surface to look for other poses. ICP then starts
-there with the same reach; steps twice as long would leave gaps."""
+there with the same reach, so that the reaches of neighbouring starts overlap. Steps of more than twice the reach would
+leave gaps; shorter steps take more runs of ICP."""
 
 MAX_SLIDES = 6
 """Largest number of such steps to either side, because each takes one run of ICP. If these steps do not cover the

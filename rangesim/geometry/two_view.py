@@ -102,7 +102,8 @@ none of the families of F falls between two of them. The time grows with the num
 
 DIFFERENT_F = 0.02
 """Smallest difference of an entry of F, as a ratio to the norm of F in normalised coordinates, at which two minima are
-different matrices. Descents that end in the same minimum differ far less."""
+different matrices. Descents that end in the same minimum differ far less and must not count as two. A larger value
+could miss that the points allow two matrices."""
 
 MAX_STANDARD_DEVIATION = 0.3
 """Largest standard deviation of F, as a ratio to its norm in normalised coordinates. At a ratio of 1, F is unknown;

@@ -37,8 +37,8 @@ decides. Several minima exist only where the noise is about as large as that dis
 them, a smaller one searches more often, which takes longer."""
 
 CONVERGED_CORRECTION = 1e-5
-"""Relative change of a correction below which the steps end. Convergence is quadratic, so the next step would change it
-by about the square of this, which is rounding."""
+"""Relative change of a correction, a ratio, below which the steps end. Because convergence is quadratic, the next step
+would change it by about the square of this, which is rounding."""
 
 MAX_CORRECTION_STEPS = 20
 """Largest number of steps. Two suffice for most pixels (Lindstrom 2010). For a pair that needs more than 20, the search
@@ -60,8 +60,8 @@ GOLDEN_RATIO = 0.5 * (np.sqrt(5) - 1)
 """Ratio of two successive intervals of a golden-section search, (sqrt(5) - 1) / 2."""
 
 GOLDEN_STEPS = 45
-"""Number of times that a golden section shortens an interval, by a factor of 4e-10 in all. In shorter intervals a
-minimum is flat in double precision."""
+"""Number of times that a golden section shortens an interval, by a factor of 4e-10 in all. More steps would gain
+nothing, because in shorter intervals a minimum is flat in double precision."""
 
 PAIRS_AT_ONCE = 4096
 """Number of pairs whose angles are sampled at once, so that the memory stays at some ten megabytes per array; the

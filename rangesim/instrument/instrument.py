@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from rangesim.scene import Scene
 
 MAX_NAME = 100
-"""Largest number of characters of an instrument's name. A directory has the same name, and file systems allow
-255 bytes."""
+"""Largest number of characters of an instrument's name. It is limited because a directory has the same name, and file
+systems allow 255 bytes."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """Names that are safe as names of directories on all systems."""
 

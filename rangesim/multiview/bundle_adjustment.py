@@ -70,7 +70,7 @@ MAX_RELATIVE_DEVIATION = 0.5
 distance or more, two standard deviations reach the camera, and the point has no depth."""
 ONE_PLACE = 1e-6
 """Smallest extent of the start's cameras over the median distance of the points, a ratio. Below it, the cameras count
-as being in one place. It only has to exceed rounding: what noise leaves open is found after the descent."""
+as being in one place. It only has to exceed rounding, because what noise leaves open is found after the descent."""
 MIN_IMAGES = 2
 """Smallest number of images, and of images that see a point, a count: two, because one image gives no depth."""
 MAX_SHAPE_DEVIATION = 0.5
@@ -80,8 +80,8 @@ SHAPE_SAMPLE = 200
 """Approximate number of points whose joint covariance gives the deviation of the shape. The covariance matrix has three
 rows for each point; twice the points take eight times the time."""
 TESTED_OBSERVATIONS = 30_000
-"""Approximate number of observations in the F test against cameras that only rotate. It bounds the time of the test;
-fewer observations make it weaker for cameras that hardly move."""
+"""Approximate number of observations in the F test against cameras that only rotate. It is limited so that the test
+takes little time; fewer observations make the test weaker for cameras that hardly move."""
 ROTATION_ROUNDS = 10
 """Number of rounds, each of which finds the mean directions and then the rotations. They give the start of a descent.
 Measured with 3 scenes of 12 images, rotations off by 0.02 rad: without a round the descent takes 3 steps, after 1 to 30

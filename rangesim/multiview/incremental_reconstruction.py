@@ -54,7 +54,9 @@ ADJUSTMENT_GROWTH = 1.2
 views, 5 or 20 % of the observations wrong: 1.0 to 3.0 end at the same result, and 1.2 takes 0.6 to 0.8 times the time
 of 1.0. With 1.2 the number of adjustments grows as the logarithm of the number of images."""
 MAX_NOISE_RATIO = 1.5
-"""Largest ratio of the noise found to the noise stated; above it the result comes with a warning."""
+"""Largest ratio of the noise found to the noise stated; above it the result comes with a warning, because the noise or
+the lens is then stated wrongly, or most tracks are wrong. A smaller ratio would warn of a noise that is stated only
+roughly; a larger one would say nothing about a lens that is slightly wrong."""
 MIN_AGREEING = 0.5
 """Smallest fraction of observations that agree, among those of points in several images; below it the result comes with
 a warning, because most tracks are then wrong."""

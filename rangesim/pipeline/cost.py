@@ -51,7 +51,8 @@ PASS_S = 1.0
 """Seconds to compile the kernels of a pass, independent of the size of the image. Measured on `tabletop` with 64 x 48
 pixels on two busy cores: 2 s for a whole pass, with 500 000 photons."""
 START_S = 4.0
-"""Seconds per run to import the packages, load the scene and write the report. It only matters for short runs."""
+"""Seconds per run to import the packages, load the scene and write the report. A rough value is enough, because it only
+matters for short runs."""
 REPEATED_PASS_S = 0.3
 """Seconds of each further pass from another place, besides its paths and photons. It compiles nothing again. Measured:
 0.02 s on `matte`, 0.5 s on `tabletop`."""
@@ -74,7 +75,9 @@ their pictures."""
 PHOTON_BYTES = 200
 """Bytes per caustic photon that landed, as stated in `TransportSettings.memory_bytes`."""
 TRIAL_S = 60.0
-"""Seconds. If the constants predict a longer run, small passes of the scene are timed in a trial."""
+"""Seconds. If the constants predict a longer run, small passes of the scene are timed in a trial, because the constants
+may be wrong by a factor of three. A trial takes a few seconds, so with a smaller value short runs would wait for it;
+with a larger value more long runs would have a rough estimate."""
 TRIAL_WIDTH = 96
 """Width of the images of a trial in pixels. With the samples below, a trial takes a few seconds; a wider image would
 measure the time per path more exactly and take longer."""

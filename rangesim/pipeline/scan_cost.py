@@ -35,18 +35,21 @@ ALIGNED_VIEW_S = 6.0
 ALIGNED_PAIR_S = 0.3
 """Seconds per pair of views to find their poses; see `ALIGNED_VIEW_S` for the times that were measured."""
 LIBRARY_BYTES = 2e8
-"""Bytes of memory for Open3D, which a scan loads and a run does not."""
+"""Bytes of memory for Open3D, which a scan loads and a run does not. No measurement of it is recorded. A larger value
+refuses more scans because of their memory; a smaller one lets scans start that run out of it."""
 VIEW_BYTES = 62
 """Bytes of memory per pixel of each view, from the types of the arrays: 25 for the range image, 37 for the truth."""
 TRIANGLE_BYTES = 500
 """Bytes of memory per triangle at the peak, voxels included. Measured: 1.2 GB in all at 1.2 million triangles."""
 FILE_BYTES = 10
-"""Bytes on the disk per pixel of each view, for its compressed range image."""
+"""Bytes on the disk per pixel of each view, for its compressed range image, which takes 25 in memory. No measurement of
+it is recorded. A rough value is enough, because it is only told to the user and refuses no scan."""
 MESH_FILE_BYTES = 19
 """Bytes on the disk per triangle of mesh.ply, in binary PLY: 13 for the face, and 6 for half a vertex,
 because a mesh has about half as many vertices as triangles."""
 REPORT_BYTES = 1.5e6
-"""Bytes on the disk of report.html, most of them for its pictures."""
+"""Bytes on the disk of report.html, most of them for its pictures. A rough value is enough, for the reason at
+`FILE_BYTES`."""
 
 
 def estimate_scan_cost(settings: ScanSettings, scene: Scene, trial: bool = True) -> Cost:

@@ -37,10 +37,11 @@ if TYPE_CHECKING:
 MAX_COMPARED_VOXELS = 1_000_000
 """Largest number of voxels of the grid on which the seen and the true volume are compared. If voxels of the size of the
 fusion's would be more than that, the voxels of this grid are larger. Time and memory of the comparison grow with this
-number."""
+number; a smaller number makes the comparison coarser."""
 BACKGROUND = 0.3
 """Ratio of the size of a shape to that of the largest shape. Above it the shape is background, such as a table or a
-wall. The statistics of what the views saw leave background out, as long as there are other shapes."""
+wall. The statistics of what the views saw leave background out, as long as there are other shapes. A larger ratio would
+count tables as things, a smaller one would leave out large things."""
 SAMPLES = 20_000
 """Number of points sampled on each surface to measure its error. The standard error of a fraction of them, such as the
 recall, is then at most 0.5 / sqrt(20 000) = 0.35 %."""

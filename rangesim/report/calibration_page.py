@@ -19,12 +19,13 @@ if TYPE_CHECKING:
     from rangesim.rig import Intrinsics
 
 CELLS = (8, 6)
-"""Counts of cells across and down an image in which corners are sought; the cells are square in images of 4 : 3."""
+"""Counts of cells across and down an image in which corners are sought; the cells are square in images of 4 : 3. With
+more cells, more views are needed until all have corners; fewer cells hide gaps between the corners."""
 MIN_COVERED = 0.6
 """Fraction of the cells with corners below which the page warns, because distortion is unknown in the other cells."""
 WORSE_FACTOR = 2.0
-"""The page names a board as worse above this multiple of the median error of all boards; other values were not
-measured."""
+"""The page names a board as worse above this multiple of the median error of all boards. A smaller multiple would name
+boards that are worse by chance, a larger one would miss bad boards; other values were not measured."""
 SHOWN_WIDTH = 400
 """Approximate width of a view in the page, in pixels; larger images are averaged so that the page stays small."""
 ARROW_LENGTH = 0.03

@@ -18,10 +18,11 @@ NO_DATA = (203, 206, 210)
 ERROR_KNEE_M = 1e-4
 """Error, in metres, below which the error scale is linear; above, it is logarithmic.
 
-With a smaller value more of the colours show errors below 0.1 mm.
+With a smaller value more of the colours show errors below 0.1 mm; with a larger one such errors look like none.
 """
 ERROR_LIMIT_M = 0.1
-"""Error, in metres, at the end of the error scale; larger errors have the same colour."""
+"""Error, in metres, at the end of the error scale; larger errors have the same colour. With a larger value fewer
+colours are left for small errors; with a smaller one more of the large errors look alike."""
 
 STATUS_NAMES = {
     Status.OK: "measured",

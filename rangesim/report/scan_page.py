@@ -23,7 +23,7 @@ PICTURES = 3
 """Count of views, spread over the path, from which pictures of the mesh are taken: that many pictures stand side by
 side."""
 WIDTH_PX = 480
-"""Width of the pictures in pixels; larger ones make a larger page."""
+"""Width of the pictures in pixels; larger ones make a larger page, smaller ones show less of the mesh's detail."""
 SAMPLES = 20_000
 """Number of points on the mesh. The first sentence of the page summarises their distances from the true surface.
 

@@ -21,7 +21,8 @@ from rangesim.report.tables import (
 from rangesim.results.experiment_results import Measurement
 
 MAIN_CAUSE = 0.1
-"""Smallest fraction of the failures at which the verdict names a cause; causes below it are rare and many."""
+"""Smallest fraction of the failures at which the verdict names a cause. It is not smaller, so that the sentence stays
+short: causes below it are rare and many."""
 
 
 @dataclass(frozen=True)
