@@ -231,7 +231,7 @@ def test_depth_ends_where_half_a_projector_pixel_means_five_per_cent(axes: tuple
 
 def test_wrong_sensor_and_wrong_projector_are_refused() -> None:
     rig, sensor = stereo_rig(), StructuredLight(640, 400)
-    with pytest.raises(ValueError, match="projector of 640 x 400"):
+    with pytest.raises(ValueError, match="projector has the 640 x 400 pixels that the sensor codes"):
         decode(Capture(np.ones((sensor.n_frames, 120, 160), np.float32), sensor, rig))
     with pytest.raises(ValueError, match="structured-light"):
         decode(Capture(np.ones((2, 4, 4), np.float32), IdealToF()), StructuredLightDecoder())

@@ -65,7 +65,7 @@ def test_sound_captures_are_silent(sensor: StructuredLight, exposure_s: float | 
 
 @pytest.mark.parametrize("sensor", SENSORS, ids=str)
 def test_fringes_in_the_other_direction_are_named(sensor: StructuredLight) -> None:
-    with pytest.warns(RangesimWarning, match="along columns contradict the Gray code.*other direction"):
+    with pytest.warns(RangesimWarning, match="along columns contradict the Gray code.*opposite direction"):
         decode(with_fringes(capture_of(replace(sensor, axes=("columns",))), "reversed"))
 
 

@@ -443,7 +443,9 @@ def test_patterns_fit_the_projector(corner: rangesim.Scene) -> None:
     rig = corner.rig(**SIZE)
     with pytest.raises(ValueError, match="projector of 1280 x 800"):
         transport(corner, rig, [Images(np.ones((2, 10, 10), np.float32))], spp=1)
-    with pytest.raises(ValueError, match="a rig whose projector has 1280 x 800"):
+    with pytest.raises(
+        ValueError, match="a rig whose projector has the 640 x 400 pixels that the sensor codes, got 1280 x 800"
+    ):
         transport(corner, rig, [StructuredLight(640, 400)], spp=1)
 
 
