@@ -247,7 +247,7 @@ def over() -> Any:
 
 
 @pytest.mark.validation
-@pytest.mark.filterwarnings("ignore:.*lamp")
+@pytest.mark.filterwarnings("ignore:.*point and spot emitters does not pass glass")
 @pytest.mark.parametrize(
     "kind",
     ["ball", "rough ball", "glass in water", "lamp in water", "milk in glass", "point lamp, milk and stone in water"],
