@@ -38,6 +38,7 @@ from rangesim.decoding.gray import GrayThresholds
 from rangesim.errors import FileFormatError
 from rangesim.experiment import experiment_from_dict, load_experiment
 from rangesim.instrument.instrument import Instrument
+from rangesim.response import Response
 from rangesim.rig.calibration_files import load_calibration
 from rangesim.sensor import Background
 from rangesim.sensors import AmcwDecoder, StructuredLightDecoder, presets, sensor_from_dict, sensor_of
@@ -425,3 +426,24 @@ def test_a_file_imports_its_neighbours(tmp_path: Path) -> None:
         "class Beside(AmcwToF):\n    contrast: float = CONTRAST\n    type_name = 'beside'\n"
     )
     assert sensor_of("with_a_neighbour.py:Beside", tmp_path).contrast == 0.25  # type: ignore[attr-defined]
+
+
+def test_a_file_that_fails_leaves_no_member_in_any_family(tmp_path: Path) -> None:
+    """Its response, too, is unknown then: the name is free for another file."""
+    source = """
+from typing import ClassVar
+from rangesim import AmcwToF
+from rangesim.response import DenseResponse
+class Half(DenseResponse):
+    type_name: ClassVar[str] = "half-done"
+    def weights(self, path, m):
+        return [path.u]
+"""
+    failing, working = tmp_path / "failing.py", tmp_path / "working.py"
+    failing.write_text(source + "raise RuntimeError('not yet')\n")
+    working.write_text(source + "SENSOR = AmcwToF()\n")
+    with pytest.raises(FileFormatError, match="not yet"):
+        sensor_of(f"{failing}:SENSOR")
+    assert "half-done" not in Response.known
+    assert sensor_of(f"{working}:SENSOR").type_name == "amcw-tof"
+    assert Response.known.pop("half-done").__name__ == "Half"

@@ -13,7 +13,7 @@ from typing import Any
 from pcgraph.plumbing.python_files import module_of_file
 from rangesim.errors import FileFormatError
 from rangesim.sensor import Decoder, Sensor
-from rangesim.settings.config import brief, from_dict, nearest, shown, to_dict
+from rangesim.settings.config import Named, brief, from_dict, nearest, shown, to_dict
 
 IMAGES_PRESET = "gray"
 """Preset of the sensor for a folder of bare images if the user names none: the code of OpenCV's GrayCodePattern."""
@@ -181,7 +181,7 @@ def _module(path: Path) -> ModuleType:
     """The module of a file. The file runs once, and again when it has changed."""
     if not path.is_file():
         raise FileFormatError(f"{path} does not exist; expected a Python file with a sensor.")
-    before = [(family, dict(family.known)) for family in (Sensor, Decoder)]
+    before = [(family, dict(family.known)) for family in Named.families()]
     try:
         return module_of_file(path, "rangesim")
     except (Exception, SystemExit) as error:

@@ -198,6 +198,25 @@ class Named:
             raise TypeError(f"expected {cls.__name__} to have a type_name of its own; {name!r} is taken.")
         cls.known[name] = cls
 
+    @staticmethod
+    def families() -> list[type[Named]]:
+        """The bases of all families that are loaded, such as `Sensor`, `Decoder` and `Response`.
+
+        Examples
+        --------
+        >>> from rangesim.response import Response
+        >>> Response in Named.families()
+        True
+        """
+        found, waiting = [], list(Named.__subclasses__())
+        while waiting:
+            kind = waiting.pop()
+            if "known" in vars(kind):
+                found.append(kind)
+            else:
+                waiting += kind.__subclasses__()
+        return found
+
 
 def _source(kind: type[Any]) -> str:
     """File in which a class is defined, or the name of its module if there is no file."""
