@@ -243,6 +243,21 @@ def verify_directory(directory: str | Path, kind: DirectoryKind) -> Verification
     )
 
 
+def sidecar_of(directory: str | Path, kind: DirectoryKind) -> Path:
+    """Path of the sidecar of a directory, after a replacement that a killed process began is completed.
+
+    Raises
+    ------
+    kind.error
+        The directory has no sidecar of this kind, or as `recover`.
+    """
+    recover(directory, kind.error)
+    sidecar = Path(directory) / kind.sidecar
+    if not sidecar.is_file():
+        raise kind.error(f"{directory} is no {kind.format} directory: it has no {kind.sidecar}.")
+    return sidecar
+
+
 def recover(directory: str | Path, error: type[Exception]) -> None:
     """Complete a replacement that a killed process began. Call this before reading a directory that rangesim wrote.
 

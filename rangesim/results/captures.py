@@ -15,7 +15,7 @@ from rangesim.capture import DTYPES, Capture
 from rangesim.electronics.ambient import Ambient
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.errors import FileFormatError
-from rangesim.files.atomic_directories import DirectoryKind, new_directory, recover, write_manifest
+from rangesim.files.atomic_directories import DirectoryKind, new_directory, sidecar_of, write_manifest
 from rangesim.files.image_files import SUFFIXES, read_stack, write_grey
 from rangesim.files.schema import write_json
 from rangesim.files.text_files import read_json
@@ -102,10 +102,7 @@ def load_capture(directory: str | Path) -> Capture:
     >>> from rangesim import decode, load_capture
     >>> image = decode(load_capture("out/tabletop/amcw/capture"))  # doctest: +SKIP
     """
-    sidecar = Path(directory) / SIDECAR
-    recover(directory, FileFormatError)
-    if not sidecar.is_file():
-        raise FileFormatError(f"{directory} is no {FORMAT} directory: it has no {SIDECAR}.")
+    sidecar = sidecar_of(directory, CAPTURE)
     settings = read_json(sidecar)
     if not isinstance(settings, dict) or settings.get("format") != FORMAT:
         raise FileFormatError(f"{sidecar} is no {FORMAT} file.")

@@ -18,7 +18,7 @@ from typing import Any, Literal
 from rangesim import __version__
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
-from rangesim.files.atomic_directories import DirectoryKind, new_directory, recover
+from rangesim.files.atomic_directories import DirectoryKind, new_directory, sidecar_of
 from rangesim.files.schema import Fraction, Record, read_record, write_record
 from rangesim.results.range_images import load_range_image, save_range_image
 from rangesim.rig import Rig
@@ -101,10 +101,7 @@ def load_decoded(directory: str | Path) -> Decoded:
         The directory holds no decoded capture, or a file is missing or broken. The message names the file.
     """
     folder = Path(directory)
-    recover(folder, FileFormatError)
-    if not (folder / SIDECAR).is_file():
-        raise FileFormatError(f"{folder} is no {FORMAT} directory: it has no {SIDECAR}.")
-    record = read_record(folder / SIDECAR, DecodedRecord)
+    record = read_record(sidecar_of(folder, DECODED), DecodedRecord)
     try:
         sensor = sensor_from_dict(record.sensor, "sensor")
         rig = None if record.rig is None else Rig.from_dict(record.rig)

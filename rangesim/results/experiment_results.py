@@ -33,7 +33,7 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.files.array_files import write_arrays
-from rangesim.files.atomic_directories import DirectoryKind, recover
+from rangesim.files.atomic_directories import DirectoryKind, sidecar_of
 from rangesim.files.schema import (
     ArraySpec,
     Count,
@@ -331,10 +331,7 @@ def load_result(directory: str | Path) -> Result:
 
 def read_settings(folder: Path) -> ResultRecord:
     """The contents of `experiment.json` in the directory of a result; FileFormatError if it holds no result."""
-    recover(folder, FileFormatError)
-    if not (folder / SETTINGS).is_file():
-        raise FileFormatError(f"{folder} is no {FORMAT} directory: it has no {SETTINGS}.")
-    return read_record(folder / SETTINGS, ResultRecord)
+    return read_record(sidecar_of(folder, RESULT), ResultRecord)
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:

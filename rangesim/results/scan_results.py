@@ -23,7 +23,7 @@ import numpy as np
 from rangesim.errors import FileFormatError
 from rangesim.experiment.scan_settings import ScanSettings, scan_settings_from_dict, scan_settings_to_dict
 from rangesim.files.array_files import write_arrays
-from rangesim.files.atomic_directories import DirectoryKind, recover
+from rangesim.files.atomic_directories import DirectoryKind, sidecar_of
 from rangesim.files.schema import (
     MAX_METRES,
     ArraySpec,
@@ -276,10 +276,7 @@ def load_scan(directory: str | Path) -> ScanResult:
         The directory holds no scan, or a file is missing or broken. The message names the file.
     """
     folder = Path(directory)
-    recover(folder, FileFormatError)
-    if not (folder / SIDECAR).is_file():
-        raise FileFormatError(f"{folder} is no {FORMAT} directory: it has no {SIDECAR}.")
-    record = read_record(folder / SIDECAR, ScanRecord)
+    record = read_record(sidecar_of(folder, SCAN), ScanRecord)
     try:
         settings = scan_settings_from_dict(record.settings)
         grid = from_dict(VoxelGrid, record.grid, "grid")
