@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.settings.config import ShortRepr
 
 if TYPE_CHECKING:
-    from rangesim.decoding.range_image import RangeImage
     from rangesim.rig import Rig
 
 
@@ -57,6 +57,18 @@ class Coordinates(ShortRepr, ABC):
         ----------
         rig : Rig that took the capture; None: z is NaN everywhere.
         """
+
+    def _image(self, rig: Rig | None, z: np.ndarray, range_m: np.ndarray, status: np.ndarray) -> RangeImage:
+        """Range image with these depths, and with the confidence and the intensity of the coordinates."""
+        return RangeImage(
+            z=z,
+            range_m=range_m,
+            confidence=self.confidence,
+            status=status,
+            intensity=self.intensity,
+            camera=rig.camera if rig else None,
+            T_world_camera=rig.T_world_camera if rig else None,
+        )
 
     def _keep_valid(self, name: str, dtype: type[np.floating]) -> None:
         """Set the array of that name, if there is one, to NaN wherever `status` is not OK."""

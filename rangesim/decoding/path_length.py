@@ -95,12 +95,4 @@ class PathLengths(Coordinates):
             status[rows][(status[rows] == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
             ok = status[rows] == Status.OK
             z_m[rows], range_m[rows] = np.where(ok, z, np.nan), np.where(ok, along_ray, np.nan)
-        return RangeImage(
-            z=z_m,
-            range_m=range_m,
-            confidence=self.confidence,
-            status=status,
-            intensity=self.intensity,
-            camera=rig.camera if rig else None,
-            T_world_camera=rig.T_world_camera if rig else None,
-        )
+        return self._image(rig, z_m, range_m, status)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
@@ -128,17 +128,8 @@ class ProjectorCoordinates(Coordinates):
             contradiction = behind_contradiction(np.concatenate(behind_px))
             if contradiction and not self.is_doubted:
                 warn(contradiction)
-        return RangeImage(
-            z=z,
-            range_m=range_m,
-            confidence=self.confidence,
-            status=status,
-            intensity=self.intensity,
-            camera=rig.camera if rig else None,
-            T_world_camera=rig.T_world_camera if rig else None,
-            projector_column=column,
-            projector_row=row,
-        )
+        image = self._image(rig, z, range_m, status)
+        return replace(image, projector_column=column, projector_row=row)
 
 
 def behind_contradiction(behind_px: np.ndarray) -> str | None:

@@ -127,7 +127,7 @@ class Instrument:
     @property
     def emitter_wavelength_m(self) -> float | None:
         """Wavelength of the emitter's light, metres; None: the instrument is ideal and has no wavelength."""
-        return self.wavelength_m or getattr(self.detector, "wavelength_m", None)
+        return self.wavelength_m or (self.detector.wavelength_m if self.detector else None)
 
     def rig(self, scene: Scene, width: int | None = None, height: int | None = None) -> Rig:
         """The instrument's camera and emitter in a scene.
