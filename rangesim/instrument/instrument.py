@@ -152,6 +152,17 @@ class Instrument:
             wavelength_m=self.emitter_wavelength_m,
         )
 
+    def rigs(self, scene: Scene, width: int | None = None, height: int | None = None) -> tuple[Rig, ...]:
+        """Rigs of all cameras of the sensor in a scene, that of the reference camera first.
+
+        They have one emitter, so one transport pass serves them all. Most sensors have one camera.
+
+        Parameters
+        ----------
+        width, height : as for `rig`.
+        """
+        return self.sensor.rigs(self.rig(scene, width, height))
+
 
 def name_of(given: str, sensor: Sensor) -> str:
     """Name of an instrument that is given by its sensor only: the preset's, or the `type_name` if it is from a file."""

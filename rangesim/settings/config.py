@@ -235,7 +235,8 @@ def _value(hint: Any, value: Any, where: str) -> Any:
         raise ValueError(
             f"{where}: expected one of {', '.join(valid)}, got {shown(value)}{nearest(str(value), valid)}."
         )
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+    is_table = isinstance(value, Mapping)
+    if isinstance(hint, type) and (dataclasses.is_dataclass(hint) or (issubclass(hint, Named) and is_table)):
         return from_dict(hint, value, where)
     if get_origin(hint) is tuple and dataclasses.is_dataclass(get_args(hint)[0]):
         return tuple(from_dict(get_args(hint)[0], v, f"{where}[{i}]") for i, v in enumerate(value))
