@@ -320,8 +320,8 @@ def risley_prisms(
         rays = _refracted(_refracted(rays, axis, 1 / index), out, index)
         if np.isnan(rays).any():
             raise ValueError(
-                f"expected prisms that let the beam through, got a wedge of {wedge:g} rad of index {index:g} with total "
-                "reflection."
+                f"expected prisms that let the beam through, got a wedge of {wedge:g} rad and index {index:g} with "
+                "total reflection."
             )
     return ScanRays(rays, None, times)
 
