@@ -24,6 +24,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.plumbing.plain_files import check_file
 from rangesim.errors import FileFormatError
 from rangesim.files.text_files import read_json
 from rangesim.recordings.lidar_sweep import LidarSweep
@@ -394,8 +395,13 @@ def ouster_sweeps(
         A file cannot be read, the recording has no packets of the size that the metadata state, or it has those of
         another sensor or of several; it is raised at the first step of the iteration, or where the packet is met.
     """
+    if metadata is None:
+        check_file(path, FileFormatError)
+        metadata = Path(path).with_suffix(".json")
+        if not metadata.exists():
+            raise FileFormatError(f"{path}: expected the sensor's metadata in {metadata.name} beside it, found none.")
     if not isinstance(metadata, OusterMetadata):
-        metadata = load_ouster_metadata(Path(path).with_suffix(".json") if metadata is None else metadata)
+        metadata = load_ouster_metadata(metadata)
     layout = PacketLayout(metadata)
     turn: _Turn | None = None
     finished: int | None = None
