@@ -38,7 +38,7 @@ from rangesim.recordings import (
     rings_of_order,
 )
 from rangesim.recordings.ouster import PROFILES, PacketLayout
-from rangesim.rig.scan_patterns import spinning
+from rangesim.rig.scan_patterns import column_shifts, spinning
 
 REAL = ("OS-0-128-U1_v2.3.0_1024x10", "OS-1-32-G_v2.1.1_1024x10")
 """Recordings with digests: one of a low data rate, one of the legacy format."""
@@ -119,6 +119,8 @@ def test_a_real_sweep_takes_a_tenth_of_a_second_and_destaggers_to_directions(rea
     directions = sweep.destaggered(sweep.rays.directions)
     azimuth = np.unwrap(np.arctan2(directions[..., 0], directions[..., 2]), axis=0)
     assert np.degrees(np.ptp(azimuth, axis=0)).max() < 1.5 * 360 / 1024  # shifts are whole columns
+    shifts = column_shifts(sweep.rays.directions)
+    assert np.ptp(shifts - sweep.pixel_shift) <= 1  # those of the rays are those of the maker, but for rounding
     ranges = sweep.destaggered(sweep.range_m)
     assert ranges.shape == sweep.range_m.shape
     across = np.nanmedian(np.abs(np.diff(ranges[0], axis=0)))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rangesim.rig.scan_patterns import ScanRays, lissajous, risley, risley_prisms, spinning
+from rangesim.rig.scan_patterns import ScanRays, column_shifts, lissajous, risley, risley_prisms, spinning
 
 ELEVATIONS = np.radians([15.0, 1.0, 0.0, -3.0, -25.0])
 TEN_HERTZ_S = 0.1
@@ -90,6 +90,19 @@ def test_the_head_of_a_vlp_16_turns_on_between_its_firings() -> None:
     np.testing.assert_allclose(rays.times_s[:, 7], 7 * cycle_s + np.arange(16) * step_s)
     speed = 2 * np.pi / (columns * cycle_s)
     np.testing.assert_allclose(np.unwrap(azimuth(rays), axis=1), speed * rays.times_s, atol=1e-9)
+
+
+@pytest.mark.parametrize("arc_deg", [360.0, -360.0, 120.0])
+def test_shifted_columns_are_directions(arc_deg: float) -> None:
+    leads = np.radians(np.array([11.24, 3.93, -3.29, -10.34, 10.81]))
+    rays = spinning(ELEVATIONS, 1024, TEN_HERTZ_S, leads, arc_rad=np.radians(arc_deg))
+    shifts = column_shifts(rays.directions)
+    rolled = np.array([np.roll(row, shift) for row, shift in zip(azimuth(rays), shifts, strict=True)])
+    inner = rolled[:, 300:-300]  # an arc does not close
+    spread = np.ptp(np.unwrap(np.unwrap(inner, axis=1), axis=0), axis=0)
+    assert spread.max() <= np.radians(abs(arc_deg)) / 1024 + 1e-12
+    assert shifts.min() == 0
+    assert not column_shifts(rays.directions[:, :1]).any()
 
 
 # ---- Mirrors that oscillate -----------------------------------------------------------------------------------------

@@ -162,6 +162,28 @@ def _turned(offset_m: ArrayLike, heads: Array) -> Array | None:
     return np.stack([x * cos + z * sin, np.broadcast_to(y, heads.shape), z * cos - x * sin], axis=-1)
 
 
+def column_shifts(directions: ArrayLike) -> NDArray[np.int64]:
+    """Columns by which the rows of a turning head's image are shifted to the right, so that columns are directions.
+
+    A ring whose beam leads the head by n columns looks where the head will be n columns later (Ouster calls the shifts
+    `pixel_shift_by_row`). The smallest shift is 0.
+
+    directions : (h, w, 3) float, rays as `spinning` has them, of a whole turn or of an arc.
+
+    Examples
+    --------
+    >>> rays = spinning([0.1, 0.0], columns=360, period_s=0.1, azimuth_offsets_rad=np.radians([3.0, -1.0]))
+    >>> column_shifts(rays.directions)
+    array([4, 0])
+    """
+    rays = np.asarray(directions, dtype=np.float64)
+    turns = rays[..., 2] + 1j * rays[..., 0]  # the azimuth as the angle of a complex number
+    step = np.angle((turns[:, 1:] * turns[:, :-1].conj()).sum()) if turns.shape[1] > 1 else 0.0
+    leads = np.angle((turns * turns[0].conj()).sum(axis=1))
+    shifts = np.rint(leads / step).astype(np.int64) if step else np.zeros(len(turns), dtype=np.int64)
+    return shifts - shifts.min()
+
+
 # ---- A mirror that oscillates ---------------------------------------------------------------------------------------
 
 
