@@ -184,8 +184,8 @@ class Risley(Scanner):
     --------
     >>> rosette = Risley(10, 100, deflections_deg=(9.0, 9.0), rates_hz=(121.6, -77.8), duration_s=0.1)
     >>> z = rosette.pixel_rays().directions[..., 2]
-    >>> bool(np.degrees(np.arccos(z.min())) <= 18.0)
-    True
+    >>> np.degrees(np.arccos(z.min())).round(1)
+    np.float64(18.0)
     """
 
     rows: Annotated[int, whole(1, "pixels")]
