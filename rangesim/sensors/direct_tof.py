@@ -452,7 +452,7 @@ def _window_bins(sensor: DirectToF) -> int:
 
 
 def _pulses(capture: Capture) -> int | None:
-    """Number of pulses in the exposure, if only the first photon of each was counted; None without pile-up."""
-    if isinstance(capture.detector, SpadDetector) and capture.detector.pile_up:
-        return capture.detector.pulses(capture.sensor.gate, capture.exposure_s)
+    """Number of pulses in the exposure, times that of timers, if each counted its first photon alone; else None."""
+    if isinstance(capture.detector, SpadDetector):
+        return capture.detector.first_only(capture.sensor.gate, capture.exposure_s)
     return None
