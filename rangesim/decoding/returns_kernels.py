@@ -28,15 +28,17 @@ tell its place."""
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def fit_returns(histograms, shape, rules, is_cyclic, distance, place, strength, sigma):  # type: ignore[no-untyped-def]
+def fit_returns(histograms, excess, shape, rules, is_cyclic, distance, place, strength, sigma):  # type: ignore[no-untyped-def]
     """Write the places, strengths and standard deviations (most, n) of the returns of each histogram.
 
-    histograms : (k, n) counts. shape : `PulseShape`. rules : `ReturnRules`. distance : bins, least one of two returns.
+    histograms : (k, n) counts. excess : (k, n) or (1, 1), variance of the counts over their means.
+    shape : `PulseShape`. rules : `ReturnRules`. distance : bins, least one of two returns.
     """
     bins, columns = histograms.shape
     template = np.empty(shape.before + shape.behind + 1)
     for j in range(len(template)):
         template[j] = _part(shape, j - shape.before - 0.5)
+    excesses = np.ones(bins)
     counts, expected, others, is_refused = np.empty(bins), np.empty(bins), np.empty(bins), np.empty(bins, np.bool_)
     at, n, spread, at_before, n_before = np.empty((5, rules.most))
     for column in range(columns):
@@ -45,11 +47,12 @@ def fit_returns(histograms, shape, rules, is_cyclic, distance, place, strength, 
             counts[b] = histograms[b, column]
             total += counts[b]
             is_refused[b] = False
+            excesses[b] = excess[b % len(excess), column % excess.shape[1]]
         found, level = 0, max(total, 0.0) / bins
         while found < rules.most:
             _expect(expected, level, at, n, found, -1, shape, is_cyclic)
             candidate, amount = _strongest(
-                counts, expected, level, is_refused, template, shape.before, rules, is_cyclic
+                counts, expected, level, excesses, is_refused, template, shape.before, rules, is_cyclic
             )
             if candidate < 0:
                 break
@@ -61,7 +64,7 @@ def fit_returns(histograms, shape, rules, is_cyclic, distance, place, strength, 
                 for i in range(found):
                     _expect(others, level, at, n, found, i, shape, is_cyclic)
                     was = at[i]
-                    at[i], n[i], spread[i] = _fit(counts, others, at[i], n[i], shape, is_cyclic)
+                    at[i], n[i], spread[i] = _fit(counts, others, excesses, at[i], n[i], shape, is_cyclic)
                     moved = max(moved, abs(at[i] - was))
                 level_was, level = level, _level(total, at, n, found, bins, shape, is_cyclic)
                 if moved < CONVERGED and abs(level - level_was) * bins <= CONVERGED * total:
@@ -87,7 +90,7 @@ def _write(at, n, spread, found, column, place, strength, sigma, bins, is_cyclic
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def _strongest(counts, expected, level, is_refused, template, before, rules, is_cyclic):  # type: ignore[no-untyped-def]
+def _strongest(counts, expected, level, excess, is_refused, template, before, rules, is_cyclic):  # type: ignore[no-untyped-def]
     """Bin and strength of the strongest return that is not explained yet and meets the rules; -1 if there is none."""
     bins, best, most = len(counts), -1, 0.0
     energy = (template**2).sum()
@@ -104,7 +107,7 @@ def _strongest(counts, expected, level, is_refused, template, before, rules, is_
             t = template[j]
             square += t * t
             match += t * (counts[i] - expected[i])
-            variance += t * t * expected[i]
+            variance += t * t * expected[i] * excess[i]
             other += t * (expected[i] - level)
         if square < WHOLE * energy:
             continue
@@ -158,7 +161,7 @@ def _expect(expected, level, at, n, found, without, shape, is_cyclic):  # type: 
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def _fit(counts, others, at, n, shape, is_cyclic):  # type: ignore[no-untyped-def]
+def _fit(counts, others, excess, at, n, shape, is_cyclic):  # type: ignore[no-untyped-def]
     """Place, strength and the place's standard deviation of one return, after some scoring steps.
 
     The score and the Fisher information are those of Poisson counts with the means n part_b(at) + others_b.
@@ -173,7 +176,7 @@ def _fit(counts, others, at, n, shape, is_cyclic):  # type: ignore[no-untyped-de
             part = _part(shape, b - at)
             slope = -n * (_density(shape, b + 1 - at) - _density(shape, b - at))
             mean = n * part + others[b % bins]
-            weight = 1 / max(mean, FLOOR * n)
+            weight = 1 / (max(mean, FLOOR * n) * excess[b % bins])
             rest = (counts[b % bins] - mean) * weight
             gn, gp = gn + part * rest, gp + slope * rest
             nn, np_, pp = nn + part * part * weight, np_ + part * slope * weight, pp + slope * slope * weight

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigs of a camera and an emitter: intrinsics, the camera model, lenses, poses, and calibration files."""
 
+from rangesim.rig.cover_glass import CoverGlass
 from rangesim.rig.rig import (
     CAMERA_LENS,
     PROJECTOR_LENS,
@@ -25,6 +26,7 @@ __all__ = [
     "RESIDUAL_PX",
     "Array",
     "Coefficient",
+    "CoverGlass",
     "FocalLength",
     "Intrinsics",
     "Lens",

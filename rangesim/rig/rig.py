@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rangesim.rig import camera_model
 from rangesim.rig.camera_model import CameraModel, fold_radius2
+from rangesim.rig.cover_glass import CoverGlass
 from rangesim.settings import limits
 from rangesim.settings.bounds import (
     MAX_COORDINATE_M,
@@ -331,6 +332,8 @@ class Rig:
     camera_lens, projector_lens : Lens
     projector_power_w : float, radiant power in watts that leaves the projector when it shows white.
     wavelength_m : wavelength of the emitter's light, metres; None: not stated.
+    cover_glass : CoverGlass, a window in front of camera and emitter that returns a little light; None: it returns
+        none.
 
     Raises
     ------
@@ -354,6 +357,7 @@ class Rig:
     projector_lens: Lens = PROJECTOR_LENS
     projector_power_w: Watts = 1.0
     wavelength_m: Wavelength | None = None
+    cover_glass: CoverGlass | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_world_camera", pose(self.T_world_camera, "T_world_camera"))
@@ -444,6 +448,14 @@ class Rig:
         """Irradiance in W/m2 of a fronto-parallel plane at z = 1 m when the projector shows white."""
         p = self.projector
         return self.projector_power_w * p.fx * p.fy / (p.width * p.height)
+
+    @property
+    def cover_glass_radiance(self) -> float:
+        """Radiance in W/m2/sr of a surface that would bring each pixel as much light as the cover glass; 0 without."""
+        if self.cover_glass is None:
+            return 0.0
+        etendue = np.pi * self.camera_lens.aperture_radius_m**2 / (self.camera.fx * self.camera.fy)
+        return float(self.cover_glass.fraction * self.projector_power_w / etendue)
 
     @property
     def camera_illumination(self) -> NDArray[np.float32]:
