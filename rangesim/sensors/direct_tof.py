@@ -13,6 +13,7 @@ from rangesim.capture import Capture, bright_level
 from rangesim.decoding.histogram import coates, find_peak, place_sigma, pulses_left, runs_out, window_reach
 from rangesim.decoding.path_length import PathLengths
 from rangesim.decoding.status import Status
+from rangesim.decoding.working_range import WorkingRange
 from rangesim.electronics.detector import Gate
 from rangesim.electronics.spad import SpadDetector
 from rangesim.response import SPEED_OF_LIGHT, Response, TransientHistogram
@@ -180,16 +181,18 @@ class DirectToFDecoder(Decoder):
     peak_sigmas, min_counts : float, least height of a peak over the background, in standard deviations of the counts in
         its window, and in counts.
     relative_peak : float, least peak as a fraction of the bright peaks of the image, for noise-free captures.
+    working_range : WorkingRange, outside which readings are refused; None: all are kept.
 
     Examples
     --------
     >>> DirectToFDecoder(peak_sigmas=8.0)
-    DirectToFDecoder(peak_sigmas=8.0, min_counts=5.0, relative_peak=0.0001)
+    DirectToFDecoder(peak_sigmas=8.0, min_counts=5.0, relative_peak=0.0001, working_range=None)
     """
 
     peak_sigmas: Threshold = 5.0
     min_counts: Threshold = 5.0
     relative_peak: Threshold = 1e-4
+    working_range: WorkingRange | None = None
 
     type_name: ClassVar[str] = "direct-tof"
     reads: ClassVar[type[Sensor]] = DirectToF
