@@ -14,9 +14,9 @@ from rangesim import Intrinsics, Scene, load_scene, look_at
 from rangesim.electronics.detector import Detector
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
 from rangesim.instrument.instrument import Instrument
-from rangesim.instrument.presets import instrument
 from rangesim.pipeline.experiment_run import carry_out, run
 from rangesim.pipeline.shared_passes import group_by_rig
+from rangesim.presets import instrument
 from rangesim.results.experiment_results import load_result
 from rangesim.rig import translation
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight
