@@ -221,6 +221,13 @@ def test_a_faulty_file_is_refused_in_one_sentence(tmp_path: Path, old: str, new:
     assert str(path) in str(error.value)
 
 
+def test_a_file_has_the_name_of_an_instrument(tmp_path: Path) -> None:
+    path = tmp_path / "my device.toml"
+    path.write_text(presets.describe("kinect-v2").text)
+    with pytest.raises(FileFormatError, match="whose name is that of the instrument.*'my device.toml'"):
+        presets.load(path)
+
+
 def test_a_table_has_its_own_camera_instead_of_the_pinhole_of_the_sheet(tmp_path: Path) -> None:
     own = Intrinsics(512, 424, 365.5, 365.5, 255.0, 205.0)
     text = presets.describe("kinect-v2").text

@@ -95,7 +95,7 @@ class Instrument:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if not _NAME.fullmatch(self.name) or len(self.name) > MAX_NAME:
+        if not is_name(self.name):
             raise ValueError(
                 f"expected a name of letters, digits, - and _, at most {MAX_NAME}, got {shown(self.name)}."
             )
@@ -151,6 +151,17 @@ class Instrument:
             T_camera_projector=rig.T_camera_projector if self.T_camera_projector is None else self.T_camera_projector,
             wavelength_m=self.emitter_wavelength_m,
         )
+
+
+def is_name(text: str) -> bool:
+    """Whether an instrument may have this name.
+
+    Examples
+    --------
+    >>> is_name("kinect-v2"), is_name("../results")
+    (True, False)
+    """
+    return bool(_NAME.fullmatch(text)) and len(text) <= MAX_NAME
 
 
 def name_of(given: str, sensor: Sensor) -> str:

@@ -21,7 +21,7 @@ from typing import Any
 
 from rangesim.errors import FileFormatError
 from rangesim.files.text_files import read_text, read_toml
-from rangesim.instrument.instrument import Instrument, instrument_from_dict
+from rangesim.instrument.instrument import MAX_NAME, Instrument, instrument_from_dict, is_name
 from rangesim.presets.data_sheet import DataSheet
 from rangesim.settings.config import ShortRepr, check_keys, from_dict, nearest, shown
 
@@ -87,6 +87,11 @@ def read_preset(path: str | Path) -> Preset:
         names the place.
     """
     path = Path(path)
+    if not is_name(path.stem):
+        raise FileFormatError(
+            f"expected a file whose name is that of the instrument, with letters, digits, - and _, at most {MAX_NAME}, "
+            f"got {shown(path.name)}."
+        )
     try:
         return _preset(path.stem, read_toml(path), read_text(path))
     except ValueError as error:
@@ -104,7 +109,9 @@ def _preset(name: str, data: Mapping[str, Any], text: str) -> Preset:
             raise ValueError(f"expected {part} as a table, got {shown(data[part])}.")
     sheet, given = from_dict(DataSheet, data["sheet"], "sheet"), data["instrument"]
     follows = sheet.settings(has_camera="camera" in given)
-    decoder = {**follows["decoder"], **given.get("decoder", {})}
+    decoder = given.get("decoder", {})
+    if isinstance(decoder, Mapping):  # else it is refused below
+        decoder = {**follows["decoder"], **decoder}
     instrument = instrument_from_dict({"name": name, **follows, **given, "decoder": decoder}, "instrument")
     numbers = list(numbers_of({"sheet": data["sheet"], "instrument": given}))
     sources = sources_of(numbers, data["sources"], data["documents"])

@@ -182,6 +182,14 @@ sensor = "ideal-tof"
     return seeds | {"every sensor": of_file("experiment.toml", (every + SPAD).encode())}
 
 
+def devices() -> Seeds:
+    """Files of devices, one of each kind of sensor."""
+    from rangesim import presets
+
+    found = {presets.load(name).sensor.type_name: name for name in presets.names()}
+    return {name: of_file("device.toml", presets.describe(name).text.encode()) for name in found.values()}
+
+
 # --- calibrations and models ------------------------------------------------------------------------------------------
 
 
