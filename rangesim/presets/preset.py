@@ -89,8 +89,8 @@ def read_preset(path: str | Path) -> Preset:
     path = Path(path)
     if not is_name(path.stem):
         raise FileFormatError(
-            f"expected a file whose name is that of the instrument, with letters, digits, - and _, at most {MAX_NAME}, "
-            f"got {shown(path.name)}."
+            f"{path}: expected a file name of letters, digits, - and _, at most {MAX_NAME}, which is that of the "
+            f"instrument, got {shown(path.name)}."
         )
     try:
         return _preset(path.stem, read_toml(path), read_text(path))
