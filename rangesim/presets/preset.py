@@ -5,7 +5,8 @@ A file is TOML with these parts:
 
 - `title`: the name of the device in words.
 - `[sheet]`: a `DataSheet`.
-- `[instrument]`: what `Instrument` takes besides what follows from the sheet, as in an experiment.
+- `[instrument]`: what `Instrument` takes besides what follows from the sheet, as in an experiment. Its name is that of
+  the file, unless it is stated.
 - `[documents]`: short names of documents, with their full titles.
 - `[sources]`: for every number, by the name of its setting, where it comes from: the short name of a document, with a
   place in it after a colon if need be; or `assumed: why`, `computed: how`, `fitted: to what`. The name of a table or of
@@ -39,7 +40,7 @@ class Preset(ShortRepr):
 
     Parameters
     ----------
-    name : name of the file without its suffix, and of the instrument.
+    name : name of the instrument: that of the file without its suffix, unless the file states another.
     title : the device in words.
     sheet : DataSheet.
     instrument : Instrument.
@@ -87,11 +88,6 @@ def read_preset(path: str | Path) -> Preset:
         names the place.
     """
     path = Path(path)
-    if not is_name(path.stem):
-        raise FileFormatError(
-            f"{path}: expected a file name of letters, digits, - and _, at most {MAX_NAME}, which is that of the "
-            f"instrument, got {shown(path.name)}."
-        )
     try:
         return _preset(path.stem, read_toml(path), read_text(path))
     except ValueError as error:
@@ -109,13 +105,18 @@ def _preset(name: str, data: Mapping[str, Any], text: str) -> Preset:
             raise ValueError(f"expected {part} as a table, got {shown(data[part])}.")
     sheet, given = from_dict(DataSheet, data["sheet"], "sheet"), data["instrument"]
     follows = sheet.settings(has_camera="camera" in given)
+    if "name" not in given and not is_name(name):
+        raise ValueError(
+            f"expected a file name of letters, digits, - and _, at most {MAX_NAME}, which is that of the instrument, "
+            f"got {shown(name)}; or state its name under [instrument]."
+        )
     decoder = given.get("decoder", {})
     if isinstance(decoder, Mapping):  # else it is refused below
         decoder = {**follows["decoder"], **decoder}
     instrument = instrument_from_dict({"name": name, **follows, **given, "decoder": decoder}, "instrument")
     numbers = list(numbers_of({"sheet": data["sheet"], "instrument": given}))
     sources = sources_of(numbers, data["sources"], data["documents"])
-    return Preset(name, data["title"], sheet, instrument, data["documents"], sources, text)
+    return Preset(instrument.name, data["title"], sheet, instrument, data["documents"], sources, text)
 
 
 def numbers_of(table: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

@@ -187,7 +187,10 @@ def devices() -> Seeds:
     from rangesim import presets
 
     found = {presets.load(name).sensor.type_name: name for name in presets.names()}
-    return {name: of_file("device.toml", presets.describe(name).text.encode()) for name in found.values()}
+    texts = {
+        n: presets.describe(n).text.replace("[instrument]\n", '[instrument]\nname = "one"\n') for n in found.values()
+    }
+    return {name: of_file("device.toml", text.encode()) for name, text in texts.items()}
 
 
 # --- calibrations and models ------------------------------------------------------------------------------------------
