@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from rangesim.decoding.coordinates import Coordinates
 from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.returns import Returns
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.rig import Rig
@@ -44,6 +46,54 @@ def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Ri
         return np.asarray(np.where(length > np.linalg.norm(b), result, np.nan))
 
 
+def range_slope(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
+    """(...) float64, derivative of `range_from_path_length` by the length; 1/2 without a baseline.
+
+    Examples
+    --------
+    >>> from rangesim.rig import Intrinsics, Rig
+    >>> device = Intrinsics(640, 480, 800, 800, 320, 240)
+    >>> range_slope(np.array([1.8]), np.array([[0.0, 0.0, 1.0]]), Rig(device, device))
+    array([0.5])
+    """
+    b = rig.T_camera_projector[:3, 3]
+    d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    length, along = np.asarray(length_m, dtype=np.float64), d @ b
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray((length**2 - 2 * length * along + b @ b) / (2 * (length - along) ** 2))
+
+
+class LengthReturns(NamedTuple):
+    """All returns of each pixel, before any geometry; (k, h, w) each, nearest first.
+
+    length_m : float64, metres, path length there and back; NaN where there is none.
+    sigma_m : float64, metres, its standard deviation by the noise of the frames; NaN where not known.
+    strength : float64, counts of the pulse. status : uint8, values of `Status`.
+    """
+
+    length_m: np.ndarray
+    sigma_m: np.ndarray
+    strength: np.ndarray
+    status: np.ndarray
+
+    def ranges(self, rig: Rig | None) -> Returns:
+        """The returns as ranges from the camera; without a rig, half of the lengths."""
+        range_m, sigma_m = np.empty((2, *self.length_m.shape), dtype=np.float32)
+        status = self.status.astype(np.uint8)
+        for rows in bands(self.length_m.shape[1]):
+            length = self.length_m[:, rows]
+            along_ray, slope = length / 2, np.full(length.shape, 0.5)
+            if rig is not None:
+                directions = rig.camera.directions(rig.camera.pixel_centres(rows))
+                along_ray = range_from_path_length(length, directions, rig)
+                slope = range_slope(length, directions, rig)
+            is_behind = ~(np.nan_to_num(along_ray, nan=-1.0) > 0)
+            status[:, rows][is_behind & (status[:, rows] == Status.OK)] = Status.OUT_OF_RANGE
+            range_m[:, rows] = np.where(is_behind, np.nan, along_ray)
+            sigma_m[:, rows] = np.where(is_behind, np.nan, slope * self.sigma_m[:, rows])
+        return Returns(range_m, self.strength.astype(np.float32), sigma_m, status)
+
+
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class PathLengths(Coordinates):
     """Path lengths of a time-of-flight capture, from the emitter to the surface and back to the camera.
@@ -53,6 +103,7 @@ class PathLengths(Coordinates):
     length_m : (h, w) float64, metres; NaN where `status` is not OK.
     sigma_m : (h, w) float32, metres, standard deviation of `length_m` that the noise of the frames causes; NaN where
         `status` is not OK. None: not known, as for noise-free captures and unknown detectors.
+    returns : LengthReturns, all returns of each pixel, of which `length_m` is one; None: they were not looked for.
 
     Examples
     --------
@@ -67,6 +118,7 @@ class PathLengths(Coordinates):
 
     length_m: np.ndarray
     sigma_m: np.ndarray | None = None
+    returns: LengthReturns | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -95,4 +147,5 @@ class PathLengths(Coordinates):
             status[rows][(status[rows] == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
             ok = status[rows] == Status.OK
             z_m[rows], range_m[rows] = np.where(ok, z, np.nan), np.where(ok, along_ray, np.nan)
-        return self._image(rig, z_m, range_m, status)
+        image = self._image(rig, z_m, range_m, status)
+        return image if self.returns is None else replace(image, returns=self.returns.ranges(rig))

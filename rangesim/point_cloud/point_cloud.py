@@ -21,6 +21,8 @@ FAR_M = 100.0
 
 Beyond it they have double precision, because neighbouring numbers of single precision are 8 µm apart at 100 m.
 """
+SCAN_DTYPES = {"time_s": np.float64, "ring": np.uint16, "return_number": np.uint8}
+"""Arrays that scanning instruments tell of each point, with their types."""
 NORMAL_RADIUS = 2
 """Radius, in pixels, of the window of (2 r + 1)^2 pixels that a normal is fitted to.
 
@@ -50,11 +52,15 @@ class PointCloud(ShortRepr):
     intensity : (...) float32, in the units of the capture's frames. None: not known.
     colors : (..., 3) uint8, RGB. None: not known.
     confidence : (...) float32 in 0..1, see `RangeImage`. None: not known.
+    time_s : (...) float64, seconds, when each point was measured, after the first ray of its scan. None: not known.
+    ring : (...) uint16, number of the beam that measured each point, from the uppermost (0) downwards unless its maker
+        counts otherwise. None: not known.
+    return_number : (...) uint8, 1 for the first return of a ray, 2 for the second. None: not known.
 
     Raises
     ------
     ValueError
-        The coordinates are unknown, or the arrays do not fit together.
+        The coordinates are unknown, the arrays do not fit together, or `ring` or `return_number` has another type.
 
     Examples
     --------
@@ -74,6 +80,9 @@ class PointCloud(ShortRepr):
     intensity: np.ndarray | None = None
     colors: np.ndarray | None = None
     confidence: np.ndarray | None = None
+    time_s: np.ndarray | None = None
+    ring: np.ndarray | None = None
+    return_number: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         shape = self.points.shape
@@ -84,10 +93,17 @@ class PointCloud(ShortRepr):
         for name, value in self.attributes().items():
             if value.shape not in (shape[:-1], shape):
                 raise ValueError(f"expected {name} of shape {shape[:-1]} or {shape}, got {value.shape}.")
+        for name, dtype in SCAN_DTYPES.items():
+            value = getattr(self, name)
+            if value is not None and (value.dtype != dtype or value.shape != shape[:-1]):
+                raise ValueError(
+                    f"expected {name} of shape {shape[:-1]} and type {np.dtype(dtype)}, "
+                    f"got {value.shape} and {value.dtype}."
+                )
 
     def attributes(self) -> dict[str, np.ndarray]:
         """Arrays besides the points that are not None, by name."""
-        names = ("normals", "intensity", "colors", "confidence")
+        names = ("normals", "intensity", "colors", "confidence", *SCAN_DTYPES)
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
     @property
