@@ -33,6 +33,7 @@ ROOMS = [
     "rangesim.pipeline",
     "rangesim.point_cloud",
     "rangesim.presets",
+    "rangesim.recordings",
     "rangesim.report",
     "rangesim.response",
     "rangesim.results",
