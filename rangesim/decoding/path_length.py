@@ -13,7 +13,7 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.returns import Returns
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
-from rangesim.rig import Rig
+from rangesim.rig import Beam, Intrinsics, Rig, tangents
 
 
 def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
@@ -63,6 +63,30 @@ def range_slope(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.nd
         return np.asarray((length**2 - 2 * length * along + b @ b) / (2 * (length - along) ** 2))
 
 
+def range_along_ray(length_m: np.ndarray, directions: np.ndarray, emitters: np.ndarray) -> np.ndarray:
+    """(...) float64, as `range_from_path_length`, for rays whose emitters stand at other places beside them.
+
+    Parameters
+    ----------
+    length_m : (...) float, metres, there and back.
+    directions : (..., 3) float, unit vectors, camera coordinates.
+    emitters : (..., 3) float, metres, from the origin of each ray to its emitter, camera coordinates.
+    """
+    b2, along = np.sum(emitters**2, axis=-1), np.sum(directions * emitters, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        result = (length_m**2 - b2) / (2 * (length_m - along))
+        return np.asarray(np.where(length_m > np.sqrt(b2), result, np.nan))
+
+
+def emitter_offsets(rig: Rig) -> np.ndarray:
+    """(h, w, 3) float64, metres, from the origin of each ray of the camera to its emitter, camera coordinates."""
+    rays, emitter = rig.camera.pixel_rays(), rig.projector
+    if not isinstance(emitter, Beam):
+        return np.asarray(rig.T_camera_projector[:3, 3] - rays.origins)
+    right, down = tangents(rays.directions if emitter.directions is None else emitter.directions)
+    return np.asarray(right * emitter.offset_m[0] + down * emitter.offset_m[1])
+
+
 class LengthReturns(NamedTuple):
     """All returns of each pixel, before any geometry; (k, h, w) each, nearest first.
 
@@ -84,9 +108,7 @@ class LengthReturns(NamedTuple):
             length = self.length_m[:, rows]
             along_ray, slope = length / 2, np.full(length.shape, 0.5)
             if rig is not None:
-                directions = rig.camera.directions(rig.camera.pixel_centres(rows))
-                along_ray = range_from_path_length(length, directions, rig)
-                slope = range_slope(length, directions, rig)
+                along_ray, slope = _ranges(length, rows, rig), _slopes(length, rows, rig)
             is_behind = ~(np.nan_to_num(along_ray, nan=-1.0) > 0)
             status[:, rows][is_behind & (status[:, rows] == Status.OK)] = Status.OUT_OF_RANGE
             range_m[:, rows] = np.where(is_behind, np.nan, along_ray)
@@ -138,14 +160,34 @@ class PathLengths(Coordinates):
         z_m, range_m = np.empty((2, *status.shape), dtype=np.float32)
         for rows in bands(len(status)):
             if rig is None:
-                along_ray, z = self.length_m[rows] / 2, np.float64(np.nan)
+                along_ray = self.length_m[rows] / 2
+                z = np.full(along_ray.shape, np.nan)
             else:
-                directions = rig.camera.directions(rig.camera.pixel_centres(rows))
-                along_ray = range_from_path_length(self.length_m[rows], directions, rig)
-                z = along_ray / np.linalg.norm(directions, axis=-1)
+                along_ray = _ranges(self.length_m[rows], rows, rig)
+                z = rig.camera.z_of(along_ray, rows)
             in_front = np.nan_to_num(along_ray, nan=-1.0) > 0
             status[rows][(status[rows] == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
             ok = status[rows] == Status.OK
             z_m[rows], range_m[rows] = np.where(ok, z, np.nan), np.where(ok, along_ray, np.nan)
         image = self._image(rig, z_m, range_m, status)
         return image if self.returns is None else replace(image, returns=self.returns.ranges(rig))
+
+
+def _ranges(length_m: np.ndarray, rows: slice, rig: Rig) -> np.ndarray:
+    """(..., rows, w) float64, metres, ranges along the rays of some rows, from their path lengths."""
+    if isinstance(rig.camera, Intrinsics):
+        directions = rig.camera.directions(rig.camera.pixel_centres(rows))
+        return range_from_path_length(length_m, directions, rig)
+    rays = rig.camera.pixel_rays()
+    emitters = emitter_offsets(rig)[rows]
+    return range_along_ray(length_m, rays.directions[rows], emitters)
+
+
+def _slopes(length_m: np.ndarray, rows: slice, rig: Rig) -> np.ndarray:
+    """(..., rows, w) float64, derivative of the ranges of some rows by their path lengths; 1/2 without a baseline."""
+    if isinstance(rig.camera, Intrinsics):
+        return range_slope(length_m, rig.camera.directions(rig.camera.pixel_centres(rows)), rig)
+    emitters = emitter_offsets(rig)[rows]
+    b2, along = np.sum(emitters**2, axis=-1), np.sum(rig.camera.pixel_rays().directions[rows] * emitters, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray((length_m**2 - 2 * length_m * along + b2) / (2 * (length_m - along) ** 2))
