@@ -114,6 +114,10 @@ def _preset(name: str, data: Mapping[str, Any], text: str) -> Preset:
     if isinstance(decoder, Mapping):  # else it is refused below
         decoder = {**follows["decoder"], **decoder}
     instrument = instrument_from_dict({"name": name, **follows, **given, "decoder": decoder}, "instrument")
+    camera = instrument.camera
+    if camera is not None and (camera.width, camera.height) != sheet.resolution_px:
+        size = "{} x {}".format(*sheet.resolution_px)
+        raise ValueError(f"expected a camera of {size} pixels, as the sheet has, got {camera.width} x {camera.height}.")
     numbers = list(numbers_of({"sheet": data["sheet"], "instrument": given}))
     sources = sources_of(numbers, data["sources"], data["documents"])
     return Preset(instrument.name, data["title"], sheet, instrument, data["documents"], sources, text)
