@@ -26,20 +26,39 @@ import argparse
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from rangesim import Ambient, Intrinsics, RangeImage, Rig, Status, StillSignals, decode, expose, presets
+from rangesim import (
+    Ambient,
+    Intrinsics,
+    RangeImage,
+    Rig,
+    Status,
+    StillSignals,
+    decode,
+    expose,
+    load_scene,
+    presets,
+    transport,
+)
+from rangesim.environment.backend import select_variant
 from rangesim.instrument.instrument import Instrument
 from rangesim.presets import Preset
 from rangesim.response import LightPath, NumpyMath, Response, SparseResponse
+from rangesim.rig import Camera, Fisheye, RayTable
 from rangesim.robust_scale import sigma_from_median
 from rangesim.signals import EnergySplit, GroundTruth
 
 PIXELS = 64
 """Pixels across and down that look at the wall: 4096 readings tell a standard deviation to 1 %."""
+RAYS = 32
+"""Beams across and down that look at the wall: 1024 readings tell a standard deviation to 2 %."""
+SPP = 16
+"""Light paths of each traced beam. The wall is even, so its sampling error is far below the noise of the photons."""
 MIN_VALID = 0.9
 """Least fraction of the pixels with a reading of a wall at mid-range."""
 POWERS_W = (1e-6, 1e4)
@@ -113,11 +132,19 @@ def contradictions(preset: Preset) -> list[str]:
     return faults
 
 
-def field_of_view_deg(camera: Intrinsics) -> tuple[float, float]:
-    """Full angles across and down of a pinhole, degrees."""
-    x = np.degrees(np.arctan([camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx])).sum()
-    y = np.degrees(np.arctan([camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy])).sum()
-    return float(x), float(y)
+def field_of_view_deg(camera: Camera) -> tuple[float, float]:
+    """Full angles across and down, degrees: of an image between its edges, of a scanner between its outermost rays."""
+    if isinstance(camera, Intrinsics):
+        x = np.degrees(np.arctan([camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx])).sum()
+        y = np.degrees(np.arctan([camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy])).sum()
+        return float(x), float(y)
+    if isinstance(camera, Fisheye):
+        return float(np.degrees(camera.width / camera.fx)), float(np.degrees(camera.height / camera.fy))
+    x, y, z = np.moveaxis(camera.pixel_rays().directions, -1, 0)
+    azimuth, elevation = np.degrees(np.arctan2(x, z)), np.degrees(np.arcsin(-y))
+    across = np.ptp(np.unwrap(azimuth, axis=1, period=360), axis=1)
+    is_whole_turn = across.min() > 360 * (1 - 1.5 / camera.width)
+    return 360.0 if is_whole_turn else float(np.ptp(azimuth)), float(np.ptp(elevation))
 
 
 def fitted_power_w(preset: Preset) -> float:
@@ -150,47 +177,98 @@ def scatter_m(image: RangeImage) -> float:
 
 
 def of_wall(instrument: Instrument, distance_m: float, reflectance: float, sunlight_lux: float) -> RangeImage:
-    """Range image of a matte wall that faces the device, by the pixels in the middle of its image."""
-    assert instrument.camera is not None
+    """Range image of a matte wall that faces the device, by pixels in the middle of its view."""
+    sun = Ambient("sun", illuminance_lux=sunlight_lux) if sunlight_lux else None
+    daylight_w_m2 = 1.0 if sunlight_lux else 0.0
+    if isinstance(instrument.projector, Intrinsics):
+        signals = flooded_wall(instrument, distance_m, reflectance, daylight_w_m2)
+    else:
+        signals = traced_wall(instrument, distance_m, reflectance, daylight_w_m2)
+    capture = expose(signals, instrument.sensor, instrument.detector, instrument.exposure_s, seed=0, ambient=sun)
+    return decode(capture, instrument.decoder)
+
+
+def rig_of(instrument: Instrument) -> Rig:
+    """The rig of a device at the origin, with few pixels, all of which look along z or nearly so."""
+    camera = instrument.camera
+    assert camera is not None
     assert instrument.projector is not None
-    assert instrument.T_camera_projector is not None
-    camera = replace(instrument.camera, width=PIXELS, height=PIXELS, cx=PIXELS / 2, cy=PIXELS / 2)
-    rig = Rig(
+    middle = {"width": PIXELS, "height": PIXELS, "cx": PIXELS / 2, "cy": PIXELS / 2}
+    if isinstance(camera, (Intrinsics, Fisheye)):
+        camera = replace(camera, **middle)
+    else:
+        ahead = np.tile([0.0, 0.0, 1.0], (RAYS, RAYS, 1))
+        camera = RayTable(ahead, field_rad=camera.field_rad, acceptance=camera.acceptance)
+    pose = np.eye(4) if instrument.T_camera_projector is None else instrument.T_camera_projector
+    return Rig(
         camera,
         instrument.projector,
-        T_camera_projector=instrument.T_camera_projector,
+        T_camera_projector=pose,
         camera_lens=instrument.camera_lens,
         projector_lens=instrument.projector_lens,
         projector_power_w=instrument.power_w,
         wavelength_m=instrument.emitter_wavelength_m,
     )
-    signals = signals_of_wall(rig, instrument, distance_m, reflectance, 1.0 if sunlight_lux else 0.0)
-    sun = Ambient("sun", illuminance_lux=sunlight_lux) if sunlight_lux else None
-    capture = expose(signals, instrument.sensor, instrument.detector, instrument.exposure_s, seed=0, ambient=sun)
-    return decode(capture, instrument.decoder)
 
 
-def signals_of_wall(
-    rig: Rig, instrument: Instrument, distance_m: float, reflectance: float, daylight_w_m2: float
-) -> StillSignals:
-    """Signals of the wall in closed form: direct light, and broadband daylight of an irradiance on the wall."""
-    camera = rig.camera
-    points = camera.directions(camera.pixel_centres()) * distance_m
+@lru_cache(maxsize=64)  # the search for a power asks for the same wall again
+def bright_wall(instrument: Instrument, distance_m: float, reflectance: float, daylight_w_m2: float) -> StillSignals:
+    """Signals of the wall that beams of 1 W light, traced."""
+    import mitsuba as mi
+
+    select_variant()
+    to_world = mi.ScalarTransform4f()
+    size = max(1.0, 0.1 * distance_m)
+    parts: dict[str, Any] = {
+        "sensor": {"type": "perspective", "to_world": to_world.look_at([0, 0, 0], [0, 0, 1], [0, 1, 0])},
+        "wall": {
+            "type": "rectangle",
+            "to_world": to_world.translate([0, 0, distance_m]).scale([size, size, -1]),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "spectrum", "value": reflectance}},
+        },
+    }
+    if daylight_w_m2:
+        light = {"type": "spectrum", "value": daylight_w_m2 / np.pi}
+        parts["sky"] = {"type": "constant", "radiance": light}
+    scene = load_scene({"type": "scene", **parts})
+    return transport(scene, rig_of(instrument), [instrument.sensor], spp=SPP, max_depth=2, photons=0, glint=False)
+
+
+def traced_wall(instrument: Instrument, distance_m: float, reflectance: float, daylight_w_m2: float) -> StillSignals:
+    """Signals of the wall that beams light: traced once for 1 W, and scaled."""
+    one = bright_wall(replace(instrument, power_w=1.0), distance_m, reflectance, daylight_w_m2)
+    factor, energy = np.float32(instrument.power_w), one.energy
+    kinds = {f.name: factor * getattr(energy, f.name) for f in fields(energy) if f.name != "ambient"}
+    return replace(
+        one,
+        rig=replace(one.rig, projector_power_w=instrument.power_w),
+        energy=replace(energy, **kinds),
+        channels={response: factor * values for response, values in one.channels.items()},
+        sampling=None,
+    )
+
+
+def flooded_wall(instrument: Instrument, distance_m: float, reflectance: float, daylight_w_m2: float) -> StillSignals:
+    """Signals of the wall that the emitter lights at once, in closed form: direct light, and broadband daylight of an
+    irradiance on the wall."""
+    rig = rig_of(instrument)
+    emitter = rig.projector
+    assert isinstance(emitter, Intrinsics)
+    rays = rig.camera.pixel_rays().directions
+    points = rays / rays[..., 2:] * distance_m
     in_projector = (points - rig.T_camera_projector[:3, 3]) @ rig.T_camera_projector[:3, :3]
-    uv, range_m = rig.projector.project(in_projector), np.linalg.norm(points, axis=-1)
+    uv, range_m = emitter.project(in_projector), np.linalg.norm(points, axis=-1)
     out_m = np.linalg.norm(in_projector, axis=-1)
     with np.errstate(invalid="ignore"):
-        lit = ((uv >= 0) & (uv <= [rig.projector.width, rig.projector.height])).all(axis=-1)
-    facing = distance_m - rig.T_camera_projector[2, 3]  # of the wall's normal and the light, times the distance
-    cosine = facing / out_m
+        lit = ((uv >= 0) & (uv <= [emitter.width, emitter.height])).all(axis=-1)
+    cosine = (distance_m - rig.T_camera_projector[2, 3]) / out_m  # of the wall's normal and the light
     irradiance = rig.projector_irradiance * (out_m / in_projector[..., 2]) ** 3 / out_m**2 * cosine
     radiance = np.where(lit, reflectance / np.pi * irradiance, 0.0)
     path = LightPath(*(np.nan_to_num(a) * lit for a in (uv[..., 0], uv[..., 1], range_m + out_m)), lit)
     channels = {r: weighted(r, path, radiance) for r in instrument.sensor.responses()}
     zero = np.zeros(radiance.shape, dtype=np.float32)
-    energy = EnergySplit(
-        radiance.astype(np.float32), zero, zero, zero, zero, zero + np.float32(reflectance / np.pi * daylight_w_m2)
-    )
+    ambient = zero + np.float32(reflectance / np.pi * daylight_w_m2)
+    energy = EnergySplit(radiance.astype(np.float32), zero, zero, zero, zero, ambient)
     truth = GroundTruth(
         z=zero + np.float32(distance_m),
         range_m=range_m.astype(np.float32),
