@@ -231,8 +231,8 @@ class Device:
         """Straight connection of the point `si` to the projector, through `media` if there are any.
 
         All projector pixels have the same power. With E the irradiance at z = 1 m on the axis, the radiant intensity is
-        E / cos^3. The irradiance on a surface that faces the projector is this times cos^2 / z^2, which is E / (z^2 cos).
-        The lens multiplies E by the density of its pixels and by its relative illumination.
+        E / cos^3. The irradiance on a surface that faces the projector is this times cos^2 / z^2, which is
+        E / (z^2 cos). The lens multiplies E by the density of its pixels and by its relative illumination.
 
         Parameters
         ----------

@@ -7,6 +7,7 @@ from rangesim.rig.intrinsics import RESIDUAL_PX, Coefficient, FocalLength, Intri
 from rangesim.rig.poses import Array, check_rigid, is_same_pose, look_at, pose, translation
 from rangesim.rig.ray_cameras import Fisheye, Orthographic, RayTable, ScanningCamera
 from rangesim.rig.rig import CAMERA_LENS, PROJECTOR_LENS, Lens, Rig
+from rangesim.rig.scanners import Lissajous, MovingCamera, Risley, Spinning
 
 __all__ = [
     "CAMERA_LENS",
@@ -21,13 +22,17 @@ __all__ = [
     "FocalLength",
     "Intrinsics",
     "Lens",
+    "Lissajous",
+    "MovingCamera",
     "Optics",
     "Orthographic",
     "PixelRays",
     "PrincipalPoint",
     "RayTable",
     "Rig",
+    "Risley",
     "ScanningCamera",
+    "Spinning",
     "check_rigid",
     "is_same_pose",
     "look_at",

@@ -76,11 +76,14 @@ class Fisheye(Camera):
             raise ValueError(f"expected at most 4 distortion coefficients, got {shown(self.distortion)}.")
 
     def pixel_rays(self) -> PixelRays:
-        """Rays through the pixel centres; NaN beyond `max_angle_rad`, and where the polynomial has no inverse."""
+        """Rays through the pixel centres; NaN for pixels that are not wholly within `max_angle_rad`, and where the
+        polynomial has no inverse."""
         centres, half = self.pixel_centres(), np.array([[0.5, 0.0], [0.0, 0.5]])
         beside = [self._unit_rays(centres + sign * offset) for offset in half for sign in (1, -1)]
         steps = np.stack([beside[0] - beside[1], beside[2] - beside[3]], axis=-2)
-        return PixelRays(np.zeros((*centres.shape[:2], 3)), self._unit_rays(centres), steps)
+        directions = self._unit_rays(centres)
+        directions[~np.isfinite(steps).all(axis=(-2, -1))] = np.nan
+        return PixelRays(np.zeros(directions.shape), directions, steps)
 
     def project(self, points: ArrayLike) -> Array:
         """(..., 2) float64, pixel coordinates of points (..., 3) in coordinates of this camera, metres.

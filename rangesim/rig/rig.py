@@ -84,6 +84,7 @@ class Rig:
 
     Examples
     --------
+    >>> from rangesim.rig import look_at
     >>> camera = Intrinsics.from_fov(640, 480, fov_x_deg=50.0)
     >>> projector = Intrinsics.from_fov(1280, 800, fov_x_deg=60.0)
     >>> beside = look_at((0.2, 0, 0), (0, 0, 1), up=(0, -1, 0))  # 0.2 m to the right of the camera, turned inwards
