@@ -11,7 +11,7 @@ from rangesim.decoding.coordinates import Coordinates
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
-from rangesim.rig import Rig
+from rangesim.rig import Beam, Intrinsics, Rig, tangents
 
 
 def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
@@ -42,6 +42,30 @@ def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Ri
     with np.errstate(invalid="ignore", divide="ignore"):
         result = (length**2 - b @ b) / (2 * (length - d @ b))
         return np.asarray(np.where(length > np.linalg.norm(b), result, np.nan))
+
+
+def range_along_ray(length_m: np.ndarray, directions: np.ndarray, emitters: np.ndarray) -> np.ndarray:
+    """(...) float64, as `range_from_path_length`, for rays whose emitters stand at other places beside them.
+
+    Parameters
+    ----------
+    length_m : (...) float, metres, there and back.
+    directions : (..., 3) float, unit vectors, camera coordinates.
+    emitters : (..., 3) float, metres, from the origin of each ray to its emitter, camera coordinates.
+    """
+    b2, along = np.sum(emitters**2, axis=-1), np.sum(directions * emitters, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        result = (length_m**2 - b2) / (2 * (length_m - along))
+        return np.asarray(np.where(length_m > np.sqrt(b2), result, np.nan))
+
+
+def emitter_offsets(rig: Rig) -> np.ndarray:
+    """(h, w, 3) float64, metres, from the origin of each ray of the camera to its emitter, camera coordinates."""
+    rays, emitter = rig.camera.pixel_rays(), rig.projector
+    if not isinstance(emitter, Beam):
+        return np.asarray(rig.T_camera_projector[:3, 3] - rays.origins)
+    right, down = tangents(rays.directions if emitter.directions is None else emitter.directions)
+    return np.asarray(right * emitter.offset_m[0] + down * emitter.offset_m[1])
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -86,13 +110,23 @@ class PathLengths(Coordinates):
         z_m, range_m = np.empty((2, *status.shape), dtype=np.float32)
         for rows in bands(len(status)):
             if rig is None:
-                along_ray, z = self.length_m[rows] / 2, np.float64(np.nan)
+                along_ray = self.length_m[rows] / 2
+                z = np.full(along_ray.shape, np.nan)
             else:
-                directions = rig.camera.directions(rig.camera.pixel_centres(rows))
-                along_ray = range_from_path_length(self.length_m[rows], directions, rig)
-                z = along_ray / np.linalg.norm(directions, axis=-1)
+                along_ray = _ranges(self.length_m, rows, rig)
+                z = rig.camera.z_of(along_ray, rows)
             in_front = np.nan_to_num(along_ray, nan=-1.0) > 0
             status[rows][(status[rows] == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
             ok = status[rows] == Status.OK
             z_m[rows], range_m[rows] = np.where(ok, z, np.nan), np.where(ok, along_ray, np.nan)
         return self._image(rig, z_m, range_m, status)
+
+
+def _ranges(length_m: np.ndarray, rows: slice, rig: Rig) -> np.ndarray:
+    """(rows, w) float64, metres, ranges along the rays of some rows, from the path lengths of all."""
+    if isinstance(rig.camera, Intrinsics):
+        directions = rig.camera.directions(rig.camera.pixel_centres(rows))
+        return range_from_path_length(length_m[rows], directions, rig)
+    rays = rig.camera.pixel_rays()
+    emitters = emitter_offsets(rig)[rows]
+    return range_along_ray(length_m[rows], rays.directions[rows], emitters)

@@ -10,7 +10,7 @@ import numpy as np
 
 from rangesim.decoding.status import Status
 from rangesim.point_cloud import PointCloud, organised_cloud
-from rangesim.rig import Intrinsics
+from rangesim.rig import Camera, Intrinsics
 from rangesim.settings.config import ShortRepr
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class RangeImage(ShortRepr):
         fraction of the highest peak), and the radiance of the ideal sensor.
     status : (h, w) uint8, values of `Status`.
     intensity : (h, w) float32, mean signal in the capture's units, for colouring points.
-    camera : Intrinsics, or None for an uncalibrated capture, whose z is all NaN.
+    camera : Camera, or None for an uncalibrated capture, whose z is all NaN.
     T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres; None as `camera`.
     projector_column, projector_row : (h, w) float32, decoded projector pixel coordinates (pixel centres at
         integer + 0.5), NaN where not decoded; None for sensors without a code along that axis.
@@ -63,7 +63,7 @@ class RangeImage(ShortRepr):
     confidence: np.ndarray
     status: np.ndarray
     intensity: np.ndarray
-    camera: Intrinsics | None = None
+    camera: Camera | None = None
     T_world_camera: np.ndarray | None = None
     projector_column: np.ndarray | None = None
     projector_row: np.ndarray | None = None
@@ -74,6 +74,19 @@ class RangeImage(ShortRepr):
     def valid(self) -> np.ndarray:
         """(h, w) bool, where `status` is OK."""
         return np.asarray(self.status == Status.OK)
+
+    @property
+    def pinhole(self) -> Intrinsics:
+        """The camera, which has to be a pinhole; ValueError if it is not, or if there is none."""
+        if not isinstance(self.camera, Intrinsics):
+            name = type(self.camera).__name__
+            raise ValueError(f"expected a range image of a pinhole camera (Intrinsics), got one of {name}.")
+        return self.camera
+
+    @property
+    def reading_m(self) -> np.ndarray:
+        """(h, w) float32, metres, the readings: z of a pinhole camera, `range_m` of every other one."""
+        return self.z if self.camera is None else self.camera.reading(self)
 
     @property
     def is_consistent(self) -> bool:
@@ -95,4 +108,6 @@ class RangeImage(ShortRepr):
         """
         if self.camera is None or self.T_world_camera is None:
             raise ValueError("expected a calibrated range image: without a rig there are no points.")
-        return organised_cloud(self.z, self.camera, self.T_world_camera, self.intensity, self.confidence, coordinates)
+        return organised_cloud(
+            self.reading_m, self.camera, self.T_world_camera, self.intensity, self.confidence, coordinates
+        )
