@@ -13,7 +13,11 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.returns import Returns
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
-from rangesim.rig import Rig
+from rangesim.rig import Beam, Intrinsics, Rig, tangents
+
+SMALL_M = 1e-4
+"""Change of a path length, metres, by which the slope of ranges over lengths is told: small beside every baseline, and
+large beside the rounding of double precision."""
 
 
 def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
@@ -46,21 +50,28 @@ def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Ri
         return np.asarray(np.where(length > np.linalg.norm(b), result, np.nan))
 
 
-def range_slope(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
-    """(...) float64, derivative of `range_from_path_length` by the length; 1/2 without a baseline.
+def range_along_ray(length_m: np.ndarray, directions: np.ndarray, emitters: np.ndarray) -> np.ndarray:
+    """(...) float64, as `range_from_path_length`, for rays whose emitters stand at other places beside them.
 
-    Examples
-    --------
-    >>> from rangesim.rig import Intrinsics, Rig
-    >>> device = Intrinsics(640, 480, 800, 800, 320, 240)
-    >>> range_slope(np.array([1.8]), np.array([[0.0, 0.0, 1.0]]), Rig(device, device))
-    array([0.5])
+    Parameters
+    ----------
+    length_m : (...) float, metres, there and back.
+    directions : (..., 3) float, unit vectors, camera coordinates.
+    emitters : (..., 3) float, metres, from the origin of each ray to its emitter, camera coordinates.
     """
-    b = rig.T_camera_projector[:3, 3]
-    d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    length, along = np.asarray(length_m, dtype=np.float64), d @ b
+    b2, along = np.sum(emitters**2, axis=-1), np.sum(directions * emitters, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray((length**2 - 2 * length * along + b @ b) / (2 * (length - along) ** 2))
+        result = (length_m**2 - b2) / (2 * (length_m - along))
+        return np.asarray(np.where(length_m > np.sqrt(b2), result, np.nan))
+
+
+def emitter_offsets(rig: Rig) -> np.ndarray:
+    """(h, w, 3) float64, metres, from the origin of each ray of the camera to its emitter, camera coordinates."""
+    rays, emitter = rig.camera.pixel_rays(), rig.projector
+    if not isinstance(emitter, Beam):
+        return np.asarray(rig.T_camera_projector[:3, 3] - rays.origins)
+    right, down = tangents(rays.directions if emitter.directions is None else emitter.directions)
+    return np.asarray(right * emitter.offset_m[0] + down * emitter.offset_m[1])
 
 
 class LengthReturns(NamedTuple):
@@ -84,9 +95,9 @@ class LengthReturns(NamedTuple):
             length = self.length_m[:, rows]
             along_ray, slope = length / 2, np.full(length.shape, 0.5)
             if rig is not None:
-                directions = rig.camera.directions(rig.camera.pixel_centres(rows))
-                along_ray = range_from_path_length(length, directions, rig)
-                slope = range_slope(length, directions, rig)
+                along_ray = np.stack([_ranges(one, rows, rig) for one in self.length_m])
+                beyond = np.stack([_ranges(one + SMALL_M, rows, rig) for one in self.length_m])
+                slope = (beyond - along_ray) / SMALL_M
             is_behind = ~(np.nan_to_num(along_ray, nan=-1.0) > 0)
             status[:, rows][is_behind & (status[:, rows] == Status.OK)] = Status.OUT_OF_RANGE
             range_m[:, rows] = np.where(is_behind, np.nan, along_ray)
@@ -138,14 +149,24 @@ class PathLengths(Coordinates):
         z_m, range_m = np.empty((2, *status.shape), dtype=np.float32)
         for rows in bands(len(status)):
             if rig is None:
-                along_ray, z = self.length_m[rows] / 2, np.float64(np.nan)
+                along_ray = self.length_m[rows] / 2
+                z = np.full(along_ray.shape, np.nan)
             else:
-                directions = rig.camera.directions(rig.camera.pixel_centres(rows))
-                along_ray = range_from_path_length(self.length_m[rows], directions, rig)
-                z = along_ray / np.linalg.norm(directions, axis=-1)
+                along_ray = _ranges(self.length_m, rows, rig)
+                z = rig.camera.z_of(along_ray, rows)
             in_front = np.nan_to_num(along_ray, nan=-1.0) > 0
             status[rows][(status[rows] == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
             ok = status[rows] == Status.OK
             z_m[rows], range_m[rows] = np.where(ok, z, np.nan), np.where(ok, along_ray, np.nan)
         image = self._image(rig, z_m, range_m, status)
         return image if self.returns is None else replace(image, returns=self.returns.ranges(rig))
+
+
+def _ranges(length_m: np.ndarray, rows: slice, rig: Rig) -> np.ndarray:
+    """(rows, w) float64, metres, ranges along the rays of some rows, from the path lengths of all."""
+    if isinstance(rig.camera, Intrinsics):
+        directions = rig.camera.directions(rig.camera.pixel_centres(rows))
+        return range_from_path_length(length_m[rows], directions, rig)
+    rays = rig.camera.pixel_rays()
+    emitters = emitter_offsets(rig)[rows]
+    return range_along_ray(length_m[rows], rays.directions[rows], emitters)

@@ -11,7 +11,7 @@ import numpy as np
 from rangesim.decoding.returns import Returns
 from rangesim.decoding.status import Status
 from rangesim.point_cloud import PointCloud, organised_cloud
-from rangesim.rig import Intrinsics
+from rangesim.rig import Camera, Intrinsics
 from rangesim.settings.config import ShortRepr
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class RangeImage(ShortRepr):
         fraction of the highest peak), and the radiance of the ideal sensor.
     status : (h, w) uint8, values of `Status`.
     intensity : (h, w) float32, mean signal in the capture's units, for colouring points.
-    camera : Intrinsics, or None for an uncalibrated capture, whose z is all NaN.
+    camera : Camera, or None for an uncalibrated capture, whose z is all NaN.
     T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres; None as `camera`.
     projector_column, projector_row : (h, w) float32, decoded projector pixel coordinates (pixel centres at
         integer + 0.5), NaN where not decoded; None for sensors without a code along that axis.
@@ -66,7 +66,7 @@ class RangeImage(ShortRepr):
     confidence: np.ndarray
     status: np.ndarray
     intensity: np.ndarray
-    camera: Intrinsics | None = None
+    camera: Camera | None = None
     T_world_camera: np.ndarray | None = None
     projector_column: np.ndarray | None = None
     projector_row: np.ndarray | None = None
@@ -78,6 +78,19 @@ class RangeImage(ShortRepr):
     def valid(self) -> np.ndarray:
         """(h, w) bool, where `status` is OK."""
         return np.asarray(self.status == Status.OK)
+
+    @property
+    def pinhole(self) -> Intrinsics:
+        """The camera, which has to be a pinhole; ValueError if it is not, or if there is none."""
+        if not isinstance(self.camera, Intrinsics):
+            name = type(self.camera).__name__
+            raise ValueError(f"expected a range image of a pinhole camera (Intrinsics), got one of {name}.")
+        return self.camera
+
+    @property
+    def reading_m(self) -> np.ndarray:
+        """(h, w) float32, metres, the readings: z of a pinhole camera, `range_m` of every other one."""
+        return self.z if self.camera is None else self.camera.reading(self)
 
     @property
     def is_consistent(self) -> bool:
@@ -105,7 +118,7 @@ class RangeImage(ShortRepr):
             raise ValueError("expected a calibrated range image: without a rig there are no points.")
         if returns == "reading":
             return organised_cloud(
-                self.z, self.camera, self.T_world_camera, self.intensity, self.confidence, coordinates
+                self.reading_m, self.camera, self.T_world_camera, self.intensity, self.confidence, coordinates
             )
         if returns != "all":
             raise ValueError(f"expected returns to be one of reading, all, got {returns!r}.")
@@ -114,12 +127,12 @@ class RangeImage(ShortRepr):
                 "expected a range image with all returns; decode with a decoder that looks for several, such as "
                 "DirectToFDecoder(max_returns=3)."
             )
-        away = np.linalg.norm(self.camera.directions(self.camera.pixel_centres()), axis=-1)
         clouds = []
         for i, range_m in enumerate(self.returns.range_m):
-            z = np.where(self.returns.status[i] == Status.OK, range_m / away, np.nan).astype(np.float32)
-            strength, number = self.returns.strength[i], np.full(z.shape, i + 1, dtype=np.uint8)
-            cloud = organised_cloud(z, self.camera, self.T_world_camera, strength, strength, coordinates)
+            ok = np.where(self.returns.status[i] == Status.OK, range_m, np.float32(np.nan))
+            one = replace(self, range_m=ok, z=self.camera.z_of(ok).astype(np.float32))
+            strength, number = self.returns.strength[i], np.full(ok.shape, i + 1, dtype=np.uint8)
+            cloud = organised_cloud(one.reading_m, self.camera, self.T_world_camera, strength, strength, coordinates)
             clouds.append(replace(cloud, confidence=None, return_number=number).finite())
         arrays = {name: np.concatenate([getattr(c, name) for c in clouds]) for name in clouds[0].attributes()}
         return PointCloud(np.concatenate([c.points for c in clouds]), coordinates, **arrays)
