@@ -11,7 +11,7 @@ from rangesim.settings.bounds import Bounds, Metres, check_fields
 
 @dataclass(frozen=True)
 class CoverGlass:
-    """Light that the window of a device returns from the emitter to the camera, the same to each pixel.
+    """Light that the window of a device returns from the emitter to the camera, the same to pixels of the same size.
 
     Time-of-flight devices call it optical crosstalk. In a histogram it is a peak at a range of nearly zero; an AMCW
     camera reads all surfaces too near because of it. Its light belongs to the frames alone: neither the energy split
@@ -19,8 +19,9 @@ class CoverGlass:
 
     Parameters
     ----------
-    fraction : fraction of the emitter's power that arrives at one pixel by way of the glass, 0 to 1. A fingerprint
-        makes it many times larger.
+    fraction : fraction of the emitter's power that arrives at one pixel by way of the glass, 0 to 1; at the largest
+        pixel, if the camera is no pinhole, and at others in proportion to their solid angle. A fingerprint makes it
+        many times larger.
     path_m : metres, optical length of this way from the emitter to the camera.
 
     Examples
