@@ -29,6 +29,7 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from rangesim.causes import explain as explain
     from rangesim.decoding import decode as decode
     from rangesim.decoding.range_image import RangeImage as RangeImage
+    from rangesim.decoding.returns import Returns as Returns
     from rangesim.decoding.status import Status as Status
     from rangesim.electronics.ambient import Ambient as Ambient
     from rangesim.electronics.detector import Detector as Detector
@@ -40,6 +41,7 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from rangesim.point_cloud import PointCloud as PointCloud
     from rangesim.report import errors_markdown as errors_markdown
     from rangesim.report import failures_markdown as failures_markdown
+    from rangesim.response import Pulse as Pulse
     from rangesim.results.captures import import_capture as import_capture
     from rangesim.results.captures import load_capture as load_capture
     from rangesim.results.captures import save_capture as save_capture
@@ -47,9 +49,17 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from rangesim.results.range_images import save_range_image as save_range_image
     from rangesim.results.saved_signals import load_signals as load_signals
     from rangesim.results.saved_signals import save_signals as save_signals
+    from rangesim.rig import Beam as Beam
+    from rangesim.rig import Camera as Camera
+    from rangesim.rig import Fisheye as Fisheye
     from rangesim.rig import Intrinsics as Intrinsics
     from rangesim.rig import Lens as Lens
+    from rangesim.rig import Lissajous as Lissajous
+    from rangesim.rig import Orthographic as Orthographic
+    from rangesim.rig import RayTable as RayTable
     from rangesim.rig import Rig as Rig
+    from rangesim.rig import Risley as Risley
+    from rangesim.rig import Spinning as Spinning
     from rangesim.rig import look_at as look_at
     from rangesim.rig.calibration_files import load_calibration as load_calibration
     from rangesim.scene import Scene as Scene
@@ -68,21 +78,31 @@ _HOME = {
     "ActiveStereo": "rangesim.sensors",
     "Ambient": "rangesim.electronics.ambient",
     "AmcwToF": "rangesim.sensors",
+    "Beam": "rangesim.rig",
+    "Camera": "rangesim.rig",
     "Capture": "rangesim.capture",
     "CaptureSet": "rangesim.capture",
     "Decoder": "rangesim.sensors",
     "Detector": "rangesim.electronics.detector",
     "DirectToF": "rangesim.sensors",
+    "Fisheye": "rangesim.rig",
     "IdealToF": "rangesim.sensors",
     "Intrinsics": "rangesim.rig",
     "Lens": "rangesim.rig",
+    "Lissajous": "rangesim.rig",
+    "Orthographic": "rangesim.rig",
     "PointCloud": "rangesim.point_cloud",
+    "Pulse": "rangesim.response",
     "RangeImage": "rangesim.decoding.range_image",
+    "RayTable": "rangesim.rig",
+    "Returns": "rangesim.decoding.returns",
     "Rig": "rangesim.rig",
+    "Risley": "rangesim.rig",
     "Scene": "rangesim.scene",
     "Sensor": "rangesim.sensors",
     "Signals": "rangesim.signals",
     "SpadDetector": "rangesim.electronics.spad",
+    "Spinning": "rangesim.rig",
     "Status": "rangesim.decoding.status",
     "StillSignals": "rangesim.signals",
     "StructuredLight": "rangesim.sensors",

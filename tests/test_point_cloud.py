@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,49 @@ def test_pcgraph_reads_the_files(tmp_path: Path, cloud: PointCloud, suffix: str)
     assert [p.name for p in tmp_path.iterdir()] == [f"cloud{suffix}"]
 
 
+def scanned(cloud: PointCloud) -> PointCloud:
+    """The cloud with what a scanner tells of each point."""
+    rows, columns = np.indices(cloud.points.shape[:-1])
+    return dataclasses.replace(
+        cloud,
+        time_s=1e-6 * columns + 1 / 3,
+        ring=(60_000 + rows).astype(np.uint16),
+        return_number=(1 + columns % 2).astype(np.uint8),
+    )
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_files_keep_time_ring_and_return(tmp_path: Path, cloud: PointCloud, suffix: str) -> None:
+    scan = scanned(cloud)
+    scan.save(tmp_path / f"cloud{suffix}")
+    loaded = pcgraph.read_cloud(tmp_path / f"cloud{suffix}")
+    expected = scan if suffix == ".pcd" else scan.finite()
+    np.testing.assert_array_equal(loaded.columns["time"], expected.time_s)
+    np.testing.assert_array_equal(loaded.columns["ring"], expected.ring)
+    np.testing.assert_array_equal(loaded.columns["return_number"], expected.return_number)
+    np.testing.assert_array_equal(loaded.points, expected.points)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_open3d_reads_ring_and_time(tmp_path: Path, cloud: PointCloud, suffix: str) -> None:
+    o3d = pytest.importorskip("open3d")
+    scan = scanned(cloud)
+    scan.save(tmp_path / f"cloud{suffix}")
+    read = {k: v.numpy() for k, v in o3d.t.io.read_point_cloud(str(tmp_path / f"cloud{suffix}")).point.items()}
+    keep = np.isfinite(read["positions"]).all(axis=1)
+    for name, expected in (("time", scan.time_s), ("ring", scan.ring), ("return_number", scan.return_number)):
+        assert expected is not None
+        np.testing.assert_array_equal(read[name][keep].ravel(), expected[scan.valid])
+
+
+@pytest.mark.parametrize(("suffix", "digest"), [(".ply", "1f5431e32571e834"), (".pcd", "7ff7ee653a6226af")])
+def test_files_of_clouds_that_no_scanner_made_keep_their_bytes(tmp_path: Path, suffix: str, digest: str) -> None:
+    rows, columns = np.indices((3, 4))
+    points = np.stack([columns, rows, 1 + 0 * rows], axis=-1).astype(np.float32)
+    PointCloud(points, intensity=points[..., 0]).save(tmp_path / f"cloud{suffix}")
+    assert hashlib.sha256((tmp_path / f"cloud{suffix}").read_bytes()).hexdigest()[:16] == digest
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".pcd"])
 def test_open3d_reads_the_files(tmp_path: Path, cloud: PointCloud, suffix: str) -> None:
     o3d = pytest.importorskip("open3d")
@@ -140,6 +184,10 @@ def test_bad_clouds_are_refused(tmp_path: Path, cloud: PointCloud) -> None:
         PointCloud(np.zeros((4, 3), np.float32), normals=np.zeros((5, 3), np.float32))
     with pytest.raises(ValueError, match="coordinates"):
         PointCloud(np.zeros((4, 3), np.float32), coordinates="table")
+    with pytest.raises(ValueError, match=r"ring of shape .* and type uint16"):
+        PointCloud(np.zeros((4, 3), np.float32), ring=np.zeros(4, np.int64))
+    with pytest.raises(ValueError, match="time_s"):
+        PointCloud(np.zeros((4, 3), np.float32), time_s=np.zeros((4, 3)))
 
 
 def test_uncalibrated_images_have_no_points() -> None:

@@ -168,7 +168,7 @@ def test_a_scene_that_comes_along_is_found_by_name_from_anywhere(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "plane").mkdir()  # a result of that name is no scene
-    assert scene_names() == ("cornell", "corner", "glassware", "matte", "plane", "tabletop")
+    assert scene_names() == ("cornell", "corner", "glassware", "matte", "plane", "street", "tabletop")
     scene = rangesim.load_scene("plane")
     assert scene.name == "plane"
     assert scene.source is not None
@@ -190,7 +190,7 @@ def test_a_file_of_that_name_goes_first(tmp_path: Path, monkeypatch: pytest.Monk
         (
             "tabeltop",
             "tabeltop does not exist, and no scene of that name comes with rangesim (did you mean 'tabletop'?); "
-            "those are cornell, corner, glassware, matte, plane, tabletop.",
+            "those are cornell, corner, glassware, matte, plane, street, tabletop.",
         ),
         ("scenes/plane.xml", "; the scene that comes with rangesim is named plane, without folder and suffix."),
         ("part.ply", "expected a scene or mesh file, but part.ply does not exist."),

@@ -149,7 +149,7 @@ def test_what_is_no_rig_with_several_cameras_is_refused(tabletop: Scene, rigs: A
         ((np.full((4, 4), np.nan),), "expected T_camera_other to hold finite numbers"),
         ((np.eye(4)[:3],), r"expected T_camera_other to be a \(4, 4\) matrix, got shape \(3, 4\)"),
         ((2 * np.eye(4),), "expected T_camera_other to be rigid"),
-        ((np.eye(4), 0), "expected intrinsics as Intrinsics, got 0"),
+        ((np.eye(4), 0), "expected intrinsics as Camera, got 0"),
         ((np.eye(4), None, 0.02), "expected lens as Lens, got 0.02"),
     ],
 )

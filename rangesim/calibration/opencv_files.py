@@ -45,10 +45,10 @@ def save_opencv(rig: Rig, path: str | Path) -> None:
     R, t = T_projector_camera[:3, :3], T_projector_camera[:3, 3:]
     x, y, z = t[:, 0]
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R
-    to_camera, to_projector = (np.linalg.inv(_opencv_matrix(device)) for device in (rig.camera, rig.projector))
+    to_camera, to_projector = (np.linalg.inv(_opencv_matrix(device)) for device in (rig.pinhole, rig.image_projector))
     fundamental = to_projector.T @ essential @ to_camera
     matrices = {"R": R, "T": t, "E": essential, "F": fundamental}
-    _write(path, {**_entries("camera", rig.camera), **_entries("projector", rig.projector), **matrices})
+    _write(path, {**_entries("camera", rig.pinhole), **_entries("projector", rig.image_projector), **matrices})
 
 
 def save_opencv_camera(camera: Intrinsics, path: str | Path) -> None:

@@ -98,11 +98,11 @@ def _pose(board: Board, rig: Rig, tilt_deg: float, margin_px: float, random: np.
     for _ in range(TRIES):
         T = np.eye(4)
         T[:3, :3] = Rotation.from_euler("xyz", random.uniform(-tilt_deg, tilt_deg, 3), degrees=True).as_matrix()
-        depth = extent / random.uniform(*FILLS) * rig.camera.fx / rig.camera.width
+        depth = extent / random.uniform(*FILLS) * rig.pinhole.fx / rig.camera.width
         pixel = random.uniform([0.0, 0.0], [rig.camera.width, rig.camera.height])
-        T[:3, 3] = depth * rig.camera.directions(pixel) - T[:3, :3] @ board.points.mean(axis=0)
+        T[:3, 3] = depth * rig.pinhole.directions(pixel) - T[:3, :3] @ board.points.mean(axis=0)
         at_projector = T_projector_camera @ T
-        if _is_seen(board, rig.camera, T, margin_px) and _is_seen(board, rig.projector, at_projector, margin_px):
+        if _is_seen(board, rig.pinhole, T, margin_px) and _is_seen(board, rig.image_projector, at_projector, margin_px):
             return T
     raise ValueError(
         f"expected a pose of the board that camera and projector see as a whole, found none in {TRIES}; turn both to "

@@ -205,10 +205,10 @@ def find_board_ranges(board: Board, captures: Sequence[Capture], names: Sequence
             raise ValueError(f"{name}: expected a rig with the calibrated camera, got none.")
         try:
             view = board.find(capture.sensor.white_image(capture.frames))
-            found = fit_camera_pose(board.points[view.indices], view.pixels, capture.rig.camera)
+            found = fit_camera_pose(board.points[view.indices], view.pixels, capture.rig.pinhole)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
-        ranges.append(board_range(board, capture.rig.camera, found.T_camera_object))
+        ranges.append(board_range(board, capture.rig.pinhole, found.T_camera_object))
     return ranges
 
 
@@ -280,7 +280,7 @@ class ToFCalibration:
             raise ValueError(
                 f"expected a range image by the calibrated decoder {self.decoder}, got one by {image.decoder}."
             )
-        rays = self.rig.camera.directions(self.rig.camera.pixel_centres())
+        rays = self.rig.pinhole.directions(self.rig.pinhole.pixel_centres())
         read = path_length(np.where(image.valid, image.range_m, np.nan), rays, self.rig)
         with np.errstate(invalid="ignore"):
             known = (read >= self.shortest_m) & (read <= self.longest_m)
@@ -417,7 +417,7 @@ def calibrate_tof(
         orders = tuple(len(TAPS_DEG) * n for n in range(1, N_ORDERS + 1))
     if not orders or len(set(orders)) < len(orders) or not all(map(_is_order, orders)):
         raise ValueError(f"expected orders as different whole numbers from 1 to {MAX_ORDER}, got {shown(orders)}.")
-    rays = rig.camera.directions(rig.camera.pixel_centres())
+    rays = rig.pinhole.directions(rig.pinhole.pixel_centres())
     readings = []
     for k, (capture, truth) in enumerate(zip(captures, true_range_m, strict=True)):
         image = decoder.decode(capture)

@@ -93,6 +93,11 @@ class Evidence:
         """The true surfaces."""
         return self.signals.truth
 
+    @cached_property
+    def true_m(self) -> np.ndarray:
+        """(h, w) float32, metres, true readings, see `Camera.reading`."""
+        return self.signals.rig.camera.reading(self.truth)
+
     # ---- The reading ---------------------------------------------------------------------------------
 
     @cached_property
@@ -103,12 +108,12 @@ class Evidence:
     @cached_property
     def error(self) -> np.ndarray:
         """float64, z - true z in metres; NaN without a reading or a surface."""
-        return np.where(self.image.valid, self.image.z.astype(np.float64) - self.truth.z, np.nan)
+        return np.where(self.image.valid, self.image.reading_m.astype(np.float64) - self.true_m, np.nan)
 
     @cached_property
     def failed(self) -> np.ndarray:
         """Whether there is a surface, but no reading of it within the tolerance."""
-        return np.isfinite(self.truth.z) & ~(np.abs(self.error) <= self.tolerance_m)
+        return np.isfinite(self.true_m) & ~(np.abs(self.error) <= self.tolerance_m)
 
     @cached_property
     def optical(self) -> np.ndarray:
@@ -127,9 +132,11 @@ class Evidence:
         """Whether more than `MAX_PULSES_HIT` of the pulses brought a photon, or the decoder found that the pulses ran
         out although no counter is full."""
         detector, capture = self.capture.detector, self.capture
-        if not isinstance(detector, SpadDetector) or not detector.pile_up:
-            return np.zeros(self.truth.z.shape, dtype=bool)
-        pulses = detector.pulses(capture.sensor.gate, capture.exposure_s)
+        if not isinstance(detector, SpadDetector):
+            return np.zeros(self.true_m.shape, dtype=bool)
+        pulses = detector.first_only(capture.sensor.gate, capture.exposure_s)
+        if pulses is None:
+            return np.zeros(self.true_m.shape, dtype=bool)
         ran_out = (self.image.status == Status.SATURATED) & ~capture.saturated(capture.frames)
         return np.asarray(ran_out | (capture.frames.sum(axis=0, dtype=np.float64) > MAX_PULSES_HIT * pulses))
 
@@ -163,13 +170,13 @@ class Evidence:
     @cached_property
     def beside_shadow(self) -> np.ndarray:
         """Whether a neighbouring pixel is in shadow, so that this one may be lit in part."""
-        return np.any(neighbours(self.in_shadow & np.isfinite(self.truth.z), 1), axis=0)
+        return np.any(neighbours(self.in_shadow & np.isfinite(self.true_m), 1), axis=0)
 
     @cached_property
     def at_edge(self) -> np.ndarray:
         """Whether a depth edge lies between the pixel and one of its eight neighbours, or as far away as the reading of
         the pixel reaches (`Decoder.reach_px`)."""
-        edges, reach = depth_edges(self.truth.z, self.tolerance_m), self.readings.decoder.reach_px
+        edges, reach = depth_edges(self.true_m, self.tolerance_m), self.readings.decoder.reach_px
         return edges if not reach else binary_dilation(edges, np.ones((3, 3)), iterations=reach)
 
     @cached_property
@@ -187,8 +194,8 @@ class Evidence:
         fits = np.ones(len(rows), dtype=bool)
         for y, x in ((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1)):
             at = np.clip(rows + y, 0, where.shape[0] - 1), np.clip(columns + x, 0, where.shape[1] - 1)
-            there = self.truth.z[at].astype(np.float64)
-            plane = depth_on_plane(rig, self.truth, where, rig.camera.directions(rig.camera.pixel_centres()[at]))
+            there = self.true_m[at].astype(np.float64)
+            plane = depth_on_plane(rig, self.truth, where, *rig.camera.rays_at(at))
             fits &= np.abs(there - plane) <= across(np.fmin(there, plane), self.tolerance_m) - np.fmin(there, plane)
         result = np.zeros(where.shape, dtype=bool)
         result[where] = fits
@@ -200,7 +207,7 @@ class Evidence:
         is not to blame."""
         result, where = np.zeros(self.failed.shape, dtype=bool), self.failed & self.at_edge
         error = np.where(self.missing, np.inf, np.abs(self.error))
-        around = error_off_edge(where, error, self.at_edge, self.truth.z, self.truth.instance, self.tolerance_m)
+        around = error_off_edge(where, error, self.at_edge, self.true_m, self.truth.instance, self.tolerance_m)
         result[where] = around >= self._half_of_error[where]
         return result
 
@@ -209,7 +216,7 @@ class Evidence:
         """Whether the surface moves by more than `MOTION_FRACTION` of the tolerance during the acquisition."""
         motion_m = self.signals.motion_m
         if motion_m is None:
-            return np.zeros(self.truth.z.shape, dtype=bool)
+            return np.zeros(self.true_m.shape, dtype=bool)
         return np.nan_to_num(motion_m) > MOTION_FRACTION * self.tolerance_m
 
     # ---- The light -----------------------------------------------------------------------------------
@@ -352,7 +359,7 @@ class Evidence:
 
     def _wrong(self, z: np.ndarray) -> np.ndarray:
         """(h, w) bool, whether depths z (n,) of the failed pixels have half of their error or more, or are NaN."""
-        error = np.abs(z - self.truth.z[self.failed])
+        error = np.abs(z - self.true_m[self.failed])
         return self._of_failed(~(error <= self._half_of_error[self.failed]))
 
     def _of_failed(self, values: np.ndarray) -> np.ndarray:
@@ -364,7 +371,7 @@ class Evidence:
     @cached_property
     def _in_projector(self) -> np.ndarray:
         """(n, 3) float64 true surface points of the failed pixels in projector coordinates, metres."""
-        return points_in_projector(self.signals.rig, self.truth.z, self.failed)
+        return points_in_projector(self.signals.rig, self.true_m, self.failed)
 
     @cached_property
     def _in_world(self) -> np.ndarray:
@@ -382,7 +389,7 @@ def _hidden_from(other: Signals, points: np.ndarray, tolerance_m: float) -> np.n
     points : (n, 3) float, metres, world coordinates.
     tolerance_m : metres by which a point must be farther than all that the camera sees within one pixel.
     """
-    T, camera = other.rig.T_world_camera, other.rig.camera
+    T, camera = other.rig.T_world_camera, other.rig.pinhole
     in_camera = (points - T[:3, 3]) @ T[:3, :3]
     place = camera.project(in_camera)
     outside = np.asarray(~((place >= 0) & (place < [camera.width, camera.height])).all(axis=-1))

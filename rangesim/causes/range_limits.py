@@ -30,7 +30,7 @@ def fraction_beyond_range(sensor: Sensor, rig: Rig, truth: GroundTruth) -> tuple
     """
     lit = np.isfinite(truth.z) & truth.projector_visible
     range_m = truth.range_m[lit].astype(np.float64)
-    length = range_m + np.linalg.norm(points_in_projector(rig, truth.z, lit), axis=-1)
+    length = range_m + np.linalg.norm(points_in_projector(rig, rig.camera.reading(truth), lit), axis=-1)
     beyond = sensor.is_beyond_range(length)
     if not beyond.any():
         return 0.0, float("nan")

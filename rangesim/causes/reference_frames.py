@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rangesim.decoding.path_length import emitter_offsets
 from rangesim.response import DenseResponse, LightPath, NumpyMath, SparseResponse
-from rangesim.rig import Rig
+from rangesim.rig import Beam, Rig
 from rangesim.sensor import Sensor
 from rangesim.signals import GroundTruth
 
@@ -102,46 +103,60 @@ def _add_bins(
         values[index[inside].astype(np.intp), pixels[inside]] += radiance * weight[inside]
 
 
-def points_in_projector(rig: Rig, z: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """(n, 3) float64 points at depths z (h, w) of the n pixels `where`, in projector coordinates, metres."""
-    points = rig.camera.directions(rig.camera.pixel_centres()[where]) * z[where].astype(np.float64)[:, None]
+def points_in_projector(rig: Rig, reading: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """(n, 3) float64 points at these readings (h, w) of the n pixels `where`, in projector coordinates, metres.
+
+    Coordinates of a beam are those of the camera, from the emitter of each ray.
+    """
+    origins, directions = rig.camera.rays_at(where)
+    return _in_projector(rig, where, origins + directions * reading[where].astype(np.float64)[:, None])
+
+
+def _in_projector(rig: Rig, where: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (n, 3) of the n pixels `where`, from camera coordinates to projector coordinates, metres."""
+    if isinstance(rig.projector, Beam):
+        return np.asarray(points - rig.camera.rays_at(where)[0] - emitter_offsets(rig)[where])
     return np.asarray((points - rig.T_camera_projector[:3, 3]) @ rig.T_camera_projector[:3, :3])
 
 
 def _straight_path(rig: Rig, truth: GroundTruth, where: np.ndarray) -> LightPath:
     """Direct path to the true point of each of the n pixels `where`; a point outside the projector's image is clamped
     to the nearest place in it."""
-    return _path(rig, points_in_projector(rig, truth.z, where), truth.range_m[where])
+    return _path(rig, points_in_projector(rig, rig.camera.reading(truth), where), truth.range_m[where])
 
 
 def _path_beside(rig: Rig, truth: GroundTruth, where: np.ndarray, offset: np.ndarray) -> LightPath:
     """Light paths as in `_straight_path`, but to the tangent planes, `offset` (2,) pixels beside the centres."""
-    ray = rig.camera.directions(rig.camera.pixel_centres()[where] + offset)
-    depth = depth_on_plane(rig, truth, where, ray)
-    points = ray * np.where(np.isfinite(depth), depth, truth.z[where])[:, None]
-    in_projector = (points - rig.T_camera_projector[:3, 3]) @ rig.T_camera_projector[:3, :3]
-    return _path(rig, in_projector, np.linalg.norm(points, axis=-1))
+    origin, ray = rig.camera.rays_at(where, offset)
+    depth = depth_on_plane(rig, truth, where, origin, ray)
+    along = ray * np.where(np.isfinite(depth), depth, rig.camera.reading(truth)[where])[:, None]
+    return _path(rig, _in_projector(rig, where, origin + along), np.linalg.norm(along, axis=-1))
 
 
-def depth_on_plane(rig: Rig, truth: GroundTruth, where: np.ndarray, ray: np.ndarray) -> np.ndarray:
-    """(n,) float64 depths, in metres, where rays meet the tangent planes of the surfaces of n pixels.
+def depth_on_plane(rig: Rig, truth: GroundTruth, where: np.ndarray, origin: np.ndarray, ray: np.ndarray) -> np.ndarray:
+    """(n,) float64 readings, in metres, where rays meet the tangent planes of the surfaces of n pixels.
 
-    A depth is NaN where a ray meets its plane behind the camera, or not at all.
+    A reading is NaN where a ray meets its plane behind the camera, or not at all.
 
     Parameters
     ----------
     where : (h, w) bool, the n pixels.
-    ray : (n, 3) float, directions with z = 1, camera coordinates.
+    origin, ray : (n, 3) float, camera coordinates, as `Camera.rays_at` returns them.
     """
     normal = truth.normal[where].astype(np.float64) @ rig.T_world_camera[:3, :3]
-    centre = rig.camera.directions(rig.camera.pixel_centres()[where])
+    start, centre = rig.camera.rays_at(where)
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth = truth.z[where] * np.sum(normal * centre, axis=-1) / np.sum(normal * ray, axis=-1)
+        depth = rig.camera.reading(truth)[where] * np.sum(normal * centre, axis=-1) / np.sum(normal * ray, axis=-1)
+        if not rig.camera.is_pinhole:
+            depth = depth + np.sum(normal * (start - origin), axis=-1) / np.sum(normal * ray, axis=-1)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
 
 
 def _path(rig: Rig, point: np.ndarray, range_m: np.ndarray) -> LightPath:
     """Light paths to points (n, 3), metres, in projector coordinates, at distances `range_m` (n,) from the camera."""
-    uv = np.nan_to_num(rig.projector.project(point))
+    if isinstance(rig.projector, Beam):
+        middle = np.full(len(point), 0.5)
+        return LightPath(middle, middle, range_m + np.linalg.norm(point, axis=-1), True)
+    uv = np.nan_to_num(rig.image_projector.project(point))
     u, v = np.clip(uv[:, 0], 0, rig.projector.width), np.clip(uv[:, 1], 0, rig.projector.height)
     return LightPath(u, v, range_m + np.linalg.norm(point, axis=-1), True)

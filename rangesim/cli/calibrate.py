@@ -266,8 +266,8 @@ def _table(found: RigCalibration, captures: list[Path]) -> str:
 
     lines = []
     for name, device, deviations in (
-        ("camera", found.rig.camera, found.camera_deviations),
-        ("projector", found.rig.projector, found.projector_deviations),
+        ("camera", found.rig.pinhole, found.camera_deviations),
+        ("projector", found.rig.image_projector, found.projector_deviations),
     ):
         lines.append(_device_line(name, device, deviations))
     lines.append(f"{'baseline':10s}{1e3 * found.baseline_m:.4f} ± {1e3 * found.baseline_deviation_m:.2g} mm")

@@ -112,7 +112,7 @@ class Disparities(Coordinates):
         z = np.full(self.status.shape, np.nan, dtype=np.float32)
         range_m, status = z.copy(), self.status.copy()
         if rig is not None and self.pair is not None:
-            directions = rig.camera.directions(rig.camera.pixel_centres())
+            directions = rig.pinhole.directions(rig.pinhole.pixel_centres())
             along = (
                 directions @ self.pair.R_rectified_first[2]
             )  # depth of the rectified camera per depth of the real one

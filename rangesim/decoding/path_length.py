@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from rangesim.decoding.coordinates import Coordinates
 from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.returns import Returns
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
-from rangesim.rig import Rig
+from rangesim.rig import Beam, Intrinsics, Rig, tangents
 
 
 def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
@@ -44,6 +46,77 @@ def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Ri
         return np.asarray(np.where(length > np.linalg.norm(b), result, np.nan))
 
 
+def range_along_ray(length_m: np.ndarray, directions: np.ndarray, emitters: np.ndarray) -> np.ndarray:
+    """(...) float64, as `range_from_path_length`, for rays whose emitters stand at other places beside them.
+
+    Parameters
+    ----------
+    length_m : (...) float, metres, there and back.
+    directions : (..., 3) float, unit vectors, camera coordinates.
+    emitters : (..., 3) float, metres, from the origin of each ray to its emitter, camera coordinates.
+    """
+    b2, along = np.sum(emitters**2, axis=-1), np.sum(directions * emitters, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        result = (length_m**2 - b2) / (2 * (length_m - along))
+        return np.asarray(np.where(length_m > np.sqrt(b2), result, np.nan))
+
+
+def emitter_offsets(rig: Rig) -> np.ndarray:
+    """(h, w, 3) float64, metres, from the origin of each ray of the camera to its emitter, camera coordinates."""
+    rays, emitter = rig.camera.pixel_rays(), rig.projector
+    if not isinstance(emitter, Beam):
+        return np.asarray(rig.T_camera_projector[:3, 3] - rays.origins)
+    right, down = tangents(rays.directions if emitter.directions is None else emitter.directions)
+    return np.asarray(right * emitter.offset_m[0] + down * emitter.offset_m[1])
+
+
+def range_slope(length_m: np.ndarray, directions: np.ndarray, emitters: np.ndarray) -> np.ndarray:
+    """(...) float64, derivative of `range_along_ray` by the length; 1/2 without a baseline.
+
+    Examples
+    --------
+    >>> range_slope(np.array([1.8]), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)))
+    array([0.5])
+    """
+    length, along = np.asarray(length_m, dtype=np.float64), np.sum(directions * emitters, axis=-1)
+    b2 = np.sum(emitters**2, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray((length**2 - 2 * length * along + b2) / (2 * (length - along) ** 2))
+
+
+class LengthReturns(NamedTuple):
+    """All returns of each pixel, before any geometry; (k, h, w) each, nearest first.
+
+    length_m : float64, metres, path length there and back; NaN where there is none.
+    sigma_m : float64, metres, its standard deviation by the noise of the frames; NaN where not known.
+    strength : float64, counts of the pulse. status : uint8, values of `Status`.
+    """
+
+    length_m: np.ndarray
+    sigma_m: np.ndarray
+    strength: np.ndarray
+    status: np.ndarray
+
+    def ranges(self, rig: Rig | None) -> Returns:
+        """The returns as ranges from the camera; without a rig, half of the lengths."""
+        range_m, sigma_m = np.empty((2, *self.length_m.shape), dtype=np.float32)
+        status = self.status.astype(np.uint8)
+        directions = emitters = None
+        if rig is not None:
+            directions, emitters = rig.camera.pixel_rays().directions, emitter_offsets(rig)
+        for rows in bands(self.length_m.shape[1]):
+            length = self.length_m[:, rows]
+            along_ray, slope = length / 2, np.full(length.shape, 0.5)
+            if directions is not None and emitters is not None:
+                along_ray = range_along_ray(length, directions[rows], emitters[rows])
+                slope = range_slope(length, directions[rows], emitters[rows])
+            is_behind = ~(np.nan_to_num(along_ray, nan=-1.0) > 0)
+            status[:, rows][is_behind & (status[:, rows] == Status.OK)] = Status.OUT_OF_RANGE
+            range_m[:, rows] = np.where(is_behind, np.nan, along_ray)
+            sigma_m[:, rows] = np.where(is_behind, np.nan, slope * self.sigma_m[:, rows])
+        return Returns(range_m, self.strength.astype(np.float32), sigma_m, status)
+
+
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class PathLengths(Coordinates):
     """Path lengths of a time-of-flight capture, from the emitter to the surface and back to the camera.
@@ -53,6 +126,7 @@ class PathLengths(Coordinates):
     length_m : (h, w) float64, metres; NaN where `status` is not OK.
     sigma_m : (h, w) float32, metres, standard deviation of `length_m` that the noise of the frames causes; NaN where
         `status` is not OK. None: not known, as for noise-free captures and unknown detectors.
+    returns : LengthReturns, all returns of each pixel, of which `length_m` is one; None: they were not looked for.
 
     Examples
     --------
@@ -67,6 +141,7 @@ class PathLengths(Coordinates):
 
     length_m: np.ndarray
     sigma_m: np.ndarray | None = None
+    returns: LengthReturns | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,13 +161,24 @@ class PathLengths(Coordinates):
         z_m, range_m = np.empty((2, *status.shape), dtype=np.float32)
         for rows in bands(len(status)):
             if rig is None:
-                along_ray, z = self.length_m[rows] / 2, np.float64(np.nan)
+                along_ray = self.length_m[rows] / 2
+                z = np.full(along_ray.shape, np.nan)
             else:
-                directions = rig.camera.directions(rig.camera.pixel_centres(rows))
-                along_ray = range_from_path_length(self.length_m[rows], directions, rig)
-                z = along_ray / np.linalg.norm(directions, axis=-1)
+                along_ray = _ranges(self.length_m[rows], rows, rig)
+                z = rig.camera.z_of(along_ray, rows)
             in_front = np.nan_to_num(along_ray, nan=-1.0) > 0
             status[rows][(status[rows] == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
             ok = status[rows] == Status.OK
             z_m[rows], range_m[rows] = np.where(ok, z, np.nan), np.where(ok, along_ray, np.nan)
-        return self._image(rig, z_m, range_m, status)
+        image = self._image(rig, z_m, range_m, status)
+        return image if self.returns is None else replace(image, returns=self.returns.ranges(rig))
+
+
+def _ranges(length_m: np.ndarray, rows: slice, rig: Rig) -> np.ndarray:
+    """(..., rows, w) float64, metres, ranges along the rays of some rows, from their path lengths."""
+    if isinstance(rig.camera, Intrinsics):
+        directions = rig.camera.directions(rig.camera.pixel_centres(rows))
+        return range_from_path_length(length_m, directions, rig)
+    rays = rig.camera.pixel_rays()
+    emitters = emitter_offsets(rig)[rows]
+    return range_along_ray(length_m, rays.directions[rows], emitters)

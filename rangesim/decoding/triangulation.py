@@ -110,7 +110,7 @@ class ProjectorCoordinates(Coordinates):
             behind_px = []
             for rows in bands(len(status)):
                 y, x = np.nonzero(decoded[rows])
-                directions = rig.camera.directions(np.stack([x + 0.5, y + rows.start + 0.5], axis=-1))
+                directions = rig.pinhole.directions(np.stack([x + 0.5, y + rows.start + 0.5], axis=-1))
                 found = triangulate_coordinates(
                     directions,
                     rig,

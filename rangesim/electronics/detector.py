@@ -134,8 +134,7 @@ class PhotoDetector(Named, ABC):
 
     def electron_rate_per_radiance(self, rig: Rig) -> float:
         """Electrons per second of exposure and per W/m2/sr of radiance."""
-        camera = rig.camera
-        etendue = np.pi * rig.camera_lens.aperture_radius_m**2 / (camera.fx * camera.fy)
+        etendue = rig.camera.etendue_m2sr(rig.camera_lens.aperture_radius_m)
         return float(etendue * self.quantum_efficiency * self.wavelength_m / PLANCK_TIMES_C)
 
     def _check(self) -> None:

@@ -136,12 +136,13 @@ def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = 
         truth = truth.truth
         if image.T_world_camera is not None and not is_same_pose(image.T_world_camera, there):
             raise ValueError("expected the signals that the range image comes from, got those of a camera elsewhere.")
+    true_m = truth.z if image.camera is None else image.camera.reading(truth)
     if image.z.shape != truth.z.shape:
         raise ValueError(f"expected ground truth of shape {image.z.shape} as the image, got {truth.z.shape}.")
     if not outlier_m > 0:
         raise ValueError(f"expected a positive outlier_m in metres, got {outlier_m}.")
-    error = np.where(image.valid, image.z.astype(np.float64) - truth.z, np.nan)
-    edge, flying = _flying(image.z, truth.z, outlier_m)
+    error = np.where(image.valid, image.reading_m.astype(np.float64) - true_m, np.nan)
+    edge, flying = _flying(image.reading_m, true_m, outlier_m)
     table = [
         _statistics(name, mask, error, truth.projector_visible, edge, flying, outlier_m)
         for name, mask in truth.classes().items()

@@ -156,7 +156,7 @@ def noise_of(readings: ReferenceReadings) -> RangeNoise:
         captures = [exposed_again(readings.capture, readings.signals, *each) for each in seeds_and_errors]
         again, above, below = readings.read(captures)
         repeats = Repeats(~image.valid, np.isnan(again), (np.isnan(above), np.isnan(below)))
-    return RangeNoise((image.z - clean).astype(np.float32), sampling, repeats)
+    return RangeNoise((image.reading_m - clean).astype(np.float32), sampling, repeats)
 
 
 def sampling_draw(image: RangeImage, capture: Captured, signals: Signals) -> tuple[np.ndarray, np.ndarray]:

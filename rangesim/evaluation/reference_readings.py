@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reference readings of a range image: depths decoded from the same light without noise, or from parts of it."""
+"""Reference readings of a range image: readings decoded from the same light without noise, or from parts of it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ReferenceReadings:
     def read(self, captures: Sequence[Captured]) -> list[np.ndarray]:
         """Depths of captures, read by the decoder of the range image."""
         with without_warnings():
-            return [decode(capture, self.decoder).z for capture in captures]
+            return [decode(capture, self.decoder).reading_m for capture in captures]
 
     @cached_property
     def noise_free(self) -> np.ndarray:

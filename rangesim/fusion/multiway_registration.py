@@ -273,7 +273,7 @@ def _registered_points(scan: Scan, spacing_m: float | None, seed: int) -> tuple[
             )
     # The area of a surface is the number of its readings times the footprint of a pixel
     pixels = [
-        float(np.median(i.z[i.valid])) ** 2 / (i.camera.fx * i.camera.fy) for i in scan.images if i.camera is not None
+        float(np.median(i.z[i.valid])) ** 2 / (i.pinhole.fx * i.pinhole.fy) for i in scan.images if i.camera is not None
     ]
     coarse = float(np.sqrt(np.median([a * len(c) for a, c in zip(pixels, every, strict=True)]) / POINTS_PER_VIEW))
     clouds = [_without_planes(cloud, spacing_m or coarse, seed) for cloud in every]

@@ -173,7 +173,7 @@ def reading_weights(image: RangeImage, weighting: Weighting = "confidence") -> n
         return image.valid.astype(np.float32)
     if image.camera is None:
         raise ValueError("expected a calibrated range image: without a rig it has no surface to fuse.")
-    rays = image.camera.directions(image.camera.pixel_centres())
+    rays = image.pinhole.directions(image.pinhole.pixel_centres())
     z = image.z.astype(np.float64)
     cosine = -(lattice_normals(z, rays) * rays).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
     with np.errstate(invalid="ignore"):
@@ -276,7 +276,7 @@ def camera_and_pose(
     size = (image.camera.height, image.camera.width)
     if image.z.shape != size:
         raise ValueError(f"expected a range image of its camera's {size} pixels (h, w), got {image.z.shape}.")
-    return image.camera, pose(T, name)
+    return image.pinhole, pose(T, name)
 
 
 def check_lookup(lookup: str) -> None:

@@ -215,7 +215,7 @@ def _warn_of_views_apart(boxes: np.ndarray) -> None:
 def _check_fineness(images: Sequence[RangeImage], voxel_m: float) -> None:
     """Raise ValueError if voxels are far smaller than the distance between readings."""
     spacings = [
-        float(np.median(i.z[i.valid][::SPACING_STEP])) / i.camera.fx for i in images if i.camera and i.valid.any()
+        float(np.median(i.z[i.valid][::SPACING_STEP])) / i.pinhole.fx for i in images if i.camera and i.valid.any()
     ]
     if voxel_m < MIN_VOXEL_SPACINGS * min(spacings):
         raise ValueError(

@@ -98,7 +98,7 @@ def triangulate_coordinates(
         raise ValueError("expected projector columns, rows or both, got neither.")
     rotation, t = rig.T_camera_projector[:3, :3], rig.T_camera_projector[:3, 3]
     a, b = rotation.T @ np.asarray(directions).T, -t @ rotation
-    projector = rig.projector
+    projector = rig.image_projector
     both = column is not None and row is not None
     u = np.full(len(directions), projector.cx) if column is None else np.asarray(column, dtype=np.float64)
     v = np.full(len(directions), projector.cy) if row is None else np.asarray(row, dtype=np.float64)

@@ -108,20 +108,20 @@ class AdaptiveSampling(Sampler):
     def samples(self, truth: GroundTruth, signals_of: Callable[[Sequence[Response]], StillSignals]) -> np.ndarray:
         group = groups(truth.instance)
         excess = np.zeros(group.max() + 1)  # ratio of the variance by sampling to the largest one allowed, per group
-        z = truth.z[np.isfinite(truth.z)]
-        negligible = NEGLIGIBLE * float(np.median(z)) if z.size else 0.0
         for instrument in self.instruments:
             signals = signals_of(instrument.sensor.responses())
             if instrument.sensor.n_cameras > 1:  # a reading needs the signals of all cameras
                 excess = np.fmax(excess, self._excess_of_frames(instrument, signals, group))
                 continue
+            true_m = signals.rig.camera.reading(truth)[np.isfinite(truth.z)]
+            negligible = NEGLIGIBLE * float(np.median(true_m)) if true_m.size else 0.0
             capture = expose(
                 signals, instrument.sensor, instrument.detector_in_use, instrument.exposure_s, 0, self.ambient
             )
             image = decode(capture, instrument.decoder)
             middle, sampling = sampling_draw(image, capture, signals)
             # z less the middle of the two draws estimates the detector's error, without a further decoding.
-            from_middle = (image.z - middle).astype(np.float32)
+            from_middle = (image.reading_m - middle).astype(np.float32)
             enough = np.full(len(excess), negligible)
             if capture.is_digital:  # a group without any reading needs no further samples: its limit is infinite
                 enough = np.maximum(enough, self.fraction * group_sigma(from_middle, group, where_unknown=np.inf))

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera and projector as kernels see them, and the straight connection of a surface point to the projector."""
+"""Camera and projector as kernels see them, and the straight connection of a surface point to the projector.
+
+`rangesim.light_transport.ray_tables` has cameras that are no pinhole, `rangesim.light_transport.beams` the emitter of a
+scanner. They have the same methods, as far as cameras and emitters need them.
+"""
 
 from __future__ import annotations
 
@@ -36,6 +40,26 @@ class PrimaryRay(NamedTuple):
     direction: mi.Vector3f
     path_offset: mi.Float
     exists: mi.Bool = None
+
+
+class Connection(NamedTuple):
+    """The straight segment from a surface point to the projector.
+
+    uv : Point2f, projector pixel coordinates.
+    direction : Vector3f, unit, world, towards the projector.
+    distance : Float, metres.
+    geometry : Float, ratio of the irradiance on a surface at the point that faces the projector to the irradiance at
+        z = 1 m.
+    lit : Bool, whether the point is inside the projector's image and nothing stands in between.
+    blur_px : Float, see `rangesim.response.LightPath`; None: sharp.
+    """
+
+    uv: mi.Point2f
+    direction: mi.Vector3f
+    distance: mi.Float
+    geometry: mi.Float
+    lit: mi.Bool
+    blur_px: mi.Float | None = None
 
 
 class Device:
@@ -76,12 +100,14 @@ class Device:
 
     @classmethod
     def camera(cls, rig: Rig) -> Device:
-        """The rig's camera without its vignetting: signals are radiance, and the exposure applies the vignetting."""
+        """The rig's pinhole camera without its vignetting: signals are radiance, and the exposure applies it."""
+        assert isinstance(rig.camera, Intrinsics)
         return cls(rig.camera, rig.T_world_camera, replace(rig.camera_lens, vignetting=0.0))
 
     @classmethod
     def projector(cls, rig: Rig) -> Device:
         """The rig's projector."""
+        assert isinstance(rig.projector, Intrinsics)
         return cls(rig.projector, rig.T_world_projector, rig.projector_lens)
 
     # ---- From pixels to rays -----------------------------------------------------------------------------
@@ -100,6 +126,17 @@ class Device:
         """Rays from the centre of the lens through the centres of the pixels `begin` to `end` - 1, row by row."""
         index, row = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin), mi.UInt32(self.size.x)
         return self.centre_ray(mi.Point2f(mi.Float(index % row) + 0.5, mi.Float(index // row) + 0.5))
+
+    def ray_in(self, corner: mi.Point2f, place: mi.Point2f, lens: mi.Point2f | None = None) -> PrimaryRay:
+        """The ray through a place within a pixel.
+
+        Parameters
+        ----------
+        corner : Point2f, pixel coordinates of the pixel's upper left corner, whole numbers.
+        place : Point2f, place within the pixel, in the unit square.
+        lens : as for `sample_ray`; None: the ray through the centre of the lens.
+        """
+        return self.centre_ray(corner + place) if lens is None else self.sample_ray(corner + place, lens)
 
     def sample_ray(self, pixel: mi.Point2f, lens: mi.Point2f | None) -> PrimaryRay:
         """The ray through pixel coordinates from a point of the lens.
@@ -180,61 +217,44 @@ class Device:
             return None
         return 0.5 * self.aperture * dr.sqrt(self.f.x * self.f.y) * dr.abs(dr.rcp(z) - dr.rcp(self.focus))
 
+    # ---- The straight connection to a point --------------------------------------------------------------
 
-class Connection(NamedTuple):
-    """The straight segment from a surface point to the projector.
+    def connect(
+        self,
+        scene: mi.Scene,
+        si: mi.SurfaceInteraction3f,
+        active: mi.Bool,
+        pixel: mi.UInt32,
+        media: Media | None = None,
+        inside: Medium | None = None,
+    ) -> Connection:
+        """Straight connection of the point `si` to the projector, through `media` if there are any.
 
-    uv : Point2f, projector pixel coordinates.
-    direction : Vector3f, unit, world, towards the projector.
-    distance : Float, metres.
-    geometry : Float, ratio of the irradiance on a surface at the point that faces the projector to the irradiance at
-        z = 1 m.
-    lit : Bool, whether the point is inside the projector's image and nothing stands in between.
-    blur_px : Float, see `rangesim.response.LightPath`; None: sharp.
-    """
+        All projector pixels have the same power. With E the irradiance at z = 1 m on the axis, the radiant intensity is
+        E / cos^3. The irradiance on a surface that faces the projector is this times cos^2 / z^2, which is
+        E / (z^2 cos). The lens multiplies E by the density of its pixels and by its relative illumination.
 
-    uv: mi.Point2f
-    direction: mi.Vector3f
-    distance: mi.Float
-    geometry: mi.Float
-    lit: mi.Bool
-    blur_px: mi.Float | None = None
-
-
-def connect(
-    scene: mi.Scene,
-    projector: Device,
-    si: mi.SurfaceInteraction3f,
-    active: mi.Bool,
-    media: Media | None = None,
-    inside: Medium | None = None,
-) -> Connection:
-    """Straight connection of the point `si` to the projector, through `media` if there are any.
-
-    All projector pixels have the same power. With E the irradiance at z = 1 m on the axis, the radiant intensity is
-    E / cos^3. The irradiance on a surface that faces the projector is this times cos^2 / z^2, which is E / (z^2 cos).
-    The lens multiplies E by the density of its pixels and by its relative illumination.
-
-    Parameters
-    ----------
-    inside : Medium, in which the point lies; None without media.
-    """
-    uv, z = projector.project(si.p)
-    to_projector = projector.centre - mi.Vector3f(si.p)
-    distance = dr.norm(to_projector)
-    to_projector /= distance
-    in_image = (uv.x >= 0) & (uv.x < projector.size.x) & (uv.y >= 0) & (uv.y < projector.size.y) & (z > 0)
-    geometry = dr.rcp(dr.square(z) * -dr.dot(projector.z, to_projector))
-    if projector.model is not None:
-        geometry *= projector.pixel_density(-to_projector)
-    if projector.vignetting is not None:
-        geometry *= projector.relative_illumination(-to_projector)
-    in_image &= active
-    if media is None or inside is None:
-        shadow_ray = si.spawn_ray_to(mi.Point3f(projector.centre))
-        lit = in_image & ~scene.ray_test(shadow_ray, coherent=False, active=in_image)
-    else:
-        fraction, _ = media.transmittance(scene, si, mi.Point3f(projector.centre), inside, in_image)
-        lit, geometry = in_image & (fraction > 0), geometry * fraction
-    blur = projector.blur_px(z)
-    return Connection(uv, to_projector, distance, geometry, lit, None if blur is None else dr.select(lit, blur, 0))
+        Parameters
+        ----------
+        pixel : UInt32, index of the pixel that sees the point; it plays no part for a projector.
+        inside : Medium, in which the point lies; None without media.
+        """
+        uv, z = self.project(si.p)
+        to_projector = self.centre - mi.Vector3f(si.p)
+        distance = dr.norm(to_projector)
+        to_projector /= distance
+        in_image = (uv.x >= 0) & (uv.x < self.size.x) & (uv.y >= 0) & (uv.y < self.size.y) & (z > 0)
+        geometry = dr.rcp(dr.square(z) * -dr.dot(self.z, to_projector))
+        if self.model is not None:
+            geometry *= self.pixel_density(-to_projector)
+        if self.vignetting is not None:
+            geometry *= self.relative_illumination(-to_projector)
+        in_image &= active
+        if media is None or inside is None:
+            shadow_ray = si.spawn_ray_to(mi.Point3f(self.centre))
+            lit = in_image & ~scene.ray_test(shadow_ray, coherent=False, active=in_image)
+        else:
+            fraction, _ = media.transmittance(scene, si, mi.Point3f(self.centre), inside, in_image)
+            lit, geometry = in_image & (fraction > 0), geometry * fraction
+        blur = self.blur_px(z)
+        return Connection(uv, to_projector, distance, geometry, lit, None if blur is None else dr.select(lit, blur, 0))

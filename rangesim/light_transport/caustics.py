@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.accumulators import Accumulators
+from rangesim.light_transport.beams import BeamDevice
 from rangesim.light_transport.indirect_filter import REACH_PX
 from rangesim.light_transport.photon_maps import LEVELS, MAX_MAPS, GatheringRadius, PhotonMaps
 from rangesim.light_transport.photons import Photons, has_delta, trace_photons
@@ -47,14 +48,14 @@ def caustic_photons(
     traced: TracedScene, rig: Rig, settings: TransportSettings, spp: int, report: Callable[[], None] = lambda: None
 ) -> Photons | None:
     """Photons for a pass of any camera; None if the caller wants none, no surface has a delta interaction, or none
-    landed.
+    landed. A beam needs none, see `rangesim.light_transport.beams`.
 
     Parameters
     ----------
     spp : int, number of samples of a pixel, which is the number of photon maps up to `MAX_MAPS`.
     report : called after each kernel launch.
     """
-    if not settings.photons or not has_delta(traced.scene):
+    if not settings.photons or not has_delta(traced.scene) or isinstance(traced.projector, BeamDevice):
         return None
     maps, memory_bytes = min(spp, MAX_MAPS), settings.memory_bytes
     landed = trace_photons(traced, rig.projector_power_w, settings.photons, maps, settings.seed, memory_bytes, report)
@@ -69,7 +70,7 @@ def caustic_maps(photons: Photons | None, rig: Rig, radius_m: float | None) -> P
     if photons is None:
         return None
     radius = gathering_radius(rig, photons.per_pixel, radius_m)
-    return PhotonMaps(photons, radius, rig.projector_irradiance, REACH_PX / rig.camera.fx)
+    return PhotonMaps(photons, radius, rig.projector_irradiance, rig.camera.angle_of(REACH_PX))
 
 
 def gathering_radius(rig: Rig, photons_per_pixel: float, fixed_m: float | None = None) -> GatheringRadius:
@@ -79,9 +80,9 @@ def gathering_radius(rig: Rig, photons_per_pixel: float, fixed_m: float | None =
     metres everywhere.
     """
     of_projector = min(np.sqrt(PHOTONS_PER_DISC / (np.pi * photons_per_pixel)), MAX_RADIUS_PROJECTOR_PX)
-    low, high = (pixels / rig.camera.fx for pixels in (MIN_RADIUS_CAMERA_PX, MAX_RADIUS_CAMERA_PX))
+    low, high = (rig.camera.angle_of(pixels) for pixels in (MIN_RADIUS_CAMERA_PX, MAX_RADIUS_CAMERA_PX))
     places = (rig.T_world_projector[:3, 3], rig.T_world_camera[:3, 3])
-    return GatheringRadius(float(of_projector / rig.projector.fx), (low, high), *places, fixed_m)
+    return GatheringRadius(rig.image_projector.angle_of(float(of_projector)), (low, high), *places, fixed_m)
 
 
 class CausticLight(NamedTuple):

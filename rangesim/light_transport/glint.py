@@ -167,6 +167,7 @@ def _sums(
     nearest, total = (np.zeros(len(pixel), np.float32) for _ in range(2))
     radiance = rig.projector_irradiance / (np.pi * radius_m**2)
     accumulators, launches, projector = Accumulators(responses, len(pixel)), Launches(), view.traced.projector
+    assert isinstance(projector, Device)
     for begin, end in launches.ranges(len(pixel), SEGMENTS * paths, at_least=min_lanes()):
         some, n = slice(begin, end), end - begin
         lens = LensDisc(projector, radius_m[some], radiance[some])
@@ -315,12 +316,16 @@ class LensDisc:
 
 def _worth_probing(traced: TracedScene, h: int, w: int) -> np.ndarray:
     """Flat indices of the pixels to be probed: beside a delta surface, or beside the lens in plain view."""
+    assert isinstance(traced.projector, Device)
     meets, exists = meets_delta(traced.scene, traced.camera)
     mask = meets.reshape(h, w)
-    uv, z = traced.camera.project(mi.Point3f(traced.projector.centre))
-    u, v = float(uv.x[0]), float(uv.y[0])
-    if float(z[0]) > 0 and 0 <= u < w and 0 <= v < h:
-        mask[int(v), int(u)] = True
+    if isinstance(traced.camera, Device):
+        uv, z = traced.camera.project(mi.Point3f(traced.projector.centre))
+        u, v = float(uv.x[0]), float(uv.y[0])
+        if float(z[0]) > 0 and 0 <= u < w and 0 <= v < h:
+            mask[int(v), int(u)] = True
+    else:
+        mask |= traced.camera.looks_at(np.array(traced.projector.centre).ravel()).reshape(h, w)
     return np.flatnonzero(binary_dilation(mask, np.ones((3, 3))) & exists.reshape(h, w))
 
 
@@ -335,6 +340,7 @@ def _near_the_lens(
     radius_m : (n,) float, metres, radius of the disc that stands for the lens in each pixel.
     """
     aperture = np.full(len(pixel), rig.projector_lens.aperture_radius_m)
+    assert isinstance(view.traced.projector, Device)
     lens = LensDisc(view.traced.projector, aperture[:1], aperture[:1])
     nearest, spread = np.empty(len(pixel), np.float32), np.empty(len(pixel), np.float32)
     launches = Launches()
@@ -363,7 +369,7 @@ def _probe(
     while (state.chain.number < lanes.paths) & (left > 0):
         chain = state.chain  # a part of the state, changed in place
         rng = lanes.random.at(chain.random)
-        primary = traced.camera.centre_ray(lanes.corner + stratified(lanes.shift, chain.number))
+        primary = traced.camera.ray_in(lanes.corner, stratified(lanes.shift, chain.number))
         starts = chain.length == 0
         ray = mi.Ray3f(
             dr.select(starts, primary.origin, chain.origin), dr.select(starts, primary.direction, chain.direction)
@@ -409,7 +415,7 @@ def _paths_to_the_lens(
         on_lens = (
             mi.Point2f(rng.next_float32(), rng.next_float32()) if dr.hint(camera.has_lens, mode="scalar") else None
         )
-        primary = camera.sample_ray(lanes.corner + stratified(lanes.shift, lanes.first + chain.number), on_lens)
+        primary = camera.ray_in(lanes.corner, stratified(lanes.shift, lanes.first + chain.number), on_lens)
         ray = mi.Ray3f(
             dr.select(starts, primary.origin, chain.origin), dr.select(starts, primary.direction, chain.direction)
         )

@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.camera_rays import connect
 from rangesim.light_transport.cutouts import first_surface
 from rangesim.light_transport.indirect_filter import Guides
 from rangesim.light_transport.kernel_launches import Launches
@@ -91,7 +90,7 @@ def mean_reflectance(view: View, settings: PathSettings, rig: Rig, has_cutouts: 
         most = dr.opaque(mi.UInt32, samples)
         while sample < most:
             place, lens = in_pairs(lanes.shift, lanes.lens_shift, sample, lanes.total)
-            ray = camera.sample_ray(lanes.corner + place, lens)
+            ray = camera.ray_in(lanes.corner, place, lens)
             si = first_surface(surfaces, mi.Ray3f(ray.origin, ray.direction), has_cutouts)
             total += mono(si.bsdf().eval_diffuse_reflectance(si, si.is_valid()))
             sample += 1
@@ -139,15 +138,16 @@ def _first_surfaces(
     ray = camera.centre_rays(begin, end)
     si = first_surface(traced.surfaces, mi.Ray3f(ray.origin, ray.direction), has_cutouts)
     hit = si.is_valid() if ray.exists is None else si.is_valid() & ray.exists
-    to_camera = camera.centre - mi.Vector3f(si.p)
+    to_camera = mi.Vector3f(ray.origin) - mi.Vector3f(si.p)
     normal = dr.select(dr.dot(si.n, to_camera) < 0, -si.n, si.n)
-    link = connect(traced.scene, traced.projector, si, hit)
+    pixel = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin)
+    link = traced.projector.connect(traced.scene, si, hit, pixel)
     shape = number_of(si.shape)
     through = dr.gather(mi.Bool, transmits_of, shape, hit)
     return FirstSurfaces(
         hit=hit,
         index=dr.gather(mi.Int32, index_of, shape, hit),
-        z=-dr.dot(to_camera, camera.z),
+        z=dr.dot(mi.Vector3f(si.p) - camera.centre, camera.z),
         range_m=dr.norm(to_camera),
         visible=link.lit & (through | (dr.dot(normal, link.direction) > 0)),
         uv=link.uv,

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from rangesim.light_transport.camera_rays import Device
 from rangesim.light_transport.caustics import caustic_maps, caustic_photons
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
@@ -22,13 +21,14 @@ from rangesim.light_transport.kernel_launches import Launches, Progress, Report,
 from rangesim.light_transport.loop import PathSettings, Radiance, View
 from rangesim.light_transport.narrow_lobes import warn_of_narrow_lobes
 from rangesim.light_transport.photons import Photons
+from rangesim.light_transport.ray_tables import camera_device
 from rangesim.light_transport.samples_per_pixel import Sampler
 from rangesim.light_transport.sampling_error import MIN_FOR_HALVES, Estimate
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.transport_settings import TransportSettings
 from rangesim.light_transport.truncation import estimate_truncation
 from rangesim.response import Response
-from rangesim.rig import Rig
+from rangesim.rig import Beam, Camera, Intrinsics, Rig
 from rangesim.scene import Scene
 from rangesim.scene.media import body_around, inside_out
 from rangesim.sensor import Sensor
@@ -116,15 +116,18 @@ class _CameraPass:
     ) -> None:
         self.scene, self.rig, self.here = scene, rig, scene.in_renderer(rig)
         self.settings = replace(settings, seed=derived_seed(settings.seed, number)) if number else settings
-        self.traced = traced._replace(camera=Device.camera(self.here))
+        self.traced = traced._replace(camera=camera_device(self.here))
         self.truth, self.guides = ground_truth(scene, self.traced, rig)
+        # The indirect light of beams changes from pixel to pixel, because each has a spot of its own
+        can_share = rig.camera.has_neighbours and not isinstance(rig.projector, Beam)
+        self.is_filtered = settings.indirect == "filtered" and can_share
         spp, pixels = settings.spp, rig.camera.height * rig.camera.width
         if isinstance(spp, Sampler):
             self.samples = np.full(pixels, spp.first_spp)
         elif isinstance(spp, int):
             self.samples = np.full(pixels, spp)
         else:
-            is_shared = (settings.indirect == "filtered") & (self.guides.instance.ravel() >= 0)
+            is_shared = self.is_filtered & (self.guides.instance.ravel() >= 0)
             self.samples = np.where(is_shared, MATTE_SPP, OTHER_SPP)
 
     def trace(
@@ -148,13 +151,14 @@ class _CameraPass:
         fewest = int(self.samples.min())
         maps = caustic_maps(photons, self.here, settings.caustic_radius_m)
         view, of_paths = View(self.traced, maps), PathSettings.of(self.scene, settings)
-        keeps_apart = settings.indirect == "filtered"
+        keeps_apart = self.is_filtered
         if keeps_apart and self.scene.has_matte_textures:
             few = min(fewest, TEXTURE_SAMPLES)
             guides = guides._replace(reflectance=mean_reflectance(view, of_paths, rig, self.scene.has_cutouts, few))
         shared = LightFilter(guides) if keeps_apart else None
         at_work = partial(report, 0.0)
-        glints = trace_glint(self.traced, self.here, responses, settings.seed, at_work) if settings.glint else None
+        sees_glint = settings.glint and not isinstance(rig.projector, Beam)
+        glints = trace_glint(self.traced, self.here, responses, settings.seed, at_work) if sees_glint else None
         has_halves = settings.sampling_error and fewest >= MIN_FOR_HALVES
         estimate = Estimate(view, of_paths, rig, responses, keeps_apart, has_halves, settings.memory_bytes, launches)
 
@@ -229,17 +233,17 @@ def _check_in_air(scene: Scene, rig: Rig) -> None:
     Light paths start in air, so both would be rendered wrongly.
     """
     T_camera = scene.in_renderer(rig).T_world_camera
-    devices = ("camera", rig.camera, T_camera), ("projector", rig.projector, T_camera @ rig.T_camera_projector)
-    for name, intrinsics, T in devices:
+    devices: list[tuple[str, Camera, np.ndarray]] = [("camera", rig.camera, T_camera)]
+    if isinstance(rig.projector, Intrinsics):
+        devices.append(("projector", rig.projector, T_camera @ rig.T_camera_projector))
+    for name, device, T in devices:
         body = body_around(scene.mitsuba, T[:3, 3])
         if body is not None:
             raise ValueError(
                 f"expected the {name} to stand in air, but it is inside the medium of shape {body!r}; move it out, or "
                 "let the body begin in front of it."
             )
-        steps = (np.arange(RAYS_TO_MEDIA) + 0.5) / RAYS_TO_MEDIA
-        pixels = np.stack(np.meshgrid(steps * intrinsics.width, steps * intrinsics.height), axis=-1)
-        directions = intrinsics.directions(pixels).reshape(-1, 3) @ T[:3, :3].T
+        directions = _directions_over(device) @ T[:3, :3].T
         match inside_out(scene.mitsuba, T[:3, 3], directions[np.isfinite(directions).all(axis=1)]):
             case (shape, "interior"):
                 raise ValueError(
@@ -251,3 +255,12 @@ def _check_in_air(scene: Scene, rig: Rig) -> None:
                     f"expected a body that holds the exterior medium of shape {shape!r}, but none is around it, so "
                     f"the {name} would stand in that medium; put one in front of it, or leave the medium out."
                 )
+
+
+def _directions_over(device: Camera) -> np.ndarray:
+    """(n, 3) float64, directions of `RAYS_TO_MEDIA` x `RAYS_TO_MEDIA` rays that are spread over the device's image."""
+    steps = (np.arange(RAYS_TO_MEDIA) + 0.5) / RAYS_TO_MEDIA
+    x, y = np.meshgrid(steps * device.width, steps * device.height)
+    if isinstance(device, Intrinsics):
+        return device.directions(np.stack([x, y], axis=-1)).reshape(-1, 3)
+    return device.pixel_rays().directions[y.astype(int), x.astype(int)].reshape(-1, 3)

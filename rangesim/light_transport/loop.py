@@ -35,7 +35,7 @@ import numpy as np
 
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.ambient_light import ambient_on_ray, sampled_ambient, sampled_ambient_through_media
-from rangesim.light_transport.camera_rays import connect
+from rangesim.light_transport.beams import BeamDevice, Pencil, Spot
 from rangesim.light_transport.caustics import Vertex, caustic_light, gather
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
 from rangesim.light_transport.photon_maps import PhotonMaps
@@ -44,7 +44,8 @@ from rangesim.light_transport.sampling import Continued, Seed, Stream, aligned, 
 from rangesim.light_transport.scattering import MAX_EVENTS, ROULETTE_BELOW
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray, survival
-from rangesim.light_transport.strategies import can_be_vertex, is_delta, next_event_kind, owner
+from rangesim.light_transport.spots import connect_to_spot, lit_spot
+from rangesim.light_transport.strategies import beam_connects, can_be_vertex, is_delta, next_event_kind, owner
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.transport_settings import TransportSettings
 from rangesim.light_transport.truncation import Tally
@@ -196,6 +197,8 @@ class PathState:
     pdf : Float, 1/sr, density of the BSDF sample that made the ray.
     events : UInt32, scattering events inside media and crossed boundaries so far; None in scenes without media.
     scattered_inside : Bool, whether the path has scattered since it entered the medium; None in scenes without media.
+    spot : Spot of the lane's beam; None for a projector, and in scenes with media.
+    pencil : Pencil of the lane's beam around the path; None for a projector, and in scenes without delta interactions.
     """
 
     depth: mi.UInt32
@@ -211,6 +214,8 @@ class PathState:
     pdf: mi.Float
     events: mi.UInt32
     scattered_inside: mi.Bool
+    spot: Spot | None = None
+    pencil: Pencil | None = None
 
 
 @dataclass
@@ -335,6 +340,7 @@ class Lanes:
 def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes: Lanes) -> LaneState:
     """The state of lanes that have done nothing yet."""
     n, gathers, in_media = dr.width(lanes.pixel), view.maps is not None, view.traced.media is not None
+    is_beam = isinstance(view.traced.projector, BeamDevice)
 
     def zeros(exist: bool = True) -> mi.Float:
         return dr.zeros(mi.Float, n) if exist else None
@@ -361,6 +367,8 @@ def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes:
             pdf=dr.zeros(mi.Float, n),
             events=dr.zeros(mi.UInt32, n) if in_media else None,
             scattered_inside=dr.full(mi.Bool, False, n) if in_media else None,
+            spot=Spot.none(n) if is_beam and not in_media else None,
+            pencil=Pencil.none(n) if is_beam and settings.delta else None,
         ),
         channels=accumulators.zeros(n),
         radiance=Radiance(
@@ -395,6 +403,9 @@ def walk(
     traced, maps = view
     scene, surfaces, camera, projector, media, cutouts, absorbers = traced
     n = dr.width(state.sample)
+    is_beam = isinstance(projector, BeamDevice)
+    has_spot, has_pencil = state.path.spot is not None, state.path.pencil is not None
+    flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if has_pencil else mi.RayFlags.All
     left = max_iterations + dr.zeros(mi.UInt32, n)  # iterations
     active = (state.sample < lanes.samples) & (left > 0)
 
@@ -412,16 +423,26 @@ def walk(
             starts &= path.events == 0
         number = lanes.number(state.sample)
         jitter, lens = in_pairs(lanes.shift, lanes.lens_shift, number, lanes.total)
-        primary = camera.sample_ray(lanes.corner + jitter, lens)
+        primary = camera.ray_in(lanes.corner, jitter, lens)
         ray = mi.Ray3f(
             dr.select(starts, primary.origin, path.origin), dr.select(starts, primary.direction, path.direction)
         )
         path.ray_state = path.ray_state.restarted(starts, primary.origin, primary.path_offset)
         if dr.hint(primary.exists is not None, mode="scalar"):
             path.throughput = dr.select(starts & ~primary.exists, 0, path.throughput)  # no ray, no light
+        if dr.hint(has_pencil, mode="scalar"):
+            assert path.pencil is not None
+            assert isinstance(projector, BeamDevice)
+            path.pencil = path.pencil.replaced(starts, projector.pencil(lanes.pixel, primary.direction))
+        if dr.hint(has_spot, mode="scalar"):
+            assert path.spot is not None
+            xi = mi.Point2f(rng.next_float32(), rng.next_float32())
+            spot, random = lit_spot(traced, lanes.pixel, xi, rng.state, lanes.random, settings.delta, starts & active)
+            rng = lanes.random.at(random)
+            path.spot = path.spot.replaced(starts, spot)
 
         # ---- Next surface ----------------------------------------------------------------------------
-        si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        si = surfaces.ray_intersect(ray, flags, coherent=False, active=active)
         hit = si.is_valid() & active
         met = mi.Point3f(si.p)
         si.p = dr.select(path.left_delta, corrected_point(si, path.ray_state.previous, ray.d), met)
@@ -441,7 +462,14 @@ def walk(
             path.depth += 1
         path.ray_state.length = path.ray_state.length_to(si.p, hit)
         if dr.hint(absorbers is not None, mode="scalar"):
-            path.throughput *= path.ray_state.unabsorbed(traced, si.p, hit)
+            unabsorbed = path.ray_state.unabsorbed(traced, si.p, hit)
+            path.throughput *= unabsorbed
+            if dr.hint(has_pencil, mode="scalar"):
+                assert path.pencil is not None
+                path.pencil.fraction *= unabsorbed
+        if dr.hint(has_pencil, mode="scalar"):
+            assert path.pencil is not None
+            path.pencil = path.pencil.arrived(ray.d, dr.norm(si.p - path.ray_state.previous), si.n)
         bsdf = si.bsdf(ray)
         is_vertex = hit & (path.depth < settings.max_depth) & (scatters | can_be_vertex(bsdf))
 
@@ -455,7 +483,13 @@ def walk(
 
         # ---- Next-event estimation: straight to the projector ----------------------------------------
         is_connected = owner(is_vertex, delta_interactions=0).next_event
-        link = connect(scene, projector, si, is_connected, media, path.ray_state.inside)
+        if dr.hint(is_beam, mode="scalar"):
+            is_connected &= beam_connects(path.depth, path.left_delta, has_spot)
+        link = projector.connect(scene, si, is_connected, lanes.pixel, media, path.ray_state.inside)
+        if dr.hint(has_pencil, mode="scalar"):
+            assert path.pencil is not None
+            comes_back = is_vertex & at_surface & (path.depth == 1) & path.left_delta
+            link = path.pencil.connection(comes_back, ray.d, path.ray_state.length, link)
         value, _, bs, bs_weight = bsdf.eval_pdf_sample(
             mi.BSDFContext(),
             si,
@@ -485,6 +519,23 @@ def walk(
         radiance.specular += dr.select(kind == SPECULAR, light, 0)
         radiance.multipath += dr.select(kind == MULTIPATH, light, 0)
         tally.indirect += dr.select(is_later, light, 0)
+
+        # ---- The spot of the beam: light that another vertex throws on this one -----------------------
+        if dr.hint(has_spot, mode="scalar"):
+            assert path.spot is not None
+            looks = is_vertex & (path.depth + 1 < settings.max_depth)
+            brought = connect_to_spot(traced, path.spot, si, looks)
+            thrown = mono(bsdf.eval(mi.BSDFContext(), si, si.to_local(brought.direction), looks))
+            light = path.throughput * thrown * brought.irradiance * lanes.irradiance
+            is_lit = light > 0
+            light = dr.select(is_lit, light, 0)
+            u, v, path_length = (
+                dr.select(is_lit, x, 0) for x in (path.spot.u, path.spot.v, path.ray_state.length + brought.length)
+            )
+            light_path = LightPath(u, v, path_length, mi.Bool(False), mi.UInt32(MULTIPATH))
+            state.channels = accumulators.add(state.channels, light_path, light, lanes.place, is_lit, mi.Bool(True))
+            radiance.multipath += light
+            tally.indirect += light
 
         # ---- Caustic photons: light that reached this point through glass or off mirrors -------------
         if dr.hint(maps is not None, mode="scalar"):
@@ -518,6 +569,13 @@ def walk(
 
         # ---- Next direction --------------------------------------------------------------------------
         goes_delta = is_delta(bs)
+        if dr.hint(has_pencil, mode="scalar"):
+            assert path.pencil is not None
+            bends = goes_delta & at_surface
+            eta = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission), bs.eta, 1)
+            turned = path.pencil.turned(ray.d, si, wo, eta)
+            turned.fraction *= bs_weight * bs.pdf
+            path.pencil = path.pencil.replaced(bends, turned)
         path.throughput *= bs_weight
         path.ray_state = path.ray_state.refracted(bs, at_surface)
         path.left_delta = goes_delta & ~crosses

@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.errors import warn
+from rangesim.light_transport.beams import BeamDevice
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
@@ -61,9 +62,14 @@ def thrown_light(traced: TracedScene) -> ThrownLight | None:
     index = dr.arange(mi.UInt32, lanes)
     rng = mi.PCG32(lanes)
     place = mi.Vector2f(index % columns + rng.next_float32(), index // columns + rng.next_float32())
-    first = projector.centre_ray(mi.Point2f(place * projector.size / mi.Vector2f(columns, rows)))
-    ray = mi.Ray3f(first.origin, first.direction)
-    active = mi.Bool(True) if first.exists is None else mi.Bool(first.exists)
+    if isinstance(projector, BeamDevice):
+        pixels = traced.camera.pixels
+        beam = projector.sampled(mi.UInt32(mi.Float(index) / lanes * pixels), mi.Point2f(place - dr.floor(place)))
+        ray, active = mi.Ray3f(beam.origin, beam.direction), mi.Bool(True)
+    else:
+        first = projector.centre_ray(mi.Point2f(place * projector.size / mi.Vector2f(columns, rows)))
+        ray = mi.Ray3f(first.origin, first.direction)
+        active = mi.Bool(True) if first.exists is None else mi.Bool(first.exists)
     throughput, thrower, is_thrown = dr.full(mi.Float, 1.0, lanes), dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Bool, lanes)
     by, onto = (dr.zeros(mi.Float, int(dr.max(number_of(scene.shapes_dr()))[0]) + 1) for _ in range(2))
     for _ in range(MAX_SURFACES):

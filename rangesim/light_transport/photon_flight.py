@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.camera_rays import Device
 from rangesim.light_transport.sampling import Continued, Seed, aligned, random_stream
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray, survival
@@ -63,6 +64,7 @@ def trace_photon_paths(
     flux : (n,) float, watts.
     number : (n,) int, numbers of the photons, on which their random numbers depend.
     """
+    assert isinstance(traced.projector, Device)
     pixel, width = mi.UInt32(aligned(pixel, np.uint32)), mi.UInt32(traced.projector.size.x)
     photon = mi.UInt32(aligned(number, np.uint32))
     rng = random_stream(Seed.of(seed), photon ^ 0x9E3779B9)
@@ -78,6 +80,7 @@ def _chain(
 ) -> tuple[PhotonDeposit, PhotonEnergy]:
     """Follow photons through delta interactions until they land, leave, are absorbed, or the chain is too long."""
     lanes, projector, media, absorbers = dr.width(power), traced.projector, traced.media, traced.absorbers
+    assert isinstance(projector, Device)
     lens = mi.Point2f(rng.next_float32(), rng.next_float32()) if dr.hint(projector.has_lens, mode="scalar") else None
     primary = projector.sample_ray(uv, lens)
     flux = power * projector.relative_illumination(primary.direction)

@@ -26,6 +26,7 @@ from scipy.ndimage import binary_dilation
 from rangesim.light_transport.camera_rays import Device
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.photon_flight import trace_photon_paths
+from rangesim.light_transport.ray_tables import RayTableDevice
 from rangesim.light_transport.sampling import Seed, Stream, random_stream
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
@@ -113,7 +114,7 @@ def _is_delta(shape: mi.Shape) -> bool:
     return bool(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta)) and not is_boundary(shape)
 
 
-def meets_delta(scene: mi.Scene, device: Device) -> tuple[np.ndarray, np.ndarray]:
+def meets_delta(scene: mi.Scene, device: Device | RayTableDevice) -> tuple[np.ndarray, np.ndarray]:
     """Whether the first surface behind each pixel's centre has a delta interaction.
 
     Returns
@@ -153,6 +154,7 @@ def trace_photons(
     memory_bytes : largest size of the renderer's arrays during a launch.
     report : called after each kernel launch.
     """
+    assert isinstance(traced.projector, Device)  # a beam needs no photons
     pixels, fraction = _chances(traced.scene, traced.projector)
     per_map = -(-photons // maps)
     cumulative, shift = np.cumsum(fraction), shift_of(seed)

@@ -62,6 +62,29 @@ def owner(has_vertex: mi.Bool, delta_interactions: mi.UInt32 | int) -> Owner:
     return Owner(has_vertex & is_straight, has_vertex & (delta_interactions != 0), ~has_vertex)
 
 
+def beam_connects(vertices: mi.UInt32, left_delta: mi.Bool, has_spot: bool) -> mi.Bool:
+    """Whether next-event estimation owns the path from the emitter of a beam straight to the last vertex.
+
+    It owns paths of one vertex that the camera sees straight, and longer paths whose last segment between vertices has
+    delta interactions. A path of one vertex behind delta interactions belongs to the pencil of rays that came the same
+    way, and a longer path whose last two vertices see each other belongs to the spot (`beams.py`). In scenes with media
+    there is no spot, and next-event estimation owns all longer paths.
+
+    Parameters
+    ----------
+    vertices : UInt32, number of vertices of the path.
+    left_delta : Bool, whether the path came to the last vertex by a delta interaction.
+    has_spot : whether the spot is a light vertex.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> beam_connects(np.array([1, 1, 2, 2]), np.array([False, True, False, True]), has_spot=True)
+    array([ True, False, False,  True])
+    """
+    return (vertices == 1) ^ left_delta if has_spot else (vertices != 1) | ~left_delta
+
+
 def next_event_kind(is_first: mi.Bool, via_delta: mi.Bool) -> mi.UInt32:
     """Kind of the light that next-event estimation finds at a vertex, an index into `rangesim.response.KINDS`.
 

@@ -8,8 +8,10 @@ from typing import NamedTuple
 import mitsuba as mi
 
 from rangesim.light_transport.absorption import Absorbers, absorbers_of
+from rangesim.light_transport.beams import BeamDevice, emitter_device
 from rangesim.light_transport.camera_rays import Device
 from rangesim.light_transport.cutouts import Cutouts, cutouts_of
+from rangesim.light_transport.ray_tables import RayTableDevice, camera_device
 from rangesim.light_transport.scattering import Media, media_of
 from rangesim.light_transport.surfaces import Surfaces, surfaces_of
 from rangesim.rig import Rig
@@ -20,15 +22,16 @@ class TracedScene(NamedTuple):
 
     scene : mitsuba.Scene
     surfaces : the scene itself, or its `Surfaces`; rays are intersected with this, see `surfaces_of`.
-    camera, projector : Device
+    camera : Device of a pinhole, or RayTableDevice.
+    projector : Device, or BeamDevice.
     media, cutouts, absorbers : Media, Cutouts and Absorbers. None if the scene has none: no kernel then has code for
         them.
     """
 
     scene: mi.Scene
     surfaces: mi.Scene | Surfaces
-    camera: Device
-    projector: Device
+    camera: Device | RayTableDevice
+    projector: Device | BeamDevice
     media: Media | None = None
     cutouts: Cutouts | None = None
     absorbers: Absorbers | None = None
@@ -37,6 +40,6 @@ class TracedScene(NamedTuple):
     def of(cls, scene: mi.Scene, rig: Rig) -> TracedScene:
         """A traced scene of a mitsuba.Scene that `rangesim.scene.load_scene` has checked, and a rig in its
         coordinates."""
-        camera, projector = Device.camera(rig), Device.projector(rig)
+        camera, projector = camera_device(rig), emitter_device(rig)
         parts = surfaces_of(scene), camera, projector, media_of(scene), cutouts_of(scene), absorbers_of(scene)
         return cls(scene, *parts)

@@ -12,9 +12,22 @@ An object moves to the right by 0.3 m/s, while patterns are projected and captur
 >>> signals = transport_moving(scene, rig, timings, motion)  # doctest: +SKIP
 """
 
+from rangesim.motion.deskewing import deskewed
+from rangesim.motion.moving_scanner import as_reported, moving_scanner
 from rangesim.motion.moving_signals import MovingSignals
 from rangesim.motion.pose_tracks import ConstantTwist, Motion, PoseTrack, Track
 from rangesim.motion.timing import Timing
 from rangesim.motion.transport_moving import transport_moving
 
-__all__ = ["ConstantTwist", "Motion", "MovingSignals", "PoseTrack", "Timing", "Track", "transport_moving"]
+__all__ = [
+    "ConstantTwist",
+    "Motion",
+    "MovingSignals",
+    "PoseTrack",
+    "Timing",
+    "Track",
+    "as_reported",
+    "deskewed",
+    "moving_scanner",
+    "transport_moving",
+]

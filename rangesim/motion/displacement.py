@@ -25,7 +25,7 @@ def displacement(truth: GroundTruth, rig: Rig, start: Poses, end: Poses) -> np.n
     rig : Rig without motion, with the camera that `truth` belongs to.
     start, end : poses of everything that moves, before and after.
     """
-    points = rig.camera.directions(rig.camera.pixel_centres()) * truth.z[..., None]
+    points = rig.camera.points(truth)
     result = np.zeros(truth.z.shape, dtype=np.float32)
     T_camera_world = np.linalg.inv(end.place(rig))
     for index, name in enumerate(truth.instance_names):

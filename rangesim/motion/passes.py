@@ -56,11 +56,11 @@ class Pass:
         camera, window = rig.camera, self.window
         if window != Window.whole(camera):
             camera = replace(
-                camera,
+                rig.pinhole,
                 width=window.right - window.left,
                 height=window.bottom - window.top,
-                cx=camera.cx - window.left,
-                cy=camera.cy - window.top,
+                cx=rig.pinhole.cx - window.left,
+                cy=rig.pinhole.cy - window.top,
             )
         return replace(rig, camera=camera, T_world_camera=self.poses.place(rig))
 

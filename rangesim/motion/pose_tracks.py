@@ -35,6 +35,10 @@ class Track(Named, ABC):
     def at(self, time_s: float) -> Array:
         """World transform at a time in seconds: (4, 4) float64, rigid, metres."""
 
+    def poses_at(self, times_s: ArrayLike) -> Array:
+        """World transforms at times (n,) in seconds: (n, 4, 4) float64, rigid, metres."""
+        return np.array([self.at(float(time_s)) for time_s in np.asarray(times_s)]).reshape(-1, 4, 4)
+
 
 @dataclass(frozen=True, eq=False)
 class PoseTrack(Track):
@@ -98,13 +102,18 @@ class PoseTrack(Track):
         return hash((self.times_s.tobytes(), self.poses.tobytes()))
 
     def at(self, time_s: float) -> Array:
+        return np.asarray(self.poses_at([time_s])[0])
+
+    def poses_at(self, times_s: ArrayLike) -> Array:
         from scipy.spatial.transform import Rotation, Slerp
 
-        time = float(np.clip(time_s, self.times_s[0], self.times_s[-1]))
-        result = np.eye(4)
-        result[:3, 3] = [np.interp(time, self.times_s, self.poses[:, i, 3]) for i in range(3)]
+        times = np.clip(np.asarray(times_s, dtype=np.float64), self.times_s[0], self.times_s[-1])
+        result = np.tile(np.eye(4), (len(times), 1, 1))
+        for i in range(3):
+            result[:, i, 3] = np.interp(times, self.times_s, self.poses[:, i, 3])
         rotations = Rotation.from_matrix(self.poses[:, :3, :3])
-        result[:3, :3] = (rotations[0] if len(self.times_s) == 1 else Slerp(self.times_s, rotations)(time)).as_matrix()
+        one = len(self.times_s) == 1
+        result[:, :3, :3] = rotations.as_matrix() if one else Slerp(self.times_s, rotations)(times).as_matrix()
         return result
 
 
@@ -142,12 +151,16 @@ class ConstantTwist(Track):
             object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
 
     def at(self, time_s: float) -> Array:
+        return np.asarray(self.poses_at([time_s])[0])
+
+    def poses_at(self, times_s: ArrayLike) -> Array:
         from scipy.spatial.transform import Rotation
 
-        result = np.eye(4)
-        result[:3, :3] = Rotation.from_rotvec(np.multiply(self.rotation_rad_s, time_s)).as_matrix()
+        times = np.asarray(times_s, dtype=np.float64)
+        result = np.tile(np.eye(4), (len(times), 1, 1))
+        result[:, :3, :3] = Rotation.from_rotvec(np.multiply.outer(times, self.rotation_rad_s)).as_matrix()
         centre = np.asarray(self.centre_m)
-        result[:3, 3] = centre - result[:3, :3] @ centre + np.multiply(self.velocity_m_s, time_s)
+        result[:, :3, 3] = centre - result[:, :3, :3] @ centre + np.multiply.outer(times, self.velocity_m_s)
         return result
 
 

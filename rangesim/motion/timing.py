@@ -8,7 +8,7 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
-from rangesim.rig import Array, Intrinsics
+from rangesim.rig import Array, Camera
 from rangesim.sensor import Sensor
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, Pause, check_fields, whole
@@ -23,7 +23,7 @@ class Window(NamedTuple):
     right: int
 
     @classmethod
-    def whole(cls, camera: Intrinsics) -> Window:
+    def whole(cls, camera: Camera) -> Window:
         """The window that is the whole image of a camera."""
         return cls(0, camera.height, 0, camera.width)
 
@@ -111,7 +111,7 @@ class Timing:
         limits.check("passes", passes, f"passes for {exposures} exposures in {bands} bands")
         return np.asarray(self.start_s + self.frame_period_s * np.arange(exposures), dtype=np.float64)
 
-    def reference_s(self, sensor: Sensor, camera: Intrinsics) -> float:
+    def reference_s(self, sensor: Sensor, camera: Camera) -> float:
         """Time of the middle of the acquisition, in seconds.
 
         It is halfway between the first line of the first exposure and the last line of the last exposure.
@@ -119,7 +119,7 @@ class Timing:
         times = self.exposure_times_s(sensor)
         return float(0.5 * (times[0] + times[-1] + self.line_period_s * (self._lines(camera) - 1)))
 
-    def instants(self, exposure_time_s: float, camera: Intrinsics) -> list[Instant]:
+    def instants(self, exposure_time_s: float, camera: Camera) -> list[Instant]:
         """Moments at which the windows of the image are rendered, for one exposure.
 
         exposure_time_s : seconds, middle of the exposure in line 0.
@@ -138,5 +138,5 @@ class Timing:
             result += [Instant(middle + offset, window, 1 / n) for offset in offsets]
         return result
 
-    def _lines(self, camera: Intrinsics) -> int:
+    def _lines(self, camera: Camera) -> int:
         return camera.height if self.lines == "rows" else camera.width

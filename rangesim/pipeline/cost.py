@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from rangesim.errors import TruncationWarning
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
+from rangesim.rig import Beam, Intrinsics, RayTable
 from rangesim.settings import limits
 
 if TYPE_CHECKING:
@@ -264,7 +265,13 @@ def _timed_trial(
     from rangesim.instrument.transport import transport
 
     rig, instruments = one_pass
-    camera = rig.camera.resized(TRIAL_WIDTH, max(1, round(TRIAL_WIDTH * rig.camera.height / rig.camera.width)))
+    small = TRIAL_WIDTH, max(1, round(TRIAL_WIDTH * rig.camera.height / rig.camera.width))
+    camera = (
+        rig.camera.resized(*small) if isinstance(rig.camera, Intrinsics) else RayTable.of(rig.camera).thinned(*small)
+    )
+    smaller = replace(rig, camera=camera)
+    if isinstance(rig.projector, Beam):
+        smaller = replace(smaller, projector=replace(rig.projector, directions=None))
     settings = experiment.transport_settings(instruments)
     sensors = [instrument.sensor for instrument in instruments]
     took: list[float] = []
@@ -272,7 +279,7 @@ def _timed_trial(
         warnings.simplefilter("ignore", TruncationWarning)  # the run itself will warn
         for spp in (TRIAL_SPP[0], *TRIAL_SPP):  # the first compiles
             start = _Elapsed.now()
-            transport(scene, replace(rig, camera=camera), sensors, settings, spp=spp)
+            transport(scene, smaller, sensors, settings, spp=spp)
             took.append((_Elapsed.now() - start).idle_s)
     paths = camera.width * camera.height * (TRIAL_SPP[1] - TRIAL_SPP[0])
     path_s = max((took[2] - took[1]) / paths, 0.1 / _paths_per_s())

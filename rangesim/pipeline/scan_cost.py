@@ -76,7 +76,7 @@ def _beside_tracing(settings: ScanSettings, scene: Scene, rig: Rig, views: int) 
     pixels = rig.camera.width * rig.camera.height
     finer = 1.0
     if settings.voxel_m is not None:
-        finer = min(VOXEL_SPACINGS * scene.working_distance_m / rig.camera.fx / settings.voxel_m, MAX_FINER)
+        finer = min(VOXEL_SPACINGS * scene.working_distance_m * rig.camera.angle_of(1) / settings.voxel_m, MAX_FINER)
     triangles = TRIANGLES * pixels * finer**2
     seconds = views * pixels * (VIEW_PIXEL_S + FRAME_S * settings.instrument.sensor.n_frames)
     seconds += triangles * len(scene.instances) * TRIANGLE_S

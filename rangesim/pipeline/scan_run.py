@@ -208,7 +208,7 @@ def errors_by_shape(
 def _voxel_m(views: Scan) -> float:
     """Default edge of a voxel in metres, from the median distance between neighbouring readings of the views."""
     spacings = [
-        float(np.median(i.z[i.valid])) / i.camera.fx for i in views.images if i.camera is not None and i.valid.any()
+        float(np.median(i.z[i.valid])) / i.pinhole.fx for i in views.images if i.camera is not None and i.valid.any()
     ]
     return float(f"{VOXEL_SPACINGS * np.median(spacings):.2g}")
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from pcgraph.kernel_cache import cached_njit
 from pcgraph.parallel import MIN_ROWS, in_blocks
-from rangesim.rig import Intrinsics
+from rangesim.rig import Camera, Intrinsics, tangents
 from rangesim.settings.config import ShortRepr
 
 COORDINATES = ("camera", "world")
@@ -21,6 +21,8 @@ FAR_M = 100.0
 
 Beyond it they have double precision, because neighbouring numbers of single precision are 8 µm apart at 100 m.
 """
+SCAN_DTYPES = {"time_s": np.float64, "ring": np.uint16, "return_number": np.uint8}
+"""Arrays that scanning instruments tell of each point, with their types."""
 NORMAL_RADIUS = 2
 """Radius, in pixels, of the window of (2 r + 1)^2 pixels that a normal is fitted to.
 
@@ -50,11 +52,15 @@ class PointCloud(ShortRepr):
     intensity : (...) float32, in the units of the capture's frames. None: not known.
     colors : (..., 3) uint8, RGB. None: not known.
     confidence : (...) float32 in 0..1, see `RangeImage`. None: not known.
+    time_s : (...) float64, seconds, when each point was measured, after the first ray of its scan. None: not known.
+    ring : (...) uint16, number of the beam that measured each point, from the uppermost (0) downwards unless its maker
+        counts otherwise. None: not known.
+    return_number : (...) uint8, 1 for the first return of a ray, 2 for the second. None: not known.
 
     Raises
     ------
     ValueError
-        The coordinates are unknown, or the arrays do not fit together.
+        The coordinates are unknown, the arrays do not fit together, or `ring` or `return_number` has another type.
 
     Examples
     --------
@@ -74,6 +80,9 @@ class PointCloud(ShortRepr):
     intensity: np.ndarray | None = None
     colors: np.ndarray | None = None
     confidence: np.ndarray | None = None
+    time_s: np.ndarray | None = None
+    ring: np.ndarray | None = None
+    return_number: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         shape = self.points.shape
@@ -84,10 +93,17 @@ class PointCloud(ShortRepr):
         for name, value in self.attributes().items():
             if value.shape not in (shape[:-1], shape):
                 raise ValueError(f"expected {name} of shape {shape[:-1]} or {shape}, got {value.shape}.")
+        for name, dtype in SCAN_DTYPES.items():
+            value = getattr(self, name)
+            if value is not None and (value.dtype != dtype or value.shape != shape[:-1]):
+                raise ValueError(
+                    f"expected {name} of shape {shape[:-1]} and type {np.dtype(dtype)}, "
+                    f"got {value.shape} and {value.dtype}."
+                )
 
     def attributes(self) -> dict[str, np.ndarray]:
         """Arrays besides the points that are not None, by name."""
-        names = ("normals", "intensity", "colors", "confidence")
+        names = ("normals", "intensity", "colors", "confidence", *SCAN_DTYPES)
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
     @property
@@ -133,19 +149,20 @@ class PointCloud(ShortRepr):
 
 
 def organised_cloud(
-    z: np.ndarray,
-    camera: Intrinsics,
+    reading_m: np.ndarray,
+    camera: Camera,
     T_world_camera: np.ndarray,
     intensity: np.ndarray,
     confidence: np.ndarray,
     coordinates: str = "camera",
 ) -> PointCloud:
-    """Organised point cloud of a depth image, with normals.
+    """Organised point cloud of an image of readings, with normals, and with the times and rings of a scanner.
 
     Parameters
     ----------
-    z : (h, w) float32, metres, along the optical axis; NaN where there is no reading.
-    camera : Intrinsics of the image.
+    reading_m : (h, w) float32, metres, depths z along the optical axis of a pinhole camera, or ranges along the rays of
+        any other; NaN where there is no reading.
+    camera : Camera of the image. The normals are unknown (None) if its pixels have no neighbours.
     T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres.
     intensity : (h, w) float32, in the units of the capture's frames; the cloud's grey colours are made from it.
     confidence : (h, w) float32 in 0..1.
@@ -162,7 +179,7 @@ def organised_cloud(
 
     >>> import numpy as np
     >>> from rangesim.point_cloud import organised_cloud
-    >>> from rangesim.rig import Intrinsics
+    >>> from rangesim.rig import Camera, Intrinsics, tangents
     >>> z = np.ones((3, 4), dtype=np.float32)
     >>> cloud = organised_cloud(z, Intrinsics.from_fov(4, 3, 60), np.eye(4), intensity=z, confidence=z)
     >>> cloud.points.shape
@@ -172,21 +189,30 @@ def organised_cloud(
     """
     if coordinates not in COORDINATES:
         raise ValueError(f"expected coordinates to be one of {', '.join(COORDINATES)}, got {coordinates!r}.")
-    rays = camera.directions(camera.pixel_centres())
-    depth = z.astype(np.float64)
-    points, normals = rays * depth[..., None], lattice_normals(depth, rays)
+    depth, normals = reading_m.astype(np.float64), None
+    if isinstance(camera, Intrinsics):
+        rays = camera.directions(camera.pixel_centres())
+        points, normals = rays * depth[..., None], lattice_normals(depth, rays)
+    else:
+        table = camera.pixel_rays()
+        points = table.origins + table.directions * depth[..., None]
+        if camera.has_neighbours:
+            normals = ray_normals(points, table.origins, table.directions, camera.angle_of(1))
     kind: type[np.floating] = np.float32
     if coordinates == "world":
         rotation, origin = T_world_camera[:3, :3], T_world_camera[:3, 3]
-        points, normals = points @ rotation.T + origin, normals @ rotation.T
+        points = points @ rotation.T + origin
+        normals = None if normals is None else normals @ rotation.T
         kind = np.float64 if np.abs(origin).max() > FAR_M else kind
     return PointCloud(
         points=points.astype(kind),
         coordinates=coordinates,
-        normals=normals.astype(np.float32),
+        normals=None if normals is None else normals.astype(np.float32),
         intensity=intensity,
-        colors=_grey_colors(intensity, np.isfinite(z)),
+        colors=_grey_colors(intensity, np.isfinite(reading_m)),
         confidence=confidence,
+        time_s=camera.times_s,
+        ring=camera.rings,
     )
 
 
@@ -209,6 +235,78 @@ def lattice_normals(z: np.ndarray, rays: np.ndarray, radius: int = NORMAL_RADIUS
     arguments = (radius, limits, z, 1 / z, np.ascontiguousarray(rays, dtype=np.float64), normals)
     in_blocks(_fit_normals, len(z), *arguments, smallest=MIN_ROWS)
     return normals
+
+
+def ray_normals(
+    points: np.ndarray, origins: np.ndarray, directions: np.ndarray, pixel_rad: float, radius: int = NORMAL_RADIUS
+) -> np.ndarray:
+    """(h, w, 3) float64 unit normals towards the camera of points on rays that are no pinhole's; NaN where there is no
+    surface.
+
+    The method is that of `lattice_normals`, in the frame of each pixel's own ray: x to the right of the ray, y down and
+    z along it. Points whose rays are farther apart than their pixels are leave the fit.
+
+    Parameters
+    ----------
+    points, origins, directions : (h, w, 3) float, metres and unit, the points, and the rays that they lie on.
+    pixel_rad : float, radians, angle between neighbouring rays.
+    radius : pixels, see `NORMAL_RADIUS`.
+    """
+    steps = np.arange(-radius, radius + 1)
+    angles = np.hypot(*np.meshgrid(steps, steps)) * pixel_rad
+    limits = np.maximum(MAX_SLOPE * angles, STEP_FLOOR)
+    right, down = tangents(directions)
+    normals = np.empty(points.shape)
+    arrays = (np.ascontiguousarray(a, dtype=np.float64) for a in (points, origins, right, down, directions))
+    in_blocks(_fit_ray_normals, len(points), radius, limits, *arrays, normals, smallest=MIN_ROWS)
+    return normals
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _fit_ray_normals(start, stop, radius, limits, points, origins, right, down, along, normals):  # type: ignore[no-untyped-def]
+    """Write the normals of the rows from `start` to `stop`."""
+    h, w = points.shape[:2]
+    local = np.empty(3)
+    for row in range(start, stop):
+        for column in range(w):
+            range_m = 0.0
+            for k in range(3):
+                range_m += (points[row, column, k] - origins[row, column, k]) * along[row, column, k]
+            n = x = y = v = xx = xy = yy = xv = yv = 0.0
+            for i in range(max(0, row - radius), min(h, row + radius + 1)):
+                for j in range(max(0, column - radius), min(w, column + radius + 1)):
+                    local[:] = 0.0
+                    for k in range(3):
+                        d = points[i, j, k] - origins[row, column, k]
+                        local[0] += d * right[row, column, k]
+                        local[1] += d * down[row, column, k]
+                        local[2] += d * along[row, column, k]
+                    limit = limits[i - row + radius, j - column + radius] * range_m
+                    if abs(local[2] - range_m) <= limit and local[2] > 0:  # False if a range is NaN
+                        dx, dy, dv = local[0] / local[2], local[1] / local[2], 1 / local[2] - 1 / range_m
+                        n += 1
+                        x += dx
+                        y += dy
+                        v += dv
+                        xx += dx * dx
+                        xy += dx * dy
+                        yy += dy * dy
+                        xv += dx * dv
+                        yv += dy * dv
+            count = max(n, 1.0)
+            sxx, sxy, syy = xx - x * x / count, xy - x * y / count, yy - y * y / count
+            sxv, syv = xv - x * v / count, yv - y * v / count
+            determinant = sxx * syy - sxy * sxy
+            if n < 3 or not determinant > 1e-3 * sxx * syy:
+                normals[row, column] = np.nan
+                continue
+            a, b = (sxv * syy - syv * sxy) / determinant, (syv * sxx - sxv * sxy) / determinant
+            c = 1 / range_m + (v - a * x - b * y) / count
+            length = np.sqrt(a * a + b * b + c * c)
+            for k in range(3):
+                normals[row, column, k] = (
+                    -(a * right[row, column, k] + b * down[row, column, k] + c * along[row, column, k]) / length
+                )
 
 
 @cached_njit(nogil=True, error_model="numpy")

@@ -2,8 +2,9 @@
 """Point clouds written as binary PLY and PCD files.
 
 The fields are x, y and z, and normals, intensity, colours and confidence if the cloud has them, under the names that
-Open3D, PCL and MeshLab know. The numbers have single precision; points have the precision of the cloud. A comment line
-names the coordinate frame. `pcgraph.read_cloud` reads both formats.
+Open3D, PCL and MeshLab know. The numbers have single precision; points have the precision of the cloud. Clouds of
+scanning instruments also have time (seconds, double precision), ring and return_number (whole numbers). A comment
+line names the coordinate frame. `pcgraph.read_cloud` reads both formats.
 """
 
 from __future__ import annotations
@@ -19,6 +20,14 @@ from rangesim.point_cloud import PointCloud
 _PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short",
               "u4": "uint", "i4": "int"}  # fmt: skip
 """Names of number types in PLY files, by NumPy's codes."""
+
+
+_PCD_TYPES = {"f": "F", "u": "U", "i": "I"}
+"""Names of kinds of numbers in PCD files, by NumPy's codes."""
+_SCAN_FIELDS = {"time_s": ("time", "<f8"), "ring": ("ring", "<u2"), "return_number": ("return_number", "u1")}
+"""Names of the fields of scanning instruments in both formats and their types in PCD, by the names of the arrays."""
+_PLY_KINDS = {"<u2": "<i4"}
+"""Types in PLY that differ from those in PCD: Open3D skips a property of 16 bits in PLY, and warns."""
 
 
 def save_point_cloud(cloud: PointCloud, path: str | Path) -> None:
@@ -62,6 +71,10 @@ def _table(cloud: PointCloud, pcd: bool) -> np.ndarray:
         (name, place if name in ("x", "y", "z") else "u1" if v.dtype == np.uint8 else "<f4")
         for name, v in columns.items()
     ]
+    for array, (name, kind) in _SCAN_FIELDS.items():
+        if array in cloud.attributes():
+            columns[name] = cloud.attributes()[array]
+            kinds.append((name, kind if pcd else _PLY_KINDS.get(kind, kind)))
     table = np.empty(cloud.points.size // 3, dtype=kinds)
     for name, values in columns.items():
         table[name] = values.ravel()
@@ -83,13 +96,14 @@ def _pcd_bytes(cloud: PointCloud) -> bytes:
     table = _table(cloud, pcd=True)
     shape = cloud.points.shape[:-1]
     height, width = shape if len(shape) == 2 else (1, shape[0])
-    names, sizes = zip(*((name, table.dtype[name].itemsize) for name in table.dtype.names or ()), strict=True)
+    names = table.dtype.names or ()
+    kinds = [table.dtype[name] for name in names]
     lines = [
         f"# .PCD v0.7 - coordinates {cloud.coordinates}, metres",
         "VERSION 0.7",
         "FIELDS " + " ".join(names),
-        "SIZE " + " ".join(map(str, sizes)),
-        "TYPE " + " ".join("F" for _ in names),
+        "SIZE " + " ".join(str(kind.itemsize) for kind in kinds),
+        "TYPE " + " ".join(_PCD_TYPES[kind.kind] for kind in kinds),
         "COUNT " + " ".join("1" for _ in names),
         f"WIDTH {width}",
         f"HEIGHT {height}",

@@ -56,7 +56,7 @@ def render_calibration(found: RigCalibration, names: Sequence[str], images: Sequ
 
 def context(found: RigCalibration, names: list[str], images: Sequence[np.ndarray] | None) -> dict[str, Any]:
     """Values of the variables of the template, by name."""
-    camera, projector = found.rig.camera, found.rig.projector
+    camera, projector = found.rig.pinhole, found.rig.image_projector
     devices = [
         _device("camera", camera, found.camera_deviations, found.camera_views, found.camera_residuals),
         _device("projector", projector, found.projector_deviations, found.projector_views, found.projector_residuals),
@@ -173,7 +173,7 @@ def _boards(found: RigCalibration, names: list[str]) -> list[dict[str, Any]]:
 
 def _view(found: RigCalibration, k: int, name: str, image: np.ndarray | None) -> dict[str, Any]:
     """Image of capture k with the errors of its corners, as the template shows it."""
-    camera, view = found.rig.camera, found.camera_views[k]
+    camera, view = found.rig.pinhole, found.camera_views[k]
     picture = None
     if image is not None:
         every = max(1, round(camera.width / SHOWN_WIDTH))
@@ -194,8 +194,8 @@ def _verdict(
     """Sentences at the top of the page, each in two parts: its subject, which is shown in bold, and the rest."""
     lines = []
     for device, deviations, said in (
-        (found.rig.camera, found.camera_deviations, devices[0]),
-        (found.rig.projector, found.projector_deviations, devices[1]),
+        (found.rig.pinhole, found.camera_deviations, devices[0]),
+        (found.rig.image_projector, found.projector_deviations, devices[1]),
     ):
         focal = 100 * float((deviations[:2] / [device.fx, device.fy]).max())
         lines.append(

@@ -14,6 +14,7 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.files.image_files import PNG_STRATEGY
 from rangesim.report import palette
 from rangesim.results.experiment_results import Measurement
+from rangesim.rig.scan_patterns import column_shifts
 from rangesim.signals import EnergySplit, GroundTruth
 
 GAMMA = 2.2
@@ -138,6 +139,63 @@ def depth_map(measurement: Measurement, limits: tuple[float, float], table: np.n
     """
     low, high = limits
     return color_map((measurement.image.z - low) / (high - low), table)
+
+
+MAX_STRIP = 3.0
+"""Largest ratio of width to height of the picture of a turn; a longer one is cut into strips, one below the other. With
+3, a turn of 64 rings over 45 degrees and 1024 columns becomes two strips of 512 pixels, as wide as other maps."""
+MAX_ROW_REPEATS = 8
+"""Largest number of pixel rows per ring in the picture of a turn: a scanner of few rings still has stripes then."""
+
+
+def unrolled(ranges: np.ndarray, directions: np.ndarray) -> Picture:
+    """Picture of a turn of a scanner, unrolled: a row for each ring, the highest at the top, a column per direction.
+
+    Columns follow each other as the scanner turned. A long picture is cut into strips, one below the other.
+
+    Parameters
+    ----------
+    ranges : (h, w) float, metres; NaN where there is no reading.
+    directions : (h, w, 3) float64, unit vectors, coordinates of the scanner (x right, y down, z forward).
+
+    Examples
+    --------
+    >>> from rangesim.report.figures import unrolled
+    >>> from rangesim.rig.scan_patterns import spinning
+    >>> rays = spinning(np.radians([10.0, 0.0, -10.0]), columns=360, period_s=0.1, first_azimuth_rad=-np.pi)
+    >>> unrolled(np.ones((3, 360)), rays.directions).caption
+    'Range over a turn of the scanner, unrolled: 3 rings, 360° from azimuth -180°, 1.0 m (dark) to 1.0 m (bright).'
+    """
+    shifts = column_shifts(directions)
+    rows = np.argsort(-np.arcsin(np.clip(-directions[..., 1], -1, 1)).mean(axis=1), kind="stable")
+    source = (np.arange(ranges.shape[1]) - shifts[:, None]) % ranges.shape[1]
+    image = np.take_along_axis(ranges, source, axis=1)[rows].astype(np.float64)
+    repeats = _rows_per_ring(directions)
+    image = np.log(np.where(image > 0, image, np.nan)).repeat(repeats, axis=0)
+    strips = 1
+    while image.shape[1] / strips > MAX_STRIP * image.shape[0] * strips:
+        strips += 1
+    padded = np.pad(image, ((0, 0), (0, -image.shape[1] % strips)), constant_values=np.nan)
+    gap = np.full((2, padded.shape[1] // strips), np.nan)
+    parts = [part for strip in np.split(padded, strips, axis=1) for part in (strip, gap)][:-1]
+    folded = np.concatenate(parts)
+    measured = np.isfinite(folded).any()
+    azimuths = np.unwrap(np.arctan2(directions[shifts.argmin(), :, 0], directions[shifts.argmin(), :, 2]))
+    first, arc = np.degrees((azimuths[0], (azimuths[-1] - azimuths[0]) * len(azimuths) / max(len(azimuths) - 1, 1)))
+    low, high = np.exp(np.nanpercentile(folded, [1, 99])) if measured else (np.nan, np.nan)
+    caption = f"Range over a turn of the scanner, unrolled: {len(ranges)} rings, {arc:.0f}° from azimuth {first:.0f}°"
+    caption += f", {low:.1f} m (dark) to {high:.1f} m (bright)." if measured else ", no reading."
+    fraction = _stretched(folded) if measured else folded
+    return Picture(png(*_indexed(fraction, palette.color_table("viridis"))), caption, "the turn, unrolled")
+
+
+def _rows_per_ring(directions: np.ndarray) -> int:
+    """Pixel rows per ring for which angles are about as large upwards as sideways."""
+    if min(directions.shape[:2]) < 2:
+        return MAX_ROW_REPEATS
+    upwards = np.abs(np.diff(np.sort(np.arcsin(np.clip(directions[:, 0, 1], -1, 1))))).mean()
+    sideways = np.linalg.norm(np.diff(directions[:1], axis=1), axis=-1).mean()
+    return int(np.clip(np.rint(upwards / max(sideways, 1e-12)), 1, MAX_ROW_REPEATS))
 
 
 def error_map(measurement: Measurement, table: np.ndarray) -> str:

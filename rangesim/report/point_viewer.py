@@ -49,8 +49,7 @@ def packed_measurement(m: Measurement, title: str, view: int, far_m: float) -> d
     intensity, status, cause : uint8.
     segmentation : supervoxels as uint16 or uint32, 0 without a point, else index + 1; and their tree. None: no points.
     """
-    camera = m.image.camera
-    assert camera is not None  # every measurement of an experiment has its rig
+    camera = m.image.pinhole
     drawn = m.image.valid & (m.image.z < far_m)
     near = float(m.image.z[drawn].min()) if drawn.any() else 0.0
     step = max((far_m - near) / 65534, 1e-6)

@@ -56,8 +56,7 @@ def context(result: ScanResult) -> dict[str, Any]:
     """Values of the variables of the template, by name."""
     error = palette.color_table("RdBu_r")
     truth = TriangleMesh.joined(list(result.surfaces.values()))
-    camera = result.scan.images[0].camera
-    assert camera is not None
+    camera = result.scan.images[0].pinhole
     camera = camera.resized(WIDTH_PX, max(1, round(WIDTH_PX * camera.height / camera.width)))
     number = len(result.scan)
     places = _places(result)
@@ -95,8 +94,7 @@ def _places(result: ScanResult) -> list[int]:
 
 def _line(result: ScanResult) -> str:
     """The settings of the scan in one line."""
-    camera = result.scan.images[0].camera
-    assert camera is not None
+    camera = result.scan.images[0].pinhole
     s, fused = result.settings, result.fused
     known = "poses known" if s.registration == "known" else "poses found from the readings"
     return (

@@ -13,6 +13,7 @@ import numpy as np
 from rangesim.capture import Capture, CaptureSet
 from rangesim.decoding.disparities import Disparities, ImageNoise, match_capture
 from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.working_range import WorkingRange
 from rangesim.geometry.dense_stereo import DenseMatching
 from rangesim.geometry.stereo import rectify
 from rangesim.response import DenseResponse, Dots, Images, Response
@@ -154,6 +155,7 @@ class StereoDecoder(Decoder):
     step_px : disparities are rounded to multiples of this, pixels; 0: they are not. Real devices have steps of 1/8 to
         1/32 pixel.
     noise : ImageNoise, where the detector is not known.
+    working_range : WorkingRange, outside which readings are refused; None: all are kept.
 
     Examples
     --------
@@ -166,6 +168,7 @@ class StereoDecoder(Decoder):
     disparities: Annotated[int, Bounds("a number of disparities", 2, 4096)] = 128
     step_px: Annotated[float, Bounds("pixels", 0, 16)] = 0.0
     noise: ImageNoise = field(default_factory=ImageNoise)
+    working_range: WorkingRange | None = None
 
     type_name: ClassVar[str] = "stereo"
     reads: ClassVar[type[Sensor]] = ActiveStereo
@@ -180,7 +183,7 @@ class StereoDecoder(Decoder):
         pair = None
         if first.rig is not None and second.rig is not None:
             T_second_first = np.linalg.inv(second.rig.T_world_camera) @ first.rig.T_world_camera
-            pair = rectify(first.rig.camera, second.rig.camera, T_second_first)
+            pair = rectify(first.rig.pinhole, second.rig.pinhole, T_second_first)
         frame = second.frames.mean(axis=0, dtype=np.float32)
         noise = self.noise.of(second, frame) / np.sqrt(len(second.frames))
         searched = self.least_px, self.least_px + self.disparities
@@ -190,7 +193,8 @@ class StereoDecoder(Decoder):
 
     def decode(self, capture: CaptureSet) -> RangeImage:  # type: ignore[override]  # of two cameras
         """Range image of the first camera, from captures of two cameras."""
-        return self.coordinates(capture).range_image(capture.reference.rig)
+        image = self.coordinates(capture).range_image(capture.reference.rig)
+        return image if self.working_range is None else self.working_range.applied_to(image)
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         """Least light whose dots locate a match to `matching.max_sigma_px`, if a camera's pixel is as wide as a

@@ -151,7 +151,11 @@ def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
     if not issubclass(cls, Named):
         return cls
     own = getattr(cls, "type_name", None)
-    choices: dict[str, type[Any]] = {own: cls} if own else cls.known
+    if not own and dataclasses.is_dataclass(cls):  # the untagged member itself
+        return cls
+    if not own and "type" not in values and cls.untagged is not None:
+        return cls.untagged
+    choices: dict[str, type[Any]] = {own: cls} if own else {k: v for k, v in cls.known.items() if issubclass(v, cls)}
     tag = values.pop("type", own)
     if not isinstance(tag, str) or tag not in choices:
         raise ValueError(
@@ -185,9 +189,14 @@ class Named:
     type_name: typing.ClassVar[str]
     known: typing.ClassVar[dict[str, type[Any]]]
     """Classes of the family by `type_name`, in the order of their definition; every family has its own."""
+    untagged: typing.ClassVar[type[Any] | None] = None
+    """The member whose tables have no key `type`, because files with such tables are older than the family."""
 
-    def __init_subclass__(cls) -> None:
+    def __init_subclass__(cls, untagged: bool = False) -> None:
         super().__init_subclass__()
+        if untagged:
+            family = next(kind for kind in cls.__mro__ if "known" in vars(kind))
+            family.untagged = cls  # type: ignore[attr-defined]
         if "known" in vars(cls) or not hasattr(cls, "type_name"):
             return
         name = cls.type_name
@@ -235,8 +244,9 @@ def _value(hint: Any, value: Any, where: str) -> Any:
         raise ValueError(
             f"{where}: expected one of {', '.join(valid)}, got {shown(value)}{nearest(str(value), valid)}."
         )
-    is_table = isinstance(value, Mapping)
-    if isinstance(hint, type) and (dataclasses.is_dataclass(hint) or (issubclass(hint, Named) and is_table)):
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return from_dict(hint, value, where)
+    if isinstance(hint, type) and issubclass(hint, Named) and isinstance(value, Mapping):
         return from_dict(hint, value, where)
     if get_origin(hint) is tuple and dataclasses.is_dataclass(get_args(hint)[0]):
         return tuple(from_dict(get_args(hint)[0], v, f"{where}[{i}]") for i, v in enumerate(value))

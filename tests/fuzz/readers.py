@@ -183,6 +183,12 @@ def _experiment(path: Path, _: Arguments) -> Any:
     return load_experiment(path)
 
 
+def _device(path: Path, _: Arguments) -> Any:
+    from rangesim import presets
+
+    return presets.describe(path)
+
+
 def _calibration(path: Path, _: Arguments) -> Any:
     import rangesim
 
@@ -199,6 +205,19 @@ def _tof_calibration(path: Path, _: Arguments) -> Any:
     from rangesim.calibration import load_tof_calibration
 
     return load_tof_calibration(path)
+
+
+def _ouster(path: Path, _: Arguments) -> Any:
+    from rangesim.recordings import read_ouster
+
+    beside = path.with_name("drive.json")  # whatever the recording is called
+    return read_ouster(path, beside if beside.exists() else None)
+
+
+def _kitti(path: Path, _: Arguments) -> Any:
+    from rangesim.recordings import read_kitti
+
+    return read_kitti(path)
 
 
 def _result(path: Path, _: Arguments) -> Any:
@@ -287,6 +306,23 @@ def _rig_is_finite(rig: Any) -> None:
 
     assert np.isfinite(rig.T_camera_projector).all()
     assert np.isfinite(rig.camera.directions([0.5, 0.5])[..., 2]).all()
+
+
+def _is_sweep(sweep: Any) -> None:
+    import numpy as np
+
+    k, h, w = sweep.range_m.shape
+    assert (k, h, w) == (sweep.returns, *sweep.rays.times_s.shape)
+    assert np.isfinite(sweep.time_s).any()
+    assert not np.isfinite(sweep.range_m[..., np.isnan(sweep.time_s)]).any()
+    assert len(sweep.to_point_cloud(return_number=None).points) == np.isfinite(sweep.range_m).sum()
+
+
+def _rings_agree(cloud: Any) -> None:
+    import numpy as np
+
+    assert np.isfinite(cloud.points).all()
+    assert cloud.ring is None or cloud.ring.shape == cloud.points.shape[:-1]
 
 
 # --- the list ---------------------------------------------------------------------------------------------------------
@@ -543,6 +579,7 @@ READERS = {
         Reader("capture", _capture, seeds.captures, ("*.json", "*.json", "*/00*.*"), (_sidecar_trees,)),
         Reader("capture-decoded", _decoded, seeds.captures, ("*.json",), (_sidecar_trees,), share=0.5),
         Reader("experiment", _experiment, seeds.experiments, by_hand=(hostile.toml_files,)),
+        Reader("device", _device, seeds.devices, share=0.5),
         Reader("calibration-json", _calibration, seeds.rig_files, by_hand=(hostile.json_trees,), check=_rig_is_finite),
         Reader(
             "calibration-xml", _calibration, seeds.opencv_files, by_hand=(hostile.opencv_calibrations,),
@@ -550,6 +587,8 @@ READERS = {
         ),
         Reader("opencv-rig", _opencv_rig, seeds.opencv_rig_files, share=0.3, check=_rig_is_finite),
         Reader("tof-calibration", _tof_calibration, seeds.tof_calibrations, by_hand=(hostile.npz_files,), share=0.3),
+        Reader("ouster", _ouster, seeds.lidar_recordings, ("*.pcap", "*.json"), (_sidecar_trees,), check=_is_sweep),
+        Reader("kitti", _kitti, seeds.kitti_sweeps, check=_rings_agree),
         Reader("signals", _signals, seeds.signals_files, by_hand=(hostile.npz_files,), share=0.3),
         Reader("range-image", _range_image, seeds.range_image_files, by_hand=(hostile.npz_files,), share=0.3),
         *(

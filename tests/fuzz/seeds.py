@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import json
 import tempfile
 from collections.abc import Callable
 from functools import cache, partial
@@ -182,6 +183,17 @@ sensor = "ideal-tof"
     return seeds | {"every sensor": of_file("experiment.toml", (every + SPAD).encode())}
 
 
+def devices() -> Seeds:
+    """Files of devices, one of each kind of sensor."""
+    from rangesim import presets
+
+    found = {presets.load(name).sensor.type_name: name for name in presets.names()}
+    texts = {
+        n: presets.describe(n).text.replace("[instrument]\n", '[instrument]\nname = "one"\n') for n in found.values()
+    }
+    return {name: of_file("device.toml", text.encode()) for name, text in texts.items()}
+
+
 # --- calibrations and models ------------------------------------------------------------------------------------------
 
 
@@ -246,6 +258,31 @@ def tof_calibrations() -> Seeds:
         stereo_rig(12, 8), sensor, sensor.default_decoder, (4, 8), series, -series, np.zeros((8, 12)), **numbers
     )
     return {"tof": of_file("tof.npz", written("tof.npz", found.save))}
+
+
+def lidar_recordings() -> Seeds:
+    """Recordings of an Ouster sensor: whole datagrams with one header, fragments and two returns with the other."""
+    import made_recordings as made
+
+    whole = of_file(
+        "drive.pcap", made.recording(made.small_turns()), **{"drive.json": json.dumps(made.metadata()).encode()}
+    )
+    block = made.dual((2000, 5000), (10, 20), (30, 40), 50)
+    payload = made.packet(70_000, [made.column(j, 10**6 * j, [block] * 4) for j in range(8)], is_safety=True)
+    data = made.nested(made.metadata(columns=8, profile="RNG19_RFL8_SIG16_NIR16_DUAL"))
+    fragments = made.pcap(made.ip_packets(payload, largest=400))
+    return {
+        "whole": whole,
+        "fragments": of_file("drive.pcap", fragments, **{"drive.json": json.dumps(data).encode()}),
+    }
+
+
+def kitti_sweeps() -> Seeds:
+    """A sweep of three rings."""
+    azimuth, elevation = np.meshgrid(np.linspace(0.1, 6.2, 40), np.radians([2.0, -3.0, -8.0]))
+    across = 10 + 3 * np.cos(2 * azimuth)
+    columns = [across * np.cos(azimuth), across * np.sin(azimuth), 0.2 + across * np.tan(elevation), 0.01 * across]
+    return {"rings": of_file("000000.bin", np.stack(columns, axis=-1).astype("<f4").tobytes())}
 
 
 def edge_models() -> Seeds:

@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What real LiDARs recorded: packets of Ouster sensors, sweeps of KITTI."""
+
+from rangesim.recordings.kitti import Rings, read_kitti, rings_of_order
+from rangesim.recordings.lidar_sweep import LidarSweep
+from rangesim.recordings.ouster import OusterMetadata, load_ouster_metadata, ouster_sweeps, read_ouster
+from rangesim.recordings.pcap import Datagram, datagrams
+
+__all__ = [
+    "Datagram",
+    "LidarSweep",
+    "OusterMetadata",
+    "Rings",
+    "datagrams",
+    "load_ouster_metadata",
+    "ouster_sweeps",
+    "read_kitti",
+    "read_ouster",
+    "rings_of_order",
+]
