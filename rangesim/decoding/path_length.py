@@ -46,23 +46,6 @@ def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Ri
         return np.asarray(np.where(length > np.linalg.norm(b), result, np.nan))
 
 
-def range_slope(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
-    """(...) float64, derivative of `range_from_path_length` by the length; 1/2 without a baseline.
-
-    Examples
-    --------
-    >>> from rangesim.rig import Intrinsics, Rig
-    >>> device = Intrinsics(640, 480, 800, 800, 320, 240)
-    >>> range_slope(np.array([1.8]), np.array([[0.0, 0.0, 1.0]]), Rig(device, device))
-    array([0.5])
-    """
-    b = rig.T_camera_projector[:3, 3]
-    d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    length, along = np.asarray(length_m, dtype=np.float64), d @ b
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray((length**2 - 2 * length * along + b @ b) / (2 * (length - along) ** 2))
-
-
 def range_along_ray(length_m: np.ndarray, directions: np.ndarray, emitters: np.ndarray) -> np.ndarray:
     """(...) float64, as `range_from_path_length`, for rays whose emitters stand at other places beside them.
 
@@ -87,6 +70,20 @@ def emitter_offsets(rig: Rig) -> np.ndarray:
     return np.asarray(right * emitter.offset_m[0] + down * emitter.offset_m[1])
 
 
+def range_slope(length_m: np.ndarray, directions: np.ndarray, emitters: np.ndarray) -> np.ndarray:
+    """(...) float64, derivative of `range_along_ray` by the length; 1/2 without a baseline.
+
+    Examples
+    --------
+    >>> range_slope(np.array([1.8]), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)))
+    array([0.5])
+    """
+    length, along = np.asarray(length_m, dtype=np.float64), np.sum(directions * emitters, axis=-1)
+    b2 = np.sum(emitters**2, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray((length**2 - 2 * length * along + b2) / (2 * (length - along) ** 2))
+
+
 class LengthReturns(NamedTuple):
     """All returns of each pixel, before any geometry; (k, h, w) each, nearest first.
 
@@ -104,11 +101,15 @@ class LengthReturns(NamedTuple):
         """The returns as ranges from the camera; without a rig, half of the lengths."""
         range_m, sigma_m = np.empty((2, *self.length_m.shape), dtype=np.float32)
         status = self.status.astype(np.uint8)
+        directions = emitters = None
+        if rig is not None:
+            directions, emitters = rig.camera.pixel_rays().directions, emitter_offsets(rig)
         for rows in bands(self.length_m.shape[1]):
             length = self.length_m[:, rows]
             along_ray, slope = length / 2, np.full(length.shape, 0.5)
-            if rig is not None:
-                along_ray, slope = _ranges(length, rows, rig), _slopes(length, rows, rig)
+            if directions is not None and emitters is not None:
+                along_ray = range_along_ray(length, directions[rows], emitters[rows])
+                slope = range_slope(length, directions[rows], emitters[rows])
             is_behind = ~(np.nan_to_num(along_ray, nan=-1.0) > 0)
             status[:, rows][is_behind & (status[:, rows] == Status.OK)] = Status.OUT_OF_RANGE
             range_m[:, rows] = np.where(is_behind, np.nan, along_ray)
@@ -181,13 +182,3 @@ def _ranges(length_m: np.ndarray, rows: slice, rig: Rig) -> np.ndarray:
     rays = rig.camera.pixel_rays()
     emitters = emitter_offsets(rig)[rows]
     return range_along_ray(length_m, rays.directions[rows], emitters)
-
-
-def _slopes(length_m: np.ndarray, rows: slice, rig: Rig) -> np.ndarray:
-    """(..., rows, w) float64, derivative of the ranges of some rows by their path lengths; 1/2 without a baseline."""
-    if isinstance(rig.camera, Intrinsics):
-        return range_slope(length_m, rig.camera.directions(rig.camera.pixel_centres(rows)), rig)
-    emitters = emitter_offsets(rig)[rows]
-    b2, along = np.sum(emitters**2, axis=-1), np.sum(rig.camera.pixel_rays().directions[rows] * emitters, axis=-1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray((length_m**2 - 2 * length_m * along + b2) / (2 * (length_m - along) ** 2))

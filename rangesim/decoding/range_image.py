@@ -127,13 +127,12 @@ class RangeImage(ShortRepr):
                 "expected a range image with all returns; decode with a decoder that looks for several, such as "
                 "DirectToFDecoder(max_returns=3)."
             )
-        away = 1.0
-        if isinstance(self.camera, Intrinsics):
-            away = np.linalg.norm(self.camera.directions(self.camera.pixel_centres()), axis=-1)
         clouds = []
         for i, range_m in enumerate(self.returns.range_m):
-            reading = np.where(self.returns.status[i] == Status.OK, range_m / away, np.nan).astype(np.float32)
-            strength, number = self.returns.strength[i], np.full(reading.shape, i + 1, dtype=np.uint8)
+            found = np.where(self.returns.status[i] == Status.OK, range_m, np.nan)
+            z = self.camera.z_of(found).astype(np.float32)
+            reading = self.camera.reading(replace(self, z=z, range_m=found.astype(np.float32)))
+            strength, number = self.returns.strength[i], np.full(z.shape, i + 1, dtype=np.uint8)
             cloud = organised_cloud(reading, self.camera, self.T_world_camera, strength, strength, coordinates)
             clouds.append(replace(cloud, confidence=None, return_number=number).finite())
         arrays = {name: np.concatenate([getattr(c, name) for c in clouds]) for name in clouds[0].attributes()}

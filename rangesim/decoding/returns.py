@@ -123,13 +123,20 @@ class FoundReturns(NamedTuple):
     sigma: np.ndarray
 
 
-def find_returns(histogram: np.ndarray, shape: PulseShape, rules: ReturnRules, is_cyclic: bool = False) -> FoundReturns:
+def find_returns(
+    histogram: np.ndarray,
+    shape: PulseShape,
+    rules: ReturnRules,
+    is_cyclic: bool = False,
+    excess: np.ndarray | None = None,
+) -> FoundReturns:
     """Returns of each histogram, nearest first.
 
     Parameters
     ----------
     histogram : (k, n) float, counts without pile-up, one histogram per column.
     is_cyclic : whether the first bin follows on the last one.
+    excess : (k, n) float, variance of the counts over their means, as `coates_excess` tells it; None: 1, as of photons.
 
     Examples
     --------
@@ -147,7 +154,8 @@ def find_returns(histogram: np.ndarray, shape: PulseShape, rules: ReturnRules, i
     place, strength, sigma = np.empty((3, rules.most, histogram.shape[1]))
     distance = max(SPARROW_SIGMAS * shape.sigma, MIN_DISTANCE_BINS)
     counts = np.ascontiguousarray(histogram, dtype=np.float64)
-    fit_returns(counts, shape, rules, bool(is_cyclic), distance, place, strength, sigma)
+    ratio = np.ones((1, 1)) if excess is None else np.ascontiguousarray(excess, dtype=np.float64)
+    fit_returns(counts, ratio, shape, rules, bool(is_cyclic), distance, place, strength, sigma)
     return FoundReturns(place, strength, sigma)
 
 

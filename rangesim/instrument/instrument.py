@@ -13,7 +13,7 @@ import numpy as np
 
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.motion import Timing
-from rangesim.rig import CAMERA_LENS, PROJECTOR_LENS, Beam, Camera, Intrinsics, Lens, Optics, pose
+from rangesim.rig import CAMERA_LENS, PROJECTOR_LENS, Beam, Camera, CoverGlass, Intrinsics, Lens, Optics, pose
 from rangesim.sensors import Decoder, Sensor, check_sensor, is_file_name, sensor_from_dict
 from rangesim.settings.bounds import Metres, Seconds, Watts, Wavelength, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, on_top_of, shown, to_dict
@@ -59,6 +59,7 @@ class Instrument:
     exposure_s : exposure of each frame, seconds; None: automatic.
     camera_lens, projector_lens : Lens, aperture, focus and vignetting.
     timing : Timing, the times at which frames are taken, for an experiment in which something moves.
+    cover_glass : CoverGlass, the window in front of the device; None: it returns no light.
 
     Raises
     ------
@@ -93,6 +94,7 @@ class Instrument:
     projector: Optics | None = None
     T_camera_projector: np.ndarray | None = None
     wavelength_m: Wavelength | None = None
+    cover_glass: CoverGlass | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -163,6 +165,7 @@ class Instrument:
             projector=self.projector or rig.projector,
             T_camera_projector=np.eye(4) if isinstance(self.projector, Beam) else T_camera_projector,
             wavelength_m=self.emitter_wavelength_m,
+            cover_glass=self.cover_glass,
         )
 
 

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from rangesim.rig.poses import Array
 from rangesim.settings.config import Named, shown
@@ -86,6 +86,12 @@ class Camera(Optics):
     @property
     def times_s(self) -> Array | None:
         """(h, w) float64, seconds from the start of an image, when each ray is measured; None: all at once."""
+        return None
+
+    @property
+    def rings(self) -> NDArray[np.uint16] | None:
+        """(h, w) uint16, the beam of a turning head that measures each ray, if the rows are its rings; None: they are
+        not."""
         return None
 
     def pixel_centres(self, rows: slice = slice(None)) -> Array:

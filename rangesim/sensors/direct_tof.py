@@ -11,7 +11,15 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.decoding.histogram import coates, find_peak, place_sigma, pulses_left, runs_out, window_reach
+from rangesim.decoding.histogram import (
+    coates,
+    coates_excess,
+    find_peak,
+    place_sigma,
+    pulses_left,
+    runs_out,
+    window_reach,
+)
 from rangesim.decoding.path_length import LengthReturns, PathLengths
 from rangesim.decoding.returns import PulseShape, ReturnRules, find_returns
 from rangesim.decoding.status import Status
@@ -386,8 +394,10 @@ class DirectToFDecoder(Decoder):
         def measure(start: int, stop: int, rules: ReturnRules) -> None:
             for row in range(start, stop):
                 frames = capture.frames[:, row]
-                histogram = frames.astype(np.float64) if pulses is None else coates(frames, pulses)
-                found = find_returns(np.nan_to_num(histogram), sensor.shape, rules, sensor.is_cyclic)
+                histogram, excess = frames.astype(np.float64), None
+                if pulses is not None:
+                    histogram, excess = coates(frames, pulses), coates_excess(frames, pulses)
+                found = find_returns(np.nan_to_num(histogram), sensor.shape, rules, sensor.is_cyclic, excess)
                 place[:, row], strength[:, row], sigma[:, row] = found
                 intensity[row] = frames.sum(axis=0, dtype=np.float64)
                 if pulses is not None:
@@ -401,18 +411,22 @@ class DirectToFDecoder(Decoder):
         in_blocks(measure, height, rules, smallest=MIN_ROWS)
         length = (sensor.start_s + place * sensor.bin_s) * SPEED_OF_LIGHT
         status = np.where(np.isfinite(place), Status.OK, Status.LOW_SIGNAL)
-        if pulses is not None:
-            status[runs_out(kept, pulses) & np.isfinite(place)] = Status.SATURATED
-            sigma *= np.sqrt(pulses / np.maximum(kept, 1))  # Coates' correction adds to the variance of counts
+        ran_out = np.zeros(place.shape, dtype=bool) if pulses is None else runs_out(kept, pulses) & np.isfinite(place)
+        status[ran_out] = Status.SATURATED
         is_outside = (place < 0) | (place > sensor.bins) | (length < 2 * self.min_range_m)
         status[is_outside] = Status.OUT_OF_RANGE
         if capture.detector is None:
             sigma[:] = np.nan
         returns = LengthReturns(length, sigma * sensor.bin_s * SPEED_OF_LIGHT, strength, status.astype(np.uint8))
-        return self._read(returns, intensity, capture)
+        return self._read(returns, np.asarray(ran_out.any(axis=0)), intensity, capture)
 
-    def _read(self, returns: LengthReturns, intensity: np.ndarray, capture: Capture) -> PathLengths:
-        """The reading of each pixel: the first, the strongest or the last of the returns that are targets."""
+    def _read(
+        self, returns: LengthReturns, ran_out: np.ndarray, intensity: np.ndarray, capture: Capture
+    ) -> PathLengths:
+        """The reading of each pixel: the first, the strongest or the last of the returns that are targets.
+
+        ran_out : (h, w) bool, where the pulses ran out within a return, be it that of the cover glass.
+        """
         is_target = (returns.status == Status.OK) | (returns.status == Status.SATURATED)
         number = np.arange(len(is_target), dtype=np.float64)[:, None, None]
         merit = {"strongest": returns.strength, "first": -number, "last": number}[self.reading]
@@ -421,7 +435,8 @@ class DirectToFDecoder(Decoder):
         has_target = is_target.any(axis=0)
         near = np.where(returns.status == Status.OUT_OF_RANGE, returns.strength, 0.0).sum(axis=0)
         least = self.cover_glass_counts + self.peak_sigmas * np.sqrt(self.cover_glass_counts)
-        status = np.where(has_target, status, np.where(near > least, Status.OUT_OF_RANGE, Status.LOW_SIGNAL))
+        without = np.where(near > least, Status.OUT_OF_RANGE, Status.LOW_SIGNAL)
+        status = np.where(has_target, status, np.where(ran_out, Status.SATURATED, without))
         status[capture.saturated(capture.frames)] = Status.SATURATED
         strength = np.where(has_target, strength, 0.0)
         is_one = self.max_returns == 1 and self.min_range_m == 0
