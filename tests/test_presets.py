@@ -16,7 +16,7 @@ import pytest
 from delta_scenes import matte, scene_of, wall
 from synthetic import signals_of_depth
 
-from rangesim import Intrinsics, RayTable, Rig, Status, decode, expose, presets, transport
+from rangesim import Beam, Intrinsics, RayTable, Rig, Status, decode, expose, presets, transport
 from rangesim.cli import main
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
