@@ -15,10 +15,6 @@ from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.rig import Beam, Intrinsics, Rig, tangents
 
-SMALL_M = 1e-4
-"""Change of a path length, metres, by which the slope of ranges over lengths is told: small beside every baseline, and
-large beside the rounding of double precision."""
-
 
 def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
     """(...) float64, ranges in metres along camera rays at which the path emitter -> point -> camera has this length.
@@ -74,6 +70,20 @@ def emitter_offsets(rig: Rig) -> np.ndarray:
     return np.asarray(right * emitter.offset_m[0] + down * emitter.offset_m[1])
 
 
+def range_slope(length_m: np.ndarray, directions: np.ndarray, emitters: np.ndarray) -> np.ndarray:
+    """(...) float64, derivative of `range_along_ray` by the length; 1/2 without a baseline.
+
+    Examples
+    --------
+    >>> range_slope(np.array([1.8]), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)))
+    array([0.5])
+    """
+    length, along = np.asarray(length_m, dtype=np.float64), np.sum(directions * emitters, axis=-1)
+    b2 = np.sum(emitters**2, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray((length**2 - 2 * length * along + b2) / (2 * (length - along) ** 2))
+
+
 class LengthReturns(NamedTuple):
     """All returns of each pixel, before any geometry; (k, h, w) each, nearest first.
 
@@ -91,13 +101,15 @@ class LengthReturns(NamedTuple):
         """The returns as ranges from the camera; without a rig, half of the lengths."""
         range_m, sigma_m = np.empty((2, *self.length_m.shape), dtype=np.float32)
         status = self.status.astype(np.uint8)
+        directions = emitters = None
+        if rig is not None:
+            directions, emitters = rig.camera.pixel_rays().directions, emitter_offsets(rig)
         for rows in bands(self.length_m.shape[1]):
             length = self.length_m[:, rows]
             along_ray, slope = length / 2, np.full(length.shape, 0.5)
-            if rig is not None:
-                along_ray = np.stack([_ranges(one, rows, rig) for one in self.length_m])
-                beyond = np.stack([_ranges(one + SMALL_M, rows, rig) for one in self.length_m])
-                slope = (beyond - along_ray) / SMALL_M
+            if directions is not None and emitters is not None:
+                along_ray = range_along_ray(length, directions[rows], emitters[rows])
+                slope = range_slope(length, directions[rows], emitters[rows])
             is_behind = ~(np.nan_to_num(along_ray, nan=-1.0) > 0)
             status[:, rows][is_behind & (status[:, rows] == Status.OK)] = Status.OUT_OF_RANGE
             range_m[:, rows] = np.where(is_behind, np.nan, along_ray)

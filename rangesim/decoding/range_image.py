@@ -129,10 +129,11 @@ class RangeImage(ShortRepr):
             )
         clouds = []
         for i, range_m in enumerate(self.returns.range_m):
-            ok = np.where(self.returns.status[i] == Status.OK, range_m, np.float32(np.nan))
-            one = replace(self, range_m=ok, z=self.camera.z_of(ok).astype(np.float32))
-            strength, number = self.returns.strength[i], np.full(ok.shape, i + 1, dtype=np.uint8)
-            cloud = organised_cloud(one.reading_m, self.camera, self.T_world_camera, strength, strength, coordinates)
+            found = np.where(self.returns.status[i] == Status.OK, range_m, np.nan)
+            z = self.camera.z_of(found).astype(np.float32)
+            reading = self.camera.reading(replace(self, z=z, range_m=found.astype(np.float32)))
+            strength, number = self.returns.strength[i], np.full(z.shape, i + 1, dtype=np.uint8)
+            cloud = organised_cloud(reading, self.camera, self.T_world_camera, strength, strength, coordinates)
             clouds.append(replace(cloud, confidence=None, return_number=number).finite())
         arrays = {name: np.concatenate([getattr(c, name) for c in clouds]) for name in clouds[0].attributes()}
         return PointCloud(np.concatenate([c.points for c in clouds]), coordinates, **arrays)
