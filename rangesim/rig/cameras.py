@@ -88,6 +88,11 @@ class Camera(Optics):
         """(h, w) float64, seconds from the start of an image, when each ray is measured; None: all at once."""
         return None
 
+    @property
+    def traced(self) -> Camera:
+        """The camera whose rays are traced: this one, or the finer one that zones are made of."""
+        return self
+
     def pixel_centres(self, rows: slice = slice(None)) -> Array:
         """(height, width, 2) float64, pixel coordinates (x, y) of the pixel centres.
 
