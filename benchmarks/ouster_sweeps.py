@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real sweeps of Ouster's scanners, of 8 to 128 beams: is the place from which they were taken found, and which side?
 
-They come as tests with the source distribution of `ouster-sdk` (BSD-3-Clause), whose versions of other packages
-contradict ours, so it reads them in an environment of its own:
+Recordings (.pcap) are read as they are, with the sensor's metadata beside them (.json):
+
+    python benchmarks/ouster_sweeps.py ../shared/data/lidar [--pictures out/]
+
+More come as tests with the source distribution of `ouster-sdk` (BSD-3-Clause), some as .osf, which it reads in an
+environment of its own, because its versions of other packages contradict ours:
 
     pip download --no-deps --no-binary :all: ouster-sdk && tar xzf ouster_sdk-*.tar.gz
     python -m venv sdk && sdk/bin/pip install ouster-sdk
@@ -39,7 +43,7 @@ CAPTURES = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="of unpacked sweeps")
+    parser.add_argument("folder", type=Path, help="of unpacked sweeps and of recordings")
     parser.add_argument("--unpack", type=Path, metavar="TESTS", help="folder of the SDK's tests, from which to unpack")
     parser.add_argument("--pictures", type=Path, metavar="OUT", help="folder for range, reflectivity and objects")
     arguments = parser.parse_args()
@@ -67,6 +71,19 @@ def unpack(tests: Path, folder: Path) -> None:
             np.savez_compressed(folder / f"{Path(capture).stem}_{number}.npz", **image, place=lenses)
 
 
+def read(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (h, w, 3), reflectivities (h, w), and the place of the lenses, of an unpacked sweep or of a recording."""
+    if file.suffix == ".npz":
+        with np.load(file) as columns:
+            return columns["points"], columns["reflectivity"], columns["place"]
+    from rangesim.recordings import read_ouster
+
+    sweep = read_ouster(file)
+    cloud = sweep.to_point_cloud(coordinates="world", destaggered=True)
+    assert cloud.intensity is not None
+    return cloud.points, cloud.intensity, sweep.T_world_camera[:3, 3]
+
+
 def measure(folder: Path, pictures: Path | None) -> None:
     """Print one line per sweep, and JSON."""
     from scipy.spatial.transform import Rotation
@@ -79,9 +96,8 @@ def measure(folder: Path, pictures: Path | None) -> None:
     warnings.simplefilter("ignore")  # of viewpoints edge-on and the like: none is given here
     print(f"{'':42s}{'beams':>6s}{'points':>8s}{'told':>9s}{'off':>7s}{'worst':>7s}{'facing':>8s}   objects")
     report = {}
-    for file in sorted(folder.glob("*.npz")):
-        with np.load(file) as columns:
-            image, reflectivity, lenses = columns["points"], columns["reflectivity"], columns["place"]
+    for file in sorted((*folder.glob("*.npz"), *folder.glob("*.pcap"))):
+        image, reflectivity, lenses = read(file)
         points = image[np.isfinite(image).all(axis=-1)]
         off, facing, objects, told = [], [], [], []
         for seed in range(TURNS):

@@ -240,6 +240,17 @@ def test_beam_origins_may_be_given_as_a_transform(tmp_path: Path) -> None:
     np.testing.assert_array_equal(by_distance.to_point_cloud().points, by_transform.to_point_cloud().points)
 
 
+def test_metadata_make_the_sensor_a_camera(tmp_path: Path) -> None:
+    (tmp_path / "drive.json").write_text(json.dumps(metadata()))
+    found = load_ouster_metadata(tmp_path / "drive.json")
+    camera = found.camera(field_rad=(1e-3, 3e-3))
+    rays = camera.pixel_rays()
+    np.testing.assert_allclose(rays.directions, found.rays.directions, atol=1e-14)
+    assert found.rays.origins is not None
+    np.testing.assert_allclose(rays.origins, found.rays.origins, atol=1e-14)
+    np.testing.assert_array_equal(camera.times_s, found.rays.times_s)
+
+
 def test_destaggered_clouds_keep_what_belongs_to_a_point(tmp_path: Path) -> None:
     sweep = read_ouster(write(tmp_path, recording(small_turns())))
     raw, shifted = sweep.to_point_cloud(), sweep.to_point_cloud(destaggered=True)

@@ -164,7 +164,7 @@ class PathLengths(Coordinates):
                 along_ray = self.length_m[rows] / 2
                 z = np.full(along_ray.shape, np.nan)
             else:
-                along_ray = _ranges(self.length_m, rows, rig)
+                along_ray = _ranges(self.length_m[rows], rows, rig)
                 z = rig.camera.z_of(along_ray, rows)
             in_front = np.nan_to_num(along_ray, nan=-1.0) > 0
             status[rows][(status[rows] == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
@@ -175,10 +175,10 @@ class PathLengths(Coordinates):
 
 
 def _ranges(length_m: np.ndarray, rows: slice, rig: Rig) -> np.ndarray:
-    """(rows, w) float64, metres, ranges along the rays of some rows, from the path lengths of all."""
+    """(..., rows, w) float64, metres, ranges along the rays of some rows, from their path lengths."""
     if isinstance(rig.camera, Intrinsics):
         directions = rig.camera.directions(rig.camera.pixel_centres(rows))
-        return range_from_path_length(length_m[rows], directions, rig)
+        return range_from_path_length(length_m, directions, rig)
     rays = rig.camera.pixel_rays()
     emitters = emitter_offsets(rig)[rows]
-    return range_along_ray(length_m[rows], rays.directions[rows], emitters)
+    return range_along_ray(length_m, rays.directions[rows], emitters)

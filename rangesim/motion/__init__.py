@@ -13,6 +13,7 @@ An object moves to the right by 0.3 m/s, while patterns are projected and captur
 """
 
 from rangesim.motion.deskewing import deskewed
+from rangesim.motion.moving_scanner import as_reported, moving_scanner
 from rangesim.motion.moving_signals import MovingSignals
 from rangesim.motion.pose_tracks import ConstantTwist, Motion, PoseTrack, Track
 from rangesim.motion.timing import Timing
@@ -25,6 +26,8 @@ __all__ = [
     "PoseTrack",
     "Timing",
     "Track",
+    "as_reported",
     "deskewed",
+    "moving_scanner",
     "transport_moving",
 ]

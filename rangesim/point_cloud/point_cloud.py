@@ -156,7 +156,7 @@ def organised_cloud(
     confidence: np.ndarray,
     coordinates: str = "camera",
 ) -> PointCloud:
-    """Organised point cloud of an image of readings, with normals.
+    """Organised point cloud of an image of readings, with normals, and with the times and rings of a scanner.
 
     Parameters
     ----------
@@ -211,6 +211,8 @@ def organised_cloud(
         intensity=intensity,
         colors=_grey_colors(intensity, np.isfinite(reading_m)),
         confidence=confidence,
+        time_s=camera.times_s,
+        ring=camera.rings,
     )
 
 

@@ -29,8 +29,9 @@ from rangesim.errors import FileFormatError
 from rangesim.files.text_files import read_json
 from rangesim.recordings.lidar_sweep import LidarSweep
 from rangesim.recordings.pcap import Datagram, datagrams
-from rangesim.rig import pose
+from rangesim.rig import Acceptance, Spinning, pose
 from rangesim.rig.scan_patterns import ScanRays, spinning
+from rangesim.rig.scanners import FIELD_RAD
 from rangesim.settings import limits
 from rangesim.settings.bounds import check_number, whole
 from rangesim.settings.config import shown
@@ -201,6 +202,22 @@ class OusterMetadata:
             self.azimuths_rad,
             self.beam_origin_m,
             first_azimuth_rad=np.pi,
+        )
+
+    def camera(self, field_rad: tuple[float, float] = FIELD_RAD, acceptance: Acceptance = "gaussian") -> Spinning:
+        """This very sensor as a camera, to simulate what it would measure; its rays are `rays`.
+
+        field_rad, acceptance : field of a ray, see `Spinning`; the metadata do not tell it.
+        """
+        return Spinning(
+            elevations_deg=tuple(np.degrees(self.elevations_rad).tolist()),
+            columns=self.columns,
+            period_s=self.period_s,
+            azimuth_offsets_deg=tuple(np.degrees(self.azimuths_rad).tolist()),
+            origin_m=tuple(self.beam_origin_m.tolist()),
+            first_azimuth_deg=180.0,
+            field_rad=field_rad,
+            acceptance=acceptance,
         )
 
     @property

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from rangesim.rig.poses import Array
 from rangesim.settings.config import Named, shown
@@ -92,6 +92,12 @@ class Camera(Optics):
     def traced(self) -> Camera:
         """The camera whose rays are traced: this one, or the finer one that zones are made of."""
         return self
+
+    @property
+    def rings(self) -> NDArray[np.uint16] | None:
+        """(h, w) uint16, the beam of a turning head that measures each ray, if the rows are its rings; None: they are
+        not."""
+        return None
 
     def pixel_centres(self, rows: slice = slice(None)) -> Array:
         """(height, width, 2) float64, pixel coordinates (x, y) of the pixel centres.

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rangesim.rig.cameras import Acceptance, Camera, PixelRays, finite_array
 from rangesim.rig.poses import Array, check_rigid
@@ -103,6 +104,10 @@ class Spinning(Scanner):
     @property
     def height(self) -> int:  # type: ignore[override]
         return len(self.elevations_deg)
+
+    @property
+    def rings(self) -> NDArray[np.uint16]:
+        return np.broadcast_to(np.arange(self.height, dtype=np.uint16)[:, None], (self.height, self.width))
 
     def scan_rays(self) -> ScanRays:
         return spinning(
@@ -280,6 +285,10 @@ class MovingCamera(Camera):
     @property
     def times_s(self) -> Array | None:
         return self.camera.times_s
+
+    @property
+    def rings(self) -> NDArray[np.uint16] | None:
+        return self.camera.rings
 
     def __eq__(self, other: Any) -> bool:
         return (

@@ -141,7 +141,7 @@ class Zones(Camera):
         return csr_array(kron(csr_array(down), csr_array(across)))
 
     def mean(self, image: np.ndarray) -> Array:
-        """(rows, columns, ...) float64, mean of an image (h, w, ...) of the finer camera over each zone, without NaN."""
+        """(rows, columns, ...) float64, mean of an image (h, w, ...) of the finer camera over zones, without NaN."""
         flat = np.asarray(image, dtype=np.float64).reshape(self.matrix.shape[1], -1)
         known = np.isfinite(flat)
         with np.errstate(invalid="ignore"):

@@ -23,6 +23,7 @@ from rangesim.decoding.histogram import (
 from rangesim.decoding.path_length import LengthReturns, PathLengths
 from rangesim.decoding.returns import PulseShape, ReturnRules, find_returns
 from rangesim.decoding.status import Status
+from rangesim.decoding.working_range import WorkingRange
 from rangesim.electronics.detector import Gate
 from rangesim.electronics.spad import SpadDetector
 from rangesim.response import SPEED_OF_LIGHT, Pulse, Response, TransientHistogram
@@ -301,6 +302,8 @@ class DirectToFDecoder(Decoder):
         A pixel without a target is OUT_OF_RANGE if its return within `min_range_m` is stronger than that by
         `peak_sigmas`, because a target must be in there; otherwise it is LOW_SIGNAL. With 0, every such pixel is
         OUT_OF_RANGE.
+    working_range : WorkingRange, outside which readings are refused; None: all are kept. It does not change the list of
+        returns.
 
     Examples
     --------
@@ -320,6 +323,7 @@ class DirectToFDecoder(Decoder):
     pulse_tolerance: Fraction = 0.1
     min_range_m: Annotated[float, Bounds("0 or positive", 0, 1e6)] = 0.0
     cover_glass_counts: Annotated[float, Bounds("0 or positive", 0, 1e15)] = 0.0
+    working_range: WorkingRange | None = None
 
     type_name: ClassVar[str] = "direct-tof"
     reads: ClassVar[type[Sensor]] = DirectToF

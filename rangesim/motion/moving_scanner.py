@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scanners that move while they scan: their rig for one light-transport pass, and their images as they report them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rangesim.decoding.range_image import RangeImage
+from rangesim.motion.pose_tracks import Track
+from rangesim.rig import Beam, MovingCamera, Rig
+
+
+def moving_scanner(rig: Rig, track: Track) -> Rig:
+    """The rig of a scanner that moves along a track during its scan; a still scene takes one pass, however it moves.
+
+    Its camera is a `MovingCamera`: the rays of the scanner, each from where it is measured. So range images of this rig
+    know the motion, and their clouds are de-skewed, in the coordinates of the scanner at time 0. `as_reported` gives
+    what the scanner itself would report.
+
+    Parameters
+    ----------
+    rig : Rig without motion, whose camera has times, such as `Spinning`, and whose emitter is a `Beam`.
+    track : motion of the rig as in `Motion.rig`: world transforms T(t), applied to the rig as it stands. Its clock
+        starts with the scan.
+
+    Raises
+    ------
+    ValueError
+        The rays of the camera have no times, or the emitter is no beam: other emitters do not move with the rays.
+
+    Examples
+    --------
+    >>> from rangesim.motion import ConstantTwist
+    >>> from rangesim.rig import Spinning, look_at
+    >>> head = Spinning(elevations_deg=(0.0,), columns=4, period_s=0.1)
+    >>> rig = Rig(head, Beam(), look_at((0, 0, 1.8), (1, 0, 1.8)))
+    >>> moving_scanner(rig, ConstantTwist(velocity_m_s=(15.0, 0.0, 0.0))).camera.pixel_rays().origins[0, :, 2]
+    array([0.   , 0.375, 0.75 , 1.125])
+    """
+    times = rig.camera.times_s
+    if times is None:
+        raise ValueError(f"expected a camera whose rays have times, got {type(rig.camera).__name__}.")
+    if not isinstance(rig.projector, Beam):
+        raise ValueError(
+            f"expected a Beam as the emitter of a scanner that moves, got {type(rig.projector).__name__}: only a beam "
+            "moves with the rays."
+        )
+    start = track.at(0.0) @ rig.T_world_camera
+    poses = np.linalg.inv(start) @ track.poses_at(np.unique(times)) @ rig.T_world_camera
+    return replace(rig, camera=MovingCamera(rig.camera, poses), T_world_camera=start)
+
+
+def as_reported(image: RangeImage) -> RangeImage:
+    """The range image of a scanner that moved, as the scanner reports it: as if it had stood still (a raw scan).
+
+    The ranges are the same; they are taken along the rays of the scanner at rest, in its coordinates at the start. So
+    the cloud is skewed, and `deskewed` straightens it.
+
+    Raises
+    ------
+    ValueError
+        The image is not that of a `MovingCamera`.
+    """
+    if not isinstance(image.camera, MovingCamera):
+        name = "none" if image.camera is None else type(image.camera).__name__
+        raise ValueError(f"expected a range image of a MovingCamera, got one of {name}.")
+    camera = image.camera.camera
+    return replace(image, camera=camera, z=camera.z_of(image.range_m).astype(image.z.dtype))
