@@ -216,7 +216,7 @@ def _traced_pixels(experiment: Experiment, rig: Rig, instruments: Sequence[Instr
     If something moves, each frame has a pass, which renders only the window where something changes.
     """
     if experiment.motion is None:
-        return rig.camera.width * rig.camera.height, 1
+        return rig.traced.camera.width * rig.traced.camera.height, 1
     from rangesim.motion.passes import plan
 
     planned = [
@@ -240,7 +240,7 @@ def _tracing_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int)
     """Bytes of the arrays of a pass that exist at once, at the peak: while it is traced or its frames are exposed."""
     at_once = 0.0
     for rig, instruments in passes:
-        pixels = rig.camera.width * rig.camera.height
+        pixels = rig.traced.camera.width * rig.traced.camera.height
         responses = dict.fromkeys(r for instrument in instruments for r in instrument.sensor.responses())
         channels = sum(r.channels for r in responses)
         tiles = min(TRANSPORT_BYTES, pixels * (LANE_BYTES + 2 * 4 * channels))  # indirect light has its own channels
@@ -263,7 +263,7 @@ def _timed_trial(
     """
     from rangesim.instrument.transport import transport
 
-    rig, instruments = one_pass
+    rig, instruments = one_pass[0].traced, one_pass[1]
     small = TRIAL_WIDTH, max(1, round(TRIAL_WIDTH * rig.camera.height / rig.camera.width))
     camera = (
         rig.camera.resized(*small) if isinstance(rig.camera, Intrinsics) else RayTable.of(rig.camera).thinned(*small)
