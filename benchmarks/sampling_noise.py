@@ -36,8 +36,8 @@ from rangesim import Capture, Signals, decode, expose, load_scene, transport
 from rangesim.evaluation.range_noise import robust_sigma
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
-from rangesim.instrument.presets import instrument
 from rangesim.pipeline.shared_passes import group_by_rig
+from rangesim.presets import instrument
 from rangesim.scene import Scene
 from rangesim.scene.materials import MATERIAL_CLASSES
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from rangesim.causes import explain as explain
     from rangesim.decoding import decode as decode
     from rangesim.decoding.range_image import RangeImage as RangeImage
+    from rangesim.decoding.returns import Returns as Returns
     from rangesim.decoding.status import Status as Status
     from rangesim.electronics.ambient import Ambient as Ambient
     from rangesim.electronics.detector import Detector as Detector
@@ -39,6 +40,7 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from rangesim.point_cloud import PointCloud as PointCloud
     from rangesim.report import errors_markdown as errors_markdown
     from rangesim.report import failures_markdown as failures_markdown
+    from rangesim.response import Pulse as Pulse
     from rangesim.results.captures import import_capture as import_capture
     from rangesim.results.captures import load_capture as load_capture
     from rangesim.results.captures import save_capture as save_capture
@@ -86,8 +88,10 @@ _HOME = {
     "Lissajous": "rangesim.rig",
     "Orthographic": "rangesim.rig",
     "PointCloud": "rangesim.point_cloud",
+    "Pulse": "rangesim.response",
     "RangeImage": "rangesim.decoding.range_image",
     "RayTable": "rangesim.rig",
+    "Returns": "rangesim.decoding.returns",
     "Rig": "rangesim.rig",
     "Risley": "rangesim.rig",
     "Scene": "rangesim.scene",

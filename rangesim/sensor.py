@@ -276,6 +276,9 @@ class Decoder(Named, ABC):
     """Name in configuration files."""
     reads: ClassVar[type[Sensor]] = Sensor  # type: ignore[type-abstract]
     """Class of the sensors whose captures this decoder accepts."""
+    working_range: Any = None
+    """A `rangesim.decoding.working_range.WorkingRange`, outside which readings are refused; None: all are kept. A
+    decoder with this setting has a field for it."""
 
     def check(self, sensor: Sensor) -> None:
         """Raise ValueError if this decoder takes no captures of the sensor."""
@@ -301,7 +304,8 @@ class Decoder(Named, ABC):
         """
         if capture.rig is not None:
             capture.sensor.check(capture.rig.projector.width, capture.rig.projector.height)
-        return self.coordinates(capture).range_image(capture.rig)
+        image = self.coordinates(capture).range_image(capture.rig)
+        return image if self.working_range is None else self.working_range.applied_to(image)  # type: ignore[no-any-return]
 
     @abstractmethod
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:

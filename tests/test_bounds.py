@@ -23,8 +23,8 @@ from rangesim.electronics.ambient import Ambient, Tungsten
 from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
-from rangesim.instrument.presets import instrument
 from rangesim.motion import ConstantTwist, Motion, PoseTrack, Timing
+from rangesim.presets import instrument
 from rangesim.response import (
     FirstReturn,
     Fringes,

@@ -16,11 +16,11 @@ from small_result import ROOT
 from rangesim import load_scene
 from rangesim.cli import main
 from rangesim.experiment import Experiment
-from rangesim.instrument.presets import instrument
 from rangesim.motion import ConstantTwist, Motion, Timing
 from rangesim.pipeline import cost, experiment_run
 from rangesim.pipeline.cost import Cost, available_memory_bytes, estimate_cost
 from rangesim.pipeline.shared_passes import group_by_rig
+from rangesim.presets import instrument
 from rangesim.sensors import DirectToF
 from rangesim.settings import limits
 

@@ -22,6 +22,7 @@ from rangesim.decoding.matched_filter import gaussian_filter
 from rangesim.decoding.path_length import range_from_path_length
 from rangesim.decoding.phase_shift import tap_phase
 from rangesim.decoding.status import Status
+from rangesim.decoding.working_range import WorkingRange
 from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.instrument.instrument import Instrument
@@ -104,6 +105,48 @@ def test_amcw_unwraps_up_to_the_common_range(range_m: float, frequencies: tuple[
     image = decode(Capture(np.array(taps, dtype=np.float32).reshape(-1, 1, 1), sensor))
     assert sensor.unambiguous_range_m > 18.7
     assert abs(image.range_m[0, 0] - range_m) < 1e-4
+
+
+@pytest.mark.parametrize("taps", [3, 5])
+def test_another_number_of_taps_is_exact_without_noise_and_has_the_noise_of_theory(taps: int) -> None:
+    """sigma_phi^2 = (2 / (N B))^2 sum of sin^2(phi - theta_k) (n_k + sigma_r^2), n_k the electrons of tap k."""
+    rig, sensor = stereo_rig(baseline_m=0.0), AmcwToF((50e6,), taps=taps)
+    detector = Detector.time_of_flight()
+    signals = plane_signals(rig, sensor, ambient=0.05)
+    z = plane_depth(rig)
+    lit = signals.truth.projector_visible
+    assert len(sensor.frame_names()) == taps
+    np.testing.assert_allclose(signals.frames(sensor).sum(axis=0)[lit], (signals.energy.direct + 0.05)[lit], rtol=1e-5)
+    assert np.nanmax(np.abs(decode(expose(signals, sensor)).z - z)) < 1e-5
+    capture = expose(signals, sensor, detector, exposure_s=1e-3)
+    image = decode(capture)
+    electrons = detector.mean_electrons(signals.frames(sensor, 0.03), None, rig, 1e-3) + detector.own_noise_e2(0.0)
+    modulation = 0.8 / taps * detector.electron_rate_per_radiance(rig) * 1e-3 * signals.energy.direct
+    phase = 4 * np.pi * 50e6 / SPEED_OF_LIGHT * signals.truth.range_m
+    across = np.sin(phase - 2 * np.pi * np.arange(taps)[:, None, None] / taps) ** 2
+    sigma = 2 / (taps * modulation) * np.sqrt((across * electrons).sum(axis=0)) * SPEED_OF_LIGHT / (4 * np.pi * 50e6)
+    pull = ((image.range_m - signals.truth.range_m) / sigma)[lit & image.valid]
+    assert pull.std() == pytest.approx(1, rel=0.02)
+
+
+def test_a_square_wave_needs_four_taps() -> None:
+    with pytest.raises(ValueError, match="expected 4 taps for a square waveform, got 3"):
+        AmcwToF(waveform="square", taps=3)
+
+
+def test_readings_outside_the_working_range_of_a_device_are_refused() -> None:
+    rig, sensor = stereo_rig(baseline_m=0.0), AmcwToF((20e6,))
+    z = np.tile(np.linspace(0.3, 6, 160), (120, 1))
+    capture = expose(signals_of_depth(rig, z, [sensor]), sensor)
+    free = decode(capture)
+    for along, reading in (("z", free.z), ("ray", free.range_m)):
+        image = decode(capture, AmcwDecoder(working_range=WorkingRange(0.5, 4.5, along)))  # type: ignore[arg-type]
+        inside = (reading >= 0.5) & (reading <= 4.5)
+        np.testing.assert_array_equal(image.valid, inside)
+        assert (image.status[~inside & free.valid] == Status.OUT_OF_RANGE).all()
+        np.testing.assert_array_equal(image.z[inside], free.z[inside])
+    with pytest.raises(ValueError, match="near_m < far_m"):
+        WorkingRange(2.0, 1.0)
 
 
 def test_phases_that_agree_on_nothing_are_wrapped() -> None:

@@ -32,6 +32,7 @@ ROOMS = [
     "rangesim.multiview",
     "rangesim.pipeline",
     "rangesim.point_cloud",
+    "rangesim.presets",
     "rangesim.recordings",
     "rangesim.report",
     "rangesim.response",

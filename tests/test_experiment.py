@@ -23,10 +23,10 @@ from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict, load_experiment
 from rangesim.experiment.scan_settings import scan_settings_from_dict
 from rangesim.instrument.instrument import Instrument
-from rangesim.instrument.presets import DEFAULT_SENSORS, instrument
 from rangesim.motion import ConstantTwist, Motion, Timing
 from rangesim.pipeline.experiment_run import noise_seed, run
 from rangesim.pipeline.shared_passes import group_by_rig
+from rangesim.presets import DEFAULT_SENSORS, instrument
 from rangesim.results.experiment_results import load_result
 from rangesim.rig import Lens
 from rangesim.sensors import DirectToF, IdealToF

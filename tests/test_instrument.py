@@ -14,11 +14,11 @@ from rangesim import Intrinsics, Scene, load_scene, look_at
 from rangesim.electronics.detector import Detector
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
 from rangesim.instrument.instrument import Instrument
-from rangesim.instrument.presets import instrument
 from rangesim.pipeline.experiment_run import carry_out, run
 from rangesim.pipeline.shared_passes import group_by_rig
+from rangesim.presets import instrument
 from rangesim.results.experiment_results import load_result
-from rangesim.rig import translation
+from rangesim.rig import Beam, RayTable, translation
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight
 
 CAMERA = Intrinsics(40, 30, 50.0, 50.0, 20.0, 15.0)
@@ -73,11 +73,24 @@ def test_an_instrument_brings_camera_emitter_and_places(plane: Scene) -> None:
         ({"T_camera_projector": ASIDE, "baseline_m": 0.1}, "either T_camera_projector or baseline_m"),
         ({"T_world_camera": 2 * np.eye(4)}, "T_world_camera"),
         ({"wavelength_m": -1.0}, "wavelength_m"),
+        ({"projector": Beam(), "baseline_m": 0.1}, "its beam starts at its ray"),
+        ({"camera": RayTable([[[0.0, 0.0, 1.0]]])}, "expected a projector of instrument 'one'"),
     ],
 )
 def test_contradictions_and_bad_places_are_refused(change: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         Instrument("one", AmcwToF(), **change)
+
+
+def test_an_instrument_has_rays_of_its_own_and_a_beam(plane: Scene) -> None:
+    table = RayTable(np.array([[[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]]]))
+    scanner = Instrument("one", DirectToF(), camera=table, projector=Beam((1e-3, 1e-3)), power_w=0.5)
+    rig = scanner.rig(plane, 64, 48)
+    assert (rig.camera, rig.projector, rig.projector_power_w) == (table, Beam((1e-3, 1e-3)), 0.5)
+    np.testing.assert_array_equal(rig.T_world_camera, plane.T_world_camera)
+    np.testing.assert_array_equal(rig.T_camera_projector, np.eye(4))
+    plain = experiment_to_dict(Experiment("plane", instruments=(scanner,)))
+    assert experiment_from_dict(plain).instruments == (scanner,)
 
 
 def test_a_pass_is_shared_where_emitter_wavelength_and_camera_agree(plane: Scene) -> None:

@@ -43,7 +43,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_wheel_holds_scenes_templates_and_types(built: Path) -> None:
+def test_the_wheel_holds_scenes_devices_templates_and_types(built: Path) -> None:
     with zipfile.ZipFile(next(built.glob("*.whl"))) as wheel:
         names = set(wheel.namelist())
     scenes = {f"rangesim/scene/catalogue/{p.relative_to(ROOT / 'scenes')}" for p in delivered(ROOT / "scenes")}
@@ -53,6 +53,9 @@ def test_the_wheel_holds_scenes_templates_and_types(built: Path) -> None:
     assert {
         f"rangesim/report/{n}" for n in ("report.html.j2", "report.js", "scroll.js", "viewer.js", "style.css")
     } <= names
+    devices = {f"rangesim/presets/devices/{p.name}" for p in (ROOT / "rangesim" / "presets" / "devices").glob("*.toml")}
+    assert len(devices) >= 7
+    assert devices <= names
     assert {name.split("/")[0] for name in names} == {"rangesim", "pcgraph", f"rangesim-{PROJECT['version']}.dist-info"}
 
 

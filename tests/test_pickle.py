@@ -16,8 +16,8 @@ from small_result import SCENES, small_result
 from rangesim import Rig, load_capture
 from rangesim.experiment import Experiment, ScanSettings, Turntable
 from rangesim.instrument.instrument import Instrument
-from rangesim.instrument.presets import instrument
 from rangesim.motion import ConstantTwist, Motion
+from rangesim.presets import instrument
 from rangesim.results.experiment_results import load_result
 from rangesim.sensors import sensor_of
 

@@ -18,8 +18,8 @@ from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment
 from rangesim.files.image_files import check_pixels, read_grey, write_grey
 from rangesim.files.utf8_names import is_utf8, utf8_name
-from rangesim.instrument.presets import instrument
 from rangesim.pipeline.experiment_run import run
+from rangesim.presets import instrument
 from rangesim.results.captures import import_capture, load_capture
 from rangesim.results.experiment_results import load_result
 from rangesim.sensors import IdealToF

@@ -43,6 +43,7 @@ class ClippingThresholds:
 
     levels : number of levels below the largest value that are compared with it, each 1/256 of that value wide.
     min_fraction : least fraction of the pixels that are at the largest value; fewer are single highlights.
+    min_pixels : least number of such pixels, because in an image of a few pixels the brightest one alone is many.
     min_peak : least ratio of the number of these pixels to the mean number of pixels in one of the `levels` below; a
         smaller value takes the peaks of fringes for clipping.
     min_tail : least ratio of the number of pixels in all `levels` below to the number at the largest value; an image of
@@ -51,6 +52,7 @@ class ClippingThresholds:
 
     levels: int = 16
     min_fraction: float = 0.005
+    min_pixels: int = 2
     min_peak: float = 10.0
     min_tail: float = 0.05
 
@@ -79,7 +81,8 @@ def clip_level(brightest: np.ndarray, max_dn: int) -> int:
     width = max(1.0, top / 256)
     below = int(((brightest < top) & (brightest >= top - CLIPPING.levels * width)).sum())
     piled = at_top > CLIPPING.min_peak * below / CLIPPING.levels and below > CLIPPING.min_tail * at_top
-    return top if piled and at_top > CLIPPING.min_fraction * brightest.size else max_dn
+    is_many = at_top > CLIPPING.min_fraction * brightest.size and at_top >= CLIPPING.min_pixels
+    return top if piled and is_many else max_dn
 
 
 def _masked_in_all(frames: np.ndarray) -> np.ndarray:

@@ -129,9 +129,11 @@ class Evidence:
         """Whether more than `MAX_PULSES_HIT` of the pulses brought a photon, or the decoder found that the pulses ran
         out although no counter is full."""
         detector, capture = self.capture.detector, self.capture
-        if not isinstance(detector, SpadDetector) or not detector.pile_up:
+        if not isinstance(detector, SpadDetector):
             return np.zeros(self.true_m.shape, dtype=bool)
-        pulses = detector.pulses(capture.sensor.gate, capture.exposure_s)
+        pulses = detector.first_only(capture.sensor.gate, capture.exposure_s)
+        if pulses is None:
+            return np.zeros(self.true_m.shape, dtype=bool)
         ran_out = (self.image.status == Status.SATURATED) & ~capture.saturated(capture.frames)
         return np.asarray(ran_out | (capture.frames.sum(axis=0, dtype=np.float64) > MAX_PULSES_HIT * pulses))
 

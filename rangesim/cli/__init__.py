@@ -18,6 +18,7 @@ from rangesim import __version__
 from rangesim.cli.calibrate import calibrate_command
 from rangesim.cli.compare import compare_command
 from rangesim.cli.decode import decode_command
+from rangesim.cli.presets import presets_command
 from rangesim.cli.report import report_command
 from rangesim.cli.run import run_command
 from rangesim.cli.scan import scan_command
@@ -35,6 +36,7 @@ app.command("calibrate")(calibrate_command)
 app.command("compare")(compare_command)
 app.command("report")(report_command)
 app.command("verify")(verify_command)
+app.command("presets")(presets_command)
 app.command("doctor")(doctor_command)
 
 

@@ -39,7 +39,8 @@ def run_command(
         typer.Option(
             "--sensor",
             "-s",
-            help="gray, gray-phase, amcw, direct-tof, ideal-tof, or FILE.py:NAME for a sensor of your own. Repeat the "
+            help="gray, gray-phase, amcw, direct-tof or ideal-tof; a device such as kinect-v2 (rangesim presets "
+            "lists them); FILE.toml for a device, FILE.py:NAME for a sensor of your own. Repeat the "
             "option for several sensors. (default: gray-phase, amcw, ideal-tof)",
             show_default=False,
         ),
@@ -174,7 +175,7 @@ def _warn_of_instruments_without_points(result: Result) -> None:
 def _instruments(sensors: list[str]) -> tuple[Instrument, ...]:
     """One instrument per sensor. Sensors from files that have the same `type_name` are named by the NAME of their class
     or object instead, because the names of instruments must differ."""
-    from rangesim.instrument.presets import instrument
+    from rangesim.presets import instrument
     from rangesim.sensors import is_file_name
 
     found = [instrument(name) for name in sensors]

@@ -125,7 +125,7 @@ def scan_command(
 def _settings(scene: Path | None, config: Path | None, given: dict[str, Any], sensor: str | None) -> ScanSettings:
     """The scan of a file of settings or of a scene. Options of the command line replace the settings of the file."""
     from rangesim.experiment.scan_settings import ScanSettings, load_scan_settings
-    from rangesim.instrument.presets import instrument
+    from rangesim.presets import instrument
 
     if config is None and scene is None:
         raise typer.BadParameter("expected a scene or --config FILE.", param_hint="SCENE")

@@ -84,6 +84,23 @@ def coates(counts: np.ndarray, pulses: int) -> np.ndarray:
     return np.asarray(-pulses * np.log1p(-fraction)).reshape(counts.shape)
 
 
+def coates_excess(counts: np.ndarray, pulses: int) -> np.ndarray:
+    """(k, n) float64, variance of the counts that `coates` returns over their means: all pulses by those left.
+
+    Parameters
+    ----------
+    counts : (k, n) int, histograms of the first photon of each of `pulses` pulses, as the detector counted them.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> coates_excess(np.array([[500], [250], [0]]), pulses=1000).ravel()
+    array([1., 2., 4.])
+    """
+    used = np.cumsum(counts, axis=0, dtype=np.int64)
+    return np.asarray(pulses / np.maximum(pulses - (used - counts), 1))
+
+
 def pulses_left(counts: np.ndarray, place: np.ndarray, pulses: int, sigma_bins: float, is_cyclic: bool) -> np.ndarray:
     """(n,) int64, number of pulses that have met no photon by the end of the window of each peak.
 

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from rangesim.decoding.coordinates import Coordinates
 from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.returns import Returns
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.rig import Beam, Intrinsics, Rig, tangents
@@ -68,6 +70,53 @@ def emitter_offsets(rig: Rig) -> np.ndarray:
     return np.asarray(right * emitter.offset_m[0] + down * emitter.offset_m[1])
 
 
+def range_slope(length_m: np.ndarray, directions: np.ndarray, emitters: np.ndarray) -> np.ndarray:
+    """(...) float64, derivative of `range_along_ray` by the length; 1/2 without a baseline.
+
+    Examples
+    --------
+    >>> range_slope(np.array([1.8]), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)))
+    array([0.5])
+    """
+    length, along = np.asarray(length_m, dtype=np.float64), np.sum(directions * emitters, axis=-1)
+    b2 = np.sum(emitters**2, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray((length**2 - 2 * length * along + b2) / (2 * (length - along) ** 2))
+
+
+class LengthReturns(NamedTuple):
+    """All returns of each pixel, before any geometry; (k, h, w) each, nearest first.
+
+    length_m : float64, metres, path length there and back; NaN where there is none.
+    sigma_m : float64, metres, its standard deviation by the noise of the frames; NaN where not known.
+    strength : float64, counts of the pulse. status : uint8, values of `Status`.
+    """
+
+    length_m: np.ndarray
+    sigma_m: np.ndarray
+    strength: np.ndarray
+    status: np.ndarray
+
+    def ranges(self, rig: Rig | None) -> Returns:
+        """The returns as ranges from the camera; without a rig, half of the lengths."""
+        range_m, sigma_m = np.empty((2, *self.length_m.shape), dtype=np.float32)
+        status = self.status.astype(np.uint8)
+        directions = emitters = None
+        if rig is not None:
+            directions, emitters = rig.camera.pixel_rays().directions, emitter_offsets(rig)
+        for rows in bands(self.length_m.shape[1]):
+            length = self.length_m[:, rows]
+            along_ray, slope = length / 2, np.full(length.shape, 0.5)
+            if directions is not None and emitters is not None:
+                along_ray = range_along_ray(length, directions[rows], emitters[rows])
+                slope = range_slope(length, directions[rows], emitters[rows])
+            is_behind = ~(np.nan_to_num(along_ray, nan=-1.0) > 0)
+            status[:, rows][is_behind & (status[:, rows] == Status.OK)] = Status.OUT_OF_RANGE
+            range_m[:, rows] = np.where(is_behind, np.nan, along_ray)
+            sigma_m[:, rows] = np.where(is_behind, np.nan, slope * self.sigma_m[:, rows])
+        return Returns(range_m, self.strength.astype(np.float32), sigma_m, status)
+
+
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class PathLengths(Coordinates):
     """Path lengths of a time-of-flight capture, from the emitter to the surface and back to the camera.
@@ -77,6 +126,7 @@ class PathLengths(Coordinates):
     length_m : (h, w) float64, metres; NaN where `status` is not OK.
     sigma_m : (h, w) float32, metres, standard deviation of `length_m` that the noise of the frames causes; NaN where
         `status` is not OK. None: not known, as for noise-free captures and unknown detectors.
+    returns : LengthReturns, all returns of each pixel, of which `length_m` is one; None: they were not looked for.
 
     Examples
     --------
@@ -91,6 +141,7 @@ class PathLengths(Coordinates):
 
     length_m: np.ndarray
     sigma_m: np.ndarray | None = None
+    returns: LengthReturns | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -113,20 +164,21 @@ class PathLengths(Coordinates):
                 along_ray = self.length_m[rows] / 2
                 z = np.full(along_ray.shape, np.nan)
             else:
-                along_ray = _ranges(self.length_m, rows, rig)
+                along_ray = _ranges(self.length_m[rows], rows, rig)
                 z = rig.camera.z_of(along_ray, rows)
             in_front = np.nan_to_num(along_ray, nan=-1.0) > 0
             status[rows][(status[rows] == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
             ok = status[rows] == Status.OK
             z_m[rows], range_m[rows] = np.where(ok, z, np.nan), np.where(ok, along_ray, np.nan)
-        return self._image(rig, z_m, range_m, status)
+        image = self._image(rig, z_m, range_m, status)
+        return image if self.returns is None else replace(image, returns=self.returns.ranges(rig))
 
 
 def _ranges(length_m: np.ndarray, rows: slice, rig: Rig) -> np.ndarray:
-    """(rows, w) float64, metres, ranges along the rays of some rows, from the path lengths of all."""
+    """(..., rows, w) float64, metres, ranges along the rays of some rows, from their path lengths."""
     if isinstance(rig.camera, Intrinsics):
         directions = rig.camera.directions(rig.camera.pixel_centres(rows))
-        return range_from_path_length(length_m[rows], directions, rig)
+        return range_from_path_length(length_m, directions, rig)
     rays = rig.camera.pixel_rays()
     emitters = emitter_offsets(rig)[rows]
-    return range_along_ray(length_m[rows], rays.directions[rows], emitters)
+    return range_along_ray(length_m, rays.directions[rows], emitters)

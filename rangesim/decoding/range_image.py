@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from rangesim.decoding.returns import Returns
 from rangesim.decoding.status import Status
 from rangesim.point_cloud import PointCloud, organised_cloud
 from rangesim.rig import Camera, Intrinsics
@@ -44,6 +45,8 @@ class RangeImage(ShortRepr):
         is no reading, infinite where sampling decides whether there is one. None: not known, see
         `rangesim.evaluation.range_noise`.
     decoder : Decoder that made it; None: not known.
+    returns : Returns, all returns of each pixel, of which `range_m` is one (the decoder's `reading`); None: the decoder
+        looked for one alone.
 
     Examples
     --------
@@ -69,6 +72,7 @@ class RangeImage(ShortRepr):
     projector_row: np.ndarray | None = None
     sampling_sigma_m: np.ndarray | None = None
     decoder: Decoder | None = None
+    returns: Returns | None = None
 
     @property
     def valid(self) -> np.ndarray:
@@ -94,20 +98,42 @@ class RangeImage(ShortRepr):
         finite, ok = np.isfinite(self.z), self.valid
         return not (finite > ok).any() and (self.camera is None or not (finite < ok).any())
 
-    def to_point_cloud(self, coordinates: str = "camera") -> PointCloud:
-        """Organised point cloud (h, w) of this image, with normals, intensities and confidences.
+    def to_point_cloud(self, coordinates: str = "camera", returns: Literal["reading", "all"] = "reading") -> PointCloud:
+        """Point cloud of this image, with normals, intensities and confidences.
 
         Parameters
         ----------
         coordinates : "camera" or "world".
+        returns : "reading", an organised cloud (h, w) with one point for each pixel; or "all", a list (n,) of all
+            returns whose status is OK: the nearest of each pixel, row by row, then the second ones, and so on. Their
+            `return_number` counts from 1, their intensity is the strength of the return, and they have no confidence.
 
         Raises
         ------
         ValueError
-            The range image has no camera (uncalibrated capture), or these coordinates are unknown.
+            The range image has no camera (uncalibrated capture), these coordinates are unknown, or all returns are
+            asked for but were not decoded.
         """
         if self.camera is None or self.T_world_camera is None:
             raise ValueError("expected a calibrated range image: without a rig there are no points.")
-        return organised_cloud(
-            self.reading_m, self.camera, self.T_world_camera, self.intensity, self.confidence, coordinates
-        )
+        if returns == "reading":
+            return organised_cloud(
+                self.reading_m, self.camera, self.T_world_camera, self.intensity, self.confidence, coordinates
+            )
+        if returns != "all":
+            raise ValueError(f"expected returns to be one of reading, all, got {returns!r}.")
+        if self.returns is None:
+            raise ValueError(
+                "expected a range image with all returns; decode with a decoder that looks for several, such as "
+                "DirectToFDecoder(max_returns=3)."
+            )
+        clouds = []
+        for i, range_m in enumerate(self.returns.range_m):
+            found = np.where(self.returns.status[i] == Status.OK, range_m, np.nan)
+            z = self.camera.z_of(found).astype(np.float32)
+            reading = self.camera.reading(replace(self, z=z, range_m=found.astype(np.float32)))
+            strength, number = self.returns.strength[i], np.full(z.shape, i + 1, dtype=np.uint8)
+            cloud = organised_cloud(reading, self.camera, self.T_world_camera, strength, strength, coordinates)
+            clouds.append(replace(cloud, confidence=None, return_number=number).finite())
+        arrays = {name: np.concatenate([getattr(c, name) for c in clouds]) for name in clouds[0].attributes()}
+        return PointCloud(np.concatenate([c.points for c in clouds]), coordinates, **arrays)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rangesim.electronics.ambient import Ambient
 from rangesim.files.settings_files import load_settings
-from rangesim.instrument.instrument import Instrument, instrument_from_dict
-from rangesim.instrument.presets import DEFAULT_SENSORS, instrument
+from rangesim.instrument.instrument import Instrument
 from rangesim.motion import Motion
 from rangesim.motion.pose_tracks import motion_from_dict
+from rangesim.presets import DEFAULT_SENSORS, instrument, instrument_from_dict
 from rangesim.settings import limits
 from rangesim.settings.bounds import Metres, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
@@ -131,7 +131,7 @@ def load_experiment(path: str | Path) -> Experiment:
 def experiment_from_dict(data: Mapping[str, Any], files_in: Path | None = None) -> Experiment:
     """The experiment that plain data describes. Each table under `instrument` is one instrument.
 
-    files_in : as for `rangesim.instrument.instrument.instrument_from_dict`.
+    files_in : as for `rangesim.presets.instrument_from_dict`.
 
     Raises
     ------

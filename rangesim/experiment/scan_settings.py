@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from rangesim.electronics.ambient import Ambient
 from rangesim.experiment.camera_paths import CameraPath, Turntable
 from rangesim.files.settings_files import load_settings
-from rangesim.instrument.instrument import Instrument, instrument_from_dict
-from rangesim.instrument.presets import instrument
+from rangesim.instrument.instrument import Instrument
+from rangesim.presets import instrument, instrument_from_dict
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, Metres, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
@@ -110,7 +110,7 @@ def load_scan_settings(file: str | Path) -> ScanSettings:
 def scan_settings_from_dict(data: Mapping[str, Any], files_in: Path | None = None) -> ScanSettings:
     """The scan that plain data describes.
 
-    files_in : as for `rangesim.instrument.instrument.instrument_from_dict`.
+    files_in : as for `rangesim.presets.instrument_from_dict`.
 
     Raises
     ------

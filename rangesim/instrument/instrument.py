@@ -13,7 +13,7 @@ import numpy as np
 
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.motion import Timing
-from rangesim.rig import CAMERA_LENS, PROJECTOR_LENS, Intrinsics, Lens, pose
+from rangesim.rig import CAMERA_LENS, PROJECTOR_LENS, Beam, Camera, CoverGlass, Intrinsics, Lens, Optics, pose
 from rangesim.sensors import Decoder, Sensor, check_sensor, is_file_name, sensor_from_dict
 from rangesim.settings.bounds import Metres, Seconds, Watts, Wavelength, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, on_top_of, shown, to_dict
@@ -46,8 +46,8 @@ class Instrument:
     width, height : size of the image, pixels, if the scene's camera is used. Its field of view is kept. None: as the
         experiment says.
     T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres; None: the scene's camera.
-    projector : Intrinsics of the emitter; None: the size that the sensor states, with a field of view that covers
-        that of the camera.
+    projector : Intrinsics of the emitter, or a Beam, which starts at its ray and has no pose; None: Intrinsics of the
+        size that the sensor states, with a field of view that covers that of a pinhole camera.
     T_camera_projector : (4, 4) float64, maps projector coordinates to camera coordinates, metres. None: the emitter
         stands to the right of the camera, at the distance `baseline_m`, and is turned towards the point that the
         camera looks at.
@@ -59,12 +59,14 @@ class Instrument:
     exposure_s : exposure of each frame, seconds; None: automatic.
     camera_lens, projector_lens : Lens, aperture, focus and vignetting.
     timing : Timing, the times at which frames are taken, for an experiment in which something moves.
+    cover_glass : CoverGlass, the window in front of the device; None: it returns no light.
 
     Raises
     ------
     ValueError
-        A name or a number out of its range, a decoder or detector that does not fit the sensor, or two fields that
-        contradict each other: `camera` and `width`, `T_camera_projector` and `baseline_m`.
+        A name or a number out of its range, a decoder or detector that does not fit the sensor, two fields that
+        contradict each other (`camera` and `width`, `T_camera_projector` and `baseline_m`, a Beam and either of these
+        two), or no projector for a camera that is no pinhole.
 
     Examples
     --------
@@ -85,17 +87,18 @@ class Instrument:
     camera_lens: Lens = CAMERA_LENS
     projector_lens: Lens = PROJECTOR_LENS
     timing: Timing = field(default_factory=Timing)
-    camera: Intrinsics | None = None
+    camera: Camera | None = None
     width: Annotated[int, whole(1, "pixels")] | None = None
     height: Annotated[int, whole(1, "pixels")] | None = None
     T_world_camera: np.ndarray | None = None
-    projector: Intrinsics | None = None
+    projector: Optics | None = None
     T_camera_projector: np.ndarray | None = None
     wavelength_m: Wavelength | None = None
+    cover_glass: CoverGlass | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if not _NAME.fullmatch(self.name) or len(self.name) > MAX_NAME:
+        if not is_name(self.name):
             raise ValueError(
                 f"expected a name of letters, digits, - and _, at most {MAX_NAME}, got {shown(self.name)}."
             )
@@ -109,6 +112,16 @@ class Instrument:
         for one, others in (("camera", ("width", "height")), ("T_camera_projector", ("baseline_m",))):
             if getattr(self, one) is not None and (twice := [n for n in others if getattr(self, n) is not None]):
                 raise ValueError(f"expected either {one} or {twice[0]} of instrument {self.name!r}, got both.")
+        has_place = self.baseline_m is not None or self.T_camera_projector is not None
+        if isinstance(self.projector, Beam) and has_place:
+            raise ValueError(
+                f"expected neither baseline_m nor T_camera_projector of instrument {self.name!r}, because its beam "
+                "starts at its ray; state offset_m of the beam."
+            )
+        if self.camera is not None and not self.camera.is_pinhole and self.projector is None:
+            raise ValueError(
+                f"expected a projector of instrument {self.name!r}, such as a Beam, because its camera is no pinhole."
+            )
         for pose_name in ("T_world_camera", "T_camera_projector"):
             if getattr(self, pose_name) is not None:
                 object.__setattr__(self, pose_name, pose(getattr(self, pose_name), pose_name))
@@ -141,16 +154,30 @@ class Instrument:
             width, height = self.width, self.height
         rig = scene.rig(
             baseline_m if self.baseline_m is None else self.baseline_m, size, self.power_w, width, height,
-            camera=self.camera, T_world_camera=self.T_world_camera,
+            camera=self.camera if isinstance(self.camera, Intrinsics) else None, T_world_camera=self.T_world_camera,
         )  # fmt: skip
+        T_camera_projector = rig.T_camera_projector if self.T_camera_projector is None else self.T_camera_projector
         return replace(
             rig,
+            camera=self.camera or rig.camera,
             camera_lens=self.camera_lens,
             projector_lens=self.projector_lens,
             projector=self.projector or rig.projector,
-            T_camera_projector=rig.T_camera_projector if self.T_camera_projector is None else self.T_camera_projector,
+            T_camera_projector=np.eye(4) if isinstance(self.projector, Beam) else T_camera_projector,
             wavelength_m=self.emitter_wavelength_m,
+            cover_glass=self.cover_glass,
         )
+
+
+def is_name(text: str) -> bool:
+    """Whether an instrument may have this name.
+
+    Examples
+    --------
+    >>> is_name("kinect-v2"), is_name("../results")
+    (True, False)
+    """
+    return bool(_NAME.fullmatch(text)) and len(text) <= MAX_NAME
 
 
 def name_of(given: str, sensor: Sensor) -> str:

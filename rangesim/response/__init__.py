@@ -3,6 +3,7 @@
 
 from rangesim.response.path_lengths import SPEED_OF_LIGHT, FirstReturn, LengthSplit, Phasor, TransientHistogram
 from rangesim.response.patterns import Fringes, GrayBits, Images
+from rangesim.response.pulse import Pulse
 from rangesim.response.response import (
     CAUSTIC,
     DIRECT,
@@ -36,6 +37,7 @@ __all__ = [
     "Math",
     "NumpyMath",
     "Phasor",
+    "Pulse",
     "Response",
     "SparseResponse",
     "TransientHistogram",

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.returns import Returns
 from rangesim.decoding.status import Status
 from rangesim.errors import FileFormatError
 from rangesim.files.array_files import write_arrays
@@ -31,6 +32,16 @@ _RANGE = {
     "sampling_sigma_m": ArraySpec("float32", low=0, nan=True, inf=True, required=False),
     "settings": replace(SETTINGS, required=False),
 }
+_RETURNS = {
+    "range_m": ArraySpec("float32", ("k", "h", "w"), high=MAX_METRES, nan=True, required=False),
+    "strength": ArraySpec("float32", ("k", "h", "w"), nan=True, required=False),
+    "sigma_m": ArraySpec("float32", ("k", "h", "w"), low=0, nan=True, inf=True, required=False),
+    "status": ArraySpec("uint8", ("k", "h", "w"), high=max(Status), required=False),
+}
+"""Those of `Returns`; in files their names begin with `_PREFIX`."""
+_PREFIX = "returns_"
+"""First letters of the names of arrays of `Returns` in files of range images."""
+_ARRAYS = _RANGE | {_PREFIX + name: spec for name, spec in _RETURNS.items()}
 """Type, shape and bounds of the arrays of a range image, by their names in files. The bound of the confidence leaves
 room for the rounding of single precision."""
 
@@ -46,8 +57,9 @@ def save_range_image(image: RangeImage, path: str | Path) -> None:
     >>> save_range_image(decode(capture), "out/range.npz")  # doctest: +SKIP
     """
     arrays = {f.name: getattr(image, f.name) for f in fields(image) if isinstance(getattr(image, f.name), np.ndarray)}
+    returns = {} if image.returns is None else {_PREFIX + name: getattr(image.returns, name) for name in _RETURNS}
     settings = {"camera": to_dict(image.camera), "decoder": to_dict(image.decoder)}
-    write_arrays(path, {**arrays, "settings": settings_array(settings)})
+    write_arrays(path, {**arrays, **returns, "settings": settings_array(settings)})
 
 
 def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> RangeImage:
@@ -67,13 +79,17 @@ def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> R
     >>> load_range_image("out/range.npz").to_point_cloud().save("out/cloud.ply")  # doctest: +SKIP
     """
     path = Path(path)
-    arrays: dict[str, Any] = read_checked_arrays(path, _RANGE, dict(sizes or {}))
+    arrays: dict[str, Any] = read_checked_arrays(path, _ARRAYS, dict(sizes or {}))
     settings = settings_of(arrays.pop("settings"), path) if "settings" in arrays else {}
+    returns = {name: arrays.pop(_PREFIX + name) for name in _RETURNS if _PREFIX + name in arrays}
     try:
+        if returns and len(returns) < len(_RETURNS):
+            raise ValueError(f"expected all arrays {', '.join(_PREFIX + name for name in _RETURNS)} or none of them.")
         check_keys(settings, ("camera", "decoder"), "settings")
         camera, decoder = settings.get("camera"), settings.get("decoder")
         image = RangeImage(
             **arrays,
+            returns=Returns(**returns) if returns else None,
             camera=None if camera is None else from_dict(Intrinsics, camera, "camera"),
             decoder=None if decoder is None else from_dict(Decoder, decoder, "decoder"),  # type: ignore[type-abstract]
         )

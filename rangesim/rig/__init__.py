@@ -3,6 +3,7 @@
 
 from rangesim.rig.beam import Beam
 from rangesim.rig.cameras import Acceptance, Camera, Optics, PixelRays, tangents
+from rangesim.rig.cover_glass import CoverGlass
 from rangesim.rig.intrinsics import RESIDUAL_PX, Coefficient, FocalLength, Intrinsics, PrincipalPoint
 from rangesim.rig.poses import Array, check_rigid, is_same_pose, look_at, pose, translation
 from rangesim.rig.ray_cameras import Fisheye, Orthographic, RayTable, ScanningCamera
@@ -18,6 +19,7 @@ __all__ = [
     "Beam",
     "Camera",
     "Coefficient",
+    "CoverGlass",
     "Fisheye",
     "FocalLength",
     "Intrinsics",

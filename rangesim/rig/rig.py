@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rangesim.rig.beam import Beam
 from rangesim.rig.cameras import Camera, Optics
+from rangesim.rig.cover_glass import CoverGlass
 from rangesim.rig.intrinsics import Intrinsics
 from rangesim.rig.poses import SAME_PLACE, Array, is_same_pose, pose
 from rangesim.settings.bounds import Exponent, Metres, Watts, Wavelength, check_fields
@@ -76,6 +77,8 @@ class Rig:
     camera_lens, projector_lens : Lens
     projector_power_w : float, radiant power in watts that leaves the projector when it shows white.
     wavelength_m : wavelength of the emitter's light, metres; None: not stated.
+    cover_glass : CoverGlass, a window in front of camera and emitter that returns a little light; None: it returns
+        none.
 
     Raises
     ------
@@ -100,6 +103,7 @@ class Rig:
     projector_lens: Lens = PROJECTOR_LENS
     projector_power_w: Watts = 1.0
     wavelength_m: Wavelength | None = None
+    cover_glass: CoverGlass | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_world_camera", pose(self.T_world_camera, "T_world_camera"))
@@ -233,6 +237,14 @@ class Rig:
         if not isinstance(p, Intrinsics):
             return self.projector_power_w
         return self.projector_power_w * p.fx * p.fy / (p.width * p.height)
+
+    @property
+    def cover_glass_radiance(self) -> float:
+        """Radiance in W/m2/sr of a surface that would bring each pixel as much light as the cover glass; 0 without."""
+        if self.cover_glass is None:
+            return 0.0
+        etendue = self.camera.etendue_m2sr(self.camera_lens.aperture_radius_m)
+        return float(self.cover_glass.fraction * self.projector_power_w / etendue)
 
     @property
     def camera_illumination(self) -> NDArray[np.float32]:

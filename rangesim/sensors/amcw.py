@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""AMCW (indirect) time of flight: a camera with four taps per modulation frequency, and its decoder."""
+"""AMCW (indirect) time of flight: a camera with several taps per modulation frequency, and its decoder."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
@@ -12,10 +12,11 @@ import numpy as np
 
 from rangesim.capture import Capture
 from rangesim.decoding.path_length import PathLengths
-from rangesim.decoding.phase_shift import Phase, PhaseThresholds, modulation_is_weak, phase_sigma, tap_phase
+from rangesim.decoding.phase_shift import Phase, PhaseThresholds, modulation_is_weak, phase_of, phase_sigma, tap_phase
 from rangesim.decoding.phase_unwrapping import unwrap
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
+from rangesim.decoding.working_range import WorkingRange
 from rangesim.electronics.detector import Detector
 from rangesim.response import SPEED_OF_LIGHT, Phasor, Response
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, of_type
@@ -27,12 +28,11 @@ MAX_RANGE_M = 100.0
 the time of the search grows with this range, and the emitter of such a camera does not reach as far."""
 
 TAPS_DEG = (0, 90, 180, 270)
-"""Delays of the taps of each frequency, in degrees of its phase: quarter turns, as in nearly all such cameras. `frames`
-and `tap_phase` are written for them."""
+"""Delays of four taps, in degrees of the phase: quarter turns, as in nearly all such cameras. `quarter_turns` and
+`tap_phase` are written for them."""
 
-TAP_FRACTION = 1 / len(TAPS_DEG)
-"""Fraction of an exposure's light that each tap collects on average. All are equal, because the taps divide the light
-and lose none."""
+MAX_TAPS = 16
+"""Largest number of taps of a frequency: real cameras have 2 to 8 samples of the phase; more only costs memory."""
 
 WEIGHT_HZ = 1e8
 """Modulation frequency, hertz, that sets the unit of the weights of phase unwrapping. It is a typical frequency, so a
@@ -49,19 +49,23 @@ noise-free capture has a reading."""
 
 @dataclass(frozen=True)
 class AmcwToF(Sensor):
-    """Amplitude-modulated continuous wave camera with four taps per frequency (0, 90, 180, 270 degrees).
+    """Amplitude-modulated continuous wave camera with evenly spaced taps, by default four (0, 90, 180, 270 degrees).
 
-    The four taps of a pixel share the light of one exposure. The mean of tap theta is (A + contrast * B cos(phi -
-    theta)) / 4 with phi = 2 pi f l / c over the path length l (there and back); A is the white and the ambient light.
+    The N taps of a pixel share the light of one exposure. The mean of tap theta is (A + contrast * B cos(phi -
+    theta)) / N with phi = 2 pi f l / c over the path length l (there and back); A is the white and the ambient light.
     So the taps add up to A. A pixel with two taps, which takes two exposures, collects as much in each tap as this one
-    with twice the `exposure_s`. Frames: frequency by frequency, four taps each.
+    with twice the `exposure_s`. Frames: frequency by frequency, `taps` each.
+
+    A pixel of a Kinect v2 takes N exposures, and delivers the difference of two opposite taps for each. Such a
+    difference has the modulation and the shot noise of one of N taps that share an exposure as long as all N together.
 
     Parameters
     ----------
     modulation_hz : tuple of floats, hertz; or one float.
     contrast : float in (0, 1], demodulation contrast.
     waveform : "sine", or "square" for a square source against a square reference. The correlation is then a triangle,
-        and a decoder that takes it for a sine has a periodic error, the "wiggling".
+        and a decoder that takes it for a sine has a periodic error, the "wiggling". It needs four taps.
+    taps : number of taps of each frequency, at 0, 360 / taps, ... degrees of its phase. Kinect v2 has 3.
 
     Examples
     --------
@@ -75,6 +79,7 @@ class AmcwToF(Sensor):
     modulation_hz: tuple[Hertz, ...] = (20e6, 80e6, 100e6)
     contrast: Annotated[float, Bounds("a positive fraction", 1e-3, 1)] = 0.8
     waveform: Literal["sine", "square"] = "sine"
+    taps: Annotated[int, Bounds("a number of taps", 3, MAX_TAPS)] = len(TAPS_DEG)
 
     type_name: ClassVar[str] = "amcw-tof"
 
@@ -85,6 +90,8 @@ class AmcwToF(Sensor):
         check_fields(self)
         if not self.modulation_hz:
             raise ValueError("expected modulation_hz to hold at least one frequency in hertz, got none.")
+        if self.waveform == "square" and self.taps != len(TAPS_DEG):
+            raise ValueError(f"expected {len(TAPS_DEG)} taps for a square waveform, got {self.taps}.")
         limits.check("frequencies", len(self.modulation_hz), "frequencies in modulation_hz")
         limits.check("wraps", self.wraps, "wraps of the highest frequency before all frequencies repeat")
 
@@ -115,17 +122,25 @@ class AmcwToF(Sensor):
     def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         offset = white + ambient
         result = np.empty((self.n_frames, *offset.shape), dtype=np.float32)
-        taps = ((phasor, tap) for phasor in channels for tap in TAPS_DEG)
-        for frame, (phasor, tap) in zip(result, taps, strict=True):
-            axis, sign = tap // 90 % 2, 1 - tap // 180 * 2  # cos or sin of the phase, and its sign
-            np.multiply(TAP_FRACTION, offset + sign * self.contrast * phasor[axis], out=frame, casting="same_kind")
+        modulated = quarter_turns if self.taps == len(TAPS_DEG) else even_turns
+        correlations = (values for phasor in channels for values in modulated(phasor, self.contrast, self.taps))
+        for frame, correlation in zip(result, correlations, strict=True):
+            np.multiply(self.tap_fraction, offset + correlation, out=frame, casting="same_kind")
         return result
 
+    @property
+    def tap_fraction(self) -> float:
+        """Fraction of an exposure's light that each tap collects on average.
+
+        All are equal, because the taps divide the light and lose none.
+        """
+        return 1 / self.taps
+
     def frames_per_exposure(self, single_tap: bool = False) -> int:
-        return 1 if single_tap else len(TAPS_DEG)
+        return 1 if single_tap else self.taps
 
     def frame_names(self) -> list[str]:
-        return [f"{f / 1e6:g}MHz_{tap}deg" for f in self.modulation_hz for tap in TAPS_DEG]
+        return [f"{f / 1e6:g}MHz_{360 * k / self.taps:.4g}deg" for f in self.modulation_hz for k in range(self.taps)]
 
     @property
     def default_emitter(self) -> Emitter:
@@ -156,11 +171,11 @@ class AmcwToF(Sensor):
     @property
     def details(self) -> str:
         megahertz = ", ".join(f"{f / 1e6:g}" for f in self.modulation_hz)
-        return f"{megahertz} MHz, {len(TAPS_DEG)} taps, {self.waveform} wave"
+        return f"{megahertz} MHz, {self.taps} taps, {self.waveform} wave"
 
     def representative_frames(self, frames: np.ndarray) -> list[int]:
         """Indices of a tap of the first frequency, and of two taps of the last one."""
-        last = len(TAPS_DEG) * (len(self.modulation_hz) - 1)
+        last = self.taps * (len(self.modulation_hz) - 1)
         return sorted({0, last, last + 1})
 
 
@@ -177,6 +192,7 @@ class AmcwDecoder(Decoder):
     max_residual : float, turns; a phase that is farther from the phase of the common path length contradicts it.
     max_ambiguity : float, largest misfit of the best wrap counts as a fraction of that of the second best. Above it,
         the choice between the two is a guess.
+    working_range : WorkingRange, outside which readings are refused; None: all are kept.
 
     Examples
     --------
@@ -188,6 +204,7 @@ class AmcwDecoder(Decoder):
     correct_wiggling: bool = True
     max_residual: Annotated[float, Bounds("0 or positive", 0, 1)] = 0.1
     max_ambiguity: Annotated[float, Bounds("0 or positive", 0, 1)] = 0.5
+    working_range: WorkingRange | None = None
 
     type_name: ClassVar[str] = "amcw-tof"
     reads: ClassVar[type[Sensor]] = AmcwToF
@@ -205,8 +222,11 @@ class AmcwDecoder(Decoder):
         amplitude, mean = np.empty((2, *shape), dtype=np.float32)
         sigma_m = None if capture.noise(capture.frames[0, :1]) is None else np.empty(shape, dtype=np.float32)
         for rows in bands(len(status)):
-            phases = [tap_phase(taps[:, rows], exact_square) for taps in groups]
-            sigmas = [phase_sigma(capture, phase, len(TAPS_DEG)) for phase in phases]
+            if sensor.taps == len(TAPS_DEG):
+                phases = [tap_phase(taps[:, rows], exact_square) for taps in groups]
+            else:
+                phases = [phase_of(taps[:, rows]) for taps in groups]
+            sigmas = [phase_sigma(capture, phase, sensor.taps) for phase in phases]
             weights = [_weight(*read) for read in zip(phases, sigmas, sensor.modulation_hz, strict=True)]
             unwrapped = unwrap([p.normalised for p in phases], sensor.modulation_hz, weights, sensor.searched_m)
             contradiction = unwrapped.residual > self.max_residual
@@ -228,14 +248,40 @@ class AmcwDecoder(Decoder):
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        visibility = of_type(sensor, AmcwToF).contrast * TAP_FRACTION
-        least = self.phase.least_signal(len(TAPS_DEG), visibility, self.content(sensor), background)
+        visibility = of_type(sensor, AmcwToF).contrast * of_type(sensor, AmcwToF).tap_fraction
+        least = self.phase.least_signal(of_type(sensor, AmcwToF).taps, visibility, self.content(sensor), background)
         if background.noise_variance is None:
             least = np.maximum(least, background.floor(RELATIVE_SIGNAL))
         return least
 
     def content(self, sensor: Sensor) -> FrameContent:
-        return FrameContent(signal=TAP_FRACTION, ambient=TAP_FRACTION)
+        fraction = of_type(sensor, AmcwToF).tap_fraction
+        return FrameContent(signal=fraction, ambient=fraction)
+
+
+def quarter_turns(phasor: np.ndarray, contrast: float, taps: int = len(TAPS_DEG)) -> Iterator[np.ndarray]:
+    """Correlations (h, w) of four taps: `contrast` times cos, sin, -cos and -sin of the phase, of sines or triangles.
+
+    phasor : (2, h, w), the channel of a `Phasor`.
+    """
+    for tap in TAPS_DEG:
+        axis, sign = tap // 90 % 2, 1 - tap // 180 * 2  # cos or sin of the phase, and its sign
+        yield sign * contrast * phasor[axis]
+
+
+def even_turns(phasor: np.ndarray, contrast: float, taps: int) -> Iterator[np.ndarray]:
+    """Correlations (h, w) of `taps` evenly spaced taps with sine waves; parameters as for `quarter_turns`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> third = np.array([np.cos(2 * np.pi / 3), np.sin(2 * np.pi / 3)])  # the phase is a third of a turn
+    >>> [round(float(tap), 3) for tap in even_turns(third, contrast=0.5, taps=3)]
+    [-0.25, 0.5, -0.25]
+    """
+    for k in range(taps):
+        theta = 2 * math.pi * k / taps
+        yield np.float32(contrast * math.cos(theta)) * phasor[0] + np.float32(contrast * math.sin(theta)) * phasor[1]
 
 
 def _weight(phase: Phase, sigma: np.ndarray | None, modulation_hz: float) -> np.ndarray:

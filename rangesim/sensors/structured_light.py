@@ -16,6 +16,7 @@ from rangesim.decoding.phase_shift import PhaseThresholds
 from rangesim.decoding.range_image import MIN_MEASURED, RangeImage
 from rangesim.decoding.status import Status
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
+from rangesim.decoding.working_range import WorkingRange
 from rangesim.errors import warn
 from rangesim.response import DenseResponse, LightPath, NumpyMath
 from rangesim.rig import Rig
@@ -185,6 +186,7 @@ class StructuredLightDecoder(Decoder):
     Parameters
     ----------
     gray : GrayThresholds. phase : PhaseThresholds. triangulation : TriangulationLimits.
+    working_range : WorkingRange, outside which readings are refused; None: all that triangulate are kept.
 
     Examples
     --------
@@ -197,6 +199,7 @@ class StructuredLightDecoder(Decoder):
     gray: GrayThresholds = field(default_factory=GrayThresholds)
     phase: PhaseThresholds = field(default_factory=PhaseThresholds)
     triangulation: TriangulationLimits = field(default_factory=TriangulationLimits)
+    working_range: WorkingRange | None = None
 
     type_name: ClassVar[str] = "structured-light"
     reads: ClassVar[type[Sensor]] = StructuredLight

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rangesim.response import Response
+from rangesim.response import GLINT, DenseResponse, LightPath, NumpyMath, Response, SparseResponse
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
 from rangesim.settings.config import ShortRepr
@@ -213,9 +213,36 @@ class StillSignals(Signals):
             scale, error = np.float32(sampling_errors), self.sampling
             channels = [c + scale * error.channels[r] for c, r in zip(channels, sensor.responses(), strict=True)]
             projector = projector + scale * error.projector
+        if self.rig.cover_glass is not None:
+            window = np.float32(self.rig.cover_glass_radiance)
+            channels = [
+                c + window * _off_glass(r, self.rig)[:, None, None]
+                for c, r in zip(channels, sensor.responses(), strict=True)
+            ]
+            projector = projector + window
         frames = sensor.frames(channels, projector, ambient_transmission * self.energy.ambient)
         expected = (sensor.n_frames, *projector.shape)
         if not isinstance(frames, np.ndarray) or frames.shape != expected or frames.dtype != np.float32:
             got = f"{frames.shape} and {frames.dtype}" if isinstance(frames, np.ndarray) else type(frames).__name__
             raise ValueError(f"expected frames of {sensor.type_name} of shape {expected} and type float32, got {got}.")
         return frames
+
+
+def _off_glass(response: Response, rig: Rig) -> np.ndarray:
+    """(c,) float32, weights with which a response counts light off the cover glass: the mean over the emitter's pixels.
+
+    The light is no first return: a sensor that sees first returns alone does not see it.
+    """
+    assert rig.cover_glass is not None
+    projector, length = rig.projector, rig.cover_glass.path_m
+    total = np.zeros(response.channels)
+    for row in range(projector.height):
+        u = np.arange(projector.width) + 0.5
+        path = LightPath(u, np.full_like(u, row + 0.5), np.full_like(u, length), np.zeros(u.shape, bool), GLINT)
+        if isinstance(response, SparseResponse):
+            for index, weight in response.bin_weights(path, NumpyMath()):
+                weights = np.broadcast_to(weight, u.shape)
+                total += np.bincount(index.astype(np.int64), weights, response.channels + 1)[: response.channels]
+        elif isinstance(response, DenseResponse):
+            total += [np.broadcast_to(w, u.shape).sum() for w in response.weights(path, NumpyMath())]
+    return (total / (projector.width * projector.height)).astype(np.float32)

@@ -183,6 +183,12 @@ def _experiment(path: Path, _: Arguments) -> Any:
     return load_experiment(path)
 
 
+def _device(path: Path, _: Arguments) -> Any:
+    from rangesim import presets
+
+    return presets.describe(path)
+
+
 def _calibration(path: Path, _: Arguments) -> Any:
     import rangesim
 
@@ -573,6 +579,7 @@ READERS = {
         Reader("capture", _capture, seeds.captures, ("*.json", "*.json", "*/00*.*"), (_sidecar_trees,)),
         Reader("capture-decoded", _decoded, seeds.captures, ("*.json",), (_sidecar_trees,), share=0.5),
         Reader("experiment", _experiment, seeds.experiments, by_hand=(hostile.toml_files,)),
+        Reader("device", _device, seeds.devices, share=0.5),
         Reader("calibration-json", _calibration, seeds.rig_files, by_hand=(hostile.json_trees,), check=_rig_is_finite),
         Reader(
             "calibration-xml", _calibration, seeds.opencv_files, by_hand=(hostile.opencv_calibrations,),

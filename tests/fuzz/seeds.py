@@ -183,6 +183,17 @@ sensor = "ideal-tof"
     return seeds | {"every sensor": of_file("experiment.toml", (every + SPAD).encode())}
 
 
+def devices() -> Seeds:
+    """Files of devices, one of each kind of sensor."""
+    from rangesim import presets
+
+    found = {presets.load(name).sensor.type_name: name for name in presets.names()}
+    texts = {
+        n: presets.describe(n).text.replace("[instrument]\n", '[instrument]\nname = "one"\n') for n in found.values()
+    }
+    return {name: of_file("device.toml", text.encode()) for name, text in texts.items()}
+
+
 # --- calibrations and models ------------------------------------------------------------------------------------------
 
 

@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Do the devices of `rangesim.presets` have the noise, the pixels, the view and the range of their data sheets?
+
+Each device reads a matte wall that faces it, at the distances at which somebody published its noise. The emitter's
+power, as it stands in the file of the device, was fitted at one of these distances (marked *); the others are
+predictions. The wall is seen by a few pixels in the middle of the image. Where the emitter lights the whole field of
+view, the light is computed in closed form; beams are traced.
+
+For a figure that is an upper bound ("<="), noise below the bound counts as a ratio of 1. At mid-range, most pixels
+have to give a reading, and none closer or farther than the sheet allows may.
+
+`--fit` prints the power that makes the noise at the marked distance equal to the published one.
+
+The last line is JSON:
+
+    presets                 number of devices whose pixels, field of view and range agree with their sheet
+    with_published_noise    number of devices with a published figure
+    worst_noise_ratio       largest ratio of simulated and published noise, or its inverse, at all distances
+
+Usage: python benchmarks/presets.py [--devices kinect-v2 ...] [--fit]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from rangesim import (
+    Ambient,
+    Intrinsics,
+    RangeImage,
+    Rig,
+    Status,
+    StillSignals,
+    decode,
+    expose,
+    load_scene,
+    presets,
+    transport,
+)
+from rangesim.environment.backend import select_variant
+from rangesim.instrument.instrument import Instrument
+from rangesim.presets import Preset
+from rangesim.response import LightPath, NumpyMath, Response, SparseResponse
+from rangesim.rig import Camera, Fisheye, RayTable
+from rangesim.robust_scale import sigma_from_median
+from rangesim.signals import EnergySplit, GroundTruth
+
+PIXELS = 64
+"""Pixels across and down that look at the wall: 4096 readings tell a standard deviation to 1 %."""
+RAYS = 32
+"""Beams across and down that look at the wall: 1024 readings tell a standard deviation to 2 %."""
+SPP = 16
+"""Light paths of each traced beam. The wall is even, so its sampling error is far below the noise of the photons."""
+MIN_VALID = 0.9
+"""Least fraction of the pixels with a reading of a wall at mid-range."""
+POWERS_W = (1e-6, 1e4)
+"""Powers between which `--fit` searches."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--devices", nargs="+", choices=presets.names(), default=presets.names())
+    parser.add_argument("--fit", action="store_true", help="print the fitted power of each device and end")
+    args = parser.parse_args()
+    found = [presets.describe(name) for name in args.devices]
+    if args.fit:
+        for preset in found:
+            if preset.sheet.noise is not None and preset.sheet.noise.fitted_at_m is not None:
+                print(f"{preset.name:28s}power_w = {fitted_power_w(preset):.3g}", flush=True)
+        return
+    agree, ratios = 0, []
+    for preset in found:
+        faults = contradictions(preset)
+        agree += not faults
+        print(f"{preset.name}: {'as its sheet' if not faults else '; '.join(faults)}")
+        ratios += noise_ratios(preset)
+    published = sum(preset.sheet.noise is not None for preset in found)
+    worst = round(max(ratios, default=math.nan), 3)
+    print(json.dumps({"presets": agree, "with_published_noise": published, "worst_noise_ratio": worst}))
+
+
+def noise_ratios(preset: Preset) -> list[float]:
+    """Ratio, or its inverse, of simulated and published noise at each distance; prints a line for each."""
+    noise = preset.sheet.noise
+    if noise is None:
+        print("    no published figure")
+        return []
+    ratios, simulated = [], []
+    for distance_m, published_m in zip(noise.range_m, noise.sigma_m, strict=True):
+        image = of_wall(unlimited(preset.instrument), distance_m, noise.reflectance, noise.sunlight_lux)
+        sigma_m = scatter_m(image)
+        simulated.append(sigma_m)
+        simulated_ratio = sigma_m / published_m
+        ratios.append(max(simulated_ratio, 1.0 if noise.is_bound else 1 / simulated_ratio))
+        mark, relation = "*" if distance_m == noise.fitted_at_m else " ", "<=" if noise.is_bound else "  "
+        print(
+            f"    {distance_m:7.2f} m{mark} published {relation} {1e3 * published_m:7.2f} mm  "
+            f"simulated {1e3 * sigma_m:7.2f} mm  ratio {simulated_ratio:5.2f}  readings {image.valid.mean():4.0%}"
+        )
+    if len(noise.range_m) > 1:
+        slope = math.log(simulated[-1] / simulated[0]) / math.log(noise.range_m[-1] / noise.range_m[0])
+        print(f"    exponent of the distance: published {noise.slope:.2f}, simulated {slope:.2f}")
+    return ratios
+
+
+def contradictions(preset: Preset) -> list[str]:
+    """What of the instrument does not agree with the sheet, in words."""
+    sheet, faults = preset.sheet, []
+    camera = preset.instrument.camera
+    assert camera is not None
+    if (camera.width, camera.height) != sheet.resolution_px:
+        faults.append(f"{camera.width} x {camera.height} pixels instead of {sheet.resolution_px}")
+    view = field_of_view_deg(camera)
+    if not np.allclose(view, sheet.field_of_view_deg, rtol=0.02):
+        faults.append(f"field of view {view} instead of {sheet.field_of_view_deg}")
+    near_m, far_m = sheet.range_m
+    middle_m = math.sqrt(max(near_m, 0.01) * far_m)
+    valid = of_wall(preset.instrument, middle_m, 0.8, 0.0).valid.mean()
+    if valid < MIN_VALID:
+        faults.append(f"readings in {valid:.0%} of the pixels at {middle_m:.2f} m")
+    for distance_m in (0.9 * near_m, 1.1 * far_m):
+        if distance_m > 0 and (valid := of_wall(preset.instrument, distance_m, 0.8, 0.0).valid.mean()) > 0:
+            faults.append(f"readings in {valid:.0%} of the pixels at {distance_m:.2f} m, outside its range")
+    return faults
+
+
+def field_of_view_deg(camera: Camera) -> tuple[float, float]:
+    """Full angles across and down, degrees: of an image between its edges, of a scanner between its outermost rays."""
+    if isinstance(camera, Intrinsics):
+        x = np.degrees(np.arctan([camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx])).sum()
+        y = np.degrees(np.arctan([camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy])).sum()
+        return float(x), float(y)
+    if isinstance(camera, Fisheye):
+        return float(np.degrees(camera.width / camera.fx)), float(np.degrees(camera.height / camera.fy))
+    x, y, z = np.moveaxis(camera.pixel_rays().directions, -1, 0)
+    azimuth, elevation = np.degrees(np.arctan2(x, z)), np.degrees(np.arcsin(-y))
+    across = np.ptp(np.unwrap(azimuth, axis=1, period=360), axis=1)
+    is_whole_turn = across.min() > 360 * (1 - 1.5 / camera.width)
+    return 360.0 if is_whole_turn else float(np.ptp(azimuth)), float(np.ptp(elevation))
+
+
+def fitted_power_w(preset: Preset) -> float:
+    """Power of the emitter at which the noise at the marked distance is the published one."""
+    noise = preset.sheet.noise
+    assert noise is not None
+    assert noise.fitted_at_m is not None
+    wanted_m = noise.sigma_m[noise.range_m.index(noise.fitted_at_m)]
+    low, high = np.log(POWERS_W)
+    for _ in range(30):
+        middle = (low + high) / 2
+        instrument = replace(unlimited(preset.instrument), power_w=float(np.exp(middle)))
+        image = of_wall(instrument, noise.fitted_at_m, noise.reflectance, noise.sunlight_lux)
+        is_bright = (image.status == Status.SATURATED).mean() > 0.5
+        is_noisy = not is_bright and (image.valid.mean() < 0.5 or scatter_m(image) > wanted_m)
+        low, high = (middle, high) if is_noisy else (low, middle)
+    return float(np.exp((low + high) / 2))
+
+
+def unlimited(instrument: Instrument) -> Instrument:
+    """The device without its limits of range, which cut off half of the readings of a wall at a limit."""
+    assert instrument.decoder is not None
+    return replace(instrument, decoder=replace(instrument.decoder, working_range=None))  # type: ignore[call-arg]
+
+
+def scatter_m(image: RangeImage) -> float:
+    """Robust standard deviation of the readings of a wall, metres; NaN without readings."""
+    reading = image.z[image.valid].astype(np.float64)
+    return sigma_from_median(reading, float(np.median(reading))) if len(reading) else math.nan
+
+
+def of_wall(instrument: Instrument, distance_m: float, reflectance: float, sunlight_lux: float) -> RangeImage:
+    """Range image of a matte wall that faces the device, by pixels in the middle of its view."""
+    sun = Ambient("sun", illuminance_lux=sunlight_lux) if sunlight_lux else None
+    daylight_w_m2 = 1.0 if sunlight_lux else 0.0
+    if isinstance(instrument.projector, Intrinsics):
+        signals = flooded_wall(instrument, distance_m, reflectance, daylight_w_m2)
+    else:
+        signals = traced_wall(instrument, distance_m, reflectance, daylight_w_m2)
+    capture = expose(signals, instrument.sensor, instrument.detector, instrument.exposure_s, seed=0, ambient=sun)
+    return decode(capture, instrument.decoder)
+
+
+def rig_of(instrument: Instrument) -> Rig:
+    """The rig of a device at the origin, with few pixels, all of which look along z or nearly so."""
+    camera = instrument.camera
+    assert camera is not None
+    assert instrument.projector is not None
+    middle = {"width": PIXELS, "height": PIXELS, "cx": PIXELS / 2, "cy": PIXELS / 2}
+    if isinstance(camera, (Intrinsics, Fisheye)):
+        camera = replace(camera, **middle)
+    else:
+        ahead = np.tile([0.0, 0.0, 1.0], (RAYS, RAYS, 1))
+        camera = RayTable(ahead, field_rad=camera.field_rad, acceptance=camera.acceptance)
+    pose = np.eye(4) if instrument.T_camera_projector is None else instrument.T_camera_projector
+    return Rig(
+        camera,
+        instrument.projector,
+        T_camera_projector=pose,
+        camera_lens=instrument.camera_lens,
+        projector_lens=instrument.projector_lens,
+        projector_power_w=instrument.power_w,
+        wavelength_m=instrument.emitter_wavelength_m,
+    )
+
+
+@lru_cache(maxsize=64)  # the search for a power asks for the same wall again
+def bright_wall(instrument: Instrument, distance_m: float, reflectance: float, daylight_w_m2: float) -> StillSignals:
+    """Signals of the wall that beams of 1 W light, traced."""
+    import mitsuba as mi
+
+    select_variant()
+    to_world = mi.ScalarTransform4f()
+    size = max(1.0, 0.1 * distance_m)
+    parts: dict[str, Any] = {
+        "sensor": {"type": "perspective", "to_world": to_world.look_at([0, 0, 0], [0, 0, 1], [0, 1, 0])},
+        "wall": {
+            "type": "rectangle",
+            "to_world": to_world.translate([0, 0, distance_m]).scale([size, size, -1]),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "spectrum", "value": reflectance}},
+        },
+    }
+    if daylight_w_m2:
+        light = {"type": "spectrum", "value": daylight_w_m2 / np.pi}
+        parts["sky"] = {"type": "constant", "radiance": light}
+    scene = load_scene({"type": "scene", **parts})
+    return transport(scene, rig_of(instrument), [instrument.sensor], spp=SPP, max_depth=2, photons=0, glint=False)
+
+
+def traced_wall(instrument: Instrument, distance_m: float, reflectance: float, daylight_w_m2: float) -> StillSignals:
+    """Signals of the wall that beams light: traced once for 1 W, and scaled."""
+    one = bright_wall(replace(instrument, power_w=1.0), distance_m, reflectance, daylight_w_m2)
+    factor, energy = np.float32(instrument.power_w), one.energy
+    kinds = {f.name: factor * getattr(energy, f.name) for f in fields(energy) if f.name != "ambient"}
+    return replace(
+        one,
+        rig=replace(one.rig, projector_power_w=instrument.power_w),
+        energy=replace(energy, **kinds),
+        channels={response: factor * values for response, values in one.channels.items()},
+        sampling=None,
+    )
+
+
+def flooded_wall(instrument: Instrument, distance_m: float, reflectance: float, daylight_w_m2: float) -> StillSignals:
+    """Signals of the wall that the emitter lights at once, in closed form: direct light, and broadband daylight of an
+    irradiance on the wall."""
+    rig = rig_of(instrument)
+    emitter = rig.projector
+    assert isinstance(emitter, Intrinsics)
+    rays = rig.camera.pixel_rays().directions
+    points = rays / rays[..., 2:] * distance_m
+    in_projector = (points - rig.T_camera_projector[:3, 3]) @ rig.T_camera_projector[:3, :3]
+    uv, range_m = emitter.project(in_projector), np.linalg.norm(points, axis=-1)
+    out_m = np.linalg.norm(in_projector, axis=-1)
+    with np.errstate(invalid="ignore"):
+        lit = ((uv >= 0) & (uv <= [emitter.width, emitter.height])).all(axis=-1)
+    cosine = (distance_m - rig.T_camera_projector[2, 3]) / out_m  # of the wall's normal and the light
+    irradiance = rig.projector_irradiance * (out_m / in_projector[..., 2]) ** 3 / out_m**2 * cosine
+    radiance = np.where(lit, reflectance / np.pi * irradiance, 0.0)
+    path = LightPath(*(np.nan_to_num(a) * lit for a in (uv[..., 0], uv[..., 1], range_m + out_m)), lit)
+    channels = {r: weighted(r, path, radiance) for r in instrument.sensor.responses()}
+    zero = np.zeros(radiance.shape, dtype=np.float32)
+    ambient = zero + np.float32(reflectance / np.pi * daylight_w_m2)
+    energy = EnergySplit(radiance.astype(np.float32), zero, zero, zero, zero, ambient)
+    truth = GroundTruth(
+        z=zero + np.float32(distance_m),
+        range_m=range_m.astype(np.float32),
+        normal=np.tile(np.float32([0, 0, -1]), (*radiance.shape, 1)),
+        instance=np.zeros(radiance.shape, dtype=np.int32),
+        material=np.zeros(radiance.shape, dtype=np.int32),
+        projector_uv=uv.astype(np.float32),
+        projector_visible=lit,
+        instance_names=("wall",),
+        material_names=("matte",),
+    )
+    return StillSignals(rig, energy, truth, channels=channels)
+
+
+def weighted(response: Response, path: LightPath, radiance: np.ndarray) -> np.ndarray:
+    """(c, h, w) float32, W/m2/sr, what the channels of a response read of the direct light."""
+    if isinstance(response, SparseResponse):
+        weights = response.bin_weights(path, NumpyMath())
+        bins: Sequence[Any] = range(response.channels)
+        return np.stack([sum(np.where(i == b, radiance * w, 0) for i, w in weights) for b in bins]).astype(np.float32)
+    return np.stack([radiance * w for w in response.weights(path, NumpyMath())]).astype(np.float32)  # type: ignore[attr-defined]
+
+
+if __name__ == "__main__":
+    main()

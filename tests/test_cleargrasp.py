@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenes rebuilt from depth images: planes and front surfaces, of images whose truth is known and of real ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rebuilt_scene import Rebuilt, front_surface, rebuild, reflectances, scene_dictionary
+
+from rangesim import Intrinsics, load_scene, transport
+
+CAMERA = Intrinsics(320, 180, fx=230.0, fy=230.0, cx=160.0, cy=90.0)
+SIGMA_Q = 0.08 / (230 * 0.05)
+"""Noise of 1 / z, per metre: 0.08 pixel of disparity at a baseline of 50 mm."""
+NORMAL, DISTANCE_M = np.array([0.0, -0.8, -0.6]), 0.45
+"""A table that is seen at 53 degrees: points X on it have NORMAL . X = -DISTANCE_M."""
+CENTRE, RADIUS_M = np.array([0.02, 0.03, 0.60]), 0.06
+"""A ball before it."""
+Images = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def images() -> Images:
+    """Depth of table and ball, (h, w) metres, without noise; depth of the table alone; mask of the ball."""
+    rays = CAMERA.directions(CAMERA.pixel_centres())
+    table = -DISTANCE_M / (rays @ NORMAL)
+    table[~((table > 0) & (table < 1.2))] = np.nan
+    a, b, c = (rays * rays).sum(-1), rays @ CENTRE, CENTRE @ CENTRE - RADIUS_M**2
+    root = b * b - a * c
+    mask = root > 0.05 * b * b * RADIUS_M**2 / (CENTRE @ CENTRE)  # without the outermost rays, along the surface
+    ball = (b - np.sqrt(np.where(root > 0, root, np.nan))) / a
+    return np.where(mask, ball, table), table, mask
+
+
+@pytest.fixture(scope="module")
+def rebuilt(images: Images) -> Rebuilt:
+    """Rebuilt from depth with noise, with a hole of 12 x 12 pixels in the ball, and with flying pixels on it."""
+    z, _, mask = images
+    random = np.random.default_rng(0)
+    noisy = 1 / (1 / z + SIGMA_Q * random.normal(size=z.shape))
+    rows, columns = (int(np.median(index)) for index in np.nonzero(mask))
+    noisy[rows - 6 : rows + 6, columns - 6 : columns + 6] = np.nan
+    noisy[mask & (random.random(mask.shape) < 0.02)] = 0.9
+    return rebuild(CAMERA, noisy, mask, SIGMA_Q)
+
+
+def test_the_table_is_found_and_goes_on_behind_the_object(images: Images, rebuilt: Rebuilt) -> None:
+    _, table, mask = images
+    assert len(rebuilt.planes) == 1
+    np.testing.assert_allclose(rebuilt.behind[mask], table[mask], atol=1e-3)
+    assert not np.isfinite(rebuilt.things).any()
+
+
+def test_the_front_surface_is_the_objects_also_in_a_hole(images: Images, rebuilt: Rebuilt) -> None:
+    """The noise of a pixel is 2 mm; the surface is better than a millimetre, except where it turns away."""
+    z, _, mask = images
+    error = np.abs(rebuilt.front - z)[mask]
+    assert np.array_equal(np.isfinite(rebuilt.front), mask)
+    assert np.median(error) < 0.5e-3
+    assert np.quantile(error, 0.8) < 1e-3
+
+
+def test_a_surface_goes_on_straight_where_depth_is_missing_at_its_boundary() -> None:
+    x, y = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
+    q = 1.8 + 0.002 * x - 0.001 * y
+    mask = (x > 10) & (x < 60) & (y > 10) & (y < 50)
+    front = front_surface(np.where(mask & (x < 48), q, np.nan), mask, SIGMA_Q)
+    assert front is not None
+    np.testing.assert_allclose(front[mask], 1 / q[mask], atol=1e-5)
+
+
+@pytest.mark.parametrize("glass", ["wall", "thin", "two walls", "solid"])
+def test_the_renderer_sees_the_front_surface_and_the_table(
+    images: Images, rebuilt: Rebuilt, glass: str, tmp_path: Path
+) -> None:
+    z, table, mask = images
+    reflectance = reflectances(np.full(mask.shape, 128.0), mask)
+    scene = load_scene(scene_dictionary(rebuilt, reflectance, tmp_path, glass=glass))  # type: ignore[arg-type]
+    truth = transport(scene, scene.rig(width=320), [], spp=1, photons=0).truth
+    is_glass = truth.material == truth.material_names.index("transparent")
+    assert (is_glass != mask).mean() < 0.02
+    np.testing.assert_allclose(np.median(np.abs(truth.z - z)[is_glass & mask]), 0, atol=1e-3)
+    np.testing.assert_allclose(np.nanquantile(np.abs(truth.z - table)[~is_glass], 0.95), 0, atol=1e-3)

@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Devices by name are what their data sheets say, and every number of theirs has a source."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from synthetic import signals_of_depth
+
+from rangesim import Intrinsics, Rig, Status, decode, expose, presets
+from rangesim.cli import main
+from rangesim.errors import FileFormatError
+from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
+from rangesim.experiment.experiment import load_experiment
+from rangesim.experiment.scan_settings import scan_settings_from_dict
+from rangesim.files.text_files import read_toml
+from rangesim.instrument.instrument import Instrument
+from rangesim.presets.catalogue import FOLDER
+from rangesim.presets.preset import STANDINGS, numbers_of, standing
+from rangesim.sensors import presets as sensor_presets
+from rangesim.settings.config import to_dict
+
+NAMES = presets.names()
+UNUSED = ("pixel_pitch_m", "min_exposure_s", "max_exposure_s", "ambient_transmission")
+"""Settings of detectors on which nothing depends if the exposure is stated and the light's spectrum is known."""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_number_of_a_device_is_in_its_file_with_a_source(name: str) -> None:
+    """No setting of sensor and detector is left to a default of the package, and neither are power and exposure."""
+    preset = presets.describe(name)
+    data = read_toml(FOLDER / f"{name}.toml")
+    assert set(preset.sources) == set(numbers_of({"sheet": data["sheet"], "instrument": data["instrument"]}))
+    used = {standing(source) for source in preset.sources.values()}
+    assert used - {*STANDINGS} <= set(preset.documents)
+    assert {"power_w", "exposure_s"} <= set(data["instrument"])
+    assert preset.instrument.exposure_s is not None
+    for part in ("sensor", "detector"):
+        stated = set(data["instrument"][part])
+        missing = set(settings_that_are_numbers(getattr(preset.instrument, part))) - stated - {*UNUSED}
+        assert not missing
+
+
+def settings_that_are_numbers(setting: Any) -> Iterator[str]:
+    for field in fields(setting):
+        value = getattr(setting, field.name)
+        first = value[0] if isinstance(value, tuple) and value else value
+        if isinstance(first, (int, float)) and not isinstance(first, bool):
+            yield field.name
+        assert not is_dataclass(value) or isinstance(value, type)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_experiment_with_a_device_is_read_back_equal(name: str) -> None:
+    experiment = Experiment("plane", instruments=(presets.load(name),))
+    assert experiment.instruments[0].name == name
+    assert experiment_from_dict(experiment_to_dict(experiment)) == experiment
+
+
+def pinholes() -> list[str]:
+    return [name for name in NAMES if isinstance(presets.load(name).camera, Intrinsics)]
+
+
+@pytest.mark.parametrize("name", pinholes())
+def test_the_corners_of_the_image_lie_at_the_angles_of_the_sheet(name: str) -> None:
+    preset = presets.describe(name)
+    camera = preset.instrument.camera
+    assert isinstance(camera, Intrinsics)
+    assert (camera.width, camera.height) == preset.sheet.resolution_px
+    left, right = camera.directions([[0.0, camera.cy], [camera.width, camera.cy]])
+    top, bottom = camera.directions([[camera.cx, 0.0], [camera.cx, camera.height]])
+    across, down = (
+        math.degrees(math.acos(a @ b / math.sqrt(a @ a * (b @ b)))) for a, b in ((left, right), (top, bottom))
+    )
+    assert (across, down) == pytest.approx(preset.sheet.field_of_view_deg)
+
+
+@pytest.mark.parametrize("name", pinholes())
+def test_a_device_reads_a_wall_within_its_range_and_none_beyond(name: str) -> None:
+    preset = presets.describe(name)
+    near_m, far_m = preset.sheet.range_m
+    for distance_m, least, most in (
+        (0.95 * near_m, 0.0, 0.0),
+        (math.sqrt(near_m * far_m), 0.9, 1.0),
+        (1.05 * far_m, 0.0, 0.0),
+    ):
+        image = of_wall(preset.instrument, distance_m)
+        assert least <= image.valid.mean() <= most
+        assert not image.valid.any() or np.nanmedian(np.abs(image.z - distance_m)) < 0.01 * distance_m
+        if most == 0.0:
+            assert (image.status == Status.OUT_OF_RANGE).mean() > 0.5 or (image.status != Status.OK).all()
+
+
+def of_wall(instrument: Instrument, distance_m: float) -> Any:
+    """Range image of a wall that faces the device, 32 x 32 pixels in the middle."""
+    camera, projector, pose = instrument.camera, instrument.projector, instrument.T_camera_projector
+    assert isinstance(camera, Intrinsics)
+    assert projector is not None
+    assert pose is not None
+    rig = Rig(
+        replace(camera, width=32, height=32, cx=16.0, cy=16.0),
+        projector,
+        T_camera_projector=pose,
+        camera_lens=instrument.camera_lens,
+        projector_power_w=instrument.power_w,
+    )
+    signals = signals_of_depth(rig, np.full((32, 32), distance_m), [instrument.sensor], albedo=0.6)
+    capture = expose(signals, instrument.sensor, instrument.detector, instrument.exposure_s)
+    return decode(capture, instrument.decoder)
+
+
+# ---- Names ---------------------------------------------------------------------------------------------------------
+
+
+def test_no_device_has_the_name_of_a_sensor() -> None:
+    assert not set(NAMES) & set(sensor_presets())
+    assert len(NAMES) >= 7
+
+
+@pytest.mark.parametrize("find", [presets.load, presets.instrument])
+def test_an_unknown_name_is_refused_with_the_nearest(find: Any) -> None:
+    with pytest.raises(ValueError, match=re.escape("got 'kinectv2' (did you mean 'kinect-v2'?)")):
+        find("kinectv2")
+
+
+def test_a_device_in_an_experiment_is_changed_key_by_key() -> None:
+    device = presets.load("kinect-v2")
+    assert device.decoder is not None
+    table = {
+        "sensor": "kinect-v2",
+        "name": "weak",
+        "power_w": 0.5,
+        "detector": {"read_noise_e": 8.0},
+        "decoder": {"max_residual": 0.2},
+    }
+    (one,) = experiment_from_dict({"scene": "plane", "instrument": [table]}).instruments
+    assert one == replace(
+        device,
+        name="weak",
+        power_w=0.5,
+        detector=replace(device.detector, read_noise_e=8.0),  # type: ignore[type-var]
+        decoder=replace(device.decoder, max_residual=0.2),  # type: ignore[call-arg]
+    )
+    scan = scan_settings_from_dict({"scene": "plane", "instrument": {"sensor": "kinect-v2"}})
+    assert scan.instrument == device
+    with pytest.raises(ValueError, match=r"instrument\[0\]: unknown key 'powr_w' \(did you mean 'power_w'"):
+        experiment_from_dict({"scene": "plane", "instrument": [{"sensor": "kinect-v2", "powr_w": 1.0}]})
+    with pytest.raises(ValueError, match=r"instrument\[0\].sensor: .*did you mean 'kinect-v2'"):
+        experiment_from_dict({"scene": "plane", "instrument": [{"sensor": "kinect-v22"}]})
+
+
+def test_a_file_of_a_device_is_found_beside_the_experiment(tmp_path: Path) -> None:
+    text = presets.describe("kinect-v2").text.replace("[512, 424]", "[64, 53]")
+    (tmp_path / "mine.toml").write_text(text)
+    (tmp_path / "experiment.toml").write_text('scene = "plane"\n[[instrument]]\nsensor = "mine.toml"\n')
+    (one,) = load_experiment(tmp_path / "experiment.toml").instruments
+    assert one.name == "mine"
+    assert one.camera == presets.load(tmp_path / "mine.toml").camera
+    with pytest.raises(ValueError, match="sensor"):  # a record that is read back loads no file
+        experiment_from_dict({"scene": "plane", "instrument": [{"sensor": str(tmp_path / "mine.toml")}]})
+
+
+RANGE, PIXELS = '"sheet.range_m"', '"sheet.resolution_px"'
+"""Two keys of the sources."""
+
+
+# ---- Files ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (
+            '"sheet.range_m" = "libfreenect2: least and largest depth of its settings"\n',
+            "",
+            "no source for sheet.range_m",
+        ),
+        (
+            '"sheet.range_m" = "libf',
+            '"sheet.rang_m" = "libf',
+            "'sheet.rang_m' is no setting .*did you mean 'sheet.range_m'",
+        ),
+        (
+            '"instrument.detector" = "assumed: a common lock-in pixel"',
+            '"instrument.detector" = "assumed"',
+            "say more than",
+        ),
+        (
+            '"sheet.resolution_px" = "libfreenect2"',
+            '"sheet.resolution_px" = "libfrenect"',
+            "did you mean 'libfreenect2'",
+        ),
+        ('"sheet.resolution_px" = "libfreenect2"', '"sheet.resolution_px" = 1', "as text, got 1"),
+        ("taps = 3", "tabs = 3", "instrument.sensor: unknown key 'tabs'"),
+        ("range_m = [0.5, 4.5]", "range_m = [4.5, 0.5]", "range_m as nearest, farthest"),
+        ("[512, 424]", "[512]", "resolution_px"),
+        ("[70.0, 60.0]", "[180.0, 60.0]", "at most 175 degrees for a pinhole"),
+        ("fitted_at_m = 3.0", "fitted_at_m = 3.5", "fitted_at_m"),
+        ("0.0027, 0.0043]", "0.0027]", "as many sigma_m as range_m"),
+        ("[documents]", "[papers]", "unknown key 'papers'"),
+        ('title = "Kinect for Xbox One (Kinect v2)"', "", "missing 'title'"),
+        ('title = "Kinect for Xbox One (Kinect v2)"', "title = 1", "title as text"),
+        ("[sheet]", "[[sheet]]", "no valid TOML|sheet as a table"),
+    ],
+)
+def test_a_faulty_file_is_refused_in_one_sentence(tmp_path: Path, old: str, new: str, words: str) -> None:
+    text = presets.describe("kinect-v2").text
+    assert text.count(old) == 1
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace(old, new))
+    with pytest.raises(FileFormatError, match=words) as error:
+        presets.load(path)
+    assert str(path) in str(error.value)
+
+
+def test_a_file_has_the_name_of_an_instrument(tmp_path: Path) -> None:
+    path = tmp_path / "my device.toml"
+    path.write_text(presets.describe("kinect-v2").text)
+    with pytest.raises(FileFormatError, match=r"expected a file name of letters.*got 'my device'"):
+        presets.load(path)
+    path.write_text(path.read_text().replace("[instrument]\n", '[instrument]\nname = "mine"\n'))
+    assert presets.load(path).name == "mine"
+
+
+def test_a_table_has_its_own_camera_instead_of_the_pinhole_of_the_sheet(tmp_path: Path) -> None:
+    own = Intrinsics(512, 424, 365.5, 365.5, 255.0, 205.0)
+    text = presets.describe("kinect-v2").text
+    camera = "\n".join(f"{key} = {value}" for key, value in to_dict(own).items())
+    text = text.replace(
+        "[instrument.sensor]", f"[instrument.camera]\n{camera}\n\n[instrument.sensor]".replace("()", "[]")
+    )
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace("[sources]", '[sources]\n"instrument.camera" = "libfreenect2"'))
+    assert presets.load(path).camera == own
+
+
+# ---- The command line ----------------------------------------------------------------------------------------------
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
+    monkeypatch.setattr(sys, "argv", ["rangesim", *map(str, arguments)])
+    try:
+        main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def test_the_command_lists_the_devices_and_draws_them(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    picture = tmp_path / "views.png"
+    assert command(monkeypatch, "presets", "--picture", picture) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["device", *NAMES]
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    assert command(monkeypatch, "presets", "kinect-v2") == 0
+    assert capsys.readouterr().out == (FOLDER / "kinect-v2.toml").read_text()
+    assert command(monkeypatch, "presets", "kinect-v3") == 1
+    assert "did you mean 'kinect-v2'" in capsys.readouterr().err
+
+
+def test_a_device_runs_by_its_name_and_by_its_file(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    text = (
+        presets.describe("kinect-v2").text.replace("[512, 424]", "[64, 53]").replace("range_m = [0.5", "range_m = [0.1")
+    )
+    path = tmp_path / "small.toml"
+    path.write_text(text)
+    assert command(monkeypatch, "run", "plane", "--sensor", path, "--spp", "2", "--out", tmp_path / "out") == 0
+    assert (tmp_path / "out" / "small" / "capture").is_dir()
+    assert command(monkeypatch, "run", "plane", "--sensor", "kinect-v3", "--out", tmp_path / "other") == 1
+    assert "did you mean 'kinect-v2'" in capsys.readouterr().err
+    assert command(monkeypatch, "scan", "plane", "--sensor", "kinect-v2", "--estimate") == 0
