@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rangesim.report.figures import STRIP_ASPECT, Picture, unrolled
+from rangesim.report.figures import MAX_STRIP, Picture, unrolled
 from rangesim.rig.scan_patterns import spinning
 
 VLP_16_DEG = [-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15]
@@ -38,7 +38,7 @@ def test_rings_are_sorted_and_a_pillar_is_upright() -> None:
 def test_strips_fit_the_page(shape: tuple[int, int]) -> None:
     rays = spinning(np.radians(np.linspace(20, -20, shape[0])), shape[1], 0.1)
     height, width = pixels(unrolled(np.full(shape, 5.0), rays.directions)).shape[:2]
-    assert width <= 2.1 * STRIP_ASPECT * height  # one strip more would be as far off
+    assert width <= MAX_STRIP * height
     assert width * height >= shape[0] * shape[1]
 
 

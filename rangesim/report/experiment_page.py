@@ -113,14 +113,10 @@ def _camera(result: Result, group: Sequence[Measurement]) -> dict[str, Any]:
 
 
 def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -> dict[str, Any]:
-    """Maps of depth, of error and of causes of one instrument, with the legend of the causes; the turn of a scanner."""
+    """Maps of depth, of error and of causes of one instrument, with the legend of the causes."""
     causes, legend = figures.cause_map(m)
-    camera = m.image.camera
-    is_turn = camera is not None and camera.rings is not None
     return {
         "name": m.name,
-        "quantity": "depth z" if camera is None or camera.is_pinhole else "range",
-        "turn": figures.unrolled(m.image.range_m, camera.pixel_rays().directions) if is_turn and camera else None,
         "depth": figures.depth_map(m, limits, depth),
         "error": figures.error_map(m, error),
         "causes": causes,
@@ -184,7 +180,6 @@ def _viewer_data(
             point_viewer.packed_measurement(m, visible_text(names[m.name]), camera_of[m.name], far[camera_of[m.name]])
             for m in result.measurements
         ],
-        "rays": [point_viewer.packed_rays(group) for group in cameras],
         "passes": [_pass_materials(light_pass.truth) for light_pass in result.passes],
         "errorColors": error.ravel().tolist(),
         "errorKneeM": palette.ERROR_KNEE_M,

@@ -83,7 +83,7 @@ def color_map(fraction: np.ndarray, table: np.ndarray) -> str:
 
 def map_pictures(image: RangeImage) -> dict[str, bytes]:
     """PNG files of the maps of a range image, by name: projector columns and rows if it has them, depth and status."""
-    maps = {"columns": image.projector_column, "rows": image.projector_row, "depth": image.reading_m}
+    maps = {"columns": image.projector_column, "rows": image.projector_row, "depth": image.z}
     table = palette.color_table("viridis")
     pictures = {
         name: png_bytes(*_indexed(_stretched(values), table))
@@ -133,17 +133,17 @@ def material_picture(truth: GroundTruth) -> tuple[Picture, list[LegendEntry]]:
 
 
 def depth_map(measurement: Measurement, limits: tuple[float, float], table: np.ndarray) -> str:
-    """PNG, as a data URI, of the measured depths; of ranges, if the camera is no pinhole.
+    """PNG, as a data URI, of the measured depths.
 
     limits : depths, in metres, at the ends of the colour table.
     """
     low, high = limits
-    return color_map((measurement.image.reading_m - low) / (high - low), table)
+    return color_map((measurement.image.z - low) / (high - low), table)
 
 
-STRIP_ASPECT = 3.0
-"""Width over height to which the picture of a turn comes near: a longer one is cut into strips, one below the other.
-With 3, a turn of 64 rings over 45 degrees and 1024 columns becomes two strips, 512 pixels wide."""
+MAX_STRIP = 3.0
+"""Largest ratio of width to height of the picture of a turn; a longer one is cut into strips, one below the other. With
+3, a turn of 64 rings over 45 degrees and 1024 columns becomes two strips of 512 pixels, as wide as other maps."""
 MAX_ROW_REPEATS = 8
 """Largest number of pixel rows per ring in the picture of a turn: a scanner of few rings still has stripes then."""
 
@@ -172,8 +172,9 @@ def unrolled(ranges: np.ndarray, directions: np.ndarray) -> Picture:
     image = np.take_along_axis(ranges, source, axis=1)[rows].astype(np.float64)
     repeats = _rows_per_ring(directions)
     image = np.log(np.where(image > 0, image, np.nan)).repeat(repeats, axis=0)
-    wanted = np.sqrt(image.shape[1] / image.shape[0] / STRIP_ASPECT)
-    strips = min((max(1, int(wanted)), int(wanted) + 1), key=lambda n: abs(np.log(n / wanted)))
+    strips = 1
+    while image.shape[1] / strips > MAX_STRIP * image.shape[0] * strips:
+        strips += 1
     padded = np.pad(image, ((0, 0), (0, -image.shape[1] % strips)), constant_values=np.nan)
     gap = np.full((2, padded.shape[1] // strips), np.nan)
     parts = [part for strip in np.split(padded, strips, axis=1) for part in (strip, gap)][:-1]
@@ -198,8 +199,8 @@ def _rows_per_ring(directions: np.ndarray) -> int:
 
 
 def error_map(measurement: Measurement, table: np.ndarray) -> str:
-    """PNG, as a data URI, of the errors of depth; of ranges, if the camera is no pinhole."""
-    return color_map(palette.error_fraction(measurement.image.reading_m - measurement.true_m), table)
+    """PNG, as a data URI, of the errors of depth."""
+    return color_map(palette.error_fraction(measurement.image.z - measurement.truth.z), table)
 
 
 def cause_map(measurement: Measurement) -> tuple[str, list[LegendEntry]]:

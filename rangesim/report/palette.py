@@ -92,11 +92,11 @@ def color_table(name: str) -> np.ndarray:
 
 
 def depth_limits(measurements: tuple[Measurement, ...]) -> tuple[float, float]:
-    """Nearest and farthest reading of the depth scale, metres, of the true surfaces of all measurements.
+    """Nearest and farthest depth of the depth scale, metres, of the true surfaces of all measurements.
 
     The scale leaves out half a percent of the pixels at either end, and then gets a margin.
     """
-    z = np.concatenate([m.true_m[np.isfinite(m.true_m)] for m in measurements])
+    z = np.concatenate([m.truth.z[np.isfinite(m.truth.z)] for m in measurements])
     if z.size == 0:
         return 0.0, 1.0
     low, high = (float(v) for v in np.percentile(z, [0.5, 99.5]))

@@ -12,7 +12,6 @@ import numpy as np
 
 from rangesim.report import palette
 from rangesim.results.experiment_results import Measurement, Segmentation
-from rangesim.rig import Camera, Intrinsics
 
 NO_ERROR = -32768
 """Value of a packed error where there is no reading or no true surface: the smallest int16."""
@@ -45,22 +44,21 @@ def packed_measurement(m: Measurement, title: str, view: int, far_m: float) -> d
 
     Returns
     -------
-    z : uint16, 0 without a point, else nearM + (value - 1) * stepM; z of a pinhole camera, else the range.
+    z : uint16, 0 without a point, else z = nearM + (value - 1) * stepM.
     error : int16, in units of `ERROR_STEP_M`, clipped; `NO_ERROR` where it is not known.
     intensity, status, cause : uint8.
     segmentation : supervoxels as uint16 or uint32, 0 without a point, else index + 1; and their tree. None: no points.
     """
-    camera, readings = m.image.camera, m.image.reading_m
-    assert camera is not None
-    drawn = m.image.valid & (readings < far_m)
-    near = float(readings[drawn].min()) if drawn.any() else 0.0
+    camera = m.image.pinhole
+    drawn = m.image.valid & (m.image.z < far_m)
+    near = float(m.image.z[drawn].min()) if drawn.any() else 0.0
     step = max((far_m - near) / 65534, 1e-6)
-    z = np.where(drawn, 1 + np.rint((np.where(drawn, readings, near) - near) / step), 0).astype(np.uint16)
+    z = np.where(drawn, 1 + np.rint((np.where(drawn, m.image.z, near) - near) / step), 0).astype(np.uint16)
     return {
         "title": title,
         "width": camera.width,
         "height": camera.height,
-        "camera": list(_view_intrinsics(camera)),
+        "camera": [camera.fx, camera.fy, camera.cx, camera.cy],
         "nearM": near,
         "stepM": step,
         "view": view,
@@ -75,55 +73,15 @@ def packed_measurement(m: Measurement, title: str, view: int, far_m: float) -> d
     }
 
 
-VIEW_FOCAL = 0.75
-"""Focal length, in sizes of the canvas, of the view of a camera that is no pinhole: a field of view of 67 degrees."""
-VIEW_POINTS = 220
-"""Points of a scanner, side by side, that the height of a canvas shows: they are about 2 pixels large."""
-VIEW_DISTANCE = 1.6
-"""Distance of the view from the camera, in median ranges: nearly all points of a turn are in the picture then."""
-VIEW_PITCH_RAD = np.radians(30.0)
-"""Angle by which the view looks down on the points of a scanner, so that the ground does not hide them."""
-
-
-def _view_intrinsics(camera: Camera) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy of the view of a camera's points: those of a pinhole itself."""
-    if isinstance(camera, Intrinsics):
-        return camera.fx, camera.fy, camera.cx, camera.cy
-    return VIEW_FOCAL * camera.width, VIEW_FOCAL * camera.height, camera.width / 2, camera.height / 2
-
-
-def packed_rays(measurements: Sequence[Measurement]) -> dict[str, Any] | None:
-    """Rays of the camera that measurements share, in coordinates of a view from behind and above; None for a pinhole.
-
-    A point is origin + direction * range (x right, y up, z towards the viewer, metres).
-
-    Returns
-    -------
-    directions, origins : float32, three numbers per pixel; 0 for a pixel without a ray.
-    middleM : distance from the view to the camera, metres.
-    points : points side by side that the height of a canvas shows.
-    """
-    camera = measurements[0].image.camera
-    if camera is None or camera.is_pinhole:
-        return None
-    rays, true_m = camera.pixel_rays(), measurements[0].true_m
-    middle_m = VIEW_DISTANCE * (float(np.nanmedian(true_m)) if np.isfinite(true_m).any() else 1.0)
-    cos, sin = np.cos(VIEW_PITCH_RAD), np.sin(VIEW_PITCH_RAD)
-    tilt = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]]) @ np.diag([1, -1, -1])  # from OpenCV's axes
-    directions, origins = rays.directions @ tilt.T, rays.origins @ tilt.T - [0, 0, middle_m]
-    packed = [pack(np.nan_to_num(array).astype(np.float32)) for array in (directions, origins)]
-    return {"directions": packed[0], "origins": packed[1], "middleM": middle_m, "points": VIEW_POINTS}
-
-
 def far_limit(measurements: Sequence[Measurement]) -> float:
     """Depth, in metres, from which points are not drawn, for measurements that share a camera."""
-    depths = [float(np.nanmax(m.true_m)) for m in measurements if np.isfinite(m.true_m).any()]
+    depths = [float(np.nanmax(m.truth.z)) for m in measurements if np.isfinite(m.truth.z).any()]
     return FAR_FACTOR * max(depths, default=1.0)
 
 
 def _error(m: Measurement) -> np.ndarray:
     """(h, w) int16 errors of z, as `packed_measurement` says."""
-    error = m.image.reading_m - m.true_m
+    error = m.image.z - m.truth.z
     known = np.isfinite(error)
     steps = np.clip(np.rint(np.where(known, error, 0) / ERROR_STEP_M), -32767, 32767)
     return np.where(known, steps, NO_ERROR).astype(np.int16)

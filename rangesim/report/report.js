@@ -129,7 +129,7 @@ class Page {
     this.mode = "intensity";
     this.levels = new Levels(DATA.instruments.map((one) => one.segmentation).filter(Boolean));
     this.view = { ...START, changed: () => this.redraw() };
-    for (const one of DATA.instruments) one.middleM = one.rays ? one.rays.middleM : this.middle(one.view);
+    for (const one of DATA.instruments) one.middleM = this.middle(one.view);
     this.clouds = all("canvas.cloud").map((c) => cloudView(c, this.of(c), this.of(c).z, this.view));
     if (this.clouds.some((cloud) => cloud instanceof StillView)) this.sayStill();
     $("level").addEventListener("input", () => { this.setMode("segments"); this.setAltitude(this.levels.altitude(+$("level").value)); });
@@ -224,10 +224,6 @@ function reading(one, i) {
 async function start() {
   await Promise.all(DATA.passes.map(async (one) => { one.material = await unpack(one.material, Int8Array); }));
   await Promise.all(DATA.instruments.map(unpackInstrument));
-  await Promise.all(DATA.rays.filter(Boolean).map(async (rays) => {
-    for (const name of ["directions", "origins"]) rays[name] = await unpack(rays[name], Float32Array);
-  }));
-  for (const one of DATA.instruments) one.rays = DATA.rays[one.view];
   const wanted = new URLSearchParams(location.hash.slice(1));
   const page = window.page = new Page();
   const asked = wanted.has("altitude") ? +wanted.get("altitude") : NaN, altitude = Number.isNaN(asked) ? page.levels.usual : asked;

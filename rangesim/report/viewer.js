@@ -24,9 +24,7 @@ const START = { yaw: -0.45, pitch: 0.22, zoom: 1, shift: [0, 0] };
 // Positions (3 per point; x right, y up, z towards the viewer, metres) and the pixel of each, of a depth image.
 // The camera is the pinhole of rangesim.rig.camera_model, repeated here for the browser; tests/test_rig.py compares them.
 // Distortion is left out.
-// Cameras that are no pinholes give the rays themselves, and readings along them.
 function unproject(instrument, z) {
-  const rays = instrument.rays;
   const [fx, fy, cx, cy] = instrument.camera, width = instrument.width;
   const count = z.reduce((n, v) => n + (v > 0), 0);
   const positions = new Float32Array(3 * count), pixels = new Uint32Array(count);
@@ -34,11 +32,6 @@ function unproject(instrument, z) {
   for (let i = 0; i < z.length; i++) {
     if (!z[i]) continue;
     const depth = instrument.nearM + (z[i] - 1) * instrument.stepM;
-    if (rays) {
-      for (let c = 0; c < 3; c++) positions[3 * k + c] = rays.origins[3 * i + c] + depth * rays.directions[3 * i + c];
-      pixels[k++] = i;
-      continue;
-    }
     positions[3 * k] = ((i % width) + 0.5 - cx) / fx * depth;
     positions[3 * k + 1] = -(Math.floor(i / width) + 0.5 - cy) / fy * depth;
     positions[3 * k + 2] = -depth;
@@ -54,9 +47,7 @@ function focalOf(instrument, aspect) {
 }
 
 // Size of a point in pixels of a canvas, with which the points of a surface seen from the camera cover it.
-function pointSize(instrument, focal, height) {
-  return instrument.rays ? height / instrument.rays.points : 1.35 * focal * height / 2 / instrument.camera[1];
-}
+function pointSize(camera, focal, height) { return 1.35 * focal * height / 2 / camera[1]; }
 
 // Matrix, column by column, that turns the points about the centre at a depth, moves them back and projects them.
 function projection(view, depth, focal, aspect) {
@@ -123,7 +114,7 @@ class StillView {
   draw() {
     const [width, height] = fit(this.canvas);
     if (!(width && height)) return;
-    const one = this.instrument, focal = focalOf(one, width / height), size = pointSize(one, focal, height);
+    const one = this.instrument, focal = focalOf(one, width / height), size = pointSize(one.camera, focal, height);
     const m = projection(this.view, one.middleM, focal, width / height), positions = this.positions;
     const context = this.canvas.getContext("2d"), image = context.createImageData(width, height);
     const nearest = new Float32Array(width * height).fill(Infinity), shown = new Uint32Array(image.data.buffer);
@@ -184,7 +175,7 @@ class CloudView {
     const one = this.instrument, focal = focalOf(one, width / height);
     const matrix = projection(this.view, one.middleM, focal, width / height);
     gl.uniformMatrix4fv(gl.getUniformLocation(this.program, "matrix"), false, matrix);
-    gl.uniform1f(gl.getUniformLocation(this.program, "size"), pointSize(one, focal, height));
+    gl.uniform1f(gl.getUniformLocation(this.program, "size"), pointSize(one.camera, focal, height));
     gl.drawArrays(gl.POINTS, 0, this.pixels.length);
   }
 

@@ -230,11 +230,6 @@ class Measurement(ShortRepr):
     metadata: MeasurementRecord
     light_pass: int
 
-    @property
-    def true_m(self) -> np.ndarray:
-        """(h, w) float32, metres, what the readings `image.reading_m` should be: depths of a pinhole, else ranges."""
-        return self.truth.z if self.image.camera is None else self.image.camera.reading(self.truth)
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(ShortRepr):
