@@ -201,7 +201,7 @@ def test_beams_have_the_same_bytes_twice_and_no_samples_of_others() -> None:
 
 
 def test_a_mirror_sends_a_beam_back_into_its_own_eye() -> None:
-    """A mirror at distance d shows the emitter, a disc of radius a, at 2 d: radiance R P p / (pi a^2) over its field."""
+    """A mirror at distance d shows the emitter, a disc of radius a, at 2 d: its radiance is P p / (pi a^2)."""
     T = mi.ScalarTransform4f
     silver = {"type": "twosided", "b": {"type": "conductor", "material": "none"}}
     scene = load_scene(

@@ -225,12 +225,6 @@ class Estimate:
 
 
 def projector_light(radiance: Radiance) -> np.ndarray:
-    """(h, w) float32, W/m2/sr, all light of the projector but glint."""
-    return np.asarray(
-        radiance.direct
-        + radiance.multipath
-        + radiance.specular
-        + radiance.caustic
-        + radiance.smooth_caustic
-        + radiance.glint
-    )
+    """(h, w) float32, W/m2/sr, all light of the projector but the glint of `glint.py`."""
+    straight = radiance.direct + radiance.multipath + radiance.specular
+    return np.asarray(straight + radiance.caustic + radiance.smooth_caustic + radiance.glint)

@@ -12,7 +12,7 @@ from rangesim.motion.pose_tracks import Track
 from rangesim.rig import Beam, MovingCamera, Rig
 
 
-def moving_scanner(rig: Rig, track: Track) -> Rig:
+def moving_scanner(rig: Rig, track: Track, start_s: float = 0.0) -> Rig:
     """The rig of a scanner that moves along a track during its scan; a still scene takes one pass, however it moves.
 
     Its camera is a `MovingCamera`: the rays of the scanner, each from where it is measured. So range images of this rig
@@ -23,7 +23,8 @@ def moving_scanner(rig: Rig, track: Track) -> Rig:
     ----------
     rig : Rig without motion, whose camera has times, such as `Spinning`, and whose emitter is a `Beam`.
     track : motion of the rig as in `Motion.rig`: world transforms T(t), applied to the rig as it stands. Its clock
-        starts with the scan.
+        starts with the scan, unless `start_s` says otherwise.
+    start_s : float, seconds on the clock of the track, time at which the scan starts.
 
     Raises
     ------
@@ -47,8 +48,8 @@ def moving_scanner(rig: Rig, track: Track) -> Rig:
             f"expected a Beam as the emitter of a scanner that moves, got {type(rig.projector).__name__}: only a beam "
             "moves with the rays."
         )
-    start = track.at(0.0) @ rig.T_world_camera
-    poses = np.linalg.inv(start) @ track.poses_at(np.unique(times)) @ rig.T_world_camera
+    start = track.at(start_s) @ rig.T_world_camera
+    poses = np.linalg.inv(start) @ track.poses_at(start_s + np.unique(times)) @ rig.T_world_camera
     return replace(rig, camera=MovingCamera(rig.camera, poses), T_world_camera=start)
 
 

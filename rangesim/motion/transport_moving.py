@@ -19,6 +19,7 @@ from rangesim.signals import Signals, SignalSet, StillSignals
 if TYPE_CHECKING:
     from rangesim.light_transport.transport_settings import TransportOptions, TransportSettings
     from rangesim.scene import Scene
+    from rangesim.scene.rigid_motion import MovingScene
 
 
 def transport_moving(
@@ -59,6 +60,9 @@ def transport_moving(
         sees at the middle and the points that it sees at its exposures, such as those of an object that passes by.
         Where a shadow passes, it is the distance of the fastest object. It is None if one pass serves all exposures of
         the sensor.
+
+        A scanner, whose rays have times of their own, reads each ray where it is measured. Its `truth` is that of each
+        ray's own time, and `motion_m` is None.
 
     Raises
     ------
@@ -104,8 +108,10 @@ def transport_moving(
         raise ValueError(
             f'expected a number of samples or "auto" where something moves, got {type(settings.spp).__name__}.'
         )
-    passes = plan(rig, timings, motion)
     stage = MovingScene(scene, tuple(motion.objects))
+    if rig.camera.times_s is not None:
+        return _scanned(stage, rig, timings, motion, settings, progress)
+    passes = plan(rig, timings, motion)
     at_once: dict[Sensor, list[StillSignals]] = {}
     stacks: dict[Sensor, list[FrameStack]] = {}
     for number, one in enumerate(passes):
@@ -137,6 +143,29 @@ def transport_moving(
 def _together(of_cameras: Sequence[Signals]) -> Signals:
     """The signals of the only camera, or a set of those of several."""
     return of_cameras[0] if len(of_cameras) == 1 else SignalSet.of(of_cameras)
+
+
+def _scanned(
+    stage: MovingScene,
+    rig: Rig,
+    timings: Mapping[Sensor, Timing],
+    motion: Motion,
+    settings: TransportSettings,
+    progress: Callable[[float], None] | None,
+) -> dict[Sensor, Signals]:
+    """Signals of sensors whose scanner measures each ray at its own time; sensors of equal timings share passes."""
+    from rangesim.light_transport.truncation import warn_of_truncation
+    from rangesim.motion.scanned import scanned_signals
+
+    found: dict[Sensor, Signals] = {}
+    together = list(dict.fromkeys(timings.values()))
+    for number, timing in enumerate(together):
+        sensors = [sensor for sensor, own in timings.items() if own == timing]
+        report = progress and partial(_report, progress, number, len(together))
+        signals = scanned_signals(stage.at, rig, sensors, timing, motion, settings, report)
+        warn_of_truncation(signals.truncation, settings.max_depth, "", stacklevel=3)
+        found |= {sensor: signals.only(sensor) for sensor in sensors}
+    return found
 
 
 def _report(progress: Callable[[float], None], number: int, passes: int, fraction: float) -> None:
