@@ -94,7 +94,7 @@ def by_camera(measurements: Sequence[Measurement]) -> list[list[Measurement]]:
 
 def _shares_camera(one: Measurement, other: Measurement) -> bool:
     """Whether two instruments look through the same camera from the same place."""
-    rig, other_rig = one.capture.rig, other.capture.rig
+    rig, other_rig = one.capture.reference.rig, other.capture.reference.rig
     assert rig is not None
     assert other_rig is not None
     return rig.camera == other_rig.camera and rig.shares_camera_pose(other_rig)
@@ -146,7 +146,7 @@ def _frames(m: Measurement) -> dict[str, Any]:
 def _light(result: Result, number: int) -> dict[str, Any]:
     """Pictures of the light of pass `number` (from 0) by the kind of light path, and its emitter."""
     of_pass = [m for m in result.measurements if m.light_pass == number + 1]
-    rig = of_pass[0].capture.rig
+    rig = of_pass[0].capture.reference.rig
     assert rig is not None
     return {
         "names": [m.name for m in of_pass],

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rangesim.capture import Capture
+from rangesim.capture import Captured
 from rangesim.decoding.range_image import RangeImage
 from rangesim.files.image_files import PNG_STRATEGY
 from rangesim.report import palette
@@ -209,13 +209,18 @@ def cause_map(measurement: Measurement) -> tuple[str, list[LegendEntry]]:
     return png(classes, palette.OUTCOME_COLORS), _legend(classes, palette.OUTCOME_NAMES, palette.OUTCOME_COLORS)
 
 
-def captured_frames(capture: Capture) -> list[Picture]:
-    """Pictures of a few representative frames of a capture, all with the same white."""
-    names = capture.sensor.frame_names()
-    chosen = [i for i in capture.sensor.representative_frames(capture.frames) if 0 <= i < len(names)]
-    white = max(float(np.percentile(capture.frames[i], 99.5)) for i in chosen)
-    black = capture.black_level
-    return [Picture(grey(capture.frames[i], white, black), names[i].replace("_", " "), names[i]) for i in chosen]
+def captured_frames(captured: Captured) -> list[Picture]:
+    """Pictures of a few representative frames of a capture, all with the same white; of several cameras, of each."""
+    pictures = []
+    for number, capture in enumerate(captured.captures, 1):
+        names = capture.sensor.frame_names()
+        chosen = [i for i in capture.sensor.representative_frames(capture.frames) if 0 <= i < len(names)]
+        white = max(float(np.percentile(capture.frames[i], 99.5)) for i in chosen)
+        camera = f", camera {number}" if len(captured.captures) > 1 else ""
+        for i in chosen:
+            caption = names[i].replace("_", " ") + camera
+            pictures.append(Picture(grey(capture.frames[i], white, capture.black_level), caption, names[i] + camera))
+    return pictures
 
 
 def light_pictures(energy: EnergySplit) -> list[Picture]:

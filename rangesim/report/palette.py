@@ -31,12 +31,24 @@ STATUS_NAMES = {
     Status.CODE_ERROR: "code error",
     Status.UNWRAPPING_FAILED: "phases disagree",
     Status.OUT_OF_RANGE: "out of range",
+    Status.OCCLUDED: "occluded from a camera",
+    Status.AMBIGUOUS: "ambiguous match",
 }
 """Text of each status where a page or the command line shows it."""
 STATUS_COLORS = np.array(
-    [(231, 234, 237), (52, 104, 176), (240, 171, 0), (196, 56, 45), (125, 79, 163), (40, 44, 52)], dtype=np.uint8
+    [
+        (231, 234, 237),
+        (52, 104, 176),
+        (240, 171, 0),
+        (196, 56, 45),
+        (125, 79, 163),
+        (40, 44, 52),
+        (118, 176, 220),
+        (226, 130, 170),
+    ],
+    dtype=np.uint8,
 )
-"""(6, 3) uint8, colour of each status, RGB, in the order of `Status`."""
+"""(8, 3) uint8, colour of each status, RGB, in the order of `Status`."""
 OUTCOME_NAMES = [*(TITLES[c] for c in Cause), "nothing there"]
 """Text of each value of `outcomes`."""
 OUTCOME_COLORS = np.array(
@@ -56,6 +68,8 @@ OUTCOME_COLORS = np.array(
         (138, 103, 242),  # decoder: violets
         (43, 31, 76),
         (184, 248, 176),  # pile-up: a green, as noise
+        (60, 12, 252),  # occluded: a blue, as geometry
+        (0, 0, 12),  # no texture: black
         (203, 206, 210),  # nothing there
     ],
     dtype=np.uint8,

@@ -27,7 +27,7 @@ import msgspec
 import numpy as np
 
 from pcgraph.parallel import side_by_side
-from rangesim.capture import Capture
+from rangesim.capture import Captured
 from rangesim.causes import Cause, CauseMap
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
@@ -210,7 +210,7 @@ class Measurement(ShortRepr):
     """The measurement of one instrument.
 
     name : name of the instrument.
-    capture : Capture.
+    capture : Capture, or CaptureSet of several cameras.
     image : RangeImage.
     truth : GroundTruth of the instrument's pass.
     causes : CauseMap, the cause of each failed pixel.
@@ -221,7 +221,7 @@ class Measurement(ShortRepr):
     """
 
     name: str
-    capture: Capture
+    capture: Captured
     image: RangeImage
     truth: GroundTruth
     causes: CauseMap
@@ -370,7 +370,8 @@ def _image_sizes(info: ResultRecord, path: Path) -> dict[int, dict[str, int]]:
 
 def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: dict[str, int]) -> Measurement:
     """The measurement in the directory of an instrument, checked against its pass."""
-    capture = load_capture(folder / "capture")
+    captured = load_capture(folder / "capture")
+    capture = captured.reference
     if capture.rig is None or capture.frames.shape[1:] != (sizes["h"], sizes["w"]):
         raise FileFormatError(f"{folder / 'capture'}: expected a rig, and frames of the size of the ground truth.")
     image = load_range_image(folder / "range.npz", sizes)
@@ -384,7 +385,7 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
         raise FileFormatError(f"{folder / 'measurement.json'}: expected sensor, frames and pixels of the capture.")
     return Measurement(
         name=folder.name,
-        capture=capture,
+        capture=captured,
         image=replace(image, T_world_camera=capture.rig.T_world_camera),
         truth=truth,
         causes=CauseMap(data["cause"], float(data["tolerance_m"])),
