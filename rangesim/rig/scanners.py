@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rangesim.rig.cameras import Acceptance, Camera, PixelRays, finite_array
 from rangesim.rig.poses import Array, check_rigid
-from rangesim.rig.ray_cameras import FieldAngle, ScanningCamera
+from rangesim.rig.ray_cameras import FieldAngle, RayTable, ScanningCamera
 from rangesim.rig.scan_patterns import ScanRays, lissajous, risley, spinning
 from rangesim.settings.bounds import Bounds, Seconds, check_fields, whole
 
@@ -289,6 +289,9 @@ class MovingCamera(Camera):
     @property
     def rings(self) -> NDArray[np.uint16] | None:
         return self.camera.rings
+
+    def cropped(self, top: int, bottom: int, left: int, right: int) -> RayTable:
+        return RayTable.of(self).cropped(top, bottom, left, right)
 
     def __eq__(self, other: Any) -> bool:
         return (
