@@ -231,7 +231,6 @@ def test_a_scanner_reads_a_moving_ball_where_it_is_at_each_ray() -> None:
     inside = 0.8**2 - (centre**2).sum(axis=-1) + along**2
     expected = np.where(inside > 0, along - np.sqrt(np.maximum(inside, 0)), np.nan)
     clear = np.abs(inside) > 0.02  # away from the rim
-    np.testing.assert_allclose(signals.truth.range_m[clear], expected[clear], atol=2e-3)
     image = decode(expose(signals, sensor, None))
     sure = clear & (inside > 0)
     np.testing.assert_allclose(image.range_m[sure], expected[sure], atol=2e-3)
@@ -244,5 +243,5 @@ def test_a_scanner_that_moves_takes_one_pass_and_knows_its_way(corner: Scene) ->
     signals = transport_moving(corner, rig, {sensor: Timing()}, Motion(rig=track), spp=4, glint=False)[sensor]
     whole = transport(corner, moving_scanner(rig, track), [sensor], spp=4, glint=False)
     np.testing.assert_array_equal(signals.energy.direct, whole.energy.direct)
-    with pytest.raises(ValueError, match="expected line_period_s=0 for a Spinning"):
+    with pytest.raises(ValueError, match="expected a timing without line_period_s"):
         transport_moving(corner, rig, {sensor: Timing(line_period_s=1e-3)}, Motion(rig=track), spp=4)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Unpack
 
+from rangesim.motion.moving_scanner import on_its_way
 from rangesim.motion.moving_signals import FrameStack
 from rangesim.motion.passes import plan
 from rangesim.motion.pose_tracks import Motion
@@ -19,7 +20,6 @@ from rangesim.signals import Signals, SignalSet, StillSignals
 if TYPE_CHECKING:
     from rangesim.light_transport.transport_settings import TransportOptions, TransportSettings
     from rangesim.scene import Scene
-    from rangesim.scene.rigid_motion import MovingScene
 
 
 def transport_moving(
@@ -42,7 +42,8 @@ def transport_moving(
     Parameters
     ----------
     scene : Scene of `load_scene`; it is not changed.
-    rig : Rig without motion.
+    rig : Rig without motion. If its rays have times (`rangesim.rig.Spinning`), they move with the rig in one pass, and
+        the result is in the coordinates of the scanner at the start (`moving_scanner`).
     timings : sensor -> Timing, the times of its frames.
     motion : Motion, the tracks of objects and rig.
     settings : TransportSettings of each pass; None: the defaults. AdaptiveSampling is refused: passes would sample the
@@ -60,9 +61,6 @@ def transport_moving(
         sees at the middle and the points that it sees at its exposures, such as those of an object that passes by.
         Where a shadow passes, it is the distance of the fastest object. It is None if one pass serves all exposures of
         the sensor.
-
-        A scanner, whose rays have times of their own, reads each ray where it is measured. Its `truth` is that of each
-        ray's own time, and `motion_m` is None.
 
     Raises
     ------
@@ -86,6 +84,7 @@ def transport_moving(
     from rangesim.scene.rigid_motion import MovingScene
 
     _check(scene, rig, timings, motion)
+    rig, motion = on_its_way(rig, timings, motion)
     settings = with_options(settings, options)
     kinds: list[dict[Sensor, Timing]] = []  # sensors that share all cameras
     for sensor, timing in timings.items():
@@ -109,8 +108,6 @@ def transport_moving(
             f'expected a number of samples or "auto" where something moves, got {type(settings.spp).__name__}.'
         )
     stage = MovingScene(scene, tuple(motion.objects))
-    if rig.camera.times_s is not None:
-        return _scanned(stage, rig, timings, motion, settings, progress)
     passes = plan(rig, timings, motion)
     at_once: dict[Sensor, list[StillSignals]] = {}
     stacks: dict[Sensor, list[FrameStack]] = {}
@@ -143,29 +140,6 @@ def transport_moving(
 def _together(of_cameras: Sequence[Signals]) -> Signals:
     """The signals of the only camera, or a set of those of several."""
     return of_cameras[0] if len(of_cameras) == 1 else SignalSet.of(of_cameras)
-
-
-def _scanned(
-    stage: MovingScene,
-    rig: Rig,
-    timings: Mapping[Sensor, Timing],
-    motion: Motion,
-    settings: TransportSettings,
-    progress: Callable[[float], None] | None,
-) -> dict[Sensor, Signals]:
-    """Signals of sensors whose scanner measures each ray at its own time; sensors of equal timings share passes."""
-    from rangesim.light_transport.truncation import warn_of_truncation
-    from rangesim.motion.scanned import scanned_signals
-
-    found: dict[Sensor, Signals] = {}
-    together = list(dict.fromkeys(timings.values()))
-    for number, timing in enumerate(together):
-        sensors = [sensor for sensor, own in timings.items() if own == timing]
-        report = progress and partial(_report, progress, number, len(together))
-        signals = scanned_signals(stage.at, rig, sensors, timing, motion, settings, report)
-        warn_of_truncation(signals.truncation, settings.max_depth, "", stacklevel=3)
-        found |= {sensor: signals.only(sensor) for sensor in sensors}
-    return found
 
 
 def _report(progress: Callable[[float], None], number: int, passes: int, fraction: float) -> None:

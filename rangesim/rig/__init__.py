@@ -8,7 +8,7 @@ from rangesim.rig.intrinsics import RESIDUAL_PX, Coefficient, FocalLength, Intri
 from rangesim.rig.poses import Array, check_rigid, is_same_pose, look_at, pose, translation
 from rangesim.rig.ray_cameras import Fisheye, Orthographic, RayTable, ScanningCamera
 from rangesim.rig.rig import CAMERA_LENS, PROJECTOR_LENS, Lens, Rig
-from rangesim.rig.scanners import CroppedCamera, Lissajous, MovingCamera, Risley, Spinning
+from rangesim.rig.scanners import Lissajous, MovingCamera, Risley, Spinning
 from rangesim.rig.zones import Zones
 
 __all__ = [
@@ -21,7 +21,6 @@ __all__ = [
     "Camera",
     "Coefficient",
     "CoverGlass",
-    "CroppedCamera",
     "Fisheye",
     "FocalLength",
     "Intrinsics",

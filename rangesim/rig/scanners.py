@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rangesim.rig.cameras import Acceptance, Camera, PixelRays, finite_array
 from rangesim.rig.poses import Array, check_rigid
-from rangesim.rig.ray_cameras import FieldAngle, ScanningCamera
+from rangesim.rig.ray_cameras import FieldAngle, RayTable, ScanningCamera
 from rangesim.rig.scan_patterns import ScanRays, lissajous, risley, spinning
 from rangesim.settings.bounds import Bounds, Seconds, check_fields, whole
 
@@ -290,6 +290,9 @@ class MovingCamera(Camera):
     def rings(self) -> NDArray[np.uint16] | None:
         return self.camera.rings
 
+    def cropped(self, top: int, bottom: int, left: int, right: int) -> RayTable:
+        return RayTable.of(self).cropped(top, bottom, left, right)
+
     def __eq__(self, other: Any) -> bool:
         return (
             isinstance(other, MovingCamera) and self.camera == other.camera and np.array_equal(self.poses, other.poses)
@@ -309,68 +312,3 @@ class MovingCamera(Camera):
         shift = None if rays.origin_steps is None else np.einsum("hwij,hwkj->hwki", rotation, rays.origin_steps)
         origins = np.einsum(turn, rotation, rays.origins) + place
         return PixelRays(origins, np.einsum(turn, rotation, rays.directions), steps, shift)
-
-
-@dataclass(frozen=True)
-class CroppedCamera(Camera):
-    """Some rows and columns of another camera.
-
-    Parameters
-    ----------
-    camera : Camera
-    top, bottom, left, right : int, first row, row after the last, first column and column after the last.
-
-    Raises
-    ------
-    ValueError
-        A window that is empty or reaches beyond the camera's image.
-
-    Examples
-    --------
-    >>> head = Spinning(elevations_deg=(1.0, 0.0, -1.0), columns=8)
-    >>> CroppedCamera(head, 0, 2, 4, 8).pixel_rays().directions.shape
-    (2, 4, 3)
-    """
-
-    camera: Camera
-    top: int
-    bottom: int
-    left: int
-    right: int
-
-    type_name: ClassVar[str] = "cropped"
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        inside = 0 <= self.top < self.bottom <= self.camera.height and 0 <= self.left < self.right <= self.camera.width
-        if not inside:
-            raise ValueError(
-                f"expected a window within {self.camera.height} rows and {self.camera.width} columns, got rows "
-                f"{self.top} to {self.bottom} and columns {self.left} to {self.right}."
-            )
-
-    @property
-    def width(self) -> int:  # type: ignore[override]
-        return self.right - self.left
-
-    @property
-    def height(self) -> int:  # type: ignore[override]
-        return self.bottom - self.top
-
-    @property
-    def acceptance(self) -> Acceptance:  # type: ignore[override]
-        return self.camera.acceptance
-
-    @property
-    def has_neighbours(self) -> bool:  # type: ignore[override]
-        return self.camera.has_neighbours
-
-    @property
-    def times_s(self) -> Array | None:
-        times = self.camera.times_s
-        return None if times is None else times[self.top : self.bottom, self.left : self.right]
-
-    def pixel_rays(self) -> PixelRays:
-        """The rays of the window."""
-        some = slice(self.top, self.bottom), slice(self.left, self.right)
-        return PixelRays(*(None if a is None else a[some] for a in self.camera.pixel_rays()))  # type: ignore[arg-type]
