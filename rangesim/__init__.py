@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from typing import Any
 
     from rangesim.capture import Capture as Capture
+    from rangesim.capture import CaptureSet as CaptureSet
     from rangesim.capture.exposure import expose as expose
     from rangesim.causes import explain as explain
     from rangesim.decoding import decode as decode
@@ -50,6 +51,7 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from rangesim.results.saved_signals import save_signals as save_signals
     from rangesim.rig import Beam as Beam
     from rangesim.rig import Camera as Camera
+    from rangesim.rig import CoverGlass as CoverGlass
     from rangesim.rig import Fisheye as Fisheye
     from rangesim.rig import Intrinsics as Intrinsics
     from rangesim.rig import Lens as Lens
@@ -59,10 +61,12 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from rangesim.rig import Rig as Rig
     from rangesim.rig import Risley as Risley
     from rangesim.rig import Spinning as Spinning
+    from rangesim.rig import Zones as Zones
     from rangesim.rig import look_at as look_at
     from rangesim.rig.calibration_files import load_calibration as load_calibration
     from rangesim.scene import Scene as Scene
     from rangesim.scene import load_scene as load_scene
+    from rangesim.sensors import ActiveStereo as ActiveStereo
     from rangesim.sensors import AmcwToF as AmcwToF
     from rangesim.sensors import Decoder as Decoder
     from rangesim.sensors import DirectToF as DirectToF
@@ -73,11 +77,14 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from rangesim.signals import StillSignals as StillSignals
 
 _HOME = {
+    "ActiveStereo": "rangesim.sensors",
     "Ambient": "rangesim.electronics.ambient",
     "AmcwToF": "rangesim.sensors",
     "Beam": "rangesim.rig",
     "Camera": "rangesim.rig",
     "Capture": "rangesim.capture",
+    "CaptureSet": "rangesim.capture",
+    "CoverGlass": "rangesim.rig",
     "Decoder": "rangesim.sensors",
     "Detector": "rangesim.electronics.detector",
     "DirectToF": "rangesim.sensors",
@@ -103,6 +110,7 @@ _HOME = {
     "StillSignals": "rangesim.signals",
     "StructuredLight": "rangesim.sensors",
     "TransportSettings": "rangesim.light_transport.transport_settings",
+    "Zones": "rangesim.rig",
     "compare": "rangesim.evaluation.comparison",
     "decode": "rangesim.decoding",
     "errors_markdown": "rangesim.report",

@@ -27,8 +27,9 @@ from rangesim.light_transport.sampling_error import MIN_FOR_HALVES, Estimate
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.transport_settings import TransportSettings
 from rangesim.light_transport.truncation import estimate_truncation
+from rangesim.light_transport.zone_sums import ZoneSums
 from rangesim.response import Response
-from rangesim.rig import Beam, Camera, Intrinsics, Rig
+from rangesim.rig import Beam, Camera, Intrinsics, Rig, Zones
 from rangesim.scene import Scene
 from rangesim.scene.media import body_around, inside_out
 from rangesim.sensor import Sensor
@@ -114,6 +115,8 @@ class _CameraPass:
         settings: TransportSettings,
         number: int,
     ) -> None:
+        self.zones = ZoneSums(rig, rig.camera.matrix) if isinstance(rig.camera, Zones) else None
+        rig = rig.traced
         self.scene, self.rig, self.here = scene, rig, scene.in_renderer(rig)
         self.settings = replace(settings, seed=derived_seed(settings.seed, number)) if number else settings
         self.traced = traced._replace(camera=camera_device(self.here))
@@ -175,7 +178,7 @@ class _CameraPass:
         pixels = np.arange(len(self.samples))
         estimate.sample(pixels, self.samples, partial(report_part, report, 0.0, PATHS_FRACTION - left))
         if sampler and sampler.most_spp > fewest:
-            more = sampler.samples(self.truth, signals_of).ravel() - self.samples
+            more = self._samples(sampler, signals_of).ravel() - self.samples
             pixels = np.flatnonzero(more)
             if len(pixels):
                 estimate.sample(pixels, more[pixels], partial(report_part, report, PATHS_FRACTION - left, left))
@@ -183,7 +186,15 @@ class _CameraPass:
         report(1.0)
         cut = photons.energy.cut if photons else 0.0
         truncation = estimate_truncation(estimate.mean_tally(), signals.energy, settings.max_depth, cut)
-        return replace(signals, truncation=truncation)
+        signals = replace(signals, truncation=truncation)
+        return signals if self.zones is None else self.zones.signals(signals)
+
+    def _samples(self, sampler: Sampler, signals_of: Callable[[Sequence[Response] | None], StillSignals]) -> np.ndarray:
+        """Number of samples of each pixel, (h, w); for zones, so many that the zones' readings need no more."""
+        zones = self.zones
+        if zones is None:
+            return sampler.samples(self.truth, signals_of)
+        return zones.spread(sampler.samples(zones.truth(self.truth), lambda some: zones.signals(signals_of(some))))
 
 
 def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Glint | None) -> EnergySplit:

@@ -187,7 +187,7 @@ def estimate_cost(
         size = rig.camera.width * rig.camera.height * TRUTH_BYTES  # the file of a pass, as it is read for a report
         limits.check("bytes", size, "bytes in the results of one pass")
         traced, n = _traced_pixels(experiment, rig, instruments)
-        pixels, count = pixels + traced, count + n
+        pixels, count = pixels + traced * instruments[0].sensor.n_cameras, count + n
     paths, all_photons = places * pixels * (experiment.spp or TYPICAL_SPP), places * photons * count
     beside = beside or _beside_tracing(passes)
     beside_s, again = START_S + beside.seconds, (places - 1) * count
@@ -216,7 +216,7 @@ def _traced_pixels(experiment: Experiment, rig: Rig, instruments: Sequence[Instr
     If something moves, each frame has a pass, which renders only the window where something changes.
     """
     if experiment.motion is None:
-        return rig.camera.width * rig.camera.height, 1
+        return rig.traced.camera.width * rig.traced.camera.height, 1
     from rangesim.motion.moving_scanner import on_its_way
     from rangesim.motion.passes import plan
 
@@ -234,8 +234,9 @@ def _beside_tracing(passes: Sequence[tuple[Rig, list[Instrument]]]) -> CostBesid
     seconds, result_bytes = 0.0, []
     for rig, instruments in passes:
         pixels = rig.camera.width * rig.camera.height
-        seconds += sum(pixels * (PIXEL_S + FRAME_S * i.sensor.n_frames) for i in instruments)
-        result_bytes.append(sum(pixels * (2 * i.sensor.n_frames + RESULT_BYTES) for i in instruments))
+        frames = [i.sensor.n_frames * i.sensor.n_cameras for i in instruments]
+        seconds += sum(pixels * (PIXEL_S + FRAME_S * n) for n in frames)
+        result_bytes.append(sum(pixels * (2 * n + RESULT_BYTES) for n in frames))
     return CostBesideTracing(seconds, sum(result_bytes[:-1]), sum(result_bytes), 0)
 
 
@@ -243,7 +244,7 @@ def _tracing_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int)
     """Bytes of the arrays of a pass that exist at once, at the peak: while it is traced or its frames are exposed."""
     at_once = 0.0
     for rig, instruments in passes:
-        pixels = rig.camera.width * rig.camera.height
+        pixels = rig.traced.camera.width * rig.traced.camera.height * instruments[0].sensor.n_cameras
         responses = dict.fromkeys(r for instrument in instruments for r in instrument.sensor.responses())
         channels = sum(r.channels for r in responses)
         tiles = min(TRANSPORT_BYTES, pixels * (LANE_BYTES + 2 * 4 * channels))  # indirect light has its own channels
@@ -266,7 +267,7 @@ def _timed_trial(
     """
     from rangesim.instrument.transport import transport
 
-    rig, instruments = one_pass
+    rig, instruments = one_pass[0].traced, one_pass[1]
     small = TRIAL_WIDTH, max(1, round(TRIAL_WIDTH * rig.camera.height / rig.camera.width))
     camera = (
         rig.camera.resized(*small) if isinstance(rig.camera, Intrinsics) else RayTable.of(rig.camera).thinned(*small)

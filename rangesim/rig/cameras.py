@@ -89,6 +89,11 @@ class Camera(Optics):
         return None
 
     @property
+    def traced(self) -> Camera:
+        """The camera whose rays are traced: this one, or the finer one that zones are made of."""
+        return self
+
+    @property
     def rings(self) -> NDArray[np.uint16] | None:
         """(h, w) uint16, the beam of a turning head that measures each ray, if the rows are its rings; None: they are
         not."""
