@@ -107,8 +107,8 @@ def transport_moving(
         raise ValueError(
             f'expected a number of samples or "auto" where something moves, got {type(settings.spp).__name__}.'
         )
-    passes = plan(rig, timings, motion)
     stage = MovingScene(scene, tuple(motion.objects))
+    passes = plan(rig, timings, motion)
     at_once: dict[Sensor, list[StillSignals]] = {}
     stacks: dict[Sensor, list[FrameStack]] = {}
     for number, one in enumerate(passes):
