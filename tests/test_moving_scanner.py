@@ -22,7 +22,7 @@ from rangesim.motion import (
 )
 from rangesim.motion.moving_scanner import on_its_way
 from rangesim.motion.passes import plan
-from rangesim.rig import Beam, Intrinsics, Orthographic, Rig, Spinning, look_at
+from rangesim.rig import Beam, Intrinsics, MovingCamera, Orthographic, Rig, Spinning, Zones, look_at
 
 HEAD = Spinning(tuple(np.linspace(15, -15, 8)), 48, 0.1, origin_m=(0.0, 0.0, 0.03), first_azimuth_deg=-180.0)
 DRIVE = ConstantTwist(velocity_m_s=(15.0, 0.0, 0.0), rotation_rad_s=(0.0, 0.0, 0.6))
@@ -207,5 +207,7 @@ def test_what_cannot_move_with_its_rays_is_refused(rig: Rig, image: RangeImage) 
         moving_scanner(replace(rig, projector=flood), DRIVE)
     with pytest.raises(ValueError, match="whose rays have times, got Intrinsics"):
         moving_scanner(replace(rig, camera=flood), DRIVE)
+    with pytest.raises(ValueError, match="make zones of the moving camera"):
+        MovingCamera(Zones(HEAD, 24, 4), np.eye(4)[None])
     with pytest.raises(ValueError, match="of a MovingCamera, got one of Spinning"):
         as_reported(as_reported(image))

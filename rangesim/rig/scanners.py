@@ -238,7 +238,8 @@ class MovingCamera(Camera):
     Raises
     ------
     ValueError
-        The camera has no times, there is not one pose for each different time, or a pose is not rigid.
+        The camera has no times or consists of zones, there is not one pose for each different time, or a pose is not
+        rigid.
 
     Examples
     --------
@@ -259,6 +260,8 @@ class MovingCamera(Camera):
     def __post_init__(self) -> None:
         if not isinstance(self.camera, Camera) or self.camera.times_s is None:
             raise ValueError(f"expected a camera whose rays have times, got {type(self.camera).__name__}.")
+        if self.camera.traced is not self.camera:
+            raise ValueError("expected a camera without zones; make zones of the moving camera instead.")
         times = len(np.unique(self.camera.times_s))
         poses = finite_array(self.poses, "poses", (None, 4, 4))
         if len(poses) != times:
