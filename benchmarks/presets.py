@@ -9,7 +9,8 @@ view, the light is computed in closed form; beams are traced.
 For a figure that is an upper bound ("<="), noise below the bound counts as a ratio of 1. At mid-range, most pixels
 have to give a reading, and none closer or farther than the sheet allows may.
 
-`--fit` prints the power that makes the noise at the marked distance equal to the published one.
+`--fit` prints the power that makes the noise at the marked distance equal to the published one. Without a mark, it is
+the least power with which the device reads a wall at the end of its range.
 
 The last line is JSON:
 
@@ -48,6 +49,7 @@ from rangesim import (
 from rangesim.environment.backend import select_variant
 from rangesim.instrument.instrument import Instrument
 from rangesim.presets import Preset
+from rangesim.presets.preset import standing
 from rangesim.response import LightPath, NumpyMath, Response, SparseResponse
 from rangesim.rig import Camera, Fisheye, RayTable
 from rangesim.robust_scale import sigma_from_median
@@ -59,6 +61,10 @@ RAYS = 32
 """Beams across and down that look at the wall: 1024 readings tell a standard deviation to 2 %."""
 SPP = 16
 """Light paths of each traced beam. The wall is even, so its sampling error is far below the noise of the photons."""
+REFLECTANCE = 0.8
+"""Reflectance of the wall where no published figure states one: white paint, as in most data sheets."""
+NEARLY_ALL = 0.95
+"""Fraction of the pixels that read a wall at the end of the range of a device whose power is fitted to its range."""
 MIN_VALID = 0.9
 """Least fraction of the pixels with a reading of a wall at mid-range."""
 POWERS_W = (1e-6, 1e4)
@@ -73,7 +79,7 @@ def main() -> None:
     found = [presets.describe(name) for name in args.devices]
     if args.fit:
         for preset in found:
-            if preset.sheet.noise is not None and preset.sheet.noise.fitted_at_m is not None:
+            if standing(preset.sources["instrument.power_w"]) == "fitted":
                 print(f"{preset.name:28s}power_w = {fitted_power_w(preset):.3g}", flush=True)
         return
     agree, ratios = 0, []
@@ -123,11 +129,11 @@ def contradictions(preset: Preset) -> list[str]:
         faults.append(f"field of view {view} instead of {sheet.field_of_view_deg}")
     near_m, far_m = sheet.range_m
     middle_m = math.sqrt(max(near_m, 0.01) * far_m)
-    valid = of_wall(preset.instrument, middle_m, 0.8, 0.0).valid.mean()
+    valid = of_wall(preset.instrument, middle_m, REFLECTANCE, 0.0).valid.mean()
     if valid < MIN_VALID:
         faults.append(f"readings in {valid:.0%} of the pixels at {middle_m:.2f} m")
     for distance_m in (0.9 * near_m, 1.1 * far_m):
-        if distance_m > 0 and (valid := of_wall(preset.instrument, distance_m, 0.8, 0.0).valid.mean()) > 0:
+        if distance_m > 0 and (valid := of_wall(preset.instrument, distance_m, REFLECTANCE, 0.0).valid.mean()) > 0:
             faults.append(f"readings in {valid:.0%} of the pixels at {distance_m:.2f} m, outside its range")
     return faults
 
@@ -148,19 +154,20 @@ def field_of_view_deg(camera: Camera) -> tuple[float, float]:
 
 
 def fitted_power_w(preset: Preset) -> float:
-    """Power of the emitter at which the noise at the marked distance is the published one."""
-    noise = preset.sheet.noise
-    assert noise is not None
-    assert noise.fitted_at_m is not None
-    wanted_m = noise.sigma_m[noise.range_m.index(noise.fitted_at_m)]
+    """Power at which the noise at the marked distance is the published one; without such a mark, the least power at
+    which nearly all pixels read a wall at the end of the range."""
+    noise, far_m = preset.sheet.noise, preset.sheet.range_m[1]
+    reflectance, sunlight_lux = (noise.reflectance, noise.sunlight_lux) if noise else (REFLECTANCE, 0.0)
+    distance_m = noise.fitted_at_m if noise and noise.fitted_at_m else far_m
+    wanted_m = noise.sigma_m[noise.range_m.index(distance_m)] if noise and noise.fitted_at_m else math.inf
     low, high = np.log(POWERS_W)
     for _ in range(30):
         middle = (low + high) / 2
         instrument = replace(unlimited(preset.instrument), power_w=float(np.exp(middle)))
-        image = of_wall(instrument, noise.fitted_at_m, noise.reflectance, noise.sunlight_lux)
+        image = of_wall(instrument, distance_m, reflectance, sunlight_lux)
         is_bright = (image.status == Status.SATURATED).mean() > 0.5
-        is_noisy = not is_bright and (image.valid.mean() < 0.5 or scatter_m(image) > wanted_m)
-        low, high = (middle, high) if is_noisy else (low, middle)
+        is_weak = image.valid.mean() < (0.5 if math.isfinite(wanted_m) else NEARLY_ALL) or scatter_m(image) > wanted_m
+        low, high = (middle, high) if is_weak and not is_bright else (low, middle)
     return float(np.exp((low + high) / 2))
 
 

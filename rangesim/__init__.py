@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from typing import Any
 
     from rangesim.capture import Capture as Capture
+    from rangesim.capture import CaptureSet as CaptureSet
     from rangesim.capture.exposure import expose as expose
     from rangesim.causes import explain as explain
     from rangesim.decoding import decode as decode
@@ -65,6 +66,7 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from rangesim.rig.calibration_files import load_calibration as load_calibration
     from rangesim.scene import Scene as Scene
     from rangesim.scene import load_scene as load_scene
+    from rangesim.sensors import ActiveStereo as ActiveStereo
     from rangesim.sensors import AmcwToF as AmcwToF
     from rangesim.sensors import Decoder as Decoder
     from rangesim.sensors import DirectToF as DirectToF
@@ -75,11 +77,13 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from rangesim.signals import StillSignals as StillSignals
 
 _HOME = {
+    "ActiveStereo": "rangesim.sensors",
     "Ambient": "rangesim.electronics.ambient",
     "AmcwToF": "rangesim.sensors",
     "Beam": "rangesim.rig",
     "Camera": "rangesim.rig",
     "Capture": "rangesim.capture",
+    "CaptureSet": "rangesim.capture",
     "CoverGlass": "rangesim.rig",
     "Decoder": "rangesim.sensors",
     "Detector": "rangesim.electronics.detector",

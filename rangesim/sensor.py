@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from rangesim.capture import Capture
     from rangesim.decoding.coordinates import Coordinates
     from rangesim.decoding.range_image import RangeImage
+    from rangesim.rig import Rig
 
 
 TOF_BASELINE_M = 0.03
@@ -69,6 +70,12 @@ class Sensor(Named, ABC):
     is_ideal: ClassVar[bool] = False
     """Whether this is a reference that nobody can build: its frames have no noise, and reports do not rank it."""
 
+    n_cameras: ClassVar[int] = 1
+    """Number of cameras. The captures of several are a `rangesim.capture.CaptureSet`; see `rigs`."""
+
+    compares_texture: ClassVar[bool] = False
+    """Whether a reading compares the pattern of neighbouring pixels, so that it needs the light of their whole area."""
+
     first_return_frame: ClassVar[int | None] = None
     """Index of the frame that holds the radiance of the first return, for a sensor that reads no other light."""
 
@@ -100,6 +107,11 @@ class Sensor(Named, ABC):
         """Number of frames in a capture."""
         return len(self.frame_names())
 
+    @property
+    def reads_emitter(self) -> bool:
+        """Whether the sensor reads light of its emitter; if not, shadows and the emitter's power mean nothing to it."""
+        return bool(self.responses())
+
     def frames_per_exposure(self, single_tap: bool = False) -> int:
         """Number of consecutive frames of a capture that one exposure fills.
 
@@ -120,6 +132,15 @@ class Sensor(Named, ABC):
     @abstractmethod
     def default_decoder(self) -> Decoder:
         """The decoder that the sensor comes with."""
+
+    def rigs(self, rig: Rig) -> tuple[Rig, ...]:
+        """Rigs of all `n_cameras` cameras of the sensor, which share the emitter; by default the given one alone.
+
+        Parameters
+        ----------
+        rig : Rig of the reference camera and the emitter. It comes first in the result.
+        """
+        return (rig,)
 
     @property
     def default_detector(self) -> PhotoDetector | None:
@@ -310,6 +331,11 @@ class Decoder(Named, ABC):
     @abstractmethod
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         """(h, w) float64, least light of the emitter at full power that the thresholds accept, in `background.unit`."""
+
+    @property
+    def reach_px(self) -> int:
+        """Pixels around a pixel on which its reading depends, so that a depth edge as far away can spoil it."""
+        return 0
 
     def content(self, sensor: Sensor) -> FrameContent:
         """Light and dark current in the frame that decides about a reading, on average over the patterns."""

@@ -20,7 +20,8 @@ from rangesim.electronics.spad import SpadDetector
 from rangesim.environment.backend import select_variant
 from rangesim.errors import RangesimWarning
 from rangesim.motion import ConstantTwist, Motion, Timing, transport_moving
-from rangesim.sensors import DirectToF
+from rangesim.response import Dots
+from rangesim.sensors import ActiveStereo, DirectToF
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 SIZE = {"width": 80, "height": 60}
@@ -296,6 +297,52 @@ def pile_up() -> Case:
     )
     healed = right(measure(weak, sensor, detector, 1e-3)[1], weak)
     return timed_case(signals, sensor, detector, 1e-3, [(healed, Cause.PILE_UP)])
+
+
+def occluded() -> Case:
+    """Active stereo on a wall, whose left border the second camera does not see; the other pixels are right, but for
+    windows that the border cuts."""
+    scene = room(wall=board(0, 0, 1.0, 2))
+    sensor = ActiveStereo(Dots(256, 160, spacing_px=12.0, dot_px=2.5), baseline_m=0.2)
+    signals = transport(scene, sensor.rigs(rig_of(scene, 0.1)), [sensor], spp=64, max_depth=2)
+    second = signals[1].rig
+    place = second.camera.project(points_of(signals) @ second.T_world_camera[:3, :3] + origin_of(second))
+    outside = ~((place >= 0) & (place <= [SIZE["width"], SIZE["height"]])).all(axis=-1)
+    return case(signals, sensor, Detector(), lambda c, i: [(outside, Cause.OCCLUDED), (True, Cause.RESOLUTION)])
+
+
+def no_texture() -> Case:
+    """Passive stereo on a white wall in room light; healed by a wall with texture."""
+    import mitsuba as mi
+
+    select_variant()
+    grey = np.random.default_rng(0).uniform(0.1, 0.9, (256, 256, 1)).astype(np.float32)
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(grey), "raw": True}
+    painted = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture}}
+    lamp = {"type": "constant", "radiance": 1.0}
+    sensor = ActiveStereo(None, baseline_m=0.2)
+    scenes = room(wall=board(0, 0, 1.0, 2), room=lamp), room(wall=board(0, 0, 1.0, 2, painted), room=lamp)
+    signals, on_texture = (
+        transport(s, sensor.rigs(rig_of(s, 0.1)), [sensor], spp=64, max_depth=2, photons=0) for s in scenes
+    )
+    healed = right(measure(on_texture, sensor, Detector())[1], on_texture)
+    second = signals[1].rig
+    place = second.camera.project(points_of(signals) @ second.T_world_camera[:3, :3] + origin_of(second))
+    outside = ~((place >= 0) & (place <= [SIZE["width"], SIZE["height"]])).all(axis=-1)
+    assert healed[~outside].mean() > 0.95  # not where the border cuts the window
+    return case(signals, sensor, Detector(), lambda c, i: [(outside, Cause.OCCLUDED), (True, Cause.NO_TEXTURE)])
+
+
+def points_of(signals: Signals) -> np.ndarray:
+    """(h, w, 3) true points in the world, metres."""
+    rig = signals.rig
+    rays = rig.camera.directions(rig.camera.pixel_centres())
+    return np.asarray((rays * signals.truth.z[..., None]) @ rig.T_world_camera[:3, :3].T + rig.T_world_camera[:3, 3])
+
+
+def origin_of(rig: Rig) -> np.ndarray:
+    """(3,) origin of the world in coordinates of a camera, metres."""
+    return np.asarray(np.linalg.inv(rig.T_world_camera)[:3, 3])
 
 
 def ambient() -> Case:

@@ -341,6 +341,7 @@ GEOMETRY = {
     "ideal_pixels lens_pixels project projection_matrix rays",
     "camera_pose": "CameraPose find_camera_pose fit_camera_pose",
     "camera_projector": "ProjectorTriangulation triangulate_coordinates",
+    "dense_stereo": "DenseMatch DenseMatching MatchOutcome match_densely",
     "hand_eye": "HandEye eye_in_hand eye_to_hand",
     "homography": "Homography find_homography fit_homography homography_dlt transfer_error",
     "projective_plane": "LINE_AT_INFINITY Decomposition PlaneTransform affine_rectification classify euclidean "
@@ -451,11 +452,13 @@ def test_the_public_surface_of_fusion_is_this() -> None:
 
 def test_the_public_surface_is_this() -> None:
     assert rangesim.__all__ == [
+        "ActiveStereo",
         "Ambient",
         "AmcwToF",
         "Beam",
         "Camera",
         "Capture",
+        "CaptureSet",
         "CoverGlass",
         "Decoder",
         "Detector",

@@ -16,6 +16,7 @@ from synthetic import plane_signals, stereo_rig
 
 import rangesim
 from rangesim import decode, explain, expose
+from rangesim.decoding.disparities import Disparities, ImageNoise
 from rangesim.decoding.gray import GrayThresholds
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
@@ -23,9 +24,11 @@ from rangesim.electronics.ambient import Ambient, Tungsten
 from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
+from rangesim.geometry.dense_stereo import DenseMatching
 from rangesim.motion import ConstantTwist, Motion, PoseTrack, Timing
 from rangesim.presets import instrument
 from rangesim.response import (
+    Dots,
     FirstReturn,
     Fringes,
     GrayBits,
@@ -38,6 +41,7 @@ from rangesim.response import (
 )
 from rangesim.rig import Intrinsics, Lens, Rig, translation
 from rangesim.sensors import (
+    ActiveStereo,
     AmcwDecoder,
     AmcwToF,
     Decoder,
@@ -46,9 +50,11 @@ from rangesim.sensors import (
     IdealToF,
     IdealToFDecoder,
     Sensor,
+    StereoDecoder,
     StructuredLight,
     StructuredLightDecoder,
 )
+from rangesim.signals import SignalSet
 
 NONSENSE = (
     *(math.nan, math.inf, -math.inf, -1, 0, True, 1e300, 1e-300, -1e300, 10**30, 10**400, 1 << 63, 1j),
@@ -57,6 +63,7 @@ NONSENSE = (
 )
 
 CAMERA = Intrinsics.from_fov(24, 18, 45)
+STEREO = ActiveStereo(Dots(1280, 800))
 RIG = stereo_rig(24, 18)
 
 
@@ -67,8 +74,18 @@ def expose_and_decode(sensor: Sensor, rig: Rig = RIG, detector: Any = None, ambi
     assert np.isfinite(image.range_m[image.valid]).all()
 
 
+def signals_of(sensor: Sensor, rig: Rig = RIG) -> Any:
+    """Signals of a plane; of a sensor with several cameras a set."""
+    found = [plane_signals(one, sensor, ambient=0.1) for one in sensor.rigs(rig)]
+    return found[0] if sensor.n_cameras == 1 else SignalSet.of(found)
+
+
 def use_sensor(sensor: Any) -> None:
     hash(sensor)
+    if isinstance(sensor, ActiveStereo):
+        signals = signals_of(sensor)
+        assert rangesim.decode(rangesim.expose(signals, sensor)).status.shape == (18, 24)
+        return
     rig = RIG
     if isinstance(sensor, StructuredLight):
         rig = stereo_rig(24, 18, projector=Intrinsics.from_fov(sensor.projector_width, sensor.projector_height, 60))
@@ -95,9 +112,10 @@ def use_decoder(decoder: Decoder) -> None:
         AmcwDecoder: AmcwToF(waveform="square"),
         DirectToFDecoder: DirectToF(bins=32),
         IdealToFDecoder: IdealToF(),
+        StereoDecoder: STEREO,
     }[type(decoder)]
     for detector in (None, sensor.default_detector):
-        signals = plane_signals(RIG, sensor, ambient=0.1)
+        signals = signals_of(sensor)
         capture = expose(signals, sensor, detector)
         image = decode(capture, decoder)
         assert image.decoder == decoder
@@ -175,6 +193,10 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (DirectToF(pulse_fwhm_s=400e-12), use_sensor),
     (IdealToF(), use_sensor),
     (StructuredLightDecoder(), use_decoder),
+    (STEREO, use_sensor),
+    (StereoDecoder(disparities=8), use_decoder),
+    (DenseMatching(), lambda matching: use_decoder(StereoDecoder(matching, disparities=8))),
+    (ImageNoise(), lambda noise: use_decoder(StereoDecoder(noise=noise, disparities=8))),
     (GrayThresholds(), lambda t: use_decoder(StructuredLightDecoder(gray=t))),
     (PhaseThresholds(), lambda t: use_decoder(StructuredLightDecoder(phase=t))),
     (TriangulationLimits(), lambda t: use_decoder(StructuredLightDecoder(triangulation=t))),
@@ -197,6 +219,7 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (ConstantTwist(), use_track),
     (Motion({"ball": ConstantTwist()}), lambda m: m.at(1.0)),
     (GrayBits(0, 4, 1), use_response),
+    (Dots(8, 6), use_response),
     (Fringes(0, 16.0), use_response),
     (Images(np.ones((2, 6, 8), np.float32)), use_response),
     (Phasor(20e6), use_response),
@@ -270,10 +293,11 @@ MODULES = (
         "response.patterns",
         "rig.rig",
     ),
-    *("sensors.structured_light", "sensors.amcw", "sensors.direct_tof", "sensors.ideal_tof"),
-    *("decoding.gray", "decoding.phase_shift", "decoding.triangulation"),
+    *("sensors.structured_light", "sensors.amcw", "sensors.direct_tof", "sensors.ideal_tof", "sensors.active_stereo"),
+    *("decoding.gray", "decoding.phase_shift", "decoding.triangulation", "decoding.disparities"),
+    "geometry.dense_stereo",
 )
-RESULTS = {ProjectorCoordinates, Phase}
+RESULTS = {Disparities, ProjectorCoordinates, Phase}
 
 
 def test_every_setting_has_a_case() -> None:

@@ -95,7 +95,7 @@ ARRAY_DAMAGES: list[tuple[str, Edit, str]] = [
     ("pass_1.npz", put("energy_direct", np.full((90, 120), -1, np.float32)), r"expected values from 0 to"),
     ("pass_1.npz", put("truth_instance", np.full((90, 120), 99, np.int32)), r"expected indices into"),
     ("pass_1.npz", put("truth_material_names", np.zeros(2)), r"expected str, got float64"),
-    ("lines/range.npz", put("status", np.full((90, 120), 77, np.uint8)), r"expected values from .* to 5"),
+    ("lines/range.npz", put("status", np.full((90, 120), 77, np.uint8)), r"expected values from .* to 7"),
     ("lines/range.npz", put("status", np.zeros((90, 120), np.uint8)), r"expected z to be finite where status is 0"),
     ("lines/range.npz", put("z", np.full((90, 120), np.inf, np.float32)), r"expected finite values, got infinity"),
     ("lines/causes.npz", put("cause", np.full((90, 120), 200, np.uint8)), r"expected values from"),

@@ -7,10 +7,14 @@ from rangesim.capture.capture import (
     Capture,
     bright_level,
 )
+from rangesim.capture.capture_set import Captured, CaptureSet, together
 
 __all__ = [
     "BRIGHT_PERCENTILE",
     "DTYPES",
     "Capture",
+    "CaptureSet",
+    "Captured",
     "bright_level",
+    "together",
 ]

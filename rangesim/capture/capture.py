@@ -151,6 +151,16 @@ class Capture(ShortRepr):
         object.__setattr__(self, "frames", _masked_in_all(self.frames))
 
     @property
+    def captures(self) -> tuple[Capture, ...]:
+        """This capture alone, as `CaptureSet.captures` of several cameras."""
+        return (self,)
+
+    @property
+    def reference(self) -> Capture:
+        """This capture, as `CaptureSet.reference` of several cameras."""
+        return self
+
+    @property
     def is_digital(self) -> bool:
         """Whether the frames are digital numbers, not radiance."""
         return bool(np.issubdtype(self.frames.dtype, np.integer))

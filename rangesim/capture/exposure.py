@@ -3,23 +3,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 
-from rangesim.capture import Capture, bright_level
+from rangesim.capture import Capture, Captured, CaptureSet, bright_level, together
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.errors import warn
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
 from rangesim.settings.bounds import SECONDS, check_number
 from rangesim.settings.config import ShortRepr
-from rangesim.settings.seeds import check_seed
+from rangesim.settings.seeds import check_seed, derived_seed
 
 if TYPE_CHECKING:
     from rangesim.electronics.ambient import Ambient
-    from rangesim.signals import Signals
+    from rangesim.signals import Signals, SignalSet
 
 TARGET_FRACTION = 0.7
 """Fraction of the saturation capacity to which automatic exposure brings the bright pixels (`bright_level`).
@@ -29,6 +30,28 @@ values were not measured.
 """
 
 
+@overload
+def expose(  # type: ignore[overload-overlap]
+    signals: SignalSet,
+    sensor: Sensor,
+    detector: PhotoDetector | None = ...,
+    exposure_s: float | None = ...,
+    seed: int = ...,
+    ambient: Ambient | None = ...,
+) -> CaptureSet: ...
+
+
+@overload
+def expose(
+    signals: Signals,
+    sensor: Sensor,
+    detector: PhotoDetector | None = ...,
+    exposure_s: float | None = ...,
+    seed: int = ...,
+    ambient: Ambient | None = ...,
+) -> Capture: ...
+
+
 def expose(
     signals: Signals,
     sensor: Sensor,
@@ -36,8 +59,11 @@ def expose(
     exposure_s: float | None = None,
     seed: int = 0,
     ambient: Ambient | None = None,
-) -> Capture:
+) -> Captured:
     """The capture that a sensor takes of signals, with the noise and the limits of a detector.
+
+    Of signals of several cameras (`SignalSet`) it is a `CaptureSet`. All cameras then have one exposure, which
+    automatic exposure chooses for the first one, and noise of their own. The first one has the same bytes as alone.
 
     Parameters
     ----------
@@ -77,20 +103,20 @@ def expose(
 class Exposure(ShortRepr):
     """A capture together with the light that it was exposed from.
 
-    capture : Capture.
+    capture : Capture, or CaptureSet of several cameras.
     signals : Signals.
-    radiance : (k, h, w) float32, W/m2/sr, mean of the light that the detector turns into each frame; None: the capture
-        is noise-free, and its frames are the radiance.
+    radiance : (k, h, w) float32, W/m2/sr, mean of the light that the detector of the reference camera turns into each
+        frame; None: the capture is noise-free, and its frames are the radiance.
     """
 
-    capture: Capture
+    capture: Captured
     signals: Signals
     radiance: np.ndarray | None = None
 
     def photons_per_pulse(self) -> np.ndarray | None:
         """(h, w) float64, mean number of photons that each pixel detects per laser pulse; with pile-up, it counts only
         the first of them. None if the detector integrates, or the capture is noise-free."""
-        capture = self.capture
+        capture = self.capture.reference
         if capture.detector is None or self.radiance is None or capture.sensor.gate is None:
             return None
         return capture.detector.photons_per_pulse(self.radiance, capture.sensor.gate, self.signals.rig)
@@ -104,7 +130,7 @@ class Exposure(ShortRepr):
         -----
         RangesimWarning
         """
-        capture, rig = self.capture, self.signals.rig
+        capture, rig = self.capture.reference, self.signals.rig
         detector = capture.detector
         if detector is None or self.radiance is None or capture.exposure_s > detector.min_exposure_s:
             return
@@ -137,26 +163,46 @@ def exposed(
         ambient.check_emitters(bool(signals.energy.ambient.any()))
     if detector is None or sensor.is_ideal:
         return Exposure(noise_free_capture(signals, sensor, ambient), signals)
-    radiance = _mean_radiance(signals, sensor, detector, ambient)
-    if exposure_s is None:
-        exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
-    frames = detector.read_out(radiance, sensor.gate, signals.rig, exposure_s, seed)
-    return Exposure(Capture(frames, sensor, signals.rig, detector, exposure_s, ambient), signals, radiance)
+    captures, of_reference = [], None
+    for number, one in enumerate(signals.cameras):
+        radiance = _mean_radiance(one, sensor, detector, ambient)
+        of_reference = radiance if of_reference is None else of_reference
+        if exposure_s is None:
+            exposure_s = auto_exposure_s(radiance, sensor, detector, one.rig)
+        frames = detector.read_out(radiance, sensor.gate, one.rig, exposure_s, _seed_of_camera(seed, number))
+        captures.append(Capture(frames, sensor, one.rig, detector, exposure_s, ambient))
+    return Exposure(together(captures), signals, of_reference)
+
+
+def _seed_of_camera(seed: int, number: int) -> int:
+    """Seed of the noise of a camera; that of the reference camera, number 0, is the seed itself."""
+    return derived_seed(seed, number) if number else seed
 
 
 def noise_free_capture(
     signals: Signals, sensor: Sensor, ambient: Ambient | None = None, sampling_errors: float = 0.0
-) -> Capture:
-    """Capture of the radiance of signals, without a detector.
+) -> Captured:
+    """Capture of the radiance of signals, without a detector; a `CaptureSet` of several cameras.
 
     sampling_errors : factor on the draw of the sampling error that is added to the signals; 0: none is added.
     """
     unfiltered = 1.0 if ambient is None else ambient.scale
-    frames = signals.frames(sensor, unfiltered, sampling_errors)
-    return Capture(_through_lens(frames, signals.rig), sensor, signals.rig, ambient=ambient)
+    captures = []
+    for one in signals.cameras:
+        frames = one.frames(sensor, unfiltered, sampling_errors)
+        captures.append(Capture(_through_lens(frames, one.rig), sensor, one.rig, ambient=ambient))
+    return together(captures)
 
 
-def exposed_again(capture: Capture, signals: Signals, seed: int, sampling_errors: float = 0.0) -> Capture:
+def capture_of_frames(signals: Signals, sensor: Sensor, frames_of: Callable[[Signals], np.ndarray]) -> Captured:
+    """Noise-free capture of frames that a function makes for each camera of the signals.
+
+    frames_of : function of the signals of one camera that returns frames (k, h, w) float32, W/m2/sr.
+    """
+    return together([Capture(frames_of(one), sensor, one.rig) for one in signals.cameras])
+
+
+def exposed_again(capture: Captured, signals: Signals, seed: int, sampling_errors: float = 0.0) -> Captured:
     """Capture of the same signals with the same settings, and with the noise of another seed.
 
     sampling_errors : factor on the draw of the sampling error that is added to the signals; 0: none is added.
@@ -166,11 +212,15 @@ def exposed_again(capture: Capture, signals: Signals, seed: int, sampling_errors
     ValueError
         The detector of the capture is not known.
     """
-    if capture.detector is None:
-        raise ValueError("expected a capture whose detector is known, got one without.")
-    radiance = _mean_radiance(signals, capture.sensor, capture.detector, capture.ambient, sampling_errors)
-    frames = capture.detector.read_out(radiance, capture.sensor.gate, signals.rig, capture.exposure_s, seed)
-    return replace(capture, frames=frames)
+    captures = []
+    for number, (taken, one) in enumerate(zip(capture.captures, signals.cameras, strict=True)):
+        if taken.detector is None:
+            raise ValueError("expected a capture whose detector is known, got one without.")
+        radiance = _mean_radiance(one, taken.sensor, taken.detector, taken.ambient, sampling_errors)
+        gate, camera_seed = taken.sensor.gate, _seed_of_camera(seed, number)
+        frames = taken.detector.read_out(radiance, gate, one.rig, taken.exposure_s, camera_seed)
+        captures.append(replace(taken, frames=frames))
+    return together(captures)
 
 
 def _mean_radiance(

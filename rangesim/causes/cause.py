@@ -41,6 +41,8 @@ class Cause(IntEnum):
     RANGE_AMBIGUITY = 12
     RESOLUTION = 13
     PILE_UP = 14
+    OCCLUDED = 15
+    NO_TEXTURE = 16
 
 
 DEFINITIONS = {
@@ -59,6 +61,8 @@ DEFINITIONS = {
     Cause.RANGE_AMBIGUITY: "The distance lies beyond the unambiguous range, or a wrong period was chosen.",
     Cause.RESOLUTION: "Neither stray light nor noise is to blame: code, bins or baseline are too coarse for the depth.",
     Cause.PILE_UP: "So many pulses brought photons that the first ones hid the others; less light would be read right.",
+    Cause.OCCLUDED: "The second camera of a pair does not see the point: something is in between, or it lies outside.",
+    Cause.NO_TEXTURE: "The surface shows no texture by which the images of two cameras could be matched.",
 }
 """Meaning of each cause, in one sentence, which the tables of docs/causes.md and of reports show."""
 
@@ -78,6 +82,8 @@ TITLES = {
     Cause.RANGE_AMBIGUITY: "range ambiguity",
     Cause.RESOLUTION: "too coarse",
     Cause.PILE_UP: "pile-up",
+    Cause.OCCLUDED: "occluded from a camera",
+    Cause.NO_TEXTURE: "no texture",
 }
 """Name of each cause in tables and legends."""
 

@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from rangesim.capture import Capture
+from rangesim.capture.exposure import capture_of_frames
 from rangesim.causes.light_budget import LightBudget, light_budget, white_radiance
 from rangesim.causes.reference_frames import (
     depth_on_plane,
@@ -77,8 +80,8 @@ class Evidence:
 
     @property
     def capture(self) -> Capture:
-        """The capture that the range image was decoded from."""
-        return self.readings.capture
+        """The capture of the camera that the range image is of."""
+        return self.readings.capture.reference
 
     @property
     def signals(self) -> Signals:
@@ -146,8 +149,18 @@ class Evidence:
 
     @cached_property
     def in_shadow(self) -> np.ndarray:
-        """Whether the emitter does not light the surface at the centre of the pixel."""
+        """Whether the emitter does not light the surface at the centre of the pixel, and the sensor reads its light."""
+        if not self.capture.sensor.reads_emitter:
+            return np.zeros(self.truth.z.shape, dtype=bool)
         return ~self.truth.projector_visible
+
+    @cached_property
+    def hidden(self) -> np.ndarray:
+        """Whether a further camera of the sensor does not see the surface at the centre of the pixel."""
+        result = np.zeros(self.truth.z.shape, dtype=bool)
+        for other in self.signals.cameras[1:]:
+            result[self.failed] |= _hidden_from(other, self._in_world, self.tolerance_m)
+        return result
 
     @cached_property
     def unlit(self) -> np.ndarray:
@@ -161,8 +174,10 @@ class Evidence:
 
     @cached_property
     def at_edge(self) -> np.ndarray:
-        """Whether a depth edge lies between the pixel and one of its eight neighbours."""
-        return depth_edges(self.true_m, self.tolerance_m)
+        """Whether a depth edge lies between the pixel and one of its eight neighbours, or as far away as the reading of
+        the pixel reaches (`Decoder.reach_px`)."""
+        edges, reach = depth_edges(self.true_m, self.tolerance_m), self.readings.decoder.reach_px
+        return edges if not reach else binary_dilation(edges, np.ones((3, 3)), iterations=reach)
 
     @cached_property
     def merely_inclined(self) -> np.ndarray:
@@ -224,6 +239,8 @@ class Evidence:
     @cached_property
     def swamped(self) -> np.ndarray:
         """Whether the emitter's light would suffice without ambient light, which makes most of the noise."""
+        if not self.capture.sensor.reads_emitter:
+            return np.zeros(self.truth.z.shape, dtype=bool)
         return np.asarray((self.budget.signal >= self.budget.needed_in_the_dark) & self.mostly_ambient)
 
     @cached_property
@@ -264,17 +281,35 @@ class Evidence:
 
     @cached_property
     def coarse(self) -> np.ndarray:
-        """Whether the reading of the straight path alone is missing, or still has half of the error or more."""
-        return self._wrong(self._read(single_path_frames(self.capture.sensor, self.signals.rig, self.truth)))
+        """Whether the reading of the straight path alone is missing, or still has half of the error or more.
+
+        A sensor that compares texture needs straight paths to the whole area of each pixel; beside a depth edge, the
+        edge is to blame.
+        """
+        sensor = self.capture.sensor
+        if not sensor.reads_emitter:
+            return np.zeros(self.truth.z.shape, dtype=bool)
+        if sensor.compares_texture:
+            spread = self._read(lambda one: footprint_frames(sensor, one.rig, one.truth, np.isfinite(one.truth.z)))
+            return self._wrong(spread) & ~self.at_edge
+        return self._wrong(self._read(lambda one: single_path_frames(sensor, one.rig, one.truth)))
+
+    @cached_property
+    def textureless(self) -> np.ndarray:
+        """Whether a sensor that compares texture found too little of it for a reading."""
+        low = self.missing & (self.image.status == Status.LOW_SIGNAL)
+        return low if self.capture.sensor.compares_texture else np.zeros(low.shape, dtype=bool)
 
     @cached_property
     def blurred(self) -> np.ndarray:
         """Whether the reading of straight paths to the whole area of the pixel, on its tangent plane, has half of the
         error or more, or is missing; it is computed only where other light disturbs the pixel too."""
-        rig, spread = self.signals.rig, self._may_blur
+        sensor, spread = self.capture.sensor, self._may_blur
+        if sensor.compares_texture:
+            return spread & self.coarse
         if not spread.any():
             return spread
-        return spread & self._wrong(self._read(footprint_frames(self.capture.sensor, rig, self.truth, spread)))
+        return spread & self._wrong(self._read(lambda one: footprint_frames(sensor, one.rig, one.truth, spread)))
 
     @cached_property
     def _may_blur(self) -> np.ndarray:
@@ -285,7 +320,10 @@ class Evidence:
 
     @cached_property
     def beyond_range(self) -> np.ndarray:
-        """Whether a time-of-flight sensor confuses the path length with another one, or has no bin for it."""
+        """Whether a time-of-flight sensor confuses the path length with another one, or has no bin for it; or whether
+        a matcher of texture found its match outside its range."""
+        if self.capture.sensor.compares_texture:
+            return np.asarray(self.failed & (self.image.status == Status.OUT_OF_RANGE))
         length = self.truth.range_m[self.failed] + np.linalg.norm(self._in_projector, axis=-1)
         return self._of_failed(self.capture.sensor.is_beyond_range(length))
 
@@ -309,9 +347,10 @@ class Evidence:
         """
         return np.asarray(np.where(self.missing, self.tolerance_m, np.abs(self.error) / 2))
 
-    def _read(self, frames: np.ndarray) -> np.ndarray:
-        """(n,) float64 depths that the decoder reads from noise-free frames (k, h, w) in the failed pixels, metres."""
-        (z,) = self.readings.read([Capture(frames, self.capture.sensor, self.signals.rig)])
+    def _read(self, frames_of: Callable[[Signals], np.ndarray]) -> np.ndarray:
+        """(n,) float64 depths in the failed pixels, metres, that the decoder reads from noise-free frames (k, h, w),
+        which a function makes for each camera."""
+        (z,) = self.readings.read([capture_of_frames(self.signals, self.capture.sensor, frames_of)])
         return self._of_failed_pixels(z)
 
     def _of_failed_pixels(self, z: np.ndarray) -> np.ndarray:
@@ -333,6 +372,31 @@ class Evidence:
     def _in_projector(self) -> np.ndarray:
         """(n, 3) float64 true surface points of the failed pixels in projector coordinates, metres."""
         return points_in_projector(self.signals.rig, self.true_m, self.failed)
+
+    @cached_property
+    def _in_world(self) -> np.ndarray:
+        """(n, 3) float64 true surface points of the failed pixels in world coordinates, metres."""
+        T = self.signals.rig.T_world_projector
+        return np.asarray(self._in_projector @ T[:3, :3].T + T[:3, 3])
+
+
+def _hidden_from(other: Signals, points: np.ndarray, tolerance_m: float) -> np.ndarray:
+    """(n,) bool, whether a camera does not see points: they lie outside its image, or behind what it sees there.
+
+    Parameters
+    ----------
+    other : Signals of the camera.
+    points : (n, 3) float, metres, world coordinates.
+    tolerance_m : metres by which a point must be farther than all that the camera sees within one pixel.
+    """
+    T, camera = other.rig.T_world_camera, other.rig.pinhole
+    in_camera = (points - T[:3, 3]) @ T[:3, :3]
+    place = camera.project(in_camera)
+    outside = np.asarray(~((place >= 0) & (place < [camera.width, camera.height])).all(axis=-1))
+    column, row = np.where(outside[:, None], 0, place).astype(int).T
+    seen = np.where(np.isfinite(other.truth.z), other.truth.z, np.inf).astype(np.float64)
+    farthest = np.stack(neighbours(seen, 1)).max(axis=0)
+    return np.asarray(outside | (in_camera[:, 2] > farthest[row, column] + tolerance_m))
 
 
 def error_off_edge(

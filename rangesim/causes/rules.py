@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rangesim.capture import Capture
+from rangesim.capture import Captured
 from rangesim.causes.cause import Cause, CauseMap
 from rangesim.causes.evidence import Evidence
 from rangesim.decoding.range_image import RangeImage
@@ -27,7 +27,7 @@ OTHER = range(MULTIPATH, GLINT + 1)
 
 def explain(
     image: RangeImage,
-    capture: Capture,
+    capture: Captured,
     signals: Signals,
     tolerance_m: float = OUTLIER_M,
 ) -> CauseMap:
@@ -41,7 +41,7 @@ def explain(
     Parameters
     ----------
     image : RangeImage, decoded from `capture`.
-    capture : Capture, as `rangesim.expose` made it from `signals`.
+    capture : Capture or CaptureSet, as `rangesim.expose` made it from `signals`.
     signals : Signals of a transport pass that the sensor of the capture was part of.
     tolerance_m : float, metres, error above which a reading failed.
 
@@ -68,7 +68,7 @@ def explain(
 
 def causes_of(readings: ReferenceReadings, tolerance_m: float) -> CauseMap:
     """The cause of each failed pixel, from the reference readings of a range image; raises the errors of `explain`."""
-    image, capture, signals = readings.image, readings.capture, readings.signals
+    image, capture, signals = readings.image, readings.capture.reference, readings.signals
     shape = signals.truth.z.shape
     if image.z.shape != shape or capture.frames.shape[1:] != shape:
         raise ValueError(
@@ -111,6 +111,8 @@ def rules(e: Evidence) -> list[Rule]:
         (e.unlit & e.enough & e.mostly(CAUSTIC), Cause.CAUSTIC),
         (e.unlit & e.enough & e.mostly(SPECULAR), Cause.MIRRORED_GHOST),
         (e.unlit, Cause.SHADOWED),
+        # ---- A camera of a pair does not see the point
+        (e.hidden, Cause.OCCLUDED),
         # ---- Too little of the emitter's light comes back
         (e.is_a("glossy") & e.faint & ~e.optical, Cause.SPECULAR_AWAY),
         (dim & (too_dark | e.missing), Cause.SPECULAR_AWAY),
@@ -119,6 +121,7 @@ def rules(e: Evidence) -> list[Rule]:
         (too_dark, Cause.LOW_SIGNAL),
         # ---- The distance itself
         (e.beyond_range, Cause.RANGE_AMBIGUITY),
+        (e.optical & e.textureless, Cause.NO_TEXTURE),
         (e.optical & e.coarse, Cause.RESOLUTION),
         # ---- The pixel covers more than one distance
         (e.moving, Cause.MOTION),

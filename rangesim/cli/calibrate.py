@@ -111,7 +111,10 @@ def calibrate_command(
         raise ValueError("expected either --sensor or --code, got both.")
     axes = ALL_AXES if sensor is None or projector is not None else None
     taken_with = sensor_of_images(sensor, code, projector, axes, period, steps)
-    taken = [load_frames(path, taken_with, bits) for path in captures]
+    loaded = [load_frames(path, taken_with, bits) for path in captures]
+    if several := [path for path, one in zip(captures, loaded, strict=True) if len(one.captures) > 1]:
+        raise ValueError(f"expected captures of one camera, got those of several in {several[0]}.")
+    taken = [one.reference for one in loaded]
     of_tof = any(capture.sensor.default_emitter.size is None for capture in taken)  # its light shows no pattern
     if of_tof != (out.suffix.lower() == TOF_SUFFIX):
         raise ValueError(

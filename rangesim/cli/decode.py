@@ -90,12 +90,15 @@ def decode_command(
     loaded = load_frames(capture, taken_with, bits)
     if taken_with is not None and type(loaded.sensor) is not type(taken_with):
         raise ValueError(f"expected --sensor to name the sensor of {capture}, {loaded.sensor.type_name}.")
+    first = loaded.reference
+    if calibration and len(loaded.captures) > 1:
+        raise ValueError(f"expected no --calibration: {capture} holds the rigs of its {len(loaded.captures)} cameras.")
     if calibration and calibration.suffix.lower() == TOF_SUFFIX:
-        image = _calibrated_tof(loaded, calibration)
+        image = _calibrated_tof(first, calibration)
     else:
-        loaded = _calibrated(loaded, calibration, code_step, unit) if calibration else loaded
-        image = decode(loaded)
-    decoded = Decoded(image, loaded.sensor, loaded.rig, status_fractions(image), likely_cause(image, loaded))
+        first = _calibrated(first, calibration, code_step, unit) if calibration else first
+        image = decode(first if calibration else loaded)
+    decoded = Decoded(image, first.sensor, first.rig, status_fractions(image), likely_cause(image, first))
     save_decoded(decoded, out, map_pictures(image))
     typer.echo(summary(decoded, out))
 

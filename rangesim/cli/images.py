@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from rangesim.capture import Capture
+    from rangesim.capture import Capture, Captured
     from rangesim.sensor import Sensor
 
 ALL_AXES = "columns,rows"
@@ -115,8 +115,8 @@ def _size(projector: str) -> tuple[int, int]:
     return int(size[1]), int(size[2])
 
 
-def load_frames(folder: Path, sensor: Sensor | None, bits: int | None) -> Capture:
-    """The capture of a directory with a sidecar, or of bare images.
+def load_frames(folder: Path, sensor: Sensor | None, bits: int | None) -> Captured:
+    """The capture of a directory with a sidecar, or of bare images; a directory may hold those of several cameras.
 
     Parameters
     ----------

@@ -8,27 +8,31 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from rangesim.capture import Capture
+from rangesim.capture import Capture, Captured, CaptureSet
 from rangesim.decoding.range_image import RangeImage
 from rangesim.sensor import Decoder
 from rangesim.settings.config import shown
 
 __all__ = ["decode"]
 
+_HINTS = ("expose the signals of all cameras together", "decode each capture of the set by itself")
+"""What to do if a capture has too few cameras, and if it has too many."""
 
-def decode(capture: Capture, decoder: Decoder | None = None) -> RangeImage:
+
+def decode(capture: Captured, decoder: Decoder | None = None) -> RangeImage:
     """Range image of a capture (docs/decoding.md).
 
     Parameters
     ----------
-    capture : Capture, simulated or real.
+    capture : Capture, simulated or real; of a sensor with several cameras a CaptureSet. The range image is then one of
+        the reference camera.
     decoder : Decoder; None: the decoder that the sensor comes with, with the default thresholds.
 
     Raises
     ------
     ValueError
-        The argument is no capture, or a capture of a sensor that the decoder does not know; or the decoder returned
-        something other than a range image of the capture.
+        The argument is no capture, or a capture of a sensor that the decoder does not know, or has more or fewer
+        cameras than the sensor; or the decoder returned something other than a range image of the capture.
 
     Examples
     --------
@@ -38,12 +42,18 @@ def decode(capture: Capture, decoder: Decoder | None = None) -> RangeImage:
     >>> decode(Capture(frames, IdealToF())).range_m
     array([[1.5, nan]], dtype=float32)
     """
-    if not isinstance(capture, Capture):
+    if not isinstance(capture, (Capture, CaptureSet)):
         raise ValueError(f"expected a Capture, as expose, load_capture or import_capture return, got {capture!r}.")
-    decoder = decoder or capture.sensor.default_decoder
-    decoder.check(capture.sensor)
-    image = decoder.decode(capture)
-    _check(image, capture, decoder)
+    sensor = capture.sensor
+    if len(capture.captures) != sensor.n_cameras:
+        raise ValueError(
+            f"expected captures of {sensor.n_cameras} camera{'s' * (sensor.n_cameras != 1)} for {sensor.type_name}, "
+            f"got {len(capture.captures)}; {_HINTS[sensor.n_cameras == 1]}."
+        )
+    decoder = decoder or sensor.default_decoder
+    decoder.check(sensor)
+    image = decoder.decode(capture)  # type: ignore[arg-type]  # decoders of one camera take a Capture
+    _check(image, capture.reference, decoder)
     return replace(image, decoder=decoder)
 
 

@@ -28,3 +28,7 @@ class Status(IntEnum):
     """The phases of several frequencies do not agree on one distance."""
     OUT_OF_RANGE = 5
     """The sensor cannot measure the decoded distance: it lies behind the sensor, or beyond its limits."""
+    OCCLUDED = 6
+    """The second camera of a pair does not see the point."""
+    AMBIGUOUS = 7
+    """Several places fit equally well, or two ways to match images disagree."""

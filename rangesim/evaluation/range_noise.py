@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rangesim.capture import Capture
+from rangesim.capture import Captured
 from rangesim.capture.exposure import exposed_again
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import SamplingWarning, sentence
@@ -124,13 +124,13 @@ class RangeNoise:
         ]
 
 
-def range_noise(image: RangeImage, capture: Capture, signals: Signals) -> RangeNoise:
+def range_noise(image: RangeImage, capture: Captured, signals: Signals) -> RangeNoise:
     """Noise of a range image that was decoded from a capture of these signals.
 
     Parameters
     ----------
     image : RangeImage, decoded from `capture`.
-    capture : Capture, as `rangesim.expose` made it from `signals`.
+    capture : Capture or CaptureSet, as `rangesim.expose` made it from `signals`.
     signals : Signals that know their sampling error, as passes of at least 3 samples per pixel do.
 
     Raises
@@ -143,7 +143,7 @@ def range_noise(image: RangeImage, capture: Capture, signals: Signals) -> RangeN
 
 def noise_of(readings: ReferenceReadings) -> RangeNoise:
     """Noise of a range image, from its reference readings; the errors are those of `range_noise`."""
-    image, capture = readings.image, readings.capture
+    image, capture = readings.image, readings.capture.reference
     above, below = readings.halves
     _, sampling = _middle_and_draw(image, above, below)
     if not capture.is_digital:
@@ -153,13 +153,13 @@ def noise_of(readings: ReferenceReadings) -> RangeNoise:
     repeats = None
     if capture.detector is not None:
         seeds_and_errors = zip(NOISE_SEEDS, (0.0, 1.0, -1.0), strict=True)
-        captures = [exposed_again(capture, readings.signals, *each) for each in seeds_and_errors]
+        captures = [exposed_again(readings.capture, readings.signals, *each) for each in seeds_and_errors]
         again, above, below = readings.read(captures)
         repeats = Repeats(~image.valid, np.isnan(again), (np.isnan(above), np.isnan(below)))
     return RangeNoise((image.reading_m - clean).astype(np.float32), sampling, repeats)
 
 
-def sampling_draw(image: RangeImage, capture: Capture, signals: Signals) -> tuple[np.ndarray, np.ndarray]:
+def sampling_draw(image: RangeImage, capture: Captured, signals: Signals) -> tuple[np.ndarray, np.ndarray]:
     """Mean of the noise-free depths of both halves of the samples, (h, w) float64, metres, and `RangeNoise.sampling`.
 
     Where the sampling error is large, a decoder does not act linearly: the mean then differs from the reading of all

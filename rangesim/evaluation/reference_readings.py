@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rangesim.capture import Capture
-from rangesim.capture.exposure import noise_free_capture
+from rangesim.capture import Captured
+from rangesim.capture.exposure import capture_of_frames, noise_free_capture
 from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import without_warnings
@@ -32,12 +32,12 @@ class ReferenceReadings:
     Parameters
     ----------
     image : RangeImage, decoded from `capture`.
-    capture : Capture, as `rangesim.expose` made it from `signals`.
+    capture : Capture or CaptureSet, as `rangesim.expose` made it from `signals`.
     signals : Signals of the pass.
     """
 
     image: RangeImage
-    capture: Capture
+    capture: Captured
     signals: Signals
 
     @property
@@ -45,7 +45,7 @@ class ReferenceReadings:
         """The decoder that made the range image."""
         return self.image.decoder or self.capture.sensor.default_decoder
 
-    def read(self, captures: Sequence[Capture]) -> list[np.ndarray]:
+    def read(self, captures: Sequence[Captured]) -> list[np.ndarray]:
         """Depths of captures, read by the decoder of the range image."""
         with without_warnings():
             return [decode(capture, self.decoder).reading_m for capture in captures]
@@ -53,7 +53,7 @@ class ReferenceReadings:
     @cached_property
     def noise_free(self) -> np.ndarray:
         """Depths without the noise and the limits of the detector, in the ambient light of the capture."""
-        return self.read([noise_free_capture(self.signals, self.capture.sensor, self.capture.ambient)])[0]
+        return self.read([noise_free_capture(self.signals, self.capture.sensor, self.capture.reference.ambient)])[0]
 
     @cached_property
     def halves(self) -> tuple[np.ndarray, np.ndarray]:
@@ -64,15 +64,20 @@ class ReferenceReadings:
         ValueError
             The signals do not know their sampling error (`Signals.knows_sampling_error`).
         """
-        sensor, ambient = self.capture.sensor, self.capture.ambient
+        sensor, ambient = self.capture.sensor, self.capture.reference.ambient
         above, below = self.read([noise_free_capture(self.signals, sensor, ambient, error) for error in (1.0, -1.0)])
         return above, below
 
     @cached_property
     def emitter_alone(self) -> np.ndarray:
-        """Depths in the emitter's light alone: without noise, ambient light and the vignetting of the lens."""
+        """Depths in the emitter's light alone: without noise, ambient light and the vignetting of the lens.
+
+        A sensor that reads no light of the emitter is read in ambient light.
+        """
+        if not self.capture.sensor.reads_emitter:
+            return self.noise_free
         moves = self.signals.motion_m is not None
         if not (moves or self.signals.energy.ambient.any() or self.signals.rig.camera_lens.vignetting):
             return self.noise_free
-        frames = self.signals.frames(self.capture.sensor, ambient_transmission=0.0)
-        return self.read([Capture(frames, self.capture.sensor, self.signals.rig)])[0]
+        sensor = self.capture.sensor
+        return self.read([capture_of_frames(self.signals, sensor, lambda one: one.frames(sensor, 0.0))])[0]

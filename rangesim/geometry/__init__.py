@@ -33,6 +33,10 @@ if TYPE_CHECKING:
     from rangesim.geometry.camera_pose import fit_camera_pose as fit_camera_pose
     from rangesim.geometry.camera_projector import ProjectorTriangulation as ProjectorTriangulation
     from rangesim.geometry.camera_projector import triangulate_coordinates as triangulate_coordinates
+    from rangesim.geometry.dense_stereo import DenseMatch as DenseMatch
+    from rangesim.geometry.dense_stereo import DenseMatching as DenseMatching
+    from rangesim.geometry.dense_stereo import MatchOutcome as MatchOutcome
+    from rangesim.geometry.dense_stereo import match_densely as match_densely
     from rangesim.geometry.hand_eye import HandEye as HandEye
     from rangesim.geometry.hand_eye import eye_in_hand as eye_in_hand
     from rangesim.geometry.hand_eye import eye_to_hand as eye_to_hand
@@ -111,6 +115,7 @@ else:
             ],
             "camera_pose": ["CameraPose", "find_camera_pose", "fit_camera_pose"],
             "camera_projector": ["ProjectorTriangulation", "triangulate_coordinates"],
+            "dense_stereo": ["DenseMatch", "DenseMatching", "MatchOutcome", "match_densely"],
             "hand_eye": ["HandEye", "eye_in_hand", "eye_to_hand"],
             "homography": ["Homography", "find_homography", "fit_homography", "homography_dlt", "transfer_error"],
             "projective_plane": [

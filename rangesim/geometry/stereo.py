@@ -9,12 +9,13 @@ about their centres (Fusiello, Trucco, Verri: "A compact algorithm for rectifica
 Pixel centres lie at integer + 0.5 here and at integers in OpenCV. `RectifiedPair.warp` is the only place in this module
 that converts between the two.
 
-Used by: no other module of rangesim; it is for users alone (`examples/rectification.py`).
+Used by: rangesim.decoding.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,6 +37,10 @@ before."""
 BORDER_POINTS = 33
 """Number of points per side of an image whose rays say how far the rectified image reaches. Distortion bends the border
 between two points; with so many points, at most a fraction of a pixel is cut off there."""
+
+ROUNDING_PX = 1e-6
+"""Pixels by which rounding may widen the field of view of a rectified image. Without it, cameras that are parallel
+already could get an image one pixel wider than theirs."""
 
 STEPS_PER_PIXEL = 16
 """Number of steps per pixel in OpenCV's disparities, which are integers with four fractional bits (source:
@@ -149,14 +154,22 @@ class RectifiedPair:
         """(..., 2) float64 rectified pixels of distorted pixels (..., 2) of the second camera."""
         return self.camera.project(self.second.directions(pixels) @ self.R_rectified_second.T)
 
-    def warp(self, first: np.ndarray, second: np.ndarray) -> tuple[Array, Array]:
+    def warp(
+        self, first: np.ndarray, second: np.ndarray, interpolation: Literal["linear", "spline"] = "linear"
+    ) -> tuple[Array, Array]:
         """The images (h, w) of both cameras as the rectified cameras see them, float32, in the unit of the images.
 
         Pixels that a camera does not see are NaN.
+
+        Parameters
+        ----------
+        interpolation : "linear" (OpenCV's remap, which rounds places to 1/32 pixel), or "spline", cubic B-splines,
+            which blur fine texture less, and not more at half pixels than at whole ones.
         """
+        warped = _warped if interpolation == "linear" else _warped_by_splines
         return (
-            _warped(self.first, self.camera, self.R_rectified_first, first),
-            _warped(self.second, self.camera, self.R_rectified_second, second),
+            warped(self.first, self.camera, self.R_rectified_first, first),
+            warped(self.second, self.camera, self.R_rectified_second, second),
         )
 
     def points(self, disparity_px: np.ndarray) -> Array:
@@ -219,7 +232,7 @@ def rectify(first: Intrinsics, second: Intrinsics, T_second_first: ArrayLike) ->
             raise ValueError(_ALONG_BASELINE.format(why="the image reaches beyond 90 degrees from the common axis"))
         corners.append(focal * border[:, :2] / border[:, 2:])
     low, high = np.nanmin(np.concatenate(corners), axis=0), np.nanmax(np.concatenate(corners), axis=0)
-    width, height = (int(n) for n in np.ceil(high - low))
+    width, height = (int(n) for n in np.ceil(high - low - ROUNDING_PX))
     pixels = max(first.width * first.height, second.width * second.height)
     if width * height > MAX_GROWTH * pixels:
         raise ValueError(_ALONG_BASELINE.format(why=f"the rectified image would have {width} x {height} pixels"))
@@ -337,14 +350,37 @@ def _warped(real: Intrinsics, rectified: Intrinsics, rotation: Array, image: np.
     import cv2
 
     pixels = checked_array("image", image, None, None)
-    if pixels.shape != (real.height, real.width):
-        raise ValueError(f"expected an image of shape {(real.height, real.width)}, got {pixels.shape}.")
-    rays = rectified.directions(rectified.pixel_centres()) @ rotation
-    source = real.project(rays) - 0.5  # OpenCV's pixel centres lie at integers
-    outside = ~((source >= -0.5) & (source <= np.array([real.width, real.height]) - 0.5)).all(axis=-1)
+    source, outside = _sources(real, rectified, rotation, pixels)
     source[outside] = -10
     warped = cv2.remap(
         pixels.astype(np.float32), source.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     warped[outside] = np.nan
     return np.asarray(warped)
+
+
+def _warped_by_splines(real: Intrinsics, rectified: Intrinsics, rotation: Array, image: np.ndarray) -> Array:
+    """The image as `_warped` gives it, interpolated by cubic B-splines."""
+    from scipy.ndimage import map_coordinates
+
+    pixels = np.asarray(image, dtype=np.float64)
+    source, outside = _sources(real, rectified, rotation, pixels)
+    known = np.isfinite(pixels)
+    filled = np.where(known, pixels, float(pixels[known].mean()) if known.any() else 0.0)
+    source[outside] = 0
+    x, y = source[..., 0], source[..., 1]
+    warped = map_coordinates(filled, [y, x], order=3, mode="mirror").astype(np.float32)
+    at = np.rint(y).astype(int).clip(0, real.height - 1), np.rint(x).astype(int).clip(0, real.width - 1)
+    warped[outside | ~known[at]] = np.nan
+    return np.asarray(warped)
+
+
+def _sources(real: Intrinsics, rectified: Intrinsics, rotation: Array, pixels: np.ndarray) -> tuple[Array, np.ndarray]:
+    """The place (x, y) in an image (h, w) of each rectified pixel, counted from the centre of the first pixel as in
+    OpenCV, and where the image does not reach (bool)."""
+    if pixels.shape != (real.height, real.width):
+        raise ValueError(f"expected an image of shape {(real.height, real.width)}, got {pixels.shape}.")
+    rays = rectified.directions(rectified.pixel_centres()) @ rotation
+    source = real.project(rays) - 0.5
+    outside = ~((source >= -0.5) & (source <= np.array([real.width, real.height]) - 0.5)).all(axis=-1)
+    return source, np.asarray(outside)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
+from rangesim.capture import bright_level
 from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.electronics.ambient import Ambient
@@ -32,6 +33,10 @@ noise alone, because variances add."""
 NEGLIGIBLE = 1e-5
 """Ratio of a standard deviation to the median depth of the scene below which sampling noise is always small enough. It
 limits the samples of noise-free captures, where a tenth of this ratio would need a hundred times as many samples."""
+NEGLIGIBLE_OF_BRIGHT = 0.002
+"""Ratio of a standard deviation of a noise-free frame to its bright pixels below which sampling noise is always small
+enough, for sensors of several cameras. It is the noise that their decoder assumes in such frames
+(`rangesim.decoding.disparities.ImageNoise.relative`)."""
 BLOCK_PX = 16
 """Edge in pixels of the squares in which the noise of an instance is estimated. In larger squares the estimate uses
 more pixels; in smaller ones it follows changes of the noise better."""
@@ -105,6 +110,9 @@ class AdaptiveSampling(Sampler):
         excess = np.zeros(group.max() + 1)  # ratio of the variance by sampling to the largest one allowed, per group
         for instrument in self.instruments:
             signals = signals_of(instrument.sensor.responses())
+            if instrument.sensor.n_cameras > 1:  # a reading needs the signals of all cameras
+                excess = np.fmax(excess, self._excess_of_frames(instrument, signals, group))
+                continue
             true_m = signals.rig.camera.reading(truth)[np.isfinite(truth.z)]
             negligible = NEGLIGIBLE * float(np.median(true_m)) if true_m.size else 0.0
             capture = expose(
@@ -122,6 +130,28 @@ class AdaptiveSampling(Sampler):
         wanted = SPP_STEP * np.ceil(self.first_spp * np.minimum(excess, self.max_spp) / SPP_STEP)
         most = max(self.first_spp, self.max_spp // SPP_STEP * SPP_STEP)
         return np.clip(wanted, self.first_spp, most).astype(np.int64)[group]
+
+    def _excess_of_frames(self, instrument: Instrument, signals: StillSignals, group: np.ndarray) -> np.ndarray:
+        """Ratio of the sampling variance of the frames of one camera to the largest one allowed, per group.
+
+        The largest one is that of the detector's noise times `fraction` squared; without noise, the standard deviation
+        may be `NEGLIGIBLE_OF_BRIGHT` of the bright pixels.
+        """
+        sensor = instrument.sensor
+        transmission = 1.0 if self.ambient is None else self.ambient.scale
+        light = signals.frames(sensor, transmission)
+        error = signals.frames(sensor, transmission, sampling_errors=1.0) - light
+        taken = expose(signals, sensor, instrument.detector_in_use, instrument.exposure_s, 0, self.ambient)
+        noise = np.full(light.shape, NEGLIGIBLE_OF_BRIGHT * bright_level(light))
+        if taken.is_digital:
+            own = [taken.noise(frame) for frame in taken.frames]
+            values = taken.frames.astype(np.float64) - taken.black_level
+            gain = max(float(values.sum()), 1.0) / max(float(light.sum(dtype=np.float64)), 1e-30)
+            if all(one is not None for one in own):
+                noise = self.fraction * np.stack([np.asarray(one, dtype=np.float64) for one in own]) / gain
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios = [group_sigma((e / n).astype(np.float32), group) ** 2 for e, n in zip(error, noise, strict=True)]
+        return np.asarray(np.max(ratios, axis=0))
 
 
 def groups(instance: np.ndarray) -> np.ndarray:

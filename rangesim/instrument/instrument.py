@@ -169,6 +169,17 @@ class Instrument:
             cover_glass=self.cover_glass,
         )
 
+    def rigs(self, scene: Scene, width: int | None = None, height: int | None = None) -> tuple[Rig, ...]:
+        """Rigs of all cameras of the sensor in a scene, that of the reference camera first.
+
+        They have one emitter, so one transport pass serves them all. Most sensors have one camera.
+
+        Parameters
+        ----------
+        width, height : as for `rig`.
+        """
+        return self.sensor.rigs(self.rig(scene, width, height))
+
 
 def is_name(text: str) -> bool:
     """Whether an instrument may have this name.

@@ -15,7 +15,7 @@ from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.sensor import Sensor
-from rangesim.signals import StillSignals
+from rangesim.signals import SignalSet, StillSignals
 
 
 @overload
@@ -39,7 +39,7 @@ def transport(
     *,
     progress: Callable[[float], None] | None = ...,
     **options: Unpack[TransportOptions],
-) -> list[StillSignals]: ...
+) -> SignalSet: ...
 
 
 def transport(
@@ -50,7 +50,7 @@ def transport(
     *,
     progress: Callable[[float], None] | None = None,
     **options: Unpack[TransportOptions],
-) -> StillSignals | list[StillSignals]:
+) -> StillSignals | SignalSet:
     """Signals of any number of sensors that share a rig, from one pass of light paths.
 
     Parameters
@@ -67,8 +67,8 @@ def transport(
     Returns
     -------
     StillSignals
-        A list of them, one for each camera, if a list of rigs is given. Cameras do not share random numbers. The first
-        camera gets the same bytes as in a pass without the others, if its pixels take the same number of samples.
+        A SignalSet of them, one for each camera, if a list of rigs is given. Cameras do not share random numbers. The
+        first camera gets the same bytes as in a pass without the others, if its pixels take the same number of samples.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def transport(
     for number, one in enumerate(signals):
         of = f" of camera {number}" if len(signals) > 1 else ""
         warn_of_truncation(one.truncation, settings.max_depth, of, stacklevel=2)  # where `transport` was called
-    return signals[0] if isinstance(rig, Rig) else signals
+    return signals[0] if isinstance(rig, Rig) else SignalSet.of(signals)
 
 
 def _with_sampler(settings: TransportSettings, sensors: Sequence[Sensor | Response]) -> TransportSettings:

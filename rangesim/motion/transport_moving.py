@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Unpack
@@ -14,7 +14,7 @@ from rangesim.motion.pose_tracks import Motion
 from rangesim.motion.timing import Timing
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
-from rangesim.signals import Signals
+from rangesim.signals import Signals, SignalSet, StillSignals
 
 if TYPE_CHECKING:
     from rangesim.light_transport.transport_settings import TransportOptions, TransportSettings
@@ -52,12 +52,13 @@ def transport_moving(
     Returns
     -------
     dict
-        sensor -> Signals for `rangesim.expose`. `truth`, `energy` and `rig` are those at the middle of the sensor's
-        acquisition, `Timing.reference_s`. The pose of a point cloud is also that of the middle. For each pixel,
-        `motion_m` is the largest distance, in camera coordinates, between a surface point at an exposure of the pixel
-        and the same point at that middle. It covers the point that the pixel sees at the middle and the points that it
-        sees at its exposures, such as those of an object that passes by. Where a shadow passes, it is the distance of
-        the fastest object. It is None if one pass serves all exposures of the sensor.
+        sensor -> Signals for `rangesim.expose`; a `SignalSet` for a sensor of several cameras. `truth`, `energy` and
+        `rig` are those at the middle of the sensor's acquisition, `Timing.reference_s`. The pose of a point cloud is
+        also that of the middle. For each pixel, `motion_m` is the largest distance, in camera coordinates, between a
+        surface point at an exposure of the pixel and the same point at that middle. It covers the point that the pixel
+        sees at the middle and the points that it sees at its exposures, such as those of an object that passes by.
+        Where a shadow passes, it is the distance of the fastest object. It is None if one pass serves all exposures of
+        the sensor.
 
     Raises
     ------
@@ -82,32 +83,60 @@ def transport_moving(
 
     _check(scene, rig, timings, motion)
     settings = with_options(settings, options)
+    kinds: list[dict[Sensor, Timing]] = []  # sensors that share all cameras
+    for sensor, timing in timings.items():
+        shared = (kind for kind in kinds if next(iter(kind)).rigs(rig) == sensor.rigs(rig))
+        kind = next(shared, None)
+        if kind is None:
+            kinds.append({sensor: timing})
+        else:
+            kind[sensor] = timing
+    if len(kinds) > 1:
+        found: dict[Sensor, Signals] = {}
+        for number, kind in enumerate(kinds):
+            told = progress and partial(_report, progress, number, len(kinds))
+            found |= transport_moving(scene, rig, kind, motion, settings, progress=told)
+        return {sensor: found[sensor] for sensor in timings}
+    rigs = next(iter(timings)).rigs(rig)
+    if any((one.camera.width, one.camera.height) != (rig.camera.width, rig.camera.height) for one in rigs):
+        raise ValueError("expected cameras of one size where something moves.")
     if isinstance(settings.spp, Sampler):
         raise ValueError(
             f'expected a number of samples or "auto" where something moves, got {type(settings.spp).__name__}.'
         )
     passes = plan(rig, timings, motion)
     stage = MovingScene(scene, tuple(motion.objects))
-    at_once: dict[Sensor, Signals] = {}
-    stacks: dict[Sensor, FrameStack] = {}
+    at_once: dict[Sensor, list[StillSignals]] = {}
+    stacks: dict[Sensor, list[FrameStack]] = {}
     for number, one in enumerate(passes):
-        (signals,) = trace_light(
+        of_cameras = trace_light(
             stage.at(one.poses.objects),
-            [one.rig(rig)],
+            [one.rig(of_camera) for of_camera in rigs],
             [response for sensor in one.sensors for response in sensor.responses()],
             replace(settings, seed=one.seed(settings.seed)),
             progress and partial(_report, progress, number, len(passes)),
         )
-        warn_of_truncation(signals.truncation, settings.max_depth, "", stacklevel=2)
+        warn_of_truncation(of_cameras[0].truncation, settings.max_depth, "", stacklevel=2)
         for sensor in one.reference_of:
             if any(sensor in other.sensors for other in passes if other is not one):
-                stacks[sensor] = FrameStack(sensor, timings[sensor], rig, one, signals)
+                stacks[sensor] = [
+                    FrameStack(sensor, timings[sensor], of_camera, one, signals)
+                    for of_camera, signals in zip(rigs, of_cameras, strict=True)
+                ]
             else:
-                at_once[sensor] = signals.only(sensor)
+                at_once[sensor] = [signals.only(sensor) for signals in of_cameras]
         for sensor in one.sensors:
-            if sensor in stacks:
-                stacks[sensor].add(one, signals)
-    return {s: at_once[s] if s in at_once else stacks[s].signals() for s in timings}
+            for stack, signals in zip(stacks.get(sensor, []), of_cameras, strict=False):
+                stack.add(one, signals)
+    return {
+        sensor: _together(at_once[sensor] if sensor in at_once else [stack.signals() for stack in stacks[sensor]])
+        for sensor in timings
+    }
+
+
+def _together(of_cameras: Sequence[Signals]) -> Signals:
+    """The signals of the only camera, or a set of those of several."""
+    return of_cameras[0] if len(of_cameras) == 1 else SignalSet.of(of_cameras)
 
 
 def _report(progress: Callable[[float], None], number: int, passes: int, fraction: float) -> None:

@@ -187,7 +187,7 @@ def estimate_cost(
         size = rig.camera.width * rig.camera.height * TRUTH_BYTES  # the file of a pass, as it is read for a report
         limits.check("bytes", size, "bytes in the results of one pass")
         traced, n = _traced_pixels(experiment, rig, instruments)
-        pixels, count = pixels + traced, count + n
+        pixels, count = pixels + traced * instruments[0].sensor.n_cameras, count + n
     paths, all_photons = places * pixels * (experiment.spp or TYPICAL_SPP), places * photons * count
     beside = beside or _beside_tracing(passes)
     beside_s, again = START_S + beside.seconds, (places - 1) * count
@@ -231,8 +231,9 @@ def _beside_tracing(passes: Sequence[tuple[Rig, list[Instrument]]]) -> CostBesid
     seconds, result_bytes = 0.0, []
     for rig, instruments in passes:
         pixels = rig.camera.width * rig.camera.height
-        seconds += sum(pixels * (PIXEL_S + FRAME_S * i.sensor.n_frames) for i in instruments)
-        result_bytes.append(sum(pixels * (2 * i.sensor.n_frames + RESULT_BYTES) for i in instruments))
+        frames = [i.sensor.n_frames * i.sensor.n_cameras for i in instruments]
+        seconds += sum(pixels * (PIXEL_S + FRAME_S * n) for n in frames)
+        result_bytes.append(sum(pixels * (2 * n + RESULT_BYTES) for n in frames))
     return CostBesideTracing(seconds, sum(result_bytes[:-1]), sum(result_bytes), 0)
 
 
@@ -240,7 +241,7 @@ def _tracing_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int)
     """Bytes of the arrays of a pass that exist at once, at the peak: while it is traced or its frames are exposed."""
     at_once = 0.0
     for rig, instruments in passes:
-        pixels = rig.traced.camera.width * rig.traced.camera.height
+        pixels = rig.traced.camera.width * rig.traced.camera.height * instruments[0].sensor.n_cameras
         responses = dict.fromkeys(r for instrument in instruments for r in instrument.sensor.responses())
         channels = sum(r.channels for r in responses)
         tiles = min(TRANSPORT_BYTES, pixels * (LANE_BYTES + 2 * 4 * channels))  # indirect light has its own channels

@@ -208,8 +208,9 @@ def _warn(result: Result) -> None:
     """Warn of surfaces outside a sensor's range, and of readings whose sampling error is not small."""
     beyond = []
     for m in result.measurements:
-        assert m.capture.rig is not None
-        beyond.append((m.name, *fraction_beyond_range(m.capture.sensor, m.capture.rig, m.truth)))
+        rig = m.capture.reference.rig
+        assert rig is not None
+        beyond.append((m.name, *fraction_beyond_range(m.capture.sensor, rig, m.truth)))
     warn_of_range(beyond)
     experiment = result.experiment
     warn_of_sampling({m.name: m.rows for m in result.measurements}, experiment.spp or experiment.max_spp)
@@ -263,7 +264,7 @@ def measure(
         causes=causes,
         rows=complete_rows(rows),
         segmentation=segmentation,
-        metadata=acquisition(capture, photons, instrument.timing, moves, points, times),
+        metadata=acquisition(capture.reference, photons, instrument.timing, moves, points, times),
         light_pass=light_pass,
     )
 
@@ -342,7 +343,8 @@ def _trace(
 
     settings = experiment.transport_settings(instruments)
     if experiment.motion is None:
-        return transport(scene, rig, [i.sensor for i in instruments], settings, progress=progress)
+        rigs, sensors = instruments[0].sensor.rigs(rig), [i.sensor for i in instruments]
+        return transport(scene, rig if len(rigs) == 1 else rigs, sensors, settings, progress=progress)
     (instrument,) = instruments
     timings = {instrument.sensor: instrument.timing}
     return transport_moving(scene, rig, timings, experiment.motion, settings, progress=progress)[instrument.sensor]

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[Instrument]]]:
     """The passes of an experiment, each as a rig and the list of instruments that share it.
 
+    A sensor of several cameras has its pass with all of them; the rig of a pass is that of the first camera.
+
     The passes are in the order in which their first instruments appear. An ideal instrument has no wavelength, so it
     joins the first pass with its camera and emitter. If something moves, each instrument has a pass of its own, because
     each takes its frames at other times.
@@ -24,7 +26,7 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
     groups: list[tuple[Rig, list[Instrument]]] = []
     for instrument in experiment.instruments:
         rig = instrument.rig(scene, experiment.width, experiment.height)
-        shared = None if experiment.motion is not None else _first_that_agrees(groups, rig)
+        shared = None if experiment.motion is not None else _first_that_agrees(groups, rig, instrument)
         if shared is None:
             groups.append((rig, [instrument]))
         else:
@@ -33,9 +35,12 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
     return groups
 
 
-def _first_that_agrees(groups: list[tuple[Rig, list[Instrument]]], rig: Rig) -> int | None:
-    """Index of the first group whose emitter, wavelength and camera are those of a rig; None if there is none."""
-    for index, (other, _) in enumerate(groups):
+def _first_that_agrees(groups: list[tuple[Rig, list[Instrument]]], rig: Rig, instrument: Instrument) -> int | None:
+    """Index of the first group whose emitter, wavelength and cameras are those of a rig and an instrument; None if
+    there is none."""
+    for index, (other, members) in enumerate(groups):
+        if members[0].sensor.rigs(rig)[1:] != instrument.sensor.rigs(rig)[1:]:
+            continue
         is_same_light = None in (rig.wavelength_m, other.wavelength_m) or rig.wavelength_m == other.wavelength_m
         if is_same_light and replace(rig, wavelength_m=other.wavelength_m) == other:
             return index

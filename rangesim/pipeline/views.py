@@ -109,7 +109,8 @@ def rendered_views(
     for number, T in enumerate(poses):
         placed = replace(rig, T_world_camera=T)
         here = replace(settings, seed=derived_seed(seed, number, 0))
-        signals = transport(scene, placed, [instrument.sensor], here)
+        rigs = instrument.sensor.rigs(placed)
+        signals = transport(scene, rigs[0] if len(rigs) == 1 else rigs, [instrument.sensor], here)
         noise_seed = derived_seed(seed, number, 1)
         capture = expose(
             signals, instrument.sensor, instrument.detector_in_use, instrument.exposure_s, noise_seed, ambient

@@ -94,7 +94,7 @@ def by_camera(measurements: Sequence[Measurement]) -> list[list[Measurement]]:
 
 def _shares_camera(one: Measurement, other: Measurement) -> bool:
     """Whether two instruments look through the same camera from the same place."""
-    rig, other_rig = one.capture.rig, other.capture.rig
+    rig, other_rig = one.capture.reference.rig, other.capture.reference.rig
     assert rig is not None
     assert other_rig is not None
     return rig.camera == other_rig.camera and rig.shares_camera_pose(other_rig)
@@ -102,11 +102,11 @@ def _shares_camera(one: Measurement, other: Measurement) -> bool:
 
 def _camera(result: Result, group: Sequence[Measurement]) -> dict[str, Any]:
     """Pictures of the scene from the camera that a group of measurements shares."""
-    materials, legend = figures.material_picture(group[0].truth)
+    materials, legend = figures.material_picture(group[0].truth, group[0].camera)
     return {
         "names": [m.name for m in group],
         "size": tables.size_text(group[0].truth.z.shape),
-        "scene": figures.scene_picture(result.passes[group[0].light_pass - 1].energy),
+        "scene": figures.scene_picture(result.passes[group[0].light_pass - 1].energy, group[0].camera),
         "materials": materials,
         "legend": legend,
     }
@@ -117,6 +117,8 @@ def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -
     causes, legend = figures.cause_map(m)
     return {
         "name": m.name,
+        "depth_name": "depth z" if m.camera.is_pinhole else "range",
+        "letter": "z" if m.camera.is_pinhole else "range",
         "depth": figures.depth_map(m, limits, depth),
         "error": figures.error_map(m, error),
         "causes": causes,
@@ -146,13 +148,13 @@ def _frames(m: Measurement) -> dict[str, Any]:
 def _light(result: Result, number: int) -> dict[str, Any]:
     """Pictures of the light of pass `number` (from 0) by the kind of light path, and its emitter."""
     of_pass = [m for m in result.measurements if m.light_pass == number + 1]
-    rig = of_pass[0].capture.rig
+    rig = of_pass[0].capture.reference.rig
     assert rig is not None
     return {
         "names": [m.name for m in of_pass],
         "baseline_mm": f"{1e3 * rig.baseline_m:.0f}",
         "power_w": f"{rig.projector_power_w:g}",
-        "pictures": figures.light_pictures(result.passes[number].energy),
+        "pictures": figures.light_pictures(result.passes[number].energy, rig.camera),
     }
 
 

@@ -31,12 +31,24 @@ STATUS_NAMES = {
     Status.CODE_ERROR: "code error",
     Status.UNWRAPPING_FAILED: "phases disagree",
     Status.OUT_OF_RANGE: "out of range",
+    Status.OCCLUDED: "occluded from a camera",
+    Status.AMBIGUOUS: "ambiguous match",
 }
 """Text of each status where a page or the command line shows it."""
 STATUS_COLORS = np.array(
-    [(231, 234, 237), (52, 104, 176), (240, 171, 0), (196, 56, 45), (125, 79, 163), (40, 44, 52)], dtype=np.uint8
+    [
+        (231, 234, 237),
+        (52, 104, 176),
+        (240, 171, 0),
+        (196, 56, 45),
+        (125, 79, 163),
+        (40, 44, 52),
+        (118, 176, 220),
+        (226, 130, 170),
+    ],
+    dtype=np.uint8,
 )
-"""(6, 3) uint8, colour of each status, RGB, in the order of `Status`."""
+"""(8, 3) uint8, colour of each status, RGB, in the order of `Status`."""
 OUTCOME_NAMES = [*(TITLES[c] for c in Cause), "nothing there"]
 """Text of each value of `outcomes`."""
 OUTCOME_COLORS = np.array(
@@ -56,6 +68,8 @@ OUTCOME_COLORS = np.array(
         (138, 103, 242),  # decoder: violets
         (43, 31, 76),
         (184, 248, 176),  # pile-up: a green, as noise
+        (60, 12, 252),  # occluded: a blue, as geometry
+        (0, 0, 12),  # no texture: black
         (203, 206, 210),  # nothing there
     ],
     dtype=np.uint8,
@@ -96,7 +110,7 @@ def depth_limits(measurements: tuple[Measurement, ...]) -> tuple[float, float]:
 
     The scale leaves out half a percent of the pixels at either end, and then gets a margin.
     """
-    z = np.concatenate([m.truth.z[np.isfinite(m.truth.z)] for m in measurements])
+    z = np.concatenate([m.true_m[np.isfinite(m.true_m)] for m in measurements])
     if z.size == 0:
         return 0.0, 1.0
     low, high = (float(v) for v in np.percentile(z, [0.5, 99.5]))

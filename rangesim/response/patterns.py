@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Responses to the projector pixel that light left: Gray code, fringes, images."""
+"""Responses to the projector pixel that light left: Gray code, fringes, dots, images."""
 
 from __future__ import annotations
 
@@ -11,10 +11,18 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from rangesim.response.defocus import BlurredImage, blurred_stripes, fringe_contrast
-from rangesim.response.response import DenseResponse, LightPath, Math
+from rangesim.response.response import DenseResponse, LightPath, Math, NumpyMath
 from rangesim.settings import limits
-from rangesim.settings.bounds import Bounds, check_fields
+from rangesim.settings.bounds import Bounds, check_fields, whole
 from rangesim.settings.config import shown
+from rangesim.settings.seeds import SEEDS
+
+MAX_DOT = 1 / 3
+"""Largest standard deviation of a dot as a fraction of the spacing. A place sees the dots of nine cells; of a wider dot
+more than 1 % of its height would be left out."""
+MAX_BLURRED_DOT = 0.5
+"""Largest standard deviation of a dot out of focus as a fraction of the spacing. A wider one would reach beyond the
+nine cells; its contrast is then below a tenth of that in focus, so more blur changes little."""
 
 Axis = Annotated[int, Bounds("0 (columns) or 1 (rows)", 0, 1)]
 """Axis along which a pattern varies: 0 for columns (u), 1 for rows (v). It is the index of u or v in `LightPath`."""
@@ -104,6 +112,110 @@ class Fringes(DenseResponse):
             return [m.cos(phase), m.sin(phase)]
         contrast = fringe_contrast(self.period_px, path.blur_px, m)
         return [contrast * m.cos(phase), contrast * m.sin(phase)]
+
+
+@dataclass(frozen=True)
+class Dots(DenseResponse):
+    """A pattern of random dots, as a laser behind a diffractive element projects it: all of its light is in the dots.
+
+    The projector's image is divided into cells, and each cell has one dot at a random place. A dot is a Gaussian. The
+    mean of the pattern over the image is 1, so its dots are brighter than white light of the same power. Out of focus
+    the dots are wider and fainter.
+
+    Parameters
+    ----------
+    width, height : pixels of the projector that shows the pattern.
+    spacing_px : edge of the cells, projector pixels; it is rounded so that whole cells fill the image.
+    dot_px : standard deviation of a dot, projector pixels; at most a third of the spacing.
+    seed : seed of the places.
+
+    Raises
+    ------
+    ValueError
+        A value out of its bounds, or dots that are wider than a third of their spacing.
+
+    Examples
+    --------
+    >>> dots = Dots(64, 48, spacing_px=8.0)
+    >>> dots.number
+    48
+    >>> round(float(dots.image().mean()), 1)
+    1.0
+    """
+
+    width: Annotated[int, whole(1, "projector")]
+    height: Annotated[int, whole(1, "projector")]
+    spacing_px: Annotated[float, Bounds("projector pixels", 0.1, 1e6)] = 6.0
+    dot_px: Annotated[float, Bounds("projector pixels", 1e-3, 1e6)] = 0.8
+    seed: Annotated[int, Bounds("a seed", 0, SEEDS - 1)] = 0
+    channels: ClassVar[int] = 1  # type: ignore[misc]
+    type_name: ClassVar[str] = "Dots"
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.dot_px > MAX_DOT * self.spacing_px:
+            raise ValueError(
+                f"expected dot_px to be at most a third of spacing_px, got {self.dot_px:g} and {self.spacing_px:g}."
+            )
+        limits.check("pixels", self.number, "dots")
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Number of cells along the width and along the height."""
+        return max(1, round(self.width / self.spacing_px)), max(1, round(self.height / self.spacing_px))
+
+    @property
+    def number(self) -> int:
+        """Number of dots."""
+        columns, rows = self.cells
+        return columns * rows
+
+    def check(self, width: int, height: int) -> None:
+        if (width, height) != (self.width, self.height):
+            raise ValueError(
+                f"expected a projector of {self.width} x {self.height} pixels, as the pattern of dots, "
+                f"got {width} x {height}."
+            )
+
+    @cached_property
+    def _places(self) -> np.ndarray:
+        """(2, number) float32, projector pixels, u and v of the dot of each cell, row by row."""
+        columns, rows = self.cells
+        within = np.random.default_rng(self.seed).random((2, rows, columns))
+        row, column = np.mgrid[:rows, :columns]
+        u, v = (column + within[0]) * (self.width / columns), (row + within[1]) * (self.height / rows)
+        return np.stack([u.ravel(), v.ravel()]).astype(np.float32)
+
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        columns, rows = self.cells
+        wide, high = self.width / columns, self.height / rows
+        variance: Any = self.dot_px**2
+        if path.blur_px is not None:
+            widest = max(variance, (MAX_BLURRED_DOT * min(wide, high)) ** 2)
+            blurred = variance + path.blur_px * path.blur_px
+            variance = m.select(blurred < widest, blurred, widest)
+        all_u, all_v = (m.array(places) for places in self._places)
+        column, row = m.floor(path.u / wide), m.floor(path.v / high)
+        light: Any = 0.0
+        for down in (-1, 0, 1):
+            for across in (-1, 0, 1):
+                i, j = column + across, row + down
+                exists = (i >= 0) & (i < columns) & (j >= 0) & (j < rows)
+                index = m.unsigned(m.select(exists, j * columns + i, 0.0))
+                x, y = path.u - m.lookup(all_u, index), path.v - m.lookup(all_v, index)
+                light = light + m.select(exists, m.exp((x * x + y * y) * (-0.5 / variance)), 0.0)
+        return [light * (wide * high / (2 * np.pi)) / variance]
+
+    def image(self) -> np.ndarray:
+        """(height, width) float32, the pattern at the centres of the projector's pixels; its mean is about 1."""
+        return image_of(self, self.width, self.height)[0]
+
+
+def image_of(response: DenseResponse, width: int, height: int) -> np.ndarray:
+    """(c, height, width) float32, weights of a response to the projector pixel, at the centres of the pixels."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    weights = response.weights(LightPath(x, y, np.zeros_like(x), True), NumpyMath())
+    return np.stack([np.broadcast_to(w, x.shape) for w in weights]).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)

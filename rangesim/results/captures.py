@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rangesim import __version__
-from rangesim.capture import DTYPES, Capture
+from rangesim.capture import DTYPES, Capture, Captured, together
 from rangesim.electronics.ambient import Ambient
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.errors import FileFormatError
@@ -42,12 +42,17 @@ _KEYS = (
     "detector",
     "exposure_s",
     "ambient",
+    "further_cameras",
 )
 """Keys of `capture.json`."""
+_CAMERA = re.compile(r"camera_[0-9]{1,3}")
+"""Names of folders of further cameras."""
 
 
-def save_capture(capture: Capture, directory: str | Path) -> None:
+def save_capture(capture: Captured, directory: str | Path) -> None:
     """Write a capture as a directory with one image per frame and `capture.json`.
+
+    The captures of further cameras (`CaptureSet`) are in folders of it, `camera_2` and so on, which are captures, too.
 
     The images are PNG of 8 or 16 bits, or EXR of float32 for a noise-free capture. The files appear when all of them
     are complete. An older capture in the directory is replaced. Other files in it stay.
@@ -66,7 +71,7 @@ def save_capture(capture: Capture, directory: str | Path) -> None:
         write_capture(capture, folder)
 
 
-def write_capture(capture: Capture, folder: Path) -> None:
+def write_capture(captured: Captured, folder: Path) -> None:
     """Write the files of a capture and their manifest into an empty directory.
 
     This function does not protect the files while they are incomplete; `save_capture` does.
@@ -76,6 +81,11 @@ def write_capture(capture: Capture, folder: Path) -> None:
     FileFormatError
         The frames do not fit 16 bits.
     """
+    capture, further = captured.reference, captured.captures[1:]
+    folders = [f"camera_{number}" for number in range(2, len(further) + 2)]
+    for name, other in zip(folders, further, strict=True):
+        (folder / name).mkdir()
+        write_capture(other, folder / name)
     if capture.is_digital and capture.frames.dtype.itemsize > 2 and capture.frames.max() > 65535:
         raise FileFormatError(
             f"{folder}: expected counts up to 65535, the largest that the files hold, got {capture.frames.max()}; take "
@@ -84,12 +94,12 @@ def write_capture(capture: Capture, folder: Path) -> None:
     names = _file_names(capture)
     for name, frame in zip(names, capture.frames, strict=True):
         write_grey(folder / name, frame.astype(np.uint16) if frame.dtype == np.uint32 else frame)
-    write_json(folder / SIDECAR, _sidecar(capture, names))
+    write_json(folder / SIDECAR, _sidecar(capture, names) | ({"further_cameras": folders} if folders else {}))
     write_manifest(folder, CAPTURE)
 
 
-def load_capture(directory: str | Path) -> Capture:
-    """The capture that `save_capture` wrote, with equal frames and settings.
+def load_capture(directory: str | Path) -> Captured:
+    """The capture that `save_capture` wrote, with equal frames and settings; a `CaptureSet` of several cameras.
 
     Raises
     ------
@@ -103,6 +113,21 @@ def load_capture(directory: str | Path) -> Capture:
     >>> image = decode(load_capture("out/tabletop/amcw/capture"))  # doctest: +SKIP
     """
     sidecar = sidecar_of(directory, CAPTURE)
+    capture, further = _read_capture(sidecar)
+    captures = [capture]
+    for name in further:
+        other, more = _read_capture(sidecar_of(sidecar.parent / name, CAPTURE))
+        if more:
+            raise FileFormatError(f"{sidecar.parent / name}: expected the capture of one camera.")
+        captures.append(other)
+    try:
+        return together(captures)
+    except ValueError as error:
+        raise FileFormatError(f"{sidecar}: {error}") from error
+
+
+def _read_capture(sidecar: Path) -> tuple[Capture, list[str]]:
+    """The capture of one camera, and the names of the folders of further cameras."""
     settings = read_json(sidecar)
     if not isinstance(settings, dict) or settings.get("format") != FORMAT:
         raise FileFormatError(f"{sidecar} is no {FORMAT} file.")
@@ -121,7 +146,11 @@ def load_capture(directory: str | Path) -> Capture:
         exposure = settings.get("exposure_s")
         size = (rig.camera.width, rig.camera.height) if rig else None
         frames = _read_frames(sidecar, settings, sensor, size)
-        return Capture(frames, sensor, rig, detector, math.nan if exposure is None else float(exposure), ambient)
+        further = settings.get("further_cameras", [])
+        if not isinstance(further, list) or not all(isinstance(n, str) and _CAMERA.fullmatch(n) for n in further):
+            raise ValueError(f"expected names such as camera_2 under further_cameras, got {shown(further)}.")
+        exposure_s = math.nan if exposure is None else float(exposure)
+        return Capture(frames, sensor, rig, detector, exposure_s, ambient), further
     except (ValueError, TypeError) as error:
         raise FileFormatError(f"{sidecar}: {str(error).removeprefix(f'{sidecar}: ')}") from error
 

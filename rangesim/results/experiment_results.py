@@ -27,7 +27,7 @@ import msgspec
 import numpy as np
 
 from pcgraph.parallel import side_by_side
-from rangesim.capture import Capture
+from rangesim.capture import Captured
 from rangesim.causes import Cause, CauseMap
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
@@ -51,7 +51,7 @@ from rangesim.files.schema import (
 from rangesim.results.captures import load_capture, write_capture
 from rangesim.results.range_images import load_range_image, save_range_image
 from rangesim.results.saved_signals import LightPass, read_pass, write_pass
-from rangesim.rig import Rig
+from rangesim.rig import Camera, Rig
 from rangesim.settings.config import ShortRepr, from_dict, shown
 from rangesim.signals import ALL, GroundTruth
 
@@ -210,7 +210,7 @@ class Measurement(ShortRepr):
     """The measurement of one instrument.
 
     name : name of the instrument.
-    capture : Capture.
+    capture : Capture, or CaptureSet of several cameras.
     image : RangeImage.
     truth : GroundTruth of the instrument's pass.
     causes : CauseMap, the cause of each failed pixel.
@@ -221,7 +221,7 @@ class Measurement(ShortRepr):
     """
 
     name: str
-    capture: Capture
+    capture: Captured
     image: RangeImage
     truth: GroundTruth
     causes: CauseMap
@@ -229,6 +229,17 @@ class Measurement(ShortRepr):
     segmentation: Segmentation | None
     metadata: MeasurementRecord
     light_pass: int
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the instrument."""
+        assert self.image.camera is not None  # every measurement of an experiment has its rig
+        return self.image.camera
+
+    @property
+    def true_m(self) -> np.ndarray:
+        """(h, w) float32, metres, true readings: z for a pinhole camera, ranges for every other one."""
+        return self.camera.reading(self.truth)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -370,7 +381,8 @@ def _image_sizes(info: ResultRecord, path: Path) -> dict[int, dict[str, int]]:
 
 def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: dict[str, int]) -> Measurement:
     """The measurement in the directory of an instrument, checked against its pass."""
-    capture = load_capture(folder / "capture")
+    captured = load_capture(folder / "capture")
+    capture = captured.reference
     if capture.rig is None or capture.frames.shape[1:] != (sizes["h"], sizes["w"]):
         raise FileFormatError(f"{folder / 'capture'}: expected a rig, and frames of the size of the ground truth.")
     image = load_range_image(folder / "range.npz", sizes)
@@ -384,7 +396,7 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
         raise FileFormatError(f"{folder / 'measurement.json'}: expected sensor, frames and pixels of the capture.")
     return Measurement(
         name=folder.name,
-        capture=capture,
+        capture=captured,
         image=replace(image, T_world_camera=capture.rig.T_world_camera),
         truth=truth,
         causes=CauseMap(data["cause"], float(data["tolerance_m"])),

@@ -2,6 +2,7 @@
 """Sensors that come with the package, each with its decoder. Their interface is in `rangesim.sensor`."""
 
 from rangesim.sensor import Decoder, Emitter, Sensor
+from rangesim.sensors.active_stereo import ActiveStereo, StereoDecoder
 from rangesim.sensors.amcw import AmcwDecoder, AmcwToF
 from rangesim.sensors.direct_tof import DirectToF, DirectToFDecoder
 from rangesim.sensors.ideal_tof import IdealToF, IdealToFDecoder
@@ -9,6 +10,7 @@ from rangesim.sensors.registry import check_sensor, is_file_name, presets, senso
 from rangesim.sensors.structured_light import StructuredLight, StructuredLightDecoder
 
 __all__ = [
+    "ActiveStereo",
     "AmcwDecoder",
     "AmcwToF",
     "Decoder",
@@ -18,6 +20,7 @@ __all__ = [
     "IdealToF",
     "IdealToFDecoder",
     "Sensor",
+    "StereoDecoder",
     "StructuredLight",
     "StructuredLightDecoder",
     "check_sensor",

@@ -8,6 +8,7 @@ from rangesim.signals.signals import (
     GroundTruth,
     SamplingError,
     Signals,
+    SignalSet,
     StillSignals,
     Truncation,
 )
@@ -18,6 +19,7 @@ __all__ = [
     "EnergySplit",
     "GroundTruth",
     "SamplingError",
+    "SignalSet",
     "Signals",
     "StillSignals",
     "Truncation",

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import overload
 
 import numpy as np
 
@@ -161,6 +163,11 @@ class Signals(ShortRepr, ABC):
     truncation: Truncation | None = field(kw_only=True, default=None)
 
     @property
+    def cameras(self) -> tuple[Signals, ...]:
+        """Signals of each camera of the pass, the reference camera's first; by default these alone."""
+        return (self,)
+
+    @property
     @abstractmethod
     def knows_sampling_error(self) -> bool:
         """Whether the sampling error is known, so that `frames` can add it."""
@@ -250,3 +257,71 @@ def _off_glass(response: Response, rig: Rig) -> np.ndarray:
         elif isinstance(response, DenseResponse):
             total += [np.broadcast_to(w, u.shape).sum() for w in response.weights(path, NumpyMath())]
     return (total / (projector.width * projector.height)).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SignalSet(Signals, Sequence[Signals]):
+    """Signals of several cameras with one emitter, as `rangesim.transport` returns for a list of rigs.
+
+    The set has the attributes of the first camera's signals, which is the reference camera: `compare` and `explain`
+    take the set as they take signals of one camera, and `expose` makes a `CaptureSet` of it. As a sequence it holds the
+    signals of each camera, so ``for signals in ...`` and ``left, right = ...`` work, too.
+
+    of_cameras : signals of each camera, the reference camera's first.
+
+    Examples
+    --------
+    >>> import rangesim
+    >>> from rangesim.sensors import ActiveStereo
+    >>> scene, sensor = rangesim.load_scene("plane"), ActiveStereo()  # doctest: +SKIP
+    >>> both = rangesim.transport(scene, sensor.rigs(scene.rig(0.025, (640, 400))), [sensor])  # doctest: +SKIP
+    >>> image = rangesim.decode(rangesim.expose(both, sensor))  # doctest: +SKIP
+    """
+
+    of_cameras: tuple[Signals, ...] = field(kw_only=True)
+
+    @classmethod
+    def of(cls, signals: Sequence[Signals]) -> SignalSet:
+        """The set of these signals, the reference camera's first.
+
+        Raises
+        ------
+        ValueError
+            There are none, or their rigs have different emitters.
+        """
+        cameras = tuple(signals)
+        if not cameras or not all(isinstance(one, Signals) for one in cameras):
+            raise ValueError(f"expected signals of one camera or more, got {signals!r}.")
+        first = cameras[0]
+        for number, other in enumerate(cameras[1:], 1):
+            if names := other.rig.differences_of_emitter(first.rig):
+                raise ValueError(f"expected signals of one emitter, but camera {number} has another {names[0]}.")
+        return cls(
+            first.rig, first.energy, first.truth, motion_m=first.motion_m, truncation=first.truncation,
+            of_cameras=cameras,
+        )  # fmt: skip
+
+    @property
+    def cameras(self) -> tuple[Signals, ...]:
+        return self.of_cameras
+
+    @property
+    def knows_sampling_error(self) -> bool:
+        return all(one.knows_sampling_error for one in self.of_cameras)
+
+    def frames(self, sensor: Sensor, ambient_transmission: float = 1.0, sampling_errors: float = 0.0) -> np.ndarray:
+        """Frames of the reference camera; those of the others are `self[1].frames(...)` and so on."""
+        return self.of_cameras[0].frames(sensor, ambient_transmission, sampling_errors)
+
+    def __len__(self) -> int:
+        return len(self.of_cameras)
+
+    def __iter__(self) -> Iterator[Signals]:
+        return iter(self.of_cameras)
+
+    @overload
+    def __getitem__(self, index: int) -> Signals: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Signals, ...]: ...
+    def __getitem__(self, index: int | slice) -> Signals | tuple[Signals, ...]:
+        return self.of_cameras[index]
