@@ -25,8 +25,10 @@ from rangesim import (
     compare,
     decode,
     expose,
+    load_range_image,
     load_scene,
     load_signals,
+    save_range_image,
     save_signals,
     transport,
 )
@@ -229,6 +231,8 @@ def test_readings_comparison_causes_and_clouds_work_on_zones(corner: Scene, tmp_
     assert image.to_point_cloud("world").points.shape == (8, 8, 3)
     assert compare(image, signals.truth).rows
     assert explain(image, capture, signals).cause.shape == (8, 8)
+    save_range_image(image, tmp_path / "range.npz")
+    assert load_range_image(tmp_path / "range.npz").camera == rig.camera
     save_signals(signals, tmp_path / "signals.npz")
     loaded = load_signals(tmp_path / "signals.npz")
     assert all_bytes(loaded) == all_bytes(signals)
