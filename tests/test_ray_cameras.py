@@ -251,7 +251,7 @@ def test_a_scanner_that_moves_takes_one_pass_and_knows_its_way(corner: Scene) ->
 
 
 def test_scanners_are_not_fused_and_say_so_before_any_rendering() -> None:
-    settings = ScanSettings("corner", Instrument("head", IdealToF(), camera=sweep(), projector=Beam()))
+    settings = ScanSettings("corner", instrument=Instrument("head", IdealToF(), camera=sweep(), projector=Beam()))
     for work in (carry_out_scan, estimate_scan):
         with pytest.raises(ValueError, match="expected a pinhole camera for a scan, whose views are fused"):
             work(settings)
