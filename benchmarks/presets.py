@@ -51,7 +51,7 @@ from rangesim.instrument.instrument import Instrument
 from rangesim.presets import Preset
 from rangesim.presets.preset import standing
 from rangesim.response import LightPath, NumpyMath, Response, SparseResponse
-from rangesim.rig import Camera, Fisheye, RayTable
+from rangesim.rig import Camera, Fisheye, RayTable, ScanningCamera, Zones
 from rangesim.robust_scale import sigma_from_median
 from rangesim.signals import EnergySplit, GroundTruth
 
@@ -67,6 +67,9 @@ NEARLY_ALL = 0.95
 """Fraction of the pixels that read a wall at the end of the range of a device whose power is fitted to its range."""
 MIN_VALID = 0.9
 """Least fraction of the pixels with a reading of a wall at mid-range."""
+MAX_BEYOND = 0.01
+"""Largest fraction of the pixels with a reading of a wall that is too near or too far: now and then, noise is taken for
+a wall."""
 POWERS_W = (1e-6, 1e4)
 """Powers between which `--fit` searches."""
 
@@ -133,7 +136,8 @@ def contradictions(preset: Preset) -> list[str]:
     if valid < MIN_VALID:
         faults.append(f"readings in {valid:.0%} of the pixels at {middle_m:.2f} m")
     for distance_m in (0.9 * near_m, 1.1 * far_m):
-        if distance_m > 0 and (valid := of_wall(preset.instrument, distance_m, REFLECTANCE, 0.0).valid.mean()) > 0:
+        valid = of_wall(preset.instrument, distance_m, REFLECTANCE, 0.0).valid.mean() if distance_m > 0 else 0.0
+        if valid > MAX_BEYOND:
             faults.append(f"readings in {valid:.0%} of the pixels at {distance_m:.2f} m, outside its range")
     return faults
 
@@ -144,6 +148,8 @@ def field_of_view_deg(camera: Camera) -> tuple[float, float]:
         x = np.degrees(np.arctan([camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx])).sum()
         y = np.degrees(np.arctan([camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy])).sum()
         return float(x), float(y)
+    if isinstance(camera, Zones):
+        return field_of_view_deg(camera.camera)
     if isinstance(camera, Fisheye):
         return float(np.degrees(camera.width / camera.fx)), float(np.degrees(camera.height / camera.fy))
     x, y, z = np.moveaxis(camera.pixel_rays().directions, -1, 0)
@@ -205,7 +211,7 @@ def rig_of(instrument: Instrument) -> Rig:
         camera = replace(camera, **middle)
     else:
         ahead = np.tile([0.0, 0.0, 1.0], (RAYS, RAYS, 1))
-        camera = RayTable(ahead, field_rad=camera.field_rad, acceptance=camera.acceptance)
+        camera = RayTable(ahead, field_rad=field_rad(camera), acceptance=camera.acceptance)
     pose = np.eye(4) if instrument.T_camera_projector is None else instrument.T_camera_projector
     return Rig(
         camera,
@@ -216,6 +222,14 @@ def rig_of(instrument: Instrument) -> Rig:
         projector_power_w=instrument.power_w,
         wavelength_m=instrument.emitter_wavelength_m,
     )
+
+
+def field_rad(camera: Camera) -> tuple[float, float]:
+    """Full widths of the field of a ray of a scanner, or of the zone in the middle, radians."""
+    if isinstance(camera, ScanningCamera):
+        return camera.field_rad
+    across, down = np.linalg.norm(camera.pixel_rays().steps[camera.height // 2, camera.width // 2], axis=-1)
+    return float(across), float(down)
 
 
 @lru_cache(maxsize=64)  # the search for a power asks for the same wall again

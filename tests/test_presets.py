@@ -26,7 +26,7 @@ from rangesim.files.text_files import read_toml
 from rangesim.instrument.instrument import Instrument
 from rangesim.presets.catalogue import FOLDER
 from rangesim.presets.preset import STANDINGS, numbers_of, standing
-from rangesim.rig import ScanningCamera
+from rangesim.rig import ScanningCamera, Zones
 from rangesim.sensors import presets as sensor_presets
 from rangesim.settings.config import to_dict
 
@@ -175,6 +175,28 @@ def test_a_scanner_reads_a_wall_in_its_beams(name: str) -> None:
     image = decode(capture, instrument.decoder)
     assert image.valid.mean() > 0.9
     assert np.nanmedian(np.abs(image.range_m - distance_m)) < 0.01 * distance_m
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if isinstance(presets.load(name).camera, Zones)])
+def test_zones_tile_the_angles_of_the_sheet_and_read_a_wall(name: str) -> None:
+    preset = presets.describe(name)
+    zones = preset.instrument.camera
+    assert isinstance(zones, Zones)
+    fine = zones.camera
+    assert isinstance(fine, Intrinsics)
+    half = [fine.width / 2 / fine.fx, fine.height / 2 / fine.fy]
+    assert 2 * np.degrees(np.arctan(half)) == pytest.approx(preset.sheet.field_of_view_deg, abs=0.01)
+    distance_m = math.sqrt(preset.sheet.range_m[0] * preset.sheet.range_m[1])
+    scene = scene_of(wall=wall(distance_m, matte(0.6)))
+    rig = preset.instrument.rig(scene)
+    signals = transport(scene, rig, [preset.instrument.sensor], spp=4, max_depth=2, photons=0, glint=False)
+    image = decode(
+        expose(signals, preset.instrument.sensor, preset.instrument.detector, preset.instrument.exposure_s),
+        preset.instrument.decoder,
+    )
+    assert image.z.shape == preset.sheet.resolution_px[::-1]
+    assert image.valid.mean() > 0.9
+    assert np.nanmedian(np.abs(image.z - distance_m)) < 0.03 * distance_m
 
 
 # ---- Names ---------------------------------------------------------------------------------------------------------
