@@ -122,7 +122,8 @@ def noise_ratios(preset: Preset) -> list[float]:
         sigma_m, valid = noise_at_m(preset.instrument, distance_m, noise)
         simulated.append(sigma_m)
         simulated_ratio = sigma_m / published_m
-        ratios.append(max(simulated_ratio, 1.0 if noise.is_bound else 1 / simulated_ratio))
+        worst = max(simulated_ratio, 1.0 if noise.is_bound else 1 / simulated_ratio)
+        ratios.append(math.inf if math.isnan(worst) else worst)  # no reading where there should be one
         mark, relation = "*" if distance_m == noise.fitted_at_m else " ", "<=" if noise.is_bound else "  "
         print(
             f"    {distance_m:7.2f} m{mark} published {relation} {1e3 * published_m:7.2f} mm  "
