@@ -209,7 +209,7 @@ def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Gl
         multipath=radiance.multipath,
         specular=radiance.specular,
         caustic=radiance.caustic + radiance.smooth_caustic,
-        glint=highlights[0],
+        glint=highlights[0] + radiance.glint,
         ambient=radiance.ambient,
     )
 

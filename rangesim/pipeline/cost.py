@@ -217,11 +217,14 @@ def _traced_pixels(experiment: Experiment, rig: Rig, instruments: Sequence[Instr
     """
     if experiment.motion is None:
         return rig.traced.camera.width * rig.traced.camera.height, 1
+    from rangesim.motion.moving_scanner import on_its_way
     from rangesim.motion.passes import plan
 
-    planned = [
-        p for instrument in instruments for p in plan(rig, {instrument.sensor: instrument.timing}, experiment.motion)
-    ]
+    planned = []
+    for instrument in instruments:
+        timings = {instrument.sensor: instrument.timing}
+        moving, motion = on_its_way(rig, timings, experiment.motion)
+        planned += plan(moving, timings, motion)
     windows = [p.window for p in planned]
     return sum((w.bottom - w.top) * (w.right - w.left) for w in windows), len(planned)
 

@@ -102,11 +102,11 @@ def _shares_camera(one: Measurement, other: Measurement) -> bool:
 
 def _camera(result: Result, group: Sequence[Measurement]) -> dict[str, Any]:
     """Pictures of the scene from the camera that a group of measurements shares."""
-    materials, legend = figures.material_picture(group[0].truth)
+    materials, legend = figures.material_picture(group[0].truth, group[0].camera)
     return {
         "names": [m.name for m in group],
         "size": tables.size_text(group[0].truth.z.shape),
-        "scene": figures.scene_picture(result.passes[group[0].light_pass - 1].energy),
+        "scene": figures.scene_picture(result.passes[group[0].light_pass - 1].energy, group[0].camera),
         "materials": materials,
         "legend": legend,
     }
@@ -117,6 +117,8 @@ def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -
     causes, legend = figures.cause_map(m)
     return {
         "name": m.name,
+        "depth_name": "depth z" if m.camera.is_pinhole else "range",
+        "letter": "z" if m.camera.is_pinhole else "range",
         "depth": figures.depth_map(m, limits, depth),
         "error": figures.error_map(m, error),
         "causes": causes,
@@ -152,7 +154,7 @@ def _light(result: Result, number: int) -> dict[str, Any]:
         "names": [m.name for m in of_pass],
         "baseline_mm": f"{1e3 * rig.baseline_m:.0f}",
         "power_w": f"{rig.projector_power_w:g}",
-        "pictures": figures.light_pictures(result.passes[number].energy),
+        "pictures": figures.light_pictures(result.passes[number].energy, rig.camera),
     }
 
 

@@ -110,7 +110,7 @@ def depth_limits(measurements: tuple[Measurement, ...]) -> tuple[float, float]:
 
     The scale leaves out half a percent of the pixels at either end, and then gets a margin.
     """
-    z = np.concatenate([m.truth.z[np.isfinite(m.truth.z)] for m in measurements])
+    z = np.concatenate([m.true_m[np.isfinite(m.true_m)] for m in measurements])
     if z.size == 0:
         return 0.0, 1.0
     low, high = (float(v) for v in np.percentile(z, [0.5, 99.5]))

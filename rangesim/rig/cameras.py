@@ -117,6 +117,16 @@ class Camera(Optics):
         """
         raise ValueError(f"expected a camera that projects points to pixels, got {type(self).__name__}.")
 
+    def cropped(self, top: int, bottom: int, left: int, right: int) -> Camera:
+        """The camera of a part of the image: rows `top` to `bottom` - 1, columns `left` to `right` - 1.
+
+        Raises
+        ------
+        ValueError
+            A part of this camera's image is no camera of the package.
+        """
+        raise ValueError(f"expected a camera whose image can be cropped, got {type(self).__name__}.")
+
     # ---- What follows from the rays -----------------------------------------------------------------------------
 
     def angle_of(self, pixels: float) -> float:
