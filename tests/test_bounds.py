@@ -49,6 +49,8 @@ from rangesim.sensors import (
     DirectToFDecoder,
     IdealToF,
     IdealToFDecoder,
+    ReferencePatternDecoder,
+    ReferencePatternStereo,
     Sensor,
     StereoDecoder,
     StructuredLight,
@@ -63,7 +65,7 @@ NONSENSE = (
 )
 
 CAMERA = Intrinsics.from_fov(24, 18, 45)
-STEREO = ActiveStereo(Dots(1280, 800))
+STEREO, DOTS = ActiveStereo(Dots(1280, 800)), ReferencePatternStereo(Dots(1280, 800))
 RIG = stereo_rig(24, 18)
 
 
@@ -82,7 +84,7 @@ def signals_of(sensor: Sensor, rig: Rig = RIG) -> Any:
 
 def use_sensor(sensor: Any) -> None:
     hash(sensor)
-    if isinstance(sensor, ActiveStereo):
+    if isinstance(sensor, (ActiveStereo, ReferencePatternStereo)):
         signals = signals_of(sensor)
         assert rangesim.decode(rangesim.expose(signals, sensor)).status.shape == (18, 24)
         return
@@ -113,6 +115,7 @@ def use_decoder(decoder: Decoder) -> None:
         DirectToFDecoder: DirectToF(bins=32),
         IdealToFDecoder: IdealToF(),
         StereoDecoder: STEREO,
+        ReferencePatternDecoder: DOTS,
     }[type(decoder)]
     for detector in (None, sensor.default_detector):
         signals = signals_of(sensor)
@@ -194,6 +197,8 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (IdealToF(), use_sensor),
     (StructuredLightDecoder(), use_decoder),
     (STEREO, use_sensor),
+    (DOTS, use_sensor),
+    (ReferencePatternDecoder(disparities=8), use_decoder),
     (StereoDecoder(disparities=8), use_decoder),
     (DenseMatching(), lambda matching: use_decoder(StereoDecoder(matching, disparities=8))),
     (ImageNoise(), lambda noise: use_decoder(StereoDecoder(noise=noise, disparities=8))),
@@ -293,7 +298,14 @@ MODULES = (
         "response.patterns",
         "rig.rig",
     ),
-    *("sensors.structured_light", "sensors.amcw", "sensors.direct_tof", "sensors.ideal_tof", "sensors.active_stereo"),
+    *(
+        "sensors.structured_light",
+        "sensors.amcw",
+        "sensors.direct_tof",
+        "sensors.ideal_tof",
+        "sensors.active_stereo",
+        "sensors.reference_pattern",
+    ),
     *("decoding.gray", "decoding.phase_shift", "decoding.triangulation", "decoding.disparities"),
     "geometry.dense_stereo",
 )

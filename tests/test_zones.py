@@ -25,12 +25,15 @@ from rangesim import (
     compare,
     decode,
     expose,
+    load_range_image,
     load_scene,
     load_signals,
+    save_range_image,
     save_signals,
     transport,
 )
 from rangesim.causes import explain
+from rangesim.causes.cause import Cause
 from rangesim.instrument.instrument import Instrument
 from rangesim.rig import Beam, Zones
 from rangesim.sensors import DirectToFDecoder
@@ -199,6 +202,19 @@ def test_a_zone_over_an_edge_has_two_returns_by_their_parts_of_it() -> None:
     np.testing.assert_allclose(returns.range_m[:, 0, 0], [1.0, 1.6], rtol=3e-3)
 
 
+def test_a_zone_that_reads_the_smaller_surface_fails_by_its_edge() -> None:
+    camera, sensor = Intrinsics.from_fov(16, 8, 6.0), DirectToF(pulse_fwhm_s=500e-12)
+    edge = (6.0 - camera.cx) / camera.fx
+    scene = scene_of(wall=wall(1.6, matte()), card=wall(1.0, matte(), half_size=0.5, x=edge - 0.5))
+    rig = rig_of(Zones(camera, 1, 1), Intrinsics.from_fov(100, 100, 20.0))  # type: ignore[arg-type]
+    signals = transport(scene, rig, [sensor], spp=32, max_depth=2)
+    assert signals.truth.z[0, 0] == pytest.approx(1.6, rel=1e-3)  # of 16 columns, ten see the wall
+    capture = expose(signals, sensor)
+    for reading, cause in (("first", Cause.DEPTH_EDGE), ("last", Cause.NONE)):
+        image = decode(capture, DirectToFDecoder(reading=reading, max_returns=2))  # type: ignore[arg-type]
+        assert explain(image, capture, signals).cause[0, 0] == cause
+
+
 # ---- The rest of the package -----------------------------------------------------------------------------------------
 
 
@@ -215,6 +231,8 @@ def test_readings_comparison_causes_and_clouds_work_on_zones(corner: Scene, tmp_
     assert image.to_point_cloud("world").points.shape == (8, 8, 3)
     assert compare(image, signals.truth).rows
     assert explain(image, capture, signals).cause.shape == (8, 8)
+    save_range_image(image, tmp_path / "range.npz")
+    assert load_range_image(tmp_path / "range.npz").camera == rig.camera
     save_signals(signals, tmp_path / "signals.npz")
     loaded = load_signals(tmp_path / "signals.npz")
     assert all_bytes(loaded) == all_bytes(signals)

@@ -179,9 +179,11 @@ class Evidence:
 
     @cached_property
     def at_edge(self) -> np.ndarray:
-        """Whether a depth edge lies between the pixel and one of its eight neighbours, or as far away as the reading of
-        the pixel reaches (`Decoder.reach_px`)."""
+        """Whether a depth edge lies between the pixel and one of its neighbours, within a zone, or as far away as the
+        reading of the pixel reaches (`Decoder.reach_px`)."""
         edges, reach = depth_edges(self.true_m, self.tolerance_m, self.pixels), self.readings.decoder.reach_px
+        if self.truth.nearest_m is not None and self.truth.farthest_m is not None:
+            edges = edges | (self.truth.farthest_m > across(self.truth.nearest_m, self.tolerance_m))
         return edges if not reach else binary_dilation(edges, np.ones((3, 3)), iterations=reach)
 
     @cached_property

@@ -124,7 +124,8 @@ def _strongest(counts, expected, level, excess, is_refused, template, before, ru
         if square < WHOLE * energy:
             continue
         amount = match / square
-        least = max(rules.counts, rules.sigmas * math.sqrt(max(variance, 0.0)) / square)
+        deviation = math.sqrt(max(variance, 0.0)) / square
+        least = max(rules.counts, rules.sigmas * deviation + 0.25 * rules.sigmas**2)
         if amount > most and amount >= max(least, rules.tolerance * other / square):
             best, most = b, amount
     return best, most

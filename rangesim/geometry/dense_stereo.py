@@ -217,12 +217,11 @@ def match_densely(
     found = fit.disparity_px if settings.refine else whole
     outside = ~((found >= least) & (found <= largest)) & (outcome == MatchOutcome.MATCHED)
     outcome[outside] = MatchOutcome.OUT_OF_RANGE
-    disparity, sigma = found.astype(np.float32), fit.sigma_px.astype(np.float32)
+    disparity = found.astype(np.float32)
     outcome[_is_speckle(disparity, outcome, settings.min_region_px)] = MatchOutcome.AMBIGUOUS
     wrong = outcome != MatchOutcome.MATCHED
     disparity[wrong] = np.nan
-    sigma[wrong] = np.nan
-    return DenseMatch(disparity, sigma, outcome)
+    return DenseMatch(disparity, np.where(wrong, np.nan, fit.sigma_px).astype(np.float32), outcome)
 
 
 def locating_sigma(image: np.ndarray, noises: tuple[np.ndarray, ...], reach: int) -> np.ndarray:

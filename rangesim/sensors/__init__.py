@@ -6,6 +6,7 @@ from rangesim.sensors.active_stereo import ActiveStereo, StereoDecoder
 from rangesim.sensors.amcw import AmcwDecoder, AmcwToF
 from rangesim.sensors.direct_tof import DirectToF, DirectToFDecoder
 from rangesim.sensors.ideal_tof import IdealToF, IdealToFDecoder
+from rangesim.sensors.reference_pattern import ReferencePatternDecoder, ReferencePatternStereo
 from rangesim.sensors.registry import check_sensor, is_file_name, presets, sensor_from_dict, sensor_of
 from rangesim.sensors.structured_light import StructuredLight, StructuredLightDecoder
 
@@ -19,6 +20,8 @@ __all__ = [
     "Emitter",
     "IdealToF",
     "IdealToFDecoder",
+    "ReferencePatternDecoder",
+    "ReferencePatternStereo",
     "Sensor",
     "StereoDecoder",
     "StructuredLight",

@@ -222,11 +222,14 @@ def pair_of(capture: CaptureSet) -> tuple[Capture, Capture]:
     return first, second
 
 
-def quantised(found: Disparities, step_px: float) -> Disparities:
-    """The disparities rounded to multiples of a step; 0: as they are. Rounding adds step^2 / 12 to the variance."""
+def quantised(found: Disparities, step_px: float, from_px: float = 0.0) -> Disparities:
+    """The disparities rounded to multiples of a step, counted from `from_px`; a step of 0 leaves them as they are.
+
+    Rounding adds step^2 / 12 to their variance.
+    """
     if not step_px:
         return found
-    rounded = np.rint(found.disparity_px / step_px) * step_px
+    rounded = np.rint((found.disparity_px - from_px) / step_px) * step_px + from_px
     sigma = np.sqrt(found.sigma_px**2 + step_px**2 * PIXEL_VARIANCE)
     return replace(found, disparity_px=rounded, sigma_px=sigma)
 

@@ -338,9 +338,13 @@ class DirectToFDecoder(Decoder):
     def coordinates(self, capture: Capture) -> PathLengths:
         """Path lengths of a `DirectToF` capture, with standard deviations of the photons' shot noise."""
         sensor = of_type(capture.sensor, DirectToF)
-        if sensor.pulse is not None or self.max_returns > 1 or self.min_range_m > 0:
+        if self._fits_pulses(sensor):
             return self._of_returns(capture, sensor)
         return self._of_peaks(capture, sensor)
+
+    def _fits_pulses(self, sensor: DirectToF) -> bool:
+        """Whether pulses are fitted, instead of taking the centroid of the highest peak."""
+        return sensor.pulse is not None or self.max_returns > 1 or self.min_range_m > 0
 
     def _of_peaks(self, capture: Capture, sensor: DirectToF) -> PathLengths:
         """Path lengths of the highest peaks, by their centroids."""
@@ -453,7 +457,8 @@ class DirectToFDecoder(Decoder):
         if background.noise_variance is None:
             return background.floor(self.relative_peak)
         window, bins = _window_bins(of_type(sensor, DirectToF)), of_type(sensor, DirectToF).bins
-        return self._least_counts(window * (background.dark + background.ambient / bins))
+        least = self._least_counts(window * (background.dark + background.ambient / bins))
+        return least + 0.25 * self.peak_sigmas**2 if self._fits_pulses(of_type(sensor, DirectToF)) else least
 
     def _least_counts(self, background: np.ndarray) -> np.ndarray:
         """(...) float64, counts, least height of a peak over the counts (...) of background in its window."""
