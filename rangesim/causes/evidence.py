@@ -128,6 +128,16 @@ class Evidence:
         return full & (self.missing | ~self.optical)
 
     @cached_property
+    def off_glass(self) -> np.ndarray:
+        """Whether light off the device's window is to blame: without it the reading is right, or the decoder refused
+        a surface so close that the two cannot be told apart."""
+        without = self.readings.without_glass
+        if without is None:
+            return np.zeros(self.true_m.shape, dtype=bool)
+        healed = ~self._wrong(self._of_failed_pixels(without))
+        return np.asarray(self.optical & (healed | (self.image.status == Status.OUT_OF_RANGE)))
+
+    @cached_property
     def piled_up(self) -> np.ndarray:
         """Whether more than `MAX_PULSES_HIT` of the pulses brought a photon, or the decoder found that the pulses ran
         out although no counter is full."""
