@@ -51,6 +51,7 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from rangesim.results.saved_signals import save_signals as save_signals
     from rangesim.rig import Beam as Beam
     from rangesim.rig import Camera as Camera
+    from rangesim.rig import CoverGlass as CoverGlass
     from rangesim.rig import Fisheye as Fisheye
     from rangesim.rig import Intrinsics as Intrinsics
     from rangesim.rig import Lens as Lens
@@ -60,6 +61,7 @@ if TYPE_CHECKING:  # the names of `_HOME`, for editors and type checkers
     from rangesim.rig import Rig as Rig
     from rangesim.rig import Risley as Risley
     from rangesim.rig import Spinning as Spinning
+    from rangesim.rig import Zones as Zones
     from rangesim.rig import look_at as look_at
     from rangesim.rig.calibration_files import load_calibration as load_calibration
     from rangesim.scene import Scene as Scene
@@ -82,6 +84,7 @@ _HOME = {
     "Camera": "rangesim.rig",
     "Capture": "rangesim.capture",
     "CaptureSet": "rangesim.capture",
+    "CoverGlass": "rangesim.rig",
     "Decoder": "rangesim.sensors",
     "Detector": "rangesim.electronics.detector",
     "DirectToF": "rangesim.sensors",
@@ -107,6 +110,7 @@ _HOME = {
     "StillSignals": "rangesim.signals",
     "StructuredLight": "rangesim.sensors",
     "TransportSettings": "rangesim.light_transport.transport_settings",
+    "Zones": "rangesim.rig",
     "compare": "rangesim.evaluation.comparison",
     "decode": "rangesim.decoding",
     "errors_markdown": "rangesim.report",

@@ -11,7 +11,7 @@ import pytest
 from scipy.special import erf
 
 from rangesim import AmcwToF, DirectToF, IdealToF, Scene, decode, expose, load_scene, transport
-from rangesim.rig import Beam, Intrinsics, RayTable, Rig
+from rangesim.rig import Beam, Intrinsics, Lens, RayTable, Rig
 
 TILES = 8
 """Beams along each side of the field that they tile."""
@@ -198,3 +198,34 @@ def test_beams_have_the_same_bytes_twice_and_no_samples_of_others() -> None:
         np.testing.assert_array_equal(values, other.channels[response])
     assert one.energy.caustic.sum() == 0
     assert one.energy.specular.sum() > 0  # the wall behind the slab
+
+
+def test_a_mirror_sends_a_beam_back_into_its_own_eye() -> None:
+    """A mirror at distance d shows the emitter, a disc of radius a, at 2 d: its radiance is P p / (pi a^2)."""
+    T = mi.ScalarTransform4f
+    silver = {"type": "twosided", "b": {"type": "conductor", "material": "none"}}
+    scene = load_scene(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "fov": 20.0, "to_world": T().look_at([0, 0, 0], [1, 0, 0], [0, 0, 1])},
+            "mirror": {
+                "type": "rectangle",
+                "to_world": T().translate([2, 0, 0]).rotate([0, 1, 0], -90).scale(0.5),
+                "b": silver,
+            },
+        }
+    )
+    field, a, d = 4e-3, 3e-3, 2.0
+    table = RayTable(np.array([[[0.0, 0.0, 1.0], [0.05, 0.0, 1.0]]]), field_rad=(field, field))
+    rig = Rig(
+        table, Beam((8e-3, 8e-3), "box"), scene.rig().T_world_camera, projector_lens=Lens(a), projector_power_w=0.5
+    )
+    sensor = DirectToF(bins=64, bin_s=1e-9, pulse_fwhm_s=0.0)
+    signals = transport(scene, rig, [sensor], spp=1 << 14)
+    seen = np.pi * (a / (2 * d)) ** 2 / field**2  # fraction of the receiver's field that sees the disc
+    expected = seen * 0.5 / 8e-3**2 / (np.pi * a**2)
+    assert signals.energy.glint[0, 0] == pytest.approx(expected, rel=0.02)
+    assert signals.energy.glint[0, 1] == 0  # the oblique beam goes elsewhere
+    histogram = signals.channels[sensor.responses()[0]][:, 0, 0]
+    assert np.flatnonzero(histogram).tolist() == [int(2 * d / 299792458.0 / 1e-9)]
+    assert transport(scene, rig, [sensor], spp=16, glint=False).energy.glint.sum() == 0

@@ -61,6 +61,14 @@ def test_recorded_poses_do_without_the_rig() -> None:
     np.testing.assert_allclose(by_twist, by_poses, atol=1e-5)
 
 
+def test_scans_may_start_later_than_their_track() -> None:
+    rig = look_at((1.0, -2.0, 0.5), (4.0, 0.0, 0.0))
+    raw = scanned_room(DRIVE, rig)
+    shifted = PoseTrack([5.0, 5.1], [DRIVE.at(0.0), DRIVE.at(0.1)])
+    early, late = deskewed(raw, DRIVE, rig), deskewed(raw, shifted, rig, start_s=5.0)
+    np.testing.assert_allclose(early.points, late.points, atol=1e-3)  # a chord of the bend
+
+
 def test_at_rest_nothing_changes_and_normals_turn_with_their_points() -> None:
     raw = scanned_room(ConstantTwist(), np.eye(4))
     normals = np.zeros_like(raw.points)

@@ -20,6 +20,10 @@ from rangesim import (
     load_scene,
     transport,
 )
+from rangesim.experiment import ScanSettings
+from rangesim.instrument.instrument import Instrument
+from rangesim.motion import ConstantTwist, Motion, Timing, moving_scanner, transport_moving
+from rangesim.pipeline.scan_run import carry_out_scan, estimate_scan
 from rangesim.rig import (
     Beam,
     Camera,
@@ -204,3 +208,71 @@ def test_what_contradicts_a_camera_is_refused(corner: Scene) -> None:
     capture = expose(transport(corner, rig, [sensor], spp=1, glint=False), sensor, None)
     with pytest.raises(ValueError, match="expected a pinhole camera"):
         decode(capture)
+
+
+def sweep() -> Spinning:
+    return Spinning((0.0, -3.0, 3.0), 60, 0.1, arc_deg=60.0, first_azimuth_deg=-30.0, field_rad=(1e-3, 1e-3))
+
+
+def test_a_scanner_reads_a_moving_ball_where_it_is_at_each_ray() -> None:
+    """A ball moves sideways while the head turns: each column sees it at the column's own time."""
+    scene = load_scene(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "fov": 40.0},
+            "ball": {"type": "sphere", "center": [0.0, 0.0, 4.0], "radius": 0.8, "b": {"type": "diffuse"}},
+        }
+    )
+    head, sensor, speed = sweep(), IdealToF(), 8.0
+    rig = Rig(head, Beam((1e-3, 1e-3)))
+    motion = Motion({"ball": ConstantTwist(velocity_m_s=(speed, 0.0, 0.0))})
+    timing = Timing(bands=60)
+    signals = transport_moving(scene, rig, {sensor: timing}, motion, spp=4, glint=False)[sensor]
+    rays, times = head.pixel_rays().directions, head.times_s
+    centre = np.stack([speed * times, 0 * times, 4 + 0 * times], axis=-1)
+    along = (rays * centre).sum(axis=-1)
+    inside = 0.8**2 - (centre**2).sum(axis=-1) + along**2
+    expected = np.where(inside > 0, along - np.sqrt(np.maximum(inside, 0)), np.nan)
+    clear = np.abs(inside) > 0.02  # away from the rim
+    image = decode(expose(signals, sensor, None))
+    sure = clear & (inside > 0)
+    np.testing.assert_allclose(image.range_m[sure], expected[sure], atol=2e-3)
+
+
+def test_a_scanner_that_moves_takes_one_pass_and_knows_its_way(corner: Scene) -> None:
+    head, sensor = sweep(), IdealToF()
+    rig = Rig(head, Beam((1e-3, 1e-3)), corner.rig().T_world_camera)
+    track = ConstantTwist(velocity_m_s=(0.0, 2.0, 0.0))
+    signals = transport_moving(corner, rig, {sensor: Timing()}, Motion(rig=track), spp=4, glint=False)[sensor]
+    whole = transport(corner, moving_scanner(rig, track), [sensor], spp=4, glint=False)
+    np.testing.assert_array_equal(signals.energy.direct, whole.energy.direct)
+    with pytest.raises(ValueError, match="expected a timing without line_period_s"):
+        transport_moving(corner, rig, {sensor: Timing(line_period_s=1e-3)}, Motion(rig=track), spp=4)
+
+
+def test_scanners_are_not_fused_and_say_so_before_any_rendering() -> None:
+    settings = ScanSettings("corner", instrument=Instrument("head", IdealToF(), camera=sweep(), projector=Beam()))
+    for work in (carry_out_scan, estimate_scan):
+        with pytest.raises(ValueError, match="expected a pinhole camera for a scan, whose views are fused"):
+            work(settings)
+
+
+def test_a_scanner_that_drives_into_fog_is_refused() -> None:
+    fog = {"type": "homogeneous", "albedo": 0.9, "sigma_t": {"type": "spectrum", "value": 2.0}}
+    scene = load_scene(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "fov": 40.0},
+            "bank": {
+                "type": "sphere",
+                "center": [0.0, 0.0, 3.0],
+                "radius": 1.0,
+                "b": {"type": "null"},
+                "interior": fog,
+            },
+        }
+    )
+    rig = Rig(sweep(), Beam((1e-3, 1e-3)))
+    transport(scene, rig, [IdealToF()], spp=1)
+    with pytest.raises(ValueError, match=r"expected the camera to stand in air, but it is inside the medium of .*bank"):
+        transport(scene, moving_scanner(rig, ConstantTwist((0.0, 0.0, 30.0))), [IdealToF()], spp=1)

@@ -46,6 +46,8 @@ def test_the_shell_lines_of_the_readme_run(tmp_path: Path) -> None:
 
 ARGUMENTS = {
     "calibration": ["calibration.png", "--width", "320", "--poses", "3"],
+    "gesture_sensor": ["gesture.png", "--spp", "8", "--places", "2"],
+    "driving_lidar": ["driving_lidar.png", "--rings", "16", "--columns", "256", "--spp", "4"],
     "light_over_length": ["light_over_length.png", "--spp", "16"],
     "motion": ["motion", "--width", "48", "--speeds", "0", "1"],
     "part_pose": ["part.png", "--width", "280", "--spacing-mm", "3"],

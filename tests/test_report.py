@@ -19,15 +19,19 @@ import pytest
 from browser import OPTIONS, WITHOUT_WEBGL, browser
 from PIL import Image
 from scroll_hints import check_scroll_hints
-from small_result import SENSORS, result_of_two_cameras, small_result
+from small_result import SCENES, SENSORS, result_of_two_cameras, small_result
 
 from rangesim.causes import Cause
 from rangesim.decoding.status import Status
 from rangesim.environment.doctor import find_browser
+from rangesim.experiment import Experiment
+from rangesim.instrument.instrument import Instrument
+from rangesim.pipeline.experiment_run import carry_out
 from rangesim.report import palette, point_viewer, render_report, tables, write_report
 from rangesim.report.experiment_page import by_camera
 from rangesim.report.verdict import verdict
 from rangesim.results.experiment_results import PhotonsRecord, load_result, write_result
+from rangesim.sensors import IdealToF
 
 BROWSER = find_browser()
 CANVAS = (16, 21, 29)
@@ -419,3 +423,11 @@ def _browse(folder: Path, state: str, *options: str, console: bool = True, path:
     run = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert run.returncode == 0, run.stderr[-2000:]
     return run.stderr if console else run.stdout
+
+
+def test_ideal_sensors_alone_have_a_verdict_without_empty_paragraphs() -> None:
+    """They are equal in all that sensors are compared by side by side."""
+    instruments = (Instrument("one", IdealToF()), Instrument("two", IdealToF()))
+    result = carry_out(Experiment(str(SCENES / "plane.xml"), width=16, height=12, spp=1, instruments=instruments))
+    assert [f.text != "" for f in verdict(result.measurements)] == [True, True]
+    assert "Ideal time of flight" in render_report(result)

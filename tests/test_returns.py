@@ -13,7 +13,20 @@ from delta_scenes import matte, rig_of, scene_of, wall
 from scipy.stats import norm
 from synthetic import signals_of_depth
 
-from rangesim import Capture, DirectToF, Intrinsics, Rig, SpadDetector, Status, decode, expose, transport
+from rangesim import (
+    Beam,
+    Capture,
+    DirectToF,
+    Intrinsics,
+    RayTable,
+    Rig,
+    SpadDetector,
+    Status,
+    decode,
+    expose,
+    look_at,
+    transport,
+)
 from rangesim.decoding.returns import FoundReturns, PulseShape, ReturnRules, Returns, find_returns
 from rangesim.errors import FileFormatError
 from rangesim.response import SPEED_OF_LIGHT, Pulse
@@ -99,10 +112,16 @@ def test_returns_merge_at_sparrow_s_limit(sigmas: float, number: int) -> None:
         assert np.nanstd(error) < 1.25  # sigma holds for known places of the others
 
 
-def test_even_light_has_no_returns_and_one_pulse_has_one() -> None:
+@pytest.mark.parametrize("background", [0.05, 1.0, 20.0])
+@pytest.mark.parametrize("sigma_bins", [0.4, 3.0])
+def test_even_light_has_no_returns(background: float, sigma_bins: float) -> None:
+    """Also where so little is counted that five standard deviations are a few photons."""
+    counts = np.random.default_rng(1).poisson(np.full((BINS, 10_000), background))
+    assert np.isfinite(find_returns(counts, PulseShape.gaussian(sigma_bins), RULES).place).any(axis=0).mean() < 3e-4
+
+
+def test_one_strong_pulse_has_one_return() -> None:
     rng, shape = np.random.default_rng(1), PulseShape.gaussian(3.0)
-    even = find_returns(rng.poisson(np.full((BINS, 4000), 20.0)), shape, RULES)
-    assert np.isfinite(even.place).any(axis=0).mean() < 1e-3
     one = find_returns(rng.poisson(brought(shape, 50 + 100 * rng.random(4000), 1e5)), shape, RULES)
     assert (np.isfinite(one.place).sum(axis=0) == 1).all()
 
@@ -214,6 +233,25 @@ def test_what_is_rendered_at_an_edge_has_both_returns() -> None:
     np.testing.assert_allclose(returns.range_m[:, :, 2], [[1.0] * 3, [1.6] * 3], rtol=1e-3)
     np.testing.assert_allclose(returns.strength[0, :, 2], 0.3 * radiance, rtol=0.05)
     np.testing.assert_allclose(returns.strength[1, :, 2], 0.7 * radiance / 1.6**2, rtol=0.05)
+
+
+@pytest.mark.parametrize("profile", ["box", "gaussian"])
+def test_a_beam_that_an_edge_splits_has_two_returns(profile: Any) -> None:
+    """Parts of a beam by its profile, each returned with P / d^2: a scan over an edge, in fractions of the beam."""
+    field, places = 8e-3, np.array([-0.3, 0.0, 0.2])  # of the edge in the beam, in full widths
+    x = -places * field  # directions of the rays, whose middle is so far beside the edge at x = 0
+    directions = np.stack([x, np.zeros(3), np.ones(3)], axis=-1)[None]
+    camera = RayTable(directions, field_rad=(2 * field, 2 * field), acceptance="box")
+    rig = Rig(camera, Beam((field, field), profile), look_at((0, 0, 0), (0, 0, 1), (0, -1, 0)))
+    scene = scene_of(wall=wall(2.0, matte()), card=wall(1.0, matte(), half_size=0.5, x=-0.5))
+    sensor = DirectToF(pulse_fwhm_s=500e-12)
+    returns = decode(expose(transport(scene, rig, [sensor], spp=20_000, max_depth=2), sensor), DUAL).returns
+    assert returns is not None
+    assert (returns.number == 2).all()
+    np.testing.assert_allclose(returns.range_m[:, 0], [[1.0] * 3, [2.0] * 3], rtol=1e-3)
+    part = places + 0.5 if profile == "box" else norm.cdf(places * 4)  # widths at 1/e^2 are four standard deviations
+    expected = part / ((1 - part) / 2.0**2)
+    np.testing.assert_allclose(returns.strength[0, 0] / returns.strength[1, 0], expected, rtol=0.05)
 
 
 def test_returns_are_saved_with_their_image(tmp_path: Path) -> None:

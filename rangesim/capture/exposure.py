@@ -239,8 +239,11 @@ def _mean_radiance(
 
 
 def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:
-    """Frames (k, h, w) behind the camera's lens, which darkens the corners if it vignettes."""
-    return frames * rig.camera_illumination if rig.camera_lens.vignetting else frames
+    """Frames (k, h, w) behind the camera's lens, which darkens the corners if it vignettes, and for smaller pixels."""
+    if rig.camera.is_pinhole and not rig.camera_lens.vignetting:
+        return frames
+    fraction = rig.camera_illumination
+    return frames if (fraction == 1).all() else frames * fraction
 
 
 def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetector, rig: Rig) -> float:

@@ -99,6 +99,8 @@ class ReturnRules(NamedTuple):
 
     most : largest number of returns of a pixel; the strongest are kept.
     sigmas : least strength in standard deviations of what lies under it: the background, and the other returns' light.
+        A quarter of its square is added, in counts, because Poisson counts stray farther upwards: their square root has
+        the standard deviation 1/2 (Anscombe, Biometrika 35, 1948).
     counts : least strength, in counts (or the unit of the histogram).
     tolerance : least strength as a fraction of what the other returns bring to its place. The shape of a pulse is known
         no better, so that a weaker return is taken for an error of the shape.

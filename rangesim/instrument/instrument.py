@@ -13,7 +13,7 @@ import numpy as np
 
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.motion import Timing
-from rangesim.rig import CAMERA_LENS, PROJECTOR_LENS, Beam, Camera, CoverGlass, Intrinsics, Lens, Optics, pose
+from rangesim.rig import CAMERA_LENS, PROJECTOR_LENS, Beam, Camera, CoverGlass, Lens, Optics, pose
 from rangesim.sensors import Decoder, Sensor, check_sensor, is_file_name, sensor_from_dict
 from rangesim.settings.bounds import Metres, Seconds, Watts, Wavelength, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, on_top_of, shown, to_dict
@@ -118,7 +118,7 @@ class Instrument:
                 f"expected neither baseline_m nor T_camera_projector of instrument {self.name!r}, because its beam "
                 "starts at its ray; state offset_m of the beam."
             )
-        if self.camera is not None and not self.camera.is_pinhole and self.projector is None:
+        if self.camera is not None and not self.camera.traced.is_pinhole and self.projector is None:
             raise ValueError(
                 f"expected a projector of instrument {self.name!r}, such as a Beam, because its camera is no pinhole."
             )
@@ -154,7 +154,8 @@ class Instrument:
             width, height = self.width, self.height
         rig = scene.rig(
             baseline_m if self.baseline_m is None else self.baseline_m, size, self.power_w, width, height,
-            camera=self.camera if isinstance(self.camera, Intrinsics) else None, T_world_camera=self.T_world_camera,
+            camera=self.camera.traced if self.camera is not None and self.camera.traced.is_pinhole else None,
+            T_world_camera=self.T_world_camera,
         )  # fmt: skip
         T_camera_projector = rig.T_camera_projector if self.T_camera_projector is None else self.T_camera_projector
         return replace(

@@ -11,6 +11,7 @@ Almost no vertex of a camera path lies in the spot by chance, so light paths are
 1. The first vertex lies in the spot of its own beam. It is connected straight to the emitter.
 2. If the camera path came to its first vertex by delta interactions, the beam came the same way. Its irradiance follows
    from how the way spreads a pencil of rays (`Pencil`; Igehy, Tracing ray differentials, SIGGRAPH 1999).
+   If it comes back to the emitter itself, as from a mirror, this is glint.
 3. Every vertex is connected to a point of the spot (`Spot`), which a ray of the beam finds, by delta interactions if
    these are on its way (one light vertex of bidirectional path tracing: Veach 1997, chapter 10).
 """
@@ -186,6 +187,21 @@ def _normal_change(si: mi.SurfaceInteraction3f, step: mi.Vector3f) -> mi.Vector3
     return (si.dn_du * (vv * su - uv * sv) + si.dn_dv * (uu * sv - uv * su)) * inverse
 
 
+class SeenEmitter(NamedTuple):
+    """The emitter of a beam as a ray meets it.
+
+    meets : Bool, whether the ray meets it at all.
+    radiance : Float, 1/m2/sr, radiance per watt of the beam.
+    distance : Float, metres, from the start of the ray.
+    uv : Point2f, place within the beam, see `BeamDevice.uv`.
+    """
+
+    meets: mi.Bool
+    radiance: mi.Float
+    distance: mi.Float
+    uv: mi.Point2f
+
+
 class BeamDevice:
     """The beams of a rig as kernels see them, one for each pixel of the camera.
 
@@ -207,6 +223,7 @@ class BeamDevice:
         self.axes, self.right, self.down = (VectorTable(v @ rotation.T) for v in (axes, right, down))
         self.width = mi.Vector2f(*(dr.opaque(mi.Float, float(w)) for w in beam.divergence_rad))
         self.is_gaussian = beam.profile == "gaussian"
+        self.aperture = dr.opaque(mi.Float, rig.projector_lens.aperture_radius_m)
 
     def at(self, pixel: mi.UInt32) -> BeamAxis:
         """The beams of these pixels."""
@@ -254,6 +271,20 @@ class BeamDevice:
             fraction, _ = media.transmittance(scene, si, beam.origin, inside, in_beam)
             lit, geometry = in_beam & (fraction > 0), geometry * fraction
         return Connection(self.uv(place), to_emitter, distance, geometry, lit)
+
+    def glint(self, ray: mi.Ray3f, pixel: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool) -> SeenEmitter:
+        """The emitter of the pixel's own beam as a ray meets it, before the surface `si`.
+
+        The emitter is a disc across the axis, as large as its aperture, which looks evenly bright from each direction.
+        """
+        beam = self.at(pixel)
+        slope = -dr.dot(ray.d, beam.direction)
+        distance = dr.dot(mi.Vector3f(ray.o) - mi.Vector3f(beam.origin), beam.direction) / slope
+        off = dr.norm(mi.Vector3f(ray(distance)) - mi.Vector3f(beam.origin))
+        place, cosine = beam.tangents_of(-ray.d)
+        intensity = self.profile(place) / (cosine * dr.square(cosine))
+        meets = active & (slope > 0) & (distance > 0) & (distance < si.t) & (off < self.aperture) & (intensity > 0)
+        return SeenEmitter(meets, intensity / (np.pi * dr.square(self.aperture) * slope), distance, self.uv(place))
 
     def pencil(self, pixel: mi.UInt32, direction: mi.Vector3f) -> Pencil:
         """The pencil of the beam around rays that leave the emitter in these directions."""

@@ -27,8 +27,9 @@ from rangesim.light_transport.sampling_error import MIN_FOR_HALVES, Estimate
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.transport_settings import TransportSettings
 from rangesim.light_transport.truncation import estimate_truncation
+from rangesim.light_transport.zone_sums import ZoneSums
 from rangesim.response import Response
-from rangesim.rig import Beam, Camera, Intrinsics, Rig
+from rangesim.rig import Beam, Camera, Intrinsics, Rig, Zones
 from rangesim.scene import Scene
 from rangesim.scene.media import body_around, inside_out
 from rangesim.sensor import Sensor
@@ -49,6 +50,9 @@ RAYS_TO_MEDIA = 16
 """Number of columns, and of rows, of the rays that look for media on the wrong side of their boundary. These 256 rays
 may miss a body that covers less than one of the cells between them. More rays would find smaller bodies and take
 longer."""
+PLACES = 8
+"""Number of places along the way of a scanner at which it must be in air. A body that it crosses between two of them is
+not noticed; more places take more rays."""
 TEXTURE_SAMPLES = 64
 """Largest number of samples per pixel over which the reflectance of a texture is averaged. More samples take longer and
 change a mean over a pixel little, because samples are spread evenly."""
@@ -114,6 +118,8 @@ class _CameraPass:
         settings: TransportSettings,
         number: int,
     ) -> None:
+        self.zones = ZoneSums(rig, rig.camera.matrix) if isinstance(rig.camera, Zones) else None
+        rig = rig.traced
         self.scene, self.rig, self.here = scene, rig, scene.in_renderer(rig)
         self.settings = replace(settings, seed=derived_seed(settings.seed, number)) if number else settings
         self.traced = traced._replace(camera=camera_device(self.here))
@@ -175,7 +181,7 @@ class _CameraPass:
         pixels = np.arange(len(self.samples))
         estimate.sample(pixels, self.samples, partial(report_part, report, 0.0, PATHS_FRACTION - left))
         if sampler and sampler.most_spp > fewest:
-            more = sampler.samples(self.truth, signals_of).ravel() - self.samples
+            more = self._samples(sampler, signals_of).ravel() - self.samples
             pixels = np.flatnonzero(more)
             if len(pixels):
                 estimate.sample(pixels, more[pixels], partial(report_part, report, PATHS_FRACTION - left, left))
@@ -183,7 +189,15 @@ class _CameraPass:
         report(1.0)
         cut = photons.energy.cut if photons else 0.0
         truncation = estimate_truncation(estimate.mean_tally(), signals.energy, settings.max_depth, cut)
-        return replace(signals, truncation=truncation)
+        signals = replace(signals, truncation=truncation)
+        return signals if self.zones is None else self.zones.signals(signals)
+
+    def _samples(self, sampler: Sampler, signals_of: Callable[[Sequence[Response] | None], StillSignals]) -> np.ndarray:
+        """Number of samples of each pixel, (h, w); for zones, so many that the zones' readings need no more."""
+        zones = self.zones
+        if zones is None:
+            return sampler.samples(self.truth, signals_of)
+        return zones.spread(sampler.samples(zones.truth(self.truth), lambda some: zones.signals(signals_of(some))))
 
 
 def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Glint | None) -> EnergySplit:
@@ -198,7 +212,7 @@ def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Gl
         multipath=radiance.multipath,
         specular=radiance.specular,
         caustic=radiance.caustic + radiance.smooth_caustic,
-        glint=highlights[0],
+        glint=highlights[0] + radiance.glint,
         ambient=radiance.ambient,
     )
 
@@ -237,7 +251,8 @@ def _check_in_air(scene: Scene, rig: Rig) -> None:
     if isinstance(rig.projector, Intrinsics):
         devices.append(("projector", rig.projector, T_camera @ rig.T_camera_projector))
     for name, device, T in devices:
-        body = body_around(scene.mitsuba, T[:3, 3])
+        bodies = (body_around(scene.mitsuba, place) for place in _places(device, T))
+        body = next((body for body in bodies if body is not None), None)
         if body is not None:
             raise ValueError(
                 f"expected the {name} to stand in air, but it is inside the medium of shape {body!r}; move it out, or "
@@ -255,6 +270,15 @@ def _check_in_air(scene: Scene, rig: Rig) -> None:
                     f"expected a body that holds the exterior medium of shape {shape!r}, but none is around it, so "
                     f"the {name} would stand in that medium; put one in front of it, or leave the medium out."
                 )
+
+
+def _places(device: Camera, T: np.ndarray) -> np.ndarray:
+    """(n, 3) float64, metres, where rays start: the device's place T, and places of a scanner that moves."""
+    if isinstance(device, Intrinsics) or device.times_s is None:
+        return T[None, :3, 3]
+    origins = device.pixel_rays().origins.reshape(-1, 3)
+    some = origins[np.linspace(0, len(origins) - 1, min(len(origins), PLACES)).astype(int)]
+    return np.vstack([T[None, :3, 3], some @ T[:3, :3].T + T[:3, 3]])
 
 
 def _directions_over(device: Camera) -> np.ndarray:

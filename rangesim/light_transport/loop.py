@@ -49,7 +49,7 @@ from rangesim.light_transport.strategies import beam_connects, can_be_vertex, is
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.transport_settings import TransportSettings
 from rangesim.light_transport.truncation import Tally
-from rangesim.response import DIRECT, MULTIPATH, SPECULAR, LightPath
+from rangesim.response import DIRECT, GLINT, MULTIPATH, SPECULAR, LightPath
 from rangesim.scene import Scene
 
 NEIGHBOURS = 256
@@ -72,6 +72,7 @@ class PathSettings(NamedTuple):
 
     seed : Seed. max_depth, rr_depth : UInt32, see `TransportSettings`.
     delta : whether some surface of the scene has a delta interaction.
+    glint : whether beams that come back to their own emitter count.
     ambient : whether the scene has light of its own.
     samples_ambient : whether directions to that light are sampled. For uniform surroundings, samples of the BSDF alone
         are best.
@@ -81,6 +82,7 @@ class PathSettings(NamedTuple):
     max_depth: mi.UInt32
     rr_depth: mi.UInt32
     delta: bool
+    glint: bool
     ambient: bool
     samples_ambient: bool
 
@@ -92,6 +94,7 @@ class PathSettings(NamedTuple):
             max_depth=dr.opaque(mi.UInt32, settings.max_depth),
             rr_depth=dr.opaque(mi.UInt32, settings.rr_depth),
             delta=has_delta(scene.mitsuba),
+            glint=settings.glint,
             ambient=scene.has_ambient,
             samples_ambient=scene.has_lamps,
         )
@@ -151,12 +154,14 @@ class Radiance(Generic[Array]):
     ambient: Array
     smooth_caustic: Array
     """Caustics that were gathered over wide circles and are therefore smooth; `caustic` has the others."""
+    glint: Array
+    """Glint of a beam, whose emitter the paths of its own pixel meet; that of a projector is traced in `glint.py`."""
 
 
 class PathSums(NamedTuple):
     """Sums over the samples of each pixel, besides channels.
 
-    radiance : (6, n) float32, in the order of the fields of `Radiance`.
+    radiance : (7, n) float32, in the order of the fields of `Radiance`.
     tally : (6, n) float32, in the order of the fields of `Tally`.
     """
 
@@ -289,7 +294,7 @@ def trace(
 
 
 def _store(sums: Radiance[mi.Float] | Tally[mi.Float], images: np.ndarray, places: np.ndarray) -> None:
-    """Write the evaluated sums of lanes to `images` (6, n) at these places; 0 where there are none."""
+    """Write the evaluated sums of lanes to `images` (k, n) at these places; 0 where there are none."""
     for image, field in zip(images, fields(sums), strict=True):
         values = getattr(sums, field.name)
         image[places] = 0 if values is None else values.numpy()
@@ -378,6 +383,7 @@ def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes:
             caustic=zeros(gathers),
             ambient=zeros(settings.ambient),
             smooth_caustic=zeros(gathers),
+            glint=zeros(settings.glint and is_beam and settings.delta),
         ),
         tally=Tally(
             first=zeros(),
@@ -405,6 +411,7 @@ def walk(
     n = dr.width(state.sample)
     is_beam = isinstance(projector, BeamDevice)
     has_spot, has_pencil = state.path.spot is not None, state.path.pencil is not None
+    sees_glint = state.radiance.glint is not None
     flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if has_pencil else mi.RayFlags.All
     left = max_iterations + dr.zeros(mi.UInt32, n)  # iterations
     active = (state.sample < lanes.samples) & (left > 0)
@@ -460,6 +467,7 @@ def walk(
         else:
             arrives = mi.Bool(True)
             path.depth += 1
+        started, arrived = path.ray_state.length, dr.select(arrives, mi.UInt32(1), mi.UInt32(0))
         path.ray_state.length = path.ray_state.length_to(si.p, hit)
         if dr.hint(absorbers is not None, mode="scalar"):
             unabsorbed = path.ray_state.unabsorbed(traced, si.p, hit)
@@ -472,6 +480,20 @@ def walk(
             path.pencil = path.pencil.arrived(ray.d, dr.norm(si.p - path.ray_state.previous), si.n)
         bsdf = si.bsdf(ray)
         is_vertex = hit & (path.depth < settings.max_depth) & (scatters | can_be_vertex(bsdf))
+
+        # ---- The ray meets the emitter of its own beam ------------------------------------------------
+        if dr.hint(sees_glint, mode="scalar"):
+            assert isinstance(projector, BeamDevice)
+            comes_back = active & (path.depth == arrived) & (path.chain > 0)
+            seen = projector.glint(ray, lanes.pixel, si, comes_back)
+            light = dr.select(seen.meets, path.throughput * seen.radiance * lanes.irradiance, 0)
+            u, v = (dr.select(seen.meets, x, 0) for x in (seen.uv.x, seen.uv.y))
+            path_length = dr.select(seen.meets, dr.fma(path.ray_state.ior, seen.distance, started), 0)
+            light_path = LightPath(u, v, path_length, mi.Bool(False), mi.UInt32(GLINT))
+            state.channels = accumulators.add(
+                state.channels, light_path, light, lanes.place, seen.meets, mi.Bool(False)
+            )
+            radiance.glint += light
 
         # ---- Throughput that tells what is left out when paths end: see `truncation` -------------------
         arriving = dr.select(is_vertex & arrives, path.throughput, 0)

@@ -36,7 +36,7 @@ class Sums:
 
     channels : response -> (c, h, w) float32.
     smooth : the same for smooth light, if it is kept apart; else empty.
-    radiance : (6, h, w) float32, W/m2/sr, in the order of the fields of `Radiance`.
+    radiance : (7, h, w) float32, W/m2/sr, in the order of the fields of `Radiance`.
     """
 
     def __init__(self, h: int, w: int) -> None:
@@ -225,7 +225,6 @@ class Estimate:
 
 
 def projector_light(radiance: Radiance) -> np.ndarray:
-    """(h, w) float32, W/m2/sr, all light of the projector but glint."""
-    return np.asarray(
-        radiance.direct + radiance.multipath + radiance.specular + radiance.caustic + radiance.smooth_caustic
-    )
+    """(h, w) float32, W/m2/sr, all light of the projector but the glint of `glint.py`."""
+    straight = radiance.direct + radiance.multipath + radiance.specular
+    return np.asarray(straight + radiance.caustic + radiance.smooth_caustic + radiance.glint)

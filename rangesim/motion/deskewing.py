@@ -14,7 +14,11 @@ from rangesim.rig import pose
 
 
 def deskewed(
-    cloud: PointCloud, track: Track, T_world_camera: ArrayLike | None = None, moment_s: float = 0.0
+    cloud: PointCloud,
+    track: Track,
+    T_world_camera: ArrayLike | None = None,
+    moment_s: float = 0.0,
+    start_s: float = 0.0,
 ) -> PointCloud:
     """The cloud without the distortion that the scanner's own motion causes (de-skewing, motion compensation).
 
@@ -29,7 +33,9 @@ def deskewed(
         poses T_world_camera(t), give a `PoseTrack` of them and leave `T_world_camera` out.
     T_world_camera : (4, 4) float, metres, pose of the rig as it stands; None: the identity. It does not matter for a
         cloud in world coordinates.
-    moment_s : seconds, the moment in whose camera coordinates the result is, on the clock of `track` and `time_s`.
+    moment_s : seconds after the start of the scan, on the clock of `time_s`: the moment in whose camera coordinates the
+        result is.
+    start_s : seconds on the track's clock at which `time_s` is 0.
 
     Returns
     -------
@@ -58,10 +64,10 @@ def deskewed(
     if (cloud.valid & ~known).any():
         raise ValueError("expected a time for each finite point, got points whose time_s is not finite.")
     times, place = np.unique(np.where(known, cloud.time_s, moment_s), return_inverse=True)
-    moves = track.poses_at(times)
+    moves = track.poses_at(start_s + times)
     if cloud.coordinates == "camera":
         rig = np.eye(4) if T_world_camera is None else pose(T_world_camera, "T_world_camera")
-        moves = np.linalg.inv(track.at(moment_s) @ rig) @ moves @ rig
+        moves = np.linalg.inv(track.at(start_s + moment_s) @ rig) @ moves @ rig
     rotations, translations = moves[:, :3, :3][place], moves[:, :3, 3][place]
     shape = cloud.points.shape
     rotations, translations = rotations.reshape(*shape, 3), translations.reshape(shape)

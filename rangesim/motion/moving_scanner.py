@@ -3,27 +3,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from rangesim.decoding.range_image import RangeImage
-from rangesim.motion.pose_tracks import Track
+from rangesim.motion.pose_tracks import Motion, Track
+from rangesim.motion.timing import Timing
 from rangesim.rig import Beam, MovingCamera, Rig
+from rangesim.sensor import Sensor
 
 
-def moving_scanner(rig: Rig, track: Track) -> Rig:
+def moving_scanner(rig: Rig, track: Track, start_s: float = 0.0) -> Rig:
     """The rig of a scanner that moves along a track during its scan; a still scene takes one pass, however it moves.
 
     Its camera is a `MovingCamera`: the rays of the scanner, each from where it is measured. So range images of this rig
-    know the motion, and their clouds are de-skewed, in the coordinates of the scanner at time 0. `as_reported` gives
+    know the motion, and their clouds are de-skewed, in the coordinates of the scanner at the start. `as_reported` gives
     what the scanner itself would report.
 
     Parameters
     ----------
     rig : Rig without motion, whose camera has times, such as `Spinning`, and whose emitter is a `Beam`.
-    track : motion of the rig as in `Motion.rig`: world transforms T(t), applied to the rig as it stands. Its clock
-        starts with the scan.
+    track : motion of the rig as in `Motion.rig`: world transforms T(t), applied to the rig as it stands.
+    start_s : seconds on the track's clock at which the scan starts.
 
     Raises
     ------
@@ -47,9 +50,31 @@ def moving_scanner(rig: Rig, track: Track) -> Rig:
             f"expected a Beam as the emitter of a scanner that moves, got {type(rig.projector).__name__}: only a beam "
             "moves with the rays."
         )
-    start = track.at(0.0) @ rig.T_world_camera
-    poses = np.linalg.inv(start) @ track.poses_at(np.unique(times)) @ rig.T_world_camera
+    start = track.at(start_s) @ rig.T_world_camera
+    poses = np.linalg.inv(start) @ track.poses_at(start_s + np.unique(times)) @ rig.T_world_camera
     return replace(rig, camera=MovingCamera(rig.camera, poses), T_world_camera=start)
+
+
+def on_its_way(rig: Rig, timings: Mapping[Sensor, Timing], motion: Motion) -> tuple[Rig, Motion]:
+    """A rig and the motion that is left for it: a scanner takes the motion of the rig into its rays.
+
+    Other cameras and their motion are returned as they are.
+
+    Raises
+    ------
+    ValueError
+        The camera scans, and a sensor has several exposures, or the timings do not start together.
+    """
+    if rig.camera.times_s is None or (motion.rig is None and not motion.objects):
+        return rig, motion
+    for sensor, timing in timings.items():
+        timing.check_scan(sensor)
+    starts = {timing.start_s for timing in timings.values()}
+    if len(starts) > 1:
+        raise ValueError(f"expected one start_s for all sensors of a scan, got {', '.join(map(str, sorted(starts)))}.")
+    if motion.rig is None:
+        return rig, motion
+    return moving_scanner(rig, motion.rig, starts.pop()), Motion(motion.objects)
 
 
 def as_reported(image: RangeImage) -> RangeImage:

@@ -10,7 +10,7 @@ import numpy as np
 
 from rangesim.motion.pose_tracks import Motion, Poses
 from rangesim.motion.timing import Instant, Timing, Window
-from rangesim.rig import Rig
+from rangesim.rig import Beam, Rig
 from rangesim.sensor import Sensor
 from rangesim.settings.seeds import derived_seed
 
@@ -53,16 +53,13 @@ class Pass:
 
     def rig(self, rig: Rig) -> Rig:
         """The rig at its place in this pass, with its camera cropped to the window."""
-        camera, window = rig.camera, self.window
+        camera, projector, window = rig.camera, rig.projector, self.window
         if window != Window.whole(camera):
-            camera = replace(
-                rig.pinhole,
-                width=window.right - window.left,
-                height=window.bottom - window.top,
-                cx=rig.pinhole.cx - window.left,
-                cy=rig.pinhole.cy - window.top,
-            )
-        return replace(rig, camera=camera, T_world_camera=self.poses.place(rig))
+            camera = camera.cropped(*window)
+            if isinstance(projector, Beam) and projector.directions is not None:
+                rows, columns = slice(window.top, window.bottom), slice(window.left, window.right)
+                projector = replace(projector, directions=projector.directions[rows, columns])
+        return replace(rig, camera=camera, projector=projector, T_world_camera=self.poses.place(rig))
 
     def seed(self, seed: int) -> int:
         """Seed of this pass, for a seed of the whole acquisition.

@@ -53,6 +53,9 @@ class Timing:
     frames share an exposure. Each pattern of structured light has its own exposure. All bins of a direct time-of-flight
     camera share one. The four taps of an AMCW frequency share one too, but with `single_tap` each tap has its own.
 
+    A camera whose rays have times of their own, such as `rangesim.rig.Spinning`, starts its scan at start_s. It takes
+    sensors of one exposure.
+
     Parameters
     ----------
     frame_period_s : float >= 0, seconds from one exposure to the next.
@@ -61,7 +64,8 @@ class Timing:
         scanning beam: a beam would light one line at a time with its full power, without multipath from other lines.
     lines : "rows" from top to bottom, or "columns" from left to right.
     bands : int >= 1, number of bands of lines (fewer if there are fewer lines), if lines are read one by one. Each band
-        is a pass of its own, rendered at the time of its middle line.
+        is a pass of its own, rendered at the time of its middle line. For a camera whose rays have times: of columns
+        or rows that are measured about the same time, if objects move; motion of the rig needs no bands there.
     single_tap : bool, whether an AMCW camera takes its taps one after another. This sets the times of the taps, not
         their signal: a tap has the light that `AmcwToF` gives it, a quarter of an exposure. A real pixel with a single
         tap collects half of the light of an exposure, which is twice as much.
@@ -117,6 +121,8 @@ class Timing:
         It is halfway between the first line of the first exposure and the last line of the last exposure.
         """
         times = self.exposure_times_s(sensor)
+        if camera.times_s is not None:
+            return float(times[0] + 0.5 * (camera.times_s.min() + camera.times_s.max()))
         return float(0.5 * (times[0] + times[-1] + self.line_period_s * (self._lines(camera) - 1)))
 
     def instants(self, exposure_time_s: float, camera: Camera) -> list[Instant]:
@@ -124,6 +130,8 @@ class Timing:
 
         exposure_time_s : seconds, middle of the exposure in line 0.
         """
+        if camera.times_s is not None:
+            return self._scan(exposure_time_s, camera.times_s)
         n, whole = self.exposure_samples, Window.whole(camera)
         offsets = [self.exposure_s * ((i + 0.5) / n - 0.5) for i in range(n)]
         if self.line_period_s == 0:
@@ -137,6 +145,31 @@ class Timing:
             middle = exposure_time_s + self.line_period_s * 0.5 * (begin + end - 1)
             result += [Instant(middle + offset, window, 1 / n) for offset in offsets]
         return result
+
+    def _scan(self, start_s: float, times: Array) -> list[Instant]:
+        """Moments of the bands of a scan whose rays have times (h, w) after its start."""
+        by_columns = np.ptp(times.mean(axis=0)) >= np.ptp(times.mean(axis=1))
+        count = times.shape[1 if by_columns else 0]
+        edges = np.linspace(0, count, min(self.bands, count) + 1).round().astype(int)
+        result = []
+        for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            whole = Window(0, times.shape[0], 0, times.shape[1])
+            window = whole._replace(left=begin, right=end) if by_columns else whole._replace(top=begin, bottom=end)
+            inside = window.of(times)
+            result.append(Instant(start_s + 0.5 * float(inside.min() + inside.max()), window, 1.0))
+        return result
+
+    def check_scan(self, sensor: Sensor) -> None:
+        """Raise ValueError if a camera whose rays have times cannot take a sensor's frames with this timing."""
+        if len(self.exposure_times_s(sensor)) > 1:
+            raise ValueError(
+                f"expected a sensor that takes all frames in one exposure for a camera that scans, got {sensor}."
+            )
+        if self.line_period_s or self.exposure_samples > 1:
+            raise ValueError(
+                "expected a timing without line_period_s and exposure_samples for a camera that scans: its rays have "
+                "times of their own."
+            )
 
     def _lines(self, camera: Camera) -> int:
         return camera.height if self.lines == "rows" else camera.width

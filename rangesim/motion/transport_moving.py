@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Unpack
 
+from rangesim.motion.moving_scanner import on_its_way
 from rangesim.motion.moving_signals import FrameStack
 from rangesim.motion.passes import plan
 from rangesim.motion.pose_tracks import Motion
@@ -41,7 +42,8 @@ def transport_moving(
     Parameters
     ----------
     scene : Scene of `load_scene`; it is not changed.
-    rig : Rig without motion.
+    rig : Rig without motion. If its rays have times (`rangesim.rig.Spinning`), they move with the rig in one pass, and
+        the result is in the coordinates of the scanner at the start (`moving_scanner`).
     timings : sensor -> Timing, the times of its frames.
     motion : Motion, the tracks of objects and rig.
     settings : TransportSettings of each pass; None: the defaults. AdaptiveSampling is refused: passes would sample the
@@ -82,6 +84,7 @@ def transport_moving(
     from rangesim.scene.rigid_motion import MovingScene
 
     _check(scene, rig, timings, motion)
+    rig, motion = on_its_way(rig, timings, motion)
     settings = with_options(settings, options)
     kinds: list[dict[Sensor, Timing]] = []  # sensors that share all cameras
     for sensor, timing in timings.items():
@@ -104,8 +107,8 @@ def transport_moving(
         raise ValueError(
             f'expected a number of samples or "auto" where something moves, got {type(settings.spp).__name__}.'
         )
-    passes = plan(rig, timings, motion)
     stage = MovingScene(scene, tuple(motion.objects))
+    passes = plan(rig, timings, motion)
     at_once: dict[Sensor, list[StillSignals]] = {}
     stacks: dict[Sensor, list[FrameStack]] = {}
     for number, one in enumerate(passes):

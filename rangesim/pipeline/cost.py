@@ -216,12 +216,15 @@ def _traced_pixels(experiment: Experiment, rig: Rig, instruments: Sequence[Instr
     If something moves, each frame has a pass, which renders only the window where something changes.
     """
     if experiment.motion is None:
-        return rig.camera.width * rig.camera.height, 1
+        return rig.traced.camera.width * rig.traced.camera.height, 1
+    from rangesim.motion.moving_scanner import on_its_way
     from rangesim.motion.passes import plan
 
-    planned = [
-        p for instrument in instruments for p in plan(rig, {instrument.sensor: instrument.timing}, experiment.motion)
-    ]
+    planned = []
+    for instrument in instruments:
+        timings = {instrument.sensor: instrument.timing}
+        moving, motion = on_its_way(rig, timings, experiment.motion)
+        planned += plan(moving, timings, motion)
     windows = [p.window for p in planned]
     return sum((w.bottom - w.top) * (w.right - w.left) for w in windows), len(planned)
 
@@ -241,7 +244,7 @@ def _tracing_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int)
     """Bytes of the arrays of a pass that exist at once, at the peak: while it is traced or its frames are exposed."""
     at_once = 0.0
     for rig, instruments in passes:
-        pixels = rig.camera.width * rig.camera.height * instruments[0].sensor.n_cameras
+        pixels = rig.traced.camera.width * rig.traced.camera.height * instruments[0].sensor.n_cameras
         responses = dict.fromkeys(r for instrument in instruments for r in instrument.sensor.responses())
         channels = sum(r.channels for r in responses)
         tiles = min(TRANSPORT_BYTES, pixels * (LANE_BYTES + 2 * 4 * channels))  # indirect light has its own channels
@@ -264,7 +267,7 @@ def _timed_trial(
     """
     from rangesim.instrument.transport import transport
 
-    rig, instruments = one_pass
+    rig, instruments = one_pass[0].traced, one_pass[1]
     small = TRIAL_WIDTH, max(1, round(TRIAL_WIDTH * rig.camera.height / rig.camera.width))
     camera = (
         rig.camera.resized(*small) if isinstance(rig.camera, Intrinsics) else RayTable.of(rig.camera).thinned(*small)

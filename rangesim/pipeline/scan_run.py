@@ -32,6 +32,7 @@ from rangesim.triangle_mesh import TriangleMesh
 if TYPE_CHECKING:
     from rangesim.decoding.range_image import RangeImage
     from rangesim.pipeline.cost import Cost
+    from rangesim.rig import Rig
     from rangesim.scene import Scene
 
 MAX_COMPARED_VOXELS = 1_000_000
@@ -87,6 +88,15 @@ def run_scan(
     return result
 
 
+def check_fusible(rig: Rig) -> None:
+    """Raise ValueError unless the camera is a pinhole, whose range images can be fused to a surface."""
+    if not rig.camera.is_pinhole:
+        raise ValueError(
+            f"expected a pinhole camera for a scan, whose views are fused to a surface, got a "
+            f"{type(rig.camera).__name__}; rangesim.scan and rangesim.transport give the views of other cameras alone."
+        )
+
+
 def estimate_scan(settings: ScanSettings) -> Cost:
     """Estimated cost of `run_scan` in light paths, memory, time and space on the disk.
 
@@ -100,6 +110,7 @@ def estimate_scan(settings: ScanSettings) -> Cost:
     from rangesim.scene import load_scene
 
     scene = load_scene(settings.scene, material=settings.material, unit_m=settings.unit_m)
+    check_fusible(settings.instrument.rig(scene, settings.width, settings.height))
     return estimate_scan_cost(settings, scene)
 
 
@@ -135,6 +146,7 @@ def carry_out_scan(
         if settings.ambient is not None:
             settings.ambient.check_emitters(scene.has_ambient)
         rig = settings.instrument.rig(scene, settings.width, settings.height)
+        check_fusible(rig)
         surfaces = true_surfaces(scene)
     cost = estimate_scan_cost(settings, scene, trial=announce is not None)
     cost.check_memory()

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from rangesim.decoding.working_range import Nearest
-from rangesim.rig import Intrinsics, look_at, translation
+from rangesim.rig import Camera, Fisheye, Intrinsics, look_at, translation
 from rangesim.settings.bounds import Bounds, Coordinate, Metres, PositiveFraction, check_fields, whole
 from rangesim.settings.config import to_dict
 
@@ -83,6 +83,8 @@ class DataSheet:
     resolution_px : pixels of the range image across and down; of a scanner, directions.
     field_of_view_deg : degrees, full angles of the field of view across and down.
     range_m : metres, nearest and farthest reading.
+    projection : "pinhole", or "equidistant" for a wide lens whose angle grows evenly with the distance from the middle
+        of the image. Other cameras are stated with the instrument.
     range_along : "z" if the range is the depth along the optical axis, "ray" if it is the distance along the ray.
     emitter_offset_m : metres, place of the emitter in the camera's frame (x right, y down, z forward). None: as the
         instrument says.
@@ -99,8 +101,7 @@ class DataSheet:
     Examples
     --------
     >>> sheet = DataSheet((640, 576), (75.0, 65.0), (0.5, 3.86))
-    >>> camera = sheet.camera
-    >>> round(camera.fx, 1), round(camera.fy, 1)  # half of the pixels over the tangent of half of the angle
+    >>> round(sheet.camera.fx, 1), round(sheet.camera.fy, 1)  # half of the pixels over the tangent of half of the angle
     (417.0, 452.1)
     >>> sheet.settings()["decoder"]
     {'working_range': {'near_m': 0.5, 'far_m': 3.86, 'along': 'z'}}
@@ -109,6 +110,7 @@ class DataSheet:
     resolution_px: tuple[Annotated[int, whole(1, "pixels")], Annotated[int, whole(1, "pixels")]]
     field_of_view_deg: tuple[Degrees, Degrees]
     range_m: tuple[Nearest, Metres]
+    projection: Literal["pinhole", "equidistant"] = "pinhole"
     range_along: Literal["z", "ray"] = "z"
     emitter_offset_m: tuple[Coordinate, Coordinate, Coordinate] | None = None
     emitter_field_of_view_deg: tuple[Degrees, Degrees] | None = None
@@ -122,9 +124,12 @@ class DataSheet:
             raise ValueError(f"expected range_m as nearest, farthest, got {self.range_m}.")
 
     @property
-    def camera(self) -> Intrinsics:
-        """The pinhole camera with this resolution and field of view."""
-        return pinhole(self.resolution_px, self.field_of_view_deg)
+    def camera(self) -> Camera:
+        """The camera with this resolution, field of view and projection, and the principal point in the middle."""
+        if self.projection == "pinhole":
+            return pinhole(self.resolution_px, self.field_of_view_deg)
+        (width, height), (across, down) = self.resolution_px, self.field_of_view_deg
+        return Fisheye(width, height, width / math.radians(across), height / math.radians(down), width / 2, height / 2)
 
     def settings(self, has_camera: bool = False) -> dict[str, Any]:
         """Settings of an `Instrument` that follow from the sheet, as plain data.
@@ -134,7 +139,7 @@ class DataSheet:
 
         Parameters
         ----------
-        has_camera : whether the instrument states its own camera, which then replaces the pinhole.
+        has_camera : whether the instrument states its own camera, which then replaces that of the sheet.
         """
         near_m, far_m = self.range_m
         result: dict[str, Any] = {
@@ -163,7 +168,7 @@ def pinhole(resolution_px: tuple[int, int], field_of_view_deg: tuple[float, floa
     if max(field_of_view_deg) > MAX_PINHOLE_DEG:
         raise ValueError(
             f"expected a field of view of at most {MAX_PINHOLE_DEG:g} degrees for a pinhole, got {field_of_view_deg}; "
-            "state the camera of the instrument."
+            "state another projection, or the camera of the instrument."
         )
     (width, height), (across, down) = resolution_px, field_of_view_deg
     fx, fy = (0.5 * n / math.tan(math.radians(a) / 2) for n, a in ((width, across), (height, down)))

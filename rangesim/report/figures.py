@@ -13,8 +13,9 @@ from rangesim.capture import Captured
 from rangesim.decoding.range_image import RangeImage
 from rangesim.files.image_files import PNG_STRATEGY
 from rangesim.report import palette
+from rangesim.report.panorama import of_directions, panorama
 from rangesim.results.experiment_results import Measurement
-from rangesim.rig.scan_patterns import column_shifts
+from rangesim.rig import Camera
 from rangesim.signals import EnergySplit, GroundTruth
 
 GAMMA = 2.2
@@ -114,44 +115,38 @@ def color_bar(table: np.ndarray) -> str:
     return png(np.arange(256, dtype=np.uint8)[None], table)
 
 
-def scene_picture(energy: EnergySplit) -> Picture:
+def scene_picture(energy: EnergySplit, camera: Camera) -> Picture:
     """Picture of the scene in its own light, or in the emitter's light if it has none."""
     own = bool(energy.ambient.max() > 0)
     image = energy.ambient if own else energy.projector
     light = "in its own light" if own else "lit by the emitter (it has no light of its own)"
-    return Picture(grey(image, _bright(image)), f"The scene from the camera, {light}.", "the scene")
+    shown = panorama(camera).picture(image, 0.0)
+    return Picture(grey(shown, _bright(image)), f"The scene from the camera, {light}.", "the scene")
 
 
-def material_picture(truth: GroundTruth) -> tuple[Picture, list[LegendEntry]]:
+def material_picture(truth: GroundTruth, camera: Camera) -> tuple[Picture, list[LegendEntry]]:
     """Picture of the material class of each pixel, and its legend."""
     classes = np.where(truth.material >= 0, truth.material, len(truth.material_names)).astype(np.uint8)
     colors = [palette.MATERIAL_COLORS.get(n, palette.NO_DATA) for n in truth.material_names]
     table = np.array([*colors, palette.NO_DATA], dtype=np.uint8)
     names = [*truth.material_names, "nothing"]
     caption = "Material class of the first surface behind each pixel."
-    return Picture(png(classes, table), caption, "material classes"), _legend(classes, names, table)
+    shown = panorama(camera).picture(classes, len(truth.material_names))
+    return Picture(png(shown, table), caption, "material classes"), _legend(classes, names, table)
 
 
 def depth_map(measurement: Measurement, limits: tuple[float, float], table: np.ndarray) -> str:
-    """PNG, as a data URI, of the measured depths.
+    """PNG, as a data URI, of the measured depths, or of the ranges of a camera that is no pinhole.
 
     limits : depths, in metres, at the ends of the colour table.
     """
     low, high = limits
-    return color_map((measurement.image.z - low) / (high - low), table)
-
-
-MAX_STRIP = 3.0
-"""Largest ratio of width to height of the picture of a turn; a longer one is cut into strips, one below the other. With
-3, a turn of 64 rings over 45 degrees and 1024 columns becomes two strips of 512 pixels, as wide as other maps."""
-MAX_ROW_REPEATS = 8
-"""Largest number of pixel rows per ring in the picture of a turn: a scanner of few rings still has stripes then."""
+    fraction = (measurement.image.reading_m - low) / (high - low)
+    return color_map(panorama(measurement.camera).picture(fraction, np.nan), table)
 
 
 def unrolled(ranges: np.ndarray, directions: np.ndarray) -> Picture:
-    """Picture of a turn of a scanner, unrolled: a row for each ring, the highest at the top, a column per direction.
-
-    Columns follow each other as the scanner turned. A long picture is cut into strips, one below the other.
+    """Picture of the ranges of a scanner as a panorama: azimuth from left to right, elevation upwards.
 
     Parameters
     ----------
@@ -164,49 +159,29 @@ def unrolled(ranges: np.ndarray, directions: np.ndarray) -> Picture:
     >>> from rangesim.rig.scan_patterns import spinning
     >>> rays = spinning(np.radians([10.0, 0.0, -10.0]), columns=360, period_s=0.1, first_azimuth_rad=-np.pi)
     >>> unrolled(np.ones((3, 360)), rays.directions).caption
-    'Range over a turn of the scanner, unrolled: 3 rings, 360° from azimuth -180°, 1.0 m (dark) to 1.0 m (bright).'
+    'Range over azimuth and elevation, 1.0 m (dark) to 1.0 m (bright).'
     """
-    shifts = column_shifts(directions)
-    rows = np.argsort(-np.arcsin(np.clip(-directions[..., 1], -1, 1)).mean(axis=1), kind="stable")
-    source = (np.arange(ranges.shape[1]) - shifts[:, None]) % ranges.shape[1]
-    image = np.take_along_axis(ranges, source, axis=1)[rows].astype(np.float64)
-    repeats = _rows_per_ring(directions)
-    image = np.log(np.where(image > 0, image, np.nan)).repeat(repeats, axis=0)
-    strips = 1
-    while image.shape[1] / strips > MAX_STRIP * image.shape[0] * strips:
-        strips += 1
-    padded = np.pad(image, ((0, 0), (0, -image.shape[1] % strips)), constant_values=np.nan)
-    gap = np.full((2, padded.shape[1] // strips), np.nan)
-    parts = [part for strip in np.split(padded, strips, axis=1) for part in (strip, gap)][:-1]
-    folded = np.concatenate(parts)
-    measured = np.isfinite(folded).any()
-    azimuths = np.unwrap(np.arctan2(directions[shifts.argmin(), :, 0], directions[shifts.argmin(), :, 2]))
-    first, arc = np.degrees((azimuths[0], (azimuths[-1] - azimuths[0]) * len(azimuths) / max(len(azimuths) - 1, 1)))
-    low, high = np.exp(np.nanpercentile(folded, [1, 99])) if measured else (np.nan, np.nan)
-    caption = f"Range over a turn of the scanner, unrolled: {len(ranges)} rings, {arc:.0f}° from azimuth {first:.0f}°"
-    caption += f", {low:.1f} m (dark) to {high:.1f} m (bright)." if measured else ", no reading."
-    fraction = _stretched(folded) if measured else folded
-    return Picture(png(*_indexed(fraction, palette.color_table("viridis"))), caption, "the turn, unrolled")
-
-
-def _rows_per_ring(directions: np.ndarray) -> int:
-    """Pixel rows per ring for which angles are about as large upwards as sideways."""
-    if min(directions.shape[:2]) < 2:
-        return MAX_ROW_REPEATS
-    upwards = np.abs(np.diff(np.sort(np.arcsin(np.clip(directions[:, 0, 1], -1, 1))))).mean()
-    sideways = np.linalg.norm(np.diff(directions[:1], axis=1), axis=-1).mean()
-    return int(np.clip(np.rint(upwards / max(sideways, 1e-12)), 1, MAX_ROW_REPEATS))
+    values = np.log(np.where(ranges > 0, ranges, np.nan).astype(np.float64))
+    shown = of_directions(np.ascontiguousarray(directions, dtype=np.float64)).picture(values, np.nan)
+    caption = "Range over azimuth and elevation, no reading."
+    if np.isfinite(shown).any():
+        low, high = np.exp(np.nanpercentile(shown, [1, 99]))
+        caption = f"Range over azimuth and elevation, {low:.1f} m (dark) to {high:.1f} m (bright)."
+        shown = _stretched(shown)
+    return Picture(png(*_indexed(shown, palette.color_table("viridis"))), caption, "the panorama")
 
 
 def error_map(measurement: Measurement, table: np.ndarray) -> str:
     """PNG, as a data URI, of the errors of depth."""
-    return color_map(palette.error_fraction(measurement.image.z - measurement.truth.z), table)
+    fraction = palette.error_fraction(measurement.image.reading_m - measurement.true_m)
+    return color_map(panorama(measurement.camera).picture(fraction, np.nan), table)
 
 
 def cause_map(measurement: Measurement) -> tuple[str, list[LegendEntry]]:
     """PNG, as a data URI, of the causes of failed pixels, and its legend."""
     classes = palette.outcomes(measurement)
-    return png(classes, palette.OUTCOME_COLORS), _legend(classes, palette.OUTCOME_NAMES, palette.OUTCOME_COLORS)
+    shown = panorama(measurement.camera).picture(classes, palette.NOTHING)
+    return png(shown, palette.OUTCOME_COLORS), _legend(classes, palette.OUTCOME_NAMES, palette.OUTCOME_COLORS)
 
 
 def captured_frames(captured: Captured) -> list[Picture]:
@@ -216,19 +191,20 @@ def captured_frames(captured: Captured) -> list[Picture]:
         names = capture.sensor.frame_names()
         chosen = [i for i in capture.sensor.representative_frames(capture.frames) if 0 <= i < len(names)]
         white = max(float(np.percentile(capture.frames[i], 99.5)) for i in chosen)
-        camera = f", camera {number}" if len(captured.captures) > 1 else ""
+        black, camera = capture.black_level, f", camera {number}" if len(captured.captures) > 1 else ""
+        layout = panorama(capture.rig.camera) if capture.rig else None
         for i in chosen:
-            caption = names[i].replace("_", " ") + camera
-            pictures.append(Picture(grey(capture.frames[i], white, capture.black_level), caption, names[i] + camera))
+            shown = layout.picture(capture.frames[i], black) if layout else capture.frames[i]
+            pictures.append(Picture(grey(shown, white, black), names[i].replace("_", " ") + camera, names[i] + camera))
     return pictures
 
 
-def light_pictures(energy: EnergySplit) -> list[Picture]:
+def light_pictures(energy: EnergySplit, camera: Camera) -> list[Picture]:
     """Pictures of the radiance by the kind of light path, all with the same white.
 
     The captions state the fraction of each kind in the emitter's light.
     """
-    white = _bright(energy.projector)
+    white, layout = _bright(energy.projector), panorama(camera)
     total = float(energy.projector.sum())
     kinds = {
         "direct": ("emitter, surface, camera", energy.direct),
@@ -239,7 +215,7 @@ def light_pictures(energy: EnergySplit) -> list[Picture]:
     }
     pictures = [
         Picture(
-            grey(image, white),
+            grey(layout.picture(image, 0.0), white),
             f"{name}: {meaning}; {100 * float(image.sum()) / total:.1f} % of the emitter’s light in the image",
             name,
         )
@@ -249,7 +225,7 @@ def light_pictures(energy: EnergySplit) -> list[Picture]:
     if energy.ambient.max() > 0:
         ratio = 100 * float(energy.ambient.sum()) / total if total > 0 else float("inf")
         text = f"ambient: all other light, before any filter; {ratio:.0f} % of the emitter’s light"
-        pictures.append(Picture(grey(energy.ambient, white), text, "ambient"))
+        pictures.append(Picture(grey(layout.picture(energy.ambient, 0.0), white), text, "ambient"))
     return pictures
 
 

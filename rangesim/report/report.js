@@ -19,6 +19,10 @@ async function unpackInstrument(one) {
     unpack(one.cause, Uint8Array),
   ]);
   Object.assign(one, { z, error, intensity, status, cause });
+  if (one.rays) {
+    [one.rays.directions, one.rays.pixel] = await Promise.all([unpack(one.rays.directions, Int16Array), unpack(one.rays.pixel, Int32Array)]);
+    if (one.rays.origins) one.rays.origins = await unpack(one.rays.origins, Float32Array);
+  }
   if (s) [s.supervoxel, s.parents, s.altitudes, s.colors] = await Promise.all([
     unpack(s.supervoxel, s.wide ? Uint32Array : Uint16Array), unpack(s.parents, Int32Array),
     unpack(s.altitudes, Float32Array), unpack(s.colors, Uint8Array)]);
@@ -91,13 +95,16 @@ function colors(one, mode) {
   return rgb;
 }
 
+// Columns and rows of the picture of an instrument's pixels.
+function shownSize(one) { return one.rays ? [one.rays.columns, one.rays.rows] : [one.width, one.height]; }
+
 function drawLabels(canvas, one, rgb) {
-  canvas.width = one.width;
-  canvas.height = one.height;
-  const context = canvas.getContext("2d"), image = context.createImageData(one.width, one.height);
-  for (let i = 0; i < one.z.length; i++) {
-    for (let c = 0; c < 3; c++) image.data[4 * i + c] = rgb[3 * i + c];
-    image.data[4 * i + 3] = 255;
+  [canvas.width, canvas.height] = shownSize(one);
+  const context = canvas.getContext("2d"), image = context.createImageData(canvas.width, canvas.height);
+  for (let place = 0; place < canvas.width * canvas.height; place++) {
+    const i = one.rays ? one.rays.pixel[place] : place;
+    for (let c = 0; c < 3; c++) image.data[4 * place + c] = i < 0 ? 224 : rgb[3 * i + c];
+    image.data[4 * place + 3] = 255;
   }
   context.putImageData(image, 0, 0);
 }
@@ -190,18 +197,19 @@ class Page {
   }
 
   probe(map, event) {
-    const box = map.getBoundingClientRect(), here = this.of(map);
-    const x = Math.floor((event.clientX - box.left) / box.width * here.width);
-    const y = Math.floor((event.clientY - box.top) / box.height * here.height), i = y * here.width + x;
+    const box = map.getBoundingClientRect(), here = this.of(map), [columns, rows] = shownSize(here);
+    const x = Math.floor((event.clientX - box.left) / box.width * columns);
+    const y = Math.floor((event.clientY - box.top) / box.height * rows), place = y * columns + x;
+    const i = here.rays ? here.rays.pixel[place] : place;
     if (!(i >= 0 && i < here.z.length)) return;
     all(".map").forEach((other) => {  // a pixel of another camera is another ray
       const display = this.of(other).view === here.view ? "block" : "none";
-      Object.assign(other.querySelector("i").style, { display, left: `${100 * (x + 0.5) / here.width}%`, top: `${100 * (y + 0.5) / here.height}%` });
+      Object.assign(other.querySelector("i").style, { display, left: `${100 * (x + 0.5) / columns}%`, top: `${100 * (y + 0.5) / rows}%` });
     });
     const truth = DATA.passes[here.lightPass], material = truth.materials[truth.material[i]] || "nothing";
     const shared = DATA.instruments.filter((one) => one.view === here.view);
     const said = shared.flatMap((one, k) => [k ? " · " : "", bold(one.title), ` ${reading(one, i)}`]);
-    $("probe").replaceChildren(bold(`(${x}, ${y})`), ` ${material}: `, ...said);
+    $("probe").replaceChildren(bold(`(${i % here.width}, ${Math.floor(i / here.width)})`), ` ${material}: `, ...said);
   }
 }
 

@@ -3,7 +3,7 @@
 
 const VERTEX = `
 attribute vec3 position; attribute vec3 color;
-uniform mat4 matrix; uniform float size; varying vec3 tint;
+uniform mat4 matrix; uniform float size; uniform float centre; varying vec3 tint;
 void main() {
   gl_Position = matrix * vec4(position, 1.0);
   // Many points share a pixel of the canvas. If the nearest were drawn, readings that are too near would hide the others.
@@ -11,7 +11,8 @@ void main() {
   float random = fract(sin(dot(position, vec3(129.898, 782.33, 377.19))) * 43758.5453);
   vec4 moved = matrix * vec4(position * (0.995 + 0.01 * random), 1.0);
   gl_Position.z = moved.z / moved.w * gl_Position.w;
-  gl_PointSize = clamp(size * -position.z / gl_Position.w, 1.0, 24.0);
+  float away = centre > 0.0 ? distance(position, vec3(0.0, 0.0, -centre)) : -position.z;
+  gl_PointSize = clamp(size * away / gl_Position.w, 1.0, 24.0);
   tint = color;
 }`;
 const FRAGMENT = `
@@ -23,15 +24,22 @@ const START = { yaw: -0.45, pitch: 0.22, zoom: 1, shift: [0, 0] };
 
 // Positions (3 per point; x right, y up, z towards the viewer, metres) and the pixel of each, of a depth image.
 // The camera is the pinhole of rangesim.rig.camera_model, repeated here for the browser; tests/test_rig.py compares them.
-// Distortion is left out.
+// Distortion is left out. Other cameras have a ray for each pixel; if their points lie all around them, the camera is put
+// where the view turns, at the middle depth.
 function unproject(instrument, z) {
-  const [fx, fy, cx, cy] = instrument.camera, width = instrument.width;
+  const [fx, fy, cx, cy] = instrument.camera, width = instrument.width, rays = instrument.rays;
   const count = z.reduce((n, v) => n + (v > 0), 0);
   const positions = new Float32Array(3 * count), pixels = new Uint32Array(count);
   let k = 0;
   for (let i = 0; i < z.length; i++) {
     if (!z[i]) continue;
     const depth = instrument.nearM + (z[i] - 1) * instrument.stepM;
+    if (rays) {
+      const at = (axis) => rays.directions[3 * i + axis] / 32767 * depth + (rays.origins ? rays.origins[3 * i + axis] : 0);
+      positions.set([at(0), -at(1), -at(2) - (rays.surrounds ? instrument.middleM : 0)], 3 * k);
+      pixels[k++] = i;
+      continue;
+    }
     positions[3 * k] = ((i % width) + 0.5 - cx) / fx * depth;
     positions[3 * k + 1] = -(Math.floor(i / width) + 0.5 - cy) / fy * depth;
     positions[3 * k + 2] = -depth;
@@ -43,6 +51,7 @@ function unproject(instrument, z) {
 // Focal length over half the canvas's height, with which a canvas of an aspect shows the camera's whole field of view.
 function focalOf(instrument, aspect) {
   const [fx, fy] = instrument.camera;
+  if (instrument.rays) return Math.min(1.6, 1.6 * aspect);
   return Math.min(2 * fy / instrument.height, aspect * 2 * fx / instrument.width);
 }
 
@@ -116,6 +125,7 @@ class StillView {
     if (!(width && height)) return;
     const one = this.instrument, focal = focalOf(one, width / height), size = pointSize(one.camera, focal, height);
     const m = projection(this.view, one.middleM, focal, width / height), positions = this.positions;
+    const surrounds = one.rays && one.rays.surrounds;
     const context = this.canvas.getContext("2d"), image = context.createImageData(width, height);
     const nearest = new Float32Array(width * height).fill(Infinity), shown = new Uint32Array(image.data.buffer);
     const color = (r, g, b) => new Uint32Array(new Uint8Array([r, g, b, 255]).buffer)[0];
@@ -123,7 +133,8 @@ class StillView {
     for (let k = 0; k < this.pixels.length; k++) {
       const [x, y, z] = positions.subarray(3 * k, 3 * k + 3), w = m[3] * x + m[7] * y + m[11] * z + m[15];
       if (w <= 0) continue;
-      const side = Math.max(1, Math.min(24, size * -z / w)), depth = w * (0.995 + 0.01 * (k * 0.618033988749895 % 1));
+      const away = surrounds ? Math.hypot(x, y, z + one.middleM) : -z;
+      const side = Math.max(1, Math.min(24, size * away / w)), depth = w * (0.995 + 0.01 * (k * 0.618033988749895 % 1));
       const left = (0.5 + 0.5 * (m[0] * x + m[4] * y + m[8] * z + m[12]) / w) * width - side / 2;
       const top = (0.5 - 0.5 * (m[1] * x + m[5] * y + m[9] * z + m[13]) / w) * height - side / 2;
       const rgb = color(...this.colors.subarray(3 * this.pixels[k], 3 * this.pixels[k] + 3));
@@ -175,6 +186,7 @@ class CloudView {
     const one = this.instrument, focal = focalOf(one, width / height);
     const matrix = projection(this.view, one.middleM, focal, width / height);
     gl.uniformMatrix4fv(gl.getUniformLocation(this.program, "matrix"), false, matrix);
+    gl.uniform1f(gl.getUniformLocation(this.program, "centre"), one.rays && one.rays.surrounds ? one.middleM : 0);
     gl.uniform1f(gl.getUniformLocation(this.program, "size"), pointSize(one.camera, focal, height));
     gl.drawArrays(gl.POINTS, 0, this.pixels.length);
   }

@@ -51,7 +51,7 @@ from rangesim.files.schema import (
 from rangesim.results.captures import load_capture, write_capture
 from rangesim.results.range_images import load_range_image, save_range_image
 from rangesim.results.saved_signals import LightPass, read_pass, write_pass
-from rangesim.rig import Rig
+from rangesim.rig import Camera, Rig
 from rangesim.settings.config import ShortRepr, from_dict, shown
 from rangesim.signals import ALL, GroundTruth
 
@@ -229,6 +229,17 @@ class Measurement(ShortRepr):
     segmentation: Segmentation | None
     metadata: MeasurementRecord
     light_pass: int
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the instrument."""
+        assert self.image.camera is not None  # every measurement of an experiment has its rig
+        return self.image.camera
+
+    @property
+    def true_m(self) -> np.ndarray:
+        """(h, w) float32, metres, true readings: z for a pinhole camera, ranges for every other one."""
+        return self.camera.reading(self.truth)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -15,7 +15,7 @@ from rangesim.decoding.status import Status
 from rangesim.errors import FileFormatError
 from rangesim.files.array_files import write_arrays
 from rangesim.files.schema import MAX_METRES, SETTINGS, ArraySpec, read_checked_arrays, settings_array, settings_of
-from rangesim.rig import Intrinsics
+from rangesim.rig import Camera
 from rangesim.sensors import Decoder  # this import also makes the package's own decoders known by their type_name
 from rangesim.settings.config import check_keys, from_dict, to_dict
 
@@ -90,7 +90,7 @@ def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> R
         image = RangeImage(
             **arrays,
             returns=Returns(**returns) if returns else None,
-            camera=None if camera is None else from_dict(Intrinsics, camera, "camera"),
+            camera=None if camera is None else from_dict(Camera, camera, "camera"),  # type: ignore[type-abstract]
             decoder=None if decoder is None else from_dict(Decoder, decoder, "decoder"),  # type: ignore[type-abstract]
         )
     except (ValueError, TypeError) as error:

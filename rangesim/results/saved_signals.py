@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,8 @@ _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
     "truth_projector_visible": ArraySpec("bool"),
     "truth_instance_names": ArraySpec("str", ("instances",)),
     "truth_material_names": ArraySpec("str", ("materials",)),
+    "truth_nearest_m": replace(_TRUE_DEPTH, required=False),
+    "truth_farthest_m": replace(_TRUE_DEPTH, required=False),
     "motion_m": ArraySpec("float32", low=0, nan=True, required=False),
     "truncation": ArraySpec("float64", (len(fields(Truncation)),), low=0, high=1, nan=True, required=False),
 }
@@ -171,7 +173,8 @@ def _truncation(data: dict[str, np.ndarray]) -> Truncation | None:
 def _pass_arrays(signals: Signals | LightPass) -> dict[str, np.ndarray]:
     """The arrays of a pass by their names in files."""
     arrays = {f"energy_{f.name}": getattr(signals.energy, f.name) for f in fields(EnergySplit)}
-    arrays |= {f"truth_{f.name}": np.asarray(getattr(signals.truth, f.name)) for f in fields(GroundTruth)}
+    known = {f.name: getattr(signals.truth, f.name) for f in fields(GroundTruth)}
+    arrays |= {f"truth_{name}": np.asarray(value) for name, value in known.items() if value is not None}
     if signals.motion_m is not None:
         arrays["motion_m"] = signals.motion_m
     if signals.truncation is not None:
@@ -185,7 +188,7 @@ def _energy_and_truth(path: Path, data: dict[str, np.ndarray]) -> tuple[EnergySp
         if data[f"truth_{ids}"].max(initial=-1) >= len(data[f"truth_{ids}_names"]):
             raise FileFormatError(f"{path}: array truth_{ids}: expected indices into truth_{ids}_names.")
     energy = EnergySplit(**{f.name: data[f"energy_{f.name}"] for f in fields(EnergySplit)})
-    truth: dict[str, Any] = {f.name: data[f"truth_{f.name}"] for f in fields(GroundTruth)}
+    truth: dict[str, Any] = {f.name: data.get(f"truth_{f.name}") for f in fields(GroundTruth)}
     for name in ("instance_names", "material_names"):
         truth[name] = tuple(map(str, truth[name]))
     return energy, GroundTruth(**truth)

@@ -9,6 +9,7 @@ from rangesim.rig.poses import Array, check_rigid, is_same_pose, look_at, pose, 
 from rangesim.rig.ray_cameras import Fisheye, Orthographic, RayTable, ScanningCamera
 from rangesim.rig.rig import CAMERA_LENS, PROJECTOR_LENS, Lens, Rig
 from rangesim.rig.scanners import Lissajous, MovingCamera, Risley, Spinning
+from rangesim.rig.zones import Zones
 
 __all__ = [
     "CAMERA_LENS",
@@ -35,6 +36,7 @@ __all__ = [
     "Risley",
     "ScanningCamera",
     "Spinning",
+    "Zones",
     "check_rigid",
     "is_same_pose",
     "look_at",

@@ -89,9 +89,20 @@ class Camera(Optics):
         return None
 
     @property
+    def traced(self) -> Camera:
+        """The camera whose rays are traced: this one, or the finer one that zones are made of."""
+        return self
+
+    @property
     def rings(self) -> NDArray[np.uint16] | None:
         """(h, w) uint16, the beam of a turning head that measures each ray, if the rows are its rings; None: they are
         not."""
+        return None
+
+    @property
+    def lattice(self) -> NDArray[np.int64] | None:
+        """(h, w) int64, flat indices of the pixels in an order in which those beside each other see places beside each
+        other, if that is not the order of the image; None: it is, or no such order is known."""
         return None
 
     def pixel_centres(self, rows: slice = slice(None)) -> Array:
@@ -111,6 +122,16 @@ class Camera(Optics):
             The pixels of this camera follow no law, so that the pixel that sees a point is not known.
         """
         raise ValueError(f"expected a camera that projects points to pixels, got {type(self).__name__}.")
+
+    def cropped(self, top: int, bottom: int, left: int, right: int) -> Camera:
+        """The camera of a part of the image: rows `top` to `bottom` - 1, columns `left` to `right` - 1.
+
+        Raises
+        ------
+        ValueError
+            A part of this camera's image is no camera of the package.
+        """
+        raise ValueError(f"expected a camera whose image can be cropped, got {type(self).__name__}.")
 
     # ---- What follows from the rays -----------------------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -100,6 +100,9 @@ class Intrinsics(Camera, untagged=True):
         scale = width / self.width
         cx, cy = (self.cx - self.width / 2) * scale + width / 2, (self.cy - self.height / 2) * scale + height / 2
         return Intrinsics(width, height, self.fx * scale, self.fy * scale, cx, cy, self.distortion)
+
+    def cropped(self, top: int, bottom: int, left: int, right: int) -> Intrinsics:
+        return replace(self, width=right - left, height=bottom - top, cx=self.cx - left, cy=self.cy - top)
 
     def normalise(self, pixels: ArrayLike) -> Array:
         """(..., 2) float64, undistorted coordinates x/z, y/z on the image plane of pixel coordinates (..., 2).

@@ -96,6 +96,9 @@ class Fisheye(Camera):
         scale = self._radius(theta)[0] / np.where(across > 0, across, 1.0)
         return np.stack([self.fx * scale * x + self.cx, self.fy * scale * y + self.cy], axis=-1)
 
+    def cropped(self, top: int, bottom: int, left: int, right: int) -> Fisheye:
+        return replace(self, width=right - left, height=bottom - top, cx=self.cx - left, cy=self.cy - top)
+
     def _radius(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Radius in units of the focal length at angles theta, and its derivative."""
         k = (*self.distortion, 0.0, 0.0, 0.0, 0.0)[:4]
@@ -200,6 +203,9 @@ class ScanningCamera(Camera):
         """(h, w, 3) float64, unit vectors, camera coordinates."""
         raise NotImplementedError
 
+    def cropped(self, top: int, bottom: int, left: int, right: int) -> RayTable:
+        return RayTable.of(self, self.field_rad).cropped(top, bottom, left, right)
+
     def pixel_rays(self) -> PixelRays:
         """The rays of the table; their fields are upright: y of a field is downwards where the ray is level."""
         directions, origins = self.ray_directions(), self.ray_origins()
@@ -280,6 +286,14 @@ class RayTable(ScanningCamera):
     def times_s(self) -> Array | None:
         return self.times
 
+    def cropped(self, top: int, bottom: int, left: int, right: int) -> RayTable:
+        return self._part((slice(top, bottom), slice(left, right)))
+
+    def _part(self, at: Any) -> RayTable:
+        """The rays at an index of the table."""
+        origins, times = (None if a is None else a[at] for a in (self.origins, self.times))
+        return replace(self, directions=self.directions[at], origins=origins, times=times)
+
     def thinned(self, width: int, height: int) -> RayTable:
         """A table of at most width x height of these rays, which are spread evenly over the table.
 
@@ -293,9 +307,7 @@ class RayTable(ScanningCamera):
             np.linspace(0, n - 1, min(n, m)).round().astype(int)
             for n, m in ((self.height, height), (self.width, width))
         )
-        at = np.ix_(rows, columns)
-        origins, times = (None if a is None else a[at] for a in (self.origins, self.times))
-        return replace(self, directions=self.directions[at], origins=origins, times=times)
+        return self._part(np.ix_(rows, columns))
 
     @classmethod
     def of(cls, camera: Camera, field_rad: tuple[float, float] | None = None) -> RayTable:

@@ -15,6 +15,7 @@ from rangesim.rig.cameras import Camera, Optics
 from rangesim.rig.cover_glass import CoverGlass
 from rangesim.rig.intrinsics import Intrinsics
 from rangesim.rig.poses import SAME_PLACE, Array, is_same_pose, pose
+from rangesim.rig.zones import Zones
 from rangesim.settings.bounds import Exponent, Metres, Watts, Wavelength, check_fields
 from rangesim.settings.config import from_dict, shown, to_dict
 
@@ -113,7 +114,7 @@ class Rig:
             raise ValueError(f"expected camera as a Camera, such as Intrinsics, got {shown(self.camera)}.")
         if not isinstance(self.projector, (Intrinsics, Beam)):
             raise ValueError(f"expected projector as Intrinsics or Beam, got {shown(self.projector)}.")
-        if not self.camera.is_pinhole and (self.camera_lens.focus_m is not None or self.camera_lens.vignetting):
+        if not self.camera.traced.is_pinhole and (self.camera_lens.focus_m is not None or self.camera_lens.vignetting):
             raise ValueError(
                 f"expected a camera_lens without focus_m and vignetting for a {type(self.camera).__name__}: only a "
                 "pinhole camera has them."
@@ -129,6 +130,8 @@ class Rig:
             )
         if self.projector_lens.focus_m is not None or self.projector_lens.vignetting:
             raise ValueError("expected a projector_lens without focus_m and vignetting for a beam.")
+        if isinstance(self.camera, Zones):
+            raise ValueError("expected a projector for a camera of zones, which measure at the same time, got a Beam.")
         size = self.camera.height, self.camera.width
         if beam.directions is not None and beam.directions.shape[:2] != size:
             raise ValueError(
@@ -187,6 +190,11 @@ class Rig:
             T_world_camera=self.T_world_camera @ T,
             T_camera_projector=np.linalg.inv(T) @ self.T_camera_projector,
         )
+
+    @property
+    def traced(self) -> Rig:
+        """The rig with the camera whose rays are traced: this one, or for zones that with the finer camera."""
+        return self if self.camera.traced is self.camera else replace(self, camera=self.camera.traced)
 
     @property
     def pinhole(self) -> Intrinsics:
@@ -251,8 +259,13 @@ class Rig:
         """(h, w) float32, relative illumination of the camera's pixels, from 0 to 1.
 
         It is cos^n of the angle between a pixel's ray and the optical axis; see `Lens.vignetting`. For a camera that is
-        no pinhole it is the solid angle of the pixel, relative to the largest. Pixels without a ray have 0.
+        no pinhole it is the solid angle of the pixel, relative to the largest. Of zones it is the sum over their
+        pixels, relative to that of the largest zone. Pixels without a ray have 0.
         """
+        if isinstance(self.camera, Zones):
+            light = self.camera.matrix @ self.traced.camera_illumination.ravel().astype(np.float64)
+            largest = self.camera.solid_angle_sr().max() / np.nanmax(self.camera.traced.solid_angle_sr())
+            return (light / largest).reshape(self.camera.height, self.camera.width).astype(np.float32)
         if not isinstance(self.camera, Intrinsics):
             shape, solid_angle = (self.camera.height, self.camera.width), self.camera.solid_angle_sr()
             relative = np.nan_to_num(solid_angle / np.nanmax(solid_angle), nan=0.0)

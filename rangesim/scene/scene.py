@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rangesim.rig import Intrinsics, Rig, look_at, pose, translation
+from rangesim.rig import Camera, Intrinsics, Rig, look_at, pose, translation
 from rangesim.settings.bounds import Bounds, check_number, whole
 
 BASELINE = Bounds("a positive baseline in metres", 1e-9, 1e6)
@@ -93,7 +93,7 @@ class Scene:
         width: int | None = None,
         height: int | None = None,
         *,
-        camera: Intrinsics | None = None,
+        camera: Camera | None = None,
         T_world_camera: np.ndarray | None = None,
     ) -> Rig:
         """A rig of the scene's camera and a projector to its right that covers the camera's field of view.
@@ -106,7 +106,8 @@ class Scene:
         power_w : radiant power in watts that leaves the projector when it shows white.
         width, height : size of the camera's image, pixels; default as in the scene file. One alone keeps the aspect
             ratio. The horizontal field of view stays the same.
-        camera : Intrinsics to use instead of the scene's camera; `width` and `height` are then ignored.
+        camera : Intrinsics, or Zones of such a camera, to use instead of the scene's camera; `width` and `height` are
+            then ignored.
         T_world_camera : (4, 4) float64, rigid, metres; pose of the camera to use instead of the scene's.
 
         Raises
@@ -128,10 +129,12 @@ class Scene:
         if baseline_m is None:
             baseline_m = float(f"{0.2 * self.working_distance_m:.1g}")
         check_number("baseline_m", baseline_m, BASELINE)
-        target = (0.0, 0.0, self.working_distance_m)
+        target, fine = (0.0, 0.0, self.working_distance_m), camera.traced
+        if not isinstance(fine, Intrinsics):
+            raise ValueError(f"expected a pinhole camera (Intrinsics) or zones of one, got a {type(camera).__name__}.")
         return Rig(
             camera=camera,
-            projector=covering(camera, *(projector_size or PROJECTOR_PIXELS)),
+            projector=covering(fine, *(projector_size or PROJECTOR_PIXELS)),
             T_world_camera=pose(T_world_camera, "T_world_camera"),
             T_camera_projector=look_at((baseline_m, 0.0, 0.0), target, up=(0.0, -1.0, 0.0)),
             projector_power_w=power_w,

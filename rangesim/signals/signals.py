@@ -58,6 +58,8 @@ class GroundTruth(ShortRepr):
     material : (h, w) int32, index into `material_names`.
     projector_uv : (h, w, 2) float32, pixel coordinates of the point in the projector, also outside its image.
     projector_visible : (h, w) bool, whether the straight line to the projector is free and the point is in its image.
+    nearest_m, farthest_m : (h, w) float32, metres, least and largest range of the surfaces within a zone; the other
+        fields then describe the surface that fills most of it. None: pixels are no `rangesim.rig.Zones`.
 
     Examples
     --------
@@ -75,6 +77,8 @@ class GroundTruth(ShortRepr):
     projector_visible: np.ndarray
     instance_names: tuple[str, ...] = ()
     material_names: tuple[str, ...] = ()
+    nearest_m: np.ndarray | None = None
+    farthest_m: np.ndarray | None = None
 
     def classes(self) -> dict[str, np.ndarray]:
         """Pixels of each material class that occurs, as (h, w) bool by name; "all" comes last, and may be empty."""
