@@ -223,6 +223,28 @@ def blank(sensor: Any = None, rig: Rig | None = None, size: tuple[int, int] = (4
     return Capture(np.zeros((sensor.n_frames, *size), np.uint8), sensor, rig)
 
 
+@pytest.mark.parametrize("value", [0, 17, 65535])
+def test_frames_without_texture_are_not_read(value: int) -> None:
+    _, rigs = stereo(64, 48)
+    frames = np.full((1, 48, 64), value, dtype=np.uint16)
+    image = decode(CaptureSet(tuple(Capture(frames, ActiveStereo(), rig) for rig in rigs)))
+    assert not image.valid.any()
+    assert (image.status == (Status.SATURATED if value == 65535 else Status.LOW_SIGNAL)).all()
+
+
+def test_masked_pixels_are_not_read() -> None:
+    sensor, rigs = stereo()
+    taken, _ = set_of_plane(sensor, rigs, (0, 0, 1), 0.8)
+    masked = []
+    for capture in taken.captures:
+        frames = capture.frames.copy()
+        frames[:, 40:60, 100:130] = np.nan
+        masked.append(replace(capture, frames=frames))
+    image = decode(CaptureSet(tuple(masked)), StereoDecoder(disparities=64))
+    assert not image.valid[40:60, 100:130].any()
+    assert np.nanmax(np.abs(image.z[MIDDLE] - 0.8)) < 0.05
+
+
 def test_what_makes_no_set_is_refused() -> None:
     _, (left, right) = stereo(64, 48)
     for captures, message in (

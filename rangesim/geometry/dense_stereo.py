@@ -323,7 +323,8 @@ def _census_codes(image: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 def _grey_levels(image: np.ndarray, of: np.ndarray) -> np.ndarray:
     """(h, w) int64, the image in `ZNCC_LEVELS` levels between the quantiles of 0.1 and 99.9 % of the image `of`."""
-    low, high = np.nanquantile(of, [0.001, 0.999])
+    known = of[np.isfinite(of)]
+    low, high = np.quantile(known, [0.001, 0.999]) if known.size else (0.0, 1.0)
     scale = ZNCC_LEVELS / max(float(high - low), 1e-30)
     return np.nan_to_num(np.rint(np.clip((image - low) * scale, 0, ZNCC_LEVELS))).astype(np.int64)
 
