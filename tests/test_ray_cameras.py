@@ -274,5 +274,5 @@ def test_a_scanner_that_drives_into_fog_is_refused() -> None:
     )
     rig = Rig(sweep(), Beam((1e-3, 1e-3)))
     transport(scene, rig, [IdealToF()], spp=1)
-    with pytest.raises(ValueError, match="expected the camera to stand in air, but it is inside the medium of .*bank"):
+    with pytest.raises(ValueError, match=r"expected the camera to stand in air, but it is inside the medium of .*bank"):
         transport(scene, moving_scanner(rig, ConstantTwist((0.0, 0.0, 30.0))), [IdealToF()], spp=1)
