@@ -201,7 +201,10 @@ class Evidence:
     @cached_property
     def merely_inclined(self) -> np.ndarray:
         """Whether the apparent edge is one steep surface, which the sensor would read correctly over the whole pixel
-        without the light that disturbs it."""
+        without the light that disturbs it. It is False for readings that reach beyond the pixel, and so to a true
+        edge."""
+        if self.readings.decoder.reach_px:
+            return np.zeros(self.failed.shape, dtype=bool)
         return self.inclined & self._may_blur & ~self.blurred
 
     @cached_property
@@ -221,7 +224,9 @@ class Evidence:
     @cached_property
     def fails_off_edge(self) -> np.ndarray:
         """Whether pixels nearby on the same surface, but off the edge, have at least half of the error: then the edge
-        is not to blame."""
+        is not to blame. It is False for readings that reach beyond the pixel, whose neighbours share their edge."""
+        if self.readings.decoder.reach_px:
+            return np.zeros(self.failed.shape, dtype=bool)
         result, where = np.zeros(self.failed.shape, dtype=bool), self.failed & self.at_edge
         error = np.where(self.missing, np.inf, np.abs(self.error))
         surfaces = self.true_m, self.truth.instance
@@ -276,6 +281,8 @@ class Evidence:
     @cached_property
     def disturbed(self) -> np.ndarray:
         """Whether enough of the emitter's light is not direct to shift the reading by the tolerance."""
+        if not self.capture.sensor.reads_emitter:
+            return np.zeros(self.failed.shape, dtype=bool)
         light = np.sum(self._kinds, axis=0)
         return np.asarray(light - self._kinds[DIRECT] > DISTURBING * light)
 
@@ -314,9 +321,12 @@ class Evidence:
 
     @cached_property
     def textureless(self) -> np.ndarray:
-        """Whether a sensor that compares texture found too little of it for a reading."""
-        low = self.missing & (self.image.status == Status.LOW_SIGNAL)
-        return low if self.capture.sensor.compares_texture else np.zeros(low.shape, dtype=bool)
+        """Whether a sensor that compares texture found too little of it for a reading; without dots, whether the
+        texture of the surface itself, if it has any, gave no reading."""
+        sensor = self.capture.sensor
+        if not sensor.compares_texture:
+            return np.zeros(self.missing.shape, dtype=bool)
+        return self.missing & ((self.image.status == Status.LOW_SIGNAL) | (not sensor.reads_emitter))
 
     @cached_property
     def blurred(self) -> np.ndarray:
