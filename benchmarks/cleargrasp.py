@@ -359,8 +359,9 @@ def report_scene(real: RealScene, number: int, args: argparse.Namespace) -> dict
     return result
 
 
-def picture(real: RealScene, seen: Simulated, width: int = 1000) -> np.ndarray:
-    """(h, w, 3) uint8, BGR: real colour image and depth above the infra-red image and depth of the simulated camera."""
+def picture(real: RealScene, seen: Simulated, width: int = 300) -> np.ndarray:
+    """(h, w, 3) uint8, BGR, side by side: colour image and depth of the real camera, depth and infra-red image of the
+    simulated one; each `width` pixels wide. Lost pixels are black."""
 
     def coloured(z: np.ndarray) -> np.ndarray:
         low, high = np.nanquantile(real.opaque, [0.01, 0.99])
@@ -371,10 +372,10 @@ def picture(real: RealScene, seen: Simulated, width: int = 1000) -> np.ndarray:
         return image
 
     infrared = cv2.cvtColor(seen.infrared, cv2.COLOR_GRAY2BGR)
-    images = [cv2.cvtColor(real.grey, cv2.COLOR_GRAY2BGR), coloured(real.transparent), infrared, coloured(seen.z)]
-    height = round(width / 2 * real.camera.height / real.camera.width)
-    cells = [cv2.resize(image, (width // 2, height), interpolation=cv2.INTER_AREA) for image in images]
-    return np.vstack([np.hstack(cells[:2]), np.hstack(cells[2:])])
+    grey = cv2.cvtColor(real.grey, cv2.COLOR_GRAY2BGR)
+    height = round(width * real.camera.height / real.camera.width)
+    cells = [grey, coloured(real.transparent), coloured(seen.z), infrared]
+    return np.hstack([cv2.resize(cell, (width, height), interpolation=cv2.INTER_AREA) for cell in cells])
 
 
 # ---- The other sensors on comparable objects -------------------------------------------------------------------------
