@@ -38,6 +38,7 @@ from rangesim import (
     Intrinsics,
     RangeImage,
     Rig,
+    Sensor,
     Status,
     StillSignals,
     decode,
@@ -48,17 +49,26 @@ from rangesim import (
 )
 from rangesim.environment.backend import select_variant
 from rangesim.instrument.instrument import Instrument
-from rangesim.presets import Preset
+from rangesim.presets import Preset, PublishedNoise
 from rangesim.presets.preset import standing
 from rangesim.response import LightPath, NumpyMath, Response, SparseResponse
 from rangesim.rig import Camera, Fisheye, RayTable, ScanningCamera, Zones
 from rangesim.robust_scale import sigma_from_median
-from rangesim.signals import EnergySplit, GroundTruth
+from rangesim.sensors import ActiveStereo
+from rangesim.signals import EnergySplit, GroundTruth, Signals, SignalSet
 
 PIXELS = 64
 """Pixels across and down that look at the wall: 4096 readings tell a standard deviation to 1 %."""
 RAYS = 32
 """Beams across and down that look at the wall: 1024 readings tell a standard deviation to 2 %."""
+STEREO_PIXELS = (320, 96)
+"""Pixels of both cameras of a stereo device; twice the disparity of the nearest wall across."""
+LEFT_PX, BORDER_PX = 136, 10
+"""Columns at the left that no pixel of the other camera need match, and the reach of a window at the other sides."""
+PHASES = (-0.375, -0.125, 0.125, 0.375)
+"""Disparities of the wall of a stereo device, pixels from that of the stated distance: even fractions of a pixel."""
+FINENESS = 4
+"""Samples across a pixel of a stereo camera; its dots are at least a pixel wide."""
 SPP = 16
 """Light paths of each traced beam. The wall is even, so its sampling error is far below the noise of the photons."""
 REFLECTANCE = 0.8
@@ -67,9 +77,14 @@ NEARLY_ALL = 0.95
 """Fraction of the pixels that read a wall at the end of the range of a device whose power is fitted to its range."""
 MIN_VALID = 0.9
 """Least fraction of the pixels with a reading of a wall at mid-range."""
-MAX_BEYOND = 0.01
-"""Largest fraction of the pixels with a reading of a wall that is too near or too far: now and then, noise is taken for
-a wall."""
+OUTLIER_SIGMAS = 6.0
+"""Robust standard deviations from the median beyond which a reading is an outlier: a wrong match or a wrong wrap."""
+MIN_SIGMA = 1e-4
+"""Least robust standard deviation that counts, as a fraction of the distance. Readings that are rounded to steps may
+have a median deviation of 0."""
+MAX_BEYOND = 0.05
+"""Largest fraction of the pixels with a reading of a wall that is too near or too far: noise that reaches into the
+range, noise that is taken for a wall, wrong matches."""
 POWERS_W = (1e-6, 1e4)
 """Powers between which `--fit` searches."""
 
@@ -104,15 +119,15 @@ def noise_ratios(preset: Preset) -> list[float]:
         return []
     ratios, simulated = [], []
     for distance_m, published_m in zip(noise.range_m, noise.sigma_m, strict=True):
-        image = of_wall(unlimited(preset.instrument), distance_m, noise.reflectance, noise.sunlight_lux)
-        sigma_m = scatter_m(image)
+        sigma_m, valid = noise_at_m(preset.instrument, distance_m, noise)
         simulated.append(sigma_m)
         simulated_ratio = sigma_m / published_m
-        ratios.append(max(simulated_ratio, 1.0 if noise.is_bound else 1 / simulated_ratio))
+        worst = max(simulated_ratio, 1.0 if noise.is_bound else 1 / simulated_ratio)
+        ratios.append(math.inf if math.isnan(worst) else worst)  # no reading where there should be one
         mark, relation = "*" if distance_m == noise.fitted_at_m else " ", "<=" if noise.is_bound else "  "
         print(
             f"    {distance_m:7.2f} m{mark} published {relation} {1e3 * published_m:7.2f} mm  "
-            f"simulated {1e3 * sigma_m:7.2f} mm  ratio {simulated_ratio:5.2f}  readings {image.valid.mean():4.0%}"
+            f"simulated {1e3 * sigma_m:7.2f} mm  ratio {simulated_ratio:5.2f}  readings {valid:4.0%}"
         )
     if len(noise.range_m) > 1:
         slope = math.log(simulated[-1] / simulated[0]) / math.log(noise.range_m[-1] / noise.range_m[0])
@@ -172,7 +187,10 @@ def fitted_power_w(preset: Preset) -> float:
         instrument = replace(unlimited(preset.instrument), power_w=float(np.exp(middle)))
         image = of_wall(instrument, distance_m, reflectance, sunlight_lux)
         is_bright = (image.status == Status.SATURATED).mean() > 0.5
-        is_weak = image.valid.mean() < (0.5 if math.isfinite(wanted_m) else NEARLY_ALL) or scatter_m(image) > wanted_m
+        is_weak = (
+            image.valid.mean() < (0.5 if math.isfinite(wanted_m) else NEARLY_ALL)
+            or scatter_m(image.z[image.valid], distance_m) > wanted_m
+        )
         low, high = (middle, high) if is_weak and not is_bright else (low, middle)
     return float(np.exp((low + high) / 2))
 
@@ -183,22 +201,55 @@ def unlimited(instrument: Instrument) -> Instrument:
     return replace(instrument, decoder=replace(instrument.decoder, working_range=None))  # type: ignore[call-arg]
 
 
-def scatter_m(image: RangeImage) -> float:
-    """Robust standard deviation of the readings of a wall, metres; NaN without readings."""
-    reading = image.z[image.valid].astype(np.float64)
-    return sigma_from_median(reading, float(np.median(reading))) if len(reading) else math.nan
+def noise_at_m(instrument: Instrument, distance_m: float, noise: PublishedNoise) -> tuple[float, float]:
+    """Standard deviation of the readings of a wall, metres, and the fraction of the pixels with a reading.
+
+    The error of a stereo camera depends on the fraction of a pixel that the disparity has. So its wall stands at
+    several places, over a pixel of disparity, whose errors are scaled to the distance.
+    """
+    places = [distance_m]
+    if isinstance(instrument.sensor, ActiveStereo):
+        assert isinstance(instrument.camera, Intrinsics)
+        one_px_m = instrument.camera.fx * instrument.sensor.baseline_m
+        places = [one_px_m / (one_px_m / distance_m + phase) for phase in PHASES]
+    errors, valid = [], []
+    for place in places:
+        image = of_wall(unlimited(instrument), place, noise.reflectance, noise.sunlight_lux)
+        errors.append((image.z[image.valid].astype(np.float64) - place) * (distance_m / place) ** 2)
+        valid.append(image.valid.mean())
+    return scatter_m(np.concatenate(errors), distance_m), float(np.mean(valid))
+
+
+def scatter_m(errors_m: np.ndarray, distance_m: float) -> float:
+    """Standard deviation of errors (n,) without outliers, metres; NaN without readings."""
+    if not len(errors_m):
+        return math.nan
+    middle = float(np.median(errors_m))
+    sigma_m = max(sigma_from_median(errors_m, middle), MIN_SIGMA * distance_m)
+    return float(errors_m[np.abs(errors_m - middle) <= OUTLIER_SIGMAS * sigma_m].std())
 
 
 def of_wall(instrument: Instrument, distance_m: float, reflectance: float, sunlight_lux: float) -> RangeImage:
     """Range image of a matte wall that faces the device, by pixels in the middle of its view."""
     sun = Ambient("sun", illuminance_lux=sunlight_lux) if sunlight_lux else None
     daylight_w_m2 = 1.0 if sunlight_lux else 0.0
-    if isinstance(instrument.projector, Intrinsics):
-        signals = flooded_wall(instrument, distance_m, reflectance, daylight_w_m2)
+    sensor, rig = instrument.sensor, rig_of(instrument)
+    if not isinstance(rig.projector, Intrinsics):
+        signals: Signals = traced_wall(instrument, distance_m, reflectance, daylight_w_m2)
+    elif sensor.n_cameras > 1:
+        signals = SignalSet.of([patterned_wall(r, sensor, distance_m, reflectance) for r in sensor.rigs(rig)])
     else:
-        signals = traced_wall(instrument, distance_m, reflectance, daylight_w_m2)
-    capture = expose(signals, instrument.sensor, instrument.detector, instrument.exposure_s, seed=0, ambient=sun)
-    return decode(capture, instrument.decoder)
+        signals = flooded_wall(rig, sensor, distance_m, reflectance, daylight_w_m2)
+    capture = expose(signals, sensor, instrument.detector, instrument.exposure_s, seed=0, ambient=sun)
+    image = decode(capture, instrument.decoder)
+    return inner(image) if sensor.n_cameras > 1 else image
+
+
+def inner(image: RangeImage) -> RangeImage:
+    """The part of a stereo image in which no window reaches beyond either image."""
+    part = slice(BORDER_PX, -BORDER_PX), slice(LEFT_PX, -BORDER_PX)
+    names = ("z", "range_m", "confidence", "status", "intensity")
+    return replace(image, camera=None, T_world_camera=None, **{name: getattr(image, name)[part] for name in names})
 
 
 def rig_of(instrument: Instrument) -> Rig:
@@ -206,7 +257,8 @@ def rig_of(instrument: Instrument) -> Rig:
     camera = instrument.camera
     assert camera is not None
     assert instrument.projector is not None
-    middle = {"width": PIXELS, "height": PIXELS, "cx": PIXELS / 2, "cy": PIXELS / 2}
+    width, height = (PIXELS, PIXELS) if instrument.sensor.n_cameras == 1 else STEREO_PIXELS
+    middle = {"width": width, "height": height, "cx": width / 2, "cy": height / 2}
     if isinstance(camera, (Intrinsics, Fisheye)):
         camera = replace(camera, **middle)
     else:
@@ -269,10 +321,21 @@ def traced_wall(instrument: Instrument, distance_m: float, reflectance: float, d
     )
 
 
-def flooded_wall(instrument: Instrument, distance_m: float, reflectance: float, daylight_w_m2: float) -> StillSignals:
+def patterned_wall(rig: Rig, sensor: Sensor, distance_m: float, reflectance: float) -> StillSignals:
+    """Signals of the wall under a pattern, in closed form; each pixel is the mean over its area."""
+    camera, n = rig.camera, FINENESS
+    assert isinstance(camera, Intrinsics)
+    fine = Intrinsics(n * camera.width, n * camera.height, n * camera.fx, n * camera.fy, n * camera.cx, n * camera.cy)
+    seen = flooded_wall(replace(rig, camera=fine), sensor, distance_m, reflectance, 0.0)
+    coarse = flooded_wall(rig, sensor, distance_m, reflectance, 0.0)
+    blocks = (camera.height, n, camera.width, n)
+    means = {r: c.reshape(len(c), *blocks).mean(axis=(2, 4)) for r, c in seen.channels.items()}
+    return replace(coarse, channels=means)
+
+
+def flooded_wall(rig: Rig, sensor: Sensor, distance_m: float, reflectance: float, daylight_w_m2: float) -> StillSignals:
     """Signals of the wall that the emitter lights at once, in closed form: direct light, and broadband daylight of an
     irradiance on the wall."""
-    rig = rig_of(instrument)
     emitter = rig.projector
     assert isinstance(emitter, Intrinsics)
     rays = rig.camera.pixel_rays().directions
@@ -286,7 +349,7 @@ def flooded_wall(instrument: Instrument, distance_m: float, reflectance: float, 
     irradiance = rig.projector_irradiance * (out_m / in_projector[..., 2]) ** 3 / out_m**2 * cosine
     radiance = np.where(lit, reflectance / np.pi * irradiance, 0.0)
     path = LightPath(*(np.nan_to_num(a) * lit for a in (uv[..., 0], uv[..., 1], range_m + out_m)), lit)
-    channels = {r: weighted(r, path, radiance) for r in instrument.sensor.responses()}
+    channels = {r: weighted(r, path, radiance) for r in sensor.responses()}
     zero = np.zeros(radiance.shape, dtype=np.float32)
     ambient = zero + np.float32(reflectance / np.pi * daylight_w_m2)
     energy = EnergySplit(radiance.astype(np.float32), zero, zero, zero, zero, ambient)

@@ -101,7 +101,9 @@ def test_an_equidistant_lens_has_its_edges_at_the_angles_of_the_sheet() -> None:
 
 
 def floods() -> list[str]:
-    return [name for name in pinholes() if isinstance(presets.load(name).projector, Intrinsics)]
+    """Devices of one pinhole camera that see all of their view at once."""
+    found = {name: presets.load(name) for name in pinholes()}
+    return [n for n, i in found.items() if isinstance(i.projector, Intrinsics) and i.sensor.n_cameras == 1]
 
 
 @pytest.mark.parametrize("name", floods())
@@ -197,6 +199,24 @@ def test_zones_tile_the_angles_of_the_sheet_and_read_a_wall(name: str) -> None:
     assert image.z.shape == preset.sheet.resolution_px[::-1]
     assert image.valid.mean() > 0.9
     assert np.nanmedian(np.abs(image.z - distance_m)) < 0.03 * distance_m
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if presets.load(name).sensor.n_cameras == 2])
+def test_a_stereo_device_reads_a_wall_by_its_dots(name: str) -> None:
+    """Both cameras, a part of their images; the left columns of the first one show what the second does not see."""
+    preset = presets.describe(name)
+    instrument, camera = preset.instrument, preset.instrument.camera
+    assert isinstance(camera, Intrinsics)
+    small = replace(instrument, camera=replace(camera, width=192, height=64, cx=96.0, cy=32.0))
+    scene = scene_of(wall=wall(1.0, matte(0.6)))
+    rigs = small.rigs(scene)
+    signals = transport(scene, rigs, [small.sensor], spp=16, max_depth=2, photons=0, glint=False)
+    image = decode(expose(signals, small.sensor, small.detector, small.exposure_s), small.decoder)
+    disparity_px = camera.fx * np.linalg.norm(rigs[1].T_world_camera[:3, 3] - rigs[0].T_world_camera[:3, 3])
+    inner = image.z[8:-8, int(disparity_px) + 12 : -8]
+    assert np.isfinite(inner).mean() > 0.9
+    assert np.nanmedian(np.abs(inner - 1.0)) < 0.01
+    assert image.valid.mean() < 0.97
 
 
 # ---- Names ---------------------------------------------------------------------------------------------------------

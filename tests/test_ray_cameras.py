@@ -255,3 +255,24 @@ def test_scanners_are_not_fused_and_say_so_before_any_rendering() -> None:
     for work in (carry_out_scan, estimate_scan):
         with pytest.raises(ValueError, match="expected a pinhole camera for a scan, whose views are fused"):
             work(settings)
+
+
+def test_a_scanner_that_drives_into_fog_is_refused() -> None:
+    fog = {"type": "homogeneous", "albedo": 0.9, "sigma_t": {"type": "spectrum", "value": 2.0}}
+    scene = load_scene(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "fov": 40.0},
+            "bank": {
+                "type": "sphere",
+                "center": [0.0, 0.0, 3.0],
+                "radius": 1.0,
+                "b": {"type": "null"},
+                "interior": fog,
+            },
+        }
+    )
+    rig = Rig(sweep(), Beam((1e-3, 1e-3)))
+    transport(scene, rig, [IdealToF()], spp=1)
+    with pytest.raises(ValueError, match="expected the camera to stand in air, but it is inside the medium of .*bank"):
+        transport(scene, moving_scanner(rig, ConstantTwist((0.0, 0.0, 30.0))), [IdealToF()], spp=1)

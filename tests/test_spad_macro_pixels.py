@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from synthetic import signals_of_depth, stereo_rig
 
-from rangesim import DirectToF, Intrinsics, Rig, SpadDetector, decode, expose
-from rangesim.decoding.histogram import coates
+from rangesim import DirectToF, Intrinsics, Rig, SpadDetector, Status, decode, expose
+from rangesim.decoding.histogram import coates, undo_pile_up
 from rangesim.electronics.detector import Gate
+from rangesim.sensors import DirectToFDecoder
 
 BINS, PERIOD_S, PULSES = 100, 100e-9, 20_000
 GATE = Gate(PERIOD_S, PERIOD_S, BINS)
@@ -227,3 +229,53 @@ def test_a_pixel_in_floods_of_light_ends() -> None:
 def test_settings_out_of_their_bounds_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         SpadDetector(**settings)
+
+
+# ---- Undone by decoders ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"dead_time_s": 20e-9, "pile_up": False},
+        {"dead_time_s": 150.3e-9, "pile_up": False},
+        {"dead_time_s": 60e-9},
+        {"dead_time_s": 5e-9, "pile_up": False, "spads": 4},
+    ],
+)
+def test_what_dead_time_hides_is_undone(settings: dict[str, Any]) -> None:
+    """Also where it reaches over to the next pulse; and the counts scatter by as much more as is said."""
+    photons = 0.004 + 0.8 * np.exp(-0.5 * ((np.arange(BINS) - 60) / 3) ** 2) / 7.5
+    counts = counted(photons, pulses=40_000, **settings)
+    blind = SpadDetector(**settings).blindness(GATE, 40_000 * PERIOD_S)
+    assert blind is not None
+    restored, excess = undo_pile_up(counts, blind)
+    expected = photons * 40_000
+    error = (restored - expected[:, None]) / np.sqrt(expected[:, None] * excess)
+    assert np.abs(error.mean(axis=1)).max() < 5 / np.sqrt(PIXELS)
+    assert error.std() == pytest.approx(1, abs=0.1)
+    assert np.abs(counts.mean(axis=1) / expected - 1).max() > 0.1  # what is undone is no trifle
+
+
+@pytest.mark.parametrize("decoder", [DirectToFDecoder(), DirectToFDecoder(max_returns=2)])
+@pytest.mark.parametrize("photons", [0.3, 2.0, 30.0])
+def test_a_wall_is_read_within_its_noise_or_refused_in_spite_of_dead_time(
+    decoder: DirectToFDecoder, photons: float
+) -> None:
+    sensor = DirectToF()
+    rig = Rig(Intrinsics.from_fov(300, 1, 20.0), Intrinsics.from_fov(1280, 800, 60))
+    signals = signals_of_depth(rig, np.full((1, 300), 2.0), [sensor])
+    still, detector = decode(expose(signals, sensor), decoder), SpadDetector(dead_time_s=10e-9, pile_up=False, bits=16)
+    brought = detector.photons_per_pulse(signals.frames(sensor), sensor.gate, rig).max()
+    bright = replace(rig, projector_power_w=photons / brought)
+    signals = signals_of_depth(bright, np.full((1, 300), 2.0), [sensor])
+    image = decode(expose(signals, sensor, detector, exposure_s=2e-4, seed=5), decoder)
+    if photons > 10:
+        assert (image.status == Status.SATURATED).all()
+        return
+    assert image.valid.all()
+    lengths = decoder.coordinates(expose(signals, sensor, detector, exposure_s=2e-4, seed=5))
+    assert lengths.sigma_m is not None
+    normalised = ((image.range_m - still.range_m) / (lengths.sigma_m / 2))[0]
+    assert abs(normalised.mean()) < 0.5
+    assert normalised.std() < 1.6

@@ -134,11 +134,13 @@ class Evidence:
         detector, capture = self.capture.detector, self.capture
         if not isinstance(detector, SpadDetector):
             return np.zeros(self.true_m.shape, dtype=bool)
-        pulses = detector.first_only(capture.sensor.gate, capture.exposure_s)
-        if pulses is None:
+        blind = detector.blindness(capture.sensor.gate, capture.exposure_s)
+        if blind is None:
             return np.zeros(self.true_m.shape, dtype=bool)
         ran_out = (self.image.status == Status.SATURATED) & ~capture.saturated(capture.frames)
-        return np.asarray(ran_out | (capture.frames.sum(axis=0, dtype=np.float64) > MAX_PULSES_HIT * pulses))
+        if not blind.until_next_pulse:
+            return ran_out
+        return np.asarray(ran_out | (capture.frames.sum(axis=0, dtype=np.float64) > MAX_PULSES_HIT * blind.trials))
 
     # ---- The surface ---------------------------------------------------------------------------------
 

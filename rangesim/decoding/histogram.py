@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from rangesim.electronics.spad import Blindness
+
 MIN_PULSES_LEFT = 10
 """Least number of pulses that have met no photon by the end of a peak's window. With m left, a bin that Coates' formula
 corrects is too large by 1 / (2 m) on average, so by 5 % here, and its noise grows as 1 / sqrt(m)."""
@@ -99,6 +101,76 @@ def coates_excess(counts: np.ndarray, pulses: int) -> np.ndarray:
     """
     used = np.cumsum(counts, axis=0, dtype=np.int64)
     return np.asarray(pulses / np.maximum(pulses - (used - counts), 1))
+
+
+def armed(counts: np.ndarray, blind: Blindness) -> np.ndarray:
+    """(k, n) float64, number of trials in which a SPAD is armed when a bin begins, on average over the bin.
+
+    A SPAD fires at most once within its dead time. So of all trials, those are blind that counted a photon within the
+    dead time before, which may have been after an earlier pulse.
+
+    Parameters
+    ----------
+    counts : (k, n) int, histograms as the detector counted them.
+
+    Examples
+    --------
+    Of 1000 pulses, 400 fired in bin 1; with a dead time of two and a half bins, these are blind in bins 2 and 3:
+
+    >>> import numpy as np
+    >>> armed(np.array([[0], [400], [0], [0], [0]]), Blindness(1000, False, dead=2.5, period=5)).ravel()
+    array([1000., 1000.,  600.,  600., 1000.])
+
+    References
+    ----------
+    Isbaner et al.: "Dead-time correction of fluorescence lifetime measurements and fluorescence lifetime imaging",
+    Optics Express 24 (2016).
+    """
+    bins, total = len(counts), np.asarray(counts.sum(axis=0, dtype=np.float64))
+    before = np.concatenate([np.zeros((1, counts.shape[1])), np.cumsum(counts, axis=0, dtype=np.float64)])
+    ends = np.arange(bins)
+    begins = ends - max(blind.dead - 0.5, 0.0)  # on average, a SPAD fires in the middle of its bin
+    if blind.until_next_pulse:
+        begins = np.minimum(begins, 0.0)
+    periods = np.floor(begins / blind.period)
+    within = np.minimum(begins - periods * blind.period, bins)
+    low = np.minimum(within.astype(np.int64), bins - 1)
+    part = (within - low)[:, None]
+    begun = (1 - part) * before[low] + part * before[low + 1] + periods[:, None] * total
+    return np.asarray(np.maximum(blind.trials - (before[ends] - begun), 0.0))
+
+
+def undo_pile_up(counts: np.ndarray, blind: Blindness) -> tuple[np.ndarray, np.ndarray]:
+    """(k, n) float64 each: counts without pile-up, and the variance of these counts over their means.
+
+    Without dead time it is `coates`; with it, the pulses that were left are those that `armed` says.
+
+    Parameters
+    ----------
+    counts : (k, n) int, histograms as the detector counted them.
+    """
+    from rangesim.decoding.histogram_kernels import MAX_FRACTION
+
+    if blind.dead == 0:
+        return coates(counts, blind.trials), coates_excess(counts, blind.trials)
+    able = np.maximum(armed(counts, blind), 1.0)
+    return -blind.trials * np.log1p(-np.minimum(counts / able, MAX_FRACTION)), blind.trials / able
+
+
+def trials_left(
+    counts: np.ndarray, place: np.ndarray, blind: Blindness, sigma_bins: float, is_cyclic: bool
+) -> np.ndarray:
+    """(n,) int64, least number of armed trials that a bin in the window of each peak leaves without a photon.
+
+    Without dead time it is `pulses_left`, whose parameters it has.
+    """
+    if blind.dead == 0:
+        return pulses_left(counts, place, blind.trials, sigma_bins, is_cyclic)
+    bins, reach = len(counts), window_reach(len(counts), sigma_bins, is_cyclic)
+    at = np.floor(place).astype(np.int64) + np.arange(-reach, reach + 1)[:, None]
+    at = at % bins if is_cyclic else np.clip(at, 0, bins - 1)
+    left = armed(counts, blind) - counts
+    return np.asarray(np.take_along_axis(left, at, axis=0).min(axis=0).astype(np.int64))
 
 
 def pulses_left(counts: np.ndarray, place: np.ndarray, pulses: int, sigma_bins: float, is_cyclic: bool) -> np.ndarray:

@@ -17,6 +17,8 @@ STEPS = 4
 CONVERGED = 1e-4
 """Rounds end when no place moves farther, in bins, and the background changes by no larger fraction of all counts. The
 noise is larger: with a million counts it is a thousandth, of the pulse's width and of the counts."""
+SETTLED = 0.01
+"""Standard deviations of a place; a place that moves no farther has settled, because the noise hides it."""
 MAX_STEP = 0.5
 """Bins, largest scoring step, because far from the maximum the steps overshoot."""
 FLOOR = 1e-6
@@ -71,7 +73,7 @@ def fit_returns(histograms, excess, shape, rules, is_cyclic, distance, place, st
                     _expect(others, level, at, n, found, i, shape, is_cyclic)
                     was = at[i]
                     at[i], n[i], spread[i] = _fit(counts, others, excesses, at[i], n[i], shape, is_cyclic)
-                    moved = max(moved, abs(at[i] - was))
+                    moved = max(moved, abs(at[i] - was) - SETTLED * spread[i])
                 _expect(expected, level, at, n, found, -1, shape, is_cyclic)
                 level_was, level = level, _level(counts, expected, level, rules.tolerance)
                 if moved < CONVERGED and abs(level - level_was) * bins <= CONVERGED * total:
@@ -212,6 +214,8 @@ def _fit(counts, others, excess, at, n, shape, is_cyclic):  # type: ignore[no-un
         grow = (gn - np_ * move) / nn
         at, n = at + move, max(n + grow, 0.1 * n)
         spread = math.sqrt(nn / determinant)
+        if abs(move) < CONVERGED:
+            break
     return at, n, spread
 
 

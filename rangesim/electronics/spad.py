@@ -27,6 +27,21 @@ MAX_PHOTONS = 1000.0
 would take minutes. A SPAD with a dead time of 1 ns is then dead more than 90 % of a period of 100 ns."""
 
 
+class Blindness(NamedTuple):
+    """When the timers of a pixel count nothing although photons come, as decoders undo it.
+
+    trials : number of laser pulses times that of timers.
+    until_next_pulse : whether a timer is blind from its first count to the next pulse.
+    dead : bins, time for which a SPAD is blind after it fired.
+    period : bins, time from pulse to pulse.
+    """
+
+    trials: int
+    until_next_pulse: bool
+    dead: float
+    period: float
+
+
 class CountingPixel(NamedTuple):
     """The linear response of one bin of a `SpadDetector` to radiance, for one exposure time.
 
@@ -137,6 +152,16 @@ class SpadDetector(PhotoDetector):
         """
         timers = self.spads if self.coincidence == 1 else 1
         return self.pulses(gate, exposure_s) * timers if self.pile_up else None
+
+    def blindness(self, gate: Gate | None, exposure_s: float) -> Blindness | None:
+        """What hides photons from the timers of a pixel; None if nothing does, or if only coincidences are counted
+        and all of them: what hides those follows no formula."""
+        gate, firsts = _counting(gate), self.first_only(gate, exposure_s)
+        if firsts is None and (self.dead_time_s == 0 or self.coincidence > 1):
+            return None
+        bin_s, dead_s = gate.open_s / gate.bins, self.dead_time_s if self.coincidence == 1 else 0.0
+        trials = self.pulses(gate, exposure_s) * self.spads if firsts is None else firsts
+        return Blindness(trials, firsts is not None, dead_s / bin_s, gate.period_s / bin_s)
 
     def ambient_fraction(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
         """Factor on the scene's ambient light: its part that passes the filter while photons are counted."""

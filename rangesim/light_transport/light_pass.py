@@ -50,6 +50,9 @@ RAYS_TO_MEDIA = 16
 """Number of columns, and of rows, of the rays that look for media on the wrong side of their boundary. These 256 rays
 may miss a body that covers less than one of the cells between them. More rays would find smaller bodies and take
 longer."""
+PLACES = 8
+"""Number of places along the way of a scanner at which it must be in air. A body that it crosses between two of them is
+not noticed; more places take more rays."""
 TEXTURE_SAMPLES = 64
 """Largest number of samples per pixel over which the reflectance of a texture is averaged. More samples take longer and
 change a mean over a pixel little, because samples are spread evenly."""
@@ -248,7 +251,8 @@ def _check_in_air(scene: Scene, rig: Rig) -> None:
     if isinstance(rig.projector, Intrinsics):
         devices.append(("projector", rig.projector, T_camera @ rig.T_camera_projector))
     for name, device, T in devices:
-        body = body_around(scene.mitsuba, T[:3, 3])
+        bodies = (body_around(scene.mitsuba, place) for place in _places(device, T))
+        body = next((body for body in bodies if body is not None), None)
         if body is not None:
             raise ValueError(
                 f"expected the {name} to stand in air, but it is inside the medium of shape {body!r}; move it out, or "
@@ -266,6 +270,15 @@ def _check_in_air(scene: Scene, rig: Rig) -> None:
                     f"expected a body that holds the exterior medium of shape {shape!r}, but none is around it, so "
                     f"the {name} would stand in that medium; put one in front of it, or leave the medium out."
                 )
+
+
+def _places(device: Camera, T: np.ndarray) -> np.ndarray:
+    """(n, 3) float64, metres, where rays start: the device's place T, and places of a scanner that moves."""
+    if isinstance(device, Intrinsics) or device.times_s is None:
+        return T[None, :3, 3]
+    origins = device.pixel_rays().origins.reshape(-1, 3)
+    some = origins[np.linspace(0, len(origins) - 1, min(len(origins), PLACES)).astype(int)]
+    return np.vstack([T[None, :3, 3], some @ T[:3, :3].T + T[:3, 3]])
 
 
 def _directions_over(device: Camera) -> np.ndarray:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,12 @@ from rangesim.report.content_security import visible_text
 from rangesim.report.template import render_page
 from rangesim.report.verdict import verdict
 from rangesim.results.experiment_results import Measurement, Result
+from rangesim.rig import Beam, Rig
 from rangesim.signals import GroundTruth
 
+FEW_PX = 64
+"""Width of an image, in pixels, below which its pixels are shown as squares: a sensor of 8 x 8 zones has no image that
+could be smoothed. With a larger value the pictures of small trial runs would be squares, too."""
 SCRIPTS = ("scroll.js", "viewer.js", "report.js")
 """Files of the page's JavaScript, in the order in which they use each other."""
 
@@ -105,6 +110,7 @@ def _camera(result: Result, group: Sequence[Measurement]) -> dict[str, Any]:
     materials, legend = figures.material_picture(group[0].truth, group[0].camera)
     return {
         "names": [m.name for m in group],
+        "few": group[0].camera.width < FEW_PX,
         "size": tables.size_text(group[0].truth.z.shape),
         "scene": figures.scene_picture(result.passes[group[0].light_pass - 1].energy, group[0].camera),
         "materials": materials,
@@ -117,6 +123,7 @@ def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -
     causes, legend = figures.cause_map(m)
     return {
         "name": m.name,
+        "few": m.camera.width < FEW_PX,
         "depth_name": "depth z" if m.camera.is_pinhole else "range",
         "letter": "z" if m.camera.is_pinhole else "range",
         "depth": figures.depth_map(m, limits, depth),
@@ -139,6 +146,7 @@ def _frames(m: Measurement) -> dict[str, Any]:
         details.append(tables.photons(f.photons_per_pulse))
     return {
         "name": m.name,
+        "few": m.camera.width < FEW_PX,
         "taken": taken,
         "details": " · ".join(details),
         "frames": figures.captured_frames(m.capture),
@@ -152,10 +160,21 @@ def _light(result: Result, number: int) -> dict[str, Any]:
     assert rig is not None
     return {
         "names": [m.name for m in of_pass],
-        "baseline_mm": f"{1e3 * rig.baseline_m:.0f}",
+        "few": rig.camera.width < FEW_PX,
+        "emitter": _emitter(rig),
         "power_w": f"{rig.projector_power_w:g}",
         "pictures": figures.light_pictures(result.passes[number].energy, rig.camera),
     }
+
+
+def _emitter(rig: Rig) -> str:
+    """What the emitter is, and where it stands."""
+    if isinstance(rig.projector, Beam):
+        beside = 1e3 * math.hypot(*rig.projector.offset_m)
+        wide, high = (1e3 * angle for angle in rig.projector.divergence_rad)
+        place = f", {beside:.0f} mm beside it" if beside else ""
+        return f"A beam of {wide:.3g} × {high:.3g} mrad along each ray{place}"
+    return f"Emitter {1e3 * rig.baseline_m:.0f}\u00a0mm beside the camera"
 
 
 def _transport(result: Result, names: dict[str, str]) -> list[dict[str, str]]:

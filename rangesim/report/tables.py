@@ -12,6 +12,7 @@ from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
 from rangesim.evaluation.comparison import OUTLIER_M, Comparison, ErrorStatistics
 from rangesim.evaluation.range_noise import SMALL, noise_ratio
 from rangesim.experiment import Experiment
+from rangesim.presets import catalogue
 from rangesim.report import palette
 from rangesim.report.figures import LegendEntry
 from rangesim.report.markdown_table import Table
@@ -87,9 +88,10 @@ class Cell:
 
 
 def titles(measurements: Sequence[Measurement]) -> dict[str, str]:
-    """Title of each instrument, by name. If two instruments would have the same title, their names are added to it."""
+    """Title of each instrument, by name. The name is added for devices, and if two instruments have the same title."""
     plain = {m.name: m.capture.sensor.title for m in measurements}
-    return {n: t if list(plain.values()).count(t) == 1 else f"{t}, {n}" for n, t in plain.items()}
+    devices, shown = catalogue.names(), list(plain.values())
+    return {n: f"{t}, {n}" if n in devices or shown.count(t) > 1 else t for n, t in plain.items()}
 
 
 def is_reference(measurement: Measurement) -> bool:

@@ -11,21 +11,13 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.decoding.histogram import (
-    coates,
-    coates_excess,
-    find_peak,
-    place_sigma,
-    pulses_left,
-    runs_out,
-    window_reach,
-)
+from rangesim.decoding.histogram import find_peak, place_sigma, runs_out, trials_left, undo_pile_up, window_reach
 from rangesim.decoding.path_length import LengthReturns, PathLengths
 from rangesim.decoding.returns import PulseShape, ReturnRules, find_returns
 from rangesim.decoding.status import Status
 from rangesim.decoding.working_range import WorkingRange
 from rangesim.electronics.detector import Gate
-from rangesim.electronics.spad import SpadDetector
+from rangesim.electronics.spad import Blindness, SpadDetector
 from rangesim.response import SPEED_OF_LIGHT, Pulse, Response, TransientHistogram
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, Threshold, of_type
 from rangesim.settings import limits
@@ -352,16 +344,16 @@ class DirectToFDecoder(Decoder):
 
         height, width = capture.frames.shape[1:]
         position, peak, background, intensity = np.empty((4, height, width))
-        left, pulses = np.empty((height, width), dtype=np.int64), _pulses(capture)
+        left, blind = np.empty((height, width), dtype=np.int64), _blindness(capture)
 
         def measure(start: int, stop: int) -> None:
             for row in range(start, stop):
                 frames = capture.frames[:, row]
-                histogram = frames.astype(np.float64) if pulses is None else coates(frames, pulses)
+                histogram = frames.astype(np.float64) if blind is None else undo_pile_up(frames, blind)[0]
                 found = find_peak(histogram, sensor.sigma_bins, sensor.is_cyclic)
                 position[row], peak[row], background[row] = found
-                if pulses is not None:
-                    left[row] = pulses_left(frames, found[0], pulses, sensor.sigma_bins, sensor.is_cyclic)
+                if blind is not None:
+                    left[row] = trials_left(frames, found[0], blind, sensor.sigma_bins, sensor.is_cyclic)
                 intensity[row] = frames.sum(axis=0, dtype=np.float64)
 
         in_blocks(measure, height, smallest=MIN_ROWS)
@@ -374,9 +366,9 @@ class DirectToFDecoder(Decoder):
         sigma_m = None
         if capture.detector is not None:
             sigma_bins = place_sigma(peak, background, sensor.bins, sensor.sigma_bins, sensor.is_cyclic)
-            if pulses is not None:
-                status[runs_out(left, pulses)] = Status.SATURATED
-                sigma_bins *= np.sqrt(pulses / np.maximum(left, 1))  # Coates' correction adds to the variance of counts
+            if blind is not None:
+                status[runs_out(left, blind.trials)] = Status.SATURATED
+                sigma_bins *= np.sqrt(blind.trials / np.maximum(left, 1))  # the correction adds to the counts' variance
             sigma_m = sigma_bins * sensor.bin_s * SPEED_OF_LIGHT
         return PathLengths(
             length_m=length,
@@ -391,7 +383,7 @@ class DirectToFDecoder(Decoder):
         from pcgraph.parallel import MIN_ROWS, in_blocks
 
         height, width = capture.frames.shape[1:]
-        most, pulses = self.max_returns + (self.min_range_m > 0), _pulses(capture)  # the cover glass is one more
+        most, blind = self.max_returns + (self.min_range_m > 0), _blindness(capture)  # the cover glass is one more
         place, strength, sigma, kept = np.empty((4, most, height, width))
         intensity = np.empty((height, width))
 
@@ -399,14 +391,14 @@ class DirectToFDecoder(Decoder):
             for row in range(start, stop):
                 frames = capture.frames[:, row]
                 histogram, excess = frames.astype(np.float64), None
-                if pulses is not None:
-                    histogram, excess = coates(frames, pulses), coates_excess(frames, pulses)
+                if blind is not None:
+                    histogram, excess = undo_pile_up(frames, blind)
                 found = find_returns(np.nan_to_num(histogram), sensor.shape, rules, sensor.is_cyclic, excess)
                 place[:, row], strength[:, row], sigma[:, row] = found
                 intensity[row] = frames.sum(axis=0, dtype=np.float64)
-                if pulses is not None:
+                if blind is not None:
                     at = np.nan_to_num(found.place)
-                    kept[:, row] = [pulses_left(frames, a, pulses, sensor.sigma_bins, sensor.is_cyclic) for a in at]
+                    kept[:, row] = [trials_left(frames, a, blind, sensor.sigma_bins, sensor.is_cyclic) for a in at]
 
         rules = ReturnRules(most, self.peak_sigmas, self.min_counts, self.pulse_tolerance)
         if not capture.is_digital:  # radiances have no noise; how strong is strong, the image tells
@@ -415,7 +407,9 @@ class DirectToFDecoder(Decoder):
         in_blocks(measure, height, rules, smallest=MIN_ROWS)
         length = (sensor.start_s + place * sensor.bin_s) * SPEED_OF_LIGHT
         status = np.where(np.isfinite(place), Status.OK, Status.LOW_SIGNAL)
-        ran_out = np.zeros(place.shape, dtype=bool) if pulses is None else runs_out(kept, pulses) & np.isfinite(place)
+        ran_out = np.zeros(place.shape, dtype=bool)
+        if blind is not None:
+            ran_out = runs_out(kept, blind.trials) & np.isfinite(place)
         status[ran_out] = Status.SATURATED
         is_outside = (place < 0) | (place > sensor.bins) | (length < 2 * self.min_range_m)
         status[is_outside] = Status.OUT_OF_RANGE
@@ -475,8 +469,8 @@ def _window_bins(sensor: DirectToF) -> int:
     return 2 * window_reach(sensor.bins, sensor.sigma_bins, sensor.is_cyclic) + 1
 
 
-def _pulses(capture: Capture) -> int | None:
-    """Number of pulses in the exposure, times that of timers, if each counted its first photon alone; else None."""
+def _blindness(capture: Capture) -> Blindness | None:
+    """What hid photons from the timers of the detector; None if nothing did, or the detector is not known."""
     if isinstance(capture.detector, SpadDetector):
-        return capture.detector.first_only(capture.sensor.gate, capture.exposure_s)
+        return capture.detector.blindness(capture.sensor.gate, capture.exposure_s)
     return None
