@@ -43,6 +43,7 @@ from rangesim import (
     decode,
     expose,
     load_scene,
+    presets,
     transport,
 )
 from rangesim.environment.backend import select_variant
@@ -71,13 +72,15 @@ Figures = dict[str, float]
 
 LEFT_M = 0.015
 """Metres from the colour camera to the left infra-red camera, to its right: librealsense's extrinsics of a D435."""
-D435 = Instrument(
-    name="d435",
+PRESET = presets.load("d435")
+"""The D435 of the package."""
+D435 = replace(
+    PRESET,
     sensor=ActiveStereo(Dots(1280, 800, spacing_px=13.8, dot_px=1.45), BASELINE_M),
     camera=Intrinsics(848, 480, fx=427.12, fy=427.12, cx=427.43, cy=235.28),
     projector=Intrinsics.from_fov(1280, 800, fov_x_deg=90.0),
-    T_camera_projector=translation(BASELINE_M / 2, 0.0, 0.0),
     power_w=0.15,
+    exposure_s=None,
     detector=Detector(bits=10, full_well_e=10_000.0, quantum_efficiency=0.3, band_width_m=0.9e-6),
     decoder=StereoDecoder(
         DenseMatching(
@@ -86,12 +89,13 @@ D435 = Instrument(
         )
     ),
 )  # fmt: skip
-"""A D435. Camera: description of a robot with one (realsense-ros). Dots: those in a real pair of infra-red images of a
-D435 (SimSense), 9.2 camera pixels apart, with a standard deviation of 1.0 camera pixel, the blur of the camera's lens
-included. Power: librealsense's default setting, if all of it leaves the device. Its cameras have no filter; electrons
-are assumed. Matcher: census as in the device, whose texture check the data set's authors had switched off. Its other
-thresholds are those with which scene 080 loses as little of its background as the real camera does (2 to 3 %); what it
-loses on glass was not looked at for them."""
+"""The preset with what is known better here. Dots: those in a real pair of infra-red images of a D435 (SimSense), 9.2
+camera pixels apart, with a standard deviation of 1.0 camera pixel, the blur of the camera's lens included. Camera: of
+the same device. Power: librealsense's default setting, 150 mW, if all of it leaves the device; automatic exposure. The
+cameras of a D435 have no filter, so they take visible light too; electrons are assumed. Matcher: census as in the
+device, without the texture check, which the data set's authors had switched off. Its other thresholds are those with
+which scene 080 loses as little of its background as the real camera does (2 to 3 %); what it loses on glass was not
+looked at for them."""
 ROOM_LUX = 400.0
 """Room light on the table, lux; assumed such that dots at 0.6 m are 2.7 times as bright as what is around them, as in
 that real pair (in another room)."""
@@ -126,12 +130,14 @@ class Matter:
 class Trial:
     """What is simulated: the objects, and what the camera does with them.
 
+    device : the instrument.
     dots : whether the projector is on.
     room : factor on the light of the room.
-    matching : settings of the matcher that differ from those of `D435`.
+    matching : settings of the matcher that differ from those of the device.
     """
 
     matter: Matter = Matter()
+    device: Instrument = D435
     dots: bool = True
     room: float = 1.0
     matching: dict[str, Any] = field(default_factory=dict)
@@ -155,6 +161,7 @@ TRIALS = {
     "  solid": Trial(Matter("solid")),
     "  rough walls, alpha 0.05": Trial(Matter(alpha=0.05)),
     "  no objects": Trial(Matter("none")),
+    "  preset d435 as it is": Trial(device=PRESET),
 }
 """What `--variants` runs; without it, the first. Trials with the same objects share a pass."""
 
@@ -229,12 +236,12 @@ def figures(measured: np.ndarray, true: np.ndarray, mask: np.ndarray, behind: np
 # ---- A rebuilt scene -------------------------------------------------------------------------------------------------
 
 
-def rigs_of(colour: Intrinsics, width: int) -> tuple[Rig, ...]:
+def rigs_of(device: Instrument, colour: Intrinsics, width: int) -> tuple[Rig, ...]:
     """Rigs of both infra-red cameras.
 
     width : pixels of their images before they are cut to what the colour camera sees, which is all that is compared.
     """
-    whole = D435.camera.resized(width, round(D435.camera.height * width / D435.camera.width))
+    whole = device.camera.resized(width, round(device.camera.height * width / device.camera.width))
     left, right = -colour.cx / colour.fx, (colour.width - colour.cx) / colour.fx
     top, bottom = -colour.cy / colour.fy, (colour.height - colour.cy) / colour.fy
     left -= (LEFT_M + BASELINE_M) / LEAST_DEPTH_M  # of what the right camera needs to match the left edge
@@ -243,10 +250,10 @@ def rigs_of(colour: Intrinsics, width: int) -> tuple[Rig, ...]:
     x0, x1, y0, y1 = max(0, x0 - FRINGE), min(width, x1 + FRINGE), max(0, y0 - FRINGE), min(whole.height, y1 + FRINGE)
     camera = replace(whole, width=x1 - x0, height=y1 - y0, cx=whole.cx - x0, cy=whole.cy - y0)
     first = Rig(
-        camera, D435.projector, translation(LEFT_M, 0, 0), D435.T_camera_projector, D435.camera_lens,
-        D435.projector_lens, D435.power_w, D435.emitter_wavelength_m,
+        camera, device.projector, translation(LEFT_M, 0, 0), device.T_camera_projector, device.camera_lens,
+        device.projector_lens, device.power_w, device.emitter_wavelength_m,
     )  # fmt: skip
-    return D435.sensor.rigs(first)
+    return device.sensor.rigs(first)
 
 
 def aligned(z: np.ndarray, camera: Intrinsics, colour: Intrinsics) -> np.ndarray:
@@ -279,33 +286,34 @@ class Simulated(NamedTuple):
     infrared: np.ndarray
 
 
-def light_of(real: RealScene, rebuilt: Rebuilt, matter: Matter, rigs: tuple[Rig, ...], spp: int, seed: int) -> Signals:
+def light_of(real: RealScene, rebuilt: Rebuilt, trial: Trial, width: int, spp: int, seed: int) -> Signals:
     """Signals of both infra-red cameras in a rebuilt scene."""
+    matter, device = trial.matter, trial.device
     with tempfile.TemporaryDirectory() as folder:
         paint = reflectances(real.grey, real.mask)
         description = scene_dictionary(
             rebuilt, paint, Path(folder), matter.glass, matter.wall_m, matter.int_ior, matter.alpha
         )
-        scene = load_scene(description)
         return transport(
-            scene, rigs, [D435.sensor], spp=spp, max_depth=3, photons=PHOTONS, caustic_radius_m=DOT_RADIUS_M,
-            sampling_error=False, seed=seed,
+            load_scene(description), rigs_of(device, real.camera, width), [device.sensor], spp=spp, max_depth=3,
+            photons=PHOTONS, caustic_radius_m=DOT_RADIUS_M, sampling_error=False, seed=seed,
         )  # fmt: skip
 
 
 def simulate(signals: Signals, trial: Trial, colour: Intrinsics, seed: int = 0) -> Simulated:
-    """What a D435 makes of the light in a rebuilt scene."""
-    sensor = D435.sensor if trial.dots else replace(D435.sensor, pattern=None)
+    """What a stereo camera makes of the light in a rebuilt scene."""
+    device = trial.device
+    sensor = device.sensor if trial.dots else replace(device.sensor, pattern=None)
     light = Ambient("led", illuminance_lux=trial.room * ROOM_LUX)
-    pair = expose(signals, sensor, D435.detector, seed=seed, ambient=light)
+    pair = expose(signals, sensor, device.detector, device.exposure_s, seed, light)
     camera = signals.rig.camera
     least, largest = (camera.fx * BASELINE_M / z for z in (FARTHEST_M, NEAREST_M))
     decoder = replace(
-        D435.decoder, matching=replace(D435.decoder.matching, **trial.matching), least_px=least,
+        device.decoder, matching=replace(device.decoder.matching, **trial.matching), least_px=least,
         disparities=int(np.ceil(largest - least)),
     )  # fmt: skip
     image = decode(pair, decoder)
-    frame = pair.reference.frames[0].astype(np.float64) / D435.detector.max_dn
+    frame = pair.reference.frames[0] / device.detector.max_dn
     shown = np.round(255 * np.sqrt(np.clip(frame, 0, 1))).astype(np.uint8)
     return Simulated(aligned(np.where(image.valid, image.z, np.nan), camera, colour), shown)
 
@@ -340,11 +348,11 @@ def report_scene(real: RealScene, number: int, args: argparse.Namespace) -> dict
         show(label, *result[label])
 
     add(f"real D435, scene {number:03d}", real.transparent, real.opaque, real.opaque)
-    rigs = rigs_of(real.camera, args.width or D435.camera.width)
     signals, of = None, None
     for label, trial in TRIALS.items() if args.variants else [(BASE, TRIALS[BASE])]:
-        if signals is None or trial.matter != of:
-            signals, of = light_of(real, rebuilt, trial.matter, rigs, args.spp, args.seed), trial.matter
+        if signals is None or (trial.matter, trial.device) != of:
+            signals = light_of(real, rebuilt, trial, args.width or D435.camera.width, args.spp, args.seed)
+            of = trial.matter, trial.device
         seen = simulate(signals, trial, real.camera, args.seed)
         add(label, seen.z, front, behind)
         lost, lost_too = (np.isnan(z)[mask & compared] for z in (real.transparent, seen.z))
