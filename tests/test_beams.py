@@ -229,3 +229,29 @@ def test_a_mirror_sends_a_beam_back_into_its_own_eye() -> None:
     histogram = signals.channels[sensor.responses()[0]][:, 0, 0]
     assert np.flatnonzero(histogram).tolist() == [int(2 * d / 299792458.0 / 1e-9)]
     assert transport(scene, rig, [sensor], spp=16, glint=False).energy.glint.sum() == 0
+
+
+def test_the_floor_of_a_pool_is_as_bright_as_the_closed_form() -> None:
+    """Light that ends inside glass or water: a beam through a plane at 1 m, of index n, to a floor 1 m below it.
+
+    The refracted beam spreads over (1 + 1 / n)^2 m2/sr; the radiance falls by n^2 on the way out.
+    """
+    T, n, power, width = mi.ScalarTransform4f, 1.33, 0.7, 4e-3
+    scene = load_scene(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "fov": 20.0, "to_world": T().look_at([0, 0, 0], [1, 0, 0], [0, 0, 1])},
+            "water": {
+                "type": "rectangle",
+                "to_world": T().translate([1, 0, 0]).rotate([0, 1, 0], -90).scale(3),
+                "b": glass(n),
+            },
+            "floor": wall(T().translate([2, 0, 0]).rotate([0, 1, 0], -90).scale(3)),
+        }
+    )
+    ray = RayTable(np.array([[[0.0, 0.0, 1.0]]]), field_rad=(1e-3, 1e-3))
+    rig = Rig(ray, Beam((width, width), "box"), scene.rig().T_world_camera, projector_power_w=power)
+    energy = transport(scene, rig, [IdealToF()], spp=1 << 14, max_depth=2, glint=False).energy
+    passed = 1 - ((n - 1) / (n + 1)) ** 2
+    irradiance = passed * power / width**2 / (1 + 1 / n) ** 2
+    assert energy.specular[0, 0] == pytest.approx(0.6 / np.pi * irradiance * passed / n**2, rel=5e-3)

@@ -596,7 +596,8 @@ def walk(
             bends = goes_delta & at_surface
             eta = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission), bs.eta, 1)
             turned = path.pencil.turned(ray.d, si, wo, eta)
-            turned.fraction *= bs_weight * bs.pdf
+            # `bs_weight` is that of radiance, which falls by eta^2 on the way into glass; power does not
+            turned.fraction *= bs_weight * bs.pdf * dr.square(eta)
             path.pencil = path.pencil.replaced(bends, turned)
         path.throughput *= bs_weight
         path.ray_state = path.ray_state.refracted(bs, at_surface)
