@@ -43,7 +43,7 @@ from rangesim.results.experiment_results import load_result
 from rangesim.rig import translation
 from rangesim.sensors import StereoDecoder, sensor_from_dict
 from rangesim.settings.config import from_dict, to_dict
-from rangesim.signals import SignalSet
+from rangesim.signals import SignalSet, StillSignals
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 PARTS = 5
@@ -285,6 +285,16 @@ def test_signals_of_several_cameras_are_a_set(both: SignalSet) -> None:
         SignalSet.of([])
     with pytest.raises(ValueError, match="camera 1 has another projector_power_w"):
         SignalSet.of([left, replace(right, rig=replace(right.rig, projector_power_w=3.0))])
+
+
+def test_signals_are_saved_camera_by_camera(both: SignalSet, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="expected StillSignals, got SignalSet; save the signals of each camera"):
+        rangesim.save_signals(both, tmp_path / "both.npz")  # type: ignore[arg-type]
+    for number, signals in enumerate(both):
+        assert isinstance(signals, StillSignals)
+        rangesim.save_signals(signals, tmp_path / f"{number}.npz")
+    again = SignalSet.of([rangesim.load_signals(tmp_path / f"{number}.npz") for number in range(2)])
+    np.testing.assert_array_equal(decode(expose(again, SENSOR)).z, decode(expose(both, SENSOR)).z)
 
 
 def test_the_first_camera_of_two_keeps_its_bytes(both: SignalSet) -> None:

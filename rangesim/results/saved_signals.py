@@ -53,7 +53,8 @@ def save_signals(signals: StillSignals, path: str | Path) -> None:
     Raises
     ------
     ValueError
-        A response holds arrays (`rangesim.response.Images`), which files cannot hold.
+        The signals are those of several cameras or of a moving scene; or a response holds arrays
+        (`rangesim.response.Images`), which files cannot hold.
     FileFormatError
         The file cannot be written.
 
@@ -62,6 +63,11 @@ def save_signals(signals: StillSignals, path: str | Path) -> None:
     >>> from rangesim import save_signals
     >>> save_signals(signals, "out/signals.npz")  # doctest: +SKIP
     """
+    if not isinstance(signals, StillSignals):
+        raise ValueError(
+            f"expected StillSignals, got {type(signals).__name__}; "
+            "save the signals of each camera of a set by themselves."
+        )
     responses = list(signals.channels)
     settings = {
         "format": FORMAT,
@@ -217,7 +223,7 @@ def _plain(response: Response) -> dict[str, Any]:
     name = type(response).__name__
     if not hasattr(response, "type_name"):
         raise ValueError(f"expected responses with a type_name, which names them in files, got {name} without one.")
-    if any(isinstance(value, np.ndarray) for value in vars(response).values()):
+    if any(isinstance(getattr(response, f.name), np.ndarray) for f in fields(response)):  # type: ignore[arg-type]
         raise ValueError(f"expected responses of numbers, got {name}, which holds arrays.")
     table: dict[str, Any] = to_dict(response)
     return table
