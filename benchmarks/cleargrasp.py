@@ -59,6 +59,10 @@ SCENE = Path(__file__).resolve().parent.parent / "scenes" / "glassware.xml"
 DATA = Path("../shared/data/cleargrasp_d435")
 REAL_SCENES = (80, 123)
 OFF_MM = 10.0
+GAPS_M = (0.0, 0.04, 0.08, 0.12, 0.2)
+"""Classes of the distance from the glass to what is behind it, metres; each begins here and ends at the next."""
+LEAST_PIXELS = 500
+"""Smaller classes say nothing: their pixels are those of a few windows of a matcher."""
 SENSORS = {
     "structured light, gray-phase": StructuredLight(),
     "AMCW ToF, 20 + 80 + 100 MHz": AmcwToF(),
@@ -218,7 +222,7 @@ def figures(measured: np.ndarray, true: np.ndarray, mask: np.ndarray, behind: np
     known = mask & np.isfinite(true)
     read = known & np.isfinite(measured)
     if not read.any():
-        return {"lost": 1.0} | dict.fromkeys(("off", "median_mm", "low_mm", "high_mm"), float("nan"))
+        return {"lost": 1.0} | dict.fromkeys(("off", "median_mm", "low_mm", "high_mm", "behind"), float("nan"))
     error_mm = 1e3 * (measured - true)[read]
     low, median, high = np.percentile(error_mm, [25, 50, 75])
     result = {
@@ -333,6 +337,28 @@ def by_object(real: RealScene, rebuilt: Rebuilt, simulated: np.ndarray) -> list[
     return rows
 
 
+def by_gap(real: RealScene, rebuilt: Rebuilt, simulated: np.ndarray) -> list[dict[str, float]]:
+    """What both cameras read, over the distance from the glass to what is behind it, printed too.
+
+    Each row holds the fraction lost, and the fractions of the measurements within 10 mm of the front of the glass and
+    of what is behind it.
+    """
+    front, behind, rows = rebuilt.front, rebuilt.behind, []
+    for near, far in zip(GAPS_M, (*GAPS_M[1:], np.inf), strict=True):
+        own = real.mask & np.isfinite(real.opaque) & (behind - front >= near) & (behind - front < far)
+        if own.sum() < LEAST_PIXELS:
+            continue
+        row: dict[str, float] = {"gap_from_m": near, "pixels": int(own.sum())}
+        for who, z, true in (("real", real.transparent, real.opaque), ("simulated", simulated, front)):
+            of = figures(z, true, own, behind)
+            row |= {f"{who}_lost": of["lost"], f"{who}_front": round(1 - of["off"], 3), f"{who}_behind": of["behind"]}
+        rows.append(row)
+        cells = [f"{row[f'{who}_lost']:.0%} lost, {row[f'{who}_front']:.0%} front, {row[f'{who}_behind']:.0%} behind"
+                 for who in ("real", "simulated")]  # fmt: skip
+        print(f"    gap from {100 * near:.0f} cm: real {cells[0]}; simulated {cells[1]}", flush=True)
+    return rows
+
+
 def report_scene(real: RealScene, number: int, args: argparse.Namespace) -> dict[str, Any]:
     """Figures on glass and on the background of the real camera and of simulated ones, printed as they come."""
     rebuilt = rebuild(real.camera, real.opaque, real.mask, NOISE_Q)
@@ -362,6 +388,7 @@ def report_scene(real: RealScene, number: int, args: argparse.Namespace) -> dict
         if label != BASE:
             continue
         result["objects"] = by_object(real, rebuilt, seen.z)
+        result["gaps"] = by_gap(real, rebuilt, seen.z)
         if args.picture:
             cv2.imwrite(str(args.picture), picture(real, seen))
     return result
@@ -456,9 +483,9 @@ def main() -> None:
         result = report_sensors(args)
     else:
         result = report_scene(read_scene(args.data, args.scene), args.scene, args)
-    objects = result.pop("objects", None)
+    lists = {key: result.pop(key) for key in ("objects", "gaps") if key in result}
     table: dict[str, Any] = {k: {"glass": a, "background": b} for k, (a, b) in result.items()}
-    print(json.dumps(table if objects is None else table | {"objects": objects}))
+    print(json.dumps(table | lists))
 
 
 if __name__ == "__main__":
