@@ -390,3 +390,18 @@ def test_bins_before_the_pulse_show_nothing_of_a_single_shot() -> None:
     image = decode(expose(walls_at(np.array([0.3, 1.0]), sensor), sensor))
     np.testing.assert_allclose(image.range_m[0], [0.3, 1.0], atol=2e-3)
     assert (image.status == Status.OK).all()
+
+
+@pytest.mark.parametrize("sigmas", [2.1, 2.5, 3.0, 5.0])
+@pytest.mark.parametrize("photons", [(20_000.0, 14_000.0), (500_000.0, 300_000.0)])
+def test_returns_that_overlap_scatter_as_they_say(sigmas: float, photons: tuple[float, float]) -> None:
+    """Close to Sparrow's limit, the place of each return depends on that of the other, and sigma knows it."""
+    shape, places = PulseShape.gaussian(4.0), np.array([60.3, 60.3 + 4.0 * sigmas])
+    mean = 1 + sum(brought(shape, place, n) for place, n in zip(places[:, None], photons, strict=True))
+    histograms = np.random.default_rng(3).poisson(np.repeat(mean, 600, axis=1)).astype(float)
+    found = find_returns(histograms, shape, RULES._replace(most=2))
+    both = np.isfinite(found.place).all(axis=0)
+    assert both.mean() > 0.8
+    z = (found.place[:, both] - places[:, None]) / found.sigma[:, both]
+    assert (0.8 < (z**2).mean(axis=1)).all()
+    assert ((z**2).mean(axis=1) < 1.25).all()
