@@ -321,10 +321,13 @@ class Decoder(Named, ABC):
         Raises
         ------
         ValueError
-            The capture is of a sensor that this decoder does not know, or the sensor does not fit the rig's projector.
+            The capture is of a sensor that this decoder does not know, the sensor does not fit the rig's projector, or
+            the working range is along z and the camera has rays that lead sideways or backwards.
         """
         if capture.rig is not None:
             capture.sensor.check(capture.rig.projector.width, capture.rig.projector.height)
+            if self.working_range is not None:
+                self.working_range.check(capture.rig.camera)
         image = self.coordinates(capture).range_image(capture.rig)
         return image if self.working_range is None else self.working_range.applied_to(image)  # type: ignore[no-any-return]
 

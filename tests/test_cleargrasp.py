@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cleargrasp import LEFT_M, NOISE_Q, aligned, read_scene
 from rebuilt_scene import Rebuilt, front_surface, rebuild, reflectances, scene_dictionary
 
 from rangesim import Intrinsics, load_scene, transport
@@ -83,3 +84,32 @@ def test_the_renderer_sees_the_front_surface_and_the_table(
     assert (is_glass != mask).mean() < 0.02
     np.testing.assert_allclose(np.median(np.abs(truth.z - z)[is_glass & mask]), 0, atol=1e-3)
     np.testing.assert_allclose(np.nanquantile(np.abs(truth.z - table)[~is_glass], 0.95), 0, atol=1e-3)
+
+
+def test_depth_is_aligned_with_the_colour_camera() -> None:
+    """A bar before a wall: the nearer one hides the wall on its right, and leaves a shadow on its left."""
+    infrared = Intrinsics(120, 60, fx=60.0, fy=60.0, cx=60.0, cy=30.0)
+    colour = Intrinsics(128, 72, fx=92.0, fy=92.0, cx=64.0, cy=36.0)
+    z = np.full((60, 120), 0.8)
+    z[:, 60:70] = 0.4
+    found = aligned(z, infrared, colour)
+
+    def column(infrared_column: int, depth: float) -> float:
+        return float(colour.project([(infrared_column - 60) / 60 * depth + LEFT_M, 0.0, depth])[0])
+
+    x = np.arange(128)
+    np.testing.assert_allclose(found[:, (x > column(60, 0.4)) & (x + 1 < column(70, 0.4))], 0.4)
+    np.testing.assert_allclose(found[:, (x > 16) & (x + 1 < column(60, 0.8))], 0.8)
+    np.testing.assert_allclose(found[:, x > column(70, 0.4)], 0.8)
+    assert np.isnan(found[:, (x > column(60, 0.8)) & (x + 1 < column(60, 0.4))]).all()
+
+
+def test_a_real_scene(real_data: Path) -> None:
+    """Of scene 080: the table and the wall, and four bottles whose surfaces agree with the measured depth to 1 mm."""
+    if not (folder := real_data / "cleargrasp_d435").is_dir():
+        pytest.skip("the ClearGrasp data are not here")
+    real = read_scene(folder, 80)
+    found = rebuild(real.camera, real.opaque, real.mask, NOISE_Q)
+    assert (len(found.planes), len(found.fronts)) == (2, 4)
+    assert np.nanmedian(np.abs(found.front - real.opaque)[real.mask]) < 1e-3
+    assert np.nanmedian(np.abs(found.behind - real.opaque)[~real.mask]) < 2e-3

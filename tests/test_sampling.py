@@ -169,6 +169,18 @@ def test_the_edges_of_a_texture_do_not_shine_into_their_surroundings() -> None:
     assert np.sqrt(np.mean((filtered - raw) ** 2)) < 0.2 * raw.mean()
 
 
+def test_a_pixel_whose_samples_miss_the_textured_surface_shares_no_light() -> None:
+    """A few samples may all miss a bar that is narrower than a pixel, though the centre of the pixel meets it."""
+    reflectance = np.full((40, 50), 0.5, np.float32)
+    reflectance[20, 25] = 0
+    guides = plane_guides(reflectance=np.full((40, 50), 0.5, np.float32)).with_reflectance(reflectance)
+    light = np.ones((1, 40, 50), np.float32)
+    light[0, 20, 25] = 7
+    after = smoothed(light, guides)
+    np.testing.assert_allclose(np.delete(after.ravel(), 20 * 50 + 25), 1, rtol=1e-5)
+    assert after[0, 20, 25] == 7
+
+
 def traced(**settings: Any) -> Signals:
     """The scene `matte`, seen by two kinds of sensors."""
     scene, sensors = load_scene(SCENES / "matte.xml"), [AmcwToF(), DirectToF(bins=64, bin_s=800e-12)]

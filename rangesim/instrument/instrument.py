@@ -66,7 +66,8 @@ class Instrument:
     ValueError
         A name or a number out of its range, a decoder or detector that does not fit the sensor, two fields that
         contradict each other (`camera` and `width`, `T_camera_projector` and `baseline_m`, a Beam and either of these
-        two), or no projector for a camera that is no pinhole.
+        two), no projector for a camera that is no pinhole, or a working range along z for one with rays that lead
+        backwards.
 
     Examples
     --------
@@ -122,6 +123,8 @@ class Instrument:
             raise ValueError(
                 f"expected a projector of instrument {self.name!r}, such as a Beam, because its camera is no pinhole."
             )
+        if self.camera is not None and self.decoder is not None and self.decoder.working_range is not None:
+            self.decoder.working_range.check(self.camera)
         for pose_name in ("T_world_camera", "T_camera_projector"):
             if getattr(self, pose_name) is not None:
                 object.__setattr__(self, pose_name, pose(getattr(self, pose_name), pose_name))

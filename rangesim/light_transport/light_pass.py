@@ -160,7 +160,7 @@ class _CameraPass:
         keeps_apart = self.is_filtered
         if keeps_apart and self.scene.has_matte_textures:
             few = min(fewest, TEXTURE_SAMPLES)
-            guides = guides._replace(reflectance=mean_reflectance(view, of_paths, rig, self.scene.has_cutouts, few))
+            guides = guides.with_reflectance(mean_reflectance(view, of_paths, rig, self.scene.has_cutouts, few))
         shared = LightFilter(guides) if keeps_apart else None
         at_work = partial(report, 0.0)
         sees_glint = settings.glint and not isinstance(rig.projector, Beam)

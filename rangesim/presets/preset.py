@@ -104,7 +104,7 @@ def _preset(name: str, data: Mapping[str, Any], text: str) -> Preset:
         if not isinstance(data[part], Mapping):
             raise ValueError(f"expected {part} as a table, got {shown(data[part])}.")
     sheet, given = from_dict(DataSheet, data["sheet"], "sheet"), data["instrument"]
-    follows = sheet.settings(has_camera="camera" in given)
+    follows = sheet.settings(has_camera="camera" in given, has_projector="projector" in given)
     if "name" not in given and not is_name(name):
         raise ValueError(
             f"expected a file name of letters, digits, - and _, at most {MAX_NAME}, which is that of the instrument, "

@@ -26,11 +26,11 @@ MAX_SETTINGS = 1_000_000
 from filling the memory."""
 
 _RADIANCE = ArraySpec("float32", low=0)
-_TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=MAX_METRES, nan=True)
+_TRUE_RANGE = ArraySpec("float32", low=1e-9, high=MAX_METRES, nan=True)
 _OPTIONAL = ArraySpec("float32", required=False)
 _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
-    "truth_z": _TRUE_DEPTH,
-    "truth_range_m": _TRUE_DEPTH,
+    "truth_z": replace(_TRUE_RANGE, low=-MAX_METRES),
+    "truth_range_m": _TRUE_RANGE,
     "truth_normal": ArraySpec("float32", ("h", "w", 3), low=-1.01, high=1.01, nan=True),
     "truth_instance": ArraySpec("int32", low=-1),
     "truth_material": ArraySpec("int32", low=-1),
@@ -38,13 +38,13 @@ _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
     "truth_projector_visible": ArraySpec("bool"),
     "truth_instance_names": ArraySpec("str", ("instances",)),
     "truth_material_names": ArraySpec("str", ("materials",)),
-    "truth_nearest_m": replace(_TRUE_DEPTH, required=False),
-    "truth_farthest_m": replace(_TRUE_DEPTH, required=False),
+    "truth_nearest_m": replace(_TRUE_RANGE, required=False),
+    "truth_farthest_m": replace(_TRUE_RANGE, required=False),
     "motion_m": ArraySpec("float32", low=0, nan=True, required=False),
     "truncation": ArraySpec("float64", (len(fields(Truncation)),), low=0, high=1, nan=True, required=False),
 }
 """Type, shape and bounds of the arrays of a pass, by their names in files. The bounds of a normal leave room for the
-rounding of single precision."""
+rounding of single precision. Depths z are negative behind a scanner."""
 
 
 def save_signals(signals: StillSignals, path: str | Path) -> None:

@@ -95,7 +95,15 @@ class Spinning(Scanner):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        self.scan_rays()  # checks the shapes
+        if self.elevations_deg and max(map(abs, self.elevations_deg)) > 90:
+            steepest = max(self.elevations_deg, key=abs)
+            raise ValueError(f"expected elevations_deg of -90 to 90 degrees, got {steepest:g}.")
+        for name in ("azimuth_offsets_deg", "firing_times_s"):
+            if (given := len(getattr(self, name))) not in (0, self.height):
+                raise ValueError(
+                    f"expected {name} for each of the {self.height} elevations_deg, or none, got {given} numbers."
+                )
+        self.scan_rays()  # checks the rest
 
     @property
     def width(self) -> int:  # type: ignore[override]
