@@ -302,3 +302,31 @@ def test_fog_before_and_behind_a_mirror_weakens_a_beam_and_sends_it_back(around_
     crossed = before_mirror + d[shown] - 2 - max(begin, 0.0)
     returned = sigma * albedo / (4 * np.pi) / width**2 / d[shown] ** 2 * np.exp(-2 * sigma * crossed) * bin_m
     assert histogram[shown].sum() == pytest.approx(returned.sum(), rel=0.05)
+
+
+def test_a_beam_through_rough_glass_brings_the_light_of_a_projector() -> None:
+    """The spot lies on the rough face of water or glass and lights the floor behind it: power, not radiance, crosses
+    the face, so nothing falls by n^2. A projector with the field of the beam is found by path tracing alone."""
+    T, width = mi.ScalarTransform4f, 0.6
+    rough = {"type": "roughdielectric", "alpha": 0.6, "int_ior": 1.33}
+    scene = load_scene(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "fov": 20.0, "to_world": T().look_at([0, 0, 0], [1, 0, 0], [0, 0, 1])},
+            "water": {
+                "type": "rectangle",
+                "to_world": T().translate([1, 0, 0]).rotate([0, 1, 0], -90).scale(5),
+                "b": rough,
+            },
+            "floor": wall(T().translate([1.5, 0, 0]).rotate([0, 1, 0], -90).scale(6), 0.8),
+        }
+    )
+    table = RayTable(np.broadcast_to([0.0, 0.0, 1.0], (8, 8, 3)), field_rad=(0.1, 0.1))
+    pose, f = scene.rig().T_world_camera, 64 / width
+    emitters = Beam((width, width), "box"), Intrinsics(64, 64, f, f, 32, 32)
+    beam, projector = (
+        transport(scene, Rig(table, emitter, pose), [IdealToF()], spp=1 << 12, max_depth=8, glint=False).energy
+        for emitter in emitters
+    )
+    assert beam.direct.mean() == pytest.approx(projector.direct.mean(), rel=1e-3)
+    assert beam.multipath.mean() == pytest.approx(projector.multipath.mean(), rel=0.06)
