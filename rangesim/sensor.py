@@ -76,6 +76,9 @@ class Sensor(Named, ABC):
     compares_texture: ClassVar[bool] = False
     """Whether a reading compares the pattern of neighbouring pixels, so that it needs the light of their whole area."""
 
+    triangulates: ClassVar[bool] = False
+    """Whether depth follows from two pinholes, so that camera and projector have to be such."""
+
     first_return_frame: ClassVar[int | None] = None
     """Index of the frame that holds the radiance of the first return, for a sensor that reads no other light."""
 

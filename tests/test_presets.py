@@ -452,3 +452,12 @@ def test_an_emitter_offset_beside_a_beam_is_refused_by_its_cause(tmp_path: Path)
     path.write_text(text.replace('"sheet.range_m" =', '"sheet.emitter_offset_m" = "velodyne"\n"sheet.range_m" ='))
     with pytest.raises(FileFormatError, match="state offset_m of the beam"):
         presets.load(path)
+
+
+def test_a_sheet_with_another_view_than_the_head_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    text = presets.describe("vlp-16").text
+    for view in ("[180.0, 30.0]", "[360.0, 40.0]"):
+        path.write_text(text.replace("field_of_view_deg = [360.0, 30.0]", f"field_of_view_deg = {view}"))
+        with pytest.raises(FileFormatError, match="as the sheet has, got 360 x 30"):
+            presets.load(path)
