@@ -54,7 +54,7 @@ from rangesim.presets.preset import standing
 from rangesim.response import LightPath, NumpyMath, Response, SparseResponse
 from rangesim.rig import Camera, Fisheye, RayTable, ScanningCamera, Zones
 from rangesim.robust_scale import sigma_from_median
-from rangesim.sensors import ActiveStereo
+from rangesim.sensors import ActiveStereo, ReferencePatternStereo
 from rangesim.signals import EnergySplit, GroundTruth, Signals, SignalSet
 
 PIXELS = 64
@@ -65,8 +65,9 @@ STEREO_PIXELS = (320, 96)
 """Pixels of both cameras of a stereo device; twice the disparity of the nearest wall across."""
 LEFT_PX, BORDER_PX = 136, 10
 """Columns at the left that no pixel of the other camera need match, and the reach of a window at the other sides."""
-PHASES = (-0.375, -0.125, 0.125, 0.375)
-"""Disparities of the wall of a stereo device, pixels from that of the stated distance: even fractions of a pixel."""
+PHASES = (-0.359, -0.078, 0.203, 0.484)
+"""Disparities of the wall of a stereo device, pixels from that of the stated distance: about even fractions of a pixel,
+and of the steps of 1/8 pixel to which a Kinect v1 rounds."""
 FINENESS = 4
 """Samples across a pixel of a stereo camera; its dots are at least a pixel wide."""
 SPP = 16
@@ -208,7 +209,7 @@ def noise_at_m(instrument: Instrument, distance_m: float, noise: PublishedNoise)
     several places, over a pixel of disparity, whose errors are scaled to the distance.
     """
     places = [distance_m]
-    if isinstance(instrument.sensor, ActiveStereo):
+    if isinstance(instrument.sensor, (ActiveStereo, ReferencePatternStereo)):
         assert isinstance(instrument.camera, Intrinsics)
         one_px_m = instrument.camera.fx * instrument.sensor.baseline_m
         places = [one_px_m / (one_px_m / distance_m + phase) for phase in PHASES]
@@ -236,13 +237,14 @@ def of_wall(instrument: Instrument, distance_m: float, reflectance: float, sunli
     sensor, rig = instrument.sensor, rig_of(instrument)
     if not isinstance(rig.projector, Intrinsics):
         signals: Signals = traced_wall(instrument, distance_m, reflectance, daylight_w_m2)
-    elif sensor.n_cameras > 1:
+    elif sensor.compares_texture:
         signals = SignalSet.of([patterned_wall(r, sensor, distance_m, reflectance) for r in sensor.rigs(rig)])
+        signals = signals if sensor.n_cameras > 1 else signals[0]
     else:
         signals = flooded_wall(rig, sensor, distance_m, reflectance, daylight_w_m2)
     capture = expose(signals, sensor, instrument.detector, instrument.exposure_s, seed=0, ambient=sun)
     image = decode(capture, instrument.decoder)
-    return inner(image) if sensor.n_cameras > 1 else image
+    return inner(image) if sensor.compares_texture else image
 
 
 def inner(image: RangeImage) -> RangeImage:
@@ -257,7 +259,7 @@ def rig_of(instrument: Instrument) -> Rig:
     camera = instrument.camera
     assert camera is not None
     assert instrument.projector is not None
-    width, height = (PIXELS, PIXELS) if instrument.sensor.n_cameras == 1 else STEREO_PIXELS
+    width, height = STEREO_PIXELS if instrument.sensor.compares_texture else (PIXELS, PIXELS)
     middle = {"width": width, "height": height, "cx": width / 2, "cy": height / 2}
     if isinstance(camera, (Intrinsics, Fisheye)):
         camera = replace(camera, **middle)

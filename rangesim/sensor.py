@@ -76,6 +76,9 @@ class Sensor(Named, ABC):
     compares_texture: ClassVar[bool] = False
     """Whether a reading compares the pattern of neighbouring pixels, so that it needs the light of their whole area."""
 
+    triangulates: ClassVar[bool] = False
+    """Whether depth follows from two pinholes, so that camera and projector have to be such."""
+
     first_return_frame: ClassVar[int | None] = None
     """Index of the frame that holds the radiance of the first return, for a sensor that reads no other light."""
 
@@ -321,10 +324,13 @@ class Decoder(Named, ABC):
         Raises
         ------
         ValueError
-            The capture is of a sensor that this decoder does not know, or the sensor does not fit the rig's projector.
+            The capture is of a sensor that this decoder does not know, the sensor does not fit the rig's projector, or
+            the working range is along z and the camera has rays that lead sideways or backwards.
         """
         if capture.rig is not None:
             capture.sensor.check(capture.rig.projector.width, capture.rig.projector.height)
+            if self.working_range is not None:
+                self.working_range.check(capture.rig.camera)
         image = self.coordinates(capture).range_image(capture.rig)
         return image if self.working_range is None else self.working_range.applied_to(image)  # type: ignore[no-any-return]
 

@@ -21,6 +21,7 @@ from rangesim.environment.backend import select_variant
 from rangesim.errors import RangesimWarning
 from rangesim.motion import ConstantTwist, Motion, Timing, transport_moving
 from rangesim.response import Dots
+from rangesim.rig import CoverGlass
 from rangesim.sensors import ActiveStereo, DirectToF
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
@@ -297,6 +298,17 @@ def pile_up() -> Case:
     )
     healed = right(measure(weak, sensor, detector, 1e-3)[1], weak)
     return timed_case(signals, sensor, detector, 1e-3, [(healed, Cause.PILE_UP)])
+
+
+def cover_glass() -> Case:
+    """An AMCW camera behind a smeared window, a wall at 1.5 m; healed without the window."""
+    scene = room(wall=board(0, 0, 1.5, 2))
+    sensor, detector = AmcwToF(), Detector.time_of_flight()
+    signals = transport(scene, replace(scene.rig(0.03, **SIZE), cover_glass=CoverGlass(1e-10)), [sensor], spp=64)
+    exposure_s = measure(signals, sensor, detector)[0].exposure_s
+    bare = replace(signals, rig=replace(signals.rig, cover_glass=None))
+    healed = right(measure(bare, sensor, detector, exposure_s)[1], bare)
+    return case(signals, sensor, detector, lambda c, i: [(healed, Cause.COVER_GLASS)])
 
 
 def occluded() -> Case:

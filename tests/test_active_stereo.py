@@ -43,7 +43,7 @@ from rangesim.results.experiment_results import load_result
 from rangesim.rig import translation
 from rangesim.sensors import StereoDecoder, sensor_from_dict
 from rangesim.settings.config import from_dict, to_dict
-from rangesim.signals import SignalSet
+from rangesim.signals import SignalSet, StillSignals
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 PARTS = 5
@@ -223,6 +223,28 @@ def blank(sensor: Any = None, rig: Rig | None = None, size: tuple[int, int] = (4
     return Capture(np.zeros((sensor.n_frames, *size), np.uint8), sensor, rig)
 
 
+@pytest.mark.parametrize("value", [0, 17, 65535])
+def test_frames_without_texture_are_not_read(value: int) -> None:
+    _, rigs = stereo(64, 48)
+    frames = np.full((1, 48, 64), value, dtype=np.uint16)
+    image = decode(CaptureSet(tuple(Capture(frames, ActiveStereo(), rig) for rig in rigs)))
+    assert not image.valid.any()
+    assert (image.status == (Status.SATURATED if value == 65535 else Status.LOW_SIGNAL)).all()
+
+
+def test_masked_pixels_are_not_read() -> None:
+    sensor, rigs = stereo()
+    taken, _ = set_of_plane(sensor, rigs, (0, 0, 1), 0.8)
+    masked = []
+    for capture in taken.captures:
+        frames = capture.frames.copy()
+        frames[:, 40:60, 100:130] = np.nan
+        masked.append(replace(capture, frames=frames))
+    image = decode(CaptureSet(tuple(masked)), StereoDecoder(disparities=64))
+    assert not image.valid[40:60, 100:130].any()
+    assert np.nanmax(np.abs(image.z[MIDDLE] - 0.8)) < 0.05
+
+
 def test_what_makes_no_set_is_refused() -> None:
     _, (left, right) = stereo(64, 48)
     for captures, message in (
@@ -285,6 +307,16 @@ def test_signals_of_several_cameras_are_a_set(both: SignalSet) -> None:
         SignalSet.of([])
     with pytest.raises(ValueError, match="camera 1 has another projector_power_w"):
         SignalSet.of([left, replace(right, rig=replace(right.rig, projector_power_w=3.0))])
+
+
+def test_signals_are_saved_camera_by_camera(both: SignalSet, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="expected StillSignals, got SignalSet; save the signals of each camera"):
+        rangesim.save_signals(both, tmp_path / "both.npz")  # type: ignore[arg-type]
+    for number, signals in enumerate(both):
+        assert isinstance(signals, StillSignals)
+        rangesim.save_signals(signals, tmp_path / f"{number}.npz")
+    again = SignalSet.of([rangesim.load_signals(tmp_path / f"{number}.npz") for number in range(2)])
+    np.testing.assert_array_equal(decode(expose(again, SENSOR)).z, decode(expose(both, SENSOR)).z)
 
 
 def test_the_first_camera_of_two_keeps_its_bytes(both: SignalSet) -> None:

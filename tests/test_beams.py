@@ -229,3 +229,104 @@ def test_a_mirror_sends_a_beam_back_into_its_own_eye() -> None:
     histogram = signals.channels[sensor.responses()[0]][:, 0, 0]
     assert np.flatnonzero(histogram).tolist() == [int(2 * d / 299792458.0 / 1e-9)]
     assert transport(scene, rig, [sensor], spp=16, glint=False).energy.glint.sum() == 0
+
+
+def test_the_floor_of_a_pool_is_as_bright_as_the_closed_form() -> None:
+    """Light that ends inside glass or water: a beam through a plane at 1 m, of index n, to a floor 1 m below it.
+
+    The refracted beam spreads over (1 + 1 / n)^2 m2/sr; the radiance falls by n^2 on the way out.
+    """
+    T, n, power, width = mi.ScalarTransform4f, 1.33, 0.7, 4e-3
+    scene = load_scene(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "fov": 20.0, "to_world": T().look_at([0, 0, 0], [1, 0, 0], [0, 0, 1])},
+            "water": {
+                "type": "rectangle",
+                "to_world": T().translate([1, 0, 0]).rotate([0, 1, 0], -90).scale(3),
+                "b": glass(n),
+            },
+            "floor": wall(T().translate([2, 0, 0]).rotate([0, 1, 0], -90).scale(3)),
+        }
+    )
+    ray = RayTable(np.array([[[0.0, 0.0, 1.0]]]), field_rad=(1e-3, 1e-3))
+    rig = Rig(ray, Beam((width, width), "box"), scene.rig().T_world_camera, projector_power_w=power)
+    energy = transport(scene, rig, [IdealToF()], spp=1 << 14, max_depth=2, glint=False).energy
+    passed = 1 - ((n - 1) / (n + 1)) ** 2
+    irradiance = passed * power / width**2 / (1 + 1 / n) ** 2
+    assert energy.specular[0, 0] == pytest.approx(0.6 / np.pi * irradiance * passed / n**2, rel=5e-3)
+
+
+@pytest.mark.parametrize("around_mirror", [True, False])
+def test_fog_before_and_behind_a_mirror_weakens_a_beam_and_sends_it_back(around_mirror: bool) -> None:
+    """A mirror at 2 m turns the beam onto a wall 1.5 m away. The fog's own return is that of the LiDAR equation,
+    sigma_s / (4 pi) P p / d^2 exp(-2 sigma_t d) for isotropic scattering."""
+    T, sigma, albedo, width = mi.ScalarTransform4f, 0.3, 0.8, 4e-3
+
+    def fog(*, begin: float, end: float) -> dict[str, Any]:
+        """Between two heights above the mirror."""
+        middle, half = (begin + end) / 2, (end - begin) / 2
+        return {
+            "type": "cube",
+            "to_world": T().translate([2, 0, middle]).scale([1, 1, half]),
+            "b": {"type": "null"},
+            "interior": {"type": "homogeneous", "sigma_t": sigma, "albedo": albedo, "phase": {"type": "isotropic"}},
+        }
+
+    begin, end = (-1.0, 1.2) if around_mirror else (0.6, 1.2)
+    scene = load_scene(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "fov": 20.0, "to_world": T().look_at([0, 0, 0], [1, 0, 0], [0, 0, 1])},
+            "mirror": {
+                "type": "rectangle",
+                "to_world": T().translate([2, 0, 0]).rotate([0, 1, 0], -45).scale(0.3),
+                "b": {"type": "twosided", "b": {"type": "conductor", "material": "none"}},
+            },
+            "ceiling": wall(T().translate([2, 0, 1.5]).rotate([1, 0, 0], 180).scale(3)),
+            "fog": fog(begin=begin, end=end),
+        }
+    )
+    ray = RayTable(np.array([[[0.0, 0.0, 1.0]]]), field_rad=(1e-3, 1e-3))
+    rig = Rig(ray, Beam((width, width), "box"), scene.rig().T_world_camera)
+    sensor = DirectToF(bins=256, bin_s=2e-10, pulse_fwhm_s=0.0, laser="single-shot")
+    signals = transport(scene, rig, [sensor], spp=1 << 15, max_depth=2, glint=False)
+    histogram, bin_m = signals.channels[sensor.responses()[0]][:, 0, 0], 299792458.0 * 2e-10 / 2
+    d = (np.arange(256) + 0.5) * bin_m
+    before_mirror = 1.0 if around_mirror else 0.0  # metres of fog
+    wall_part = histogram[np.abs(d - 3.5) < 0.1].sum()
+    through = before_mirror + end - max(begin, 0.0)
+    expected = 0.6 / np.pi / width**2 / 3.5**2 * np.exp(-2 * sigma * through)
+    assert wall_part == pytest.approx(expected, rel=0.05)
+    shown = (d > 2.05 + max(begin, 0.0)) & (d < 1.95 + end)
+    crossed = before_mirror + d[shown] - 2 - max(begin, 0.0)
+    returned = sigma * albedo / (4 * np.pi) / width**2 / d[shown] ** 2 * np.exp(-2 * sigma * crossed) * bin_m
+    assert histogram[shown].sum() == pytest.approx(returned.sum(), rel=0.05)
+
+
+def test_a_beam_through_rough_glass_brings_the_light_of_a_projector() -> None:
+    """The spot lies on the rough face of water or glass and lights the floor behind it: power, not radiance, crosses
+    the face, so nothing falls by n^2. A projector with the field of the beam is found by path tracing alone."""
+    T, width = mi.ScalarTransform4f, 0.6
+    rough = {"type": "roughdielectric", "alpha": 0.6, "int_ior": 1.33}
+    scene = load_scene(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "fov": 20.0, "to_world": T().look_at([0, 0, 0], [1, 0, 0], [0, 0, 1])},
+            "water": {
+                "type": "rectangle",
+                "to_world": T().translate([1, 0, 0]).rotate([0, 1, 0], -90).scale(5),
+                "b": rough,
+            },
+            "floor": wall(T().translate([1.5, 0, 0]).rotate([0, 1, 0], -90).scale(6), 0.8),
+        }
+    )
+    table = RayTable(np.broadcast_to([0.0, 0.0, 1.0], (8, 8, 3)), field_rad=(0.1, 0.1))
+    pose, f = scene.rig().T_world_camera, 64 / width
+    emitters = Beam((width, width), "box"), Intrinsics(64, 64, f, f, 32, 32)
+    beam, projector = (
+        transport(scene, Rig(table, emitter, pose), [IdealToF()], spp=1 << 12, max_depth=8, glint=False).energy
+        for emitter in emitters
+    )
+    assert beam.direct.mean() == pytest.approx(projector.direct.mean(), rel=1e-3)
+    assert beam.multipath.mean() == pytest.approx(projector.multipath.mean(), rel=0.06)

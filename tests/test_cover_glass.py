@@ -22,6 +22,7 @@ from rangesim import (
     load_capture,
     save_capture,
 )
+from rangesim.causes import Cause, explain
 from rangesim.electronics.detector import PLANCK_TIMES_C
 from rangesim.instrument.instrument import Instrument, instrument_from_dict
 from rangesim.response import SPEED_OF_LIGHT
@@ -129,6 +130,14 @@ def test_a_target_within_the_glass_s_peak_is_out_of_range_and_no_target_is_low_s
     touched = strong(wall_at(0.02), times=1.0)
     status = decode(expose(touched, SENSOR, DIM, exposure_s, seed=2), calibrated).status
     assert np.isin(status, [Status.OUT_OF_RANGE, Status.SATURATED]).all()
+
+
+def test_what_the_glass_does_to_readings_is_explained() -> None:
+    signals, near = strong(wall_at(1.0), times=5.0), strong(wall_at(0.03), times=0.001)
+    for seen, decoder in ((signals, DirectToFDecoder()), (near, CAREFUL)):
+        capture = expose(seen, SENSOR)
+        assert (explain(decode(capture, decoder), capture, seen).cause == Cause.COVER_GLASS).all()
+    assert not explain(decode(expose(signals, SENSOR), CAREFUL), expose(signals, SENSOR), signals).failed.any()
 
 
 def test_no_glass_changes_no_byte_and_a_glass_is_kept_in_files(tmp_path: Path) -> None:

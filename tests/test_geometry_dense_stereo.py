@@ -130,6 +130,30 @@ def test_pixels_without_an_image_have_no_match() -> None:
     assert np.nanmax(np.abs(found.disparity_px - 7.0)[INSIDE]) < 0.1
 
 
+RANDOM = np.random.default_rng(3).random((20, 30))
+STRANGE = {
+    "no image": np.full((20, 30), np.nan),
+    "one value": np.ones((20, 30)),
+    "holes": np.where(RANDOM < 0.3, np.nan, RANDOM),
+    "very bright": 1e30 * RANDOM,
+    "very dark": 1e-30 * RANDOM,
+    "negative": -RANDOM,
+    "one row": RANDOM[:1],
+    "few columns": RANDOM[:, :9],
+}
+
+
+@pytest.mark.parametrize("name", STRANGE)
+@pytest.mark.parametrize(("method", "aggregation"), METHODS)
+def test_strange_images_have_outcomes_for_all_pixels(name: str, method: Any, aggregation: Any) -> None:
+    image = STRANGE[name]
+    for second in (image, np.full(image.shape, np.nan), image[:, ::-1].copy()):
+        for noise in ((0.0, 0.0), (0.1, 0.1)):
+            found = match_densely(image, second, (0, 8), DenseMatching(method, aggregation), noise)
+            np.testing.assert_array_equal(np.isfinite(found.disparity_px), found.outcome == MatchOutcome.MATCHED)
+            assert not np.isfinite(found.disparity_px[np.isnan(image)]).any()
+
+
 @pytest.mark.parametrize("method", ["census", "zncc"])
 def test_the_number_of_threads_changes_no_byte(method: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     results = []

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rangesim import Intrinsics, Scene, load_scene, look_at
+from rangesim import Intrinsics, Scene, Sensor, load_scene, look_at
 from rangesim.electronics.detector import Detector
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
 from rangesim.instrument.instrument import Instrument
@@ -18,8 +18,8 @@ from rangesim.pipeline.experiment_run import carry_out, run
 from rangesim.pipeline.shared_passes import group_by_rig
 from rangesim.presets import instrument
 from rangesim.results.experiment_results import load_result
-from rangesim.rig import Beam, RayTable, translation
-from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight
+from rangesim.rig import Beam, RayTable, Spinning, translation
+from rangesim.sensors import ActiveStereo, AmcwToF, DirectToF, IdealToF, ReferencePatternStereo, StructuredLight
 
 CAMERA = Intrinsics(40, 30, 50.0, 50.0, 20.0, 15.0)
 ASIDE = look_at((0.2, 0.0, 0.0), (0.0, 0.0, 0.8), (0.0, -1.0, 0.0))
@@ -128,3 +128,13 @@ def test_instruments_of_different_sizes_stand_in_one_result(tmp_path: Path) -> N
 def test_a_preset_is_an_instrument_with_its_own_emitter() -> None:
     assert instrument("direct-tof").emitter_wavelength_m == 905e-9
     assert instrument("ideal-tof").emitter_wavelength_m is None
+
+
+@pytest.mark.parametrize("sensor", [StructuredLight(64, 48), ActiveStereo(), ReferencePatternStereo()])
+def test_a_sensor_that_triangulates_needs_pinholes(sensor: Sensor) -> None:
+    """Else all light would be traced before the decoder refuses."""
+    head, pinhole = Spinning(elevations_deg=(1.0, -1.0), columns=8), Intrinsics.from_fov(64, 48, fov_x_deg=60.0)
+    with pytest.raises(ValueError, match=f"pinhole as the camera .* {sensor.type_name} triangulates, got a Spinning"):
+        Instrument("one", sensor, camera=head, projector=pinhole)
+    with pytest.raises(ValueError, match=f"pinhole as the projector .* {sensor.type_name} triangulates, got a Beam"):
+        Instrument("one", sensor, camera=pinhole, projector=Beam((3e-3, 3e-3)))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter, minimum_filter
 from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
 
 import pcgraph
@@ -16,8 +17,8 @@ from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
 from rangesim.electronics.detector import Detector
-from rangesim.point_cloud import PointCloud
-from rangesim.rig import Rig, look_at
+from rangesim.point_cloud import PointCloud, organised_cloud
+from rangesim.rig import Rig, Spinning, look_at
 from rangesim.sensors import IdealToF, StructuredLight
 
 
@@ -59,6 +60,34 @@ def test_normals_do_not_round_off_a_depth_edge() -> None:
         inside = cloud.valid & mask
         unit = np.asarray(normal) / np.linalg.norm(normal)
         assert (cloud.normals[inside] @ unit > 0.99999).all()
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        Spinning(tuple(np.linspace(16, -16, 32).tolist()), 512, azimuth_offsets_deg=(3.2, 1.1, -1.1, -3.2) * 8),
+        Spinning((-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15), 900),
+    ],
+    ids=["beams that lead", "odd firing order"],
+)
+def test_normals_of_scanners_follow_their_rays_not_their_rows(head: Spinning) -> None:
+    """In a closed room, normals are those of its walls, but for the rays beside an edge of it."""
+    half_m, directions = np.array([5.0, 2.0, 7.0]), head.pixel_rays().directions
+    distances = half_m / np.maximum(np.abs(directions), 1e-12)
+    ranges, wall = distances.min(axis=-1), distances.argmin(axis=-1)
+    one = np.ones(ranges.shape, dtype=np.float32)
+    normals = organised_cloud(ranges.astype(np.float32), head, np.eye(4), one, one).normals
+    assert normals is not None
+    expected = -np.sign(directions) * np.eye(3)[wall]
+    off = np.degrees(np.arccos(np.clip(np.sum(normals * expected, axis=-1), -1, 1)))
+    side = np.sign(np.take_along_axis(directions, wall[..., None], axis=-1)[..., 0]) * (1 + wall)
+    laid_out = side.ravel()[head.lattice]
+    inside = np.empty(side.shape, dtype=bool)  # whether all rays around see the same wall
+    inside.ravel()[head.lattice] = minimum_filter(laid_out, 5) == maximum_filter(laid_out, 5)
+    assert inside.mean() > 0.2
+    assert np.isfinite(off[inside]).all()
+    assert np.nanmax(off[inside]) < 0.2
+    assert (off > 30).mean() < 0.08
 
 
 def test_a_point_without_neighbours_has_no_normal_and_its_file_no_nan(tmp_path: Path) -> None:

@@ -274,5 +274,21 @@ def test_a_scanner_that_drives_into_fog_is_refused() -> None:
     )
     rig = Rig(sweep(), Beam((1e-3, 1e-3)))
     transport(scene, rig, [IdealToF()], spp=1)
-    with pytest.raises(ValueError, match="expected the camera to stand in air, but it is inside the medium of .*bank"):
+    with pytest.raises(ValueError, match=r"expected the camera to stand in air, but it is inside the medium of .*bank"):
         transport(scene, moving_scanner(rig, ConstantTwist((0.0, 0.0, 30.0))), [IdealToF()], spp=1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"elevations_deg": (95.0, 1.0)}, "elevations_deg of -90 to 90 degrees, got 95"),
+        (
+            {"azimuth_offsets_deg": (1.0, 2.0, 3.0)},
+            "azimuth_offsets_deg for each of the 2 elevations_deg, or none, got 3",
+        ),
+        ({"firing_times_s": (0.0,)}, "firing_times_s for each of the 2 elevations_deg, or none, got 1"),
+    ],
+)
+def test_messages_on_a_turning_head_name_its_own_settings(settings: dict[str, tuple[float, ...]], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Spinning(**{"elevations_deg": (1.0, -1.0), "columns": 8, **settings})  # type: ignore[arg-type]

@@ -31,6 +31,7 @@ from rangesim.report import palette, point_viewer, render_report, tables, write_
 from rangesim.report.experiment_page import by_camera
 from rangesim.report.verdict import verdict
 from rangesim.results.experiment_results import PhotonsRecord, load_result, write_result
+from rangesim.rig import Intrinsics
 from rangesim.sensors import IdealToF
 
 BROWSER = find_browser()
@@ -220,7 +221,8 @@ def _measured(
     row |= {"failed": failed, "causes": {"multipath": 0.8 * failed, "low_signal": 0.2 * failed} if failed else {}}
     rows: list[dict[str, Any]] = [{"material": name, **row} for name in ("glossy", "all")]
     metadata = SimpleNamespace(acquisition_s=acquisition_s, frames=10)
-    return SimpleNamespace(name=sensor, capture=SimpleNamespace(sensor=SENSORS[sensor]), rows=rows, metadata=metadata)
+    capture, camera = SimpleNamespace(sensor=SENSORS[sensor]), Intrinsics.from_fov(4, 3, fov_x_deg=40.0)
+    return SimpleNamespace(name=sensor, capture=capture, camera=camera, rows=rows, metadata=metadata)
 
 
 @needs_browser

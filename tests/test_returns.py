@@ -390,3 +390,32 @@ def test_bins_before_the_pulse_show_nothing_of_a_single_shot() -> None:
     image = decode(expose(walls_at(np.array([0.3, 1.0]), sensor), sensor))
     np.testing.assert_allclose(image.range_m[0], [0.3, 1.0], atol=2e-3)
     assert (image.status == Status.OK).all()
+
+
+@pytest.mark.parametrize("sigmas", [2.1, 2.5, 3.0, 5.0])
+@pytest.mark.parametrize("photons", [(20_000.0, 14_000.0), (500_000.0, 300_000.0)])
+def test_returns_that_overlap_scatter_as_they_say(sigmas: float, photons: tuple[float, float]) -> None:
+    """Close to Sparrow's limit, the place of each return depends on that of the other, and sigma knows it."""
+    shape, places = PulseShape.gaussian(4.0), np.array([60.3, 60.3 + 4.0 * sigmas])
+    mean = 1 + sum(brought(shape, place, n) for place, n in zip(places[:, None], photons, strict=True))
+    histograms = np.random.default_rng(3).poisson(np.repeat(mean, 600, axis=1)).astype(float)
+    found = find_returns(histograms, shape, RULES._replace(most=2))
+    both = np.isfinite(found.place).all(axis=0)
+    assert both.mean() > 0.8
+    z = (found.place[:, both] - places[:, None]) / found.sigma[:, both]
+    assert ((z**2).mean(axis=1) > 0.8).all()
+    assert ((z**2).mean(axis=1) < 1.25).all()
+
+
+def test_returns_of_a_counter_that_is_full_are_saturated() -> None:
+    """A counter of 8 bits clips the peak; what is left of it is off by metres, and is no return that is OK."""
+    shape, sensor = PulseShape.gaussian(1.7), DirectToF(bins=128, bin_s=0.5e-9, pulse_fwhm_s=2e-9, laser="single-shot")
+    near, far = brought(shape, np.array([40.3]), 3000.0, 128), brought(shape, np.array([90.6]), 400.0, 128)
+    counts = np.minimum(np.round(near + far), 255).astype(np.uint8)
+    clear = np.round(near / 10 + far).astype(np.uint8)
+    capture = Capture(np.stack([counts, clear], axis=-1), sensor, detector=SpadDetector(bits=8, pile_up=False))
+    image = decode(capture, DirectToFDecoder(max_returns=2))
+    assert image.returns is not None
+    assert image.status.tolist() == [[Status.SATURATED, Status.OK]]
+    assert image.returns.number.tolist() == [[0, 2]]
+    assert (image.returns.status[:, 0, 0] == Status.SATURATED).any()

@@ -17,10 +17,13 @@ from synthetic import plane_signals, stereo_rig
 import rangesim
 from rangesim import (
     AmcwToF,
+    Beam,
     DirectToF,
     IdealToF,
+    Rig,
     Sensor,
     Signals,
+    Spinning,
     StructuredLight,
     decode,
     explain,
@@ -33,6 +36,7 @@ from rangesim import (
 from rangesim.decoding.phase_shift import PhaseThresholds
 from rangesim.errors import FileFormatError
 from rangesim.response import DenseResponse, Images, LightPath, Math
+from rangesim.results.saved_signals import LightPass, read_pass, write_pass
 from rangesim.sensors import AmcwDecoder
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -202,3 +206,20 @@ def test_damaged_range_images_are_refused(change: dict[str, Any], message: str, 
     with pytest.raises(FileFormatError, match=message) as error:
         load_range_image(path)
     assert "\n" not in str(error.value)
+
+
+def test_signals_of_a_scanner_come_back_with_depths_behind_it(tmp_path: Path) -> None:
+    scene = rangesim.load_scene("street")
+    head = Spinning(elevations_deg=(1.0, -3.0), columns=8)
+    rig = Rig(head, Beam((3e-3, 3e-3)), scene.T_world_camera)
+    sensor = DirectToF(bins=512, bin_s=1e-9, pulse_fwhm_s=4e-9, laser="single-shot")
+    signals = rangesim.transport(scene, rig, [sensor], spp=1, max_depth=2, photons=0)
+    assert (signals.truth.z < 0.0).any()
+    save_signals(signals, tmp_path / "signals.npz")
+    loaded = load_signals(tmp_path / "signals.npz")
+    assert loaded.rig == rig
+    np.testing.assert_array_equal(loaded.truth.z, signals.truth.z)
+    np.testing.assert_array_equal(expose(loaded, sensor).frames, expose(signals, sensor).frames)
+    write_pass(LightPass.of(signals), tmp_path / "pass_1.npz")  # as `rangesim report` reads it
+    again = read_pass(tmp_path / "pass_1.npz", {"h": 2, "w": 8})
+    np.testing.assert_array_equal(again.truth.z, signals.truth.z)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from synthetic import signals_of_depth, stereo_rig
 
 from rangesim import DirectToF, Intrinsics, Rig, SpadDetector, Status, decode, expose
@@ -170,6 +171,16 @@ def test_coincidence_keeps_the_laser_and_drops_ambient_light() -> None:
     assert together[signal].sum() / (PULSES * PIXELS) == pytest.approx(1 - 4 * np.exp(-3.0), rel=0.05)
     before = slice(0, 39)
     assert together[before].sum() / together[signal].sum() < 0.03 * alone[before].sum() / alone[signal].sum()
+
+
+def test_coincidence_makes_weak_walls_late_and_bright_ones_early() -> None:
+    """A count comes with the later of two photons of the pulse: in weak light sigma / sqrt(pi) behind its middle."""
+    pulse, sigma = np.diff(norm.cdf((np.arange(BINS + 1) - 50) / 4)), 4.0
+    settings = {"spads": 64, "coincidence": 2, "coincidence_window_s": 40e-9}
+    weak, bright = (counted(n * pulse, pulses=p, **settings).sum(axis=1) for n, p in ((0.05, 200_000), (10.0, 1000)))
+    late = [(np.arange(BINS) + 0.5) @ counts / counts.sum() - 50 for counts in (weak, bright)]
+    assert late[0] == pytest.approx(sigma / np.sqrt(np.pi), rel=0.06)
+    assert late[1] < -0.8 * sigma
 
 
 def test_coincidence_counts_once_a_pulse_if_the_timer_does() -> None:

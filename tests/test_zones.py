@@ -35,7 +35,7 @@ from rangesim import (
 from rangesim.causes import explain
 from rangesim.causes.cause import Cause
 from rangesim.instrument.instrument import Instrument
-from rangesim.rig import Beam, Zones
+from rangesim.rig import Beam, Fisheye, Zones
 from rangesim.sensors import DirectToFDecoder
 from rangesim.settings.config import from_dict, to_dict
 from rangesim.signals import EnergySplit
@@ -243,3 +243,24 @@ def test_an_instrument_may_have_zones(corner: Scene) -> None:
     zones = Zones(Intrinsics.from_fov(16, 16, 45.0), 4, 4)
     instrument = Instrument("zones", SENSORS[0], camera=zones)  # type: ignore[arg-type]
     assert instrument.rig(corner).camera == zones
+
+
+def test_zones_beyond_the_field_of_a_fisheye_see_nothing() -> None:
+    """Zones in the corners have pixels without rays alone: they are dark, and the others are those of a matrix."""
+    scene = scene_of(wall=wall(2.0, matte(), half_size=50.0))
+    lens = Fisheye(24, 24, fx=9.0, fy=9.0, cx=12, cy=12, max_angle_rad=np.radians(75))
+    rig = rig_of(FINE, Intrinsics.from_fov(32, 32, 90.0))
+    zones = replace(rig, camera=Zones(lens, columns=8, rows=8))
+    signals = transport(scene, zones, [IdealToF()], spp=4)
+    fine = transport(scene, replace(rig, camera=lens), [IdealToF()], spp=4).truth.range_m
+    in_zones = np.swapaxes(fine.reshape(8, 3, 8, 3), 1, 2).reshape(8, 8, 9)
+    dark = ~np.isfinite(in_zones).any(axis=-1)
+    assert dark[[0, 0, -1, -1], [0, -1, 0, -1]].all()
+    assert not dark[3:5].any()
+    np.testing.assert_array_equal(np.isnan(signals.truth.range_m), dark)
+    np.testing.assert_array_equal(np.isnan(signals.truth.nearest_m), dark)
+    seen = ~dark
+    np.testing.assert_allclose(signals.truth.nearest_m[seen], np.nanmin(in_zones[seen], axis=-1))
+    np.testing.assert_allclose(signals.truth.farthest_m[seen], np.nanmax(in_zones[seen], axis=-1))
+    image = decode(expose(signals, IdealToF(), None))
+    assert not image.valid[dark].any()

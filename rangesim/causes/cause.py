@@ -43,6 +43,7 @@ class Cause(IntEnum):
     PILE_UP = 14
     OCCLUDED = 15
     NO_TEXTURE = 16
+    COVER_GLASS = 17
 
 
 DEFINITIONS = {
@@ -63,6 +64,7 @@ DEFINITIONS = {
     Cause.PILE_UP: "So many pulses brought photons that the first ones hid the others; less light would be read right.",
     Cause.OCCLUDED: "The second camera of a pair does not see the point: something is in between, or it lies outside.",
     Cause.NO_TEXTURE: "The surface shows no texture by which the images of two cameras could be matched.",
+    Cause.COVER_GLASS: "Light off the window of the device disturbed the reading, or hid a surface close before it.",
 }
 """Meaning of each cause, in one sentence, which the tables of docs/causes.md and of reports show."""
 
@@ -84,6 +86,7 @@ TITLES = {
     Cause.PILE_UP: "pile-up",
     Cause.OCCLUDED: "occluded from a camera",
     Cause.NO_TEXTURE: "no texture",
+    Cause.COVER_GLASS: "cover glass",
 }
 """Name of each cause in tables and legends."""
 

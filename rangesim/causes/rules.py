@@ -121,6 +121,7 @@ def rules(e: Evidence) -> list[Rule]:
         (too_dark, Cause.LOW_SIGNAL),
         # ---- The distance itself
         (e.beyond_range, Cause.RANGE_AMBIGUITY),
+        (e.off_glass, Cause.COVER_GLASS),
         (e.optical & e.textureless, Cause.NO_TEXTURE),
         (e.optical & e.coarse, Cause.RESOLUTION),
         # ---- The pixel covers more than one distance

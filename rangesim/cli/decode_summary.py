@@ -64,8 +64,8 @@ def summary(decoded: Decoded, out: Path) -> str:
     measured = fractions.pop(STATUS_NAMES[Status.OK])
     parts = [f"{100 * measured:.1f} % of the pixels {'decoded' if image.camera is None else 'measured'}"]
     if image.camera is not None and image.valid.any():
-        z = image.z[image.valid]
-        parts[0] += f", z from {z.min():.3f} to {z.max():.3f} m"
+        name, reading_m = "z" if image.camera.is_pinhole else "range", image.reading_m[image.valid]
+        parts[0] += f", {name} from {reading_m.min():.3f} to {reading_m.max():.3f} m"
     if others := ", ".join(f"{100 * fraction:.1f} % {name}" for name, fraction in fractions.items() if fraction):
         parts.append(others)
     if image.camera is None:

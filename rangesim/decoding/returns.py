@@ -117,7 +117,8 @@ class FoundReturns(NamedTuple):
 
     place : bins from the start of the first bin.
     strength : counts of the pulse, also of the part that the ends of the histogram cut off.
-    sigma : bins, standard deviation of `place` by the shot noise (the Cramér-Rao bound at the place found).
+    sigma : bins, standard deviation of `place` by the shot noise (the Cramér-Rao bound at the places found, for all
+        places and strengths at once, so that it grows where returns overlap).
     """
 
     place: np.ndarray

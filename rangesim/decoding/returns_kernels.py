@@ -82,7 +82,62 @@ def fit_returns(histograms, excess, shape, rules, is_cyclic, distance, place, st
                 found -= 1  # the new one is a part of another
                 at[:found], n[:found], level = at_before[:found], n_before[:found], level_before
                 is_refused[candidate] = True
+        if found > 1:
+            _widen(spread, level, at, n, found, excesses, shape, is_cyclic)
         _write(at, n, spread, found, column, place, strength, sigma, bins, is_cyclic)
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _widen(spread, level, at, n, found, excess, shape, is_cyclic):  # type: ignore[no-untyped-def]
+    """Raise the standard deviations of the places of returns that overlap to those of a fit of all of them at once.
+
+    They follow from the inverse of the Fisher information of all places and strengths.
+    """
+    bins, size = len(excess), 2 * found
+    expected, slopes, information = np.empty(bins), np.zeros((size, bins)), np.zeros((size, size))
+    _expect(expected, level, at, n, found, -1, shape, is_cyclic)
+    least, strongest = 0.0, 0.0
+    for j in range(-shape.before, shape.behind + 1):
+        least = max(least, CORE * _part(shape, j - 0.5))
+    for i in range(found):
+        strongest = max(strongest, n[i])
+        middle = math.floor(at[i])
+        for b in range(middle - shape.before, middle + shape.behind + 1):
+            part = _part(shape, b - at[i])
+            if part >= least and (is_cyclic or 0 <= b < bins):
+                slopes[2 * i, b % bins] += -n[i] * (_density(shape, b + 1 - at[i]) - _density(shape, b - at[i]))
+                slopes[2 * i + 1, b % bins] += part
+    overlap = False
+    for b in range(bins):
+        weight = 1 / (max(expected[b], FLOOR * strongest) * excess[b])
+        for i in range(size):
+            if slopes[i, b] != 0:
+                for j in range(size):
+                    information[i, j] += slopes[i, b] * slopes[j, b] * weight
+                    overlap = overlap or (i // 2 != j // 2 and slopes[j, b] != 0)
+    if not overlap:
+        return
+    scale = np.empty(size)
+    for i in range(size):
+        if not information[i, i] > 0:
+            return
+        scale[i] = 1 / math.sqrt(information[i, i])
+    for i in range(size):
+        for j in range(size):
+            information[i, j] *= scale[i] * scale[j]
+    for i in range(size):  # Gauss and Jordan's inversion in place; the matrix is positive definite
+        pivot = information[i, i]
+        if not pivot > 1e-9:
+            return
+        information[i, i] = 1.0
+        information[i] /= pivot
+        for j in range(size):
+            if j != i:
+                factor = information[j, i]
+                information[j, i] = 0.0
+                information[j] -= factor * information[i]
+    for i in range(found):
+        spread[i] = max(spread[i], math.sqrt(information[2 * i, 2 * i]) * scale[2 * i])
 
 
 @cached_njit(nogil=True, error_model="numpy")

@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds, Metres, check_fields
+
+if TYPE_CHECKING:
+    from rangesim.rig import Camera
 
 Nearest = Annotated[float, Bounds("0 or positive", 1e-9, MAX_COORDINATE_M, or_zero=True)]
 """A least range in metres, which may be 0."""
@@ -45,6 +48,14 @@ class WorkingRange:
         check_fields(self)
         if self.far_m is not None and self.near_m >= self.far_m:
             raise ValueError(f"expected near_m < far_m, got {self.near_m:g} and {self.far_m:g}.")
+
+    def check(self, camera: Camera) -> None:
+        """Raise ValueError if depths z are limited, but some rays of the camera lead sideways or backwards."""
+        if self.along == "z" and not camera.is_pinhole and bool((camera.pixel_rays().directions[..., 2] <= 0.0).any()):
+            raise ValueError(
+                'expected a working range along the ray (along = "ray"; in a sheet, range_along = "ray"), got one '
+                f"along z: rays of this {type(camera).__name__} lead sideways or backwards, where z is no range."
+            )
 
     def applied_to(self, image: RangeImage) -> RangeImage:
         """The range image with NaN and `OUT_OF_RANGE` where it had a reading outside this range."""

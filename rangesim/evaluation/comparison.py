@@ -11,6 +11,7 @@ import numpy as np
 
 from rangesim.decoding.range_image import RangeImage
 from rangesim.evaluation.depth_edges import depth_edges
+from rangesim.evaluation.neighbourhood import Neighbourhood, neighbourhood
 from rangesim.rig import is_same_pose
 from rangesim.settings.config import ShortRepr
 from rangesim.signals import GroundTruth, Signals
@@ -142,7 +143,7 @@ def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = 
     if not outlier_m > 0:
         raise ValueError(f"expected a positive outlier_m in metres, got {outlier_m}.")
     error = np.where(image.valid, image.reading_m.astype(np.float64) - true_m, np.nan)
-    edge, flying = _flying(image.reading_m, true_m, outlier_m)
+    edge, flying = _flying(image.reading_m, true_m, outlier_m, neighbourhood(image.camera))
     table = [
         _statistics(name, mask, error, truth.projector_visible, edge, flying, outlier_m)
         for name, mask in truth.classes().items()
@@ -187,21 +188,15 @@ def _fraction(part: np.ndarray, whole: np.ndarray) -> float:
     return float(part.sum() / total) if total else math.nan
 
 
-def _flying(z: np.ndarray, true_z: np.ndarray, outlier_m: float) -> tuple[np.ndarray, np.ndarray]:
+def _flying(
+    z: np.ndarray, true_z: np.ndarray, outlier_m: float, pixels: Neighbourhood
+) -> tuple[np.ndarray, np.ndarray]:
     """Two masks, (h, w) bool each: pixels near a depth edge, and flying pixels."""
     far = np.where(np.isfinite(true_z), true_z, np.inf)
     nearest = np.full(z.shape, np.inf)
     measured = np.where(np.isfinite(z), z, np.nan)
-    for shifted in neighbours(far, EDGE_RADIUS):
+    for shifted in pixels.shifted(far, EDGE_RADIUS):
         np.fmin(nearest, np.abs(measured - shifted), out=nearest)
-    edge = np.any(neighbours(depth_edges(true_z, outlier_m), EDGE_RADIUS), axis=0) & np.isfinite(true_z)
+    edges = depth_edges(true_z, outlier_m, pixels)
+    edge = np.any(pixels.shifted(edges, EDGE_RADIUS), axis=0) & np.isfinite(true_z)
     return edge, edge & np.isfinite(measured) & (nearest > outlier_m)
-
-
-def neighbours(values: np.ndarray, radius: int) -> list[np.ndarray]:
-    """Copies of the array (h, w), one for each offset of a window of (2 radius + 1)^2 pixels, shifted by it. Beyond the
-    border, the border's values are repeated."""
-    padded = np.pad(values, radius, mode="edge")
-    h, w = values.shape
-    size = 2 * radius + 1
-    return [padded[y : y + h, x : x + w] for y in range(size) for x in range(size)]

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from rangesim.evaluation.neighbourhood import IMAGE, Neighbourhood
+
 EDGE_FRACTION = 0.02
 """Least difference of the true depths of neighbouring pixels across a depth edge, as a fraction of the nearer depth.
 
@@ -13,18 +15,18 @@ one misses objects that stand close in front of a wall. Other values were not me
 """
 
 
-def depth_edges(z: np.ndarray, tolerance_m: float) -> np.ndarray:
-    """(h, w) bool, whether a depth edge lies between a pixel and one of its eight neighbours.
+def depth_edges(z: np.ndarray, tolerance_m: float, pixels: Neighbourhood = IMAGE) -> np.ndarray:
+    """(h, w) bool, whether a depth edge lies between a pixel and one of its neighbours, eight in an image.
 
     Parameters
     ----------
     z : (h, w) float, metres, true depth; NaN, where there is no surface, counts as infinitely far.
     tolerance_m : float, metres; smaller differences of depth are no edge.
+    pixels : which pixels are neighbours.
     """
-    from scipy.ndimage import maximum_filter, minimum_filter
-
     depth = np.where(np.isfinite(z), z, np.inf)
-    near, far = minimum_filter(depth, 3, mode="nearest"), maximum_filter(depth, 3, mode="nearest")
+    around = pixels.shifted(depth, 1)
+    near, far = np.minimum.reduce(around), np.maximum.reduce(around)
     return np.asarray((depth > across(near, tolerance_m)) | (far > across(depth, tolerance_m)))
 
 

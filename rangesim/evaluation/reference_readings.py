@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -67,6 +67,21 @@ class ReferenceReadings:
         sensor, ambient = self.capture.sensor, self.capture.reference.ambient
         above, below = self.read([noise_free_capture(self.signals, sensor, ambient, error) for error in (1.0, -1.0)])
         return above, below
+
+    @cached_property
+    def without_glass(self) -> np.ndarray | None:
+        """Depths in the emitter's light alone, without that off the device's cover glass; None if there is no glass.
+
+        Signals of motion hold the glass's light in their frames, and keep it.
+        """
+        if self.signals.rig.cover_glass is None:
+            return None
+        sensor = self.capture.sensor
+
+        def bare(one: Signals) -> np.ndarray:
+            return replace(one, rig=replace(one.rig, cover_glass=None)).frames(sensor, 0.0)
+
+        return self.read([capture_of_frames(self.signals, sensor, bare)])[0]
 
     @cached_property
     def emitter_alone(self) -> np.ndarray:

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import rq
 
 from rangesim.geometry.correspondences import ROUNDING, Array, checked_array
 from rangesim.rig import Intrinsics, pose
@@ -133,6 +132,8 @@ def decompose(P: ArrayLike) -> CameraParts:
            [  0.,   0.,   1.]])
     """
     p = _finite_camera(P)
+    from scipy.linalg import rq  # takes long to load, and sensors load this module
+
     upper, rotation = rq(p[:, :3])
     signs = np.where(np.diag(upper) < 0, -1.0, 1.0)
     upper, rotation = upper * signs, signs[:, None] * rotation  # det M > 0, so this is a rotation

@@ -101,6 +101,8 @@ class DenseMatching:
     max_sigma_px : largest standard deviation of a disparity in pixels that counts as enough texture.
     min_correlation : least correlation coefficient of both windows after the refinement. Images of noise alone reach
         0.3 to 0.6 where a matcher may choose the place.
+    min_slope_correlation : the same of their derivatives along the row. An even slope of the brightness gives windows
+        a high correlation, but locates nothing: then the derivatives are noise, and differ.
     min_region_px : number of pixels; smaller regions of connected matches, whose neighbours differ by at most a pixel
         of disparity, are refused as speckles. 0: none are.
     refine : whether disparities are refined, see the module. Without it they come from a parabola through three costs.
@@ -121,6 +123,7 @@ class DenseMatching:
     max_difference_px: Annotated[float, Bounds("pixels", 0, 1e4)] = 1.0
     max_sigma_px: Annotated[float, Bounds("pixels", 1e-6, 1e4)] = 0.15
     min_correlation: Annotated[float, Bounds("a correlation coefficient", -1, 1)] = 0.7
+    min_slope_correlation: Annotated[float, Bounds("a correlation coefficient", -1, 1)] = 0.5
     min_region_px: Annotated[int, Bounds("a number of pixels", 0, 10_000_000)] = 60
     refine: bool = True
 
@@ -211,7 +214,8 @@ def match_densely(
     # Where the texture does not suffice, neither a match nor its failure means anything
     is_flat = locating_sigma(images[0], noises, settings.reach) > settings.max_sigma_px
     outcome[known & is_flat] = MatchOutcome.NO_TEXTURE
-    is_sure = (fit.correlation >= settings.min_correlation) & (fit.sigma_px <= settings.max_sigma_px)
+    is_alike = fit.slope_correlation >= settings.min_slope_correlation
+    is_sure = is_alike & (fit.correlation >= settings.min_correlation) & (fit.sigma_px <= settings.max_sigma_px)
     refused = ~(np.isfinite(fit.disparity_px) & is_sure)
     outcome[matched & (outcome == MatchOutcome.MATCHED) & refused] = MatchOutcome.AMBIGUOUS
     found = fit.disparity_px if settings.refine else whole
@@ -319,7 +323,8 @@ def _census_codes(image: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 def _grey_levels(image: np.ndarray, of: np.ndarray) -> np.ndarray:
     """(h, w) int64, the image in `ZNCC_LEVELS` levels between the quantiles of 0.1 and 99.9 % of the image `of`."""
-    low, high = np.nanquantile(of, [0.001, 0.999])
+    known = of[np.isfinite(of)]
+    low, high = np.quantile(known, [0.001, 0.999]) if known.size else (0.0, 1.0)
     scale = ZNCC_LEVELS / max(float(high - low), 1e-30)
     return np.nan_to_num(np.rint(np.clip((image - low) * scale, 0, ZNCC_LEVELS))).astype(np.int64)
 
@@ -593,11 +598,13 @@ class Refinement(NamedTuple):
 
     disparity_px, sigma_px : pixels, the disparity and its standard deviation.
     correlation : correlation coefficient of both windows.
+    slope_correlation : correlation coefficient of their derivatives along the row, which alone locate a match.
     """
 
     disparity_px: np.ndarray
     sigma_px: np.ndarray
     correlation: np.ndarray
+    slope_correlation: np.ndarray
 
 
 def refine_disparities(
@@ -624,21 +631,25 @@ def refine_disparities(
     middle = float(np.nanmean(images[1])) if known[1].any() else 0.0
     filled = np.where(known[1], images[1], middle).astype(np.float64)
     splines = spline_filter1d(filled, order=3, axis=1, mode="mirror")
+    slopes = np.zeros(filled.shape)
+    own = spline_filter1d(np.nan_to_num(images[0].astype(np.float64)), order=3, axis=1, mode="mirror")
+    slopes[:, 1:-1] = (own[:, 2:] - own[:, :-2]) / 2
     size = images[0].shape
-    result = Refinement(*(np.full(size, np.nan) for _ in range(3)))
+    result = Refinement(*(np.full(size, np.nan) for _ in range(4)))
     in_blocks(
-        _refine, size[0], images[0].astype(np.float64), known[0], splines, known[1],
+        _refine, size[0], images[0].astype(np.float64), slopes, known[0], splines, known[1],
         *(n.astype(np.float64) for n in noises), disparity_px, settings.reach, result, smallest=MIN_ROWS,
     )  # fmt: skip
     return result
 
 
 @kernel
-def _refine(start, stop, first, known, splines, other_known, noise, other_noise, start_px, reach, result):  # type: ignore[no-untyped-def]
+def _refine(start, stop, first, slopes, known, splines, other_known, noise, other_noise, start_px, reach, result):  # type: ignore[no-untyped-def]
     """Kernel over rows: refined disparities. Pixels of the window support it whose own disparity is about the same."""
     height, width = first.shape
     side = 2 * reach + 1
     values, derivatives, references = np.empty(side * side), np.empty(side * side), np.empty(side * side)
+    own = np.empty(side * side)
     for y in range(start, stop):
         for x in range(width):
             base = start_px[y, x]
@@ -656,6 +667,7 @@ def _refine(start, stop, first, known, splines, other_known, noise, other_noise,
                 )
                 v0, v1, v2, v3 = -((1 - t) ** 2) / 2, t * (1.5 * t - 2), 0.5 + t - 1.5 * t * t, t * t / 2
                 n = 0
+                mean_own = 0.0
                 mean_first, mean_value, mean_derivative, variance, other_variance = 0.0, 0.0, 0.0, 0.0, 0.0
                 for row in range(max(y - reach, 0), min(y + reach, height - 1) + 1):
                     for column in range(max(x - reach, 0), min(x + reach, width - 1) + 1):
@@ -673,6 +685,8 @@ def _refine(start, stop, first, known, splines, other_known, noise, other_noise,
                         value = w0 * s0 + w1 * s1 + w2 * s2 + w3 * s3
                         derivative = v0 * s0 + v1 * s1 + v2 * s2 + v3 * s3
                         values[n], derivatives[n], references[n] = value, derivative, first[row, column]
+                        own[n] = slopes[row, column]
+                        mean_own += slopes[row, column]
                         mean_first += first[row, column]
                         mean_value += value
                         mean_derivative += derivative
@@ -702,7 +716,14 @@ def _refine(start, stop, first, known, splines, other_known, noise, other_noise,
                     residual = max(ff - gain * vf, 0.0) / max(n - 3, 1)
                     result.disparity_px[y, x] = shift
                     result.sigma_px[y, x] = np.sqrt(max(variance, residual) / texture) / gain
+                    mean_own /= n
+                    oo, od = 0.0, 0.0
+                    for k in range(n):
+                        o = own[k] - mean_own
+                        oo += o * o
+                        od += o * (derivatives[k] - mean_derivative)
                     result.correlation[y, x] = vf / np.sqrt(vv * ff)
+                    result.slope_correlation[y, x] = od / np.sqrt(oo * dd) if oo > 0 else 0.0
                     break
                 if not gain > 0:
                     break

@@ -7,13 +7,14 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.motion import Timing
-from rangesim.rig import CAMERA_LENS, PROJECTOR_LENS, Beam, Camera, CoverGlass, Lens, Optics, pose
+from rangesim.rig import CAMERA_LENS, PROJECTOR_LENS, Beam, Camera, CoverGlass, Intrinsics, Lens, Optics, pose
 from rangesim.sensors import Decoder, Sensor, check_sensor, is_file_name, sensor_from_dict
 from rangesim.settings.bounds import Metres, Seconds, Watts, Wavelength, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, on_top_of, shown, to_dict
@@ -66,7 +67,8 @@ class Instrument:
     ValueError
         A name or a number out of its range, a decoder or detector that does not fit the sensor, two fields that
         contradict each other (`camera` and `width`, `T_camera_projector` and `baseline_m`, a Beam and either of these
-        two), or no projector for a camera that is no pinhole.
+        two), no projector for a camera that is no pinhole, or a working range along z for one with rays that lead
+        backwards.
 
     Examples
     --------
@@ -113,6 +115,13 @@ class Instrument:
             if getattr(self, one) is not None and (twice := [n for n in others if getattr(self, n) is not None]):
                 raise ValueError(f"expected either {one} or {twice[0]} of instrument {self.name!r}, got both.")
         has_place = self.baseline_m is not None or self.T_camera_projector is not None
+        for part in ("camera", "projector"):
+            device = getattr(self, part)
+            if self.sensor.triangulates and not isinstance(device, (Intrinsics, NoneType)):
+                raise ValueError(
+                    f"expected a pinhole as the {part} of instrument {self.name!r}, because {self.sensor.type_name} "
+                    f"triangulates, got a {type(device).__name__}."
+                )
         if isinstance(self.projector, Beam) and has_place:
             raise ValueError(
                 f"expected neither baseline_m nor T_camera_projector of instrument {self.name!r}, because its beam "
@@ -122,6 +131,8 @@ class Instrument:
             raise ValueError(
                 f"expected a projector of instrument {self.name!r}, such as a Beam, because its camera is no pinhole."
             )
+        if self.camera is not None and self.decoder is not None and self.decoder.working_range is not None:
+            self.decoder.working_range.check(self.camera)
         for pose_name in ("T_world_camera", "T_camera_projector"):
             if getattr(self, pose_name) is not None:
                 object.__setattr__(self, pose_name, pose(getattr(self, pose_name), pose_name))

@@ -459,7 +459,12 @@ def walk(
             scatters, crosses = media.event(
                 path.ray_state.inside, path.ray_state.previous, ray.d, si, hit, rng.next_float32()
             )
+            if dr.hint(has_pencil, mode="scalar"):
+                assert path.pencil is not None
+                way = dr.norm(si.p - path.ray_state.previous)
+                path.pencil.fraction *= dr.exp(-path.ray_state.inside.sigma_t * dr.select(hit, way, 0))
         at_surface = hit & ~scatters
+        is_own = at_surface | ~path.scattered_inside if media is not None else at_surface
         # The surface counts towards the depth if it scatters the path; this is known with the next direction
         if dr.hint(media is not None, mode="scalar"):
             arrives = ~(crosses | (scatters & path.scattered_inside))
@@ -477,7 +482,8 @@ def walk(
                 path.pencil.fraction *= unabsorbed
         if dr.hint(has_pencil, mode="scalar"):
             assert path.pencil is not None
-            path.pencil = path.pencil.arrived(ray.d, dr.norm(si.p - path.ray_state.previous), si.n)
+            facing = dr.select(scatters, ray.d, si.n)
+            path.pencil = path.pencil.arrived(ray.d, dr.norm(si.p - path.ray_state.previous), facing)
         bsdf = si.bsdf(ray)
         is_vertex = hit & (path.depth < settings.max_depth) & (scatters | can_be_vertex(bsdf))
 
@@ -506,11 +512,13 @@ def walk(
         # ---- Next-event estimation: straight to the projector ----------------------------------------
         is_connected = owner(is_vertex, delta_interactions=0).next_event
         if dr.hint(is_beam, mode="scalar"):
-            is_connected &= beam_connects(path.depth, path.left_delta, has_spot)
+            # The boundaries of media, which nothing bends at, may lie between a mirror and the vertex
+            via_delta = path.chain > 0 if settings.delta else path.left_delta
+            is_connected &= beam_connects((path.depth == 1) & is_own, via_delta, has_spot)
         link = projector.connect(scene, si, is_connected, lanes.pixel, media, path.ray_state.inside)
         if dr.hint(has_pencil, mode="scalar"):
             assert path.pencil is not None
-            comes_back = is_vertex & at_surface & (path.depth == 1) & path.left_delta
+            comes_back = is_vertex & is_own & (path.depth == 1) & (path.chain > 0)
             link = path.pencil.connection(comes_back, ray.d, path.ray_state.length, link)
         value, _, bs, bs_weight = bsdf.eval_pdf_sample(
             mi.BSDFContext(),
@@ -596,7 +604,8 @@ def walk(
             bends = goes_delta & at_surface
             eta = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission), bs.eta, 1)
             turned = path.pencil.turned(ray.d, si, wo, eta)
-            turned.fraction *= bs_weight * bs.pdf
+            # `bs_weight` is that of radiance, which falls by eta^2 on the way into glass; power does not
+            turned.fraction *= bs_weight * bs.pdf * dr.square(eta)
             path.pencil = path.pencil.replaced(bends, turned)
         path.throughput *= bs_weight
         path.ray_state = path.ray_state.refracted(bs, at_surface)

@@ -105,7 +105,8 @@ def connect_to_spot(traced: TracedScene, spot: Spot, si: mi.SurfaceInteraction3f
     to_spot = at.p - si.p
     distance = dr.norm(to_spot)
     to_spot /= distance
-    value = mono(at.bsdf(ray).eval(mi.BSDFContext(), at, at.to_local(-to_spot), active))
+    context = mi.BSDFContext(mi.TransportMode.Importance)  # light goes from the emitter on, not back to it
+    value = mono(at.bsdf(ray).eval(context, at, at.to_local(-to_spot), active))
     irradiance = spot.weight * value / dr.square(distance)
     active &= (irradiance > 0) & (distance > 0)
     visible = active & ~traced.scene.ray_test(si.spawn_ray_to(at.p), coherent=False, active=active)

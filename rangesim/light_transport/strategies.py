@@ -62,7 +62,7 @@ def owner(has_vertex: mi.Bool, delta_interactions: mi.UInt32 | int) -> Owner:
     return Owner(has_vertex & is_straight, has_vertex & (delta_interactions != 0), ~has_vertex)
 
 
-def beam_connects(vertices: mi.UInt32, left_delta: mi.Bool, has_spot: bool) -> mi.Bool:
+def beam_connects(is_first: mi.Bool, via_delta: mi.Bool, has_spot: bool) -> mi.Bool:
     """Whether next-event estimation owns the path from the emitter of a beam straight to the last vertex.
 
     It owns paths of one vertex that the camera sees straight, and longer paths whose last segment between vertices has
@@ -72,17 +72,17 @@ def beam_connects(vertices: mi.UInt32, left_delta: mi.Bool, has_spot: bool) -> m
 
     Parameters
     ----------
-    vertices : UInt32, number of vertices of the path.
-    left_delta : Bool, whether the path came to the last vertex by a delta interaction.
+    is_first : Bool, whether the last vertex of the path is its only one.
+    via_delta : Bool, whether the path came to the last vertex by delta interactions.
     has_spot : whether the spot is a light vertex.
 
     Examples
     --------
     >>> import numpy as np
-    >>> beam_connects(np.array([1, 1, 2, 2]), np.array([False, True, False, True]), has_spot=True)
+    >>> beam_connects(np.array([True, True, False, False]), np.array([False, True, False, True]), has_spot=True)
     array([ True, False, False,  True])
     """
-    return (vertices == 1) ^ left_delta if has_spot else (vertices != 1) | ~left_delta
+    return is_first ^ via_delta if has_spot else ~is_first | ~via_delta
 
 
 def next_event_kind(is_first: mi.Bool, via_delta: mi.Bool) -> mi.UInt32:

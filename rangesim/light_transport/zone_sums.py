@@ -37,12 +37,14 @@ class ZoneSums:
     """
 
     def __init__(self, rig: Rig, matrix: csr_array) -> None:
-        from scipy.sparse import diags_array
-
-        self.rig, self.matrix = rig, matrix
+        self.rig, self.matrix = rig, matrix.tocsr()
         self.shape = rig.camera.height, rig.camera.width
-        light = matrix @ diags_array(rig.traced.camera_illumination.ravel().astype(np.float64))
-        self.share = (diags_array(1 / np.maximum(light.sum(axis=1), np.finfo(np.float64).tiny)) @ light).tocsr()
+        # The share keeps the entries of pixels without light, so that every row has one, as `reduceat` needs
+        light, illumination = self.matrix.copy(), rig.traced.camera_illumination.ravel().astype(np.float64)
+        light.data = light.data * illumination[light.indices]
+        of_zone = np.maximum(light.sum(axis=1), np.finfo(np.float64).tiny)
+        light.data = light.data * np.repeat(1 / of_zone, np.diff(light.indptr))
+        self.share = light
 
     def image(self, values: np.ndarray) -> np.ndarray:
         """(..., rows, columns), mean of radiances (..., h, w) over each zone, in their type."""

@@ -297,7 +297,8 @@ def acquisition(
 ) -> MeasurementRecord:
     """The record of a capture: its frames, exposure, acquisition time and photons.
 
-    A noise-free capture has no exposure and takes no time.
+    A noise-free capture has no exposure and takes no time. The rays of a scanner are exposed one after the other, so
+    its acquisition lasts as long as its turn.
 
     Parameters
     ----------
@@ -315,6 +316,7 @@ def acquisition(
         pause = max(exposure, timing.frame_period_s) if moves else exposure
         lines = camera[0] if timing.lines == "rows" else camera[1]
         taken = (shots - 1) * pause + exposure + (lines - 1) * (timing.line_period_s if moves else 0.0)
+        taken += _scan_s(capture)
     return MeasurementRecord(
         sensor=capture.sensor.type_name,
         frames=len(capture.frames),
@@ -325,6 +327,12 @@ def acquisition(
         photons_per_pulse=_photons_record(photons) if photons is not None else None,
         times_s=times_s,
     )
+
+
+def _scan_s(capture: Capture) -> float:
+    """Seconds from the first ray of a scanner to its last one; 0 for a camera that measures all pixels at once."""
+    times_s = capture.rig.camera.times_s if capture.rig is not None else None
+    return float(np.ptp(times_s)) if times_s is not None else 0.0
 
 
 def _photons_record(photons: np.ndarray) -> PhotonsRecord:

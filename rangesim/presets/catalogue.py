@@ -130,7 +130,8 @@ def instrument(name: str, **settings: Any) -> Instrument:
 def instrument_from_dict(table: Any, place: str, files_in: Path | None = None) -> Instrument:
     """The instrument that a table of settings describes; `sensor` may be the name of a device.
 
-    All other keys then replace settings of the device. The tables `detector` and `decoder` do so key by key.
+    All other keys then replace settings of the device. Tables, such as `detector`, `camera` and `camera_lens`, do so
+    key by key, unless they state another `type`.
 
     Parameters
     ----------
@@ -166,9 +167,7 @@ def _changed(device: Instrument, changes: Mapping[str, Any], place: str) -> Inst
     """The device with some of its settings replaced."""
     check_keys(changes, [f.name for f in fields(Instrument)], place)
     values = {**to_dict(device), **changes}
-    for key in ("detector", "decoder"):
-        if changes.get(key) is not None:
-            values[key] = on_top_of(getattr(device, key), changes[key])
+    values |= {key: on_top_of(getattr(device, key), value) for key, value in changes.items()}
     return instruments.instrument_from_dict(values, place)
 
 

@@ -131,7 +131,7 @@ class DataSheet:
         (width, height), (across, down) = self.resolution_px, self.field_of_view_deg
         return Fisheye(width, height, width / math.radians(across), height / math.radians(down), width / 2, height / 2)
 
-    def settings(self, has_camera: bool = False) -> dict[str, Any]:
+    def settings(self, has_camera: bool = False, has_projector: bool = False) -> dict[str, Any]:
         """Settings of an `Instrument` that follow from the sheet, as plain data.
 
         They are `camera`, `projector` and `T_camera_projector`, where the sheet tells them, and the decoder's
@@ -139,7 +139,8 @@ class DataSheet:
 
         Parameters
         ----------
-        has_camera : whether the instrument states its own camera, which then replaces that of the sheet.
+        has_camera, has_projector : whether the instrument states its own camera or projector, which then replaces that
+            of the sheet.
         """
         near_m, far_m = self.range_m
         result: dict[str, Any] = {
@@ -148,8 +149,9 @@ class DataSheet:
         if not has_camera:
             result["camera"] = to_dict(self.camera)
         if self.emitter_offset_m is not None:
-            field_deg = self.emitter_field_of_view_deg or self.field_of_view_deg
-            result["projector"] = to_dict(pinhole(self.emitter_resolution_px or self.resolution_px, field_deg))
+            if not has_projector:
+                field_deg = self.emitter_field_of_view_deg or self.field_of_view_deg
+                result["projector"] = to_dict(pinhole(self.emitter_resolution_px or self.resolution_px, field_deg))
             pose = translation(*self.emitter_offset_m)
             if self.axes_meet_m is not None:
                 pose = look_at(self.emitter_offset_m, (0.0, 0.0, self.axes_meet_m), up=(0.0, -1.0, 0.0))

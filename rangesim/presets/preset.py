@@ -24,6 +24,7 @@ from rangesim.errors import FileFormatError
 from rangesim.files.text_files import read_text, read_toml
 from rangesim.instrument.instrument import MAX_NAME, Instrument, instrument_from_dict, is_name
 from rangesim.presets.data_sheet import DataSheet
+from rangesim.rig import Spinning
 from rangesim.settings.config import ShortRepr, check_keys, from_dict, nearest, shown
 
 PARTS = ("title", "sheet", "instrument", "documents", "sources")
@@ -32,6 +33,12 @@ PARTS = ("title", "sheet", "instrument", "documents", "sources")
 STANDINGS = ("assumed", "computed", "fitted")
 """What a number may be that no document states: chosen because nothing is known, computed from other numbers of the
 file, or fitted to a published figure. The source has to say why, how, or to what."""
+
+VIEW_TOLERANCE = 0.05
+"""Fraction by which a head's angles may differ from those of its sheet, because sheets round them."""
+
+VIEW_TOLERANCE_DEG = 1.0
+"""Degrees by which they may differ as well: a sheet may count the width of the beams, and one ring has no height."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -104,7 +111,7 @@ def _preset(name: str, data: Mapping[str, Any], text: str) -> Preset:
         if not isinstance(data[part], Mapping):
             raise ValueError(f"expected {part} as a table, got {shown(data[part])}.")
     sheet, given = from_dict(DataSheet, data["sheet"], "sheet"), data["instrument"]
-    follows = sheet.settings(has_camera="camera" in given)
+    follows = sheet.settings(has_camera="camera" in given, has_projector="projector" in given)
     if "name" not in given and not is_name(name):
         raise ValueError(
             f"expected a file name of letters, digits, - and _, at most {MAX_NAME}, which is that of the instrument, "
@@ -118,9 +125,22 @@ def _preset(name: str, data: Mapping[str, Any], text: str) -> Preset:
     if camera is not None and (camera.width, camera.height) != sheet.resolution_px:
         size = "{} x {}".format(*sheet.resolution_px)
         raise ValueError(f"expected a camera of {size} pixels, as the sheet has, got {camera.width} x {camera.height}.")
+    if isinstance(camera, Spinning):
+        _check_turn(camera, sheet)
     numbers = list(numbers_of({"sheet": data["sheet"], "instrument": given}))
     sources = sources_of(numbers, data["sources"], data["documents"])
     return Preset(instrument.name, data["title"], sheet, instrument, data["documents"], sources, text)
+
+
+def _check_turn(head: Spinning, sheet: DataSheet) -> None:
+    """Raise ValueError if a head sees other angles than the sheet states."""
+    across, down = abs(head.arc_deg), max(head.elevations_deg) - min(head.elevations_deg)
+    for seen, stated in zip((across, down), sheet.field_of_view_deg, strict=True):
+        if abs(seen - stated) > VIEW_TOLERANCE * stated + VIEW_TOLERANCE_DEG:
+            stated_deg = "{:g} x {:g}".format(*sheet.field_of_view_deg)
+            raise ValueError(
+                f"expected a camera that sees {stated_deg} degrees, as the sheet has, got {across:g} x {down:g}."
+            )
 
 
 def numbers_of(table: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

@@ -63,6 +63,7 @@ def context(result: Result) -> dict[str, Any]:
         "verdict": verdict(measurements),
         "cameras": [_camera(result, group) for group in cameras],
         "columns": tables.COLUMNS,
+        "along_rays": _along_rays(measurements, names),
         "comparison": tables.comparison_table(measurements),
         "failures": tables.failure_table(measurements),
         "noise": tables.noise_table(measurements),
@@ -95,6 +96,15 @@ def by_camera(measurements: Sequence[Measurement]) -> list[list[Measurement]]:
         else:
             group.append(m)
     return groups
+
+
+def _along_rays(measurements: Sequence[Measurement], names: dict[str, str]) -> str:
+    """Sentence that names the instruments whose readings are ranges; empty if all of them read depths."""
+    found = [names[m.name] for m in measurements if not m.camera.is_pinhole]
+    if not found:
+        return ""
+    of_whom = "" if len(found) == len(measurements) else f" of {', '.join(found)}"
+    return f" Here, z{of_whom} is the range along the ray."
 
 
 def _shares_camera(one: Measurement, other: Measurement) -> bool:

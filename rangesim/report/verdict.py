@@ -37,7 +37,7 @@ def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
     """Findings about a result: accuracy and failures of each real sensor, and then a comparison side by side."""
     names = titles(measurements)
     real = [m for m in measurements if not is_reference(m)] or list(measurements)
-    findings = [Finding(names[m.name], f"{_accuracy(m.rows)}{_failures(m.rows)}{_reasons(m.rows)}") for m in real]
+    findings = [Finding(names[m.name], f"{_accuracy(m)}{_failures(m.rows)}{_reasons(m.rows)}") for m in real]
     if len(real) > 1:
         parts = [_best_error(real, names), _most_right(real, names), _shortest_exposure(real, names)]
         if any(parts):  # ideal sensors alone may be equal in all of these
@@ -45,15 +45,16 @@ def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
     return findings
 
 
-def _accuracy(rows: Rows) -> str:
+def _accuracy(measurement: Measurement) -> str:
     """Sentences about the pixels that a sensor measured, and about its errors."""
-    total = _total(rows)
+    total = _total(measurement.rows)
     if total["median_abs_m"] is None:
         return "measured nothing."
     lit = f"{_percent(total['completeness'])} of the pixels that its emitter lights"
     measured = lit if total["completeness"] is not None else "only pixels in shadow"
+    true = "true depth" if measurement.camera.is_pinhole else "true range"
     return (
-        f"measured {measured}. Half of its readings lie within {_mm(total['median_abs_m'])} of the true depth, "
+        f"measured {measured}. Half of its readings lie within {_mm(total['median_abs_m'])} of the {true}, "
         f"{_glued('95 %')} within {_mm(total['p95_abs_m'])}."
     )
 

@@ -122,7 +122,8 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
     """The contents of `measurement.json`.
 
     exposure_s : exposure of each frame, seconds; None for a noise-free capture.
-    acquisition_s : time from the start of the first exposure to the end of the last, seconds.
+    acquisition_s : time from the start of the first exposure to the end of the last, seconds; of a scanner, that of its
+        last ray.
     points : number of pixels with a reading.
     photons_per_pulse : None where no photons are counted.
     times_s : seconds that each stage of the computation took.

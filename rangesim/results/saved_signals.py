@@ -26,11 +26,11 @@ MAX_SETTINGS = 1_000_000
 from filling the memory."""
 
 _RADIANCE = ArraySpec("float32", low=0)
-_TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=MAX_METRES, nan=True)
+_TRUE_RANGE = ArraySpec("float32", low=1e-9, high=MAX_METRES, nan=True)
 _OPTIONAL = ArraySpec("float32", required=False)
 _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
-    "truth_z": _TRUE_DEPTH,
-    "truth_range_m": _TRUE_DEPTH,
+    "truth_z": replace(_TRUE_RANGE, low=-MAX_METRES),
+    "truth_range_m": _TRUE_RANGE,
     "truth_normal": ArraySpec("float32", ("h", "w", 3), low=-1.01, high=1.01, nan=True),
     "truth_instance": ArraySpec("int32", low=-1),
     "truth_material": ArraySpec("int32", low=-1),
@@ -38,13 +38,13 @@ _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
     "truth_projector_visible": ArraySpec("bool"),
     "truth_instance_names": ArraySpec("str", ("instances",)),
     "truth_material_names": ArraySpec("str", ("materials",)),
-    "truth_nearest_m": replace(_TRUE_DEPTH, required=False),
-    "truth_farthest_m": replace(_TRUE_DEPTH, required=False),
+    "truth_nearest_m": replace(_TRUE_RANGE, required=False),
+    "truth_farthest_m": replace(_TRUE_RANGE, required=False),
     "motion_m": ArraySpec("float32", low=0, nan=True, required=False),
     "truncation": ArraySpec("float64", (len(fields(Truncation)),), low=0, high=1, nan=True, required=False),
 }
 """Type, shape and bounds of the arrays of a pass, by their names in files. The bounds of a normal leave room for the
-rounding of single precision."""
+rounding of single precision. Depths z are negative behind a scanner."""
 
 
 def save_signals(signals: StillSignals, path: str | Path) -> None:
@@ -53,7 +53,8 @@ def save_signals(signals: StillSignals, path: str | Path) -> None:
     Raises
     ------
     ValueError
-        A response holds arrays (`rangesim.response.Images`), which files cannot hold.
+        The signals are those of several cameras or of a moving scene; or a response holds arrays
+        (`rangesim.response.Images`), which files cannot hold.
     FileFormatError
         The file cannot be written.
 
@@ -62,6 +63,11 @@ def save_signals(signals: StillSignals, path: str | Path) -> None:
     >>> from rangesim import save_signals
     >>> save_signals(signals, "out/signals.npz")  # doctest: +SKIP
     """
+    if not isinstance(signals, StillSignals):
+        raise ValueError(
+            f"expected StillSignals, got {type(signals).__name__}; "
+            "save the signals of each camera of a set by themselves."
+        )
     responses = list(signals.channels)
     settings = {
         "format": FORMAT,
@@ -217,7 +223,7 @@ def _plain(response: Response) -> dict[str, Any]:
     name = type(response).__name__
     if not hasattr(response, "type_name"):
         raise ValueError(f"expected responses with a type_name, which names them in files, got {name} without one.")
-    if any(isinstance(value, np.ndarray) for value in vars(response).values()):
+    if any(isinstance(getattr(response, f.name), np.ndarray) for f in fields(response)):  # type: ignore[arg-type]
         raise ValueError(f"expected responses of numbers, got {name}, which holds arrays.")
     table: dict[str, Any] = to_dict(response)
     return table

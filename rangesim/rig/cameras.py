@@ -99,6 +99,12 @@ class Camera(Optics):
         not."""
         return None
 
+    @property
+    def lattice(self) -> NDArray[np.int64] | None:
+        """(h, w) int64, flat indices of the pixels in an order in which those beside each other see places beside each
+        other, if that is not the order of the image; None: it is, or no such order is known."""
+        return None
+
     def pixel_centres(self, rows: slice = slice(None)) -> Array:
         """(height, width, 2) float64, pixel coordinates (x, y) of the pixel centres.
 

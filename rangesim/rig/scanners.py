@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rangesim.rig.cameras import Acceptance, Camera, PixelRays, finite_array
 from rangesim.rig.poses import Array, check_rigid
 from rangesim.rig.ray_cameras import FieldAngle, RayTable, ScanningCamera
-from rangesim.rig.scan_patterns import ScanRays, lissajous, risley, spinning
+from rangesim.rig.scan_patterns import ScanRays, column_shifts, lissajous, risley, spinning
 from rangesim.settings.bounds import Bounds, Seconds, check_fields, whole
 
 Angles = tuple[Annotated[float, Bounds("an angle in degrees", -3600, 3600)], ...]
@@ -95,7 +95,15 @@ class Spinning(Scanner):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        self.scan_rays()  # checks the shapes
+        if self.elevations_deg and max(map(abs, self.elevations_deg)) > 90:
+            steepest = max(self.elevations_deg, key=abs)
+            raise ValueError(f"expected elevations_deg of -90 to 90 degrees, got {steepest:g}.")
+        for name in ("azimuth_offsets_deg", "firing_times_s"):
+            if (given := len(getattr(self, name))) not in (0, self.height):
+                raise ValueError(
+                    f"expected {name} for each of the {self.height} elevations_deg, or none, got {given} numbers."
+                )
+        self.scan_rays()  # checks the rest
 
     @property
     def width(self) -> int:  # type: ignore[override]
@@ -108,6 +116,13 @@ class Spinning(Scanner):
     @property
     def rings(self) -> NDArray[np.uint16]:
         return np.broadcast_to(np.arange(self.height, dtype=np.uint16)[:, None], (self.height, self.width))
+
+    @property
+    def lattice(self) -> NDArray[np.int64]:
+        rows = np.argsort(-np.asarray(self.elevations_deg), kind="stable")
+        shifts = column_shifts(self.ray_directions())
+        columns = (np.arange(self.width) - shifts[rows, None]) % self.width
+        return rows[:, None] * self.width + columns
 
     def scan_rays(self) -> ScanRays:
         return spinning(
@@ -292,6 +307,10 @@ class MovingCamera(Camera):
     @property
     def rings(self) -> NDArray[np.uint16] | None:
         return self.camera.rings
+
+    @property
+    def lattice(self) -> NDArray[np.int64] | None:
+        return self.camera.lattice
 
     def cropped(self, top: int, bottom: int, left: int, right: int) -> RayTable:
         return RayTable.of(self).cropped(top, bottom, left, right)

@@ -88,6 +88,7 @@ class ActiveStereo(Sensor):
     baseline_m: Metres = 0.05
 
     type_name: ClassVar[str] = "active-stereo"
+    triangulates: ClassVar[bool] = True
     n_cameras: ClassVar[int] = 2
     compares_texture: ClassVar[bool] = True
 

@@ -410,7 +410,7 @@ class DirectToFDecoder(Decoder):
         ran_out = np.zeros(place.shape, dtype=bool)
         if blind is not None:
             ran_out = runs_out(kept, blind.trials) & np.isfinite(place)
-        status[ran_out] = Status.SATURATED
+        status[(ran_out | capture.saturated(capture.frames)) & np.isfinite(place)] = Status.SATURATED
         is_outside = (place < 0) | (place > sensor.bins) | (length < 2 * self.min_range_m)
         status[is_outside] = Status.OUT_OF_RANGE
         if capture.detector is None:

@@ -55,6 +55,7 @@ class ReferencePatternStereo(Sensor):
     baseline_m: Metres = 0.075
 
     type_name: ClassVar[str] = "reference-pattern"
+    triangulates: ClassVar[bool] = True
     compares_texture: ClassVar[bool] = True
 
     def __post_init__(self) -> None:

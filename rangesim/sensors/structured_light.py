@@ -80,6 +80,7 @@ class StructuredLight(Sensor):
     steps: Annotated[int, whole(3, "steps")] = 4
 
     type_name: ClassVar[str] = "structured-light"
+    triangulates: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -99,10 +99,13 @@ def _hints(cls: type) -> dict[str, Any]:
 def on_top_of(default: Any, table: Any) -> Any:
     """A default value as plain data, updated with the entries of a table.
 
-    The table is returned unchanged if the default is no dataclass or has another `type`. A value that is no table is
-    returned unchanged too.
+    The table is returned unchanged if the default is no dataclass or has another `type`, or if the table is a whole
+    member of the family whose tables have no `type`. A value that is no table is returned unchanged too.
     """
     if not isinstance(table, Mapping) or not dataclasses.is_dataclass(default) or isinstance(default, type):
+        return table
+    untagged = getattr(default, "untagged", None)
+    if untagged is not None and {f.name for f in dataclasses.fields(untagged) if _required(f)} <= set(table):
         return table
     settings = to_dict(default)
     return {**settings, **table} if table.get("type", settings.get("type")) == settings.get("type") else table
