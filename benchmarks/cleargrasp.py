@@ -98,8 +98,7 @@ camera pixels apart, with a standard deviation of 1.0 camera pixel, the blur of 
 the same device. Power: librealsense's default setting, 150 mW, if all of it leaves the device; automatic exposure. The
 cameras of a D435 have no filter, so they take visible light too; electrons are assumed. Matcher: census as in the
 device, without the texture check, which the data set's authors had switched off. Its other thresholds are those with
-which scene 080 loses as little of its background as the real camera does (2 to 3 %); what it loses on glass was not
-looked at for them."""
+which scene 080 loses about as little of its background as the real camera does (2 to 3 %)."""
 ROOM_LUX = 400.0
 """Room light on the table, lux; assumed such that dots at 0.6 m are 2.7 times as bright as what is around them, as in
 that real pair (in another room)."""
