@@ -208,12 +208,16 @@ def read_scene(folder: Path, number: int) -> RealScene:
     fx, fy, cx, cy = (float(numbers[key]) for key in ("fx", "fy", "cx", "cy"))
     camera = Intrinsics(int(numbers["xres"]), int(numbers["yres"]), fx, fy, cx + 0.5, cy + 0.5)
 
+    def first_channel(name: str) -> np.ndarray:
+        image = np.array(mi.Bitmap(name), dtype=np.float64)
+        return image if image.ndim == 2 else image[..., 0]
+
     def depth(name: str) -> np.ndarray:
-        z = np.array(mi.Bitmap(name), dtype=np.float64)[..., 0]
+        z = first_channel(name)
         return np.where(np.isfinite(z) & (z > 0), z, np.nan)
 
     grey = cv2.imread(names[3], cv2.IMREAD_GRAYSCALE)
-    return RealScene(camera, depth(names[0]), depth(names[1]), np.array(mi.Bitmap(names[2])) > 0, grey)
+    return RealScene(camera, depth(names[0]), depth(names[1]), first_channel(names[2]) > 0, grey)
 
 
 def figures(measured: np.ndarray, true: np.ndarray, mask: np.ndarray, behind: np.ndarray | None = None) -> Figures:
