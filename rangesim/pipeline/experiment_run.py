@@ -20,6 +20,7 @@ from rangesim.capture.exposure import exposed
 from rangesim.causes.range_limits import fraction_beyond_range, warn_of_range
 from rangesim.causes.rules import causes_of
 from rangesim.decoding import decode
+from rangesim.errors import warn
 from rangesim.evaluation.comparison import compare
 from rangesim.evaluation.range_noise import noise_of, warn_of_sampling
 from rangesim.evaluation.reference_readings import ReferenceReadings
@@ -205,7 +206,12 @@ def _computed(
 
 
 def _warn(result: Result) -> None:
-    """Warn of surfaces outside a sensor's range, and of readings whose sampling error is not small."""
+    """Warn of surfaces outside a sensor's range, of readings whose sampling error is not small, and of a size that is
+    not used."""
+    sized = result.experiment.width is not None or result.experiment.height is not None
+    own = [one.name for one in result.experiment.instruments if one.camera is not None]
+    if sized and own:
+        warn(f"width and height do not apply to {', '.join(own)}, which have a camera of their own.")
     beyond = []
     for m in result.measurements:
         rig = m.capture.reference.rig
