@@ -89,7 +89,7 @@ D435 = replace(
     decoder=StereoDecoder(
         DenseMatching(
             small_penalty=20, large_penalty=100, uniqueness=0.05, min_advantage=-62.0, max_sigma_px=10.0,
-            min_correlation=0.3,
+            min_correlation=0.3, min_slope_correlation=-1.0,
         )
     ),
 )  # fmt: skip
@@ -146,9 +146,9 @@ class Trial:
     matching: dict[str, Any] = field(default_factory=dict)
 
 
-BASE = "simulated D435"
-TRIALS = {
-    BASE: Trial(),
+MAIN_TRIALS = {"preset d435": Trial(device=PRESET), "d435 as in real images": Trial()}
+"""The device of the package as it is, and with the dots and the light of a real pair of images."""
+VARIANTS = {
     "  product's default matcher": Trial(matching=to_dict(DenseMatching())),
     "  window of 5 px": Trial(matching={"window_px": 5}),
     "  window of 15 px": Trial(matching={"window_px": 15}),
@@ -164,9 +164,9 @@ TRIALS = {
     "  solid": Trial(Matter("solid")),
     "  rough walls, alpha 0.05": Trial(Matter(alpha=0.05)),
     "  no objects": Trial(Matter("none")),
-    "  preset d435 as it is": Trial(device=PRESET),
 }
-"""What `--variants` runs; without it, the first. Trials with the same objects share a pass."""
+"""What `--variants` runs besides, each differing from the last of the main trials. Trials with the same objects share a
+pass."""
 
 
 class RealScene(NamedTuple):
@@ -208,12 +208,16 @@ def read_scene(folder: Path, number: int) -> RealScene:
     fx, fy, cx, cy = (float(numbers[key]) for key in ("fx", "fy", "cx", "cy"))
     camera = Intrinsics(int(numbers["xres"]), int(numbers["yres"]), fx, fy, cx + 0.5, cy + 0.5)
 
+    def first_channel(name: str) -> np.ndarray:
+        image = np.array(mi.Bitmap(name), dtype=np.float64)
+        return image if image.ndim == 2 else image[..., 0]
+
     def depth(name: str) -> np.ndarray:
-        z = np.array(mi.Bitmap(name), dtype=np.float64)[..., 0]
+        z = first_channel(name)
         return np.where(np.isfinite(z) & (z > 0), z, np.nan)
 
     grey = cv2.imread(names[3], cv2.IMREAD_GRAYSCALE)
-    return RealScene(camera, depth(names[0]), depth(names[1]), np.array(mi.Bitmap(names[2])) > 0, grey)
+    return RealScene(camera, depth(names[0]), depth(names[1]), first_channel(names[2]) > 0, grey)
 
 
 def figures(measured: np.ndarray, true: np.ndarray, mask: np.ndarray, behind: np.ndarray | None = None) -> Figures:
@@ -374,7 +378,8 @@ def report_scene(real: RealScene, number: int, args: argparse.Namespace) -> dict
 
     add(f"real D435, scene {number:03d}", real.transparent, real.opaque, real.opaque)
     signals, of = None, None
-    for label, trial in TRIALS.items() if args.variants else [(BASE, TRIALS[BASE])]:
+    result["objects"], result["gaps"] = {}, {}
+    for label, trial in (MAIN_TRIALS | (VARIANTS if args.variants else {})).items():
         if signals is None or (trial.matter, trial.device) != of:
             signals = light_of(real, rebuilt, trial, args.width or D435.camera.width, args.spp, args.seed)
             of = trial.matter, trial.device
@@ -384,11 +389,10 @@ def report_scene(real: RealScene, number: int, args: argparse.Namespace) -> dict
         there, elsewhere = round(float(lost_too[lost].mean()), 3), round(float(lost_too[~lost].mean()), 3)
         result[label][0].update(lost_where_real_is=there, lost_elsewhere=elsewhere)
         print(f"    lost {there:.0%} of what the real one lost, {elsewhere:.0%} of what it measured", flush=True)
-        if label != BASE:
-            continue
-        result["objects"] = by_object(real, rebuilt, seen.z)
-        result["gaps"] = by_gap(real, rebuilt, seen.z)
-        if args.picture:
+        if label in MAIN_TRIALS:
+            result["objects"][label] = by_object(real, rebuilt, seen.z)
+            result["gaps"][label] = by_gap(real, rebuilt, seen.z)
+        if args.picture and trial == Trial():
             cv2.imwrite(str(args.picture), picture(real, seen))
     return result
 
@@ -405,8 +409,7 @@ def picture(real: RealScene, seen: Simulated, width: int = 300) -> np.ndarray:
         image[np.isnan(z)] = 0
         return image
 
-    infrared = cv2.cvtColor(seen.infrared, cv2.COLOR_GRAY2BGR)
-    grey = cv2.cvtColor(real.grey, cv2.COLOR_GRAY2BGR)
+    grey, infrared = (cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) for image in (real.grey, seen.infrared))
     height = round(width * real.camera.height / real.camera.width)
     cells = [grey, coloured(real.transparent), coloured(seen.z), infrared]
     return np.hstack([cv2.resize(cell, (width, height), interpolation=cv2.INTER_AREA) for cell in cells])

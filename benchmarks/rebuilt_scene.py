@@ -224,10 +224,9 @@ def front_surface(q: np.ndarray, mask: np.ndarray, sigma_q: float, step: int = F
 
 
 def _read(image: np.ndarray, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Values at the crossings of rows and columns; 0 outside of the image."""
+    """Values at the crossings of rows and columns; outside of the image, the nearest value of its border."""
     height, width = image.shape
-    inside = ((y >= 0) & (y < height))[:, None] & ((x >= 0) & (x < width))
-    return np.where(inside, image[np.clip(y, 0, height - 1)[:, None], np.clip(x, 0, width - 1)], 0)
+    return np.asarray(image[np.clip(y, 0, height - 1)[:, None], np.clip(x, 0, width - 1)])
 
 
 def _interpolation(y: np.ndarray, x: np.ndarray, top: int, left: int, step: int, number: np.ndarray) -> Any:

@@ -63,6 +63,15 @@ def test_the_front_surface_is_the_objects_also_in_a_hole(images: Images, rebuilt
     assert np.quantile(error, 0.8) < 1e-3
 
 
+def test_a_surface_reaches_the_border_of_the_image() -> None:
+    x, y = np.meshgrid(np.arange(80) + 0.5, np.arange(61) + 0.5)
+    q = 1.8 + 0.002 * x - 0.001 * y
+    mask = (x > 51) & (y > 33)
+    front = front_surface(np.where(mask, q, np.nan), mask, SIGMA_Q)
+    assert front is not None
+    np.testing.assert_allclose(front[mask], 1 / q[mask], atol=1e-5)
+
+
 def test_a_surface_goes_on_straight_where_depth_is_missing_at_its_boundary() -> None:
     x, y = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
     q = 1.8 + 0.002 * x - 0.001 * y
