@@ -188,3 +188,29 @@ def test_settings_that_make_no_sense_are_refused(change: dict[str, Any], message
 def test_images_that_cannot_be_matched_are_refused(arguments: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         match_densely(*arguments)
+
+
+@pytest.mark.parametrize("method", ["census", "zncc"])
+@pytest.mark.parametrize(("steps", "stated"), [((1.0, 0.0), 0.1), ((0.8, 0.6), 0.1), ((0.6, -0.8), 0.02)])
+def test_beside_a_lone_edge_nothing_is_read(method: Any, steps: tuple[float, float], stated: float) -> None:
+    """The outline of a thing (12 px) before a wall without texture (5 px): windows that reach it would give the wall
+    the disparity of the thing. The same holds if the noise is five times the stated one."""
+    random = np.random.default_rng(4)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+
+    def seen(shift_px: float) -> np.ndarray:
+        across = steps[0] * (x + shift_px - 80) + steps[1] * (y - 30)
+        return np.asarray(np.clip(3 * across, -3, 3) + random.normal(0, 0.1, SIZE))
+
+    found = match_densely(seen(0.0), seen(12.0), (0, 20), DenseMatching(method), noise=(stated, stated))
+    assert np.isfinite(found.disparity_px[INSIDE]).mean() < 0.002
+
+
+def test_where_texture_encloses_a_bright_thing_both_are_read() -> None:
+    """Noise that grows with brightness does not hide the fainter texture around a bright thing."""
+    random = np.random.default_rng(5)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+    gain = [np.where(np.hypot(x + shift - 85, y - 30) < 14, 6.0, 1.0) for shift in (0.0, 7.3)]
+    images = [g * (waves(s) + random.normal(0, 0.2, SIZE)) for g, s in zip(gain, (0.0, 7.3), strict=True)]
+    found = match_densely(images[0], images[1], (0, 20), noise=(0.2 * gain[0], 0.2 * gain[1]))
+    assert np.isfinite(found.disparity_px[INSIDE]).mean() > 0.9

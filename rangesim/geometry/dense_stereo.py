@@ -54,6 +54,17 @@ MIN_SUPPORT = 0.25
 MAX_STEP_PX = 1
 """Largest difference of whole disparities, in pixels, of the middle of a window and of a pixel that supports it. On a
 slanted surface neighbours differ by one; at a depth edge they differ by more."""
+DIRECTIONS = 16
+"""Number of directions, evenly around a pixel, in each of which there must be texture."""
+BESIDE_PX, AROUND = 2.5, 1.5
+"""Least distance of that texture from the pixel along the direction, pixels, about the half width of a sharp edge in
+the derivatives; and radius of the disc in which it lies, as a multiple of the side of the window. At the defaults the
+segment of the disc has the area of more than two windows, and holds ten dots."""
+SEGMENT_SHARE = 0.1
+"""Fraction of the texture that locates a match to `max_sigma_px` which a segment must have."""
+UNMATCHED = 2.0
+"""Ratio of the variance of the difference of two noises to that of one of them, which is what is left of noise that has
+no match: its gain is near 0."""
 MAX_STEPS = 32_000
 """Largest number of steps between disparities in an image of 16-bit integers, as OpenCV's filter of speckles takes."""
 BIG = 30_000
@@ -214,6 +225,8 @@ def match_densely(
     # Where the texture does not suffice, neither a match nor its failure means anything
     is_flat = locating_sigma(images[0], noises, settings.reach) > settings.max_sigma_px
     outcome[known & is_flat] = MatchOutcome.NO_TEXTURE
+    still = outcome == MatchOutcome.MATCHED
+    outcome[still & ~is_enclosed(images[0], fit.variance, still, settings)] = MatchOutcome.NO_TEXTURE
     is_alike = fit.slope_correlation >= settings.min_slope_correlation
     is_sure = is_alike & (fit.correlation >= settings.min_correlation) & (fit.sigma_px <= settings.max_sigma_px)
     refused = ~(np.isfinite(fit.disparity_px) & is_sure)
@@ -254,6 +267,76 @@ def locating_sigma(image: np.ndarray, noises: tuple[np.ndarray, ...], reach: int
         variance = own + float(np.mean(noises[1].astype(np.float64) ** 2))
         tiny = ROUNDING * np.nan_to_num(squares)
         return np.where(texture > tiny, np.sqrt(variance / (texture * side**2)), np.inf)
+
+
+def is_enclosed(image: np.ndarray, variance: np.ndarray, matched: np.ndarray, settings: DenseMatching) -> np.ndarray:
+    """(h, w) bool, whether texture encloses a pixel of the first image.
+
+    A window that holds nothing but one edge finds the place of the edge, not that of its middle: beside the outline of
+    a thing before an even wall, the wall would get the depth of the thing. Such a pixel has a
+    direction in which there is no texture. Texture counts in units of the noise, which is that of the match at the
+    pixel or around it, whichever is less. A segment that is not in the image by half counts as textured.
+
+    Parameters
+    ----------
+    image : (h, w) float, NaN where there is none.
+    variance : (h, w) float64, variance of the difference of both images at a match; NaN where there is none.
+    """
+    known = np.isfinite(image)
+    filled = np.nan_to_num(image.astype(np.float64))
+    squares = np.full(image.shape, np.nan)
+    squares[:, 1:-1] = (filled[:, 2:] - filled[:, :-2]) ** 2 / 4
+    squares[:, 1:-1][~(known[:, 2:] & known[:, :-2])] = np.nan
+    outer = AROUND * settings.window_px
+    reach = int(outer)
+    dy, dx = (v.ravel() for v in np.mgrid[-reach : reach + 1, -reach : reach + 1])
+    angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    along = np.outer(np.cos(angles), dx) + np.outer(np.sin(angles), dy)
+    beyond = (along > BESIDE_PX) & (np.hypot(dx, dy) <= outer)
+    used = beyond.any(axis=0)
+    segments = [np.flatnonzero(s) for s in beyond[:, used]]
+    starts = np.cumsum([0, *map(len, segments)])
+    tiny = ROUNDING * np.nanmean(squares) if np.isfinite(squares).any() else 0.0
+    floor = np.maximum(variance, max(float(np.nan_to_num(tiny)), 1e-300))
+    needed = SEGMENT_SHARE / settings.max_sigma_px**2
+    result = np.zeros(image.shape, dtype=np.bool_)
+    in_blocks(
+        _enclosed, len(image), squares, floor, matched, needed, dy[used], dx[used],
+        np.concatenate(segments), starts, result,
+        smallest=MIN_ROWS,
+    )  # fmt: skip
+    return result
+
+
+@kernel
+def _enclosed(start, stop, squares, variance, matched, needed, dy, dx, members, starts, result):  # type: ignore[no-untyped-def]
+    """Kernel over rows: whether each segment has more than `needed` texture, in units of the variance."""
+    height, width = squares.shape
+    values = np.empty(len(dy))
+    for y in range(start, stop):
+        for x in range(width):
+            here = variance[y, x]
+            if not (matched[y, x] and here < np.inf):
+                continue
+            for k in range(len(dy)):
+                row, column = y + dy[k], x + dx[k]
+                if 0 <= row < height and 0 <= column < width:
+                    others = UNMATCHED * variance[row, column]  # not a number where it is not known
+                    v = others if others < here else here
+                    values[k] = squares[row, column] / v - 0.5
+                else:
+                    values[k] = np.nan
+            result[y, x] = True
+            for i in range(len(starts) - 1):
+                total, n, size = 0.0, 0, starts[i + 1] - starts[i]
+                for k in range(starts[i], starts[i + 1]):
+                    value = values[members[k]]
+                    if np.isfinite(value):
+                        total += value
+                        n += 1
+                if n > size / 2 and total <= needed * n / size:
+                    result[y, x] = False
+                    break
 
 
 def _is_speckle(disparity_px: np.ndarray, outcome: np.ndarray, size: int) -> np.ndarray:
@@ -599,12 +682,14 @@ class Refinement(NamedTuple):
     disparity_px, sigma_px : pixels, the disparity and its standard deviation.
     correlation : correlation coefficient of both windows.
     slope_correlation : correlation coefficient of their derivatives along the row, which alone locate a match.
+    variance : V of `refine_disparities`, in the square of the first image's unit.
     """
 
     disparity_px: np.ndarray
     sigma_px: np.ndarray
     correlation: np.ndarray
     slope_correlation: np.ndarray
+    variance: np.ndarray
 
 
 def refine_disparities(
@@ -635,7 +720,7 @@ def refine_disparities(
     own = spline_filter1d(np.nan_to_num(images[0].astype(np.float64)), order=3, axis=1, mode="mirror")
     slopes[:, 1:-1] = (own[:, 2:] - own[:, :-2]) / 2
     size = images[0].shape
-    result = Refinement(*(np.full(size, np.nan) for _ in range(4)))
+    result = Refinement(*(np.full(size, np.nan) for _ in range(5)))
     in_blocks(
         _refine, size[0], images[0].astype(np.float64), slopes, known[0], splines, known[1],
         *(n.astype(np.float64) for n in noises), disparity_px, settings.reach, result, smallest=MIN_ROWS,
@@ -715,6 +800,7 @@ def _refine(start, stop, first, slopes, known, splines, other_known, noise, othe
                     variance = variance / n + gain * gain * other_variance / n
                     residual = max(ff - gain * vf, 0.0) / max(n - 3, 1)
                     result.disparity_px[y, x] = shift
+                    result.variance[y, x] = max(variance, residual)
                     result.sigma_px[y, x] = np.sqrt(max(variance, residual) / texture) / gain
                     mean_own /= n
                     oo, od = 0.0, 0.0
