@@ -46,7 +46,7 @@ from rangesim import (
     presets,
     transport,
 )
-from rangesim.environment.backend import select_variant
+from rangesim.environment.backend import images_can_be_read, select_variant
 from rangesim.geometry.dense_stereo import DenseMatching
 from rangesim.instrument.instrument import Instrument
 from rangesim.response import Dots
@@ -209,7 +209,8 @@ def read_scene(folder: Path, number: int) -> RealScene:
     camera = Intrinsics(int(numbers["xres"]), int(numbers["yres"]), fx, fy, cx + 0.5, cy + 0.5)
 
     def first_channel(name: str) -> np.ndarray:
-        image = np.array(mi.Bitmap(name), dtype=np.float64)
+        with images_can_be_read():
+            image = np.array(mi.Bitmap(name), dtype=np.float64)
         return image if image.ndim == 2 else image[..., 0]
 
     def depth(name: str) -> np.ndarray:
