@@ -83,7 +83,13 @@ def obstacle(name: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize(
     ("name", "tolerance"),
-    [("nothing", 0.004), ("slab", 0.015), ("lens", 0.008), ("ball", 0.015), ("mirror", 0.008)],
+    [
+        ("nothing", 0.004),
+        ("slab", 0.015),
+        pytest.param("lens", 0.008, marks=pytest.mark.validation),
+        pytest.param("ball", 0.015, marks=pytest.mark.validation),
+        pytest.param("mirror", 0.008, marks=pytest.mark.validation),
+    ],
 )
 def test_beams_that_tile_a_field_equal_the_light_of_a_projector(name: str, tolerance: float) -> None:
     """Every beam is seen by a receiver of the whole field; together they bring what a projector of all brings.

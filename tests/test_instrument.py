@@ -12,6 +12,7 @@ import pytest
 
 from rangesim import Intrinsics, Scene, Sensor, load_scene, look_at
 from rangesim.electronics.detector import Detector
+from rangesim.errors import RangesimWarning
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
 from rangesim.instrument.instrument import Instrument
 from rangesim.pipeline.experiment_run import carry_out, run
@@ -138,3 +139,9 @@ def test_a_sensor_that_triangulates_needs_pinholes(sensor: Sensor) -> None:
         Instrument("one", sensor, camera=head, projector=pinhole)
     with pytest.raises(ValueError, match=f"pinhole as the projector .* {sensor.type_name} triangulates, got a Beam"):
         Instrument("one", sensor, camera=pinhole, projector=Beam((3e-3, 3e-3)))
+
+
+def test_a_size_that_no_instrument_uses_is_told() -> None:
+    alone = Experiment("plane", instruments=(Instrument("tof", AmcwToF(), camera=CAMERA),), width=32, height=24, spp=4)
+    with pytest.warns(RangesimWarning, match="width and height of the experiment do not apply: tof have a camera"):
+        carry_out(alone)

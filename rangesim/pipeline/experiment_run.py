@@ -209,9 +209,10 @@ def _warn(result: Result) -> None:
     """Warn of surfaces outside a sensor's range, of readings whose sampling error is not small, and of a size that is
     not used."""
     sized = result.experiment.width is not None or result.experiment.height is not None
-    own = [one.name for one in result.experiment.instruments if one.camera is not None]
-    if sized and own:
-        warn(f"width and height do not apply to {', '.join(own)}, which have a camera of their own.")
+    instruments = result.experiment.instruments
+    if sized and all(one.camera is not None for one in instruments):
+        names = ", ".join(one.name for one in instruments)
+        warn(f"width and height of the experiment do not apply: {names} have a camera of their own.")
     beyond = []
     for m in result.measurements:
         rig = m.capture.reference.rig
