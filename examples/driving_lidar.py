@@ -107,7 +107,7 @@ def main() -> None:
     print(f"as many pixels of a pinhole at rest: {both[1]:.1f} s; the turn again: {both[0]:.1f} s")
     if arguments.out:
         picture(
-            arguments.out, image.range_m, head.ray_directions(), {"as the scanner reports": raw, "de-skewed": straight}
+            arguments.out, image.range_m, head.rays.directions, {"as the scanner reports": raw, "de-skewed": straight}
         )
         print(f"wrote {arguments.out}")
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rangesim.decoding.path_length import emitter_offsets
 from rangesim.response import DenseResponse, LightPath, NumpyMath, SparseResponse
 from rangesim.rig import Beam, Rig
 from rangesim.sensor import Sensor
@@ -122,7 +121,7 @@ def points_in_projector(rig: Rig, reading: np.ndarray, where: np.ndarray) -> np.
 def _in_projector(rig: Rig, where: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points (n, 3) of the n pixels `where`, from camera coordinates to projector coordinates, metres."""
     if isinstance(rig.projector, Beam):
-        return np.asarray(points - rig.camera.rays_at(where)[0] - emitter_offsets(rig)[where])
+        return np.asarray(points - rig.camera.rays_at(where)[0] - rig.emitter_offsets[where])
     return np.asarray((points - rig.T_camera_projector[:3, 3]) @ rig.T_camera_projector[:3, :3])
 
 

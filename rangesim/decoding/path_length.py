@@ -13,7 +13,7 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.returns import Returns
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
-from rangesim.rig import Beam, Intrinsics, Rig, tangents
+from rangesim.rig import Intrinsics, Rig
 
 
 def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
@@ -41,9 +41,7 @@ def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Ri
     b = rig.T_camera_projector[:3, 3]
     d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     length = np.asarray(length_m, dtype=np.float64)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        result = (length**2 - b @ b) / (2 * (length - d @ b))
-        return np.asarray(np.where(length > np.linalg.norm(b), result, np.nan))
+    return _on_ellipsoid(length, b @ b, d @ b)
 
 
 def range_along_ray(length_m: np.ndarray, directions: np.ndarray, emitters: np.ndarray) -> np.ndarray:
@@ -55,19 +53,14 @@ def range_along_ray(length_m: np.ndarray, directions: np.ndarray, emitters: np.n
     directions : (..., 3) float, unit vectors, camera coordinates.
     emitters : (..., 3) float, metres, from the origin of each ray to its emitter, camera coordinates.
     """
-    b2, along = np.sum(emitters**2, axis=-1), np.sum(directions * emitters, axis=-1)
+    return _on_ellipsoid(length_m, np.sum(emitters**2, axis=-1), np.sum(directions * emitters, axis=-1))
+
+
+def _on_ellipsoid(length_m: np.ndarray, b2: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """(...) float64, the ranges of `range_from_path_length`; `b2` is |b|^2 in square metres, `along` d.b in metres."""
     with np.errstate(invalid="ignore", divide="ignore"):
         result = (length_m**2 - b2) / (2 * (length_m - along))
         return np.asarray(np.where(length_m > np.sqrt(b2), result, np.nan))
-
-
-def emitter_offsets(rig: Rig) -> np.ndarray:
-    """(h, w, 3) float64, metres, from the origin of each ray of the camera to its emitter, camera coordinates."""
-    rays, emitter = rig.camera.pixel_rays(), rig.projector
-    if not isinstance(emitter, Beam):
-        return np.asarray(rig.T_camera_projector[:3, 3] - rays.origins)
-    right, down = tangents(rays.directions if emitter.directions is None else emitter.directions)
-    return np.asarray(right * emitter.offset_m[0] + down * emitter.offset_m[1])
 
 
 def range_slope(length_m: np.ndarray, directions: np.ndarray, emitters: np.ndarray) -> np.ndarray:
@@ -101,15 +94,13 @@ class LengthReturns(NamedTuple):
         """The returns as ranges from the camera; without a rig, half of the lengths."""
         range_m, sigma_m = np.empty((2, *self.length_m.shape), dtype=np.float32)
         status = self.status.astype(np.uint8)
-        directions = emitters = None
-        if rig is not None:
-            directions, emitters = rig.camera.pixel_rays().directions, emitter_offsets(rig)
         for rows in bands(self.length_m.shape[1]):
             length = self.length_m[:, rows]
             along_ray, slope = length / 2, np.full(length.shape, 0.5)
-            if directions is not None and emitters is not None:
-                along_ray = range_along_ray(length, directions[rows], emitters[rows])
-                slope = range_slope(length, directions[rows], emitters[rows])
+            if rig is not None:
+                directions, emitters = rig.camera.rays.directions[rows], rig.emitter_offsets[rows]
+                along_ray = range_along_ray(length, directions, emitters)
+                slope = range_slope(length, directions, emitters)
             is_behind = ~(np.nan_to_num(along_ray, nan=-1.0) > 0)
             status[:, rows][is_behind & (status[:, rows] == Status.OK)] = Status.OUT_OF_RANGE
             range_m[:, rows] = np.where(is_behind, np.nan, along_ray)
@@ -179,6 +170,4 @@ def _ranges(length_m: np.ndarray, rows: slice, rig: Rig) -> np.ndarray:
     if isinstance(rig.camera, Intrinsics):
         directions = rig.camera.directions(rig.camera.pixel_centres(rows))
         return range_from_path_length(length_m, directions, rig)
-    rays = rig.camera.pixel_rays()
-    emitters = emitter_offsets(rig)[rows]
-    return range_along_ray(length_m, rays.directions[rows], emitters)
+    return range_along_ray(length_m, rig.camera.rays.directions[rows], rig.emitter_offsets[rows])

@@ -100,7 +100,7 @@ def _nearest_rays(camera: Camera, radius: int) -> NDArray[np.intp]:
     """(h w, (2 radius + 1)^2) flat indices of the rays nearest to each ray; of itself, where there is none."""
     from scipy.spatial import cKDTree
 
-    rays = camera.pixel_rays()
+    rays = camera.rays
     directions = rays.directions.reshape(-1, 3)
     field = np.nanmax(np.linalg.norm(rays.steps, axis=-1), axis=-1).reshape(-1, 1)
     count = min((2 * radius + 1) ** 2, len(directions))

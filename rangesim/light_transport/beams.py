@@ -28,7 +28,7 @@ import numpy as np
 from rangesim.light_transport.camera_rays import Connection, Device
 from rangesim.light_transport.ray_tables import GAUSSIAN_FULL_WIDTH, VectorTable
 from rangesim.light_transport.scattering import Media, Medium
-from rangesim.rig import Beam, Rig, tangents
+from rangesim.rig import Beam, Rig
 
 GAUSSIAN_REACH = 1.5
 """Angle to the axis, in full widths of a Gaussian beam at 1/e^2, beyond which there is no light: the intensity there is
@@ -213,13 +213,13 @@ class BeamDevice:
     has_lens = False
 
     def __init__(self, rig: Rig, beam: Beam) -> None:
-        rays, T = rig.camera.pixel_rays(), rig.T_world_camera
-        axes = rays.directions if beam.directions is None else beam.directions
-        axes = np.where(np.isfinite(axes).all(axis=-1, keepdims=True), axes, [0.0, 0.0, 1.0])
-        right, down = tangents(axes)
-        origins = rays.origins + right * beam.offset_m[0] + down * beam.offset_m[1]
+        rays, T = rig.camera.rays, rig.T_world_camera
+        exists = np.isfinite(rays.directions).all(axis=-1, keepdims=True)
+        axes, right, down, offsets = beam.frames(
+            rays._replace(directions=np.where(exists, rays.directions, [0.0, 0.0, 1.0]))
+        )
         rotation = T[:3, :3]
-        self.origins = VectorTable(origins @ rotation.T + T[:3, 3])
+        self.origins = VectorTable((rays.origins + offsets) @ rotation.T + T[:3, 3])
         self.axes, self.right, self.down = (VectorTable(v @ rotation.T) for v in (axes, right, down))
         self.width = mi.Vector2f(*(dr.opaque(mi.Float, float(w)) for w in beam.divergence_rad))
         self.is_gaussian = beam.profile == "gaussian"

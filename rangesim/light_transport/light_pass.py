@@ -274,9 +274,9 @@ def _check_in_air(scene: Scene, rig: Rig) -> None:
 
 def _places(device: Camera, T: np.ndarray) -> np.ndarray:
     """(n, 3) float64, metres, where rays start: the device's place T, and places of a scanner that moves."""
-    if isinstance(device, Intrinsics) or device.times_s is None:
+    if device.times_s is None:
         return T[None, :3, 3]
-    origins = device.pixel_rays().origins.reshape(-1, 3)
+    origins = device.rays.origins.reshape(-1, 3)
     some = origins[np.linspace(0, len(origins) - 1, min(len(origins), PLACES)).astype(int)]
     return np.vstack([T[None, :3, 3], some @ T[:3, :3].T + T[:3, 3]])
 
@@ -287,4 +287,4 @@ def _directions_over(device: Camera) -> np.ndarray:
     x, y = np.meshgrid(steps * device.width, steps * device.height)
     if isinstance(device, Intrinsics):
         return device.directions(np.stack([x, y], axis=-1)).reshape(-1, 3)
-    return device.pixel_rays().directions[y.astype(int), x.astype(int)].reshape(-1, 3)
+    return device.rays.directions[y.astype(int), x.astype(int)].reshape(-1, 3)

@@ -55,7 +55,7 @@ class RayTableDevice:
 
     def __init__(self, rig: Rig) -> None:
         camera, T = rig.camera, rig.T_world_camera
-        rays, opaque = camera.pixel_rays(), lambda x: dr.opaque(mi.Float, float(x))
+        rays, opaque = camera.rays, lambda x: dr.opaque(mi.Float, float(x))
         self.size = mi.Vector2f(opaque(camera.width), opaque(camera.height))
         self.z, self.centre = (mi.Vector3f(*map(opaque, T[:3, column])) for column in (2, 3))
         exists = np.asarray(np.isfinite(rays.directions).all(axis=-1) & np.isfinite(rays.steps).all(axis=(-2, -1)))

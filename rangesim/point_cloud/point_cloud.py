@@ -199,7 +199,7 @@ def organised_cloud(
         rays = camera.directions(camera.pixel_centres())
         points, normals = rays * depth[..., None], lattice_normals(depth, rays)
     else:
-        table = camera.pixel_rays()
+        table = camera.rays
         points = table.origins + table.directions * depth[..., None]
         if camera.has_neighbours:
             normals = _ordered_normals(points, table, camera.lattice)

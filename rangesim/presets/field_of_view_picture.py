@@ -73,7 +73,7 @@ def limits(preset: Preset) -> tuple[tuple[float, float], tuple[float, float]]:
     across, down = np.radians(preset.sheet.field_of_view_deg) / 2
     elevation = float(-down), float(down)
     if isinstance(preset.instrument.camera, ScanningCamera):
-        up = np.arcsin(-preset.instrument.camera.pixel_rays().directions[..., 1])
+        up = np.arcsin(-preset.instrument.camera.rays.directions[..., 1])
         elevation = float(up.min()), float(up.max())
     return (float(-across), float(across)), elevation
 

@@ -58,7 +58,7 @@ def panorama(camera: Camera) -> Panorama:
     """
     if camera.times_s is None:
         return Panorama(np.arange(camera.height * camera.width, dtype=np.int32).reshape(camera.height, camera.width))
-    return of_directions(np.ascontiguousarray(camera.pixel_rays().directions))
+    return of_directions(np.ascontiguousarray(camera.rays.directions))
 
 
 def of_directions(directions: np.ndarray) -> Panorama:

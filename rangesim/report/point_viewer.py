@@ -96,7 +96,7 @@ def _packed_rays(camera: Camera) -> dict[str, Any]:
     surrounds : whether some rays lead backwards, so that the points lie all around the camera.
     columns, rows, pixel : size of the picture, and int32, flat index of the pixel that each place shows; -1 for none.
     """
-    rays, shown = camera.pixel_rays(), panorama(camera).pixel
+    rays, shown = camera.rays, panorama(camera).pixel
     directions = np.nan_to_num(rays.directions)
     return {
         "directions": pack(np.rint(32767 * directions).astype(np.int16)),

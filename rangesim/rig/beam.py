@@ -4,17 +4,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
-from rangesim.rig.cameras import Acceptance, Optics, unit_directions
+from rangesim.rig.cameras import Acceptance, Optics, PixelRays, tangents, unit_directions
+from rangesim.rig.poses import Array
 from rangesim.settings.bounds import Bounds, check_fields
 
 Divergence = Annotated[float, Bounds("an angle in radians", 1e-6, 1.0)]
 """Full divergence of a beam along one axis, radians. Wider light is that of a projector, not of a beam."""
 Offset = Annotated[float, Bounds("metres", -1e3, 1e3)]
 """Offset of a beam's emitter from the origin of the ray, metres; the bounds only exclude nonsense."""
+
+
+class BeamFrames(NamedTuple):
+    """The beams of a camera's pixels; (h, w, 3) float64 each, camera coordinates.
+
+    axes, right, down : unit vectors: the axis of each beam, and its x and y axes across it.
+    offsets : metres, from the origin of each ray to the emitter of its beam.
+    """
+
+    axes: Array
+    right: Array
+    down: Array
+    offsets: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +73,16 @@ class Beam(Optics):
         if self.directions is not None:
             object.__setattr__(self, "directions", unit_directions(self.directions))
 
-    def __eq__(self, other: Any) -> bool:
-        return isinstance(other, Beam) and self._key() == other._key()
+    def frames(self, rays: PixelRays) -> BeamFrames:
+        """Axes and emitters of the beams of a camera with these rays.
 
-    def __hash__(self) -> int:
-        return hash(self._key())
-
-    def _key(self) -> tuple[Any, ...]:
-        axes = None if self.directions is None else (self.directions.shape, self.directions.tobytes())
-        return tuple(self.divergence_rad), self.profile, tuple(self.offset_m), axes
+        Examples
+        --------
+        >>> from rangesim.rig import Intrinsics
+        >>> rays = Intrinsics.from_fov(3, 1, fov_x_deg=60.0).rays
+        >>> Beam(offset_m=(0.01, 0.0)).frames(rays).offsets[0, 1]
+        array([0.01, 0.  , 0.  ])
+        """
+        axes = rays.directions if self.directions is None else self.directions
+        right, down = tangents(axes)
+        return BeamFrames(axes, right, down, right * self.offset_m[0] + down * self.offset_m[1])

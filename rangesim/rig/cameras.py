@@ -11,7 +11,10 @@ position at azimuth 0.
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import cached_property
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -27,12 +30,29 @@ Acceptance = Literal["box", "gaussian"]
 class Optics(Named, ABC):
     """Base of everything that decides on the rays of a device: cameras, projectors and beams.
 
+    Subclasses are frozen dataclasses. Those with arrays among their fields are made with `eq=False`: two of them are
+    equal if all their fields are, arrays byte for byte.
+
     width, height : int, size of the image, pixels.
     """
 
     known: ClassVar[dict[str, type[Any]]] = {}
     width: int
     height: int
+
+    def __eq__(self, other: Any) -> bool:
+        return type(self) is type(other) and self._values() == other._values()
+
+    def __hash__(self) -> int:
+        return hash(self._values())
+
+    def _values(self) -> tuple[Any, ...]:
+        """Values of the fields, with arrays as their shapes and bytes, and lists as tuples."""
+        return tuple(_hashable(value) for value in self.__getstate__().values())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Fields by name: what is computed from them, such as `Camera.rays`, is not pickled."""
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
 
 
 class HasRanges(Protocol):
@@ -81,7 +101,12 @@ class Camera(Optics):
 
     @abstractmethod
     def pixel_rays(self) -> PixelRays:
-        """Rays through the pixel centres."""
+        """Rays through the pixel centres, computed anew. Whoever reads them takes `rays`."""
+
+    @cached_property
+    def rays(self) -> PixelRays:
+        """Rays through the pixel centres. They are computed once, because decoders and causes ask many times."""
+        return self.pixel_rays()
 
     @property
     def times_s(self) -> Array | None:
@@ -137,14 +162,14 @@ class Camera(Optics):
 
     def angle_of(self, pixels: float) -> float:
         """Angle between two rays that are that many pixels apart, radians, typical of the camera."""
-        return float(pixels * np.nanmedian(np.linalg.norm(self.pixel_rays().steps, axis=-1)))
+        return float(pixels * np.nanmedian(np.linalg.norm(self.rays.steps, axis=-1)))
 
     def solid_angle_sr(self) -> Array | float:
         """(h, w) float64, or one number for all pixels: solid angle from which a pixel receives light, steradians.
 
         For a pixel with Gaussian acceptance, it is the integral of the acceptance, which is 1 along the ray.
         """
-        steps = self.pixel_rays().steps
+        steps = self.rays.steps
         area = np.linalg.norm(np.cross(steps[..., 0, :], steps[..., 1, :]), axis=-1)
         return np.asarray(area * (np.pi / 8 if self.acceptance == "gaussian" else 1.0))
 
@@ -177,7 +202,7 @@ class Camera(Optics):
         at : index of the n pixels in an array (h, w).
         offset : (2,) pixels, from the pixel centres to the rays.
         """
-        rays, (x, y) = self.pixel_rays(), np.asarray(offset, dtype=np.float64)
+        rays, (x, y) = self.rays, np.asarray(offset, dtype=np.float64)
         directions = rays.directions[at] + rays.steps[at][:, 0] * x + rays.steps[at][:, 1] * y
         origins = rays.origins[at]
         if rays.origin_steps is not None:
@@ -196,8 +221,21 @@ class Camera(Optics):
 
     def z_of(self, range_m: np.ndarray, rows: slice = slice(None)) -> Array:
         """(h, w) float64, metres, z coordinate of the points at these ranges (h, w) along the rays of some rows."""
-        rays = self.pixel_rays()
+        rays = self.rays
         return np.asarray(rays.origins[rows, :, 2] + rays.directions[rows, :, 2] * range_m)
+
+
+def rays_by(unit_rays: Callable[[Array], Array], camera: Camera) -> PixelRays:
+    """Rays of a camera at whose origin all of them start.
+
+    unit_rays : function that maps pixel coordinates (..., 2) to the unit vectors (..., 3) of their rays.
+    """
+    x, y = np.arange(camera.width + 1.0), np.arange(camera.height + 1.0)
+    sides = unit_rays(np.stack(np.meshgrid(x, y[:-1] + 0.5), axis=-1))  # left and right of each pixel
+    ends = unit_rays(np.stack(np.meshgrid(x[:-1] + 0.5, y), axis=-1))  # above and below it
+    steps = np.stack([np.diff(sides, axis=1), np.diff(ends, axis=0)], axis=-2)
+    directions = unit_rays(camera.pixel_centres())
+    return PixelRays(np.zeros(directions.shape), directions, steps)
 
 
 def tangents(directions: Array) -> tuple[Array, Array]:
@@ -211,6 +249,13 @@ def tangents(directions: Array) -> tuple[Array, Array]:
     across = np.where(upright, level, 1.0)
     right = np.stack([np.where(upright, z / across, 1.0), np.zeros_like(x), np.where(upright, -x / across, 0.0)], -1)
     return right, np.cross(directions, right)
+
+
+def _hashable(value: Any) -> Any:
+    """A value that is equal and hashes equally if the given one is equal."""
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes()
+    return tuple(value) if isinstance(value, list) else value
 
 
 def finite_array(value: Any, name: str, shape: tuple[int | None, ...]) -> Array:
@@ -243,9 +288,8 @@ def unit_directions(value: Any) -> Array:
     lengths = np.linalg.norm(directions, axis=-1, keepdims=True)
     if not (lengths > 0).all():
         raise ValueError("expected directions that are not (0, 0, 0).")
-    is_unit = (
-        np.abs(lengths - 1) < 4 * np.finfo(np.float64).eps
-    )  # kept, so that reading what was written changes nothing
+    # What is unit length already is kept, so that reading what was written changes nothing
+    is_unit = np.abs(lengths - 1) < 4 * np.finfo(np.float64).eps
     result = np.where(is_unit, directions, directions / lengths)
     result.setflags(write=False)
     return np.asarray(result)

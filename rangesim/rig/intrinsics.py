@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from rangesim.rig import camera_model
 from rangesim.rig.camera_model import CameraModel, fold_radius2
-from rangesim.rig.cameras import Camera, PixelRays
+from rangesim.rig.cameras import Camera, PixelRays, rays_by
 from rangesim.rig.poses import Array
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, check_fields, check_number, whole
@@ -146,10 +146,7 @@ class Intrinsics(Camera, untagged=True):
 
     def pixel_rays(self) -> PixelRays:
         """Rays through the pixel centres; NaN where `normalise` has NaN."""
-        centres, half = self.pixel_centres(), np.array([[0.5, 0.0], [0.0, 0.5]])
-        unit = [_unit(self.directions(centres + sign * offset)) for offset in half for sign in (1, -1)]
-        steps = np.stack([unit[0] - unit[1], unit[2] - unit[3]], axis=-2)
-        return PixelRays(np.zeros((*centres.shape[:2], 3)), _unit(self.directions(centres)), steps)
+        return rays_by(lambda pixels: _unit(self.directions(pixels)), self)
 
     def angle_of(self, pixels: float) -> float:
         """Angle of that many pixels in a row, radians, on the axis."""

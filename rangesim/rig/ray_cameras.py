@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rangesim.rig.cameras import Acceptance, Camera, PixelRays, finite_array, tangents, unit_directions
+from rangesim.rig.cameras import Acceptance, Camera, PixelRays, finite_array, rays_by, tangents, unit_directions
 from rangesim.rig.intrinsics import FocalLength, PrincipalPoint
 from rangesim.rig.poses import Array
+from rangesim.rig.scan_patterns import ScanRays
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, Metres, check_fields, whole
 from rangesim.settings.config import shown
@@ -78,12 +80,9 @@ class Fisheye(Camera):
     def pixel_rays(self) -> PixelRays:
         """Rays through the pixel centres; NaN for pixels that are not wholly within `max_angle_rad`, and where the
         polynomial has no inverse."""
-        centres, half = self.pixel_centres(), np.array([[0.5, 0.0], [0.0, 0.5]])
-        beside = [self._unit_rays(centres + sign * offset) for offset in half for sign in (1, -1)]
-        steps = np.stack([beside[0] - beside[1], beside[2] - beside[3]], axis=-2)
-        directions = self._unit_rays(centres)
-        directions[~np.isfinite(steps).all(axis=(-2, -1))] = np.nan
-        return PixelRays(np.zeros(directions.shape), directions, steps)
+        rays = rays_by(self._unit_rays, self)
+        rays.directions[~np.isfinite(rays.steps).all(axis=(-2, -1))] = np.nan
+        return rays
 
     def project(self, points: ArrayLike) -> Array:
         """(..., 2) float64, pixel coordinates of points (..., 3) in coordinates of this camera, metres.
@@ -186,8 +185,7 @@ class Orthographic(Camera):
 class ScanningCamera(Camera):
     """A camera whose rays all have the same angular field: a table of rays, or a scanner of any pattern.
 
-    Subclasses have the fields `field_rad` and `acceptance`, and say `ray_origins`, `ray_directions` and perhaps
-    `times_s`.
+    Subclasses have the fields `field_rad` and `acceptance`, and say their `scan_rays`.
 
     field_rad : (along x, along y) float, radians, full widths of the field of a ray: of its box, or the 1/e^2 widths
         of its Gaussian.
@@ -195,20 +193,24 @@ class ScanningCamera(Camera):
 
     field_rad: tuple[float, float]
 
-    def ray_origins(self) -> Array | None:
-        """(h, w, 3) float64, metres, camera coordinates, where the rays start; None: at the camera's origin."""
-        return None
+    def __post_init__(self) -> None:
+        check_fields(self)
+        self.scan_rays()  # checks what belongs together
 
-    def ray_directions(self) -> Array:
-        """(h, w, 3) float64, unit vectors, camera coordinates."""
-        raise NotImplementedError
+    @abstractmethod
+    def scan_rays(self) -> ScanRays:
+        """Directions, origins and times of the rays."""
+
+    @property
+    def times_s(self) -> Array | None:
+        return self.scan_rays().times_s
 
     def cropped(self, top: int, bottom: int, left: int, right: int) -> RayTable:
         return RayTable.of(self, self.field_rad).cropped(top, bottom, left, right)
 
     def pixel_rays(self) -> PixelRays:
         """The rays of the table; their fields are upright: y of a field is downwards where the ray is level."""
-        directions, origins = self.ray_directions(), self.ray_origins()
+        directions, origins, _ = self.scan_rays()
         steps = np.stack(tangents(directions), axis=-2) * np.asarray(self.field_rad)[:, None]
         return PixelRays(np.zeros(directions.shape) if origins is None else origins, directions, steps)
 
@@ -265,26 +267,8 @@ class RayTable(ScanningCamera):
     def height(self) -> int:  # type: ignore[override]
         return int(self.directions.shape[0])
 
-    def __eq__(self, other: Any) -> bool:
-        return isinstance(other, RayTable) and self._key() == other._key()
-
-    def __hash__(self) -> int:
-        return hash(self._key())
-
-    def _key(self) -> tuple[Any, ...]:
-        arrays = (self.directions, self.origins, self.times)
-        parts = tuple(None if a is None else (a.shape, a.tobytes()) for a in arrays)
-        return (*parts, tuple(self.field_rad), self.acceptance, self.has_neighbours)
-
-    def ray_origins(self) -> Array | None:
-        return self.origins
-
-    def ray_directions(self) -> Array:
-        return self.directions
-
-    @property
-    def times_s(self) -> Array | None:
-        return self.times
+    def scan_rays(self) -> ScanRays:
+        return ScanRays(self.directions, self.origins, self.times)
 
     def cropped(self, top: int, bottom: int, left: int, right: int) -> RayTable:
         return self._part((slice(top, bottom), slice(left, right)))
@@ -321,7 +305,7 @@ class RayTable(ScanningCamera):
         >>> RayTable.of(Intrinsics.from_fov(4, 3, fov_x_deg=60.0)).directions.shape
         (3, 4, 3)
         """
-        rays = camera.pixel_rays()
+        rays = camera.rays
         if field_rad is None:
             x, y = np.nanmedian(np.linalg.norm(rays.steps, axis=-1), axis=(0, 1))
             field_rad = float(x), float(y)

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -195,6 +196,18 @@ class Rig:
     def traced(self) -> Rig:
         """The rig with the camera whose rays are traced: this one, or for zones that with the finer camera."""
         return self if self.camera.traced is self.camera else replace(self, camera=self.camera.traced)
+
+    @cached_property
+    def emitter_offsets(self) -> Array:
+        """(h, w, 3) float64, metres, camera coordinates, from the origin of each ray of the camera to its emitter."""
+        rays = self.camera.rays
+        if isinstance(self.projector, Beam):
+            return self.projector.frames(rays).offsets
+        return np.asarray(self.T_camera_projector[:3, 3] - rays.origins)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Fields by name: what is computed from them is not pickled."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
 
     @property
     def pinhole(self) -> Intrinsics:

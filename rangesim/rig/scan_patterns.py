@@ -49,12 +49,12 @@ class ScanRays(NamedTuple):
 
     directions : (h, w, 3) float64, unit vectors, coordinates of the instrument.
     origins : (h, w, 3) float64, metres, coordinates of the instrument; None: all rays begin at the origin.
-    times_s : (h, w) float64, seconds after the first ray.
+    times_s : (h, w) float64, seconds after the first ray; None: all rays at once.
     """
 
     directions: Array
     origins: Array | None
-    times_s: Array
+    times_s: Array | None
 
 
 # ---- A head that turns ----------------------------------------------------------------------------------------------

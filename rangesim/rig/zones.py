@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -119,16 +119,6 @@ class Zones(Camera):
         times = self.camera.times_s
         return None if times is None else self.mean(times)
 
-    def __eq__(self, other: Any) -> bool:
-        return isinstance(other, Zones) and self._key() == other._key()
-
-    def __hash__(self) -> int:
-        return hash(self._key())
-
-    def _key(self) -> tuple[Any, ...]:
-        weights = None if self.weights is None else self.weights.tobytes()
-        return self.camera, self.columns, self.rows, self.overlap, self.blur_px, weights
-
     @cached_property
     def matrix(self) -> csr_array:
         """(rows * columns, pixels of the finer camera) sparse float64, the weights of the pixels in each zone."""
@@ -150,7 +140,7 @@ class Zones(Camera):
 
     def pixel_rays(self) -> PixelRays:
         """Rays through the middles of the zones; a zone is as wide as an even one that spreads as much."""
-        rays = self.camera.pixel_rays()
+        rays = self.camera.rays
         directions, origins = self.mean(rays.directions), self.mean(rays.origins)
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         place = np.stack(np.meshgrid(np.arange(self.camera.width), np.arange(self.camera.height)), axis=-1)
