@@ -166,9 +166,8 @@ def instrument_from_dict(table: Any, place: str, files_in: Path | None = None) -
 def _changed(device: Instrument, changes: Mapping[str, Any], place: str) -> Instrument:
     """The device with some of its settings replaced."""
     check_keys(changes, [f.name for f in fields(Instrument)], place)
-    values = {**to_dict(device), **changes}
-    values |= {key: on_top_of(getattr(device, key), value) for key, value in changes.items()}
-    return instruments.instrument_from_dict(values, place)
+    changed = {key: on_top_of(getattr(device, key), value) for key, value in changes.items()}
+    return instruments.instrument_from_dict({**to_dict(device), **changed}, place)
 
 
 def _is_device(name: str) -> bool:
