@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from rangesim.errors import FileFormatError
-from rangesim.files.text_files import read_text, read_toml
+from rangesim.files.text_files import parse_toml, read_text
 from rangesim.instrument.instrument import MAX_NAME, Instrument, instrument_from_dict, is_name
 from rangesim.presets.data_sheet import DataSheet
 from rangesim.rig import Spinning
@@ -96,7 +96,8 @@ def read_preset(path: str | Path) -> Preset:
     """
     path = Path(path)
     try:
-        return _preset(path.stem, read_toml(path), read_text(path))
+        text = read_text(path)
+        return _preset(path.stem, parse_toml(text, path), text)
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
 
