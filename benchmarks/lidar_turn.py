@@ -73,7 +73,7 @@ def main() -> None:
     image = decode(expose(turn, sensor, None))
     unmoved = transport(scene, still, [sensor], seed=1, **options)
     error = image.range_m - turn.truth.range_m
-    wall = _largest_matte(turn)
+    wall = _largest_house(turn)
     on_wall = error[wall & image.valid]
     print(f"wall of {turn.truth.instance_names[int(turn.truth.instance[wall][0])]}: {on_wall.size} readings")
     results = {
@@ -88,8 +88,8 @@ def main() -> None:
     print(json.dumps(results))
 
 
-def _largest_matte(signals: Signals) -> np.ndarray:
-    """(h, w) bool, the pixels of the house that most rays meet, at the same height as the scanner or above it."""
+def _largest_house(signals: Signals) -> np.ndarray:
+    """(h, w) bool, the pixels of the house that most rays meet."""
     truth = signals.truth
     houses = [i for i, name in enumerate(truth.instance_names) if "house" in name]
     counts = [int((truth.instance == i).sum()) for i in houses]

@@ -62,6 +62,8 @@ def test_every_number_of_a_device_is_in_its_file_with_a_source(name: str) -> Non
     assert set(preset.sources) == set(numbers_of({"sheet": data["sheet"], "instrument": data["instrument"]}))
     used = {standing(source) for source in preset.sources.values()}
     assert used - {*STANDINGS} <= set(preset.documents)
+    cited = " ".join(preset.sources.values())
+    assert all(document in cited for document in preset.documents)
     assert {"power_w", "exposure_s"} <= set(data["instrument"])
     assert preset.instrument.exposure_s is not None
     for part in ("sensor", "detector"):

@@ -51,7 +51,7 @@ class WorkingRange:
 
     def check(self, camera: Camera) -> None:
         """Raise ValueError if depths z are limited, but some rays of the camera lead sideways or backwards."""
-        if self.along == "z" and not camera.is_pinhole and bool((camera.rays.directions[..., 2] <= 0.0).any()):
+        if self.along == "z" and not camera.is_forward:
             raise ValueError(
                 'expected a working range along the ray (along = "ray"; in a sheet, range_along = "ray"), got one '
                 f"along z: rays of this {type(camera).__name__} lead sideways or backwards, where z is no range."

@@ -56,7 +56,12 @@ def read_json(path: str | Path) -> Any:
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Plain data of a TOML file; FileFormatError if it is missing, too large, nested too deep or no TOML."""
-    text = read_text(path)
+    return parse_toml(read_text(path), path)
+
+
+def parse_toml(text: str, path: str | Path) -> dict[str, Any]:
+    """Plain data of the text of a TOML file; FileFormatError, which names the file, if it is nested too deep or no
+    TOML."""
     deepest = limits.current().nesting
     if re.search(_LONG_KEY % deepest, text):
         raise _too_deep(path)

@@ -12,6 +12,7 @@ import numpy as np
 from rangesim.capture import bright_level
 from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
+from rangesim.decoding.disparities import ImageNoise
 from rangesim.electronics.ambient import Ambient
 from rangesim.evaluation.range_noise import sampling_draw
 from rangesim.instrument.instrument import Instrument
@@ -33,10 +34,9 @@ noise alone, because variances add."""
 NEGLIGIBLE = 1e-5
 """Ratio of a standard deviation to the median depth of the scene below which sampling noise is always small enough. It
 limits the samples of noise-free captures, where a tenth of this ratio would need a hundred times as many samples."""
-NEGLIGIBLE_OF_BRIGHT = 0.002
+NEGLIGIBLE_OF_BRIGHT = ImageNoise.relative
 """Ratio of a standard deviation of a noise-free frame to its bright pixels below which sampling noise is always small
-enough, for sensors of several cameras. It is the noise that their decoder assumes in such frames
-(`rangesim.decoding.disparities.ImageNoise.relative`)."""
+enough, for sensors of several cameras. It is the noise that their decoder assumes in such frames by default."""
 BLOCK_PX = 16
 """Edge in pixels of the squares in which the noise of an instance is estimated. In larger squares the estimate uses
 more pixels; in smaller ones it follows changes of the noise better."""

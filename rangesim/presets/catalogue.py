@@ -17,10 +17,10 @@ from rangesim.sensors import presets as sensor_presets
 from rangesim.settings.config import check_keys, nearest, on_top_of, shown, to_dict
 
 FOLDER = Path(__file__).resolve().parent / "devices"
-"""Folder of the files of the devices that come with the package."""
+"""Folder with the files of the devices that come with the package."""
 
 SUFFIX = ".toml"
-"""Suffix by which a name is recognised as the file of a device."""
+"""Suffix of a file of a device; a name with this suffix is the path of such a file."""
 
 DEFAULT_SENSORS = ("gray-phase", "amcw", "ideal-tof")
 """Sensors that an experiment compares if none are given: structured light, time of flight, and the ideal ranger, which
@@ -166,9 +166,8 @@ def instrument_from_dict(table: Any, place: str, files_in: Path | None = None) -
 def _changed(device: Instrument, changes: Mapping[str, Any], place: str) -> Instrument:
     """The device with some of its settings replaced."""
     check_keys(changes, [f.name for f in fields(Instrument)], place)
-    values = {**to_dict(device), **changes}
-    values |= {key: on_top_of(getattr(device, key), value) for key, value in changes.items()}
-    return instruments.instrument_from_dict(values, place)
+    changed = {key: on_top_of(getattr(device, key), value) for key, value in changes.items()}
+    return instruments.instrument_from_dict({**to_dict(device), **changed}, place)
 
 
 def _is_device(name: str) -> bool:

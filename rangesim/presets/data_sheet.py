@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the data sheet of a device states (pixels, field of view, range, emitter, noise), and the settings that follow.
+"""The data sheet of a device (pixels, field of view, range, emitter, noise), and the settings that follow from it.
 
 The sheet speaks of angles and of metres from the device, an `Instrument` of focal lengths and poses.
 `DataSheet.settings` turns one into the other, so that a number stands once in the file of a device.
@@ -17,9 +17,11 @@ from rangesim.settings.bounds import Bounds, Coordinate, Metres, PositiveFractio
 from rangesim.settings.config import to_dict
 
 Degrees = Annotated[float, Bounds("degrees of a field of view", 1e-3, 360)]
-"""A full angle of a field of view, degrees; a scanner that turns has 360."""
+"""A full angle of a field of view, degrees; a scanner that turns has 360, which is the largest."""
 Lux = Annotated[float, Bounds("0 or positive", 0, 1e6)]
-"""An illuminance by sunlight, lux: the sun at noon gives about 1e5."""
+"""An illuminance by sunlight, lux: the sun at noon gives about 1e5, so the bound excludes only nonsense."""
+Size = tuple[Annotated[int, whole(1, "pixels")], Annotated[int, whole(1, "pixels")]]
+"""Numbers of pixels across and down."""
 MAX_PINHOLE_DEG = 175.0
 """Largest angle, degrees, of the field of view of a pinhole. Towards 180 degrees its image grows without end; devices
 with a wider view have a camera of another kind."""
@@ -107,14 +109,14 @@ class DataSheet:
     {'working_range': {'near_m': 0.5, 'far_m': 3.86, 'along': 'z'}}
     """
 
-    resolution_px: tuple[Annotated[int, whole(1, "pixels")], Annotated[int, whole(1, "pixels")]]
+    resolution_px: Size
     field_of_view_deg: tuple[Degrees, Degrees]
     range_m: tuple[Nearest, Metres]
     projection: Literal["pinhole", "equidistant"] = "pinhole"
     range_along: Literal["z", "ray"] = "z"
     emitter_offset_m: tuple[Coordinate, Coordinate, Coordinate] | None = None
     emitter_field_of_view_deg: tuple[Degrees, Degrees] | None = None
-    emitter_resolution_px: tuple[Annotated[int, whole(1, "pixels")], Annotated[int, whole(1, "pixels")]] | None = None
+    emitter_resolution_px: Size | None = None
     axes_meet_m: Metres | None = None
     noise: PublishedNoise | None = None
 
@@ -134,7 +136,7 @@ class DataSheet:
     def settings(self, has_camera: bool = False, has_projector: bool = False) -> dict[str, Any]:
         """Settings of an `Instrument` that follow from the sheet, as plain data.
 
-        They are `camera`, `projector` and `T_camera_projector`, where the sheet tells them, and the decoder's
+        They are `camera`, `projector` and `T_camera_projector`, if the sheet states them, and the decoder's
         `working_range`.
 
         Parameters

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of the fields of view of devices: from above, each with its range."""
+"""A picture of the fields of view of devices, from above and from the side, with their ranges."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from rangesim.rig import ScanningCamera
 if TYPE_CHECKING:
     from rangesim.presets.preset import Preset
 
-COLUMNS = 4
-"""Panels in a row of the picture."""
+PANELS_IN_A_ROW = 4
+"""Number of panels side by side; the 17 devices of the package make five rows."""
 PANEL_INCH = 2.6
-"""Width and height of a panel, inches."""
-ARC = 90
-"""Number of corners with which an arc is drawn."""
+"""Width and height of a panel, inches: the titles, in 9 points, fit."""
+ARC_CORNERS = 90
+"""Number of corners with which an arc is drawn: a whole turn has one every 4 degrees and looks round."""
 
 
 def fields_of_view_png(found: Sequence[Preset]) -> bytes:
@@ -38,7 +38,7 @@ def fields_of_view_png(found: Sequence[Preset]) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    across = min(COLUMNS, len(found))
+    across = min(PANELS_IN_A_ROW, len(found))
     down = math.ceil(len(found) / across)
     figure = Figure(figsize=(PANEL_INCH * across, PANEL_INCH * down), layout="constrained")
     for number, preset in enumerate(found, 1):
@@ -93,7 +93,7 @@ def sector(limits_rad: tuple[float, float], near_m: float, far_m: float, is_flat
     array([[-1.,  1.],
            [-2.,  2.]])
     """
-    angles = np.linspace(*limits_rad, ARC)
+    angles = np.linspace(*limits_rad, ARC_CORNERS)
     rays = np.stack([np.sin(angles), np.cos(angles)], axis=1)
     if is_flat and max(map(abs, limits_rad)) < math.pi / 2:
         rays /= rays[:, 1:]

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from rangesim.errors import FileFormatError
-from rangesim.files.text_files import read_text, read_toml
+from rangesim.files.text_files import parse_toml, read_text
 from rangesim.instrument.instrument import MAX_NAME, Instrument, instrument_from_dict, is_name
 from rangesim.presets.data_sheet import DataSheet
 from rangesim.rig import Spinning
@@ -31,14 +31,15 @@ PARTS = ("title", "sheet", "instrument", "documents", "sources")
 """The parts of a file, all of which it has to have."""
 
 STANDINGS = ("assumed", "computed", "fitted")
-"""What a number may be that no document states: chosen because nothing is known, computed from other numbers of the
+"""Standings of a number that no document states: chosen because nothing is known, computed from other numbers of the
 file, or fitted to a published figure. The source has to say why, how, or to what."""
 
 VIEW_TOLERANCE = 0.05
 """Fraction by which a head's angles may differ from those of its sheet, because sheets round them."""
 
 VIEW_TOLERANCE_DEG = 1.0
-"""Degrees by which they may differ as well: a sheet may count the width of the beams, and one ring has no height."""
+"""Degrees by which they may differ in addition: a sheet may count the width of the beams, and a head with one ring has
+an angle of 0 down."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -96,7 +97,8 @@ def read_preset(path: str | Path) -> Preset:
     """
     path = Path(path)
     try:
-        return _preset(path.stem, read_toml(path), read_text(path))
+        text = read_text(path)
+        return _preset(path.stem, parse_toml(text, path), text)
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What real LiDARs recorded: packets of Ouster sensors, sweeps of KITTI."""
+"""Readers of what real LiDARs recorded: packets of Ouster sensors, sweeps of KITTI."""
 
 from rangesim.recordings.kitti import Rings, read_kitti, rings_of_order
 from rangesim.recordings.lidar_sweep import LidarSweep

@@ -23,16 +23,17 @@ MAX_OFF_CONE_RAD = np.radians(0.05)
 """Largest angle between a point and the cone of its ring, radians. In a sweep of KITTI, the points of 46 rings keep
 within 0.011 degrees. Neighbouring rings are 0.3 degrees apart, so rings that are cut in the wrong places do not."""
 MAX_RINGS = 256
-"""Largest number of rings that an order of points may have: no scanner has more, and points in another order have."""
+"""Largest number of rings that are found. No scanner has more, but points in another order seem to have more."""
 MIN_POINTS = 3
-"""Least number of points of a ring whose cone is checked: two points lie on some cone always."""
+"""Least number of points of a ring whose cone is checked, because two points always lie on some cone."""
 MAX_UNCHECKED = 0.1
-"""Largest fraction of the points that may lie in rings of fewer points. Of a few points in any order, most would."""
+"""Largest fraction of the points that may lie in rings of fewer than `MIN_POINTS` points. If there are few points, in
+any order, most of them lie in such rings."""
 MIN_SPREAD = 1.02
-"""Least ratio of the farthest to the nearest point of a ring, both measured from the axis, for which its cone is told:
+"""Least ratio of the farthest to the nearest point of a ring, both measured from the axis, at which its cone is given:
 points at one distance lie on many cones."""
 MAX_COORDINATE_M = 1e4
-"""Largest coordinate in a sweep, metres: far more than any LiDAR reaches."""
+"""Largest coordinate in a sweep, metres. Any LiDAR reaches far less."""
 
 
 class Rings(NamedTuple):
@@ -114,9 +115,8 @@ def rings_of_order(points: np.ndarray) -> Rings | None:
     for number in np.flatnonzero(sizes >= MIN_POINTS):
         own = ring == number
         rho, slopes = across[own], z[own] / across[own]
-        terms = np.stack(
-            [1 / rho, np.ones_like(rho)], axis=-1
-        )  # of equations divided by rho, so that errors are angles
+        # The equations of the cone are divided by rho, so that errors are angles.
+        terms = np.stack([1 / rho, np.ones_like(rho)], axis=-1)
         (height, slope), *_ = np.linalg.lstsq(terms, slopes, rcond=None)
         if np.abs(slopes - terms @ [height, slope]).max() > MAX_OFF_CONE_RAD:
             return None

@@ -49,6 +49,9 @@ class LidarSweep(ShortRepr):
     ((2, 4, 3), array([3., 0., 0.], dtype=float32))
     >>> cloud.ring[1, 1], cloud.time_s[1, 1]
     (np.uint16(1), np.float64(0.025))
+    >>> sweep.destaggered(np.array([[10, 11, 12, 13], [20, 21, 22, 23]]))
+    array([[13, 10, 11, 12],
+           [20, 21, 22, 23]])
     """
 
     range_m: NDArray[np.float32]
@@ -79,17 +82,6 @@ class LidarSweep(ShortRepr):
         ------
         ValueError
             The array has other rows or columns.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> from rangesim.rig.scan_patterns import spinning
-        >>> rays = spinning([0.1, 0.0], columns=4, period_s=0.1)
-        >>> ranges = np.full((1, 2, 4), 3.0, dtype=np.float32)
-        >>> sweep = LidarSweep(ranges, rays, rays.times_s[0], 0, 1, np.array([1, 0]), np.eye(4))
-        >>> sweep.destaggered(np.array([[10, 11, 12, 13], [20, 21, 22, 23]]))
-        array([[13, 10, 11, 12],
-               [20, 21, 22, 23]])
         """
         h, w = self.range_m.shape[1:]
         source = (np.arange(w) - self.pixel_shift[:, None]) % w

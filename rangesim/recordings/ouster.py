@@ -37,11 +37,11 @@ from rangesim.settings.bounds import check_number, whole
 from rangesim.settings.config import shown
 
 MAX_COLUMNS = 4_096
-"""Largest number of columns of a turn: that of the finest mode of any sensor."""
+"""Largest number of columns of a turn: the finest mode of any sensor has as many."""
 MAX_RINGS = 512
-"""Largest number of rings: twice the 256 of the OS1 Max."""
+"""Largest number of rings: twice as many as the 256 of the OS1 Max."""
 MAX_PACKET = 65_507
-"""Largest number of bytes in a UDP datagram over IPv4."""
+"""Largest number of bytes of a packet: more do not fit into a UDP datagram over IPv4 (RFC 768, RFC 791)."""
 
 # ---- Profiles: where the bits are -----------------------------------------------------------------------------------
 
@@ -130,7 +130,9 @@ PROFILES = {
 # ---- Metadata -------------------------------------------------------------------------------------------------------
 
 Degrees = Annotated[float, msgspec.Meta(ge=-360, le=360)]
+"""An angle of a beam in the metadata, degrees."""
 Millimetres = Annotated[float, msgspec.Meta(ge=-1e5, le=1e5)]
+"""A length in the metadata, or an entry of a transform, millimetres; 100 m exclude only nonsense."""
 
 
 class _DataFormat(msgspec.Struct):
@@ -162,7 +164,7 @@ _GROUPS = ("sensor_info", "beam_intrinsics", "lidar_intrinsics", "config_params"
 
 @dataclass(frozen=True, eq=False)
 class OusterMetadata:
-    """What the metadata of a sensor tell of its packets and of its beams.
+    """The layout of a sensor's packets and the geometry of its beams, from its metadata.
 
     Parameters
     ----------
@@ -205,9 +207,9 @@ class OusterMetadata:
         )
 
     def camera(self, field_rad: tuple[float, float] = FIELD_RAD, acceptance: Acceptance = "gaussian") -> Spinning:
-        """This very sensor as a camera, to simulate what it would measure; its rays are `rays`.
+        """The sensor as a camera, with which its measurements are simulated; its rays are `rays`.
 
-        field_rad, acceptance : field of a ray, see `Spinning`; the metadata do not tell it.
+        field_rad, acceptance : field of a ray, see `Spinning`; the metadata do not state it.
         """
         return Spinning(
             elevations_deg=tuple(np.degrees(self.elevations_rad).tolist()),
@@ -309,7 +311,8 @@ def _checked_metadata(found: _Metadata) -> OusterMetadata:
 
 
 def _beam_origin(found: _Metadata) -> NDArray[np.float64]:
-    """Where beams begin at azimuth 0, metres, coordinates as OpenCV's (x = -y, y = -z, z = x of the lidar frame)."""
+    """(3,) float64, metres, the place where the beams begin at azimuth 0, in coordinates as OpenCV's (x = -y, y = -z,
+    z = x of the lidar frame)."""
     if found.beam_to_lidar_transform is None:
         x, y, z = found.lidar_origin_to_beam_origin_mm / 1000, 0.0, 0.0
     else:
@@ -338,7 +341,7 @@ def _serial(value: str | int) -> int:
 
 
 class PacketLayout:
-    """Where columns and words are in the packets of a sensor.
+    """The places of columns and words in the packets of a sensor.
 
     size : bytes of a packet.
     """
@@ -503,7 +506,7 @@ def _check_sender(path: str | Path, datagram: Datagram, sender: tuple[str, int],
 
 
 class _Turn:
-    """A turn of which columns arrive in packets."""
+    """A turn whose columns arrive packet by packet."""
 
     def __init__(self, metadata: OusterMetadata, frame: int) -> None:
         self.metadata, self.frame = metadata, frame
@@ -513,7 +516,7 @@ class _Turn:
         self.is_there = np.zeros(w, dtype=bool)
 
     def add(self, columns: np.ndarray, path: str | Path) -> None:
-        """Take the valid ones among columns."""
+        """Add the columns that are valid."""
         columns = columns[(columns["status"] & 1) == 1]
         places = columns["column"]
         if places.size and places.max() >= self.metadata.columns:

@@ -22,17 +22,19 @@ MAX_PENDING = 64
 """Largest number of datagrams whose fragments are waited for. A sensor sends one after the other, and a datagram that
 lost a fragment never becomes whole; 64 are enough for several sensors at once."""
 MAX_DATAGRAM = 65_535
-"""Largest number of bytes of an IPv4 packet, so of its fragments together."""
+"""Largest number of bytes of an IPv4 packet, and therefore of its fragments together (RFC 791)."""
 _MAGIC = {b"\xd4\xc3\xb2\xa1": "<", b"\xa1\xb2\xc3\xd4": ">", b"\x4d\x3c\xb2\xa1": "<", b"\xa1\xb2\x3c\x4d": ">"}
-"""First four bytes of a file, and the order of bytes that they tell; the last two have times in nanoseconds."""
+"""First four bytes of a file, and the order of bytes that they mean; the last two are of times in nanoseconds."""
 _NEXT_GENERATION = b"\x0a\x0d\x0d\x0a"
 """First four bytes of the other format that Wireshark writes, pcapng."""
 _LINK_HEADERS = {0: 4, 1: 14, 101: 0, 113: 16, 228: 0, 276: 20}
-"""Bytes before the IP packet by type of link: BSD loopback, Ethernet, raw IP, Linux cooked, IPv4, Linux cooked 2."""
+"""Number of bytes before the IP packet, by type of link: BSD loopback, Ethernet, raw IP, Linux cooked, IPv4, Linux
+cooked 2."""
 _VLAN = (0x8100, 0x88A8)
-"""Types of Ethernet frames that have four more bytes before the type of what they carry."""
+"""Types of Ethernet frames with a tag of a virtual network (IEEE 802.1Q, 802.1ad): they have four more bytes before the
+type of what they carry."""
 _UDP = 17
-"""Number of UDP among the protocols of IP."""
+"""Number of UDP among the protocols of IP (IANA)."""
 
 
 class Datagram(NamedTuple):
@@ -110,7 +112,7 @@ def _ip_packet(record: bytes, link: int) -> memoryview | None:
 
 
 class _Fragments:
-    """Fragments of datagrams that are not whole yet, in the order of their first fragment."""
+    """Fragments of datagrams that are not whole yet. The datagrams are in the order of their first fragments."""
 
     def __init__(self) -> None:
         self.pending: OrderedDict[bytes, tuple[dict[int, bytes], list[int]]] = OrderedDict()

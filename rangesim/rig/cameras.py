@@ -160,6 +160,11 @@ class Camera(Optics):
 
     # ---- What follows from the rays -----------------------------------------------------------------------------
 
+    @property
+    def is_forward(self) -> bool:
+        """Whether no ray leads sideways or backwards, so that z grows with the range along every ray."""
+        return self.is_pinhole or not bool((self.rays.directions[..., 2] <= 0.0).any())
+
     def angle_of(self, pixels: float) -> float:
         """Angle between two rays that are that many pixels apart, radians, typical of the camera."""
         return float(pixels * np.nanmedian(np.linalg.norm(self.rays.steps, axis=-1)))

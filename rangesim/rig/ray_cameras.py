@@ -22,7 +22,7 @@ FieldAngle = Annotated[float, Bounds("an angle in radians", 1e-9, np.pi)]
 """Full width of a pixel's field of view along one axis, radians; the lower bound only excludes zero."""
 FISHEYE_STEPS = 20
 """Number of Newton steps that invert the polynomial of a fisheye lens. From the undistorted angle, ten reach double
-precision for the lenses of OpenCV's examples; more cost little, because rays are computed once for each image."""
+precision for the lenses of OpenCV's examples; ten more are a reserve for other lenses."""
 MAX_FISHEYE_MISS_RAD = 1e-6
 """Largest error, in radians, with which the angle found for a pixel may be distorted back onto it. Where it is larger,
 the polynomial has no inverse, and the pixel has no ray. After Newton's method the error is far below it or above."""
@@ -84,6 +84,10 @@ class Fisheye(Camera):
         rays.directions[~np.isfinite(rays.steps).all(axis=(-2, -1))] = np.nan
         return rays
 
+    @property
+    def is_forward(self) -> bool:
+        return self.max_angle_rad <= np.pi / 2 or super().is_forward  # the angle tells it without a million rays
+
     def project(self, points: ArrayLike) -> Array:
         """(..., 2) float64, pixel coordinates of points (..., 3) in coordinates of this camera, metres.
 
@@ -110,7 +114,7 @@ class Fisheye(Camera):
         radius = np.hypot(x, y)
         theta = radius.copy()
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            for _ in range(FISHEYE_STEPS):
+            for _ in range(FISHEYE_STEPS if any(self.distortion) else 0):  # without distortion, the radius is the angle
                 at, slope = self._radius(theta)
                 theta = theta - (at - radius) / slope
             at, slope = self._radius(theta)
