@@ -27,7 +27,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 
 from pcgraph.parallel import MIN_ROWS, in_blocks, kernel, routine, side_by_side
-from rangesim.geometry.stereo import match_rows
+from rangesim.geometry.stereo import checked_images, match_rows
 from rangesim.settings.bounds import Bounds, check_fields
 
 CENSUS_ROWS, CENSUS_COLUMNS = 3, 4
@@ -204,14 +204,8 @@ def match_densely(
     5.3
     """
     settings = settings or DenseMatching()
-    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
-    if a.ndim != 2 or a.shape != b.shape:
-        raise ValueError(f"expected two images of one shape (h, w), got {a.shape} and {b.shape}.")
+    a, b = checked_images(first, second, disparities_px)
     least, largest = disparities_px
-    if not (np.isfinite([least, largest]).all() and least < largest and largest - least < a.shape[1]):
-        raise ValueError(
-            f"expected disparities (least, largest) within an image {a.shape[1]} pixels wide, got {disparities_px!r}."
-        )
     noises = tuple(np.broadcast_to(np.asarray(n, dtype=np.float32), a.shape).copy() for n in noise)
     images = a.astype(np.float32), b.astype(np.float32)
     if settings.method == "opencv":
