@@ -27,7 +27,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 
 from pcgraph.parallel import MIN_ROWS, in_blocks, kernel, routine, side_by_side
-from rangesim.geometry.stereo import checked_images, match_rows
+from rangesim.geometry.stereo import checked_images, contrast_limits, match_rows
 from rangesim.settings.bounds import Bounds, check_fields
 
 CENSUS_ROWS, CENSUS_COLUMNS = 3, 4
@@ -354,7 +354,8 @@ def _by_opencv(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Disparities (h, w) float64 of OpenCV's matcher, and outcomes. OpenCV does not say why a pixel has no match, so
     all of these count as ambiguous."""
-    if not any(np.nanmax(image, initial=-np.inf) > np.nanmin(image, initial=np.inf) for image in images[:1]):
+    low, high = contrast_limits(images[0].astype(np.float64))
+    if not high > low:
         nothing = np.full(images[0].shape, np.nan)
         return nothing, np.full(images[0].shape, MatchOutcome.AMBIGUOUS, dtype=np.uint8)
     found = match_rows(*images, disparities_px, settings.window_px).astype(np.float64)

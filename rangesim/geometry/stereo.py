@@ -331,12 +331,19 @@ def checked_images(first: np.ndarray, second: np.ndarray, disparities_px: tuple[
     return a, b
 
 
+def contrast_limits(image: np.ndarray) -> tuple[float, float]:
+    """Quantiles of 0.5 % and 99.5 % of an image (h, w), between which the matcher sees contrast; NaN for no image."""
+    known = image[~np.isnan(image)]
+    low, high = np.quantile(known, [0.005, 0.995]) if known.size else (np.nan, np.nan)
+    return float(low), float(high)
+
+
 def _eight_bits(first: Array, second: Array) -> tuple[np.ndarray, np.ndarray]:
     """Both images (h, w) as 8-bit integers on one scale, from the 0.5 % to the 99.5 % quantile of the first.
 
     Pixels without an image become 0.
     """
-    low, high = np.nanquantile(first, [0.005, 0.995])
+    low, high = contrast_limits(first)
     if not high > low:
         raise ValueError("expected images with contrast, got a first image of one value.")
     result = [
