@@ -215,16 +215,15 @@ def match_densely(
     known = np.isfinite(a)
     outcome[~known] = MatchOutcome.NO_IMAGE
     fit = refine_disparities(images, noises, whole, settings)
-    matched = outcome == MatchOutcome.MATCHED
     # Where the texture does not suffice, neither a match nor its failure means anything
     is_flat = locating_sigma(images[0], noises, settings.reach) > settings.max_sigma_px
     outcome[known & is_flat] = MatchOutcome.NO_TEXTURE
-    still = outcome == MatchOutcome.MATCHED
-    outcome[still & ~is_enclosed(images[0], fit.variance, still, settings)] = MatchOutcome.NO_TEXTURE
+    matched = outcome == MatchOutcome.MATCHED
+    outcome[matched & ~is_enclosed(images[0], fit.variance, matched, settings)] = MatchOutcome.NO_TEXTURE
     is_alike = fit.slope_correlation >= settings.min_slope_correlation
     is_sure = is_alike & (fit.correlation >= settings.min_correlation) & (fit.sigma_px <= settings.max_sigma_px)
     refused = ~(np.isfinite(fit.disparity_px) & is_sure)
-    outcome[matched & (outcome == MatchOutcome.MATCHED) & refused] = MatchOutcome.AMBIGUOUS
+    outcome[(outcome == MatchOutcome.MATCHED) & refused] = MatchOutcome.AMBIGUOUS
     found = fit.disparity_px if settings.refine else whole
     outside = ~((found >= least) & (found <= largest)) & (outcome == MatchOutcome.MATCHED)
     outcome[outside] = MatchOutcome.OUT_OF_RANGE
@@ -247,12 +246,8 @@ def locating_sigma(image: np.ndarray, noises: tuple[np.ndarray, ...], reach: int
     """
     from scipy.ndimage import uniform_filter
 
-    known = np.isfinite(image).astype(np.float64)
-    filled = np.nan_to_num(image.astype(np.float64))
-    derivative, usable = np.zeros(image.shape), np.zeros(image.shape)
-    derivative[:, 1:-1] = (filled[:, 2:] - filled[:, :-2]) / 2
-    usable[:, 1:-1] = known[:, 2:] * known[:, :-2]
-    derivative *= usable
+    slopes = _slopes(image)
+    derivative, usable = np.nan_to_num(slopes), np.isfinite(slopes).astype(np.float64)
     own = noises[0].astype(np.float64) ** 2
     side = 2 * reach + 1
     mean, squares, weight = (uniform_filter(v, side, mode="constant") for v in (derivative, derivative**2, usable))
@@ -261,6 +256,14 @@ def locating_sigma(image: np.ndarray, noises: tuple[np.ndarray, ...], reach: int
         variance = own + float(np.mean(noises[1].astype(np.float64) ** 2))
         tiny = ROUNDING * np.nan_to_num(squares)
         return np.where(texture > tiny, np.sqrt(variance / (texture * side**2)), np.inf)
+
+
+def _slopes(image: np.ndarray) -> np.ndarray:
+    """(h, w) float64, central differences along the rows, per pixel; NaN where a neighbour has no finite value."""
+    values = np.where(np.isfinite(image), image, np.nan).astype(np.float64)
+    slopes = np.full(image.shape, np.nan)
+    slopes[:, 1:-1] = (values[:, 2:] - values[:, :-2]) / 2
+    return slopes
 
 
 def is_enclosed(image: np.ndarray, variance: np.ndarray, matched: np.ndarray, settings: DenseMatching) -> np.ndarray:
@@ -276,11 +279,7 @@ def is_enclosed(image: np.ndarray, variance: np.ndarray, matched: np.ndarray, se
     image : (h, w) float, NaN where there is none.
     variance : (h, w) float64, variance of the difference of both images at a match; NaN where there is none.
     """
-    known = np.isfinite(image)
-    filled = np.nan_to_num(image.astype(np.float64))
-    squares = np.full(image.shape, np.nan)
-    squares[:, 1:-1] = (filled[:, 2:] - filled[:, :-2]) ** 2 / 4
-    squares[:, 1:-1][~(known[:, 2:] & known[:, :-2])] = np.nan
+    squares = _slopes(image) ** 2
     outer = AROUND * settings.window_px
     reach = int(outer)
     dy, dx = (v.ravel() for v in np.mgrid[-reach : reach + 1, -reach : reach + 1])
