@@ -185,10 +185,8 @@ class StereoDecoder(Decoder):
         if first.rig is not None and second.rig is not None:
             T_second_first = np.linalg.inv(second.rig.T_world_camera) @ first.rig.T_world_camera
             pair = rectify(first.rig.pinhole, second.rig.pinhole, T_second_first)
-        frame = second.frames.mean(axis=0, dtype=np.float32)
-        noise = self.noise.of(second, frame) / np.sqrt(len(second.frames))
+        image, noise = self.noise.mean_image(second)
         searched = self.least_px, self.least_px + self.disparities
-        image = frame - np.float32(second.black_level)
         found = match_capture(first, image, noise, pair, searched, self.matching, self.noise)
         return quantised(found, self.step_px)
 
