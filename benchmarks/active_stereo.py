@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +70,7 @@ def signals_of(name: str, sensor: Sensor, width: int, spp: int, **settings: Any)
 
 def row(name: str, signals: Signals, sensor: Sensor, decoder: Any = None, **exposure: Any) -> tuple[RangeImage, Any]:
     """Print what a sensor reads: fraction read of the lit pixels, median error, readings off by 10 mm, causes."""
-    detector = exposure.pop("detector", sensor.default_detector)
-    capture = expose(signals, sensor, detector, **exposure)
+    capture = expose(signals, sensor, sensor.default_detector, **exposure)
     image = decode(capture, decoder)
     compared = compare(image, signals)
     found = compared.row("all")
@@ -81,8 +79,7 @@ def row(name: str, signals: Signals, sensor: Sensor, decoder: Any = None, **expo
     read = image.valid.any()
     median = f"{1e3 * found.median_abs_m:.2f}" if read else "-"
     wrong = f"{100 * found.outlier_rate:.1f} %" if read else "-"
-    complete = found.completeness
-    print(f"| {name} | {100 * complete:.1f} % | {median} | {wrong} | {because} |")
+    print(f"| {name} | {100 * found.completeness:.1f} % | {median} | {wrong} | {because} |")
     return image, compared
 
 
@@ -193,10 +190,8 @@ def main() -> None:
     bright = signals_of("tabletop", ACTIVE, width, spp, power_w=SUN_POWER_W)
     for lux in SUN_LUX:
         sun = Ambient("sun", illuminance_lux=lux)
-        detector = ACTIVE.default_detector
-        assert detector is not None
         name = f"tabletop, dots of {SUN_POWER_W:g} W, sun of {lux:g} lx"
-        row(name, bright, ACTIVE, detector=replace(detector), exposure_s=SUN_EXPOSURE_S, ambient=sun)  # type: ignore[type-var]
+        row(name, bright, ACTIVE, exposure_s=SUN_EXPOSURE_S, ambient=sun)
     real = real_pair(arguments.data)
     if arguments.picture is not None:
         save_picture(arguments.picture, image, table, real)
