@@ -132,7 +132,7 @@ def room_planes(q: np.ndarray, sigma_q: float, seed: int = 0) -> list[Plane]:
     for _ in range(6):
         if left.sum() < max(3, MIN_PLANE * total):
             break
-        plane, on = _largest_plane(x[left], y[left], values[left], ON_PLANE * sigma_q, rng)
+        plane, on = largest_plane(x[left], y[left], values[left], ON_PLANE * sigma_q, rng)
         if on.sum() < MIN_PLANE * total:
             break
         members = np.flatnonzero(left)[on]
@@ -144,10 +144,14 @@ def room_planes(q: np.ndarray, sigma_q: float, seed: int = 0) -> list[Plane]:
     return [plane for plane, _ in planes[:3]]
 
 
-def _largest_plane(
+def largest_plane(
     x: np.ndarray, y: np.ndarray, q: np.ndarray, tolerance: float, rng: np.random.Generator
 ) -> tuple[Plane, np.ndarray]:
-    """The plane of most pixels, and which pixels (n,) bool are within `tolerance` (per metre) of it."""
+    """The plane of most of n pixels (RANSAC, then least squares), and which pixels (n,) bool are on it.
+
+    x, y : (n,) pixel coordinates. q : (n,) float, inverse depth, per metre.
+    tolerance : largest distance from the plane of a pixel that is on it, per metre.
+    """
     design = np.stack([x, y, np.ones_like(x)], axis=1)
     some = rng.choice(len(q), size=min(len(q), 4000), replace=False)
     best, most = np.zeros(3), -1
