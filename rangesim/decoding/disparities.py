@@ -24,11 +24,12 @@ SAME_PLACE_PX = 1e-3
 """Distance of a camera's pixel from the centre of a rectified pixel, in pixels, below which it takes that pixel's
 disparity as it is. Along a slope of one pixel per pixel the disparity then errs by as much, far below its noise."""
 MAX_SPAN_PX = 1.0
-"""Largest difference of four neighbouring disparities, in pixels, between which one is interpolated. On a slope
-neighbours differ by less; across a depth edge they differ by more, and the nearest one counts."""
+"""Largest difference of four neighbouring disparities, in pixels, between which a disparity is interpolated. On a
+slope, neighbours differ by less. Across a depth edge they differ by more; the nearest one is taken there, because a
+value in between is the depth of no surface."""
 MOSTLY_SATURATED = 0.25
-"""Fraction of a window that is saturated, above which a failed match is blamed on saturation. A few bright dots may
-saturate without harm."""
+"""Fraction of a window, from 0 to 1. If more of it is saturated, a failed match gets the status SATURATED. A few bright
+dots may saturate without harm, so it is not near 0."""
 STATUS_OF = {
     MatchOutcome.MATCHED: Status.OK,
     MatchOutcome.NO_TEXTURE: Status.LOW_SIGNAL,

@@ -25,8 +25,8 @@ from rangesim.settings.bounds import Bounds, Metres, check_fields
 if TYPE_CHECKING:
     from rangesim.rig import Rig
 
-PIXEL_VARIANCE = 1 / 12
-"""Variance of a place within a pixel, in pixels squared: that of an even distribution."""
+ROUNDING_VARIANCE = 1 / 12
+"""Variance of an even distribution over one step, in squared steps: that of the error of rounding."""
 
 Disparity = Annotated[float, Bounds("pixels", -1e5, 1e5)]
 """A disparity in rectified pixels; the bounds exclude nonsense."""
@@ -229,7 +229,7 @@ def quantised(found: Disparities, step_px: float, from_px: float = 0.0) -> Dispa
     if not step_px:
         return found
     rounded = np.rint((found.disparity_px - from_px) / step_px) * step_px + from_px
-    sigma = np.sqrt(found.sigma_px**2 + step_px**2 * PIXEL_VARIANCE)
+    sigma = np.sqrt(found.sigma_px**2 + step_px**2 * ROUNDING_VARIANCE)
     return replace(found, disparity_px=rounded, sigma_px=sigma)
 
 
