@@ -17,11 +17,11 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rebuilt_scene import largest_plane
 from scipy.ndimage import label
 
 from rangesim import (
@@ -71,8 +71,7 @@ def signals_of(name: str, sensor: Sensor, width: int, spp: int, **settings: Any)
 
 def row(name: str, signals: Signals, sensor: Sensor, decoder: Any = None, **exposure: Any) -> tuple[RangeImage, Any]:
     """Print what a sensor reads: fraction read of the lit pixels, median error, readings off by 10 mm, causes."""
-    detector = exposure.pop("detector", sensor.default_detector)
-    capture = expose(signals, sensor, detector, **exposure)
+    capture = expose(signals, sensor, sensor.default_detector, **exposure)
     image = decode(capture, decoder)
     compared = compare(image, signals)
     found = compared.row("all")
@@ -81,8 +80,7 @@ def row(name: str, signals: Signals, sensor: Sensor, decoder: Any = None, **expo
     read = image.valid.any()
     median = f"{1e3 * found.median_abs_m:.2f}" if read else "-"
     wrong = f"{100 * found.outlier_rate:.1f} %" if read else "-"
-    complete = found.completeness
-    print(f"| {name} | {100 * complete:.1f} % | {median} | {wrong} | {because} |")
+    print(f"| {name} | {100 * found.completeness:.1f} % | {median} | {wrong} | {because} |")
     return image, compared
 
 
@@ -130,14 +128,13 @@ def real_pair(data: Path) -> np.ndarray | None:
         f"{np.median(np.abs(apart)):.2f} px"
     )
     y, x = np.nonzero(found.valid)
-    d = found.disparity_px[y, x].astype(np.float64)
-    plane = carpet(x, y, d)
-    rest = d - (plane[0] * x + plane[1] * y + plane[2])
-    on = np.abs(rest) < CARPET_PX
-    z_of_plane = 1 / (plane[0] * x + plane[1] * y + plane[2])
-    above = np.zeros(found.valid.shape, dtype=bool)
     scale = camera.fx * sensor.baseline_m
-    above[y, x] = scale * z_of_plane - image.z[y, x] > ABOVE_M
+    d = found.disparity_px[y, x].astype(np.float64)
+    plane, on = largest_plane(x, y, d / scale, CARPET_PX / scale, np.random.default_rng(0))
+    q_of_carpet = plane.inverse_depth(x, y)
+    rest = d - scale * q_of_carpet
+    above = np.zeros(found.valid.shape, dtype=bool)
+    above[y, x] = 1 / q_of_carpet - image.z[y, x] > ABOVE_M
     sizes = np.bincount(label(above)[0].ravel())[1:]
     things = sorted(sizes[sizes > MIN_THING_PX].tolist(), reverse=True)
     print(
@@ -146,25 +143,6 @@ def real_pair(data: Path) -> np.ndarray | None:
         f"{1e3 * ABOVE_M:.0f} mm or more, of {things} pixels"
     )
     return image.z
-
-
-def carpet(x: np.ndarray, y: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """(3,) a, b, c of the plane d = a x + b y + c in disparity on which most of the readings lie: RANSAC, then least
-    squares."""
-    random, best, most = np.random.default_rng(0), np.zeros(3), -1
-    A = np.stack([x, y, np.ones_like(x)], axis=1).astype(np.float64)
-    some = random.choice(len(x), min(len(x), 20_000), replace=False)
-    for _ in range(300):
-        three = random.choice(len(x), 3, replace=False)
-        if abs(np.linalg.det(A[three])) < 1:
-            continue
-        plane = np.linalg.solve(A[three], d[three])
-        n = int((np.abs(A[some] @ plane - d[some]) < CARPET_PX).sum())
-        best, most = (plane, n) if n > most else (best, most)
-    for _ in range(3):
-        on = np.abs(A @ best - d) < CARPET_PX
-        best = np.linalg.lstsq(A[on], d[on], rcond=None)[0]
-    return best
 
 
 def main() -> None:
@@ -193,10 +171,8 @@ def main() -> None:
     bright = signals_of("tabletop", ACTIVE, width, spp, power_w=SUN_POWER_W)
     for lux in SUN_LUX:
         sun = Ambient("sun", illuminance_lux=lux)
-        detector = ACTIVE.default_detector
-        assert detector is not None
         name = f"tabletop, dots of {SUN_POWER_W:g} W, sun of {lux:g} lx"
-        row(name, bright, ACTIVE, detector=replace(detector), exposure_s=SUN_EXPOSURE_S, ambient=sun)  # type: ignore[type-var]
+        row(name, bright, ACTIVE, exposure_s=SUN_EXPOSURE_S, ambient=sun)
     real = real_pair(arguments.data)
     if arguments.picture is not None:
         save_picture(arguments.picture, image, table, real)

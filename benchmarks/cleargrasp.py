@@ -75,7 +75,8 @@ Figures = dict[str, float]
 # ---- The D435 --------------------------------------------------------------------------------------------------------
 
 LEFT_M = 0.015
-"""Metres from the colour camera to the left infra-red camera, to its right: librealsense's extrinsics of a D435."""
+"""Distance in metres by which the left infra-red camera stands to the right of the colour camera; source:
+librealsense's extrinsics of a D435."""
 PRESET = presets.load("d435")
 """The D435 of the package."""
 D435 = replace(

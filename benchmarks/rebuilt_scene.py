@@ -40,6 +40,9 @@ table is no perfect plane, so three would leave holes."""
 BEHIND_PLANE = 0.05
 """Largest fraction of the pixels on one plane of a room that another plane may hide: planes that bound a room from
 outside hide nothing of each other, faces of things do."""
+FARTHEST_M = 5.0
+"""Largest depth of a room, metres. A plane that goes on behind the objects ends there, so that no mesh reaches the
+horizon."""
 CUT_M = 0.015
 """Jump of z between neighbouring vertices, metres, at which a mesh of the room is cut: at ROOM_STEP pixels and 0.5 m a
 surface that is seen at 80 degrees changes by 12 mm."""
@@ -129,7 +132,7 @@ def room_planes(q: np.ndarray, sigma_q: float, seed: int = 0) -> list[Plane]:
     for _ in range(6):
         if left.sum() < max(3, MIN_PLANE * total):
             break
-        plane, on = _largest_plane(x[left], y[left], values[left], ON_PLANE * sigma_q, rng)
+        plane, on = largest_plane(x[left], y[left], values[left], ON_PLANE * sigma_q, rng)
         if on.sum() < MIN_PLANE * total:
             break
         members = np.flatnonzero(left)[on]
@@ -141,10 +144,14 @@ def room_planes(q: np.ndarray, sigma_q: float, seed: int = 0) -> list[Plane]:
     return [plane for plane, _ in planes[:3]]
 
 
-def _largest_plane(
+def largest_plane(
     x: np.ndarray, y: np.ndarray, q: np.ndarray, tolerance: float, rng: np.random.Generator
 ) -> tuple[Plane, np.ndarray]:
-    """The plane of most pixels, and which pixels (n,) bool are within `tolerance` (per metre) of it."""
+    """The plane of most of n pixels (RANSAC, then least squares), and which pixels (n,) bool are on it.
+
+    x, y : (n,) pixel coordinates. q : (n,) float, inverse depth, per metre.
+    tolerance : largest distance from the plane of a pixel that is on it, per metre.
+    """
     design = np.stack([x, y, np.ones_like(x)], axis=1)
     some = rng.choice(len(q), size=min(len(q), 4000), replace=False)
     best, most = np.zeros(3), -1
@@ -166,9 +173,11 @@ def _largest_plane(
 
 
 def room_depth(planes: list[Plane], x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """z in metres of the nearest plane at pixel coordinates; NaN where none is in front of the camera within 5 m."""
-    q = np.max([np.full(np.shape(x), 0.2), *(plane.inverse_depth(x, y) for plane in planes)], axis=0)
-    return np.where(q > 0.2, 1 / q, np.nan)
+    """z in metres of the nearest plane at pixel coordinates; NaN where none is in front of the camera within
+    `FARTHEST_M`."""
+    least = 1 / FARTHEST_M
+    q = np.max([np.full(np.shape(x), least), *(plane.inverse_depth(x, y) for plane in planes)], axis=0)
+    return np.where(q > least, 1 / q, np.nan)
 
 
 # ---- Surfaces --------------------------------------------------------------------------------------------------------
@@ -197,8 +206,7 @@ def front_surface(q: np.ndarray, mask: np.ndarray, sigma_q: float, step: int = F
     y, x = top + step * np.arange(height), left + step * np.arange(width)
     inside = cv2.dilate(mask.astype(np.uint8), np.ones((2 * step + 1, 2 * step + 1)))
     active = _read(inside, y, x) > 0  # one node beyond the mask, so that all of its pixels lie between nodes
-    number = np.full(active.shape, -1)
-    number[active] = np.arange(active.sum())
+    number = _numbered(active)
     known = np.isfinite(q)
     at_y, at_x = np.nonzero(known)
     if len(at_y) < 30:
@@ -227,6 +235,13 @@ def _read(image: np.ndarray, y: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Values at the crossings of rows and columns; outside of the image, the nearest value of its border."""
     height, width = image.shape
     return np.asarray(image[np.clip(y, 0, height - 1)[:, None], np.clip(x, 0, width - 1)])
+
+
+def _numbered(used: np.ndarray) -> np.ndarray:
+    """(h, w) int, numbers from 0 of the nodes that are used, row by row; -1 for the others."""
+    number = np.full(used.shape, -1)
+    number[used] = np.arange(used.sum())
+    return number
 
 
 def _interpolation(y: np.ndarray, x: np.ndarray, top: int, left: int, step: int, number: np.ndarray) -> Any:
@@ -270,9 +285,9 @@ def things_in_room(q: np.ndarray, planes: list[Plane], sigma_q: float) -> np.nda
     """
     plane_q = 1 / room_depth(planes, *_coordinates(q.shape))
     on_plane = np.abs(q - plane_q) < ON_PLANE * sigma_q
-    filled = np.where(on_plane, plane_q, q)
-    filled = np.fmin(_carried(filled), _carried(filled[:, ::-1])[:, ::-1])
-    filled = np.where(np.isfinite(q), np.where(on_plane, plane_q, q), filled)
+    seen = np.where(on_plane, plane_q, q)
+    farther = np.fmin(_carried(seen), _carried(seen[:, ::-1])[:, ::-1])
+    filled = np.where(np.isfinite(q), seen, farther)
     filled = cv2.medianBlur(np.nan_to_num(filled, nan=0.0).astype(np.float32), 5).astype(np.float64)
     is_thing = (filled > 0) & ~(np.abs(filled - plane_q) < ON_PLANE * sigma_q)
     is_thing = cv2.morphologyEx(is_thing.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2 * ROOM_STEP + 1,) * 2)) > 0
@@ -379,10 +394,8 @@ def _lattice_faces(number: np.ndarray) -> np.ndarray:
 
 def _sheet(camera: Intrinsics, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces of a surface over a lattice of pixel coordinates; NaN: no vertex."""
-    number = np.full(z.shape, -1)
-    number[np.isfinite(z)] = np.arange(np.isfinite(z).sum())
-    faces = _lattice_faces(number)
-    return _points(camera, x, y, z)[np.isfinite(z)], faces
+    used = np.isfinite(z)
+    return _points(camera, x, y, z)[used], _lattice_faces(_numbered(used))
 
 
 def _room_mesh(rebuilt: Rebuilt) -> tuple[np.ndarray, np.ndarray]:
@@ -446,9 +459,7 @@ def _normals(points: np.ndarray) -> np.ndarray:
 
 def _shell(near: np.ndarray, far: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces of the closed body between two lattices of points (h, w, 3); faces point outwards."""
-    number = np.full(used.shape, -1)
-    number[used] = np.arange(used.sum())
-    faces, n = _lattice_faces(number), int(used.sum())
+    faces, n = _lattice_faces(_numbered(used)), int(used.sum())
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     keys, back = edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0]
     open_edges = edges[~np.isin(keys, back)]

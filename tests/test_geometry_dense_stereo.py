@@ -79,6 +79,14 @@ def test_what_has_no_texture_says_so() -> None:
     assert (even.outcome == MatchOutcome.NO_TEXTURE).all()
 
 
+def test_opencv_takes_an_image_that_is_even_but_for_a_few_dots() -> None:
+    """Its own quantiles see no contrast in it, so there is no match, but no error either."""
+    sparse = np.zeros(SIZE)
+    sparse[30, 60:80:4] = 1.0
+    found = match_densely(sparse, sparse, (0, 20), DenseMatching("opencv"))
+    assert not np.isfinite(found.disparity_px).any()
+
+
 def test_a_periodic_texture_is_ambiguous_if_two_periods_fit_the_range() -> None:
     _, x = np.mgrid[: SIZE[0], : SIZE[1]]
     bars = [np.sin(2 * np.pi * (x + shift) / 8 + 0.2) for shift in (0, 5)]

@@ -187,19 +187,22 @@ def noise_free_capture(
     sampling_errors : factor on the draw of the sampling error that is added to the signals; 0: none is added.
     """
     unfiltered = 1.0 if ambient is None else ambient.scale
-    captures = []
-    for one in signals.cameras:
-        frames = one.frames(sensor, unfiltered, sampling_errors)
-        captures.append(Capture(_through_lens(frames, one.rig), sensor, one.rig, ambient=ambient))
-    return together(captures)
+
+    def radiance(one: Signals) -> np.ndarray:
+        return _through_lens(one.frames(sensor, unfiltered, sampling_errors), one.rig)
+
+    return capture_of_frames(signals, sensor, radiance, ambient)
 
 
-def capture_of_frames(signals: Signals, sensor: Sensor, frames_of: Callable[[Signals], np.ndarray]) -> Captured:
+def capture_of_frames(
+    signals: Signals, sensor: Sensor, frames_of: Callable[[Signals], np.ndarray], ambient: Ambient | None = None
+) -> Captured:
     """Noise-free capture of frames that a function makes for each camera of the signals.
 
     frames_of : function of the signals of one camera that returns frames (k, h, w) float32, W/m2/sr.
+    ambient : Ambient that the frames were taken in; None: not stated.
     """
-    return together([Capture(frames_of(one), sensor, one.rig) for one in signals.cameras])
+    return together([Capture(frames_of(one), sensor, one.rig, ambient=ambient) for one in signals.cameras])
 
 
 def exposed_again(capture: Captured, signals: Signals, seed: int, sampling_errors: float = 0.0) -> Captured:

@@ -24,11 +24,12 @@ SAME_PLACE_PX = 1e-3
 """Distance of a camera's pixel from the centre of a rectified pixel, in pixels, below which it takes that pixel's
 disparity as it is. Along a slope of one pixel per pixel the disparity then errs by as much, far below its noise."""
 MAX_SPAN_PX = 1.0
-"""Largest difference of four neighbouring disparities, in pixels, between which one is interpolated. On a slope
-neighbours differ by less; across a depth edge they differ by more, and the nearest one counts."""
+"""Largest difference of four neighbouring disparities, in pixels, between which a disparity is interpolated. On a
+slope, neighbours differ by less. Across a depth edge they differ by more; the nearest one is taken there, because a
+value in between is the depth of no surface."""
 MOSTLY_SATURATED = 0.25
-"""Fraction of a window that is saturated, above which a failed match is blamed on saturation. A few bright dots may
-saturate without harm."""
+"""Fraction of a window, from 0 to 1. If more of it is saturated, a failed match gets the status SATURATED. A few bright
+dots may saturate without harm, so it is not near 0."""
 STATUS_OF = {
     MatchOutcome.MATCHED: Status.OK,
     MatchOutcome.NO_TEXTURE: Status.LOW_SIGNAL,
@@ -70,6 +71,12 @@ class ImageNoise:
             level = self.of_scale * capture.full_scale if capture.is_digital else self.relative * bright_level(frame)
             return np.full(frame.shape, level, dtype=np.float32)
         return np.asarray(np.broadcast_to(noise, frame.shape), dtype=np.float32)
+
+    def mean_image(self, capture: Capture) -> tuple[np.ndarray, np.ndarray]:
+        """Mean frame of a capture above its black level, (h, w) float32, and the standard deviation of its noise,
+        (h, w) float, in the frame's unit. Masked pixels of the mean are NaN."""
+        mean = capture.frames.mean(axis=0, dtype=np.float32)
+        return mean - np.float32(capture.black_level), self.of(capture, mean) / np.sqrt(len(capture.frames))
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -113,9 +120,8 @@ class Disparities(Coordinates):
         range_m, status = z.copy(), self.status.copy()
         if rig is not None and self.pair is not None:
             directions = rig.pinhole.directions(rig.pinhole.pixel_centres())
-            along = (
-                directions @ self.pair.R_rectified_first[2]
-            )  # depth of the rectified camera per depth of the real one
+            # Depth of the rectified camera per depth of the real one
+            along = directions @ self.pair.R_rectified_first[2]
             depth = self.pair.parallel.depth(self.disparity_px) / along
             z = np.where(depth > 0, depth, np.nan).astype(np.float32)
             status[self.valid & ~np.isfinite(z)] = Status.OUT_OF_RANGE
@@ -152,9 +158,7 @@ def match_capture(
     pair : RectifiedPair; None: both images are rectified already.
     disparities_px : least and largest disparity, rectified pixels.
     """
-    frame = capture.frames.mean(axis=0, dtype=np.float32) - np.float32(capture.black_level)
-    frame[~np.isfinite(capture.frames[0])] = np.nan
-    own_noise = noise.of(capture, capture.frames.mean(axis=0, dtype=np.float32)) / np.sqrt(len(capture.frames))
+    frame, own_noise = noise.mean_image(capture)
     if pair is None:
         rectified, noises = (frame, other_image), (own_noise, other_noise)
     else:

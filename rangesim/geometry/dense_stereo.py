@@ -27,16 +27,20 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 
 from pcgraph.parallel import MIN_ROWS, in_blocks, kernel, routine, side_by_side
-from rangesim.geometry.stereo import match_rows
+from rangesim.geometry.stereo import checked_images, contrast_limits, match_rows
 from rangesim.settings.bounds import Bounds, check_fields
 
-CENSUS_ROWS, CENSUS_COLUMNS = 3, 4
-"""Half sizes of the census window in pixels: 7 rows of 9 pixels, whose 62 comparisons fit a word of 64 bits."""
+CENSUS_ROWS = 3
+"""Number of rows of the census window above its middle, and as many below. With `CENSUS_COLUMNS` the window has 7 rows
+of 9 pixels, because their 62 comparisons fit a word of 64 bits."""
+CENSUS_COLUMNS = 4
+"""Number of columns of the census window on either side of its middle; see `CENSUS_ROWS`."""
 LARGEST_COST = 62
 """Largest cost of a match, dimensionless: all comparisons of the census differ. ZNCC is scaled to the same range, so
 that one pair of penalties serves both."""
 ROUNDING = 1e-9
-"""Fraction of the squared derivatives below which a remainder is rounding, and no texture."""
+"""Fraction of the squared derivatives. A difference of two sums of them that is smaller is an error of rounding, and
+not texture; double precision leaves errors far below it."""
 PATHS = 8
 """Number of paths of the semi-global aggregation: all directions to neighbours, as the paper recommends. Means over
 windows are multiplied by it, so that both aggregations have one scale."""
@@ -55,20 +59,25 @@ MAX_STEP_PX = 1
 """Largest difference of whole disparities, in pixels, of the middle of a window and of a pixel that supports it. On a
 slanted surface neighbours differ by one; at a depth edge they differ by more."""
 DIRECTIONS = 16
-"""Number of directions, evenly around a pixel, in each of which there must be texture."""
-BESIDE_PX, AROUND = 2.5, 1.5
-"""Least distance of that texture from the pixel along the direction, pixels, about the half width of a sharp edge in
-the derivatives; and radius of the disc in which it lies, as a multiple of the side of the window. At the defaults the
-segment of the disc has the area of more than two windows, and holds ten dots."""
+"""Number of directions, evenly around a pixel, in each of which `is_enclosed` asks for texture. The segments of a disc
+in neighbouring directions overlap by more than half, so no side of a pixel is left out."""
+BESIDE_PX = 2.5
+"""Least distance of that texture from the pixel along the direction, in pixels: about the half width that a sharp edge
+has in the derivatives."""
+AROUND = 1.5
+"""Radius of the disc in which that texture lies, as a multiple of the side of the window. At the defaults the segment
+of the disc in one direction has the area of more than two windows, and holds ten dots."""
 SEGMENT_SHARE = 0.1
-"""Fraction of the texture that locates a match to `max_sigma_px` which a segment must have."""
+"""Least texture of a segment, as a fraction of the texture that locates a match to `max_sigma_px`."""
 UNMATCHED = 2.0
-"""Ratio of the variance of the difference of two noises to that of one of them, which is what is left of noise that has
-no match: its gain is near 0."""
+"""Ratio of two variances: that of the difference of two independent noises of equal strength, and that of one of them.
+Where there is no match, the fit has a gain near 0, so its residuals are the noise of one image alone."""
 MAX_STEPS = 32_000
-"""Largest number of steps between disparities in an image of 16-bit integers, as OpenCV's filter of speckles takes."""
+"""Largest number of steps between the least and the largest disparity, because OpenCV's filter of speckles takes images
+of 16-bit integers, which end at 32 767."""
 BIG = 30_000
-"""A cost that no path has: with eight paths of at most `LARGEST_COST` + penalty each, sums stay below it."""
+"""A cost that no path has, in the unit of `LARGEST_COST`. One path costs at most `LARGEST_COST` + the large penalty,
+and the sum of all eight stays below this value."""
 
 
 class MatchOutcome(IntEnum):
@@ -103,8 +112,8 @@ class DenseMatching:
     aggregation : "semi-global" or "local"; "opencv" is always semi-global.
     window_px : odd number of pixels, side of the window of ZNCC, of local aggregation, of OpenCV's blocks and of the
         refinement.
-    small_penalty, large_penalty : costs of a change of disparity by one pixel and by more, for "semi-global"; the cost
-        of a match is 0 to `LARGEST_COST`.
+    small_penalty, large_penalty : costs of a change of disparity by one pixel, and by more than one, along a path of
+        the "semi-global" aggregation; the cost of a match is 0 to `LARGEST_COST`.
     uniqueness : fraction by which the aggregated cost of any other disparity must be larger than the least one.
     min_advantage : cost by which the mean over the window of any other disparity must be larger. It refuses repeated
         texture, which the paths of semi-global aggregation tell apart by the border of the image alone.
@@ -112,8 +121,8 @@ class DenseMatching:
     max_sigma_px : largest standard deviation of a disparity in pixels that counts as enough texture.
     min_correlation : least correlation coefficient of both windows after the refinement. Images of noise alone reach
         0.3 to 0.6 where a matcher may choose the place.
-    min_slope_correlation : the same of their derivatives along the row. An even slope of the brightness gives windows
-        a high correlation, but locates nothing: then the derivatives are noise, and differ.
+    min_slope_correlation : least correlation coefficient of their derivatives along the row. An even slope of the
+        brightness gives both windows a high correlation, but locates nothing; their derivatives are noise, and differ.
     min_region_px : number of pixels; smaller regions of connected matches, whose neighbours differ by at most a pixel
         of disparity, are refused as speckles. 0: none are.
     refine : whether disparities are refined, see the module. Without it they come from a parabola through three costs.
@@ -204,14 +213,8 @@ def match_densely(
     5.3
     """
     settings = settings or DenseMatching()
-    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
-    if a.ndim != 2 or a.shape != b.shape:
-        raise ValueError(f"expected two images of one shape (h, w), got {a.shape} and {b.shape}.")
+    a, b = checked_images(first, second, disparities_px)
     least, largest = disparities_px
-    if not (np.isfinite([least, largest]).all() and least < largest and largest - least < a.shape[1]):
-        raise ValueError(
-            f"expected disparities (least, largest) within an image {a.shape[1]} pixels wide, got {disparities_px!r}."
-        )
     noises = tuple(np.broadcast_to(np.asarray(n, dtype=np.float32), a.shape).copy() for n in noise)
     images = a.astype(np.float32), b.astype(np.float32)
     if settings.method == "opencv":
@@ -221,16 +224,15 @@ def match_densely(
     known = np.isfinite(a)
     outcome[~known] = MatchOutcome.NO_IMAGE
     fit = refine_disparities(images, noises, whole, settings)
-    matched = outcome == MatchOutcome.MATCHED
     # Where the texture does not suffice, neither a match nor its failure means anything
     is_flat = locating_sigma(images[0], noises, settings.reach) > settings.max_sigma_px
     outcome[known & is_flat] = MatchOutcome.NO_TEXTURE
-    still = outcome == MatchOutcome.MATCHED
-    outcome[still & ~is_enclosed(images[0], fit.variance, still, settings)] = MatchOutcome.NO_TEXTURE
+    matched = outcome == MatchOutcome.MATCHED
+    outcome[matched & ~is_enclosed(images[0], fit.variance, matched, settings)] = MatchOutcome.NO_TEXTURE
     is_alike = fit.slope_correlation >= settings.min_slope_correlation
     is_sure = is_alike & (fit.correlation >= settings.min_correlation) & (fit.sigma_px <= settings.max_sigma_px)
     refused = ~(np.isfinite(fit.disparity_px) & is_sure)
-    outcome[matched & (outcome == MatchOutcome.MATCHED) & refused] = MatchOutcome.AMBIGUOUS
+    outcome[(outcome == MatchOutcome.MATCHED) & refused] = MatchOutcome.AMBIGUOUS
     found = fit.disparity_px if settings.refine else whole
     outside = ~((found >= least) & (found <= largest)) & (outcome == MatchOutcome.MATCHED)
     outcome[outside] = MatchOutcome.OUT_OF_RANGE
@@ -253,12 +255,8 @@ def locating_sigma(image: np.ndarray, noises: tuple[np.ndarray, ...], reach: int
     """
     from scipy.ndimage import uniform_filter
 
-    known = np.isfinite(image).astype(np.float64)
-    filled = np.nan_to_num(image.astype(np.float64))
-    derivative, usable = np.zeros(image.shape), np.zeros(image.shape)
-    derivative[:, 1:-1] = (filled[:, 2:] - filled[:, :-2]) / 2
-    usable[:, 1:-1] = known[:, 2:] * known[:, :-2]
-    derivative *= usable
+    slopes = _slopes(image)
+    derivative, usable = np.nan_to_num(slopes), np.isfinite(slopes).astype(np.float64)
     own = noises[0].astype(np.float64) ** 2
     side = 2 * reach + 1
     mean, squares, weight = (uniform_filter(v, side, mode="constant") for v in (derivative, derivative**2, usable))
@@ -269,24 +267,28 @@ def locating_sigma(image: np.ndarray, noises: tuple[np.ndarray, ...], reach: int
         return np.where(texture > tiny, np.sqrt(variance / (texture * side**2)), np.inf)
 
 
+def _slopes(image: np.ndarray) -> np.ndarray:
+    """(h, w) float64, central differences along the rows, per pixel; NaN where a neighbour has no finite value."""
+    values = np.where(np.isfinite(image), image, np.nan).astype(np.float64)
+    slopes = np.full(image.shape, np.nan)
+    slopes[:, 1:-1] = (values[:, 2:] - values[:, :-2]) / 2
+    return slopes
+
+
 def is_enclosed(image: np.ndarray, variance: np.ndarray, matched: np.ndarray, settings: DenseMatching) -> np.ndarray:
     """(h, w) bool, whether texture encloses a pixel of the first image.
 
     A window that holds nothing but one edge finds the place of the edge, not that of its middle: beside the outline of
-    a thing before an even wall, the wall would get the depth of the thing. Such a pixel has a
-    direction in which there is no texture. Texture counts in units of the noise, which is that of the match at the
-    pixel or around it, whichever is less. A segment that is not in the image by half counts as textured.
+    a thing before an even wall, the wall would get the depth of the thing. Such a pixel has a direction in which there
+    is no texture. Texture is counted in units of the noise: that of the match at the pixel, or that around it,
+    whichever is less. A segment of which at least half lies outside the image counts as textured.
 
     Parameters
     ----------
     image : (h, w) float, NaN where there is none.
     variance : (h, w) float64, variance of the difference of both images at a match; NaN where there is none.
     """
-    known = np.isfinite(image)
-    filled = np.nan_to_num(image.astype(np.float64))
-    squares = np.full(image.shape, np.nan)
-    squares[:, 1:-1] = (filled[:, 2:] - filled[:, :-2]) ** 2 / 4
-    squares[:, 1:-1][~(known[:, 2:] & known[:, :-2])] = np.nan
+    squares = _slopes(image) ** 2
     outer = AROUND * settings.window_px
     reach = int(outer)
     dy, dx = (v.ravel() for v in np.mgrid[-reach : reach + 1, -reach : reach + 1])
@@ -360,7 +362,8 @@ def _by_opencv(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Disparities (h, w) float64 of OpenCV's matcher, and outcomes. OpenCV does not say why a pixel has no match, so
     all of these count as ambiguous."""
-    if not any(np.nanmax(image, initial=-np.inf) > np.nanmin(image, initial=np.inf) for image in images[:1]):
+    low, high = contrast_limits(images[0].astype(np.float64))
+    if not high > low:
         nothing = np.full(images[0].shape, np.nan)
         return nothing, np.full(images[0].shape, MatchOutcome.AMBIGUOUS, dtype=np.uint8)
     found = match_rows(*images, disparities_px, settings.window_px).astype(np.float64)
@@ -720,7 +723,7 @@ def refine_disparities(
     own = spline_filter1d(np.nan_to_num(images[0].astype(np.float64)), order=3, axis=1, mode="mirror")
     slopes[:, 1:-1] = (own[:, 2:] - own[:, :-2]) / 2
     size = images[0].shape
-    result = Refinement(*(np.full(size, np.nan) for _ in range(5)))
+    result = Refinement(*(np.full(size, np.nan) for _ in Refinement._fields))
     in_blocks(
         _refine, size[0], images[0].astype(np.float64), slopes, known[0], splines, known[1],
         *(n.astype(np.float64) for n in noises), disparity_px, settings.reach, result, smallest=MIN_ROWS,

@@ -279,14 +279,8 @@ def match_rows(
     """
     import cv2
 
-    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
-    if a.ndim != 2 or a.shape != b.shape:
-        raise ValueError(f"expected two images of one shape (h, w), got {a.shape} and {b.shape}.")
+    a, b = checked_images(first, second, disparities_px)
     least, largest = disparities_px
-    if not (np.isfinite([least, largest]).all() and least < largest and largest - least < a.shape[1]):
-        raise ValueError(
-            f"expected disparities (least, largest) within an image {a.shape[1]} pixels wide, got {disparities_px!r}."
-        )
     if block_px < 1 or block_px % 2 == 0:
         raise ValueError(f"expected block_px odd and positive, got {block_px!r}.")
     known = np.isfinite(a)
@@ -318,12 +312,38 @@ def match_rows(
     return found
 
 
+def checked_images(first: np.ndarray, second: np.ndarray, disparities_px: tuple[float, float]) -> tuple[Array, Array]:
+    """Both images of a rectified pair as (h, w) float64.
+
+    Raises
+    ------
+    ValueError
+        The images differ in shape, or the range of disparities is empty or wider than the image.
+    """
+    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    if a.ndim != 2 or a.shape != b.shape:
+        raise ValueError(f"expected two images of one shape (h, w), got {a.shape} and {b.shape}.")
+    least, largest = disparities_px
+    if not (np.isfinite([least, largest]).all() and least < largest and largest - least < a.shape[1]):
+        raise ValueError(
+            f"expected disparities (least, largest) within an image {a.shape[1]} pixels wide, got {disparities_px!r}."
+        )
+    return a, b
+
+
+def contrast_limits(image: np.ndarray) -> tuple[float, float]:
+    """Quantiles of 0.5 % and 99.5 % of an image (h, w), between which the matcher sees contrast; NaN for no image."""
+    known = image[~np.isnan(image)]
+    low, high = np.quantile(known, [0.005, 0.995]) if known.size else (np.nan, np.nan)
+    return float(low), float(high)
+
+
 def _eight_bits(first: Array, second: Array) -> tuple[np.ndarray, np.ndarray]:
     """Both images (h, w) as 8-bit integers on one scale, from the 0.5 % to the 99.5 % quantile of the first.
 
     Pixels without an image become 0.
     """
-    low, high = np.nanquantile(first, [0.005, 0.995])
+    low, high = contrast_limits(first)
     if not high > low:
         raise ValueError("expected images with contrast, got a first image of one value.")
     result = [

@@ -25,8 +25,8 @@ from rangesim.settings.bounds import Bounds, Metres, check_fields
 if TYPE_CHECKING:
     from rangesim.rig import Rig
 
-PIXEL_VARIANCE = 1 / 12
-"""Variance of a place within a pixel, in pixels squared: that of an even distribution."""
+ROUNDING_VARIANCE = 1 / 12
+"""Variance of an even distribution over one step, in squared steps: that of the error of rounding."""
 
 Disparity = Annotated[float, Bounds("pixels", -1e5, 1e5)]
 """A disparity in rectified pixels; the bounds exclude nonsense."""
@@ -185,10 +185,8 @@ class StereoDecoder(Decoder):
         if first.rig is not None and second.rig is not None:
             T_second_first = np.linalg.inv(second.rig.T_world_camera) @ first.rig.T_world_camera
             pair = rectify(first.rig.pinhole, second.rig.pinhole, T_second_first)
-        frame = second.frames.mean(axis=0, dtype=np.float32)
-        noise = self.noise.of(second, frame) / np.sqrt(len(second.frames))
+        image, noise = self.noise.mean_image(second)
         searched = self.least_px, self.least_px + self.disparities
-        image = frame - np.float32(second.black_level)
         found = match_capture(first, image, noise, pair, searched, self.matching, self.noise)
         return quantised(found, self.step_px)
 
@@ -231,7 +229,7 @@ def quantised(found: Disparities, step_px: float, from_px: float = 0.0) -> Dispa
     if not step_px:
         return found
     rounded = np.rint((found.disparity_px - from_px) / step_px) * step_px + from_px
-    sigma = np.sqrt(found.sigma_px**2 + step_px**2 * PIXEL_VARIANCE)
+    sigma = np.sqrt(found.sigma_px**2 + step_px**2 * ROUNDING_VARIANCE)
     return replace(found, disparity_px=rounded, sigma_px=sigma)
 
 
