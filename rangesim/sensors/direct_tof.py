@@ -11,7 +11,15 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.decoding.histogram import find_peak, place_sigma, runs_out, trials_left, undo_pile_up, window_reach
+from rangesim.decoding.histogram import (
+    find_peak,
+    pile_up_excess,
+    place_sigma,
+    runs_out,
+    trials_left,
+    undo_pile_up,
+    window_reach,
+)
 from rangesim.decoding.path_length import LengthReturns, PathLengths
 from rangesim.decoding.returns import PulseShape, ReturnRules, find_returns
 from rangesim.decoding.status import Status
@@ -349,7 +357,7 @@ class DirectToFDecoder(Decoder):
         def measure(start: int, stop: int) -> None:
             for row in range(start, stop):
                 frames = capture.frames[:, row]
-                histogram = frames.astype(np.float64) if blind is None else undo_pile_up(frames, blind)[0]
+                histogram = frames.astype(np.float64) if blind is None else undo_pile_up(frames, blind)
                 found = find_peak(histogram, sensor.sigma_bins, sensor.is_cyclic)
                 position[row], peak[row], background[row] = found
                 if blind is not None:
@@ -392,13 +400,13 @@ class DirectToFDecoder(Decoder):
                 frames = capture.frames[:, row]
                 histogram, excess = frames.astype(np.float64), None
                 if blind is not None:
-                    histogram, excess = undo_pile_up(frames, blind)
+                    histogram, excess = undo_pile_up(frames, blind), pile_up_excess(frames, blind)
                 found = find_returns(np.nan_to_num(histogram), sensor.shape, rules, sensor.is_cyclic, excess)
                 place[:, row], strength[:, row], sigma[:, row] = found
                 intensity[row] = frames.sum(axis=0, dtype=np.float64)
                 if blind is not None:
                     at = np.nan_to_num(found.place)
-                    kept[:, row] = [trials_left(frames, a, blind, sensor.sigma_bins, sensor.is_cyclic) for a in at]
+                    kept[:, row] = trials_left(frames, at, blind, sensor.sigma_bins, sensor.is_cyclic)
 
         rules = ReturnRules(most, self.peak_sigmas, self.min_counts, self.pulse_tolerance)
         if not capture.is_digital:  # radiances have no noise; how strong is strong, the image tells
