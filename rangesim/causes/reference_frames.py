@@ -30,7 +30,8 @@ TEXTURE_PATHS = 13
 """Number of light paths over the area of a pixel for sensors that compare texture.
 
 Every pixel of every camera then needs its area. Dots are about as wide as a pixel, so fewer paths than
-`FOOTPRINT_PATHS` suffice. With 55, `explain` takes three times as long, and no failed pixel of the tabletop gets another cause.
+`FOOTPRINT_PATHS` suffice. With 55, `explain` takes three times as long, and no failed pixel of the tabletop gets
+another cause.
 """
 TEXTURE_STEP = 8
 """Step of the lattice with `TEXTURE_PATHS`, counted in lattice points: the Fibonacci number before it, see
