@@ -23,7 +23,6 @@ from rangesim.causes.reference_frames import (
 )
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
-from rangesim.electronics.spad import SpadDetector
 from rangesim.evaluation.depth_edges import across, depth_edges
 from rangesim.evaluation.neighbourhood import IMAGE, Neighbourhood, neighbourhood
 from rangesim.evaluation.reference_readings import ReferenceReadings
@@ -147,10 +146,7 @@ class Evidence:
     def piled_up(self) -> np.ndarray:
         """Whether more than `MAX_PULSES_HIT` of the pulses brought a photon, or the decoder found that the pulses ran
         out although no counter is full."""
-        detector, capture = self.capture.detector, self.capture
-        if not isinstance(detector, SpadDetector):
-            return np.zeros(self.true_m.shape, dtype=bool)
-        blind = detector.blindness(capture.sensor.gate, capture.exposure_s)
+        capture, blind = self.capture, self.capture.blindness
         if blind is None:
             return np.zeros(self.true_m.shape, dtype=bool)
         ran_out = (self.image.status == Status.SATURATED) & ~capture.saturated(capture.frames)

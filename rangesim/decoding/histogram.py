@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rangesim.electronics.spad import Blindness
+from rangesim.electronics.detector import Blindness
 
 MIN_PULSES_LEFT = 10
 """Least number of pulses that have met no photon by the end of a peak's window. With m left, a bin that Coates' formula

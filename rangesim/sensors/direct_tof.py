@@ -25,7 +25,7 @@ from rangesim.decoding.returns import PulseShape, ReturnRules, find_returns
 from rangesim.decoding.status import Status
 from rangesim.decoding.working_range import WorkingRange
 from rangesim.electronics.detector import Gate
-from rangesim.electronics.spad import Blindness, SpadDetector
+from rangesim.electronics.spad import SpadDetector
 from rangesim.response import SPEED_OF_LIGHT, Pulse, Response, TransientHistogram
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, Threshold, of_type
 from rangesim.settings import limits
@@ -352,7 +352,7 @@ class DirectToFDecoder(Decoder):
 
         height, width = capture.frames.shape[1:]
         position, peak, background, intensity = np.empty((4, height, width))
-        left, blind = np.empty((height, width), dtype=np.int64), _blindness(capture)
+        left, blind = np.empty((height, width), dtype=np.int64), capture.blindness
 
         def measure(start: int, stop: int) -> None:
             for row in range(start, stop):
@@ -391,7 +391,7 @@ class DirectToFDecoder(Decoder):
         from pcgraph.parallel import MIN_ROWS, in_blocks
 
         height, width = capture.frames.shape[1:]
-        most, blind = self.max_returns + (self.min_range_m > 0), _blindness(capture)  # the cover glass is one more
+        most, blind = self.max_returns + (self.min_range_m > 0), capture.blindness  # the cover glass is one more
         place, strength, sigma, kept = np.empty((4, most, height, width))
         intensity = np.empty((height, width))
 
@@ -475,10 +475,3 @@ class DirectToFDecoder(Decoder):
 def _window_bins(sensor: DirectToF) -> int:
     """Number of bins in the window of a peak."""
     return 2 * window_reach(sensor.bins, sensor.sigma_bins, sensor.is_cyclic) + 1
-
-
-def _blindness(capture: Capture) -> Blindness | None:
-    """What hid photons from the timers of the detector; None if nothing did, or the detector is not known."""
-    if isinstance(capture.detector, SpadDetector):
-        return capture.detector.blindness(capture.sensor.gate, capture.exposure_s)
-    return None
