@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rangesim.electronics.detector import PhotoDetector
+from rangesim.electronics.detector import Blindness, PhotoDetector
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
 from rangesim.settings.config import ShortRepr
@@ -201,3 +201,8 @@ class Capture(ShortRepr):
         """Standard deviation of the noise of each pixel of a frame, in digital numbers, by the detector's formula; None
         if the detector is unknown or counts photons."""
         return self.detector.noise_dn(frame) if self.detector else None
+
+    @property
+    def blindness(self) -> Blindness | None:
+        """When the timers of the detector were blind; None if they never were, or the detector is unknown."""
+        return self.detector.blindness(self.sensor.gate, self.exposure_s) if self.detector else None

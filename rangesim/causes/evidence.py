@@ -16,14 +16,13 @@ from rangesim.capture import Capture
 from rangesim.capture.exposure import capture_of_frames
 from rangesim.causes.light_budget import LightBudget, light_budget, white_radiance
 from rangesim.causes.reference_frames import (
-    depth_on_plane,
+    TangentPlanes,
     footprint_frames,
     points_in_projector,
     single_path_frames,
 )
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
-from rangesim.electronics.spad import SpadDetector
 from rangesim.evaluation.depth_edges import across, depth_edges
 from rangesim.evaluation.neighbourhood import IMAGE, Neighbourhood, neighbourhood
 from rangesim.evaluation.reference_readings import ReferenceReadings
@@ -147,10 +146,7 @@ class Evidence:
     def piled_up(self) -> np.ndarray:
         """Whether more than `MAX_PULSES_HIT` of the pulses brought a photon, or the decoder found that the pulses ran
         out although no counter is full."""
-        detector, capture = self.capture.detector, self.capture
-        if not isinstance(detector, SpadDetector):
-            return np.zeros(self.true_m.shape, dtype=bool)
-        blind = detector.blindness(capture.sensor.gate, capture.exposure_s)
+        capture, blind = self.capture, self.capture.blindness
         if blind is None:
             return np.zeros(self.true_m.shape, dtype=bool)
         ran_out = (self.image.status == Status.SATURATED) & ~capture.saturated(capture.frames)
@@ -218,10 +214,12 @@ class Evidence:
         """Whether all neighbours lie on the tangent plane of the surface at the pixel's centre: the pixel covers
         one surface, however steep."""
         rig, where = self.signals.rig, self.failed & self.at_edge
-        fits = np.ones(np.count_nonzero(where), dtype=bool)
-        for at in zip(*(index.T for index in self.pixels.around(where, 1)), strict=True):
-            there = self.true_m[at].astype(np.float64)
-            plane = depth_on_plane(rig, self.truth, where, *rig.camera.rays_at(at))
+        planes, (rows, columns) = TangentPlanes(rig, self.truth, where), self.pixels.around(where, 1)
+        origins, rays = (x.reshape(*rows.shape, 3) for x in rig.camera.rays_at((rows.ravel(), columns.ravel())))
+        fits = np.ones(len(rows), dtype=bool)
+        for n in range(rows.shape[1]):
+            there = self.true_m[rows[:, n], columns[:, n]].astype(np.float64)
+            plane = planes.readings(origins[:, n], rays[:, n])
             fits &= np.abs(there - plane) <= across(np.fmin(there, plane), self.tolerance_m) - np.fmin(there, plane)
         result = np.zeros(where.shape, dtype=bool)
         result[where] = fits

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -25,12 +25,16 @@ FOOTPRINT_STEP = 34
 
 It is the Fibonacci number before `FOOTPRINT_PATHS`, because two such numbers make the lattice even.
 """
-TEXTURE_PATHS, TEXTURE_STEP = 13, 8
-"""The same two numbers for sensors that compare texture, where every pixel of every camera needs its area.
+TEXTURE_PATHS = 13
+"""Number of light paths over the area of a pixel for sensors that compare texture.
 
-Dots are about as wide as a pixel, so fewer paths suffice. With 55, `explain` takes three times as long, and no failed
-pixel of the tabletop gets another cause.
+Every pixel of every camera then needs its area. Dots are about as wide as a pixel, so fewer paths than
+`FOOTPRINT_PATHS` suffice. With 55, `explain` takes three times as long, and no failed pixel of the tabletop gets
+another cause.
 """
+TEXTURE_STEP = 8
+"""Step of the lattice with `TEXTURE_PATHS`, counted in lattice points: the Fibonacci number before it, see
+`FOOTPRINT_STEP`."""
 
 
 def single_path_frames(sensor: Sensor, rig: Rig, truth: GroundTruth) -> np.ndarray:
@@ -61,9 +65,10 @@ def footprint_frames(sensor: Sensor, rig: Rig, truth: GroundTruth, spread: np.nd
     channels, alone = _no_light(sensor, where.shape), where & ~spread
     _add(channels, sensor, alone, _straight_path(rig, truth, alone))
     paths, step = (TEXTURE_PATHS, TEXTURE_STEP) if sensor.compares_texture else (FOOTPRINT_PATHS, FOOTPRINT_STEP)
+    path_beside = _paths_beside(rig, truth, spread)
     for n in range(paths):
         offset = (n + 0.5) * np.array([1, step]) / paths % 1.0 - 0.5
-        _add(channels, sensor, spread, _path_beside(rig, truth, spread, offset), 1 / paths)
+        _add(channels, sensor, spread, path_beside(offset), 1 / paths)
     return sensor.frames(channels, where.astype(np.float32), np.zeros(where.shape, dtype=np.float32))
 
 
@@ -115,14 +120,19 @@ def points_in_projector(rig: Rig, reading: np.ndarray, where: np.ndarray) -> np.
     Coordinates of a beam are those of the camera, from the emitter of each ray.
     """
     origins, directions = rig.camera.rays_at(where)
-    return _in_projector(rig, where, origins + directions * reading[where].astype(np.float64)[:, None])
+    points = origins + directions * reading[where].astype(np.float64)[:, None]
+    return _to_projector(rig, where, origins)(points)
 
 
-def _in_projector(rig: Rig, where: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points (n, 3) of the n pixels `where`, from camera coordinates to projector coordinates, metres."""
+def _to_projector(rig: Rig, where: np.ndarray, origins: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Function from points (n, 3) in camera coordinates to those in projector coordinates, metres.
+
+    where : (h, w) bool, the n pixels of the points. origins : (n, 3), origins of the rays through their centres.
+    """
     if isinstance(rig.projector, Beam):
-        return np.asarray(points - rig.camera.rays_at(where)[0] - rig.emitter_offsets[where])
-    return np.asarray((points - rig.T_camera_projector[:3, 3]) @ rig.T_camera_projector[:3, :3])
+        emitters = rig.emitter_offsets[where]
+        return lambda points: np.asarray(points - origins - emitters)
+    return lambda points: np.asarray((points - rig.T_camera_projector[:3, 3]) @ rig.T_camera_projector[:3, :3])
 
 
 def _straight_path(rig: Rig, truth: GroundTruth, where: np.ndarray) -> LightPath:
@@ -131,31 +141,49 @@ def _straight_path(rig: Rig, truth: GroundTruth, where: np.ndarray) -> LightPath
     return _path(rig, points_in_projector(rig, rig.camera.reading(truth), where), truth.range_m[where])
 
 
-def _path_beside(rig: Rig, truth: GroundTruth, where: np.ndarray, offset: np.ndarray) -> LightPath:
-    """Light paths as in `_straight_path`, but to the tangent planes, `offset` (2,) pixels beside the centres."""
-    origin, ray = rig.camera.rays_at(where, offset)
-    depth = depth_on_plane(rig, truth, where, origin, ray)
-    along = ray * np.where(np.isfinite(depth), depth, rig.camera.reading(truth)[where])[:, None]
-    return _path(rig, _in_projector(rig, where, origin + along), np.linalg.norm(along, axis=-1))
+def _paths_beside(rig: Rig, truth: GroundTruth, where: np.ndarray) -> Callable[[np.ndarray], LightPath]:
+    """Function from offsets (2,), pixels, to light paths as in `_straight_path`, but to the tangent planes, and so far
+    beside the centres."""
+    planes, rays_beside = TangentPlanes(rig, truth, where), rig.camera.rays_beside(where)
+    to_projector = _to_projector(rig, where, planes.origins)
+
+    def path(offset: np.ndarray) -> LightPath:
+        origins, rays = rays_beside(offset)
+        readings = planes.readings(origins, rays)
+        along = rays * np.where(np.isfinite(readings), readings, planes.at_centres)[:, None]
+        return _path(rig, to_projector(origins + along), np.linalg.norm(along, axis=-1))
+
+    return path
 
 
-def depth_on_plane(rig: Rig, truth: GroundTruth, where: np.ndarray, origin: np.ndarray, ray: np.ndarray) -> np.ndarray:
-    """(n,) float64 readings, in metres, where rays meet the tangent planes of the surfaces of n pixels.
-
-    A reading is NaN where a ray meets its plane behind the camera, or not at all.
+class TangentPlanes:
+    """Tangent planes of the surfaces at the centres of n pixels.
 
     Parameters
     ----------
     where : (h, w) bool, the n pixels.
-    origin, ray : (n, 3) float, camera coordinates, as `Camera.rays_at` returns them.
+
+    Attributes
+    ----------
+    origins : (n, 3) float64, metres, camera coordinates, origins of the rays through the centres.
+    at_centres : (n,) float32, metres, readings along these rays.
     """
-    normal = truth.normal[where].astype(np.float64) @ rig.T_world_camera[:3, :3]
-    start, centre = rig.camera.rays_at(where)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = rig.camera.reading(truth)[where] * np.sum(normal * centre, axis=-1) / np.sum(normal * ray, axis=-1)
-        if not rig.camera.is_pinhole:
-            depth = depth + np.sum(normal * (start - origin), axis=-1) / np.sum(normal * ray, axis=-1)
-    return np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
+
+    def __init__(self, rig: Rig, truth: GroundTruth, where: np.ndarray) -> None:
+        self.origins, rays = rig.camera.rays_at(where)
+        self.at_centres = rig.camera.reading(truth)[where]
+        self._normals = truth.normal[where].astype(np.float64) @ rig.T_world_camera[:3, :3]
+        self._heights = self.at_centres * np.sum(self._normals * rays, axis=-1)
+
+    def readings(self, origins: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        """(n,) float64 readings, in metres, where rays meet the planes; NaN behind the camera, or where they never do.
+
+        origins, rays : (n, 3) float, camera coordinates, as `Camera.rays_at` returns them.
+        """
+        approach = np.sum(self._normals * rays, axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            result = self._heights / approach + np.sum(self._normals * (self.origins - origins), axis=-1) / approach
+        return np.where(np.isfinite(result) & (result > 0), result, np.nan)
 
 
 def _path(rig: Rig, point: np.ndarray, range_m: np.ndarray) -> LightPath:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rangesim.electronics.spad import Blindness
+from rangesim.electronics.detector import Blindness
 
 MIN_PULSES_LEFT = 10
 """Least number of pulses that have met no photon by the end of a peak's window. With m left, a bin that Coates' formula
@@ -86,23 +86,6 @@ def coates(counts: np.ndarray, pulses: int) -> np.ndarray:
     return np.asarray(-pulses * np.log1p(-fraction)).reshape(counts.shape)
 
 
-def coates_excess(counts: np.ndarray, pulses: int) -> np.ndarray:
-    """(k, n) float64, variance of the counts that `coates` returns over their means: all pulses by those left.
-
-    Parameters
-    ----------
-    counts : (k, n) int, histograms of the first photon of each of `pulses` pulses, as the detector counted them.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> coates_excess(np.array([[500], [250], [0]]), pulses=1000).ravel()
-    array([1., 2., 4.])
-    """
-    used = np.cumsum(counts, axis=0, dtype=np.int64)
-    return np.asarray(pulses / np.maximum(pulses - (used - counts), 1))
-
-
 def armed(counts: np.ndarray, blind: Blindness) -> np.ndarray:
     """(k, n) float64, number of trials in which a SPAD is armed when a bin begins, on average over the bin.
 
@@ -140,8 +123,8 @@ def armed(counts: np.ndarray, blind: Blindness) -> np.ndarray:
     return np.asarray(np.maximum(blind.trials - (before[ends] - begun), 0.0))
 
 
-def undo_pile_up(counts: np.ndarray, blind: Blindness) -> tuple[np.ndarray, np.ndarray]:
-    """(k, n) float64 each: counts without pile-up, and the variance of these counts over their means.
+def undo_pile_up(counts: np.ndarray, blind: Blindness) -> np.ndarray:
+    """(k, n) float64, counts without pile-up.
 
     Without dead time it is `coates`; with it, the pulses that were left are those that `armed` says.
 
@@ -152,35 +135,51 @@ def undo_pile_up(counts: np.ndarray, blind: Blindness) -> tuple[np.ndarray, np.n
     from rangesim.decoding.histogram_kernels import MAX_FRACTION
 
     if blind.dead == 0:
-        return coates(counts, blind.trials), coates_excess(counts, blind.trials)
+        return coates(counts, blind.trials)
     able = np.maximum(armed(counts, blind), 1.0)
-    return -blind.trials * np.log1p(-np.minimum(counts / able, MAX_FRACTION)), blind.trials / able
+    return np.asarray(-blind.trials * np.log1p(-np.minimum(counts / able, MAX_FRACTION)))
+
+
+def pile_up_excess(counts: np.ndarray, blind: Blindness) -> np.ndarray:
+    """(k, n) float64, variance of the counts that `undo_pile_up` returns over their means: all trials by those armed.
+
+    Parameters
+    ----------
+    counts : (k, n) int, histograms as the detector counted them.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> pile_up_excess(np.array([[500], [250], [0]]), Blindness(1000, True, dead=0.0, period=3.0)).ravel()
+    array([1., 2., 4.])
+    """
+    return np.asarray(blind.trials / np.maximum(armed(counts, blind), 1.0))
 
 
 def trials_left(
     counts: np.ndarray, place: np.ndarray, blind: Blindness, sigma_bins: float, is_cyclic: bool
 ) -> np.ndarray:
-    """(n,) int64, least number of armed trials that a bin in the window of each peak leaves without a photon.
+    """(..., n) int64, least number of armed trials that a bin in the window of each peak leaves without a photon.
 
     Without dead time it is `pulses_left`, whose parameters it has.
     """
     if blind.dead == 0:
         return pulses_left(counts, place, blind.trials, sigma_bins, is_cyclic)
     bins, reach = len(counts), window_reach(len(counts), sigma_bins, is_cyclic)
-    at = np.floor(place).astype(np.int64) + np.arange(-reach, reach + 1)[:, None]
+    at = np.floor(place).astype(np.int64) + np.arange(-reach, reach + 1).reshape(-1, *[1] * place.ndim)
     at = at % bins if is_cyclic else np.clip(at, 0, bins - 1)
     left = armed(counts, blind) - counts
-    return np.asarray(np.take_along_axis(left, at, axis=0).min(axis=0).astype(np.int64))
+    return np.asarray(left[at, np.arange(counts.shape[1])].min(axis=0).astype(np.int64))
 
 
 def pulses_left(counts: np.ndarray, place: np.ndarray, pulses: int, sigma_bins: float, is_cyclic: bool) -> np.ndarray:
-    """(n,) int64, number of pulses that have met no photon by the end of the window of each peak.
+    """(..., n) int64, number of pulses that have met no photon by the end of the window of each peak.
 
     Parameters
     ----------
     counts : (k, n) int, histograms of the first photon of each of `pulses` pulses, as the detector counted them.
-    place : (n,) float, bins, places of the peaks that `find_peak` found in `coates` of them with the same `sigma_bins`
-        and `is_cyclic`.
+    place : (..., n) float, bins, places of the peaks that `find_peak` or `find_returns` found in `coates` of them with
+        the same `sigma_bins` and `is_cyclic`.
 
     Examples
     --------

@@ -139,7 +139,7 @@ def find_returns(
     ----------
     histogram : (k, n) float, counts without pile-up, one histogram per column.
     is_cyclic : whether the first bin follows on the last one.
-    excess : (k, n) float, variance of the counts over their means, as `coates_excess` tells it; None: 1, as of photons.
+    excess : (k, n) float, variance of the counts over their means, see `pile_up_excess`; None: 1, as of photons.
 
     Examples
     --------

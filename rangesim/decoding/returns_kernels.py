@@ -45,9 +45,10 @@ def fit_returns(histograms, excess, shape, rules, is_cyclic, distance, place, st
     template = np.empty(shape.before + shape.behind + 1)
     for j in range(len(template)):
         template[j] = _part(shape, j - shape.before - 0.5)
-    template[template < CORE * template.max()] = 0.0
-    excesses = np.ones(bins)
-    counts, expected, others, is_refused = np.empty(bins), np.empty(bins), np.empty(bins), np.empty(bins, np.bool_)
+    core = CORE * template.max()
+    template[template < core] = 0.0
+    excesses, counts, expected, others = np.empty((4, bins))
+    is_refused = np.empty(bins, np.bool_)
     at, n, spread, at_before, n_before = np.empty((5, rules.most))
     for column in range(columns):
         total = 0.0
@@ -72,7 +73,7 @@ def fit_returns(histograms, excess, shape, rules, is_cyclic, distance, place, st
                 for i in range(found):
                     _expect(others, level, at, n, found, i, shape, is_cyclic)
                     was = at[i]
-                    at[i], n[i], spread[i] = _fit(counts, others, excesses, at[i], n[i], shape, is_cyclic)
+                    at[i], n[i], spread[i] = _fit(counts, others, excesses, at[i], n[i], shape, core, is_cyclic)
                     moved = max(moved, abs(at[i] - was) - SETTLED * spread[i])
                 _expect(expected, level, at, n, found, -1, shape, is_cyclic)
                 level_was, level = level, _level(counts, expected, level, rules.tolerance)
@@ -83,28 +84,26 @@ def fit_returns(histograms, excess, shape, rules, is_cyclic, distance, place, st
                 at[:found], n[:found], level = at_before[:found], n_before[:found], level_before
                 is_refused[candidate] = True
         if found > 1:
-            _widen(spread, level, at, n, found, excesses, shape, is_cyclic)
+            _widen(spread, level, at, n, found, excesses, shape, core, is_cyclic)
         _write(at, n, spread, found, column, place, strength, sigma, bins, is_cyclic)
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def _widen(spread, level, at, n, found, excess, shape, is_cyclic):  # type: ignore[no-untyped-def]
+def _widen(spread, level, at, n, found, excess, shape, core, is_cyclic):  # type: ignore[no-untyped-def]
     """Raise the standard deviations of the places of returns that overlap to those of a fit of all of them at once.
 
-    They follow from the inverse of the Fisher information of all places and strengths.
+    They follow from the inverse of the Fisher information of all places and strengths. core : see `_fit`.
     """
     bins, size = len(excess), 2 * found
     expected, slopes, information = np.empty(bins), np.zeros((size, bins)), np.zeros((size, size))
     _expect(expected, level, at, n, found, -1, shape, is_cyclic)
-    least, strongest = 0.0, 0.0
-    for j in range(-shape.before, shape.behind + 1):
-        least = max(least, CORE * _part(shape, j - 0.5))
+    strongest = 0.0
     for i in range(found):
         strongest = max(strongest, n[i])
         middle = math.floor(at[i])
         for b in range(middle - shape.before, middle + shape.behind + 1):
             part = _part(shape, b - at[i])
-            if part >= least and (is_cyclic or 0 <= b < bins):
+            if part >= core and (is_cyclic or 0 <= b < bins):
                 slopes[2 * i, b % bins] += -n[i] * (_density(shape, b + 1 - at[i]) - _density(shape, b - at[i]))
                 slopes[2 * i + 1, b % bins] += part
     overlap = False
@@ -236,14 +235,14 @@ def _expect(expected, level, at, n, found, without, shape, is_cyclic):  # type: 
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def _fit(counts, others, excess, at, n, shape, is_cyclic):  # type: ignore[no-untyped-def]
+def _fit(counts, others, excess, at, n, shape, core, is_cyclic):  # type: ignore[no-untyped-def]
     """Place, strength and the place's standard deviation of one return, after some scoring steps.
 
     The score and the Fisher information are those of Poisson counts with the means n part_b(at) + others_b.
+
+    core : least part of the pulse in a bin that is fitted, see `CORE`.
     """
-    bins, spread, least = len(counts), np.inf, 0.0
-    for j in range(-shape.before, shape.behind + 1):
-        least = max(least, CORE * _part(shape, j - 0.5))
+    bins, spread = len(counts), np.inf
     for _ in range(STEPS):
         nn = np_ = pp = gn = gp = 0.0
         middle = math.floor(at)
@@ -251,7 +250,7 @@ def _fit(counts, others, excess, at, n, shape, is_cyclic):  # type: ignore[no-un
             if not is_cyclic and (b < 0 or b >= bins):
                 continue
             part = _part(shape, b - at)
-            if part < least:
+            if part < core:
                 continue
             slope = -n * (_density(shape, b + 1 - at) - _density(shape, b - at))
             mean = n * part + others[b % bins]

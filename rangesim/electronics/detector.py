@@ -45,6 +45,21 @@ class Gate(NamedTuple):
     bins: int
 
 
+class Blindness(NamedTuple):
+    """When the timers of a pixel count nothing although photons come, as decoders undo it.
+
+    trials : number of laser pulses times that of timers.
+    until_next_pulse : whether a timer is blind from its first count to the next pulse.
+    dead : bins, time for which a SPAD is blind after it fired.
+    period : bins, time from pulse to pulse.
+    """
+
+    trials: int
+    until_next_pulse: bool
+    dead: float
+    period: float
+
+
 class PhotoDetector(Named, ABC):
     """Electronics that turn the radiance of a sensor's frames into digital numbers; subclasses are frozen dataclasses.
 
@@ -112,6 +127,10 @@ class PhotoDetector(Named, ABC):
 
         radiance : (k, h, w) mean radiance of each frame, W/m2/sr.
         """
+        return None
+
+    def blindness(self, gate: Gate | None, exposure_s: float) -> Blindness | None:
+        """When the timers of a pixel are blind; None for a detector that integrates, or if no photon is hidden."""
         return None
 
     def ambient_fraction(self, gate: Gate | None, ambient: Ambient | None = None) -> float:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
-from rangesim.electronics.detector import BandWidth, Bits, Gate, PhotoDetector, streams
+from rangesim.electronics.detector import BandWidth, Bits, Blindness, Gate, PhotoDetector, streams
 from rangesim.rig import Rig
 from rangesim.settings.bounds import Bounds, Fraction, Pause, PositiveFraction, Seconds, Wavelength
 
@@ -25,21 +25,6 @@ counter holds at most 65535 and saturates far below."""
 MAX_PHOTONS = 1000.0
 """Largest mean number of photons of one SPAD and pulse that is drawn photon by photon; it replaces larger ones, which
 would take minutes. A SPAD with a dead time of 1 ns is then dead more than 90 % of a period of 100 ns."""
-
-
-class Blindness(NamedTuple):
-    """When the timers of a pixel count nothing although photons come, as decoders undo it.
-
-    trials : number of laser pulses times that of timers.
-    until_next_pulse : whether a timer is blind from its first count to the next pulse.
-    dead : bins, time for which a SPAD is blind after it fired.
-    period : bins, time from pulse to pulse.
-    """
-
-    trials: int
-    until_next_pulse: bool
-    dead: float
-    period: float
 
 
 class CountingPixel(NamedTuple):
@@ -154,8 +139,10 @@ class SpadDetector(PhotoDetector):
         return self.pulses(gate, exposure_s) * timers if self.pile_up else None
 
     def blindness(self, gate: Gate | None, exposure_s: float) -> Blindness | None:
-        """What hides photons from the timers of a pixel; None if nothing does, or if only coincidences are counted
-        and all of them: what hides those follows no formula."""
+        """When the timers of a pixel are blind, or None, see `PhotoDetector.blindness`.
+
+        It is None also where a pixel counts all coincidences, because no formula tells which of them are lost.
+        """
         gate, firsts = _counting(gate), self.first_only(gate, exposure_s)
         if firsts is None and (self.dead_time_s == 0 or self.coincidence > 1):
             return None

@@ -207,12 +207,23 @@ class Camera(Optics):
         at : index of the n pixels in an array (h, w).
         offset : (2,) pixels, from the pixel centres to the rays.
         """
-        rays, (x, y) = self.rays, np.asarray(offset, dtype=np.float64)
-        directions = rays.directions[at] + rays.steps[at][:, 0] * x + rays.steps[at][:, 1] * y
-        origins = rays.origins[at]
-        if rays.origin_steps is not None:
-            origins = origins + rays.origin_steps[at][:, 0] * x + rays.origin_steps[at][:, 1] * y
-        return origins, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+        return self.rays_beside(at)(offset)
+
+    def rays_beside(self, at: Any) -> Callable[[ArrayLike], tuple[Array, Array]]:
+        """Function from offsets (2,), pixels, to the rays of `rays_at`, for callers that ask for many offsets."""
+        rays = self.rays
+        origins, directions, steps = rays.origins[at], rays.directions[at], rays.steps[at]
+        origin_steps = None if rays.origin_steps is None else rays.origin_steps[at]
+
+        def through(offset: ArrayLike) -> tuple[Array, Array]:
+            x, y = np.asarray(offset, dtype=np.float64)
+            moved = directions + steps[:, 0] * x + steps[:, 1] * y
+            start = origins
+            if origin_steps is not None:
+                start = origins + origin_steps[:, 0] * x + origin_steps[:, 1] * y
+            return start, moved / np.linalg.norm(moved, axis=-1, keepdims=True)
+
+        return through
 
     def points(self, image: HasRanges) -> Array:
         """(h, w, 3) float64, metres, camera coordinates, the points that an image shows; NaN where it shows none.

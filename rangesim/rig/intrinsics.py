@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
@@ -159,9 +160,14 @@ class Intrinsics(Camera, untagged=True):
     def etendue_m2sr(self, aperture_radius_m: float) -> float:
         return float(np.pi * aperture_radius_m**2 / (self.fx * self.fy))
 
-    def rays_at(self, at: Any, offset: ArrayLike = (0.0, 0.0)) -> tuple[Array, Array]:
-        directions = self.directions(self.pixel_centres()[at] + np.asarray(offset, dtype=np.float64))
-        return np.zeros(directions.shape), directions
+    def rays_beside(self, at: Any) -> Callable[[ArrayLike], tuple[Array, Array]]:
+        centres = self.pixel_centres()[at]
+
+        def through(offset: ArrayLike) -> tuple[Array, Array]:
+            directions = self.directions(centres + np.asarray(offset, dtype=np.float64))
+            return np.zeros(directions.shape), directions
+
+        return through
 
     def z_of(self, range_m: np.ndarray, rows: slice = slice(None)) -> Array:
         directions = self.directions(self.pixel_centres(rows))

@@ -11,13 +11,21 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.decoding.histogram import find_peak, place_sigma, runs_out, trials_left, undo_pile_up, window_reach
+from rangesim.decoding.histogram import (
+    find_peak,
+    pile_up_excess,
+    place_sigma,
+    runs_out,
+    trials_left,
+    undo_pile_up,
+    window_reach,
+)
 from rangesim.decoding.path_length import LengthReturns, PathLengths
 from rangesim.decoding.returns import PulseShape, ReturnRules, find_returns
 from rangesim.decoding.status import Status
 from rangesim.decoding.working_range import WorkingRange
 from rangesim.electronics.detector import Gate
-from rangesim.electronics.spad import Blindness, SpadDetector
+from rangesim.electronics.spad import SpadDetector
 from rangesim.response import SPEED_OF_LIGHT, Pulse, Response, TransientHistogram
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, Threshold, of_type
 from rangesim.settings import limits
@@ -344,12 +352,12 @@ class DirectToFDecoder(Decoder):
 
         height, width = capture.frames.shape[1:]
         position, peak, background, intensity = np.empty((4, height, width))
-        left, blind = np.empty((height, width), dtype=np.int64), _blindness(capture)
+        left, blind = np.empty((height, width), dtype=np.int64), capture.blindness
 
         def measure(start: int, stop: int) -> None:
             for row in range(start, stop):
                 frames = capture.frames[:, row]
-                histogram = frames.astype(np.float64) if blind is None else undo_pile_up(frames, blind)[0]
+                histogram = frames.astype(np.float64) if blind is None else undo_pile_up(frames, blind)
                 found = find_peak(histogram, sensor.sigma_bins, sensor.is_cyclic)
                 position[row], peak[row], background[row] = found
                 if blind is not None:
@@ -383,7 +391,7 @@ class DirectToFDecoder(Decoder):
         from pcgraph.parallel import MIN_ROWS, in_blocks
 
         height, width = capture.frames.shape[1:]
-        most, blind = self.max_returns + (self.min_range_m > 0), _blindness(capture)  # the cover glass is one more
+        most, blind = self.max_returns + (self.min_range_m > 0), capture.blindness  # the cover glass is one more
         place, strength, sigma, kept = np.empty((4, most, height, width))
         intensity = np.empty((height, width))
 
@@ -392,13 +400,13 @@ class DirectToFDecoder(Decoder):
                 frames = capture.frames[:, row]
                 histogram, excess = frames.astype(np.float64), None
                 if blind is not None:
-                    histogram, excess = undo_pile_up(frames, blind)
+                    histogram, excess = undo_pile_up(frames, blind), pile_up_excess(frames, blind)
                 found = find_returns(np.nan_to_num(histogram), sensor.shape, rules, sensor.is_cyclic, excess)
                 place[:, row], strength[:, row], sigma[:, row] = found
                 intensity[row] = frames.sum(axis=0, dtype=np.float64)
                 if blind is not None:
                     at = np.nan_to_num(found.place)
-                    kept[:, row] = [trials_left(frames, a, blind, sensor.sigma_bins, sensor.is_cyclic) for a in at]
+                    kept[:, row] = trials_left(frames, at, blind, sensor.sigma_bins, sensor.is_cyclic)
 
         rules = ReturnRules(most, self.peak_sigmas, self.min_counts, self.pulse_tolerance)
         if not capture.is_digital:  # radiances have no noise; how strong is strong, the image tells
@@ -467,10 +475,3 @@ class DirectToFDecoder(Decoder):
 def _window_bins(sensor: DirectToF) -> int:
     """Number of bins in the window of a peak."""
     return 2 * window_reach(sensor.bins, sensor.sigma_bins, sensor.is_cyclic) + 1
-
-
-def _blindness(capture: Capture) -> Blindness | None:
-    """What hid photons from the timers of the detector; None if nothing did, or the detector is not known."""
-    if isinstance(capture.detector, SpadDetector):
-        return capture.detector.blindness(capture.sensor.gate, capture.exposure_s)
-    return None
