@@ -18,18 +18,19 @@ Almost no vertex of a camera path lies in the spot by chance, so light paths are
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.camera_rays import Connection, Device
+from rangesim.light_transport.camera_rays import Connection, Device, lit_from
 from rangesim.light_transport.ray_tables import GAUSSIAN_FULL_WIDTH, VectorTable
 from rangesim.light_transport.scattering import Media, Medium
 from rangesim.rig import Beam, Rig
 
+State = TypeVar("State", "Spot", "Pencil")
 GAUSSIAN_REACH = 1.5
 """Angle to the axis, in full widths of a Gaussian beam at 1/e^2, beyond which there is no light: the intensity there is
 exp(-18) of that on the axis. With a larger reach, more shadow rays are traced for no light."""
@@ -61,6 +62,12 @@ class BeamAxis(NamedTuple):
         return mi.Point2f(dr.dot(direction, self.right), dr.dot(direction, self.down)) / cosine, cosine
 
 
+def selected(where: mi.Bool, one: State, other: State) -> State:
+    """A structure with the fields of `one` on the lanes of the mask `where`, and those of the other elsewhere."""
+    names = (f.name for f in fields(one))
+    return type(one)(*(dr.select(where, getattr(one, name), getattr(other, name)) for name in names))
+
+
 @dataclass
 class Spot:
     """A ray of the beam that ends in the spot. Loops of Dr.Jit carry it, so it is not frozen.
@@ -89,8 +96,7 @@ class Spot:
 
     def replaced(self, where: mi.Bool, other: Spot) -> Spot:
         """The other spot on the lanes of the mask `where`."""
-        names = ("origin", "direction", "length", "ior", "weight", "u", "v")
-        return Spot(*(dr.select(where, getattr(other, name), getattr(self, name)) for name in names))
+        return selected(where, other, self)
 
 
 @dataclass
@@ -121,8 +127,7 @@ class Pencil:
 
     def replaced(self, where: mi.Bool, other: Pencil) -> Pencil:
         """The other pencil on the lanes of the mask `where`."""
-        names = ("a_point", "b_point", "a_direction", "b_direction", "fraction", "intensity", "u", "v")
-        return Pencil(*(dr.select(where, getattr(other, name), getattr(self, name)) for name in names))
+        return selected(where, other, self)
 
     def arrived(self, ray: mi.Vector3f, distance: mi.Float, normal: mi.Vector3f) -> Pencil:
         """The pencil where it meets a surface after a distance in metres, along the unit direction `ray`.
@@ -265,11 +270,7 @@ class BeamDevice:
         profile = self.profile(place)
         geometry = profile / (cosine * dr.square(cosine) * dr.square(distance))
         in_beam = active & (cosine > 0) & (profile > 0)
-        if media is None or inside is None:
-            lit = in_beam & ~scene.ray_test(si.spawn_ray_to(beam.origin), coherent=False, active=in_beam)
-        else:
-            fraction, _ = media.transmittance(scene, si, beam.origin, inside, in_beam)
-            lit, geometry = in_beam & (fraction > 0), geometry * fraction
+        lit, geometry = lit_from(scene, si, beam.origin, geometry, in_beam, media, inside)
         return Connection(self.uv(place), to_emitter, distance, geometry, lit)
 
     def glint(self, ray: mi.Ray3f, pixel: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool) -> SeenEmitter:

@@ -62,6 +62,28 @@ class Connection(NamedTuple):
     blur_px: mi.Float | None = None
 
 
+def lit_from(
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    emitter: mi.Point3f,
+    geometry: mi.Float,
+    active: mi.Bool,
+    media: Media | None,
+    inside: Medium | None,
+) -> tuple[mi.Bool, mi.Float]:
+    """Whether light comes straight from the emitter to the point `si`, and `geometry` less what media on the way take.
+
+    Parameters
+    ----------
+    geometry : Float, see `Connection`, without media.
+    media, inside : the media of the scene, and the one in which the point lies; None in scenes without any.
+    """
+    if media is None or inside is None:
+        return active & ~scene.ray_test(si.spawn_ray_to(emitter), coherent=False, active=active), geometry
+    fraction, _ = media.transmittance(scene, si, emitter, inside, active)
+    return active & (fraction > 0), geometry * fraction
+
+
 class Device:
     """A camera or a projector of the rig as kernels see it: intrinsics, centre and axes.
 
@@ -250,11 +272,6 @@ class Device:
         if self.vignetting is not None:
             geometry *= self.relative_illumination(-to_projector)
         in_image &= active
-        if media is None or inside is None:
-            shadow_ray = si.spawn_ray_to(mi.Point3f(self.centre))
-            lit = in_image & ~scene.ray_test(shadow_ray, coherent=False, active=in_image)
-        else:
-            fraction, _ = media.transmittance(scene, si, mi.Point3f(self.centre), inside, in_image)
-            lit, geometry = in_image & (fraction > 0), geometry * fraction
+        lit, geometry = lit_from(scene, si, mi.Point3f(self.centre), geometry, in_image, media, inside)
         blur = self.blur_px(z)
         return Connection(uv, to_projector, distance, geometry, lit, None if blur is None else dr.select(lit, blur, 0))

@@ -286,6 +286,21 @@ def _reach(directions: np.ndarray, radius: int) -> float:
 
 
 @cached_njit(nogil=True, error_model="numpy")
+def _regressed(n, x, y, v, xx, xy, yy, xv, yv):  # type: ignore[no-untyped-def]
+    """Slopes a, b and value c of the plane v = a x + b y + c through n points: least squares, from sums over them.
+
+    With them come the determinant of the spread of (x, y), which is 0 where the slopes are not finite, the diagonal of
+    that spread, and the sum of squares of v that the slopes explain.
+    """
+    count = max(n, 1.0)
+    sxx, sxy, syy = xx - x * x / count, xy - x * y / count, yy - y * y / count
+    sxv, syv = xv - x * v / count, yv - y * v / count
+    determinant = sxx * syy - sxy * sxy
+    a, b = (sxv * syy - syv * sxy) / determinant, (syv * sxx - sxv * sxy) / determinant
+    return a, b, (v - a * x - b * y) / count, determinant, sxx, syy, a * sxv + b * syv
+
+
+@cached_njit(nogil=True, error_model="numpy")
 def _fit_ray_normals(start, stop, radius, reach, points, origins, right, down, along, normals):  # type: ignore[no-untyped-def]
     """Write the normals of the rows from `start` to `stop`."""
     h, w = points.shape[:2]
@@ -320,19 +335,15 @@ def _fit_ray_normals(start, stop, radius, reach, points, origins, right, down, a
                         yy += dy * dy
                         xv += dx * dv
                         yv += dy * dv
-            count = max(n, 1.0)
-            sxx, sxy, syy = xx - x * x / count, xy - x * y / count, yy - y * y / count
-            sxv, syv = xv - x * v / count, yv - y * v / count
-            determinant = sxx * syy - sxy * sxy
+            a, b, offset, determinant, sxx, syy, explained = _regressed(n, x, y, v, xx, xy, yy, xv, yv)
             if n < 3 or not determinant > 1e-3 * sxx * syy:
                 normals[row, column] = np.nan
                 continue
-            a, b = (sxv * syy - syv * sxy) / determinant, (syv * sxx - sxv * sxy) / determinant
-            scatter = (vv - v * v / count - a * sxv - b * syv) / count  # of inverse depths about the plane
+            scatter = (vv - v * v / n - explained) / n  # of inverse depths about the plane
             if scatter * range_m * range_m > MAX_ROUGHNESS * MAX_ROUGHNESS:
                 normals[row, column] = np.nan
                 continue
-            c = 1 / range_m + (v - a * x - b * y) / count
+            c = 1 / range_m + offset
             length = np.sqrt(a * a + b * b + c * c)
             for k in range(3):
                 normals[row, column, k] = (
@@ -363,15 +374,11 @@ def _fit_normals(start, stop, radius, limits, z, inverse, rays, normals):  # typ
                         yy += dy * dy
                         xv += dx * dv
                         yv += dy * dv
-            count = max(n, 1.0)
-            sxx, sxy, syy = xx - x * x / count, xy - x * y / count, yy - y * y / count
-            sxv, syv = xv - x * v / count, yv - y * v / count
-            determinant = sxx * syy - sxy * sxy
+            a, b, offset, determinant, sxx, syy, _ = _regressed(n, x, y, v, xx, xy, yy, xv, yv)
             if n < 3 or not determinant > 1e-3 * max(sxx, syy) ** 2:
                 normals[row, column] = np.nan
                 continue
-            a, b = (sxv * syy - syv * sxy) / determinant, (syv * sxx - sxv * sxy) / determinant
-            centre = inverse[row, column] + (v - a * x - b * y) / count
+            centre = inverse[row, column] + offset
             c = centre - a * rays[row, column, 0] - b * rays[row, column, 1]
             length = np.sqrt(a * a + b * b + c * c)
             for k, component in enumerate((a, b, c)):

@@ -80,8 +80,8 @@ def _nearest(directions: bytes, shape: tuple[int, ...]) -> NDArray[np.int32]:
     low, high = float(elevation.min()), float(elevation.max())
     # Mean distance of neighbouring rays, if they were spread evenly over the field
     spacing = np.sqrt(max(right - left, 1e-6) * max(high - low, 1e-6) / len(exists))
-    step = max(2 * np.pi / WIDTH_PX, (right - left) / WIDTH_PX) if right - left > np.pi else (right - left) / WIDTH_PX
-    step = max(step, 1e-6)
+    shown = 2 * np.pi if right - left > np.pi else right - left
+    step = max(shown / WIDTH_PX, 1e-6)
     columns = max(1, round((right - left) / step))
     rows = int(np.clip(round((high - low + spacing) / step), 1, 4 * WIDTH_PX))
     middle = (low + high) / 2
