@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals of analytic scenes, without a renderer: one direct light path per camera pixel."""
+"""Signals and captures of analytic scenes, without a renderer: direct light paths alone."""
 
 from __future__ import annotations
 
@@ -8,10 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from rangesim.response import DenseResponse, FirstReturn, LightPath, NumpyMath, Response, SparseResponse
+from rangesim import Capture
+from rangesim.response import DenseResponse, Dots, FirstReturn, LightPath, NumpyMath, Response, SparseResponse
 from rangesim.rig import Intrinsics, Rig, translation
-from rangesim.sensors import Sensor
+from rangesim.sensors import ActiveStereo, ReferencePatternStereo, Sensor
 from rangesim.signals import EnergySplit, GroundTruth, Signals, StillSignals
+
+PARTS = 5
+"""Light paths along each side of a pixel that stand for its area, in captures of dots."""
 
 
 def stereo_rig(width: int = 160, height: int = 120, baseline_m: float = 0.2, **changes: object) -> Rig:
@@ -31,6 +35,34 @@ def plane_depth(rig: Rig, distance_m: float = 1.0, normal: tuple[float, float, f
     """(h, w) depth of a plane through (0, 0, distance_m) of the camera frame."""
     rays = rig.camera.directions(rig.camera.pixel_centres())
     return np.asarray(distance_m * normal[2] / (rays @ np.asarray(normal)))
+
+
+def dots_on_plane(
+    rig: Rig, sensor: ActiveStereo | ReferencePatternStereo, normal: Sequence[float], distance_m: float
+) -> tuple[Capture, np.ndarray]:
+    """Noise-free capture of the dots on a plane n X = d of the world, over the areas of the pixels, and true depths.
+
+    normal : n, of any length.
+    """
+    n = np.array(normal) / np.linalg.norm(normal)
+    T, P = rig.T_world_camera, np.linalg.inv(rig.T_world_projector)
+    camera, projector, pattern = rig.pinhole, rig.image_projector, sensor.pattern
+    assert isinstance(pattern, Dots)
+
+    def seen(offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """World directions (h, w, 3) of the rays beside the pixel centres, and the plane's depths along them."""
+        rays = camera.directions(camera.pixel_centres() + offset) @ T[:3, :3].T
+        return rays, (distance_m - T[:3, 3] @ n) / (rays @ n)
+
+    light = np.zeros((camera.height, camera.width))
+    for i, j in np.ndindex(PARTS, PARTS):
+        rays, depth = seen((np.array([i, j]) + 0.5) / PARTS - 0.5)
+        points = (rays * depth[..., None] + T[:3, 3]) @ P[:3, :3].T + P[:3, 3]
+        uv = projector.project(points)
+        lit = (uv >= 0).all(axis=-1) & (uv <= [projector.width, projector.height]).all(axis=-1)
+        path = LightPath(*np.where(lit[..., None], uv, 0).transpose(2, 0, 1), light, True)
+        light = light + lit * pattern.weights(path, NumpyMath())[0] / points[..., 2] ** 2 / PARTS**2
+    return Capture(light[None].astype(np.float32), sensor, rig), seen(np.zeros(2))[1]
 
 
 def signals_of_depth(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from synthetic import all_bytes
+from synthetic import all_bytes, dots_on_plane
 
 import rangesim
 from rangesim import (
@@ -46,8 +46,6 @@ from rangesim.settings.config import from_dict, to_dict
 from rangesim.signals import SignalSet, StillSignals
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
-PARTS = 5
-"""Light paths along each side of a pixel that stand for its area."""
 
 
 # ---- The pattern ---------------------------------------------------------------------------------------------------
@@ -100,27 +98,6 @@ def test_a_sensor_is_read_back_from_plain_data() -> None:
 # ---- Planes of known depth -----------------------------------------------------------------------------------------
 
 
-def plane_capture(rig: Rig, sensor: ActiveStereo, normal: np.ndarray, distance_m: float) -> tuple[Capture, np.ndarray]:
-    """Noise-free capture of the dots on a plane n X = d of the world, over the areas of the pixels, and true depths."""
-    T, P = rig.T_world_camera, np.linalg.inv(rig.T_world_projector)
-    size = np.array([rig.projector.width, rig.projector.height])
-    light = np.zeros((rig.camera.height, rig.camera.width))
-    depth = light
-    for i, j in np.ndindex(PARTS, PARTS):
-        offset = (np.array([i, j]) + 0.5) / PARTS - 0.5
-        rays = rig.camera.directions(rig.camera.pixel_centres() + offset) @ T[:3, :3].T
-        depth = (distance_m - T[:3, 3] @ normal) / (rays @ normal)
-        points = (rays * depth[..., None] + T[:3, 3]) @ P[:3, :3].T + P[:3, 3]
-        uv = rig.projector.project(points)
-        lit = (uv >= 0).all(axis=-1) & (uv <= size).all(axis=-1)
-        path = LightPath(*np.where(lit[..., None], uv, 0).transpose(2, 0, 1), light, True)
-        assert isinstance(sensor.pattern, Dots)
-        light = light + lit * sensor.pattern.weights(path, NumpyMath())[0] / points[..., 2] ** 2 / PARTS**2
-    rays = rig.camera.directions(rig.camera.pixel_centres()) @ T[:3, :3].T
-    depth = (distance_m - T[:3, 3] @ normal) / (rays @ normal)
-    return Capture(light[None].astype(np.float32), sensor, rig), depth
-
-
 def stereo(width: int = 240, height: int = 160, **changes: Any) -> tuple[ActiveStereo, tuple[Rig, ...]]:
     """A sensor and its rigs: cameras 50 mm apart and a projector between them."""
     sensor = ActiveStereo()
@@ -134,8 +111,7 @@ def stereo(width: int = 240, height: int = 160, **changes: Any) -> tuple[ActiveS
 def set_of_plane(
     sensor: ActiveStereo, rigs: tuple[Rig, ...], normal: tuple[float, ...], distance_m: float
 ) -> tuple[CaptureSet, np.ndarray]:
-    unit = np.array(normal) / np.linalg.norm(normal)
-    taken = [plane_capture(rig, sensor, unit, distance_m) for rig in rigs]
+    taken = [dots_on_plane(rig, sensor, normal, distance_m) for rig in rigs]
     return CaptureSet(tuple(capture for capture, _ in taken)), taken[0][1]
 
 

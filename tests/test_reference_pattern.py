@@ -9,20 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from synthetic import dots_on_plane
 
 import rangesim
-from rangesim import Capture, Intrinsics, Rig, Scene, compare, decode, explain, expose, look_at, transport
+from rangesim import Intrinsics, Rig, Scene, compare, decode, explain, expose, look_at, transport
 from rangesim.causes import Cause
 from rangesim.geometry import DenseMatching
 from rangesim.instrument.instrument import Instrument
-from rangesim.response import Dots, Images, LightPath, NumpyMath
+from rangesim.response import Dots, Images
 from rangesim.rig import Beam, translation
 from rangesim.sensors import ReferencePatternDecoder, ReferencePatternStereo, sensor_from_dict
 from rangesim.sensors.reference_pattern import projector_as_camera, reference_image
 from rangesim.settings.config import to_dict
 
-PARTS = 5
-"""Light paths along each side of a pixel that stand for its area."""
 SENSOR = ReferencePatternStereo(Dots(640, 400, dot_px=1.2))
 """Its dots have a standard deviation of 0.7 pixels of the camera; finer ones are sampled too coarsely."""
 
@@ -32,28 +31,11 @@ def rig_of(width: int = 240, height: int = 160, T: Any = None) -> Rig:
     return Rig(Intrinsics.from_fov(width, height, 40.0), Intrinsics.from_fov(640, 400, 60.0), T_camera_projector=place)
 
 
-def capture_of_plane(rig: Rig, normal: tuple[float, ...], distance_m: float) -> tuple[Capture, np.ndarray]:
-    """Noise-free capture of the dots on a plane n X = d in front of the camera, and its true depths."""
-    n, T = np.array(normal) / np.linalg.norm(normal), np.linalg.inv(rig.T_camera_projector)
-    camera, projector, pattern = rig.pinhole, rig.image_projector, SENSOR.pattern
-    assert isinstance(pattern, Dots)
-    light = np.zeros((camera.height, camera.width))
-    for i, j in np.ndindex(PARTS, PARTS):
-        rays = camera.directions(camera.pixel_centres() + (np.array([i, j]) + 0.5) / PARTS - 0.5)
-        points = rays * (distance_m / (rays @ n))[..., None] @ T[:3, :3].T + T[:3, 3]
-        uv = projector.project(points)
-        lit = (uv >= 0).all(axis=-1) & (uv <= [projector.width, projector.height]).all(axis=-1)
-        path = LightPath(*np.where(lit[..., None], uv, 0).transpose(2, 0, 1), light, True)
-        light = light + lit * pattern.weights(path, NumpyMath())[0] / points[..., 2] ** 2 / PARTS**2
-    rays = camera.directions(camera.pixel_centres())
-    return Capture(light[None].astype(np.float32), SENSOR, rig), distance_m / (rays @ n)
-
-
 @pytest.mark.parametrize("method", ["census", "zncc", "opencv"])
 @pytest.mark.parametrize("distance_m", [0.7, 1.0, 1.37])
 def test_a_plane_is_read_to_a_twentieth_of_a_pixel(method: Any, distance_m: float) -> None:
     rig = rig_of()
-    capture, _ = capture_of_plane(rig, (0, 0, 1), distance_m)
+    capture, _ = dots_on_plane(rig, SENSOR, (0, 0, 1), distance_m)
     found = ReferencePatternDecoder(DenseMatching(method), disparities=64).coordinates(capture)
     assert found.pair is not None
     error = (found.disparity_px - found.pair.parallel.disparity(distance_m))[8:-8, 8:-8]
@@ -65,7 +47,7 @@ def test_a_plane_is_read_to_a_twentieth_of_a_pixel(method: Any, distance_m: floa
 @pytest.mark.parametrize("place", [(0.075, 0, 0), (-0.06, 0, 0), (0.07, 0.01, 0.01)])
 def test_a_projector_that_is_turned_or_stands_elsewhere_serves_too(place: tuple[float, ...]) -> None:
     rig = rig_of(T=look_at(place, (0, 0, 1.0), up=(0.02, -1, 0)))
-    capture, z = capture_of_plane(rig, (0.2, -0.1, 1), 0.9)
+    capture, z = dots_on_plane(rig, SENSOR, (0.2, -0.1, 1), 0.9)
     image = decode(capture, ReferencePatternDecoder(disparities=64))
     error = (image.z - z)[10:-10, 10:-10]
     assert np.isfinite(error).mean() > 0.9
@@ -75,10 +57,10 @@ def test_a_projector_that_is_turned_or_stands_elsewhere_serves_too(place: tuple[
 def test_steps_count_from_the_reference_plane() -> None:
     """On the plane itself, rounding makes no error; a device's formula gives the other depths."""
     rig = rig_of()
-    on_plane, _ = capture_of_plane(rig, (0, 0, 1), 1.1)
+    on_plane, _ = dots_on_plane(rig, SENSOR, (0, 0, 1), 1.1)
     decoder = ReferencePatternDecoder(disparities=64, step_px=0.125, reference_m=1.1)
     assert np.nanmedian(decode(on_plane, decoder).z) == pytest.approx(1.1, abs=1e-6)
-    tilted, _ = capture_of_plane(rig, (0.3, 0, 1), 0.9)
+    tilted, _ = dots_on_plane(rig, SENSOR, (0.3, 0, 1), 0.9)
     image = decode(tilted, decoder)
     pair = decoder.coordinates(tilted).pair
     assert pair is not None
@@ -117,7 +99,7 @@ def test_a_rendered_plane_is_compared_and_explained(plane: Scene) -> None:
 
 
 def test_what_cannot_be_decoded_is_refused() -> None:
-    capture, _ = capture_of_plane(rig_of(), (0, 0, 1), 1.0)
+    capture, _ = dots_on_plane(rig_of(), SENSOR, (0, 0, 1), 1.0)
     with pytest.raises(ValueError, match="expected a capture with a rig: the reference image depends on"):
         ReferencePatternDecoder().coordinates(replace(capture, rig=None))
     with pytest.raises(ValueError, match="expected pattern to be a Response, got None"):

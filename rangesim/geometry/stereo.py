@@ -9,7 +9,7 @@ about their centres (Fusiello, Trucco, Verri: "A compact algorithm for rectifica
 Pixel centres lie at integer + 0.5 here and at integers in OpenCV. `RectifiedPair.warp` is the only place in this module
 that converts between the two.
 
-Used by: rangesim.decoding.
+Used by: rangesim.decoding and rangesim.sensors.
 """
 
 from __future__ import annotations
