@@ -12,6 +12,7 @@ Usage: python examples/gesture_sensor.py [OUT.png] [--spp 64] [--places 5]
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -24,6 +25,7 @@ from rangesim import (
     Rig,
     Scene,
     SpadDetector,
+    Status,
     Zones,
     decode,
     expose,
@@ -32,14 +34,19 @@ from rangesim import (
     transport,
 )
 from rangesim.environment.backend import select_variant
+from rangesim.response import SPEED_OF_LIGHT
 from rangesim.sensors import DirectToFDecoder
 
-ZONES, FINE = 8, 8
-"""Zones along an axis, and pixels of the traced camera along an axis of a zone."""
-HAND_M, WALL_M = 0.25, 0.6
-"""Distance of the hand and of the wall behind it."""
+ZONES = 8
+"""Number of zones along an axis, as in the device."""
+FINE = 8
+"""Number of pixels of the traced camera along an axis of a zone, so that a finger is five pixels wide."""
+HAND_M = 0.25
+"""Distance of the hand, metres."""
+WALL_M = 0.6
+"""Distance of the wall, metres: so far behind the hand that a pulse, which is 0.075 m wide, splits in two returns."""
 SENSOR = DirectToF(bins=80, bin_s=125e-12, start_s=-1e-9, pulse_fwhm_s=500e-12)
-"""Its first eight bins precede the pulse, so that the peak of the cover glass is whole."""
+"""The sensor. Its first eight bins precede the pulse, so that the peak of the cover glass is whole."""
 DETECTOR = SpadDetector(wavelength_m=940e-9, spads=16, dark_counts_hz=2e4, bits=16)
 DECODER = DirectToFDecoder(reading="first", max_returns=2, min_range_m=0.06)
 EXPOSURE_S = 2e-3
@@ -113,8 +120,8 @@ def main() -> None:
 
 
 def plot(fine, nearest_m, capture, image, out: Path) -> None:
-    ranges = np.where(image.returns.status == 0, image.returns.range_m, np.nan)
-    strongest = decode(capture, DirectToFDecoder(max_returns=2, min_range_m=DECODER.min_range_m))
+    ranges = np.where(image.returns.status == Status.OK, image.returns.range_m, np.nan)
+    strongest = decode(capture, replace(DECODER, reading="strongest"))
     figure, axes = plt.subplots(1, 6, figsize=(16, 2.9), layout="constrained", width_ratios=(1, 1, 1, 1, 1, 1.7))
     axes[0].imshow(fine ** (1 / 2.2), cmap="gray")
     axes[0].set(title="what is traced", xticks=[], yticks=[])
@@ -124,12 +131,10 @@ def plot(fine, nearest_m, capture, image, out: Path) -> None:
         shown = axis.imshow(values, vmin=0.2, vmax=0.65, cmap="viridis_r")
         axis.set(title=title, xticks=[], yticks=[])
     figure.colorbar(shown, ax=axes[:5], label="range, m", shrink=0.8)
-    two = (image.returns.status == 0).sum(axis=0) == 2
-    weaker = np.where(two, np.nan_to_num(np.sort(image.returns.strength, axis=0)[-2]), 0)
+    weaker = np.where(image.returns.number == 2, np.nan_to_num(np.sort(image.returns.strength, axis=0)[-2]), 0)
     row, column = np.unravel_index(weaker.argmax(), weaker.shape)
     axes[2].add_patch(plt.Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, color="#e97c01", lw=2))
-    half = 0.5 * 299_792_458.0
-    at_m = half * (SENSOR.start_s + SENSOR.bin_s * (np.arange(SENSOR.bins) + 0.5))
+    at_m = 0.5 * SPEED_OF_LIGHT * (SENSOR.start_s + SENSOR.bin_s * (np.arange(SENSOR.bins) + 0.5))
     axes[5].step(at_m, capture.frames[:, row, column], where="mid", color="#1b2330")
     for range_m, status in zip(
         image.returns.range_m[:, row, column], image.returns.status[:, row, column], strict=True

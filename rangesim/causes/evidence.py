@@ -134,8 +134,11 @@ class Evidence:
 
     @cached_property
     def off_glass(self) -> np.ndarray:
-        """Whether light off the device's window is to blame: without it the reading is right, or the decoder refused
-        a surface so close that the two cannot be told apart."""
+        """Whether light off the device's window is to blame.
+
+        It is where the reading without this light is right, and where the decoder refused a surface because it is so
+        close that the decoder cannot tell it from the window.
+        """
         without = self.readings.without_glass
         if without is None:
             return np.zeros(self.true_m.shape, dtype=bool)
@@ -188,7 +191,7 @@ class Evidence:
 
     @cached_property
     def pixels(self) -> Neighbourhood:
-        """Which pixels are neighbours."""
+        """The neighbourhood of each pixel."""
         return neighbourhood(self.signals.rig.camera)
 
     @cached_property

@@ -15,6 +15,7 @@ IEEE Trans. Signal Processing 42 (1994).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -33,7 +34,8 @@ SPARROW_SIGMAS = 2.0
 """Distance of two Gaussian pulses of equal strength, in their standard deviations, at which the dip between them
 vanishes (Sparrow's limit). Pulses that are closer count as one return."""
 MIN_DISTANCE_BINS = 1.0
-"""Least distance of two returns in bins, for pulses that are shorter than a bin."""
+"""Least distance of two returns in bins, for pulses that are shorter than a bin, because a bin does not tell where
+in it the light is."""
 
 
 class PulseShape(NamedTuple):
@@ -82,7 +84,8 @@ class PulseShape(NamedTuple):
         return _shape(pulse.start_s / bin_s, pulse.stop_s / bin_s, lambda bins: pulse.arrived(bins * bin_s))
 
 
-def _shape(start: float, stop: float, arrived_at) -> PulseShape:  # type: ignore[no-untyped-def]
+def _shape(start: float, stop: float, arrived_at: Callable[[np.ndarray], np.ndarray]) -> PulseShape:
+    """The table of a pulse between two times, bins. arrived_at : fraction that has arrived at times (t,), bins."""
     steps = int(np.ceil((stop - start) * STEPS_PER_BIN - 1e-9)) + 1
     bins = start + np.arange(steps) / STEPS_PER_BIN
     arrived = np.asarray(arrived_at(bins), dtype=np.float64)

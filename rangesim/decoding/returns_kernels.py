@@ -13,14 +13,14 @@ ROUNDS = 20
 """Largest number of rounds in which all returns of a pixel are fitted in turn. Well apart, two suffice; at Sparrow's
 limit, 20 bring the places to a hundredth of a bin."""
 STEPS = 4
-"""Number of scoring steps of one return per round; more change nothing that the next round does not."""
+"""Number of scoring steps of one return per round. More steps are of no use, because the next round takes them."""
 CONVERGED = 1e-4
 """Rounds end when no place moves farther, in bins, and the background changes by no larger fraction of all counts. The
 noise is larger: with a million counts it is a thousandth, of the pulse's width and of the counts."""
 SETTLED = 0.01
 """Standard deviations of a place; a place that moves no farther has settled, because the noise hides it."""
 MAX_STEP = 0.5
-"""Bins, largest scoring step, because far from the maximum the steps overshoot."""
+"""Largest scoring step in bins. It is limited, because far from the maximum the steps overshoot."""
 FLOOR = 1e-6
 """Least expected count of a bin, as a fraction of the return's counts. A bin that should be empty would otherwise weigh
 infinitely, although shapes are not known that well."""

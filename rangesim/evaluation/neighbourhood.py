@@ -21,7 +21,7 @@ field of the ray is larger. It takes in the rays on both sides where spacing is 
 
 
 class Neighbourhood(ABC):
-    """Which pixels lie around each pixel of an image (h, w)."""
+    """The pixels around each pixel of an image (h, w)."""
 
     @abstractmethod
     def shifted(self, values: np.ndarray, radius: int) -> list[np.ndarray]:

@@ -28,8 +28,8 @@ MAX_RANGE_M = 100.0
 the time of the search grows with this range, and the emitter of such a camera does not reach as far."""
 
 TAPS_DEG = (0, 90, 180, 270)
-"""Delays of four taps, in degrees of the phase: quarter turns, as in nearly all such cameras. `quarter_turns` and
-`tap_phase` are written for them."""
+"""Delays of four taps, in degrees of the phase: quarter turns, as in nearly all such cameras. `tap_phase` and a
+branch of `tap_correlations` are written for them."""
 
 MAX_TAPS = 16
 """Largest number of taps of a frequency: real cameras have 2 to 8 samples of the phase; more only costs memory."""
@@ -122,8 +122,7 @@ class AmcwToF(Sensor):
     def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         offset = white + ambient
         result = np.empty((self.n_frames, *offset.shape), dtype=np.float32)
-        modulated = quarter_turns if self.taps == len(TAPS_DEG) else even_turns
-        correlations = (values for phasor in channels for values in modulated(phasor, self.contrast, self.taps))
+        correlations = (tap for phasor in channels for tap in tap_correlations(phasor, self.contrast, self.taps))
         for frame, correlation in zip(result, correlations, strict=True):
             np.multiply(self.tap_fraction, offset + correlation, out=frame, casting="same_kind")
         return result
@@ -259,26 +258,23 @@ class AmcwDecoder(Decoder):
         return FrameContent(signal=fraction, ambient=fraction)
 
 
-def quarter_turns(phasor: np.ndarray, contrast: float, taps: int = len(TAPS_DEG)) -> Iterator[np.ndarray]:
-    """Correlations (h, w) of four taps: `contrast` times cos, sin, -cos and -sin of the phase, of sines or triangles.
+def tap_correlations(phasor: np.ndarray, contrast: float, taps: int) -> Iterator[np.ndarray]:
+    """Correlations (h, w) of `taps` evenly spaced taps: `contrast` times cos(phase of the light - phase of the tap).
 
-    phasor : (2, h, w), the channel of a `Phasor`.
-    """
-    for tap in TAPS_DEG:
-        axis, sign = tap // 90 % 2, 1 - tap // 180 * 2  # cos or sin of the phase, and its sign
-        yield sign * contrast * phasor[axis]
-
-
-def even_turns(phasor: np.ndarray, contrast: float, taps: int) -> Iterator[np.ndarray]:
-    """Correlations (h, w) of `taps` evenly spaced taps with sine waves; parameters as for `quarter_turns`.
+    phasor : (2, h, w), the channel of a `Phasor`. Four taps take its triangles as well as its sines.
 
     Examples
     --------
     >>> import numpy as np
     >>> third = np.array([np.cos(2 * np.pi / 3), np.sin(2 * np.pi / 3)])  # the phase is a third of a turn
-    >>> [round(float(tap), 3) for tap in even_turns(third, contrast=0.5, taps=3)]
+    >>> [round(float(tap), 3) for tap in tap_correlations(third, contrast=0.5, taps=3)]
     [-0.25, 0.5, -0.25]
     """
+    if taps == len(TAPS_DEG):
+        for tap in TAPS_DEG:
+            axis, sign = tap // 90 % 2, 1 - tap // 180 * 2  # cos or sin of the phase, and its sign
+            yield sign * contrast * phasor[axis]
+        return
     for k in range(taps):
         theta = 2 * math.pi * k / taps
         yield np.float32(contrast * math.cos(theta)) * phasor[0] + np.float32(contrast * math.sin(theta)) * phasor[1]
