@@ -20,10 +20,7 @@ from rangesim import (
     load_scene,
     transport,
 )
-from rangesim.experiment import ScanSettings
-from rangesim.instrument.instrument import Instrument
 from rangesim.motion import ConstantTwist, Motion, Timing, moving_scanner, transport_moving
-from rangesim.pipeline.scan_run import carry_out_scan, estimate_scan
 from rangesim.rig import (
     Beam,
     Camera,
@@ -248,13 +245,6 @@ def test_a_scanner_that_moves_takes_one_pass_and_knows_its_way(corner: Scene) ->
     np.testing.assert_array_equal(signals.energy.direct, whole.energy.direct)
     with pytest.raises(ValueError, match="expected a timing without line_period_s"):
         transport_moving(corner, rig, {sensor: Timing(line_period_s=1e-3)}, Motion(rig=track), spp=4)
-
-
-def test_scanners_are_not_fused_and_say_so_before_any_rendering() -> None:
-    settings = ScanSettings("corner", instrument=Instrument("head", IdealToF(), camera=sweep(), projector=Beam()))
-    for work in (carry_out_scan, estimate_scan):
-        with pytest.raises(ValueError, match="expected a pinhole camera for a scan, whose views are fused"):
-            work(settings)
 
 
 def test_a_scanner_that_drives_into_fog_is_refused() -> None:

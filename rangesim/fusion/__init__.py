@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from rangesim.fusion.multiway_registration import PoseErrors as PoseErrors
     from rangesim.fusion.multiway_registration import align as align
     from rangesim.fusion.multiway_registration import pose_errors as pose_errors
+    from rangesim.fusion.pinhole_views import pinhole_views as pinhole_views
     from rangesim.fusion.posed_images import Scan as Scan
     from rangesim.fusion.sdf import average_signed_distances as average_signed_distances
     from rangesim.fusion.sdf import reading_weights as reading_weights
@@ -80,6 +81,7 @@ else:
             "joint_registration": ["refine_jointly"],
             "mesh_error": ["SurfaceError", "surface_error"],
             "multiway_registration": ["Alignment", "PairFit", "PoseErrors", "align", "pose_errors"],
+            "pinhole_views": ["pinhole_views"],
             "posed_images": ["Scan"],
             "sdf": ["average_signed_distances", "reading_weights", "signed_distance"],
             "seen_volume": ["Occupancy", "SeenOfShape", "VoxelState", "occupancy", "true_occupancy", "voxel_states"],

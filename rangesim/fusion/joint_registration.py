@@ -21,6 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesim.decoding.range_image import RangeImage
+from rangesim.fusion.pinhole_views import local_views
 from rangesim.fusion.sdf import camera_and_pose, depth_at
 from rangesim.point_cloud import lattice_normals
 from rangesim.rig import Array, Intrinsics
@@ -47,27 +48,26 @@ CONVERGED = 1e-7
 below the errors of the poses, because a larger value would save only a step or two."""
 
 
-class _View(NamedTuple):
-    """One view, prepared for the fit.
+class _DepthImage(NamedTuple):
+    """A depth image of a view, prepared for the fit; the view of a camera that is no pinhole has several.
 
     camera : Intrinsics.
+    T : (4, 4) float64, metres, pose of this image in coordinates of the view.
     z : (h, w) float64, metres, depth; NaN without a reading.
-    normals : (h, w, 3) float64, camera coordinates; NaN near borders and on slanted surfaces.
-    points, point_normals : (n, 3) float64, metres and unit vectors, camera coordinates, a random part of the readings.
+    normals : (h, w, 3) float64, coordinates of this image; NaN near borders and on slanted surfaces.
     """
 
     camera: Intrinsics
+    T: Array
     z: Array
     normals: Array
-    points: Array
-    point_normals: Array
 
     @classmethod
-    def of(cls, image: RangeImage, random: np.random.Generator) -> _View:
-        """The view of a range image."""
+    def of(cls, image: RangeImage) -> _DepthImage:
+        """The depth image of a range image of a pinhole camera, whose pose is that in the view."""
         from scipy.ndimage import binary_erosion
 
-        camera, _ = camera_and_pose(image)
+        camera, T = camera_and_pose(image)
         rays = camera.directions(camera.pixel_centres())
         z = image.z.astype(np.float64)
         normals = lattice_normals(z, rays)
@@ -75,10 +75,36 @@ class _View(NamedTuple):
         size = 2 * BORDER_PX + 1
         inner = binary_erosion(np.isfinite(z) & (cosine > MIN_COSINE), np.ones((size, size)))  # False with NaN
         normals[~inner] = np.nan
-        rows, columns = np.nonzero(inner)
-        few = random.permutation(len(rows))[:POINTS_PER_VIEW]
-        y, x = rows[few], columns[few]
-        return cls(camera, z, normals, rays[y, x] * z[y, x, None], normals[y, x])
+        return cls(camera, T, z, normals)
+
+    def readings(self) -> tuple[Array, Array]:
+        """Points (n, 3), metres, and normals (n, 3), coordinates of the view, where the image has normals."""
+        y, x = np.nonzero(np.isfinite(self.normals[..., 0]))
+        points = self.camera.directions(self.camera.pixel_centres())[y, x] * self.z[y, x, None]
+        return points @ self.T[:3, :3].T + self.T[:3, 3], self.normals[y, x] @ self.T[:3, :3].T
+
+
+class _View(NamedTuple):
+    """One view, prepared for the fit.
+
+    depth_images : what the view measured.
+    points, point_normals : (n, 3) float64, metres and unit vectors, coordinates of the view, a random part of the
+        readings.
+    """
+
+    depth_images: list[_DepthImage]
+    points: Array
+    point_normals: Array
+
+    @classmethod
+    def of(cls, image: RangeImage, random: np.random.Generator) -> _View:
+        """The view of a range image."""
+        depth_images = [_DepthImage.of(view) for view in local_views(image)]
+        nothing = np.zeros((0, 3)), np.zeros((0, 3))
+        found = zip(nothing, *(d.readings() for d in depth_images), strict=True)
+        points, normals = (np.concatenate(arrays) for arrays in found)
+        few = random.permutation(len(points))[:POINTS_PER_VIEW]
+        return cls(depth_images, points[few], normals[few])
 
 
 def refine_jointly(images: Sequence[RangeImage], poses: Array, reach_m: float, seed: int = 0) -> Array:
@@ -138,16 +164,17 @@ def _equations(views: list[_View], T: Array, reach_m: float, scale: float, size:
     for i, source in enumerate(views):
         world = source.points @ T[i, :3, :3].T + T[i, :3, 3]
         facing = source.point_normals @ T[i, :3, :3].T
-        for j, target in enumerate(views):
+        for j, target in ((j, d) for j, view in enumerate(views) for d in view.depth_images):
             if i == j or not len(world):
                 continue
-            local = (world - T[j, :3, 3]) @ T[j, :3, :3]
+            T_target = T[j] @ target.T
+            local = (world - T_target[:3, 3]) @ T_target[:3, :3]
             pixels = target.camera.project(local)
             z = depth_at(pixels, target.z, "bilinear")
             x, y = (np.nan_to_num(pixels[:, k]).astype(int).clip(0, m - 1) for k, m in enumerate(target.z.shape[::-1]))
-            n_j = target.normals[y, x] @ T[j, :3, :3].T
+            n_j = target.normals[y, x] @ T_target[:3, :3].T
             # The reading is on the ray of the point, so the two differ along the ray only
-            along = local / local[:, 2:] * (local[:, 2] - z)[:, None] @ T[j, :3, :3].T
+            along = local / local[:, 2:] * (local[:, 2] - z)[:, None] @ T_target[:3, :3].T
             r = (along * n_j).sum(axis=-1)
             fits = (np.abs(r) < min(reach_m, TUKEY * scale)) & ((n_j * facing).sum(axis=-1) > MIN_COSINE)
             if not fits.any():

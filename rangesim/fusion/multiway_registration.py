@@ -33,8 +33,10 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import AlignmentWarning
 from rangesim.fusion.joint_registration import refine_jointly
+from rangesim.fusion.pinhole_views import local_views, pinhole_views
 from rangesim.fusion.posed_images import Scan
 from rangesim.fusion.sdf import signed_distance
 from rangesim.geometry import icp, register
@@ -265,7 +267,8 @@ def _registered_points(scan: Scan, spacing_m: float | None, seed: int) -> tuple[
     """
     if spacing_m is not None and not 0 < spacing_m < np.inf:
         raise ValueError(f"expected a positive spacing_m in metres, got {shown(spacing_m)}.")
-    every = scan.points()
+    views = [local_views(image) for image in scan.images]
+    every = [np.concatenate([np.zeros((0, 3)), *(_points(v) for v in parts)]) for parts in views]
     for number, cloud in enumerate(every):
         if len(cloud) < MIN_POINTS:
             raise ValueError(
@@ -273,7 +276,9 @@ def _registered_points(scan: Scan, spacing_m: float | None, seed: int) -> tuple[
             )
     # The area of a surface is the number of its readings times the footprint of a pixel
     pixels = [
-        float(np.median(i.z[i.valid])) ** 2 / (i.pinhole.fx * i.pinhole.fy) for i in scan.images if i.camera is not None
+        float(np.median(np.concatenate([v.z[v.valid] for v in parts]))) ** 2
+        / (parts[0].pinhole.fx * parts[0].pinhole.fy)
+        for parts in views
     ]
     coarse = float(np.sqrt(np.median([a * len(c) for a, c in zip(pixels, every, strict=True)]) / POINTS_PER_VIEW))
     clouds = [_without_planes(cloud, spacing_m or coarse, seed) for cloud in every]
@@ -290,6 +295,12 @@ def _registered_points(scan: Scan, spacing_m: float | None, seed: int) -> tuple[
                 f"which leaves {len(thinned[-1])} of view {number}."
             )
     return thinned, spacing_m
+
+
+def _points(image: RangeImage) -> Array:
+    """Readings of an image (n, 3), metres, in the coordinates in which its pose is."""
+    points = image.to_point_cloud("world").points.reshape(-1, 3).astype(np.float64)
+    return points[np.isfinite(points).all(axis=1)]
 
 
 def _without_planes(cloud: Array, spacing_m: float, seed: int) -> Array:
@@ -425,21 +436,23 @@ def _refuse_disagreement(pairs: tuple[PairFit, ...], spacing: float) -> None:
 
 def _refuse_contradiction(scan: Scan, clouds: list[Array], spacing: float) -> None:
     """Raise ValueError if a view looks through a surface that another view measured."""
-    worst, views = 0.0, (0, 0)
+    worst, pair = 0.0, (0, 0)
+    views = [pinhole_views(image) for image in scan.images]
     for i, T in enumerate(scan.poses):
         world = clouds[i] @ T[:3, :3].T + T[:3, 3]
-        for j, image in enumerate(scan.images):
+        for j, parts in enumerate(views):
             if i == j:
                 continue
-            distance = signed_distance(world, image)
-            tolerance = THROUGH_SPACINGS * spacing + 0.01 * float(np.nanmedian(image.z))
-            through = float((distance < -tolerance).mean())  # False with NaN
+            typical_m = float(np.nanmedian(np.concatenate([v.z.ravel() for v in parts])))
+            tolerance = THROUGH_SPACINGS * spacing + 0.01 * typical_m
+            # Each point is seen by one part of a view
+            through = sum(float((signed_distance(world, v) < -tolerance).mean()) for v in parts)  # False with NaN
             if through > worst:
-                worst, views = through, (i, j)
+                worst, pair = through, (i, j)
     if worst > MAX_CONTRADICTION:
         raise ValueError(
-            f"expected poses in which no view sees through what another measured, but view {views[1]} looks through "
-            f"{worst:.0%} of view {views[0]}: they fit wrongly; {REMEDY}"
+            f"expected poses in which no view sees through what another measured, but view {pair[1]} looks through "
+            f"{worst:.0%} of view {pair[0]}: they fit wrongly; {REMEDY}"
         )
 
 

@@ -74,7 +74,7 @@ def signed_distance(
     Raises
     ------
     ValueError
-        The image has no camera (it is uncalibrated), the pose is not rigid, or points are not (..., 3).
+        The image has no pinhole camera (see `pinhole_views`), the pose is not rigid, or points are not (..., 3).
 
     Examples
     --------
@@ -188,7 +188,7 @@ def relative_weights(images: Sequence[RangeImage], weighting: Weighting) -> list
     bright reading (a highlight) would outvote two others.
     """
     weights = [reading_weights(image, weighting) for image in images]
-    counted = np.concatenate([w[w > 0][:: max(1, w.size // MEDIAN_READINGS)] for w in weights])
+    counted = np.concatenate([np.zeros(0), *(w[w > 0][:: max(1, w.size // MEDIAN_READINGS)] for w in weights)])
     if not counted.size:
         raise ValueError(f"expected views with readings, got {len(images)} in which no pixel measured anything.")
     return [np.minimum(w / np.median(counted), np.float32(1)) for w in weights]
@@ -222,7 +222,7 @@ def average_signed_distances(
     Raises
     ------
     ValueError
-        A view without camera, no readings at all, or `truncation_m` not positive.
+        A view without a pinhole camera (see `pinhole_views`), no readings at all, or `truncation_m` not positive.
 
     Examples
     --------
@@ -270,13 +270,19 @@ def camera_and_pose(
     ValueError
         No camera or pose, a pose that is not rigid and finite, or an image of another size than its camera.
     """
+    T = check_view(image, name, T_world_camera)
+    return image.pinhole, T
+
+
+def check_view(image: RangeImage, name: str = "T_world_camera", T_world_camera: ArrayLike | None = None) -> np.ndarray:
+    """Pose of a view as (4, 4) float64; the errors are those of `camera_and_pose`, but every camera is taken."""
     T = image.T_world_camera if T_world_camera is None else T_world_camera
     if image.camera is None or T is None:
         raise ValueError("expected a calibrated range image: without a rig it has no place among other views.")
     size = (image.camera.height, image.camera.width)
     if image.z.shape != size:
         raise ValueError(f"expected a range image of its camera's {size} pixels (h, w), got {image.z.shape}.")
-    return image.pinhole, pose(T, name)
+    return pose(T, name)
 
 
 def check_lookup(lookup: str) -> None:

@@ -15,6 +15,7 @@ from enum import IntEnum
 import numpy as np
 
 from rangesim.decoding.range_image import RangeImage
+from rangesim.fusion.pinhole_views import pinhole_views
 from rangesim.fusion.sdf import camera_and_pose, signed_distance
 from rangesim.fusion.solids import inside_voxels
 from rangesim.fusion.voxel_grid import VoxelGrid
@@ -137,6 +138,7 @@ def occupancy(
     """
     if not len(images) or not surfaces:
         raise ValueError(f"expected views and shapes to compare, got {len(images)} and {len(surfaces)}.")
+    images = [view for image in images for view in pinhole_views(image)]
     tolerance = grid.voxel_m if tolerance_m is None else tolerance_m
     if not tolerance > 0:
         raise ValueError(f"expected a positive tolerance_m in metres, got {shown(tolerance_m)}.")
@@ -178,6 +180,7 @@ def voxel_states(images: Sequence[RangeImage], grid: VoxelGrid) -> np.ndarray:
     [1, 1, 2, 0, 0]
     """
     states = np.empty(grid.shape, np.uint8)
+    images = [view for image in images for view in pinhole_views(image)]
     slab = max(1, VOXELS_AT_ONCE // (grid.shape[1] * grid.shape[2]))
     for first in range(0, grid.shape[0], slab):
         part = slice(first, first + slab)
@@ -227,13 +230,23 @@ def seen_surface(
     samples : number of random points on the surface.
     """
     points, face = mesh.sample(samples, seed)
-    normals, seen = mesh.face_normals[face], np.zeros(samples, bool)
-    closed = mesh.is_closed
-    for image in images:
-        _, T = camera_and_pose(image)
+    return float(is_measured(images, points, mesh.face_normals[face], tolerance_m, one_sided=mesh.is_closed).mean())
+
+
+def is_measured(
+    images: Sequence[RangeImage], points: np.ndarray, normals: np.ndarray, tolerance_m: float, *, one_sided: bool
+) -> np.ndarray:
+    """Whether some view measured each point of a surface: (n,) bool. The rule is that of `seen_surface`.
+
+    points, normals : (n, 3), metres and unit vectors, world.
+    one_sided : whether only views on the side to which the normal points see the surface.
+    """
+    seen = np.zeros(len(points), bool)
+    for view in (view for image in images for view in pinhole_views(image)):
+        _, T = camera_and_pose(view)
         to_camera = T[:3, 3] - points
         cosine = (to_camera * normals).sum(axis=-1) / np.linalg.norm(to_camera, axis=-1)
-        facing = (cosine if closed else np.abs(cosine)) > MIN_VIEW_COSINE
-        off = np.abs(signed_distance(points, image, lookup="bilinear"))
+        facing = (cosine if one_sided else np.abs(cosine)) > MIN_VIEW_COSINE
+        off = np.abs(signed_distance(points, view, lookup="bilinear"))
         seen |= facing & (off * np.abs(cosine) <= tolerance_m) & (off <= MAX_SLANT_TOLERANCES * tolerance_m)
-    return float(seen.mean())
+    return seen

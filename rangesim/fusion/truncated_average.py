@@ -21,12 +21,14 @@ from numba.extending import register_jitable
 from pcgraph.parallel import in_blocks, kernel, routine
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import AlignmentWarning
+from rangesim.fusion.pinhole_views import pinhole_views
 from rangesim.fusion.sdf import (
     MAX_DEPTH_STEP,
     Lookup,
     Weighting,
     camera_and_pose,
     check_lookup,
+    check_view,
     relative_weights,
 )
 from rangesim.rig.camera_model import appears, distort, project, to_pixel
@@ -143,13 +145,15 @@ def fuse(
     least = min(MIN_VIEW_FRACTION * len(images), MAX_MIN_WEIGHT) if min_weight is None else min_weight
     if not least >= 0:
         raise ValueError(f"expected min_weight of 0 or more typical readings, got {shown(min_weight)}.")
-    relative = relative_weights(images, weights)
-    _check_fineness(images, voxel_m)
-    grid = _Blocks.near(images, relative, voxel_m, truncation)
+    of_view = [(number, view) for number, image in enumerate(images) for view in pinhole_views(image)]
+    views = [view for _, view in of_view]
+    relative = relative_weights(views, weights)
+    _check_fineness(views, voxel_m)
+    grid = _Blocks.near(views, relative, voxel_m, truncation)
     _check_coarseness(grid.boxes, voxel_m)
-    _warn_of_views_apart(grid.boxes)
-    for image, weight in zip(images, relative, strict=True):
-        grid.add(image, weight, truncation, lookup)
+    _warn_of_views_apart(_joined_boxes(grid.boxes, [number for number, _ in of_view]))
+    for view, weight in zip(views, relative, strict=True):
+        grid.add(view, weight, truncation, lookup)
     mesh, of_vertices = grid.surface(least, truncation)
     if not len(mesh.faces):
         raise ValueError(
@@ -168,7 +172,7 @@ def _checked(images: Sequence[RangeImage], voxel_m: float, truncation_m: float |
     for number, image in enumerate(images):
         if not isinstance(image, RangeImage):
             raise ValueError(f"expected range images to fuse, got {shown(image)} as number {number}.")
-        camera_and_pose(image, name=f"the pose of view {number}")
+        check_view(image, f"the pose of view {number}")
     check_number("voxel_m", voxel_m, LENGTH)
     check_lookup(lookup)
     if truncation_m is not None:
@@ -190,6 +194,16 @@ def _check_coarseness(boxes: np.ndarray, voxel_m: float) -> None:
             f"expected voxel_m of at most {MAX_VOXEL_FRACTION * extent:.2g}, half of the extent of the readings, got "
             f"{voxel_m:g} m."
         )
+
+
+def _joined_boxes(boxes: np.ndarray, numbers: list[int]) -> np.ndarray:
+    """Box of the readings of each view (k, 2, 3), from those of its parts (n, 2, 3); NaN for parts without any.
+
+    numbers : the view of each part, ascending.
+    """
+    starts = np.unique(numbers, return_index=True)[1]
+    low, high = np.fmin.reduceat(boxes[:, 0], starts), np.fmax.reduceat(boxes[:, 1], starts)
+    return np.stack([low, high], axis=1)
 
 
 def _warn_of_views_apart(boxes: np.ndarray) -> None:

@@ -19,6 +19,7 @@ from rangesim.experiment.scan_settings import ScanSettings
 from rangesim.files.atomic_directories import new_directory
 from rangesim.fusion.mesh_error import SurfaceError, distances_to, surface_error
 from rangesim.fusion.multiway_registration import align, check_first_pair, pose_errors
+from rangesim.fusion.pinhole_views import local_views
 from rangesim.fusion.posed_images import Scan
 from rangesim.fusion.seen_volume import occupancy
 from rangesim.fusion.truncated_average import fuse
@@ -32,7 +33,6 @@ from rangesim.triangle_mesh import TriangleMesh
 if TYPE_CHECKING:
     from rangesim.decoding.range_image import RangeImage
     from rangesim.pipeline.cost import Cost
-    from rangesim.rig import Rig
     from rangesim.scene import Scene
 
 MAX_COMPARED_VOXELS = 1_000_000
@@ -88,15 +88,6 @@ def run_scan(
     return result
 
 
-def check_fusible(rig: Rig) -> None:
-    """Raise ValueError unless the camera is a pinhole, whose range images can be fused to a surface."""
-    if not rig.camera.is_pinhole:
-        raise ValueError(
-            f"expected a pinhole camera for a scan, whose views are fused to a surface, got a "
-            f"{type(rig.camera).__name__}; rangesim.scan and rangesim.transport give the views of other cameras alone."
-        )
-
-
 def estimate_scan(settings: ScanSettings) -> Cost:
     """Estimated cost of `run_scan` in light paths, memory, time and space on the disk.
 
@@ -110,7 +101,6 @@ def estimate_scan(settings: ScanSettings) -> Cost:
     from rangesim.scene import load_scene
 
     scene = load_scene(settings.scene, material=settings.material, unit_m=settings.unit_m)
-    check_fusible(settings.instrument.rig(scene, settings.width, settings.height))
     return estimate_scan_cost(settings, scene)
 
 
@@ -146,7 +136,6 @@ def carry_out_scan(
         if settings.ambient is not None:
             settings.ambient.check_emitters(scene.has_ambient)
         rig = settings.instrument.rig(scene, settings.width, settings.height)
-        check_fusible(rig)
         surfaces = true_surfaces(scene)
     cost = estimate_scan_cost(settings, scene, trial=announce is not None)
     cost.check_memory()
@@ -219,9 +208,8 @@ def errors_by_shape(
 
 def _voxel_m(views: Scan) -> float:
     """Default edge of a voxel in metres, from the median distance between neighbouring readings of the views."""
-    spacings = [
-        float(np.median(i.z[i.valid])) / i.pinhole.fx for i in views.images if i.camera is not None and i.valid.any()
-    ]
+    seen = [view for image in views.images for view in local_views(image) if view.valid.any()]
+    spacings = [float(np.median(view.z[view.valid])) / view.pinhole.fx for view in seen]
     return float(f"{VOXEL_SPACINGS * np.median(spacings):.2g}")
 
 

@@ -289,14 +289,15 @@ def _reach(directions: np.ndarray, radius: int) -> float:
 def _regressed(n, x, y, v, xx, xy, yy, xv, yv):  # type: ignore[no-untyped-def]
     """Slopes a, b and value c of the plane v = a x + b y + c through n points: least squares, from sums over them.
 
-    With them come the determinant of the spread of (x, y), which is 0 where the slopes are not finite, the diagonal of
-    that spread, and the sum of squares of v that the slopes explain.
+    With them come the determinant of the spread of (x, y), which is 0 where the points do not determine the slopes, the
+    diagonal of that spread, and the sum of squares of v that the slopes explain.
     """
     count = max(n, 1.0)
     sxx, sxy, syy = xx - x * x / count, xy - x * y / count, yy - y * y / count
     sxv, syv = xv - x * v / count, yv - y * v / count
     determinant = sxx * syy - sxy * sxy
-    a, b = (sxv * syy - syv * sxy) / determinant, (syv * sxx - sxv * sxy) / determinant
+    divisor = determinant if determinant != 0.0 else 1.0
+    a, b = (sxv * syy - syv * sxy) / divisor, (syv * sxx - sxv * sxy) / divisor
     return a, b, (v - a * x - b * y) / count, determinant, sxx, syy, a * sxv + b * syv
 
 

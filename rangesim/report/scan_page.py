@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rangesim.fusion.mesh_error import distances_to, nearest_on
-from rangesim.fusion.sdf import signed_distance
-from rangesim.fusion.seen_volume import MAX_SLANT_TOLERANCES, VoxelState
+from rangesim.fusion.seen_volume import VoxelState, is_measured
 from rangesim.report import figures, palette
 from rangesim.report.mesh_pictures import mesh_picture
 from rangesim.report.template import render_page
@@ -18,6 +17,7 @@ from rangesim.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from rangesim.results.scan_results import ScanResult
+    from rangesim.rig import Camera
 
 PICTURES = 3
 """Count of views, spread over the path, from which pictures of the mesh are taken: that many pictures stand side by
@@ -56,8 +56,7 @@ def context(result: ScanResult) -> dict[str, Any]:
     """Values of the variables of the template, by name."""
     error = palette.color_table("RdBu_r")
     truth = TriangleMesh.joined(list(result.surfaces.values()))
-    camera = result.scan.images[0].pinhole
-    camera = camera.resized(WIDTH_PX, max(1, round(WIDTH_PX * camera.height / camera.width)))
+    camera = _picture_camera(result.scan.images[0].camera)
     number = len(result.scan)
     places = _places(result)
     fused = result.fused
@@ -85,6 +84,13 @@ def context(result: ScanResult) -> dict[str, Any]:
     }
 
 
+def _picture_camera(camera: Camera | None) -> Intrinsics:
+    """Camera of the pictures: that of the views, or one of 90 degrees if that is no pinhole."""
+    if not isinstance(camera, Intrinsics):
+        camera = Intrinsics.from_fov(4, 3, 90.0)
+    return camera.resized(WIDTH_PX, max(1, round(WIDTH_PX * camera.height / camera.width)))
+
+
 def _places(result: ScanResult) -> list[int]:
     """Indices of up to `PICTURES` views, spread over the path, that have at least half as many readings as the best."""
     readings = np.array([image.valid.sum() for image in result.scan.images])
@@ -94,11 +100,11 @@ def _places(result: ScanResult) -> list[int]:
 
 def _line(result: ScanResult) -> str:
     """The settings of the scan in one line."""
-    camera = result.scan.images[0].pinhole
+    height, width = result.scan.images[0].z.shape
     s, fused = result.settings, result.fused
     known = "poses known" if s.registration == "known" else "poses found from the readings"
     return (
-        f"{len(result.scan)} views of {camera.width} × {camera.height} pixels, {s.path.type_name} · "
+        f"{len(result.scan)} views of {width} × {height} pixels, {s.path.type_name} · "
         f"{s.instrument.sensor.title} · {known} · voxels of {1e3 * fused.voxel_m:.3g} mm, truncation "
         f"{1e3 * fused.truncation_m:.3g} mm, weights by {s.weights}"
     )
@@ -164,7 +170,9 @@ def _row(
         return np.asarray(error[np.rint(255 * place).astype(int)], dtype=np.float64)
 
     def by_seen(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        return np.where(_seen(result, points, truth.face_normals[faces])[:, None], SEEN, UNSEEN)
+        tolerance_m, normals = result.seen.tolerance_m, truth.face_normals[faces]
+        seen = is_measured(result.scan.images, points, normals, tolerance_m, one_sided=False)
+        return np.where(seen[:, None], SEEN, UNSEEN)
 
     colors = {"shaded": None, "error": by_error, "seen": by_seen}[which]
     pictures = []
@@ -182,19 +190,6 @@ def _signed_error(points: np.ndarray, truth: TriangleMesh, normals: np.ndarray) 
     off = points - nearest_on(points, truth)
     length = np.linalg.norm(off, axis=-1)
     return np.where((off * np.nan_to_num(normals)).sum(axis=-1) >= 0, length, -length)
-
-
-def _seen(result: ScanResult, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(n,) bool, whether some view measured the true surface at points (n, 3), metres, world, with normals (n, 3)."""
-    tolerance = result.seen.tolerance_m
-    seen = np.zeros(len(points), bool)
-    for image in result.scan.images:
-        assert image.T_world_camera is not None
-        to_camera = image.T_world_camera[:3, 3] - points
-        cosine = np.abs((to_camera * np.nan_to_num(normals)).sum(axis=-1)) / np.linalg.norm(to_camera, axis=-1)
-        off = np.abs(signed_distance(points, image, lookup="bilinear"))
-        seen |= (off * cosine <= tolerance) & (off <= MAX_SLANT_TOLERANCES * tolerance)
-    return seen
 
 
 def _slices(result: ScanResult) -> list[dict[str, str]]:
