@@ -426,7 +426,7 @@ FUSION = {
     "joint_registration": "refine_jointly",
     "mesh_error": "SurfaceError surface_error",
     "multiway_registration": "Alignment PairFit PoseErrors align pose_errors",
-    "pinhole_views": "pinhole_views",
+    "virtual_cameras": "pinhole_views",
     "posed_images": "Scan",
     "sdf": "average_signed_distances reading_weights signed_distance",
     "seen_volume": "Occupancy SeenOfShape VoxelState occupancy true_occupancy voxel_states",

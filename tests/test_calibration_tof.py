@@ -25,6 +25,7 @@ from rangesim.calibration import (
 from rangesim.decoding.phase_shift import tap_phase
 from rangesim.decoding.status import Status
 from rangesim.errors import FileFormatError
+from rangesim.rig import Spinning
 
 PHASE = np.linspace(0, 1, 1001)
 CAMERA = Intrinsics.from_fov(64, 48, 60.0)
@@ -236,6 +237,8 @@ def test_a_board_is_as_far_as_its_plane_and_has_an_end():
     assert (np.abs(on_board[:, :2] - [0.25, 0.2]) <= [0.45, 0.4]).all()
     T[2, 3] = -1.5
     assert np.isnan(plane_range(CAMERA, T)).all()
+    with pytest.raises(ValueError, match="expected a pinhole camera"):
+        board_range(board, Spinning((0.0,), columns=90), T)  # type: ignore[arg-type]
 
 
 def test_it_is_read_back_equal(calibration, tmp_path):

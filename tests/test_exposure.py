@@ -280,3 +280,9 @@ def test_impossible_exposures_are_refused() -> None:
         expose(signals, DirectToF(bins=4, pulse_fwhm_s=0.0), Detector(), 1e-3)
     with pytest.raises(ValueError, match="run transport with this sensor"):
         expose(signals, AmcwToF(), Detector(), 1e-3)
+
+
+def test_an_exposure_without_a_detector_is_refused() -> None:
+    signals = plane_signals(stereo_rig(8, 6), SENSOR)
+    with pytest.raises(ValueError, match="expected a detector with exposure_s"):
+        expose(signals, SENSOR, exposure_s=1e-3)

@@ -99,7 +99,7 @@ def test_a_pass_is_shared_where_emitter_wavelength_and_camera_agree(plane: Scene
     others = (
         Instrument("ideal", IdealToF()),
         Instrument("905", DirectToF()),
-        Instrument("850", DirectToF(), wavelength_m=850e-9),
+        Instrument("850", DirectToF(), replace(DirectToF().default_detector, wavelength_m=850e-9)),
         Instrument("small", AmcwToF(), width=20),
     )
     experiment = Experiment("plane", width=40, height=30, instruments=(near_infrared, *others))
@@ -145,3 +145,10 @@ def test_a_size_that_no_instrument_uses_is_told() -> None:
     alone = Experiment("plane", instruments=(Instrument("tof", AmcwToF(), camera=CAMERA),), width=32, height=24, spp=4)
     with pytest.warns(RangesimWarning, match="width and height of the experiment do not apply: tof have a camera"):
         carry_out(alone)
+
+
+def test_an_emitter_outside_the_band_of_its_detector_is_refused() -> None:
+    near = Detector(wavelength_m=850e-9, band_width_m=30e-9)
+    assert Instrument("near", AmcwToF(), near, wavelength_m=860e-9).emitter_wavelength_m == 860e-9
+    with pytest.raises(ValueError, match=r"wavelength_m of instrument 'far' within .* 850 nm \+- 15 nm, got 905 nm"):
+        Instrument("far", AmcwToF(), near, wavelength_m=905e-9)

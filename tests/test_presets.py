@@ -392,6 +392,8 @@ def test_the_command_lists_the_devices_and_draws_them(
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["device", *NAMES]
     assert picture.read_bytes()[:4] == b"\x89PNG"
+    assert command(monkeypatch, "presets", "--picture", tmp_path / "views.jpg") == 2
+    assert "ends with .png" in capsys.readouterr().err
     assert command(monkeypatch, "presets", "kinect-v2") == 0
     assert capsys.readouterr().out == (FOLDER / "kinect-v2.toml").read_text()
     assert command(monkeypatch, "presets", "kinect-v3") == 1
@@ -463,3 +465,10 @@ def test_a_sheet_with_another_view_than_the_head_is_refused(tmp_path: Path) -> N
         path.write_text(text.replace("field_of_view_deg = [360.0, 30.0]", f"field_of_view_deg = {view}"))
         with pytest.raises(FileFormatError, match="as the sheet has, got 360 x 30"):
             presets.load(path)
+
+
+def test_a_file_that_starts_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    """Editors under Windows write it."""
+    mine = tmp_path / "mine.toml"
+    mine.write_bytes(b"\xef\xbb\xbf" + (FOLDER / "kinect-v2.toml").read_bytes())
+    assert replace(presets.load(str(mine)), name="kinect-v2") == presets.load("kinect-v2")

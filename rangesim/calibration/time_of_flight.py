@@ -172,7 +172,14 @@ def board_range(board: Board, camera: Intrinsics, T_camera_board: ArrayLike) -> 
     >>> board, camera = Checkerboard(3, 2, 0.1), Intrinsics(4, 1, 2.0, 2.0, 1.0, 0.5)
     >>> board_range(board, camera, translation(0, 0, 0.5)).round(3)
     array([[0.515, 0.515, 0.625,   nan]])
+
+    Raises
+    ------
+    ValueError
+        The camera is no pinhole, or the pose is not rigid.
     """
+    if not isinstance(camera, Intrinsics):
+        raise ValueError(f"expected a pinhole camera (Intrinsics) to see the board, got {shown(camera)}.")
     T = pose(T_camera_board, "T_camera_board")
     distance = plane_range(camera, T)
     rays = camera.directions(camera.pixel_centres())

@@ -72,7 +72,7 @@ def expose(
     detector : Detector (EMVA 1288) or, for direct time of flight, SpadDetector. None: the capture is noise-free; its
         frames are float32 radiance in W/m2/sr and contain the ambient light without a filter. The frames of an ideal
         sensor (`Sensor.is_ideal`) are always noise-free.
-    exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`.
+    exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`. A noise-free capture has none.
     seed : int from 0 to 2^64 - 1, seed of the noise. Every frame has its own random stream (with a SpadDetector, every
         image row has one); the same seed gives the same bytes on any number of threads.
     ambient : Ambient, kind and strength of the light of the scene's own emitters; the detector's band
@@ -82,8 +82,8 @@ def expose(
     Raises
     ------
     ValueError
-        The pass lacks the sensor's signals, the exposure is not positive, the seed is out of its range, detector and
-        sensor do not go together, or ambient light is stated for a scene that has none.
+        The pass lacks the sensor's signals, the exposure is not positive or is stated without a detector, the seed is
+        out of its range, detector and sensor do not go together, or ambient light is stated for a scene that has none.
 
     Examples
     --------
@@ -159,6 +159,11 @@ def exposed(
     seed = check_seed(seed)
     if exposure_s is not None:
         check_number("exposure_s", exposure_s, SECONDS)
+        if detector is None and not sensor.is_ideal:
+            raise ValueError(
+                f"expected a detector with exposure_s, such as {sensor.type_name}'s default_detector; without one, the "
+                "frames are radiance, and no exposure counts."
+            )
     if ambient is not None:
         ambient.check_emitters(bool(signals.energy.ambient.any()))
     if detector is None or sensor.is_ideal:

@@ -38,6 +38,8 @@ def presets_command(
     """
     from rangesim import presets
 
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise typer.BadParameter(f"expected a name that ends with .png, got {picture}.", param_hint="--picture")
     found = [presets.describe(each) for each in ([name] if name is not None else presets.names())]
     if picture is not None:
         from pcgraph.plumbing.plain_files import write_file

@@ -28,12 +28,15 @@ _PARAMETER = re.compile(r"\$(\w+)")
 
 
 def read_text(path: str | Path) -> str:
-    """Contents of a text file in UTF-8; FileFormatError if it is missing, too large or no text."""
+    """Contents of a text file in UTF-8, without its byte-order mark.
+
+    FileFormatError if the file is missing, too large or no text.
+    """
     path = Path(path)
     check_file(path, FileFormatError)
     try:
         limits.check("text", path.stat().st_size, f"bytes in {path}", FileFormatError)
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{path} is no text file.") from error
     except OSError as error:

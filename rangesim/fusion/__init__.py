@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from rangesim.fusion.multiway_registration import PoseErrors as PoseErrors
     from rangesim.fusion.multiway_registration import align as align
     from rangesim.fusion.multiway_registration import pose_errors as pose_errors
-    from rangesim.fusion.pinhole_views import pinhole_views as pinhole_views
     from rangesim.fusion.posed_images import Scan as Scan
     from rangesim.fusion.sdf import average_signed_distances as average_signed_distances
     from rangesim.fusion.sdf import reading_weights as reading_weights
@@ -63,6 +62,7 @@ if TYPE_CHECKING:
     from rangesim.fusion.solids import inside_voxels as inside_voxels
     from rangesim.fusion.truncated_average import FusedSurface as FusedSurface
     from rangesim.fusion.truncated_average import fuse as fuse
+    from rangesim.fusion.virtual_cameras import pinhole_views as pinhole_views
     from rangesim.fusion.voxel_grid import VoxelGrid as VoxelGrid
 else:
     import lazy_loader
@@ -81,7 +81,7 @@ else:
             "joint_registration": ["refine_jointly"],
             "mesh_error": ["SurfaceError", "surface_error"],
             "multiway_registration": ["Alignment", "PairFit", "PoseErrors", "align", "pose_errors"],
-            "pinhole_views": ["pinhole_views"],
+            "virtual_cameras": ["pinhole_views"],
             "posed_images": ["Scan"],
             "sdf": ["average_signed_distances", "reading_weights", "signed_distance"],
             "seen_volume": ["Occupancy", "SeenOfShape", "VoxelState", "occupancy", "true_occupancy", "voxel_states"],

@@ -21,8 +21,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesim.decoding.range_image import RangeImage
-from rangesim.fusion.pinhole_views import local_views
 from rangesim.fusion.sdf import camera_and_pose, depth_at
+from rangesim.fusion.virtual_cameras import local_views
 from rangesim.point_cloud import lattice_normals
 from rangesim.rig import Array, Intrinsics
 from rangesim.robust_scale import sigma_from_median

@@ -36,9 +36,9 @@ from scipy.spatial.transform import Rotation
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import AlignmentWarning
 from rangesim.fusion.joint_registration import refine_jointly
-from rangesim.fusion.pinhole_views import local_views, pinhole_views
 from rangesim.fusion.posed_images import Scan
 from rangesim.fusion.sdf import signed_distance
+from rangesim.fusion.virtual_cameras import local_views, pinhole_views
 from rangesim.geometry import icp, register
 from rangesim.rig import Array
 from rangesim.settings.bounds import check_number

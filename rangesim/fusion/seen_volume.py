@@ -15,9 +15,9 @@ from enum import IntEnum
 import numpy as np
 
 from rangesim.decoding.range_image import RangeImage
-from rangesim.fusion.pinhole_views import pinhole_views
 from rangesim.fusion.sdf import camera_and_pose, signed_distance
 from rangesim.fusion.solids import inside_voxels
+from rangesim.fusion.virtual_cameras import pinhole_views
 from rangesim.fusion.voxel_grid import VoxelGrid
 from rangesim.settings.config import ShortRepr, shown
 from rangesim.triangle_mesh import TriangleMesh

@@ -21,7 +21,6 @@ from numba.extending import register_jitable
 from pcgraph.parallel import in_blocks, kernel, routine
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import AlignmentWarning
-from rangesim.fusion.pinhole_views import pinhole_views
 from rangesim.fusion.sdf import (
     MAX_DEPTH_STEP,
     Lookup,
@@ -31,6 +30,7 @@ from rangesim.fusion.sdf import (
     check_view,
     relative_weights,
 )
+from rangesim.fusion.virtual_cameras import pinhole_views
 from rangesim.rig.camera_model import appears, distort, project, to_pixel
 from rangesim.settings import limits
 from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds, check_number

@@ -111,6 +111,7 @@ class Instrument:
             object.__setattr__(self, "detector", self.sensor.default_detector)
         if self.detector is not None and not self.sensor.is_ideal:
             self.detector.check(self.sensor.gate)
+            self._check_wavelength(self.detector)
         for one, others in (("camera", ("width", "height")), ("T_camera_projector", ("baseline_m",))):
             if getattr(self, one) is not None and (twice := [n for n in others if getattr(self, n) is not None]):
                 raise ValueError(f"expected either {one} or {twice[0]} of instrument {self.name!r}, got both.")
@@ -136,6 +137,16 @@ class Instrument:
         for pose_name in ("T_world_camera", "T_camera_projector"):
             if getattr(self, pose_name) is not None:
                 object.__setattr__(self, pose_name, pose(getattr(self, pose_name), pose_name))
+
+    def _check_wavelength(self, detector: PhotoDetector) -> None:
+        """Raise ValueError if the emitter's light is outside the band of the detector."""
+        if self.wavelength_m is None or abs(self.wavelength_m - detector.wavelength_m) <= 0.5 * detector.band_width_m:
+            return
+        raise ValueError(
+            f"expected wavelength_m of instrument {self.name!r} within the band of its detector, "
+            f"{1e9 * detector.wavelength_m:g} nm +- {5e8 * detector.band_width_m:g} nm, got "
+            f"{1e9 * self.wavelength_m:g} nm; set the detector's wavelength_m as well."
+        )
 
     def __eq__(self, other: Any) -> bool:
         return isinstance(other, Instrument) and to_dict(self) == to_dict(other)

@@ -19,10 +19,10 @@ from rangesim.experiment.scan_settings import ScanSettings
 from rangesim.files.atomic_directories import new_directory
 from rangesim.fusion.mesh_error import SurfaceError, distances_to, surface_error
 from rangesim.fusion.multiway_registration import align, check_first_pair, pose_errors
-from rangesim.fusion.pinhole_views import local_views
 from rangesim.fusion.posed_images import Scan
 from rangesim.fusion.seen_volume import occupancy
 from rangesim.fusion.truncated_average import fuse
+from rangesim.fusion.virtual_cameras import local_views
 from rangesim.fusion.voxel_grid import VoxelGrid
 from rangesim.pipeline.scan_cost import VOXEL_SPACINGS, estimate_scan_cost
 from rangesim.pipeline.stages import Progress, timed, unwatched

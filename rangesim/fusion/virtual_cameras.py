@@ -62,7 +62,7 @@ def pinhole_views(image: RangeImage) -> tuple[RangeImage, ...]:
 
     >>> import numpy as np
     >>> from rangesim import RangeImage, Spinning
-    >>> from rangesim.fusion.pinhole_views import pinhole_views
+    >>> from rangesim.fusion import pinhole_views
     >>> head = Spinning(elevations_deg=tuple(range(-16, 16, 2)), columns=360)
     >>> range_m = np.full((16, 360), 2.0, np.float32)
     >>> z = head.z_of(range_m).astype(np.float32)
