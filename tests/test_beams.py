@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from scipy.special import erf
+from tiers import to_validate
 
 from rangesim import AmcwToF, DirectToF, IdealToF, Scene, decode, expose, load_scene, transport
 from rangesim.rig import Beam, Intrinsics, Lens, RayTable, Rig
@@ -85,10 +86,7 @@ def obstacle(name: str) -> dict[str, Any]:
     ("name", "tolerance"),
     [
         ("nothing", 0.004),
-        ("slab", 0.015),
-        pytest.param("lens", 0.008, marks=pytest.mark.validation),
-        pytest.param("ball", 0.015, marks=pytest.mark.validation),
-        pytest.param("mirror", 0.008, marks=pytest.mark.validation),
+        *to_validate(("slab", 0.015), ("lens", 0.008), ("ball", 0.015), ("mirror", 0.008)),
     ],
 )
 def test_beams_that_tile_a_field_equal_the_light_of_a_projector(name: str, tolerance: float) -> None:

@@ -20,6 +20,7 @@ from browser import OPTIONS, WITHOUT_WEBGL, browser
 from PIL import Image
 from scroll_hints import check_scroll_hints
 from small_result import SCENES, SENSORS, result_of_two_cameras, small_result
+from tiers import to_validate
 
 from rangesim.causes import Cause
 from rangesim.decoding.status import Status
@@ -311,7 +312,7 @@ def _clouds(folder: Path, options: tuple[str, ...], state: str) -> tuple[list[np
 
 
 @needs_browser
-@pytest.mark.parametrize("mode", ["intensity", "error", "segments"])
+@pytest.mark.parametrize("mode", ["error", *to_validate("intensity", "segments")])
 def test_without_webgl_the_clouds_are_still_pictures(tmp_path: Path, mode: str) -> None:
     """The same pictures as WebGL draws, with all captions, a sentence and no uncaught error."""
     still, said = _clouds(tmp_path / "without", WITHOUT_WEBGL, f"color={mode}")

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from small_result import ROOT, small_result
+from tiers import to_validate
 
 import pcgraph.cli
 import rangesim.cli
@@ -230,8 +231,14 @@ def test_signals_end_a_command_in_one_line_at_any_moment(tmp_path: Path, package
     assert ended >= len(MOMENTS) - 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("package", ["rangesim", "pcgraph"])
+@pytest.mark.parametrize(
+    ("package", "number"),
+    [
+        ("rangesim", signal.SIGINT),
+        ("pcgraph", signal.SIGTERM),
+        *to_validate(("rangesim", signal.SIGTERM), ("pcgraph", signal.SIGINT)),
+    ],
+)
 def test_a_signal_after_the_last_line_is_one_line_too_or_comes_too_late(
     tmp_path: Path, package: str, number: signal.Signals
 ) -> None:
@@ -353,7 +360,7 @@ def test_verify_takes_captures_and_decoded_ones_too(command: Command, tmp_path: 
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="streams are closed in a child before it runs")
-@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
+@pytest.mark.parametrize("closed", [(0, 1, 2), *to_validate(((1,),), ((2,),))])
 def test_closed_standard_streams_are_no_obstacle(command: Command, tmp_path: Path, closed: tuple[int, ...]) -> None:
     """`rangesim ... >&- 2>&-`: it works, no file takes the number of a stream, and signals end it as ever."""
 

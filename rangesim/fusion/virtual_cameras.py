@@ -69,7 +69,7 @@ def pinhole_views(image: RangeImage) -> tuple[RangeImage, ...]:
     >>> one = np.ones(z.shape, np.float32)
     >>> views = pinhole_views(RangeImage(z, range_m, one, np.zeros(z.shape, np.uint8), one, head, np.eye(4)))
     >>> len(views), views[0].z.shape, round(float(np.nanmax(views[0].range_m)), 3)
-    (4, (48, 123), 2.0)
+    (4, (45, 122), 2.0)
     """
     T = pose(image.T_world_camera, "T_world_camera") if image.T_world_camera is not None else None
     if image.camera is None or T is None:
