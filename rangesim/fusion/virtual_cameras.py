@@ -159,7 +159,7 @@ class _Surface(NamedTuple):
 
 
 class _RayOrder(NamedTuple):
-    """Which rays of a camera lead beside each other.
+    """Neighbourhood of the rays of a camera.
 
     leads : (h, w) bool, pixels that have a ray; those beside the image of a fisheye have none. n of them do.
     triangles : (m, 3) int32, indices of neighbouring rays, without triangles that cover a gap between rays.
@@ -175,7 +175,7 @@ class _RayOrder(NamedTuple):
 
 @lru_cache(maxsize=4)  # the views of a scan have one camera, and the hull of 65 000 rays takes a second
 def _ray_order(camera: Camera) -> _RayOrder:
-    """Which rays of a camera lead beside each other."""
+    """Neighbourhood of the rays of a camera."""
     leads = np.asarray(np.isfinite(camera.rays.directions).all(axis=-1))
     directions = camera.rays.directions[leads]
     try:

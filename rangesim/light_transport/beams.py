@@ -101,7 +101,7 @@ class Spot:
 
 @dataclass
 class Pencil:
-    """How far the rays of the beam around a camera ray have spread, and what is left of their light.
+    """Spread of the beam's rays around a camera ray, and the fraction of their light that is left.
 
     a_point, b_point : Vector3f, metres, derivatives of the place on the ray by the tangents a and b at the emitter.
     a_direction, b_direction : Vector3f, derivatives of its direction.

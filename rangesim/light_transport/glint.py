@@ -332,7 +332,7 @@ def _worth_probing(traced: TracedScene, h: int, w: int) -> np.ndarray:
 def _near_the_lens(
     view: GlintView, rig: Rig, pixel: np.ndarray, report: Callable[[], None]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Those of the pixels whose probes come near the lens, in comparison with how far the probes spread.
+    """Selection of the pixels whose probes come near the lens, compared with the spread of the probes.
 
     Returns
     -------

@@ -68,8 +68,11 @@ class Guides(NamedTuple):
     reflectance: NDArray[np.float32]
 
     def with_reflectance(self, reflectance: NDArray[np.float32]) -> Guides:
-        """These guides with another reflectance (h, w). Pixels where it is 0 share no light: at the edge of a surface,
-        the few samples over which a texture is averaged may all miss it."""
+        """The same guides with another reflectance (h, w).
+
+        Pixels where it is 0 share no light: at the edge of a surface, the few samples over which a texture is averaged
+        may all miss it.
+        """
         instance = np.where(reflectance > 0, self.instance, np.int32(-1))
         return self._replace(reflectance=reflectance, instance=instance)
 

@@ -83,7 +83,7 @@ def lit_spot(
 
 
 class SpotLight(NamedTuple):
-    """What a spot brings to a vertex of a camera path.
+    """Light of a spot at a vertex of a camera path.
 
     direction : Vector3f, unit, world, from the vertex to the spot.
     length : Float, metres, optical length from the emitter over the spot to the vertex.

@@ -117,7 +117,7 @@ class NormalEquations:
 
     @cached_property
     def _starts(self) -> list[np.ndarray]:
-        """For each term, (n_points + 1,) int64: index of the first residual of each point, and the number of all."""
+        """Index of the first residual of each point, and the number of all: (n_points + 1,) int64 for each term."""
         numbers = np.arange(self.sizes.points + 1)
         return [np.searchsorted(term.point, numbers) for term in self.terms]
 

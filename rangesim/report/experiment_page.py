@@ -178,7 +178,7 @@ def _light(result: Result, number: int) -> dict[str, Any]:
 
 
 def _emitter(rig: Rig) -> str:
-    """What the emitter is, and where it stands."""
+    """Text that names the emitter and its place."""
     if isinstance(rig.projector, Beam):
         beside = 1e3 * math.hypot(*rig.projector.offset_m)
         wide, high = (1e3 * angle for angle in rig.projector.divergence_rad)

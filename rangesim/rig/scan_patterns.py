@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the rays of scanning instruments lead, and when: turning heads, oscillating mirrors and rotating prisms.
+"""Directions and times of the rays of scanning instruments: turning heads, oscillating mirrors, rotating prisms.
 
 Each function returns a table of rays, in the coordinates of the instrument as OpenCV has them: x right, y down, z
 forward. Azimuth 0 is z and grows to the right, towards x. Seen from above, a head that turns that way turns clockwise,
