@@ -251,7 +251,7 @@ class _SearchPaths:
         return Path(str(self.paths.resolve(name)))
 
     def within(self, folder: str, beside: Path) -> _SearchPaths:
-        """The same search paths with a folder in front: the one beside the file, or else the one that these paths find."""
+        """The same search paths with a folder in front: the one beside the file, or else the one that they find."""
         near, paths = beside.parent / folder, mi.FileResolver(self.paths)
         paths.prepend(str(near if os.path.exists(near) else self.resolve(folder)))
         return _SearchPaths(paths)
