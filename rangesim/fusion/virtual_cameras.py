@@ -33,9 +33,9 @@ MAX_GAP = 4.0
 ray leads, such as below the lowest ring. A larger value closes such gaps, a smaller one opens the space between rings
 that are unevenly spaced."""
 MIN_BEND_COSINE = np.cos(np.radians(30.0))
-"""Smallest cosine (a ratio) of the angle between neighbouring triangles of one slanted surface. Readings one ring apart
-on the ground differ by far more than `MAX_DEPTH_STEP`; they are connected because the ground goes on in the same
-direction. A larger angle connects objects with what is behind them."""
+"""Smallest cosine (a ratio) of the angle by which a slanted surface bends from one reading to the next but one.
+Readings one ring apart on the ground differ by far more than `MAX_DEPTH_STEP`; they are connected because the ground
+goes on in the same direction. A larger angle connects objects with what is behind them."""
 MARGIN_PX = 4
 """Pixels by which the virtual cameras overlap on each side, so that the pixels at their borders have neighbours."""
 MAX_FACE_PX = 2048
@@ -194,22 +194,28 @@ def _ray_order(camera: Camera) -> _RayOrder:
 def _is_surface(points: Array, order: _RayOrder) -> np.ndarray:
     """Whether the readings of each triangle lie on one surface: (m,) bool.
 
-    They do if their ranges differ by `MAX_DEPTH_STEP` at most, or if the surface goes on in the same direction beyond
-    the edge along which the range changes least. Across an edge of an object it does not go on.
+    They do if their ranges differ by `MAX_DEPTH_STEP` at most, or if the surface goes straight on through the edge
+    along which the range changes least, from the third corner of the triangle beyond this edge to that of the triangle
+    itself. Across an edge of an object it does not. Noise along that edge, where readings are close together, does not
+    count.
 
     points : (n, 3), metres, readings from the centre; NaN where there is none.
     """
-    corners = points[order.triangles]
-    ranges = np.linalg.norm(corners, axis=-1)
+    ranges = np.linalg.norm(points, axis=-1)[order.triangles]
     with np.errstate(invalid="ignore", divide="ignore"):
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals *= -np.sign((normals * corners[:, 0]).sum(axis=-1))[:, None]  # towards the centre
-        normals /= np.linalg.norm(normals, axis=-1)[:, None]
         is_level = np.ptp(ranges, axis=-1) <= MAX_DEPTH_STEP * ranges.min(axis=-1)  # False with NaN
     steps = np.abs(np.roll(ranges, -1, axis=1) - np.roll(ranges, -2, axis=1))  # along the edge opposite each corner
-    next_one = order.beside[np.arange(len(steps)), np.nan_to_num(steps, nan=np.inf).argmin(axis=1)]
-    cosine = (normals * normals[next_one]).sum(axis=-1)
-    return np.asarray(is_level | ((next_one >= 0) & (cosine >= MIN_BEND_COSINE)))
+    number = np.arange(len(steps))
+    third = np.nan_to_num(steps, nan=np.inf).argmin(axis=1)
+    beyond = order.beside[number, third]
+    ends = order.triangles[number[:, None], (third[:, None] + [1, 2]) % 3]
+    apex = order.triangles[number, third]
+    other = order.triangles[beyond].sum(axis=1) - ends.sum(axis=1)  # the third corner beyond the edge
+    middle = points[ends].mean(axis=1)
+    towards, onwards = middle - points[np.where(beyond >= 0, other, apex)], points[apex] - middle
+    with np.errstate(invalid="ignore", divide="ignore"):
+        cosine = (towards * onwards).sum(axis=-1) / np.linalg.norm(towards, axis=-1) / np.linalg.norm(onwards, axis=-1)
+    return np.asarray(is_level | ((beyond >= 0) & (cosine >= MIN_BEND_COSINE)))
 
 
 def _cube_faces() -> tuple[Array, ...]:
