@@ -217,7 +217,7 @@ def test_a_lens_that_darkens_the_corners_asks_for_more_light_there(noise: bool) 
     sensor, detector = SENSORS["gray"]
     rig = replace(stereo_rig(), camera_lens=Lens(0.75e-3, vignetting=4.0))
     even, darkened = (
-        light_budget(signals, expose(signals, sensor, detector if noise else None, 2e-3), sensor.default_decoder)
+        light_budget(signals, expose(signals, sensor, *((detector, 2e-3) if noise else ())), sensor.default_decoder)
         for signals in (
             plane_signals(replace(rig, camera_lens=Lens(0.75e-3, vignetting=n)), sensor, ambient=0.0)
             for n in (0.0, 4.0)
