@@ -90,7 +90,7 @@ D435 = replace(
     decoder=StereoDecoder(
         DenseMatching(
             small_penalty=20, large_penalty=100, uniqueness=0.05, min_advantage=-62.0, max_sigma_px=10.0,
-            min_correlation=0.3, min_slope_correlation=-1.0,
+            min_correlation=0.3, min_slope_correlation=-1.0, texture_around=False,
         )
     ),
 )  # fmt: skip

@@ -212,6 +212,9 @@ def test_beside_a_lone_edge_nothing_is_read(method: Any, steps: tuple[float, flo
 
     found = match_densely(seen(0.0), seen(12.0), (0, 20), DenseMatching(method), noise=(stated, stated))
     assert np.isfinite(found.disparity_px[INSIDE]).mean() < 0.002
+    without = DenseMatching(method, texture_around=False)
+    read = match_densely(seen(0.0), seen(12.0), (0, 20), without, noise=(stated, stated)).disparity_px
+    assert np.nanmedian(read[INSIDE]) == pytest.approx(12.0, abs=0.2)
 
 
 def test_where_texture_encloses_a_bright_thing_both_are_read() -> None:

@@ -125,6 +125,8 @@ class DenseMatching:
         brightness gives both windows a high correlation, but locates nothing; their derivatives are noise, and differ.
     min_region_px : number of pixels; smaller regions of connected matches, whose neighbours differ by at most a pixel
         of disparity, are refused as speckles. 0: none are.
+    texture_around : whether a match needs texture on all sides of its pixel. Without it, a pixel on an even surface
+        beside a lone edge takes the depth of the edge.
     refine : whether disparities are refined, see the module. Without it they come from a parabola through three costs.
 
     Examples
@@ -145,6 +147,7 @@ class DenseMatching:
     min_correlation: Annotated[float, Bounds("a correlation coefficient", -1, 1)] = 0.7
     min_slope_correlation: Annotated[float, Bounds("a correlation coefficient", -1, 1)] = 0.5
     min_region_px: Annotated[int, Bounds("a number of pixels", 0, 10_000_000)] = 60
+    texture_around: bool = True
     refine: bool = True
 
     def __post_init__(self) -> None:
@@ -227,8 +230,9 @@ def match_densely(
     # Where the texture does not suffice, neither a match nor its failure means anything
     is_flat = locating_sigma(images[0], noises, settings.reach) > settings.max_sigma_px
     outcome[known & is_flat] = MatchOutcome.NO_TEXTURE
-    matched = outcome == MatchOutcome.MATCHED
-    outcome[matched & ~is_enclosed(images[0], fit.variance, matched, settings)] = MatchOutcome.NO_TEXTURE
+    if settings.texture_around:
+        matched = outcome == MatchOutcome.MATCHED
+        outcome[matched & ~is_enclosed(images[0], fit.variance, matched, settings)] = MatchOutcome.NO_TEXTURE
     is_alike = fit.slope_correlation >= settings.min_slope_correlation
     is_sure = is_alike & (fit.correlation >= settings.min_correlation) & (fit.sigma_px <= settings.max_sigma_px)
     refused = ~(np.isfinite(fit.disparity_px) & is_sure)
