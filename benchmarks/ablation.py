@@ -26,7 +26,8 @@ Columns, one row per part, the largest gain first:
 
 A part that no call of the default comes by is not run on that cloud; one by which only the way from voxels to objects
 comes starts from the default's voxels. --out keeps draws as they come, and goes on from them when it is called again;
---table shows them and runs nothing. For times set NUMBA_NUM_THREADS=1. The last line is JSON: each part's row.
+--table shows them and runs nothing. For times set NUMBA_NUM_THREADS=1. The last line is JSON: each part's row, and the
+code that would go with it.
 """
 
 from __future__ import annotations
@@ -234,14 +235,8 @@ def _is_looked_up(target: Target, called: set[CodeType]) -> bool:
 
 
 def _are_same(one: pcgraph.Segmentation, other: pcgraph.Segmentation) -> bool:
-    pairs = (
-        (one.labels, other.labels),
-        (one.supervoxels, other.supervoxels),
-        (one.tree.parents, other.tree.parents),
-        (one.tree.altitudes, other.tree.altitudes),
-        (one.surface.normals, other.surface.normals),
-    )
-    return all(np.array_equal(first, second) for first, second in pairs)
+    pairs = ((r.labels, r.supervoxels, r.tree.parents, r.tree.altitudes, r.surface.normals) for r in (one, other))
+    return all(map(np.array_equal, *pairs))
 
 
 def _scored(domain: Domain, sample: Sample, result: pcgraph.Segmentation) -> dict[str, float]:
@@ -333,7 +328,8 @@ def table(parts: list[Part], report: Report) -> list[dict[str, Any]]:
         }
         if gains:
             cost, times = source.cost(part.code)._asdict(), report["times"].get(part.name, {})
-            rows.append({"part": part.name, **_summary(gains, report), **times, **cost})
+            code = sorted(":".join(one) for one in source.removed_with(part.code))
+            rows.append({"part": part.name, **_summary(gains, report), **times, **cost, "code": code})
     return sorted(rows, key=lambda row: -row["gain"])
 
 

@@ -354,6 +354,7 @@ SIZES = (
     _constant("spacing of copies", "voxels/spacing.py", "_COPIES", 0, "_fullest", "_THIN"),
     _constant("sizes per octave", _SCAN, "_SIZES_PER_OCTAVE", 1 << 40),
     _constant("offset of the grid", _SCAN, "_GRID_OFFSET", 0.0),
+    _constant("control: another offset of the grid", _SCAN, "_GRID_OFFSET", 0.618),  # as good: what luck makes
     _function("larger voxels", _SIZE, "_enlarged_size", lambda f: lambda points, grid, *others: grid.size),
     _constant("larger: gain that is asked for", _SIZE, "_MIN_GAIN", 0.0),
     _constant("larger: gain of sparse clouds", _SIZE, "_MIN_GAIN_OF_SPARSE", 0.0),
