@@ -5,8 +5,8 @@
                                   [--draws N] [--repeats N] [--out FILE] [--table]
 
 Each part (`ablation_parts.py`) is switched off alone. A score's gain is that of the default less that without the part,
-on the same cloud. The clouds are those of `domains.py`, with the scores that count there; heaps (mOSD test clouds) and
-tables as turned images; and of each kind of `scan_places.py` the first cloud, turned, with the fraction of the voxels
+on the same cloud. The clouds (`ablation_clouds.py`) are those of `domains.py`, with the scores that count there; heaps,
+images of other cameras; and of each kind of `scan_places.py` the first cloud, turned, with the fraction of the voxels
 that face the scanner as a second score. Of a domain with one cloud, copies of it turned about z are further draws.
 
 Columns, one row per part, the largest gain first:
@@ -41,21 +41,20 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import CodeType, FrameType, FunctionType
 from typing import Any
 
 import numpy as np
+from ablation_clouds import all_domains
 from ablation_cost import Source
 from ablation_parts import PARTS, Part, Target, switched_off
-from domain_clouds import DATA, Domain, MissingDataError, Sample, domains, mosd_organised, turned
+from domain_clouds import Domain, MissingDataError, Sample, mosd_organised
 from domains import judged, scores_of_tree
-from mosd import load_clouds
 from numpy.typing import NDArray
 from room import rooms
-from scan_places import KINDS
 from scores import fraction_facing
 
 import pcgraph
@@ -112,41 +111,6 @@ def _keep(report: Report, path: Path | None) -> None:
         beside = path.with_suffix(".part")
         beside.write_text(json.dumps(report), encoding="utf-8")
         beside.replace(path)
-
-
-# --- Clouds -----------------------------------------------------------------------------------------------------------
-
-
-def all_domains(turns: int) -> list[Domain]:
-    """Domains of `domains.py`, then others; those with one cloud have so many draws of it."""
-    levels, room = ("wov", "oracle"), (0.02,)
-    found = [replace(domain, load=partial(_drawn, domain, turns)) for domain in domains()]
-    found.append(Domain("heaps", levels, _heaps, 100, room, 0.01))
-    found.append(Domain("mosd organised, turned", levels, _turned_images, 100, room, 0.01))
-    for name in KINDS:
-        found.append(Domain(f"place: {name}", ("wov", "facing"), partial(_of_place, name, turns), 100, room, 0.02))
-    return found
-
-
-def _drawn(domain: Domain, turns: int) -> list[Sample]:
-    samples = domain.load()
-    return samples[0].turned(turns) if len(samples) == 1 else samples
-
-
-def _heaps() -> list[Sample]:
-    folder = DATA / "mosd_clutter"
-    if not folder.exists():
-        raise MissingDataError(f"{folder} is not there")
-    return [Sample(cloud.points, cloud.objects, cloud.colors) for cloud in load_clouds(folder)]
-
-
-def _turned_images() -> list[Sample]:
-    return [turned(sample, seed) for seed, sample in enumerate(mosd_organised()[::3])]
-
-
-def _of_place(name: str, turns: int) -> list[Sample]:
-    first = replace(next(iter(KINDS[name]())), colors=None)
-    return [turned(first, seed) for seed in range(turns)]
 
 
 # --- Scores with and without each part --------------------------------------------------------------------------------
@@ -252,13 +216,17 @@ def _scored(domain: Domain, sample: Sample, result: pcgraph.Segmentation) -> dic
 def measure(domain: Domain, parts: list[Part], report: Report, draws: int | None = None) -> None:
     """Put the scores of a domain, with each part and without, into the report, where they are not there yet."""
     known = report["domains"].get(domain.name, {"without": {}})
-    new = [part for part in parts if part.name not in known["without"]]
-    if not new:
-        return
     try:
-        samples = domain.samples()[:draws]
+        samples = domain.samples()
     except MissingDataError as missing:
         print(f"{domain.name}: left out, {missing}", flush=True)
+        return
+    if draws is not None and draws < len(samples):
+        samples = [samples[at] for at in np.linspace(0, len(samples) - 1, draws).astype(int)]
+    if len(known.get("default", ())) != len(samples):
+        known = {"without": {}}
+    new = [part for part in parts if part.name not in known["without"]]
+    if not new:
         return
     start, default = time.perf_counter(), []
     without: dict[str, list[Scores | str | None]] = {part.name: [] for part in new}
