@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -24,7 +25,7 @@ def all_domains(turns: int) -> list[Domain]:
     """Domains of `domains.py`, then others; those with one cloud have so many draws of it."""
     levels, fine = ("wov", "oracle"), (0.02,)
     found = [replace(domain, load=partial(_drawn, domain, turns)) for domain in domains()]
-    others = {
+    others: dict[str, Callable[[], list[Sample]]] = {
         "heaps": _heaps,
         "heaps as turned lists": _heaps_as_lists,
         "tables as turned images": _turned_images,
