@@ -9,11 +9,12 @@ from functools import partial
 
 import numpy as np
 from domain_clouds import DATA, Domain, MissingDataError, Sample, domains, mosd_organised, turned
-from mosd import load_clouds
 from numpy.typing import NDArray
 from scan_places import KINDS
 from scanned_rooms import flat, office
 from scanned_scenes import Scene, caster_of
+
+import pcgraph
 
 STEP_PER_M = 2.85e-3  # of a Kinect's inverse depth
 WIDTH, HEIGHT, FOCAL = 640, 480, 525.0
@@ -44,19 +45,25 @@ def _drawn(domain: Domain, turns: int) -> list[Sample]:
 
 
 def _heaps() -> list[Sample]:
+    """Heaps of some twenty things as their files are: images, or a list."""
     folder = DATA / "mosd_clutter"
     if not folder.exists():
         raise MissingDataError(f"{folder} is not there")
-    return [Sample(cloud.points, cloud.objects, cloud.colors) for cloud in load_clouds(folder)]
+    found = []
+    for path in sorted(folder.glob("*.pcd")):
+        cloud = pcgraph.read_cloud(path)
+        assert cloud.labels is not None
+        is_true = (cloud.labels > 0) & np.isfinite(cloud.points).all(axis=-1)
+        found.append(Sample(cloud.points, np.where(is_true, cloud.labels // 10, -1).astype(np.int32), cloud.colors))
+    return found
 
 
 def _heaps_as_lists() -> list[Sample]:
     found = []
     for seed, sample in enumerate(_heaps()):
-        assert sample.colors is not None
         kept = np.isfinite(sample.points).all(axis=-1)
-        listed = Sample(sample.points[kept], sample.truth[kept], sample.colors[kept])
-        found.append(turned(listed, seed))
+        colors = None if sample.colors is None else sample.colors[kept]
+        found.append(turned(Sample(sample.points[kept], sample.truth[kept], colors), seed))
     return found
 
 
