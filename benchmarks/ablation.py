@@ -15,6 +15,7 @@ Columns, one row per part, the largest gain first:
     +- draws     standard error of it over the draws of each domain: what the luck of the grid makes of these clouds.
                  Domains of one draw take the mean variance of the others
     +- kinds     standard error of it over the domains: what other kinds of clouds may make of it
+    rest         gain without the domain that gains most
     for, against domains whose scores gain, or lose, more than 0.003 in the mean
     touched      domains on which the part changes anything at all
     best, worst  the scores that gain and lose most
@@ -323,11 +324,13 @@ def _summary(gains: dict[str, NDArray[np.float64]], report: Report) -> dict[str,
         for name, gain in gains.items()
         for score, column in zip(report["domains"][name]["scores"], gain.T, strict=True)
     }
+    others = np.arange(len(means)) != np.argmax(weights * means)
     best, worst = max(scores, key=scores.__getitem__), min(scores, key=scores.__getitem__)
     return {
         "gain": mean,
         "draws": float(np.sqrt(weights**2 @ variances) / weights.sum()),
         "kinds": float(np.sqrt(weights**2 @ (means - mean) ** 2) / weights.sum()),
+        "rest": float(weights[others] @ means[others] / max(weights[others].sum(), 1.0)),
         "for": int(np.count_nonzero(means > NOTICED)),
         "against": int(np.count_nonzero(means < -NOTICED)),
         "touched": sum(bool(gain.any()) for gain in gains.values()),
@@ -345,15 +348,16 @@ def markdown(rows: list[dict[str, Any]], report: Report) -> str:
         f"{len(report['domains'])} domains, {n_scores} scores, mean of the default {sum(every) / n_scores:.4f}",
         f"time of the default: {default}" if default else "",
         "",
-        "| part | gain | +- draws | +- kinds | for | against | touched | best | worst "
+        "| part | gain | +- draws | +- kinds | rest | for | against | touched | best | worst "
         "| image, ms | list, ms | lines | constants | kernels |",
-        "|---|" + "---:|" * 6 + "---|---|" + "---:|" * 5,
+        "|---|" + "---:|" * 7 + "---|---|" + "---:|" * 5,
     ]
     for row in rows:
         ends = " | ".join("" if row[end] is None else f"{row[end][0]} {row[end][1]:+.3f}" for end in ("best", "worst"))
         times = " | ".join("" if row.get(name) is None else f"{row[name]:.1f}" for name in ("image", "list"))
         lines.append(
-            f"| {row['part']} | {row['gain']:+.4f} | {row['draws']:.4f} | {row['kinds']:.4f} | {row['for']} "
+            f"| {row['part']} | {row['gain']:+.4f} | {row['draws']:.4f} | {row['kinds']:.4f} "
+            f"| {row['rest']:+.4f} | {row['for']} "
             f"| {row['against']} | {row['touched']} | {ends} | {times} "
             f"| {row['lines']} | {row['constants']} | {row['kernels']} |"
         )
