@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What does each part of pcgraph's default segmentation gain, on which clouds, and at what price?
 
-    python benchmarks/ablation.py [--parts "gaps,law:"] [--domains "room1,street sweep A"] [--turns N] [--quick]
-                                  [--draws N] [--repeats N] [--out FILE] [--table]
+    python benchmarks/ablation.py [--parts "gaps,law:"] [--jointly] [--domains "room1,street sweep A"] [--turns N]
+                                  [--draws N] [--quick] [--repeats N] [--out FILE] [--table]
 
-Each part (`ablation_parts.py`) is switched off alone. A score's gain is that of the default less that without the part,
+Each part (`ablation_parts.py`) is switched off alone, or with --jointly all that are named at once. A score's gain is that of the default less that without the part,
 on the same cloud. The clouds (`ablation_clouds.py`) are those of `domains.py`, with the scores that count there; heaps,
 images of other cameras; and of each kind of `scan_places.py` the first cloud, turned, with the fraction of the voxels
 that face the scanner as a second score. Of a domain with one cloud, copies of it turned about z are further draws.
@@ -51,7 +51,7 @@ from typing import Any
 import numpy as np
 from ablation_clouds import all_domains
 from ablation_cost import Source
-from ablation_parts import PARTS, Part, Target, switched_off
+from ablation_parts import PARTS, Part, Target, jointly, switched_off
 from domain_clouds import Domain, MissingDataError, Sample, mosd_organised
 from domains import judged, scores_of_tree
 from numpy.typing import NDArray
@@ -74,6 +74,7 @@ Report = dict[str, Any]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", help="names, comma-separated, or the beginnings of names; default: all")
+    parser.add_argument("--jointly", action="store_true", help="switch all of these off at once")
     parser.add_argument("--domains", help="likewise")
     parser.add_argument("--turns", type=int, default=TURNS, metavar="N", help="draws of a domain with one cloud")
     parser.add_argument("--draws", type=int, metavar="N", help="of any domain, at most; default: all")
@@ -85,6 +86,7 @@ def main() -> None:
     warnings.simplefilter("ignore")  # of switched-off parts
     report = json.loads(args.out.read_text()) if args.out and args.out.exists() else {"domains": {}, "times": {}}
     parts = _named(PARTS, args.parts)
+    parts = [jointly(parts)] if args.jointly else parts
     if not args.table:
         for domain in _named(all_domains(args.turns), args.domains):
             if args.quick and domain.large:

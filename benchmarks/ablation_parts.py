@@ -8,7 +8,7 @@ of the one it has. What kernels hold cannot be patched so; `tests/pcgraph/test_a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -52,6 +52,20 @@ class Part:
     name: str
     code: tuple[str, ...]
     off: dict[str, Replacement]
+
+
+def jointly(parts: Iterable[Part]) -> Part:
+    """All of some parts as one: what each gains alone another may gain in its place."""
+    parts, off = tuple(parts), dict[str, Replacement]()
+    for part in parts:
+        for path, replacement in part.off.items():
+            off[path] = _one_after_another(off[path], replacement) if path in off else replacement
+    code = tuple(dict.fromkeys(one for part in parts for one in part.code))
+    return Part(f"jointly: {'; '.join(part.name for part in parts)}", code, off)
+
+
+def _one_after_another(first: Replacement, second: Replacement) -> Replacement:
+    return lambda original: second(first(original))
 
 
 class Target(NamedTuple):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from ablation import Reference, markdown, measure, table
 from ablation_cost import Code, Source
-from ablation_parts import PARTS, Part, Target, switched_off
+from ablation_parts import PARTS, Part, Target, jointly, switched_off
 from clouds import two_boxes_on_a_plane
 from domain_clouds import Domain, Sample
 
@@ -55,6 +55,14 @@ def test_a_part_is_back_after_it_was_switched_off():
         with switched_off(part):
             assert all(Target.of(path).value is not target.value for path, target in zip(part.off, before, strict=True))
         assert [Target.of(path) for path in part.off] == before
+
+
+def test_parts_that_patch_one_name_are_off_together():
+    shape = Target.of("tree.region_linkage._SHAPE").value
+    both = jointly(part for part in PARTS if part.name.endswith(("(c1)", "(k1)", "(m0)")))
+    with switched_off(both):
+        found = Target.of("tree.region_linkage._SHAPE").value
+    assert found == shape._replace(c1=0.0, k1=0.0, m0=0.0)
 
 
 def test_what_starts_from_the_default_s_voxels_is_what_all_of_it_gives(sample):
