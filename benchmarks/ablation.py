@@ -7,8 +7,8 @@
 Each part (`ablation_parts.py`) is switched off alone, or with --jointly all that are named at once. A score's gain is
 that of the default less that without the part, on the same cloud. The clouds (`ablation_clouds.py`) are those of
 `domains.py`, with the scores that count there; heaps, images of other cameras; and of each kind of `scan_places.py` the
-first cloud, turned, with the fraction of the voxels that face the scanner as a second score. Of a domain with one cloud,
-copies of it turned about z are further draws.
+first cloud, turned, with the fraction of the voxels that face the scanner as a second score. Of a domain with one
+cloud, copies of it turned about z are further draws.
 
 Columns, one row per part, the largest gain first:
 
