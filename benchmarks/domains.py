@@ -203,14 +203,14 @@ def _segmented(domain: Domain, sample: Sample, **knobs: Any) -> tuple[Row, pcgra
     start = time.perf_counter()
     result = pcgraph.segment(sample.points, sample.colors, **knobs)
     seconds = time.perf_counter() - start
-    row = _judged(sample, result.labels) | _of_tree(domain, sample, result) | {"s": seconds}
+    row = judged(sample, result.labels) | scores_of_tree(domain, sample, result) | {"s": seconds}
     if sample.clean is not None:
         clean = pcgraph.segment(sample.clean.points, sample.clean.colors, **knobs)
-        row["change"] = row["wov"] - _judged(sample.clean, clean.labels)["wov"]
+        row["change"] = row["wov"] - judged(sample.clean, clean.labels)["wov"]
     return row, result
 
 
-def _of_tree(domain: Domain, sample: Sample, result: pcgraph.Segmentation) -> Row:
+def scores_of_tree(domain: Domain, sample: Sample, result: pcgraph.Segmentation) -> Row:
     """Scores of the tree and of its cut into the domain's number of segments."""
     number = min(_segments(domain, sample), result.tree.n_leaves)
     row = {"oracle": _oracle(result, sample.truth)} | voted(sample.truth, result.cut(n=number))
@@ -250,7 +250,7 @@ def _grid(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, list[Row
             rows[1.0].append(row)
             for altitude in ALTITUDES:
                 labels = result.cut(altitude=altitude * result.object_altitude)
-                rows[altitude].append(row | _judged(sample, labels))
+                rows[altitude].append(row | judged(sample, labels))
         told = " + ".join(f"{name}={value}" if name == "range_growth" else name for name, value in view.items())
         for altitude, found in rows.items():
             sized = [] if size is None else [f"voxels x{size:g} (of large clouds x{2.0 * size:g})"]
@@ -287,7 +287,7 @@ def _felzenszwalb(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, 
             start = time.perf_counter()
             labels = _spread(finite, felzenszwalb(graph, scale))
             taken = seconds + time.perf_counter() - start
-            rows[scale].append(_judged(sample, labels) | cut | {"s": taken})
+            rows[scale].append(judged(sample, labels) | cut | {"s": taken})
     for scale, found in rows.items():
         yield f"k {scale:g}", found
 
@@ -343,10 +343,10 @@ BASELINES = {"Felzenszwalb": _felzenszwalb, "DBSCAN": _dbscan, "PCL": _pcl, "sup
 
 def _of_labels(domain: Domain, sample: Sample, labels: NDArray[np.integer]) -> Row:
     """Scores of labels that have no tree."""
-    return _judged(sample, labels) | voted(sample.truth, largest(labels, _segments(domain, sample)))
+    return judged(sample, labels) | voted(sample.truth, largest(labels, _segments(domain, sample)))
 
 
-def _judged(sample: Sample, labels: NDArray[np.integer]) -> Row:
+def judged(sample: Sample, labels: NDArray[np.integer]) -> Row:
     """Scores of objects."""
     sizes = np.bincount(labels[labels >= 0])
     complete = completed(labels)
