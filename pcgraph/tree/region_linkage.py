@@ -93,6 +93,11 @@ class RegionLinkage(Linkage):
     It is 0 where the larger one is not r1 times as large; and, whatever is known of the sides, where the smaller one
     lies behind its plane, as the floor of a pit does.
 
+    What stands on a support is whole before it joins it, also where its parts meet at a neck that is a deeper valley
+    than the line along which they meet the support, as the balls of a dumbbell do: a merge above 0.25 rad of a region
+    with a flat one, twice as large or larger, waits for the first merge of the smaller one with a third that lies on
+    the same side of the flat one.
+
     Regions merge along
 
     - contacts: voxels that touch;
@@ -183,6 +188,18 @@ _STEPS = float(1 << 20)
 _MANY = 40  # edges of a region
 _OF_SEVERAL = 1.0 / 3.0  # of the price of a gap, where scans lie over each other
 _BETWEEN_SPECKS = 3.0  # radians: as of a steep valley
+_MAY_WAIT = 0.25
+"""Altitude in radians from which on a merge waits for another. What lies on a surface joins it below that. At 0.1, bins
+lose 0.07 of their covering, at 0.25 0.015; at 0.4, balls of a dumbbell join the table before the bar between them."""
+_WHOLE = 3.0
+"""Least mass in mean supervoxels of regions that wait or are waited for, because smaller ones are parts of surfaces."""
+_FLAT = 0.25
+"""Largest mean square distance of a support from its plane, squared voxel edges: half an edge is what voxels make of a
+plane. Terrain is less flat; its patches lie off each other's planes without standing on each other."""
+_CLEAR = 1.0
+"""Least distance from the plane of the support, voxel edges, because less is the noise of the support itself."""
+_MAX_WAITS = 64
+"""Largest number of times that a merge waits, so that two that wait for each other come to an end."""
 _BRIDGE_VOXELS = 2.0  # that a bridge counts as a contact where others join it: one on each side
 
 
@@ -333,6 +350,7 @@ def _merge(state: RegionState, outlines: _Outlines, relief: float, graph: Contra
     # After how many merges each region changed, each altitude was computed, and it was last asked what stands out.
     changed, computed = np.zeros(len(clusters), np.int64), np.zeros(len(heap.edges), np.int64)
     asked, normal = np.full(len(heap.edges), -1), np.empty(3)
+    waits = np.zeros(len(heap.edges), np.int64)  # how often each merge has waited for another
     while heap.size[0] > 0:
         edge = heap.order[0]
         a, b = halves[2 * edge].end, halves[2 * edge + 1].end
@@ -345,6 +363,12 @@ def _merge(state: RegionState, outlines: _Outlines, relief: float, graph: Contra
             stands_out = _standing_out(state, outlines, sums, edge, a, b, relief, shape, normal)
             if stands_out > 0.0:
                 heap_update(heap, edge, _altitude(state, sums, edge, a, b, stands_out, shape))
+                continue
+        if heap.edges[edge].cost > _MAY_WAIT and waits[edge] < _MAX_WAITS:
+            later = _awaited(state, graph, a, b, normal)
+            if later >= heap.edges[edge].cost:
+                waits[edge] += 1
+                heap_update(heap, edge, later + 1.0 / _STEPS)
                 continue
         inside = 2.0 * sums[_WEIGHT, edge]
         kept, gone, n_parallel = contract_cheapest(graph)
@@ -364,6 +388,50 @@ def _merge(state: RegionState, outlines: _Outlines, relief: float, graph: Contra
                 computed[edge] = graph.done[0]
                 a, b = halves[2 * edge].end, halves[2 * edge + 1].end
                 heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0, shape))
+
+
+@kernel
+def _awaited(state: RegionState, graph: ContractedGraph, a: int, b: int, normal: NDArray[np.float64]) -> float:
+    """Altitude of the first merge that the smaller of two regions has with a third that stands on the larger one, too,
+    or above it on nothing; -1 if there is none, or if the smaller one does not stand on the larger one.
+
+    `normal` is scratch.
+    """
+    if state.masses[b] < state.masses[a]:
+        a, b = b, a
+    side = _side_on(state, a, b, normal)
+    if state.masses[a] < _WHOLE or side == 0.0:
+        return -1.0
+    heap, halves, clusters, normal_of_other = graph.heap, graph.halves, graph.clusters, np.empty(3)
+    least, half = np.inf, clusters[a].first
+    while half != NONE:
+        c, cost = halves[half ^ 1].end, heap.edges[half >> 1].cost
+        is_whole = c != b and state.masses[c] >= _WHOLE
+        if is_whole and cost < least and side * _height(state, c, b, normal) > _CLEAR:
+            least = cost if _side_on(state, a, c, normal_of_other) == 0.0 else least
+        half = halves[half].after
+    return least if least < np.inf else -1.0
+
+
+@routine
+def _side_on(state: RegionState, a: int, b: int, normal: NDArray[np.float64]) -> float:
+    """On which side of region b region a stands, 1 or -1, where `normal` receives the normal of b; 0 if b is not flat
+    and much larger, or a is not clear of it."""
+    if _SHAPE.r1 * state.masses[a] >= state.masses[b] or state.residuals[b] > _FLAT * state.masses[b]:
+        return 0.0
+    if plane_normal(state.scatters[b], normal) < 0.0:
+        return 0.0
+    height = _height(state, a, b, normal)
+    return np.sign(height) if abs(height) > _CLEAR else 0.0
+
+
+@routine
+def _height(state: RegionState, a: int, b: int, normal: NDArray[np.float64]) -> float:
+    """Distance of region a from the plane of region b, whose normal is given, voxel edges."""
+    height = 0.0
+    for axis in range(3):
+        height += normal[axis] * (state.centroids[a, axis] - state.centroids[b, axis])
+    return height
 
 
 @inlined
