@@ -8,7 +8,7 @@ DEMO_OUT := out/demo
 export PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test validate coverage fuzz kernels lint format constraints audit clean system
+.PHONY: help demo test test-pcgraph test-rangesim validate coverage fuzz kernels lint format constraints audit clean system
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /|/' | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
@@ -23,6 +23,12 @@ PARALLEL := -n auto --maxprocesses=4 --dist loadfile --no-loadscope-reorder
 test: $(VENV)/.installed-test ## set up if needed, lint, check types, run the tests but those of `make validate`
 	@$(MAKE) --no-print-directory -j 2 lint kernels
 	$(BIN)/python -m pytest $(PARALLEL) -m "not validation"
+
+test-pcgraph: $(VENV)/.installed-test kernels ## the tests of pcgraph alone
+	$(BIN)/python -m pytest $(PARALLEL) -m "not validation" tests/pcgraph
+
+test-rangesim: $(VENV)/.installed-test kernels ## the tests of rangesim alone
+	$(BIN)/python -m pytest $(PARALLEL) -m "not validation" --ignore tests/pcgraph
 
 validate: $(VENV)/.installed-test kernels ## long comparisons and statistics, before a release: docs/validation.md
 	$(BIN)/python -m pytest $(PARALLEL) -m validation
