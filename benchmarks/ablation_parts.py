@@ -429,7 +429,7 @@ SIDES = (
     Part(
         "virtual: plane that bears things",
         ("voxels/ground_and_rooms.py:supporting_plane",),
-        {f"{_V}supporting_plane": _gives(_NOWHERE), f"{_S}supporting_plane": _gives(_NOWHERE)},
+        {f"{_V}supporting_plane": _gives(_NOWHERE)},
     ),
     _function("virtual: origin as a camera's place", _VIEW, "_has_in_view", _gives(False)),
     _function("virtual: origin sees as much", _VIEW, "_sees_as_much", _gives(True)),

@@ -717,11 +717,6 @@ class CoarseGrid(NamedTuple):
     points: NDArray[np.float64]
 
 
-def coarse_grid(grid: VoxelGrid, middle: NDArray[np.float64], reach: float) -> CoarseGrid:
-    """Voxels on surfaces in larger ones, as few as still show their shape, in the frame of `unit_frame`."""
-    return _in_cells(_surfaces(grid, middle, reach), _CELLS)
-
-
 class _Surfaces(NamedTuple):
     """Places on surfaces, about as far from each other as voxels of level 0 are.
 

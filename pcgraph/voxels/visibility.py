@@ -14,10 +14,8 @@ from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.depth_buffer import SAME_SURFACE_COSINE, cosines_towards, visibility_from
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
-from pcgraph.voxels.ground_and_rooms import supporting_plane
 from pcgraph.voxels.virtual_viewpoints import (
     VirtualViewpoints,
-    coarse_grid,
     either_normals,
     lengths,
     unit_frame,
@@ -28,7 +26,6 @@ _EDGE_ON, _LITTLE = 0.02, 0.3  # cosine below which a surface is seen edge-on, a
 _NEARLY_EDGE_ON, _SEEN_WELL = 0.1, 0.2  # cosines between normals and rays, less and more
 _NEARLY_LEVEL, _LEVEL_INDEED, _FEW_LEVEL = 0.9, 0.97, 20  # cosines to the axis, and to what is level; voxels
 _TOLD = 40.0  # votes of the viewpoint for one of the places
-_MUCH_MORE = 1.25  # times as much visible from one place as from another: enough to tell which of the two it was
 _MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at
 _SMOOTHING = 4  # rounds of votes by the voxels around
 _CLEAR = 0.3  # votes for a side that need no others, where all voxels are looked at
@@ -260,18 +257,9 @@ def _visible(grid: VoxelGrid, place: NDArray[np.float64], normals: NDArray[np.fl
 
 
 def likelier_viewpoint(grid: VoxelGrid, place: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The likelier of two scanner positions, (3,) float64, metres: that from which a quarter more is visible, else that
-    on the free side of the supporting plane, else that from which more is visible."""
+    """The likelier of two scanner positions, (3,) float64, metres: that from which more is visible."""
     normals = either_normals(grid)
-    visible, other_is = _visible_fraction(grid, place, normals), _visible_fraction(grid, other, normals)
-    if max(visible, other_is) <= _MUCH_MORE * min(visible, other_is):
-        middle, reach = unit_frame(grid, grid.centroids)
-        coarse = coarse_grid(grid, middle, reach).cells
-        upwards, offset, _ = supporting_plane(coarse, either_normals(coarse))
-        before = [bool((one - middle) / reach @ upwards >= offset) for one in (place, other)]
-        if before[0] != before[1]:
-            return place if before[0] else other
-    return place if visible >= other_is else other
+    return place if _visible_fraction(grid, place, normals) >= _visible_fraction(grid, other, normals) else other
 
 
 @kernel
