@@ -328,11 +328,6 @@ LAW = (
     _constant("law: prior of the exponent", _LAW, "_PRIOR", 0.0),
     _constant("law: several starts", _LAW, "_STARTS", 1, "_APART"),
     Part(
-        "law: pieces of a scan",
-        (f"{_LAW}:SpacingLaw.locates_scanner", *_constants(_LAW, "_MIN_HINT", "_MIN_BY_RANGE")),
-        {f"{_L}SpacingLaw.locates_scanner": _is(property(lambda law: law.holds))},
-    ),
-    Part(
         "law: mirrored place",
         (f"{_SIDE}:likelier_viewpoint", f"{_LAW}:_mirrored", f"{_LAW}:SpacingLaw.mirrored"),
         {"scan.likelier_viewpoint": _keeps(1)},
@@ -344,7 +339,7 @@ LAW = (
     ),
     Part(
         "scanner moved: place must show all",
-        (f"{_SCAN}:_MIN_SHOWN", f"{_SIDE}:shown_fraction", f"{_SIDE}:visible_fraction"),
+        (f"{_SCAN}:_MIN_SHOWN", f"{_SIDE}:shown_fraction"),
         {"scan._MIN_SHOWN": _is(0.0)},
     ),
     Part(

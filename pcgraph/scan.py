@@ -75,7 +75,6 @@ from pcgraph.voxels.visibility import (
     shown_fraction,
     sides_towards,
     sides_towards_each,
-    visible_fraction,
     visible_sides,
 )
 from pcgraph.voxels.warp import Shift, Warp, choose_warp
@@ -800,13 +799,11 @@ def _scanner_position(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] |
     Spacing grows with range about the middle of a short way, too, along which a scanner moved while its scans were
     put together. Rings about one place are not left then, and what it passed shows sides that the middle does not see.
     """
-    if not law.locates_scanner:
+    if not law.holds:
         return None
     if law.axis is not None:
         return law.viewpoint
     place = law.viewpoint if law.mirrored is None else likelier_viewpoint(grid, law.viewpoint, law.mirrored)
-    if not law.holds:
-        return place if visible_fraction(grid, place) >= _MIN_SHOWN else None
     found = (place,) if law.best_viewpoint is None else (place, law.best_viewpoint)  # an origin may lie on the ground
     return place if any(shown_fraction(grid, one) >= _MIN_SHOWN for one in found) else None
 
