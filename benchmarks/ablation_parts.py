@@ -414,7 +414,6 @@ SIDES = (
     _function("virtual: parts far apart", _VIEW, "_parts", _is(_one_part)),
     _function("virtual: partitions", _VIEW, "_without_partitions", _keeps(0)),
     _constant("virtual: passages", _VIEW, "_MIN_SHOWN_FROM_INSIDE", math.inf),
-    _constant("virtual: leaders", _VIEW, "_N_LEADERS", 0, "_set_gains"),
     _constant("virtual: planes from behind", _VIEW, "_MAX_FROM_BEHIND", math.inf),
     _constant("virtual: differences that do not count", _VIEW, "_SHOWN_TOLERANCE", 0.0),
     _constant("virtual: unanimous", _VIEW, "_W_UNANIMOUS", 0.0),

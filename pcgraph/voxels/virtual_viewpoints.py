@@ -56,7 +56,6 @@ _MAX_PART_LENGTH = 0.5  # of the bounding box's length, for a part to have candi
 # Agreements
 _ROUNDS = 12  # of voting and weighting, at most
 _N_HALVES = 14  # half spaces, whose outer candidates are first opinions
-_N_LEADERS = 6  # single candidates that are
 _BOTH_SIDES = 0.2  # cosine under which candidates in rooms see both sides of a partition
 _WELL_SEEN = 0.3  # weighted sum of cosines from which on a cell is seen well
 _MAX_OFF_PLANE = 0.1  # RMS distance of a flat cell and those around it from their plane
@@ -169,7 +168,7 @@ def _vote(
     sides = facing_cosines(candidates.places, coarse.centroids, normals, seen)
     in_rooms = candidates.enclosure >= _CLOSED
     voting = _without_partitions(sides, sides[in_rooms])
-    starts = _starts(voting, candidates.places[:_N_OUTSIDE], candidates.likely, in_rooms)
+    starts = _starts(candidates.places[:_N_OUTSIDE], candidates.likely, in_rooms)
     of_place, of_part = _looks_at_parts(seen, part_of_cell)
     if of_part.any():
         asked = of_part[:, None] == part_of_cell
@@ -311,23 +310,15 @@ def _without_partitions(sides: NDArray[np.float32], of_rooms: NDArray[np.float32
 
 
 def _starts(
-    sides: NDArray[np.float32], outside: NDArray[np.float64], likely: NDArray[np.bool_], in_rooms: NDArray[np.bool_]
+    outside: NDArray[np.float64], likely: NDArray[np.bool_], in_rooms: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """Weights of the places, (s, k), from which agreement may start: first opinions as different as there are."""
-    starts = np.zeros((_N_HALVES + 4 + _N_LEADERS, len(sides)), np.float32)
+    starts = np.zeros((_N_HALVES + 4, len(likely)), np.float32)
     starts[:_N_HALVES, :_N_OUTSIDE] = sphere_directions(_N_HALVES) @ (outside - outside.mean(axis=0)).T > 0.0
     starts[_N_HALVES, :_N_OUTSIDE] = 1.0
     starts[_N_HALVES + 1, _N_OUTSIDE:] = 1.0
     starts[_N_HALVES + 2] = likely
     starts[_N_HALVES + 3] = in_rooms if np.count_nonzero(in_rooms) >= _MIN_IN_ROOMS else 0.0
-    unseen = np.ones((2, sides.shape[1]), np.float32)  # of each side
-    news = np.empty(len(sides), np.float32)
-    for start in starts[_N_HALVES + 4 :]:
-        in_blocks(_set_gains, len(sides), sides, unseen, news, smallest=1)
-        leader = int(np.argmax(news))
-        start[leader] = 1.0
-        unseen[0, sides[leader] > 0.0] = 0.0
-        unseen[1, sides[leader] < 0.0] = 0.0
     return starts[starts.any(axis=1)]
 
 
@@ -353,24 +344,6 @@ def _sees_as_much(
     opposite = place - 2.0 * ((place - (low + high) / 2.0) @ upwards) * upwards
     seen = visibility_from(np.stack((place, opposite)), coarse.centroids, coarse.edge_lengths, normals).mean(axis=1)
     return bool(seen[0] >= _MIN_SEEN_OF_OPPOSITE * seen[1])
-
-
-@summing_routine
-def _marginal_gain(sides: NDArray[np.float32], unseen: NDArray[np.float32]) -> np.float32:
-    """Sum of the cosines that a place sees of sides that no leader has seen."""
-    total = np.float32(0.0)
-    for i in range(len(sides)):
-        total += sides[i] * unseen[0, i] if sides[i] > 0.0 else -sides[i] * unseen[1, i]
-    return total
-
-
-@kernel
-def _set_gains(
-    start: int, stop: int, sides: NDArray[np.float32], unseen: NDArray[np.float32], news: NDArray[np.float32]
-) -> None:
-    """Set what each place sees that no leader has seen."""
-    for k in range(start, stop):
-        news[k] = _marginal_gain(sides[k], unseen)
 
 
 @kernel
