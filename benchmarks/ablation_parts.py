@@ -171,22 +171,15 @@ def _no_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | None =
     return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def _from_above(
-    grid: VoxelGrid, normals: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None, *others: object
-) -> VisibleSides:
-    """Normals as they are: towards the viewpoint, else upwards."""
+def _from_above(grid: VoxelGrid, normals: NDArray[np.float64], *others: object) -> VisibleSides:
+    """Normals as they are: upwards."""
     far = 1e3 * float(np.ptp(grid.centroids, axis=0).max()) * np.array([0.0, 0.0, 1.0])
-    place = grid.centroids.mean(axis=0) + far if viewpoint is None else viewpoint
-    return VisibleSides(place[None], normals)
+    return VisibleSides((grid.centroids.mean(axis=0) + far)[None], normals)
 
 
-def _from_outside(
-    grid: VoxelGrid, normals: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None, *others: object
-) -> VisibleSides:
+def _from_outside(grid: VoxelGrid, normals: NDArray[np.float64], *others: object) -> VisibleSides:
     """Normals away from the middle."""
-    found = _from_above(grid, normals, viewpoint)
-    if viewpoint is not None:
-        return found
+    found = _from_above(grid, normals)
     outwards = np.einsum("ij,ij->i", grid.centroids - grid.centroids.mean(axis=0), normals)
     return VisibleSides(found.places, np.where(outwards[:, None] < 0.0, -normals, normals))
 
@@ -343,14 +336,9 @@ LAW = (
         {"scan._MIN_SHOWN": _is(0.0)},
     ),
     Part(
-        "scanner moved: gaps not seen through",
-        (f"{_SCAN}:OrientedPlanes.scanner_moved",),
-        {"scan._oriented_planes": _then(lambda oriented: oriented._replace(scanner_moved=False))},
-    ),
-    Part(
         "axis: level ground faces its scanner",
         (f"{_SIDE}:sides_towards", f"{_SIDE}:_upwards"),
-        {f"{_S}_cosines": lambda f: lambda grid, normals, place, axis, reach: f(grid, normals, place, None, reach)},
+        {"scan.sides_towards": _keeps(1)},
     ),
 )
 
@@ -368,7 +356,6 @@ SIZES = (
     _constant("larger: gain that is asked for", _SIZE, "_MIN_GAIN", 0.0),
     _constant("larger: gain of sparse clouds", _SIZE, "_MIN_GAIN_OF_SPARSE", 0.0),
     _function("smaller voxels", _SIZE, "_refined_size", lambda f: lambda points, grid, *others: grid.size),
-    _constant("smaller: thinned scans", _SIZE, "_THINNED_EXPONENT", -math.inf),
     _constant("smaller: price of roughness", _SIZE, "_PRICE_OF_ROUGHNESS", (0.0, 0.0)),
     _function("smaller: few voxels", _SIZE, "_enough_of_few", _gives(math.inf)),
     Part(
@@ -405,7 +392,6 @@ NOISE = (
 )
 
 SIDES = (
-    _constant("visible: surfaces edge-on from the place", _SIDE, "_LITTLE", math.inf),
     _function("visible: carried over edges", _SIDE, "_carry_over", _gives(None)),
     _function("visible: votes smoothed", _SIDE, "_smoothed_votes", _keeps(2)),
     _constant("virtual: finer cells of rooms", _VIEW, "_FINER", (1,), "_SHOWS_MOST", "_SHOWS_NEARLY_ALL"),

@@ -64,8 +64,8 @@ _CELLS_PER_BLOCK = 512  # for speed: of many rooms a candidate sees few blocks
 _SHOWN_TOLERANCE = 0.004
 _W_UNANIMOUS = 0.02  # times how unanimous its viewpoints are
 _W_OUTSIDE = 0.003  # times how much those around the cloud see from its outer side
-_W_VIEWPOINT, _W_ABOVE_GROUND, _W_FREE_SIDE = 0.02, 0.05, 0.002  # times the same of the likely ones: the given one or
-# the origin; those above the ground; or those on the free side of another supporting plane
+_W_ORIGIN, _W_ABOVE_GROUND, _W_FREE_SIDE = 0.02, 0.05, 0.002  # times the same of the likely ones: the origin; those
+# above the ground; or those on the free side of another supporting plane
 _W_ROOM = 0.2  # times the fraction of the cells in a room (in a passage 1), if its viewpoints are closed in:
 _ENCLOSED_FOR_ROOM = 0.8  # weighted mean of the fraction of directions that hit something
 _MIN_SHOWN_FROM_INSIDE = 0.001  # fraction of the surface that such viewpoints show more, to count so in a passage
@@ -131,20 +131,19 @@ def lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), _TINY)
 
 
-def virtual_viewpoints(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None) -> VirtualViewpoints:
-    """Viewpoints that tell which side of the voxels' surface is its outside; arguments as for `visible_sides`.
+def virtual_viewpoints(grid: VoxelGrid) -> VirtualViewpoints:
+    """Viewpoints that tell which side of the voxels' surface is its outside.
 
     Of many rooms, whose partitions are thin and which hold few places each, more are looked at, through smaller cells;
     and where floors and ceilings lie near to each other for cells of that size, so that hardly a place is in a room.
     """
     middle, reach = unit_frame(grid, grid.centroids)
     surfaces = _surfaces(grid, middle, reach)
-    origin, viewpoint = -middle / reach, None if viewpoint is None else (viewpoint - middle) / reach
     for finer in _FINER:
         coarse, points = _in_cells(surfaces, finer * _CELLS)
         may_be_finer = finer < _FINER[-1] and coarse.n_voxels <= grid.n_voxels // 2
         windows = _windows(coarse)
-        candidates, part_of_cell = _candidates(coarse, points, windows.normals, origin, viewpoint, finer)
+        candidates, part_of_cell = _candidates(coarse, points, windows.normals, -middle / reach, finer)
         is_layered, n_in_rooms = _is_layered(coarse), np.count_nonzero(candidates.enclosure >= _CLOSED)
         if may_be_finer and is_layered and n_in_rooms < _MIN_IN_ROOMS:
             continue  # low rooms have few places at first, and the outside of all of them shows much
@@ -197,7 +196,7 @@ class _Candidates(NamedTuple):
     enclosure : (k,) float64
         Fraction of the directions in which a place within has something; 0 of others.
     likely : (k,) bool
-        The viewpoint or origin, if all was seen from about there; else those around that are before what bears things.
+        The origin, if all was seen from about there; else those around that are before what bears things.
     likely_weight : float
         What it counts where as much is seen.
     """
@@ -213,7 +212,6 @@ def _candidates(
     points: NDArray[np.float64],
     normals: NDArray[np.float64],
     origin: NDArray[np.float64],
-    viewpoint: NDArray[np.float64] | None,
     finer: int,
 ) -> tuple[_Candidates, NDArray[np.int64]]:
     """Places around the coarse grid, and within, there so many times as many as usual; and the part of each cell."""
@@ -230,17 +228,16 @@ def _candidates(
     if not (high > low).any():
         outside = low + directions
     upwards, offset, is_ground = supporting_plane(coarse, normals)
-    sees = viewpoint is None and origin @ upwards >= offset and _has_in_view(origin, coarse.centroids)
-    if sees and (abs(upwards[2]) < LEVEL or _sees_as_much(origin, upwards, coarse, normals)):
-        viewpoint = origin
-    elif upwards[2] < -LEVEL:  # no accident: the frame stands upright, and things lie in a pit
+    sees = origin @ upwards >= offset and _has_in_view(origin, coarse.centroids)
+    is_camera = sees and (abs(upwards[2]) < LEVEL or _sees_as_much(origin, upwards, coarse, normals))
+    if not is_camera and upwards[2] < -LEVEL:  # no accident: the frame stands upright, and things lie in a pit
         upwards = -upwards
     places = np.concatenate((outside, inside))
     enclosure = np.concatenate((np.zeros(_N_OUTSIDE), hit_fractions(inside, coarse.centroids)))
-    if viewpoint is not None:
-        places, enclosure = np.concatenate((places, viewpoint[None])), np.append(enclosure, 0.0)
+    if is_camera:
+        places, enclosure = np.concatenate((places, origin[None])), np.append(enclosure, 0.0)
         likely = np.arange(len(places)) == len(places) - 1
-        return _Candidates(places, enclosure, likely, _W_VIEWPOINT), part_of_cell
+        return _Candidates(places, enclosure, likely, _W_ORIGIN), part_of_cell
     likely = np.zeros(len(places), np.bool_)
     likely[:_N_OUTSIDE] = directions @ upwards > 0.0
     return _Candidates(places, enclosure, likely, _W_ABOVE_GROUND if is_ground else _W_FREE_SIDE), part_of_cell
@@ -254,7 +251,7 @@ class _Looks(NamedTuple):
     sides : (k, n) float32
         Signed cosines, 0 hidden.
     from_outside, likely : (k,) bool
-        Whether they are those of places around the cloud, and of places before what bears things or of the viewpoint.
+        Whether they are those of places around the cloud, and of places before what bears things or of the origin.
     enclosure : (k,) float64
         Fraction of the directions in which a place has something.
     of_part : (k,) int64
