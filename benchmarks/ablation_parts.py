@@ -386,7 +386,6 @@ NOISE = (
     Part("noise fills the volume", (f"{_NOISE}:fill_the_volume",), {"scan.fill_the_volume": _gives(True)}),
     _constant("noise: scale estimated again", _SCAN, "_FEW_OUTLIERS", 0.0),
     _function("noise: surfaces among it", _NOISE, "_surfaces_among", _none_of(0)),
-    _constant("noise: beside surfaces", _NOISE, "_MUCH_NOISE", math.inf, "_FAINT"),
     _constant("noise: within reach", _NOISE, "_VOLUME_OF_REACH", math.inf),
     _constant("noise: of all two thirds at most", _NOISE, "_MAX_FRACTION", 1.0),
 )
