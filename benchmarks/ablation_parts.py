@@ -234,7 +234,7 @@ _IMAGE, _GROW, _GAPS, _BEHIND = (
     "graph/gaps.py",
     "graph/continuations.py",
 )
-_V, _S, _L, _A = "voxels.virtual_viewpoints.", "voxels.visibility.", "voxels.spacing_law.", "voxels.adapted_size."
+_V = "voxels.virtual_viewpoints."
 
 
 def _shape_part(name: str, **fields: float) -> Part:
