@@ -171,22 +171,15 @@ def _no_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | None =
     return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def _from_above(
-    grid: VoxelGrid, normals: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None, *others: object
-) -> VisibleSides:
-    """Normals as they are: towards the viewpoint, else upwards."""
+def _from_above(grid: VoxelGrid, normals: NDArray[np.float64], *others: object) -> VisibleSides:
+    """Normals as they are: upwards."""
     far = 1e3 * float(np.ptp(grid.centroids, axis=0).max()) * np.array([0.0, 0.0, 1.0])
-    place = grid.centroids.mean(axis=0) + far if viewpoint is None else viewpoint
-    return VisibleSides(place[None], normals)
+    return VisibleSides((grid.centroids.mean(axis=0) + far)[None], normals)
 
 
-def _from_outside(
-    grid: VoxelGrid, normals: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None, *others: object
-) -> VisibleSides:
+def _from_outside(grid: VoxelGrid, normals: NDArray[np.float64], *others: object) -> VisibleSides:
     """Normals away from the middle."""
-    found = _from_above(grid, normals, viewpoint)
-    if viewpoint is not None:
-        return found
+    found = _from_above(grid, normals)
     outwards = np.einsum("ij,ij->i", grid.centroids - grid.centroids.mean(axis=0), normals)
     return VisibleSides(found.places, np.where(outwards[:, None] < 0.0, -normals, normals))
 
@@ -241,7 +234,7 @@ _IMAGE, _GROW, _GAPS, _BEHIND = (
     "graph/gaps.py",
     "graph/continuations.py",
 )
-_V, _S, _L, _A = "voxels.virtual_viewpoints.", "voxels.visibility.", "voxels.spacing_law.", "voxels.adapted_size."
+_V = "voxels.virtual_viewpoints."
 
 
 def _shape_part(name: str, **fields: float) -> Part:
@@ -328,11 +321,6 @@ LAW = (
     _constant("law: prior of the exponent", _LAW, "_PRIOR", 0.0),
     _constant("law: several starts", _LAW, "_STARTS", 1, "_APART"),
     Part(
-        "law: pieces of a scan",
-        (f"{_LAW}:SpacingLaw.locates_scanner", *_constants(_LAW, "_MIN_HINT", "_MIN_BY_RANGE")),
-        {f"{_L}SpacingLaw.locates_scanner": _is(property(lambda law: law.holds))},
-    ),
-    Part(
         "law: mirrored place",
         (f"{_SIDE}:likelier_viewpoint", f"{_LAW}:_mirrored", f"{_LAW}:SpacingLaw.mirrored"),
         {"scan.likelier_viewpoint": _keeps(1)},
@@ -344,18 +332,13 @@ LAW = (
     ),
     Part(
         "scanner moved: place must show all",
-        (f"{_SCAN}:_MIN_SHOWN", f"{_SIDE}:shown_fraction", f"{_SIDE}:visible_fraction"),
+        (f"{_SCAN}:_MIN_SHOWN", f"{_SIDE}:shown_fraction"),
         {"scan._MIN_SHOWN": _is(0.0)},
-    ),
-    Part(
-        "scanner moved: gaps not seen through",
-        (f"{_SCAN}:OrientedPlanes.scanner_moved",),
-        {"scan._oriented_planes": _then(lambda oriented: oriented._replace(scanner_moved=False))},
     ),
     Part(
         "axis: level ground faces its scanner",
         (f"{_SIDE}:sides_towards", f"{_SIDE}:_upwards"),
-        {f"{_S}_cosines": lambda f: lambda grid, normals, place, axis, reach: f(grid, normals, place, None, reach)},
+        {"scan.sides_towards": _keeps(1)},
     ),
 )
 
@@ -373,7 +356,6 @@ SIZES = (
     _constant("larger: gain that is asked for", _SIZE, "_MIN_GAIN", 0.0),
     _constant("larger: gain of sparse clouds", _SIZE, "_MIN_GAIN_OF_SPARSE", 0.0),
     _function("smaller voxels", _SIZE, "_refined_size", lambda f: lambda points, grid, *others: grid.size),
-    _constant("smaller: thinned scans", _SIZE, "_THINNED_EXPONENT", -math.inf),
     _constant("smaller: price of roughness", _SIZE, "_PRICE_OF_ROUGHNESS", (0.0, 0.0)),
     _function("smaller: few voxels", _SIZE, "_enough_of_few", _gives(math.inf)),
     Part(
@@ -404,13 +386,11 @@ NOISE = (
     Part("noise fills the volume", (f"{_NOISE}:fill_the_volume",), {"scan.fill_the_volume": _gives(True)}),
     _constant("noise: scale estimated again", _SCAN, "_FEW_OUTLIERS", 0.0),
     _function("noise: surfaces among it", _NOISE, "_surfaces_among", _none_of(0)),
-    _constant("noise: beside surfaces", _NOISE, "_MUCH_NOISE", math.inf, "_FAINT"),
     _constant("noise: within reach", _NOISE, "_VOLUME_OF_REACH", math.inf),
     _constant("noise: of all two thirds at most", _NOISE, "_MAX_FRACTION", 1.0),
 )
 
 SIDES = (
-    _constant("visible: surfaces edge-on from the place", _SIDE, "_LITTLE", math.inf),
     _function("visible: carried over edges", _SIDE, "_carry_over", _gives(None)),
     _function("visible: votes smoothed", _SIDE, "_smoothed_votes", _keeps(2)),
     _constant("virtual: finer cells of rooms", _VIEW, "_FINER", (1,), "_SHOWS_MOST", "_SHOWS_NEARLY_ALL"),
@@ -419,7 +399,6 @@ SIDES = (
     _function("virtual: parts far apart", _VIEW, "_parts", _is(_one_part)),
     _function("virtual: partitions", _VIEW, "_without_partitions", _keeps(0)),
     _constant("virtual: passages", _VIEW, "_MIN_SHOWN_FROM_INSIDE", math.inf),
-    _constant("virtual: leaders", _VIEW, "_N_LEADERS", 0, "_set_gains"),
     _constant("virtual: planes from behind", _VIEW, "_MAX_FROM_BEHIND", math.inf),
     _constant("virtual: differences that do not count", _VIEW, "_SHOWN_TOLERANCE", 0.0),
     _constant("virtual: unanimous", _VIEW, "_W_UNANIMOUS", 0.0),
@@ -429,7 +408,7 @@ SIDES = (
     Part(
         "virtual: plane that bears things",
         ("voxels/ground_and_rooms.py:supporting_plane",),
-        {f"{_V}supporting_plane": _gives(_NOWHERE), f"{_S}supporting_plane": _gives(_NOWHERE)},
+        {f"{_V}supporting_plane": _gives(_NOWHERE)},
     ),
     _function("virtual: origin as a camera's place", _VIEW, "_has_in_view", _gives(False)),
     _function("virtual: origin sees as much", _VIEW, "_sees_as_much", _gives(True)),

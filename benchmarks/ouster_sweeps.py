@@ -105,7 +105,7 @@ def measure(folder: Path, pictures: Path | None) -> None:
             turn, shift = Rotation.random(rng=rng).as_matrix(), rng.uniform(-100.0, 100.0, 3)
             moved, place = points @ turn.T + shift, turn @ lenses + shift
             law = law_on_rings(moved, spacing_law(moved), spacing_and_rows(moved)[1])
-            told.append("rings" if law.axis is not None else "spacing" if law.locates_scanner else "neither")
+            told.append("rings" if law.axis is not None else "spacing" if law.holds else "neither")
             result = pcgraph.segment(moved)
             off.append(np.linalg.norm(result.viewpoint - place) / np.median(np.linalg.norm(points - lenses, axis=1)))
             facing.append(fraction_facing(result, place))

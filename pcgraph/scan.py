@@ -75,7 +75,6 @@ from pcgraph.voxels.visibility import (
     shown_fraction,
     sides_towards,
     sides_towards_each,
-    visible_fraction,
     visible_sides,
 )
 from pcgraph.voxels.warp import Shift, Warp, choose_warp
@@ -449,7 +448,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     features = edge_features(nodes, touching)
     faces = faces_of(touching.edges, features, len(leaves))
     # no place saw all of several scans
-    seen_from = grid.warp.seen_from if earlier is None and not scan.oriented.scanner_moved else None
+    seen_from = grid.warp.seen_from if earlier is None else None
     near, hidden = side_by_side(
         lambda: gaps(surface, nodes, touching.edges, seen_from),
         lambda: continuations(surface, nodes, faces, scan.oriented.viewpoints),
@@ -782,15 +781,12 @@ class OrientedPlanes(NamedTuple):
     viewpoint_known : bool
         Whether the viewpoint was given, or told by pixels or spacing.
     planes : LocalPlanes
-    scanner_moved : bool
-        Whether spacing grows with range from a place that does not show all, as that of a moving scanner.
     """
 
     viewpoint: NDArray[np.float64]
     viewpoints: NDArray[np.float64]
     viewpoint_known: bool
     planes: LocalPlanes
-    scanner_moved: bool = False
 
 
 def _scanner_position(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] | None:
@@ -800,13 +796,11 @@ def _scanner_position(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] |
     Spacing grows with range about the middle of a short way, too, along which a scanner moved while its scans were
     put together. Rings about one place are not left then, and what it passed shows sides that the middle does not see.
     """
-    if not law.locates_scanner:
+    if not law.holds:
         return None
     if law.axis is not None:
         return law.viewpoint
     place = law.viewpoint if law.mirrored is None else likelier_viewpoint(grid, law.viewpoint, law.mirrored)
-    if not law.holds:
-        return place if visible_fraction(grid, place) >= _MIN_SHOWN else None
     found = (place,) if law.best_viewpoint is None else (place, law.best_viewpoint)  # an origin may lie on the ground
     return place if any(shown_fraction(grid, one) >= _MIN_SHOWN for one in found) else None
 
@@ -822,21 +816,15 @@ def _oriented_planes(
     far from a tripod, seen edge-on, has none.
     """
     upwards = np.array([0.0, 0.0, 1.0])
+    if viewpoint is None and law is not None:
+        viewpoint = _scanner_position(law, grid)
     if viewpoint is None:
-        position = None if law is None else _scanner_position(law, grid)
-        if position is None:
-            planes, virtual = side_by_side(
-                lambda: method.planes(grid, _far_along(grid, upwards)), lambda: virtual_viewpoints(grid)
-            )
-        else:
-            planes, virtual = method.planes(grid, position), None
-        axis = None if law is None or position is None else law.axis
-        sides = visible_sides(grid, planes.normals, position, virtual, axis)
-        planes = replace(planes, normals=sides.normals)
-        scanner_moved = position is None and law is not None and law.holds
-        return OrientedPlanes(
-            sides.places[0], sides.places[:_MAX_VIEWPOINTS], position is not None, planes, scanner_moved
+        planes, virtual = side_by_side(
+            lambda: method.planes(grid, _far_along(grid, upwards)), lambda: virtual_viewpoints(grid)
         )
+        sides = visible_sides(grid, planes.normals, virtual)
+        planes = replace(planes, normals=sides.normals)
+        return OrientedPlanes(sides.places[0], sides.places[:_MAX_VIEWPOINTS], False, planes)
     if viewpoint.ndim == 1:
         planes = method.planes(grid, viewpoint)
         if law is not None and law.axis is not None:

@@ -47,8 +47,6 @@ _FEW_VOXELS = 120_000  # above: only if _ALL_JOINED are joined, and at the highe
 _MAX_VOXELS = 300_000  # of a refined grid, about
 _ALL_JOINED = 0.93  # joined fraction that has to remain
 _KEPT_JOINED = 0.97  # fraction of the joined ones that has to remain, where fewer than _MIN_JOINED are
-_KEPT_JOINED_OF_SCAN = 0.98  # the same in one scan,
-_THINNED_EXPONENT = 0.7  # which is refined only if its spacing grows with a smaller power of range than this
 _PRICE_OF_ROUGHNESS = 0.25, 0.4  # times roughness is taken off the joined fraction: up to _FEW_VOXELS, and above
 _FEW, _ENOUGH = 750, 40_000  # voxels between which the joined fraction that has to remain rises, by the logarithm,
 _MIN_JOINED_OF_FEW = 0.5  # from this to _ALL_JOINED, or 1 in one scan
@@ -128,7 +126,7 @@ def adapted_voxel_size(
     joined, of_few = _joined(degrees), _enough_of_few(grid, law)
     is_fragmented = joined < min(_MIN_JOINED, of_few)
     larger = _enlarged_size(points, grid, degrees, largest) if is_fragmented else grid.size
-    usual = _refined_size(points, grid, law, degrees) if larger == grid.size else larger
+    usual = _refined_size(points, grid, degrees) if larger == grid.size else larger
     if usual == grid.size and joined >= of_few and adapted_grading(grid) is None:
         return _finest(points, grid, slice(0, grid.n_voxels), _MAX_REFINEMENTS, of_few, 1.0), usual
     return usual, usual
@@ -185,24 +183,18 @@ def _enlarged_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArra
     return best
 
 
-def _refined_size(
-    points: NDArray[np.float64], grid: VoxelGrid, law: SpacingLaw | None, degrees: NDArray[np.int64]
-) -> float:
+def _refined_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray[np.int64]) -> float:
     """The size, or one smaller by quarters of a power of two, down to a half, where nearly all stay joined.
 
     So voxels follow how evenly points lie, not only how near to each other: those of a mesh's vertices can be smaller
     than those of points at random. Where not even three quarters are joined, as in a sweep thinned to a point per cube,
     nearly as many have to stay so. The rougher the surface, the more have to: noise needs larger voxels. All this is
     read off a slab in the middle, which may be the dense part of several scans: so all together have to be joined as
-    well. Points of one scan lie less densely where surfaces slant, and its rows far apart, so its grid stays as it is;
-    unless it was thinned, too, so that its spacing hardly grows with range nearby, and nearly as many stay joined. For
-    the time's sake no grid gets very many voxels so, nor one of many that are not all joined.
+    well. Points of one scan lie less densely where surfaces slant, and its rows far apart, so its grid stays as it is.
+    For the time's sake no grid gets very many voxels so, nor one of many that are not all joined.
     """
-    n, size, of_one_scan = grid.n_voxels, grid.size, grid.warp.of_one_scan
-    if of_one_scan and (law is None or law.min_half_exponent >= _THINNED_EXPONENT):
-        return size
-    joined = _joined(degrees)
-    if not _HALF_JOINED <= joined < (_ALL_JOINED if of_one_scan else math.inf):
+    n, size, joined = grid.n_voxels, grid.size, _joined(degrees)
+    if grid.warp.of_one_scan or joined < _HALF_JOINED:
         return size
     steps = min(_MAX_REFINEMENTS, int(2.0 * math.log2(_MAX_VOXELS / n)))  # to as many voxels as a surface would have
     if steps < 1 or (n > _FEW_VOXELS and joined < _ALL_JOINED):
@@ -210,8 +202,7 @@ def _refined_size(
     slab = slice(max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2))
     of_slab = _joined(degrees[slab])
     least = _ALL_JOINED if of_slab >= _MIN_JOINED else _KEPT_JOINED * of_slab
-    least = _KEPT_JOINED_OF_SCAN * of_slab if of_one_scan else least
-    if joined < least and not of_one_scan:
+    if joined < least:
         return size
     return _finest(points, grid, slab, steps, least, _PRICE_OF_ROUGHNESS[n > _FEW_VOXELS])
 

@@ -20,9 +20,7 @@ MIN_POINTS = 1000
 """Of fewer points none is called an outlier."""
 
 _SPARSE = 0.25  # of the median number of points around a point
-_FAINT = 0.12  # of the mean number of points in the voxels around
 _CHANCE = 1e-4  # with which noise alone is as dense as what is kept
-_MUCH_NOISE = 0.03  # of the points
 _MIN_EXTENT = 32.0  # voxels: noise fills a volume, and a flat cloud has none
 _VOLUME_OF_REACH = 4.0 / 3.0 * np.pi * MAX_GAP**3
 _MAX_FRACTION = 2.0 / 3.0
@@ -47,10 +45,9 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     The density of noise is what sparse voxels hold, over the volume of the bounding box. A voxel is an outlier if noise
     of this density had, with a chance of more than 1 in 10 000, as many points in the voxels around it. Where noise is
     so thin that a reach of three voxel edges is nearly empty of it, there must be as few points within that reach, too,
-    so that the thin far end of a scan is not taken for noise. Where many are outliers, so are the few points of voxels
-    beside full ones. What has been found is then looked at alone: where most of the 16 nearest of it lie about a plane
-    or a line, they are a coarse scan beside a fine one, and stay. Clouds of fewer than 1000 points, and those of which
-    more than two thirds would be outliers, have none.
+    so that the thin far end of a scan is not taken for noise. What has been found is then looked at alone: where most
+    of the 16 nearest of it lie about a plane or a line, they are a coarse scan beside a fine one, and stay. Clouds of
+    fewer than 1000 points, and those of which more than two thirds would be outliers, have none.
     """
     nothing = np.zeros(grid.n_voxels, np.bool_)
     n_points = int(grid.counts.sum())
@@ -75,9 +72,6 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
             np.repeat(np.arange(len(alone)), np.diff(near.indptr)), grid.counts[near.neighbours], len(alone)
         )
         outlier[alone] = held < _least_significant(background)
-    if grid.counts[outlier].sum() > _MUCH_NOISE * n_points:  # then some lies beside surfaces, in voxels of its own
-        degrees = np.maximum(np.diff(grid.indptr), 1)
-        outlier |= (grid.counts < _least_significant(density)) & (grid.counts < _FAINT * others / degrees)
     outlier &= ~_surfaces_among(outlier, grid)
     return outlier if grid.counts[outlier].sum() <= _MAX_FRACTION * n_points else nothing
 

@@ -34,7 +34,6 @@ _ROUNDING = 1e-12  # variance of readings that are all alike, about, as logarith
 _MIN_EXPLAINED = 0.55  # mean of what law and range explain
 _AT_VIEWPOINT = 0.05  # median ranges: so near to a viewpoint is the place that rings tell
 _MIN_ON_RINGS = 0.2  # the same where rings tell the place
-_MIN_HINT, _MIN_BY_RANGE = 0.2, 0.1  # the same, and what range explains alone, of a piece of a scan
 _MIN_EXPONENT = 0.5
 _MAX_EXPONENT = 1.5
 _WIDE_SPAN = 3.0  # of the ranges, from a tenth to nine tenths of the readings: over this the law is looked at in halves
@@ -93,18 +92,8 @@ class SpacingLaw(ShortRepr):
         grows_everywhere = (
             self.min_half_exponent >= _MIN_EXPONENT_OF_HALF and self.trimmed_exponent >= _MIN_OF_MOST * self.exponent
         )
-        return self._tells(least) and grows_everywhere
-
-    @property
-    def locates_scanner(self) -> bool:
-        """Whether the place is told, be it by a piece of a scan, over whose ranges spacing hardly changes."""
-        return self.holds or (
-            self._tells(_MIN_HINT) and self.partial_r_squared >= _MIN_BY_RANGE and self.mirrored is None
-        )
-
-    def _tells(self, least: float) -> bool:
-        """Whether law and range explain so much, and spacing grows with range."""
-        return (self.r_squared + self.partial_r_squared) / 2.0 >= least and self.exponent >= _MIN_EXPONENT
+        explains = (self.r_squared + self.partial_r_squared) / 2.0
+        return explains >= least and self.exponent >= _MIN_EXPONENT and grows_everywhere
 
 
 def spacing_law(

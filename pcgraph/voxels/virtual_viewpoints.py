@@ -56,7 +56,6 @@ _MAX_PART_LENGTH = 0.5  # of the bounding box's length, for a part to have candi
 # Agreements
 _ROUNDS = 12  # of voting and weighting, at most
 _N_HALVES = 14  # half spaces, whose outer candidates are first opinions
-_N_LEADERS = 6  # single candidates that are
 _BOTH_SIDES = 0.2  # cosine under which candidates in rooms see both sides of a partition
 _WELL_SEEN = 0.3  # weighted sum of cosines from which on a cell is seen well
 _MAX_OFF_PLANE = 0.1  # RMS distance of a flat cell and those around it from their plane
@@ -65,8 +64,8 @@ _CELLS_PER_BLOCK = 512  # for speed: of many rooms a candidate sees few blocks
 _SHOWN_TOLERANCE = 0.004
 _W_UNANIMOUS = 0.02  # times how unanimous its viewpoints are
 _W_OUTSIDE = 0.003  # times how much those around the cloud see from its outer side
-_W_VIEWPOINT, _W_ABOVE_GROUND, _W_FREE_SIDE = 0.02, 0.05, 0.002  # times the same of the likely ones: the given one or
-# the origin; those above the ground; or those on the free side of another supporting plane
+_W_ORIGIN, _W_ABOVE_GROUND, _W_FREE_SIDE = 0.02, 0.05, 0.002  # times the same of the likely ones: the origin; those
+# above the ground; or those on the free side of another supporting plane
 _W_ROOM = 0.2  # times the fraction of the cells in a room (in a passage 1), if its viewpoints are closed in:
 _ENCLOSED_FOR_ROOM = 0.8  # weighted mean of the fraction of directions that hit something
 _MIN_SHOWN_FROM_INSIDE = 0.001  # fraction of the surface that such viewpoints show more, to count so in a passage
@@ -132,20 +131,19 @@ def lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), _TINY)
 
 
-def virtual_viewpoints(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None) -> VirtualViewpoints:
-    """Viewpoints that tell which side of the voxels' surface is its outside; arguments as for `visible_sides`.
+def virtual_viewpoints(grid: VoxelGrid) -> VirtualViewpoints:
+    """Viewpoints that tell which side of the voxels' surface is its outside.
 
     Of many rooms, whose partitions are thin and which hold few places each, more are looked at, through smaller cells;
     and where floors and ceilings lie near to each other for cells of that size, so that hardly a place is in a room.
     """
     middle, reach = unit_frame(grid, grid.centroids)
     surfaces = _surfaces(grid, middle, reach)
-    origin, viewpoint = -middle / reach, None if viewpoint is None else (viewpoint - middle) / reach
     for finer in _FINER:
         coarse, points = _in_cells(surfaces, finer * _CELLS)
         may_be_finer = finer < _FINER[-1] and coarse.n_voxels <= grid.n_voxels // 2
         windows = _windows(coarse)
-        candidates, part_of_cell = _candidates(coarse, points, windows.normals, origin, viewpoint, finer)
+        candidates, part_of_cell = _candidates(coarse, points, windows.normals, -middle / reach, finer)
         is_layered, n_in_rooms = _is_layered(coarse), np.count_nonzero(candidates.enclosure >= _CLOSED)
         if may_be_finer and is_layered and n_in_rooms < _MIN_IN_ROOMS:
             continue  # low rooms have few places at first, and the outside of all of them shows much
@@ -169,7 +167,7 @@ def _vote(
     sides = facing_cosines(candidates.places, coarse.centroids, normals, seen)
     in_rooms = candidates.enclosure >= _CLOSED
     voting = _without_partitions(sides, sides[in_rooms])
-    starts = _starts(voting, candidates.places[:_N_OUTSIDE], candidates.likely, in_rooms)
+    starts = _starts(candidates.places[:_N_OUTSIDE], candidates.likely, in_rooms)
     of_place, of_part = _looks_at_parts(seen, part_of_cell)
     if of_part.any():
         asked = of_part[:, None] == part_of_cell
@@ -198,7 +196,7 @@ class _Candidates(NamedTuple):
     enclosure : (k,) float64
         Fraction of the directions in which a place within has something; 0 of others.
     likely : (k,) bool
-        The viewpoint or origin, if all was seen from about there; else those around that are before what bears things.
+        The origin, if all was seen from about there; else those around that are before what bears things.
     likely_weight : float
         What it counts where as much is seen.
     """
@@ -214,7 +212,6 @@ def _candidates(
     points: NDArray[np.float64],
     normals: NDArray[np.float64],
     origin: NDArray[np.float64],
-    viewpoint: NDArray[np.float64] | None,
     finer: int,
 ) -> tuple[_Candidates, NDArray[np.int64]]:
     """Places around the coarse grid, and within, there so many times as many as usual; and the part of each cell."""
@@ -231,17 +228,16 @@ def _candidates(
     if not (high > low).any():
         outside = low + directions
     upwards, offset, is_ground = supporting_plane(coarse, normals)
-    sees = viewpoint is None and origin @ upwards >= offset and _has_in_view(origin, coarse.centroids)
-    if sees and (abs(upwards[2]) < LEVEL or _sees_as_much(origin, upwards, coarse, normals)):
-        viewpoint = origin
-    elif upwards[2] < -LEVEL:  # no accident: the frame stands upright, and things lie in a pit
+    sees = origin @ upwards >= offset and _has_in_view(origin, coarse.centroids)
+    is_camera = sees and (abs(upwards[2]) < LEVEL or _sees_as_much(origin, upwards, coarse, normals))
+    if not is_camera and upwards[2] < -LEVEL:  # no accident: the frame stands upright, and things lie in a pit
         upwards = -upwards
     places = np.concatenate((outside, inside))
     enclosure = np.concatenate((np.zeros(_N_OUTSIDE), hit_fractions(inside, coarse.centroids)))
-    if viewpoint is not None:
-        places, enclosure = np.concatenate((places, viewpoint[None])), np.append(enclosure, 0.0)
+    if is_camera:
+        places, enclosure = np.concatenate((places, origin[None])), np.append(enclosure, 0.0)
         likely = np.arange(len(places)) == len(places) - 1
-        return _Candidates(places, enclosure, likely, _W_VIEWPOINT), part_of_cell
+        return _Candidates(places, enclosure, likely, _W_ORIGIN), part_of_cell
     likely = np.zeros(len(places), np.bool_)
     likely[:_N_OUTSIDE] = directions @ upwards > 0.0
     return _Candidates(places, enclosure, likely, _W_ABOVE_GROUND if is_ground else _W_FREE_SIDE), part_of_cell
@@ -255,7 +251,7 @@ class _Looks(NamedTuple):
     sides : (k, n) float32
         Signed cosines, 0 hidden.
     from_outside, likely : (k,) bool
-        Whether they are those of places around the cloud, and of places before what bears things or of the viewpoint.
+        Whether they are those of places around the cloud, and of places before what bears things or of the origin.
     enclosure : (k,) float64
         Fraction of the directions in which a place has something.
     of_part : (k,) int64
@@ -311,23 +307,15 @@ def _without_partitions(sides: NDArray[np.float32], of_rooms: NDArray[np.float32
 
 
 def _starts(
-    sides: NDArray[np.float32], outside: NDArray[np.float64], likely: NDArray[np.bool_], in_rooms: NDArray[np.bool_]
+    outside: NDArray[np.float64], likely: NDArray[np.bool_], in_rooms: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """Weights of the places, (s, k), from which agreement may start: first opinions as different as there are."""
-    starts = np.zeros((_N_HALVES + 4 + _N_LEADERS, len(sides)), np.float32)
+    starts = np.zeros((_N_HALVES + 4, len(likely)), np.float32)
     starts[:_N_HALVES, :_N_OUTSIDE] = sphere_directions(_N_HALVES) @ (outside - outside.mean(axis=0)).T > 0.0
     starts[_N_HALVES, :_N_OUTSIDE] = 1.0
     starts[_N_HALVES + 1, _N_OUTSIDE:] = 1.0
     starts[_N_HALVES + 2] = likely
     starts[_N_HALVES + 3] = in_rooms if np.count_nonzero(in_rooms) >= _MIN_IN_ROOMS else 0.0
-    unseen = np.ones((2, sides.shape[1]), np.float32)  # of each side
-    news = np.empty(len(sides), np.float32)
-    for start in starts[_N_HALVES + 4 :]:
-        in_blocks(_set_gains, len(sides), sides, unseen, news, smallest=1)
-        leader = int(np.argmax(news))
-        start[leader] = 1.0
-        unseen[0, sides[leader] > 0.0] = 0.0
-        unseen[1, sides[leader] < 0.0] = 0.0
     return starts[starts.any(axis=1)]
 
 
@@ -353,24 +341,6 @@ def _sees_as_much(
     opposite = place - 2.0 * ((place - (low + high) / 2.0) @ upwards) * upwards
     seen = visibility_from(np.stack((place, opposite)), coarse.centroids, coarse.edge_lengths, normals).mean(axis=1)
     return bool(seen[0] >= _MIN_SEEN_OF_OPPOSITE * seen[1])
-
-
-@summing_routine
-def _marginal_gain(sides: NDArray[np.float32], unseen: NDArray[np.float32]) -> np.float32:
-    """Sum of the cosines that a place sees of sides that no leader has seen."""
-    total = np.float32(0.0)
-    for i in range(len(sides)):
-        total += sides[i] * unseen[0, i] if sides[i] > 0.0 else -sides[i] * unseen[1, i]
-    return total
-
-
-@kernel
-def _set_gains(
-    start: int, stop: int, sides: NDArray[np.float32], unseen: NDArray[np.float32], news: NDArray[np.float32]
-) -> None:
-    """Set what each place sees that no leader has seen."""
-    for k in range(start, stop):
-        news[k] = _marginal_gain(sides[k], unseen)
 
 
 @kernel
@@ -715,11 +685,6 @@ class CoarseGrid(NamedTuple):
 
     cells: VoxelGrid
     points: NDArray[np.float64]
-
-
-def coarse_grid(grid: VoxelGrid, middle: NDArray[np.float64], reach: float) -> CoarseGrid:
-    """Voxels on surfaces in larger ones, as few as still show their shape, in the frame of `unit_frame`."""
-    return _in_cells(_surfaces(grid, middle, reach), _CELLS)
 
 
 class _Surfaces(NamedTuple):

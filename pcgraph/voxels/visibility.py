@@ -14,21 +14,16 @@ from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.depth_buffer import SAME_SURFACE_COSINE, cosines_towards, visibility_from
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
-from pcgraph.voxels.ground_and_rooms import supporting_plane
 from pcgraph.voxels.virtual_viewpoints import (
     VirtualViewpoints,
-    coarse_grid,
     either_normals,
     lengths,
     unit_frame,
     virtual_viewpoints,
 )
 
-_EDGE_ON, _LITTLE = 0.02, 0.3  # cosine below which a surface is seen edge-on, and fraction of the voxels that may be
 _NEARLY_EDGE_ON, _SEEN_WELL = 0.1, 0.2  # cosines between normals and rays, less and more
 _NEARLY_LEVEL, _LEVEL_INDEED, _FEW_LEVEL = 0.9, 0.97, 20  # cosines to the axis, and to what is level; voxels
-_TOLD = 40.0  # votes of the viewpoint for one of the places
-_MUCH_MORE = 1.25  # times as much visible from one place as from another: enough to tell which of the two it was
 _MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at
 _SMOOTHING = 4  # rounds of votes by the voxels around
 _CLEAR = 0.3  # votes for a side that need no others, where all voxels are looked at
@@ -44,7 +39,7 @@ class VisibleSides(ShortRepr):
     Attributes
     ----------
     places : (k, 3) float64, metres
-        From which the outside is seen, by decreasing weight; or the viewpoint, where that is known.
+        From which the outside is seen, by decreasing weight.
     normals : (v, 3) float64
         Unit normals, outwards.
     """
@@ -56,9 +51,7 @@ class VisibleSides(ShortRepr):
 def visible_sides(
     grid: VoxelGrid,
     normals: NDArray[np.float64],
-    viewpoint: NDArray[np.float64] | None = None,
     virtual: VirtualViewpoints | None = None,
-    axis: NDArray[np.float64] | None = None,
 ) -> VisibleSides:
     """The outer side of the surface at each voxel, found from what is visible.
 
@@ -67,13 +60,8 @@ def visible_sides(
     grid : VoxelGrid of v voxels
     normals : (v, 3) float64
         Unit normals of the surface, towards either side.
-    viewpoint : (3,) float64, metres, optional
-        About where all was seen from. What lies edge-on from there, as ground does from a place on it, is decided by
-        what is visible; if little does, nothing else is asked.
     virtual : VirtualViewpoints, optional
-        `virtual_viewpoints(grid, viewpoint)`, where that is known.
-    axis : (3,) float64, optional
-        Of a scanner at the viewpoint, as for `sides_towards`.
+        `virtual_viewpoints(grid)`, where that is known.
 
     Notes
     -----
@@ -95,25 +83,19 @@ def visible_sides(
     Visibility of points without a surface: Katz et al. 2007, here by a depth buffer, as voxels have a size.
     """
     middle, reach = unit_frame(grid, grid.centroids)
-    told = np.zeros(grid.n_voxels)
-    if viewpoint is not None:
-        told = _cosines(grid, normals, viewpoint, axis, reach)
-        if np.mean(np.abs(told) < _EDGE_ON) < _LITTLE:
-            return VisibleSides(viewpoint[None], _turned(normals, told))
-    virtual = virtual_viewpoints(grid, viewpoint) if virtual is None else virtual
+    virtual = virtual_viewpoints(grid) if virtual is None else virtual
     places, weights = virtual.places, virtual.weights
-    votes, (looked_at, stretch) = _TOLD * told, occluder_subset(grid)
+    votes, (looked_at, stretch) = np.zeros(grid.n_voxels), occluder_subset(grid)
     centres, widths = (grid.centroids[looked_at] - middle) / reach, stretch * grid.edge_lengths[looked_at] / reach
     sides = normals[looked_at]
     seen, towards = visibility_from(places, centres, widths, sides, stretch), np.empty((len(centres), 3))
     if virtual.part_of_cell.any():
         seen &= virtual.parts[:, None] == virtual.part_of(centres)
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
-    votes[looked_at] += np.einsum("ij,ij->i", towards, sides) / lengths(towards)
-    seen_from_places = middle + reach * places if viewpoint is None else viewpoint[None]
+    votes[looked_at] = np.einsum("ij,ij->i", towards, sides) / lengths(towards)
     votes = _smoothed_votes(grid, normals, votes)
     _carry_over(grid.neighbourhood, grid.centroids, grid.edge_lengths, normals, votes, _CLEAR / stretch**2)
-    return VisibleSides(seen_from_places, _turned(normals, votes))
+    return VisibleSides(middle + reach * places, _turned(normals, votes))
 
 
 def occluder_subset(grid: VoxelGrid) -> tuple[NDArray[np.int64], float]:
@@ -146,7 +128,15 @@ def sides_towards(
     scanners may be tilted. The other way, as ground that rises above the scanner, its own normals decide.
     """
     reach = unit_frame(grid, grid.centroids)[1]
-    return _turned(normals, _cosines(grid, normals, place, axis, reach))
+    cosines = cosines_towards(place, reach, grid.centroids, normals)
+    upwards = _upwards(normals, cosines, axis)
+    along = np.einsum("ij,j->i", normals, upwards)
+    level = np.flatnonzero((np.abs(cosines) < _NEARLY_EDGE_ON) & (np.abs(along) > _NEARLY_LEVEL))
+    ways = (place - grid.centroids[level]) / reach
+    heights = np.einsum("ij,j->i", ways, upwards) / lengths(ways)
+    below = heights > 0.0
+    cosines[level[below]] = (np.sign(along[level]) * heights)[below]
+    return _turned(normals, cosines)
 
 
 def sides_towards_each(
@@ -162,27 +152,6 @@ def sides_towards_each(
     cosines = np.einsum("ij,ij->i", normals, ways) / lengths(ways)
     edge_on = np.abs(cosines) < _SEEN_WELL
     return _turned(normals, np.where(edge_on, _smoothed_votes(grid, normals, cosines.copy()), cosines))
-
-
-def _cosines(
-    grid: VoxelGrid,
-    normals: NDArray[np.float64],
-    place: NDArray[np.float64],
-    axis: NDArray[np.float64] | None,
-    reach: float,
-) -> NDArray[np.float64]:
-    """Cosine between each normal and the way to a place, (v,); about an axis, as `sides_towards` says."""
-    cosines = cosines_towards(place, reach, grid.centroids, normals)
-    if axis is None:
-        return cosines
-    upwards = _upwards(normals, cosines, axis)
-    along = np.einsum("ij,j->i", normals, upwards)
-    level = np.flatnonzero((np.abs(cosines) < _NEARLY_EDGE_ON) & (np.abs(along) > _NEARLY_LEVEL))
-    ways = (place - grid.centroids[level]) / reach
-    heights = np.einsum("ij,j->i", ways, upwards) / lengths(ways)
-    below = heights > 0.0
-    cosines[level[below]] = (np.sign(along[level]) * heights)[below]
-    return cosines
 
 
 def _upwards(
@@ -260,18 +229,9 @@ def _visible(grid: VoxelGrid, place: NDArray[np.float64], normals: NDArray[np.fl
 
 
 def likelier_viewpoint(grid: VoxelGrid, place: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The likelier of two scanner positions, (3,) float64, metres: that from which a quarter more is visible, else that
-    on the free side of the supporting plane, else that from which more is visible."""
+    """The likelier of two scanner positions, (3,) float64, metres: that from which more is visible."""
     normals = either_normals(grid)
-    visible, other_is = _visible_fraction(grid, place, normals), _visible_fraction(grid, other, normals)
-    if max(visible, other_is) <= _MUCH_MORE * min(visible, other_is):
-        middle, reach = unit_frame(grid, grid.centroids)
-        coarse = coarse_grid(grid, middle, reach).cells
-        upwards, offset, _ = supporting_plane(coarse, either_normals(coarse))
-        before = [bool((one - middle) / reach @ upwards >= offset) for one in (place, other)]
-        if before[0] != before[1]:
-            return place if before[0] else other
-    return place if visible >= other_is else other
+    return place if _visible_fraction(grid, place, normals) >= _visible_fraction(grid, other, normals) else other
 
 
 @kernel

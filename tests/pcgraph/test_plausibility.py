@@ -43,8 +43,9 @@ def test_a_spacing_of_nearly_nothing_is_noticed():
         pcgraph.segment(np.concatenate((line, [[0.0, 0.0, 1.0]] * 3, line[-9:] + 0.5)))
 
 
-def test_two_scans_laid_on_each_other_have_the_spacing_of_one(one):
-    twice = np.concatenate((POINTS, POINTS + np.random.default_rng(0).normal(0.0, 1e-6, POINTS.shape)))
+@pytest.mark.parametrize("apart", [1e-6, 3e-5])
+def test_two_scans_laid_on_each_other_have_the_spacing_of_one(one, apart):
+    twice = np.concatenate((POINTS, POINTS + np.random.default_rng(0).normal(0.0, apart, POINTS.shape)))
     two = pcgraph.segment(twice, viewpoint=VIEWPOINT)
     assert one.voxel_size / 4 < two.voxel_size < one.voxel_size * 2
     assert two.labels.max() == one.labels.max()

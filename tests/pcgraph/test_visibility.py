@@ -575,7 +575,7 @@ def test_even_spacing_follows_no_law():
 def test_a_lattice_follows_no_law():
     """All readings are the same, so that there is nothing to explain."""
     lattice = np.stack(np.meshgrid(np.arange(49.0), np.arange(49.0), np.arange(2.0), indexing="ij"), -1).reshape(-1, 3)
-    assert not spacing_law(lattice).locates_scanner
+    assert not spacing_law(lattice).holds
     assert pcgraph.segment(lattice).objects.max() == 0
 
 
@@ -811,3 +811,16 @@ def test_first_opinions_that_meet_come_to_what_each_comes_to_alone(many):
     for column, name in enumerate(together._fields):
         np.testing.assert_array_equal(together[column], np.concatenate([one[column] for one in alone]), err_msg=name)
     np.testing.assert_array_equal((together.outward > 0.0).sum(axis=1), many * np.array([145, 125, 145, 145, 145, 145]))
+
+
+@pytest.mark.parametrize("seed", [0, 1, *to_validate(2, 3)])
+def test_a_closed_bottle_of_few_points_is_seen_from_outside(seed):
+    """Its voxels are small, as they are few, and places look between them into it: those of the usual size decide."""
+    rng = np.random.default_rng(seed)
+    heights, turns = 0.3 * rng.random(5000), 2.0 * np.pi * rng.random(5000)
+    outwards = np.column_stack((np.cos(turns), np.sin(turns), np.zeros(5000)))
+    points = np.where(heights < 0.2, 0.04, 0.015)[:, None] * outwards + heights[:, None] * [0.0, 0.0, 1.0]
+    base = rng.random(5000) < 0.15
+    points[base] = 0.04 * np.sqrt(rng.random((base.sum(), 1))) * outwards[base]
+    outwards[base] = [0.0, 0.0, -1.0]
+    assert fraction_outward(points, outwards) > 0.9

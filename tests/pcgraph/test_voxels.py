@@ -139,6 +139,13 @@ def test_a_far_point_leaves_the_spacing_as_it_was() -> None:
     assert median_spacing(np.vstack((points, [[1e9, -1e9, 1e9]]))) == pytest.approx(median_spacing(points), rel=0.02)
 
 
+def test_far_points_leave_the_spacing_as_it_was() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.random((10_000, 3)) * (0.1, 0.1, 0.0)
+    with_far = np.concatenate((points, 1e3 * rng.random((100, 3))))
+    assert median_spacing(with_far) == pytest.approx(median_spacing(points), rel=0.05)
+
+
 @given(st.lists(st.tuples(*[st.floats(allow_nan=True, allow_infinity=True)] * 3), min_size=1, max_size=30))
 def test_a_bounding_box_is_numpys_or_nan(points: list[tuple[float, float, float]]) -> None:
     array = np.array(points)
