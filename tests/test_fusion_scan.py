@@ -247,6 +247,7 @@ def test_two_views_are_warned_of_as_nothing_confirms_their_pair() -> None:
     assert pose_errors(found.poses, views.true_poses).angle_deg.max() < 0.1  # type: ignore[arg-type]
 
 
+@pytest.mark.validation
 def test_views_without_overlap_are_told_what_order_is_expected() -> None:
     """The second of them looks from the other side."""
     views = made(part(), 4, 180.0)

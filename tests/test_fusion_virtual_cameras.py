@@ -9,6 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
+from tiers import to_validate
 
 from rangesim import IdealToF, RangeImage, Status
 from rangesim.experiment import ScanSettings
@@ -21,6 +23,7 @@ from rangesim.fusion import (
     occupancy,
     pinhole_views,
     pose_errors,
+    refine_jointly,
     signed_distance,
     surface_error,
 )
@@ -36,7 +39,6 @@ HEAD = Spinning(tuple(np.linspace(20.0, -20.0, 32)), columns=512, origin_m=(0.0,
 FISHEYE = Fisheye(300, 300, 95.0, 95.0, 150.0, 150.0)
 LISSAJOUS = Lissajous(100, 200, fast_hz=20_000.0, slow_hz=173.3, amplitudes_deg=(35.0, 27.0), duration_s=0.03)
 ROSETTE = Risley(100, 200, deflections_deg=(9.0, 9.0), rates_hz=(121.6, -77.8), duration_s=0.1)
-OTHERS = [HEAD, FISHEYE, LISSAJOUS, ROSETTE]
 
 
 def seen(mesh: TriangleMesh, camera: Camera, T: np.ndarray | None = None) -> RangeImage:
@@ -79,7 +81,7 @@ def points_of(image: RangeImage) -> np.ndarray:
     return cloud[np.isfinite(cloud).all(axis=-1)]
 
 
-@pytest.mark.parametrize("camera", OTHERS, ids=lambda c: type(c).__name__)
+@pytest.mark.parametrize("camera", [HEAD, FISHEYE, *to_validate(LISSAJOUS, ROSETTE)], ids=lambda c: type(c).__name__)
 def test_planes_are_exact_and_the_whole_field_is_covered(camera: Camera) -> None:
     """The depth between readings is that of the plane through them, to the rounding of single precision."""
     views = pinhole_views(seen(room(), camera))
@@ -165,7 +167,7 @@ def test_no_readings_are_no_views_and_fuse_says_so() -> None:
         signed_distance([[0.0, 0.0, 1.0]], image)
 
 
-@pytest.mark.parametrize("camera", [HEAD, FISHEYE], ids=lambda c: type(c).__name__)
+@pytest.mark.parametrize("camera", [HEAD, *to_validate(FISHEYE)], ids=lambda c: type(c).__name__)
 def test_fused_views_are_the_room(camera: Camera) -> None:
     poses = [look_at((x, 0.2 * x, z), (x + 0.3 * x, 0.2 * x, z + 1)) for x, z in ((-1.0, 0.5), (0.8, -1.0), (0.2, 1.5))]
     images = [seen(furnished(), camera, T) for T in poses]
@@ -179,6 +181,20 @@ def test_fused_views_are_the_room(camera: Camera) -> None:
     assert found.states[tuple(middle)] == 1  # FREE
 
 
+def test_poses_of_a_head_that_are_nearly_known_are_refined() -> None:
+    """Two places, of which the second is off by a degree and 2 cm."""
+    head = Spinning(tuple(np.linspace(35.0, -35.0, 32)), columns=256)
+    poses = np.stack([look_at((x, 0.0, x), (x + 0.3, 0.1, x + 1)) for x in (0.0, 0.4)])
+    first = poses.copy()
+    first[1, :3, :3] = Rotation.from_euler("y", 1.0, degrees=True).as_matrix() @ first[1, :3, :3]
+    first[1, 0, 3] += 0.02
+    found = refine_jointly([seen(furnished(), head, T) for T in poses], first, reach_m=0.2)
+    errors = pose_errors(found, poses)
+    assert errors.angle_deg.max() < 0.1
+    assert errors.centre_m.max() < 0.005
+
+
+@pytest.mark.validation
 def test_views_of_a_head_are_registered() -> None:
     """Four places in a furnished room, no pose known: the clouds fit to a tenth of a degree."""
     head = Spinning(tuple(np.linspace(35.0, -35.0, 64)), columns=512)

@@ -105,6 +105,7 @@ def test_a_result_holds_every_stage_of_them(result: Path) -> None:
     }
 
 
+@pytest.mark.validation
 def test_other_commands_take_their_results_once_the_file_is_named(result: Path, tmp_path: Path) -> None:
     assert "gated-camera" in command("compare", result, "--markdown")
     assert "as they were written" in command("verify", result)

@@ -45,7 +45,7 @@ def test_the_shell_lines_of_the_readme_run(tmp_path: Path) -> None:
 
 
 ARGUMENTS = {
-    "active_stereo_on_glass": ["--scale", "0.2", "--spp", "8"],
+    "active_stereo_on_glass": ["--scale", "0.15", "--spp", "8"],
     "calibration": ["calibration.png", "--width", "320", "--poses", "3"],
     "gesture_sensor": ["gesture.png", "--spp", "8", "--places", "2"],
     "driving_lidar": ["driving_lidar.png", "--rings", "16", "--columns", "256", "--spp", "4"],

@@ -340,6 +340,7 @@ def test_photons_per_pulse_have_two_digits() -> None:
 
 
 @needs_browser
+@pytest.mark.validation
 def test_tables_wider_than_the_page_say_that_they_scroll(tmp_path: Path) -> None:
     with browser(tmp_path) as page:
         check_scroll_hints(page, small_result() / "report.html")

@@ -381,7 +381,7 @@ def test_closed_standard_streams_are_no_obstacle(command: Command, tmp_path: Pat
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="terminals hang up on POSIX")
-@pytest.mark.parametrize("ignored", [False, True])
+@pytest.mark.parametrize("ignored", [True, *to_validate(False)])
 def test_a_closed_terminal_ends_a_run_as_an_interrupt_does(tmp_path: Path, ignored: bool) -> None:
     """But not with nohup, which ignores the signal beforehand, as it may have for the tests themselves."""
     out = tmp_path / "n"
