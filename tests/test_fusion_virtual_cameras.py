@@ -157,6 +157,14 @@ def test_cameras_without_one_centre_or_with_one_ring_are_refused(camera: Camera,
         pinhole_views(seen(room(), camera))
 
 
+def test_readings_that_are_no_neighbours_are_no_views() -> None:
+    image = seen(room(), HEAD)
+    lost = np.ones(image.z.shape, np.bool_)
+    lost[::8, ::8] = False
+    image.status[lost], image.z[lost], image.range_m[lost] = Status.LOW_SIGNAL, np.nan, np.nan
+    assert pinhole_views(image) == ()
+
+
 def test_no_readings_are_no_views_and_fuse_says_so() -> None:
     image = seen(room(), HEAD)
     image.status[:], image.z[:], image.range_m[:] = Status.LOW_SIGNAL, np.nan, np.nan

@@ -322,7 +322,7 @@ MAX_ALONG = 0.5
 
 
 def touching_pieces(segmentation: Segmentation, pieces: list[Piece]) -> NDArray[np.int64]:
-    """Pairs of pieces, (m, 2) int64, that touch."""
+    """Pairs of pieces, (m, 2) int64, that touch, or nearly touch, by the edges of the graph."""
     of_leaf = np.full(segmentation.tree.n_leaves, -1, np.int64)
     for number, piece in enumerate(pieces):
         of_leaf[piece.supervoxels] = number
@@ -354,10 +354,13 @@ def linked_pieces(pieces: list[Piece], edge: float, touching: NDArray[np.int64])
         Largest first.
     edge : float, metres
         Of a voxel.
+    touching : (m, 2) int64
+        Pairs of pieces that touch.
 
     Notes
     -----
-    A piece that lies mostly within the box of a larger one belongs to it. What stands on a support reaches down to it.
+    A piece that lies mostly within the box of a larger one belongs to it. Two that touch and together are a surface of
+    revolution (`is_turned_body`) belong together. What stands on a support reaches down to it.
     A piece that does not is the inside of a cup (or its outside, if the inside is seen to the bottom), or stands on
     another, or is hidden behind one. Only in the first case the two end at one height, the rim, and one of them is
     hollow or, as a narrow strip of it, flat. So a floating piece joins the nearest one for which both hold.

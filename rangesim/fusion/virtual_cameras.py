@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.fusion.mesh_error import raycasting_scene
-from rangesim.fusion.sdf import MAX_DEPTH_STEP
-from rangesim.rig import Array, Camera, Intrinsics, pose
+from rangesim.fusion.sdf import MAX_DEPTH_STEP, check_view
+from rangesim.rig import Array, Camera, Intrinsics
 from rangesim.triangle_mesh import TriangleMesh
 
 MAX_CENTRE_SPREAD = 0.05
@@ -54,7 +54,8 @@ def pinhole_views(image: RangeImage) -> tuple[RangeImage, ...]:
     Raises
     ------
     ValueError
-        The image has no camera or pose, its rays start at places too far apart, or all of them lie in one plane.
+        The image has no camera or pose, or another size than its camera; its rays start at places too far apart, or all
+        of them lie in one plane.
 
     Examples
     --------
@@ -71,9 +72,7 @@ def pinhole_views(image: RangeImage) -> tuple[RangeImage, ...]:
     >>> len(views), views[0].z.shape, round(float(np.nanmax(views[0].range_m)), 3)
     (4, (45, 122), 2.0)
     """
-    T = pose(image.T_world_camera, "T_world_camera") if image.T_world_camera is not None else None
-    if image.camera is None or T is None:
-        raise ValueError("expected a calibrated range image: without a rig it has no place among other views.")
+    T = check_view(image)
     return tuple(replace(view, T_world_camera=T @ np.asarray(view.T_world_camera)) for view in local_views(image))
 
 
@@ -87,7 +86,10 @@ def local_views(image: RangeImage) -> tuple[RangeImage, ...]:
     if not image.valid.any():
         return ()
     surface = _Surface.of(image, camera)
-    seen = (surface.seen_by(R) for R in _cube_faces())
+    if not len(surface.mesh.faces):
+        return ()
+    scene, scene_origin = raycasting_scene(surface.mesh)
+    seen = (surface.seen_by(R, scene, scene_origin) for R in _cube_faces())
     return tuple(view for view in seen if view is not None)
 
 
@@ -123,10 +125,11 @@ class _Surface(NamedTuple):
         values = np.stack([image.confidence, image.intensity], axis=-1)[order.leads][used]
         return cls(centre, TriangleMesh(points[used], corners.reshape(-1, 3)), values, order.pixel_rad)
 
-    def seen_by(self, R: Array) -> RangeImage | None:
+    def seen_by(self, R: Array, scene: Any, scene_origin: Array) -> RangeImage | None:
         """The surface as a virtual camera at the centre sees it; None if it sees nothing.
 
         R : (3, 3), rotation from the virtual camera to the one of the image.
+        scene, scene_origin : Open3D's scene of the mesh, and its origin (3,), metres, see `raycasting_scene`.
         """
         import open3d as o3d
 
@@ -140,9 +143,8 @@ class _Surface(NamedTuple):
         left, top = np.floor(inside.min(axis=0)).astype(int)
         right, bottom = np.floor(inside.max(axis=0)).astype(int) + 1
         camera = whole.cropped(top, bottom, left, right)
-        scene, middle = raycasting_scene(self.mesh)
         rays = camera.directions(camera.pixel_centres())
-        starts = np.broadcast_to(-middle, rays.shape)
+        starts = np.broadcast_to(-scene_origin, rays.shape)
         hit = scene.cast_rays(o3d.core.Tensor(np.concatenate([starts, rays @ R.T], axis=-1).astype(np.float32)))
         z, uv = hit["t_hit"].numpy(), hit["primitive_uvs"].numpy()
         is_hit = np.isfinite(z)

@@ -14,18 +14,15 @@ from turned_bodies import bolt, bottle, box, dumbbell, lamp, on_a_table
 import pcgraph
 from pcgraph.detection.objects import MAX_MISS
 from pcgraph.detection.revolution import revolution_axis
+from pcgraph.metrics.node_table import NodeTable
 
 
 def best_node_overlaps(found: pcgraph.Segmentation, things: np.ndarray) -> np.ndarray:
     """Intersection over union of each thing with the node of the tree that fits it best."""
-    known = found.supervoxels >= 0
-    counts = np.zeros((len(found.tree.parents), int(things.max()) + 1))
-    np.add.at(counts, (found.supervoxels[known], things[known]), 1)
-    for node, parent in enumerate(found.tree.parents):
-        if parent != node:
-            counts[parent] += counts[node]
-    union = counts.sum(axis=1)[:, None] + np.bincount(things) - counts
-    return np.asarray((counts / union).max(axis=0)[1:])
+    table = NodeTable.of(found.tree, found.supervoxels, things)
+    best = np.zeros(len(table.true_sizes))
+    np.maximum.at(best, table.cells.segments, table.overlaps)
+    return best[1:]
 
 
 @pytest.mark.parametrize(
