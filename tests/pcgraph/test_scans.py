@@ -20,7 +20,7 @@ from pcgraph.inputs import clean_cloud
 from pcgraph.metrics import weighted_overlap
 from pcgraph.pixels import with_pixels
 from pcgraph.voxels.spacing import median_spacing
-from pcgraph.voxels.warp import CameraWarp, RangeWarp, choose_warp, warped_normal
+from pcgraph.voxels.warp import CameraWarp, RangeWarp, warped_normal
 
 
 def plate():
@@ -224,7 +224,7 @@ def image_of_a_hall(end, noise=0.0, step=0.0, shape=(240, 320)):
 def test_steps_of_depth_are_read_off_an_image(noise):
     points, _ = image_of_a_hall(4.0, noise, 2.85e-3)
     cloud = clean_cloud(points, None, None)
-    warp = choose_warp(cloud.points, np.zeros(3), True, 0.0)
+    warp = CameraWarp.about(cloud.points, np.zeros(3))
     far = np.quantile(cloud.points[:, 2], 0.8)
     needed = 2.85e-3 * far * warp.reference_depth / 0.75 / 3.5
     assert DepthImage.of(cloud.points, cloud.image, np.zeros(3), None).spacing(

@@ -8,6 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.acquisition import Acquisition
 from pcgraph.voxels.cells import UNIT_CELLS, cell_keys, sorted_keys, starts_of_runs
 from pcgraph.voxels.grading import BLOCK, Grading
 from pcgraph.voxels.grid import (
@@ -19,7 +20,6 @@ from pcgraph.voxels.grid import (
     touching_voxels,
     voxel_grid,
 )
-from pcgraph.voxels.spacing_law import SpacingLaw
 from pcgraph.voxels.surface import roughness
 
 # Seeds
@@ -62,14 +62,14 @@ _NEARLY_ALL_JOINED = 0.98  # no grading from here on,
 _MIN_GRADED = 0.003  # nor if a smaller fraction of all voxels would be larger
 
 
-def seed_spacing(grid: VoxelGrid) -> float:
+def seed_spacing(grid: VoxelGrid, acquisition: Acquisition) -> float:
     """Five voxel edges; less, but three at least, where that leaves few supervoxels.
 
     On smooth surfaces that are seen from all around, as those of meshes and of thinned clouds, many are better: their
     normals are exact, and small things need supervoxels of their own.
     """
     usual, smaller = _edges_per_seed(grid, _MIN_SUPERVOXELS), _edges_per_seed(grid, _MIN_SUPERVOXELS_ON_SMOOTH)
-    if smaller < usual and not grid.warp.of_one_scan and _joined(np.diff(grid.indptr)) >= _MIN_JOINED_IF_SMOOTH:
+    if smaller < usual and not acquisition.is_one_scan and _joined(np.diff(grid.indptr)) >= _MIN_JOINED_IF_SMOOTH:
         fraction = min(max((_ROUGH - roughness(grid)) / (_ROUGH - _SMOOTH), 0.0), 1.0)
         usual = _edges_per_seed(grid, _MIN_SUPERVOXELS * (_MIN_SUPERVOXELS_ON_SMOOTH / _MIN_SUPERVOXELS) ** fraction)
     return grid.size * usual
@@ -104,7 +104,7 @@ def seed_spacing_for(n_supervoxels: float, grid: VoxelGrid) -> float:
 
 
 def adapted_voxel_size(
-    points: NDArray[np.float64], grid: VoxelGrid, law: SpacingLaw | None, largest: float = math.inf
+    points: NDArray[np.float64], grid: VoxelGrid, acquisition: Acquisition, largest: float = math.inf
 ) -> tuple[float, float]:
     """The size of the voxels, or a larger one where surfaces fall apart, or a smaller one where they would stay whole.
 
@@ -118,31 +118,30 @@ def adapted_voxel_size(
         Those in the grid.
     grid : VoxelGrid
         Its voxels are of one size.
-    law : SpacingLaw, optional
-        How spacing depends on range, where that was asked.
+    acquisition : Acquisition
     largest : float, metres
     """
     degrees = np.diff(grid.indptr)
-    joined, of_few = _joined(degrees), _enough_of_few(grid, law)
+    joined, of_few = _joined(degrees), _enough_of_few(grid, acquisition)
     is_fragmented = joined < min(_MIN_JOINED, of_few)
-    larger = _enlarged_size(points, grid, degrees, largest) if is_fragmented else grid.size
-    usual = _refined_size(points, grid, degrees) if larger == grid.size else larger
-    if usual == grid.size and joined >= of_few and adapted_grading(grid) is None:
+    larger = _enlarged_size(points, grid, degrees, largest, acquisition.is_one_scan) if is_fragmented else grid.size
+    usual = _refined_size(points, grid, degrees, acquisition.is_one_scan) if larger == grid.size else larger
+    if usual == grid.size and joined >= of_few and adapted_grading(grid, acquisition) is None:
         return _finest(points, grid, slice(0, grid.n_voxels), _MAX_REFINEMENTS, of_few, 1.0), usual
     return usual, usual
 
 
-def _enough_of_few(grid: VoxelGrid, law: SpacingLaw | None) -> float:
+def _enough_of_few(grid: VoxelGrid, acquisition: Acquisition) -> float:
     """Fraction of the voxels, less their roughness, that have to be joined, as they are few; infinite if they are not.
 
     The fewer there are, the fewer each thing has, and the more it needs them smaller, were it so that hardly more than
     half of them are joined. An image has its pixels where it has them, and their spacing along rows may be another.
     """
-    n, of_one_scan = grid.n_voxels, grid.warp.of_one_scan
-    if n >= _ENOUGH or (of_one_scan and law is None):
+    n = grid.n_voxels
+    if n >= _ENOUGH or acquisition.has_pixels:
         return math.inf
     fraction = _log_interpolated(n, _FEW, _ENOUGH)
-    return _MIN_JOINED_OF_FEW + fraction * ((1.0 if of_one_scan else _ALL_JOINED) - _MIN_JOINED_OF_FEW)
+    return _MIN_JOINED_OF_FEW + fraction * ((1.0 if acquisition.is_one_scan else _ALL_JOINED) - _MIN_JOINED_OF_FEW)
 
 
 def _joined(degrees: NDArray[np.int64]) -> float:
@@ -150,7 +149,9 @@ def _joined(degrees: NDArray[np.int64]) -> float:
     return float(np.mean(degrees >= MIN_NEIGHBOURS_ON_SURFACE))
 
 
-def _enlarged_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray[np.int64], largest: float) -> float:
+def _enlarged_size(
+    points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray[np.int64], largest: float, of_one_scan: bool
+) -> float:
     """The size, or one larger by half powers of two, enough to join what falls apart.
 
     What is no surface at any size, as a line, stays. So does the size where half of it is joined and larger voxels
@@ -159,7 +160,7 @@ def _enlarged_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArra
     such scans is, unless each step to three quarters joins much more.
     """
     cells, size, joined, joined_at_first = [grid.cells, grid.cells], grid.size, 0.0, _joined(degrees)
-    few_beams, best = grid.warp.of_one_scan and joined_at_first < _HALF_JOINED, grid.size
+    few_beams, best = of_one_scan and joined_at_first < _HALF_JOINED, grid.size
     least, much = (math.inf, _MIN_GAIN_OF_SPARSE) if joined_at_first < _HALF_JOINED else (grid.size, _MIN_GAIN)
     for step in range(1, _MAX_ENLARGEMENTS + 1):
         size *= math.sqrt(2.0)
@@ -183,7 +184,7 @@ def _enlarged_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArra
     return best
 
 
-def _refined_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray[np.int64]) -> float:
+def _refined_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray[np.int64], of_one_scan: bool) -> float:
     """The size, or one smaller by quarters of a power of two, down to a half, where nearly all stay joined.
 
     So voxels follow how evenly points lie, not only how near to each other: those of a mesh's vertices can be smaller
@@ -194,7 +195,7 @@ def _refined_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray
     For the time's sake no grid gets very many voxels so, nor one of many that are not all joined.
     """
     n, size, joined = grid.n_voxels, grid.size, _joined(degrees)
-    if grid.warp.of_one_scan or joined < _HALF_JOINED:
+    if of_one_scan or joined < _HALF_JOINED:
         return size
     steps = min(_MAX_REFINEMENTS, int(2.0 * math.log2(_MAX_VOXELS / n)))  # to as many voxels as a surface would have
     if steps < 1 or (n > _FEW_VOXELS and joined < _ALL_JOINED):
@@ -220,7 +221,7 @@ def _finest(points: NDArray[np.float64], grid: VoxelGrid, slab: slice, steps: in
     return size
 
 
-def adapted_grading(grid: VoxelGrid) -> Grading | None:
+def adapted_grading(grid: VoxelGrid, acquisition: Acquisition) -> Grading | None:
     """Blocks in which voxels are larger by powers of two, as points lie too far apart there; None if there are few.
 
     So it is far from the tripods of several scans, near one of which spacing was read. Whether surfaces fall apart is
@@ -232,9 +233,10 @@ def adapted_grading(grid: VoxelGrid) -> Grading | None:
     ----------
     grid : VoxelGrid
         Its voxels are of one size.
+    acquisition : Acquisition
     """
     joined = grid.joined
-    if grid.warp.of_one_scan or np.mean(joined) >= _NEARLY_ALL_JOINED:
+    if acquisition.is_one_scan or np.mean(joined) >= _NEARLY_ALL_JOINED:
         return None
     keys, pitch = cell_keys(grid.cells / BLOCK, grid.size)
     ordered, order = sorted_keys(keys)
