@@ -24,7 +24,7 @@ _SIZES_PER_OCTAVE = 16
 Its effect on the scores is noise (ablation)."""
 _GRID_OFFSET = 0.382
 """Distance, in voxel edges, from the grid's origin to the lowest corner of the cloud. It is no simple fraction, so that
-points on a lattice, and walls a whole number of voxels apart, are not on a border between cells. 0.618 is as good (ablation)."""
+points on a lattice, and walls a whole number of voxels apart, are not on a border between cells. 0.618 is as good."""
 _FEW_OUTLIERS = 0.95
 """Fraction of the points left from which on scale and acquisition are not estimated again. Not varied."""
 _NOISY = 0.9
@@ -222,9 +222,8 @@ def _scale(cloud: CleanCloud, assumed: Acquisition, sizes: Sizes) -> tuple[float
     size = sizes.voxel
     if size is None:
         spacing = median_spacing(cloud.points, warp) if spacing is None else spacing
-        size = VOXELS_PER_SPACING * (
-            spacing if assumed.told.image is None else assumed.told.image.spacing(spacing, warp)
-        )
+        image = assumed.told.image
+        size = VOXELS_PER_SPACING * (spacing if image is None else image.spacing(spacing, warp))
         extent = float(np.ptp(cloud.bounds, axis=0).max())
         if 0.0 < extent < math.inf and 0.0 < size < math.inf:
             size = extent * 2.0 ** (round(_SIZES_PER_OCTAVE * math.log2(size / extent)) / _SIZES_PER_OCTAVE)

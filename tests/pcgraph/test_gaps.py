@@ -10,7 +10,7 @@ import pytest
 from tiers import draws
 
 import pcgraph
-from pcgraph.acquisition import Scanner, Told
+from pcgraph.acquisition import Scanner, Told, UnknownAcquisition
 from pcgraph.graph.gaps import gaps
 from pcgraph.graph.spherical_image import Surfels, seen_through, view_from
 from pcgraph.voxels.grid import Neighbourhood
@@ -84,7 +84,7 @@ def test_gaps_are_those_of_a_search_of_all_pairs():
     points = np.concatenate((sheet(0.0, 1.0), sheet(1.1, 1.6), sheet(0.3, 0.9, 0.12), rng.uniform(0, 1.5, (40, 3))))
     result = pcgraph.segment(points, voxel_size=VOXEL, viewpoint=(1.0, 0.5, 5.0), range_growth=0.0)
     grid, labels = result.surface.grid, result.surface.supervoxels
-    found = gaps(result.surface, result.graph.node_features, result.graph.edges)
+    found = gaps(result.surface, result.graph.node_features, result.graph.edges, UnknownAcquisition(Told()))
     touching = {tuple(pair) for pair in result.graph.edges.tolist()}
     degree = np.diff(grid.indptr)
     a, b = np.tril_indices(grid.n_voxels, -1)

@@ -96,12 +96,13 @@ def test_sides_are_known_where_all_scans_tell_them():
     told, by_normals, bare = (
         pcgraph.segment(points, **given) for given in ({"viewpoint": seen_from}, {"normals": normals}, {})
     )
-    assert [result.graph.sides_known for result in (told, by_normals, bare)] == [True, True, False]
+    assert [result.acquisition.sides_known for result in (told, by_normals, bare)] == [True, True, False]
     after = [
-        pcgraph.update(first, points + 1.0, normals=normals).graph.sides_known for first in (told, by_normals, bare)
+        pcgraph.update(first, points + 1.0, normals=normals).acquisition.sides_known
+        for first in (told, by_normals, bare)
     ]
     assert after == [True, True, False]
-    assert not pcgraph.update(told, points + 1.0).graph.sides_known
+    assert not pcgraph.update(told, points + 1.0).acquisition.sides_known
 
 
 def test_an_image_takes_a_viewpoint_per_pixel():
@@ -681,7 +682,7 @@ def test_viewpoints_that_hardly_differ_are_one():
     drifting = rng.normal(0.0, 1e-6, points.shape)
     one, each = pcgraph.segment(points, viewpoint=np.zeros(3)), pcgraph.segment(points, viewpoint=drifting)
     assert each.viewpoint == pytest.approx(np.zeros(3), abs=1e-5)
-    assert each.surface.grid.warp.of_one_scan
+    assert each.acquisition.is_one_scan
     assert each.labels.max() == pytest.approx(one.labels.max(), rel=0.1)
     apart = np.where(np.arange(len(points))[:, None] % 2 == 0, (3.0, 0.0, 0.0), (-3.0, 0.0, 0.0))
     assert pcgraph.segment(points, viewpoint=apart).viewpoint.ndim == 2
