@@ -67,68 +67,54 @@ def segment(
 ) -> Segmentation:
     """Segmentation of a point cloud: supervoxels, their adjacency graph, and the tree on it.
 
+    What is not given is found from the points. `Segmentation.acquisition` says what was found of the sensor.
+
     Parameters
     ----------
     points : (n, 3) or (h, w, 3) float or integer, metres, any frame; or a Cloud, or the name of a file
-        Of a `Cloud`, and of a file that `read_cloud` reads, colours, normals and viewpoint are used too where none
-        are given (not a viewpoint of zeros, which PCD files hold where none is known).
-        NaN, infinite and masked points are left out and labelled -1, and so are those that are exactly (0, 0, 0), as
-        drivers write holes, if there are several in an organised cloud (h, w, 3), or more than a thousand and one in a
-        thousand in a list; outliers, no denser around than noise would be, -2
-        (`pcgraph.voxels.outliers.outlier_voxels`). What looks like a camera's image, organised or not, is taken for
-        one, in whatever frame, unless `camera` says otherwise.
+        Colours, normals and viewpoint of a `Cloud` or file are used where none are given beside it. Points that are
+        NaN, infinite, masked, or (0, 0, 0) as drivers write holes, are labelled -1, outliers -2.
     colors : same shape, uint8 0..255 or float 0..1, optional
     normals : same shape, float, optional
-        Outward normals; kept in their direction. Where zero or NaN, and without them, they are estimated.
+        Outward normals. They are estimated where they are zero or NaN.
     viewpoint : (3,) or points' shape float, metres, the points' frame, optional
-        Where the sensor stood, for all points or for each (which is one for all, if no two are farther apart than a
-        fiftieth of the range); estimated normals point to its side, and convexity depends on that. Default: of
-        organised clouds the origin, if neighbours lie side by side as seen from there, as in their sensor's frame, or
-        the place of the camera that sees each point at its pixel (`pcgraph.depth_image`). So it is of lists that one
-        camera took, as their points tell which pixels they are (`pcgraph.pixels`). Any other cloud whose spacing grows
-        with range from one place that shows it (`pcgraph.voxels.spacing_law`) was seen from there; of all others, the
-        outside is found from what is visible from free places (`pcgraph.voxels.visibility.visible_sides`).
+        Where the sensor stood, for all points or for each. Estimated normals point to its side, and convexity depends
+        on that. Default: the place that the pixels of an image tell, or the spacing of the points. If neither tells
+        one, the outside of a surface is the side that is visible from free places.
     features : points' leading shape, or that + (d,), numbers; or names of columns of the Cloud or file, optional
-        What else is known of each point, such as intensity, in any unit: each column counts in spreads from its
-        median (`pcgraph.columns.RobustScaling`), to 4 at most. NaN, where unknown, counts as the median.
+        More that is known of each point, such as intensity, in any unit. Each column counts in spreads from its median
+        (`pcgraph.columns.RobustScaling`), 4 at most. NaN counts as the median.
     voxel_size : float, metres, optional
-        Edge of a voxel (R_voxel of Papon et al. 2013, PCL's voxel_resolution). Default: 3.5 times the median distance
-        between nearest points, whatever the unit, rounded to one of 16 sizes per octave of the cloud's extent; of a
-        camera's, as if all lay at the median depth; larger where surfaces would fall apart, and smaller, down to a
-        half, where points lie so evenly that surfaces stay whole, as the vertices of a mesh do, or where voxels are
-        few, so that things have too few of them.
+        Edge of a voxel (R_voxel of Papon et al. 2013, PCL's voxel_resolution), at the median depth or range where
+        voxels grow. Default: 3.5 times the median distance between nearest points; more where surfaces would fall
+        apart, and down to half of it where they stay whole.
     seed_size : float, metres, optional
         Spacing of supervoxels (R_seed of Papon et al. 2013, PCL's seed_resolution), at least `voxel_size`. Default: 5
-        times `voxel_size`, or less, 3 times at least, where that would leave fewer than some 800 supervoxels, or 6000
-        on smooth surfaces.
+        times `voxel_size`; down to 3 times where that would leave fewer than some 800 supervoxels, or 6000 on smooth
+        surfaces.
     n_supervoxels : int, optional
-        About how many supervoxels there are, in place of `seed_size`: from some dozens on within a few per cent, but at
-        least one for each piece that touches nothing else, and at most one for each voxel. For many, voxels are
-        smaller, down to a half, as long as surfaces stay whole; not if `voxel_size` is given or some are larger.
+        Number of supervoxels, in place of `seed_size`. From some dozens on it is met within a few per cent. There is at
+        least one for each piece that touches nothing else, and at most one for each voxel.
     camera : bool, optional
-        Whether voxels grow in proportion to depth from the viewpoint, being `voxel_size` at the median depth, as a
-        camera's pixels do. Default: organised clouds that a camera took, unless voxels grow with range: those in front
-        of the one viewpoint, with x/z and y/z in the order of columns and rows, and those of which the order of pixels
-        tells place and axis of a camera; and lists whose points tell them. Otherwise the camera looks along +z.
+        Whether a camera took the points, so that voxels grow in proportion to depth. Default: whether the points are
+        pixels of a pinhole camera, organised or not, in any frame. True without a viewpoint: the camera is at the
+        origin, and looks along +z unless the pixels tell another axis.
     range_growth : float, 0..1, without 1
-        Power of the range from the viewpoint with which voxels grow, being `voxel_size` at the median range; for
-        scanners, whose points thin out with range. 0.5 keeps near detail and far surfaces in one piece; 0: one size.
-        Default: 0.5 where the spacing grows with range from the one viewpoint, given or found, and `camera` is not in
-        use.
+        Power of the range from the viewpoint with which voxels grow. 0: voxels have one size. Default: 0.5 where the
+        spacing of the points grows with range from one place, and no camera took them.
     method : SupervoxelMethod, optional
-        How voxels become supervoxels; default `SurfaceGrowth()`.
+        How voxels become supervoxels. Default: `SurfaceGrowth()`.
     linkage : Linkage, optional
-        How the graph becomes a tree; default `RegionLinkage()`, whose altitudes are radians of concavity.
+        How the graph becomes a tree. Default: `RegionLinkage()`, whose altitudes are radians of concavity.
     object_altitude : float, the linkage's unit, optional
-        Altitude above which two parts are two objects: the cut that gives `labels`. Default: the linkage's.
+        Altitude of the cut that gives `labels`. Parts that join above it are two objects. Default: the linkage's.
 
     Returns
     -------
     Segmentation
-        Every finite point but outliers has a supervoxel; the voxels that hold points of a supervoxel are connected
-        (26-neighbourhood). The same points give the same supervoxels in any order, and node features up to the
-        rounding of sums; the number of threads changes nothing. A shift or another unit changes ties at most, unless
-        the origin passed for the sensor's place.
+        Every finite point but outliers has a supervoxel. The voxels that hold points of a supervoxel are connected
+        (26-neighbourhood). The order of the points and the number of threads change nothing. A shift or another unit
+        changes ties at most, unless the origin passed for the sensor's place.
 
     Raises
     ------
