@@ -159,7 +159,7 @@ def segment(
         seed_size=seed_spacing(grid, acquisition) if seed_size is None else float(seed_size),
     )
     result = segment_scan(scan, None, settings)
-    warn_of_oversegmentation(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
+    warn_of_oversegmentation(len(np.unique(result.objects)), result.tree.n_leaves, grid.size)
     return result
 
 
@@ -221,6 +221,8 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     graph = replace(graph, bridges=bridges(surface, leaves.counts, graph.joined))
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
+    if earlier is not None:
+        objects = _renumbered(objects, earlier.objects, leaves.counts)
     viewpoint = scan.acquisition.viewpoint_of(cloud)
     return Segmentation(
         labels=cloud.in_input_shape(objects[leaf_of_point], OUTLIER),
@@ -262,10 +264,29 @@ def _leaves(
     if earlier is None:
         leaves = moments_of_groups(cloud.points, cloud.colors, leaf_of_point, n_leaves, cloud.features)
     else:
-        found, group = np.unique(leaf_of_point, return_inverse=True)
-        gained = moments_of_groups(cloud.points, cloud.colors, group.astype(np.int32), len(found), cloud.features)
+        is_seen = np.bincount(leaf_of_point, minlength=n_leaves) > 0
+        found, group = np.flatnonzero(is_seen), (np.cumsum(is_seen) - 1).astype(np.int32)[leaf_of_point]
+        gained = moments_of_groups(cloud.points, cloud.colors, group, len(found), cloud.features)
         leaves = joined_moments(replace(earlier.leaves, normals=None), gained, found, n_leaves)
     return replace(leaves, normals=surface.mean_normals(n_leaves))
+
+
+def _renumbered(objects: NDArray[np.int32], before: NDArray[np.int32], weights: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Objects of k supervoxels, (k,), with the numbers that they had before, (b,) of the first b <= k supervoxels.
+
+    An object keeps the number of that with which it shares most points, if no other object shares more with that. The
+    other objects get numbers that were not used before.
+    """
+    n_before, overlap = int(before.max()) + 1, weights[: len(before)]
+    shared, pair = np.unique(objects[: len(before)].astype(np.int64) * n_before + before, return_inverse=True)
+    new, old = np.divmod(shared[np.argsort(-np.bincount(pair, overlap), kind="stable")], n_before)
+    numbers = np.full(int(objects.max()) + 1, -1, np.int32)
+    first_of_new, first_of_old = (np.unique(column, return_index=True)[1] for column in (new, old))
+    for row in np.intersect1d(first_of_new, first_of_old):
+        numbers[new[row]] = old[row]
+    fresh = np.flatnonzero(numbers < 0)
+    numbers[fresh] = n_before + np.arange(len(fresh))
+    return numbers[objects]
 
 
 def _normals(cloud: CleanCloud, oriented: OrientedPlanes, grid: VoxelGrid) -> NDArray[np.float64]:

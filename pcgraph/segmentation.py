@@ -69,7 +69,8 @@ class Segmentation:
         Supervoxel of each point, that is leaf of the tree and node of the graph; -1 where nothing was measured,
         and of outliers.
     objects : (k,) int32
-        Object of each supervoxel, also of those that hold no point of the last scan.
+        Object of each supervoxel, also of those that hold no point of the last scan. After an update some numbers may
+        be missing, as those of objects that have joined another.
     graph : AdjacencyGraph
     tree : SegmentationTree
     surface : Surface
@@ -106,7 +107,7 @@ class Segmentation:
         beside = f" and {outliers} outliers" if outliers else ""
         return (
             f"Segmentation({np.count_nonzero(self.supervoxels >= 0)} points{beside}, {self.tree.n_leaves} supervoxels, "
-            f"{len(self.graph.edges)} edges, {int(self.objects.max()) + 1} objects, "
+            f"{len(self.graph.edges)} edges, {len(np.unique(self.objects))} objects, "
             f"voxels of {self.voxel_size:.3g} m, seeds every {self.seed_size:.3g} m, {self.acquisition})"
         )
 
@@ -142,7 +143,8 @@ class Segmentation:
         Objects are connected by the graph's contacts, gaps and continuations.
         """
         k = len(self.objects)
-        first = np.unique(self.objects, return_index=True)[1][self.objects]
+        _, first, object_of = np.unique(self.objects, return_index=True, return_inverse=True)
+        first = first[object_of]
         whole = np.stack((np.arange(k), first), axis=1).astype(np.int32)
         return self._segments_on_points(connected_components(np.concatenate((self.graph.joined, whole)), k))
 

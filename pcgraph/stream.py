@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pcgraph.acquisition import SeveralScans, acquisition_of, far_along
+from pcgraph.acquisition import OrientedPlanes, SeveralScans, acquisition_of, far_along
 from pcgraph.inputs import Features, Points, as_arrays, clean_cloud
 from pcgraph.pixels import with_pixels
 from pcgraph.plausibility import warn_of_oversegmentation, warn_of_rounding, warn_of_viewpoint
@@ -35,8 +35,9 @@ def update(
 
     Supervoxels keep their numbers and what they hold: the new points join those whose voxels they fall into, or
     beside which they lie on the same surface, or found new ones. Graph and tree are made anew, over all that has
-    been seen. The points of earlier scans are not needed, and a scan costs time for its own points and for the
-    voxels of the scene, not for the points seen before.
+    been seen. An object keeps its number as long as most of it stays together; the number of an object that has
+    joined another is not given to a third. The points of earlier scans are not needed, and a scan costs time for its
+    own points and for the voxels of the scene, not for the points seen before.
 
     Parameters
     ----------
@@ -83,23 +84,24 @@ def update(
     found = voxelise_beside(without_flying_pixels(cloud, last.told.image), before.grid)
     if viewpoint is not None and last.one_viewpoint is not None:
         warn_of_viewpoint(last.one_viewpoint, found.grid)
-    oriented = last.oriented(found.cloud, found.grid, settings.method.planes)
     union = grid_union(before.grid, found.grid)
     labels = np.full(union.grid.n_voxels, -1, np.int32)
     labels[union.first] = before.supervoxels
-    viewpoint_of_voxel = np.empty((union.grid.n_voxels, 3))
-    viewpoint_of_voxel[union.second] = far_along(found.grid, oriented.planes.normals)
+    viewpoint_of_voxel, place = np.empty((union.grid.n_voxels, 3)), last.one_viewpoint
+    if place is None:
+        planes, places = last.oriented(found.cloud, found.grid, settings.method.planes)
+        viewpoint_of_voxel[union.second] = far_along(found.grid, planes.normals)
+    else:
+        viewpoint_of_voxel[union.second], places = place, place[None]
     viewpoint_of_voxel[union.first] = far_along(before.grid, before.normals)
-    places = oriented.places if earlier.viewpoint.ndim > 1 else np.vstack((oriented.places, earlier.viewpoint))
+    places = places if earlier.viewpoint.ndim > 1 else np.vstack((places, earlier.viewpoint))
     scan = Scan(
         Voxelised(found.cloud, union.grid),
         SeveralScans.of(earlier.acquisition, last),
-        oriented._replace(
-            places=np.unique(places, axis=0), planes=settings.method.planes(union.grid, viewpoint_of_voxel)
-        ),
+        OrientedPlanes(settings.method.planes(union.grid, viewpoint_of_voxel), np.unique(places, axis=0)),
         initial_labels=labels,
         seed_size=earlier.seed_size,
     )
     result = segment_scan(scan, earlier, settings)
-    warn_of_oversegmentation(int(result.objects.max()) + 1, result.tree.n_leaves, union.grid.size)
+    warn_of_oversegmentation(len(np.unique(result.objects)), result.tree.n_leaves, union.grid.size)
     return result

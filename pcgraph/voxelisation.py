@@ -15,7 +15,7 @@ from pcgraph.adapted_size import adapted_grading, adapted_voxel_size, voxel_size
 from pcgraph.depth_image import DepthImage
 from pcgraph.inputs import CleanCloud, positive
 from pcgraph.voxels.grid import VoxelGrid, grid_without, voxel_grid, with_means
-from pcgraph.voxels.outliers import detached_voxels, fill_the_volume, is_full_of_noise, is_near, outlier_voxels
+from pcgraph.voxels.outliers import detached_voxels, far_from, fill_the_volume, is_full_of_noise, outlier_voxels
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING, median_spacing
 from pcgraph.voxels.warp import Warp
 
@@ -139,11 +139,11 @@ def voxelise(cloud: CleanCloud, assumed: Acquisition, sizes: Sizes) -> Voxelisat
 def voxelise_beside(cloud: CleanCloud, earlier: VoxelGrid) -> Voxelised:
     """A later scan in voxels of the grid of earlier ones, without noise; what lies near those is none."""
     found = Voxelised.of(cloud, earlier.size, earlier.warp)
-    found = found.without(outlier_voxels(found.grid) & ~is_near(found.grid, earlier))
+    found = found.without(far_from(earlier, found.grid, outlier_voxels(found.grid)))
     if earlier.grading is not None:
         grid = voxel_grid(found.cloud.points, earlier.size, earlier.warp, earlier.grading)
         found = Voxelised(found.cloud, grid)
-    return found.without(detached_voxels(found.grid) & ~is_near(found.grid, earlier)).with_means()
+    return found.without(far_from(earlier, found.grid, detached_voxels(found.grid))).with_means()
 
 
 def without_flying_pixels(cloud: CleanCloud, image: DepthImage | None) -> CleanCloud:

@@ -183,15 +183,19 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     return detached if grid.counts[detached].sum() <= _MAX_FRACTION * grid.counts.sum() else np.zeros_like(detached)
 
 
-def is_near(grid: VoxelGrid, other: VoxelGrid) -> NDArray[np.bool_]:
-    """Whether each voxel lies within three edges, of the larger one, of a voxel of another grid of the same size and
-    warp, (v,) bool."""
-    near = np.zeros(grid.n_voxels, np.bool_)
+def far_from(other: VoxelGrid, grid: VoxelGrid, voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Those of some voxels of a grid, (v,) bool, that have no voxel of another grid within three edges of the larger.
+
+    Both grids have the same size and warp.
+    """
+    asked, far = np.flatnonzero(voxels), np.zeros(grid.n_voxels, np.bool_)
+    far[asked] = True
     for of_level, level in other.of_levels():
-        edges = np.maximum(grid.warped_edges, level.size)
-        distances = cKDTree(other.warped[of_level]).query(grid.warped)[0]
-        near |= distances <= MAX_GAP * edges
-    return near
+        edges = np.maximum(grid.warped_edges[asked], level.size)
+        far[asked] &= (
+            cKDTree(other.warped[of_level], balanced_tree=False).query(grid.warped[asked])[0] > MAX_GAP * edges
+        )
+    return far
 
 
 def _least_significant(expected: float) -> int:

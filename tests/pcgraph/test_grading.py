@@ -19,7 +19,7 @@ from pcgraph.adapted_size import adapted_grading
 from pcgraph.metrics import segmentation_covering
 from pcgraph.voxels.grading import BLOCK, Grading
 from pcgraph.voxels.grid import VoxelGrid, at_ends, grid_union, grid_without, voxel_grid, voxels_within
-from pcgraph.voxels.outliers import is_near
+from pcgraph.voxels.outliers import far_from
 from pcgraph.voxels.warp import RangeWarp, Warp
 
 seeds = st.integers(0, 2**32 - 1)
@@ -164,7 +164,8 @@ def test_what_is_near_counts_in_edges_of_the_larger_voxel() -> None:
     large = voxel_grid(np.array([[1.0, 1.0, 1.0]]), 1.0, Warp(), everywhere)
     for away, near in ((15.0, True), (23.9, True), (24.1, False)):
         small = voxel_grid(np.array([[1.0 + away, 1.0, 1.0]]), 1.0, Warp(), everywhere)
-        assert is_near(small, large)[0] == is_near(large, small)[0] == near
+        every = np.ones(1, np.bool_)
+        assert far_from(small, large, every)[0] == far_from(large, small, every)[0] == (not near)
 
 
 def test_where_points_lie_evenly_voxels_have_one_size() -> None:

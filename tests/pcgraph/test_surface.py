@@ -19,6 +19,7 @@ PACKAGE = Path(pcgraph.__file__).parent
 
 def test_public_names():
     assert pcgraph.__all__ == [
+        "Acquisition",
         "AdjacencyGraph",
         "BoundaryCost",
         "BoundaryStrength",

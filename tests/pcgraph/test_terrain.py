@@ -46,7 +46,12 @@ def main_object(labels, on, what):
 
 def found_in(result):
     graph = result.graph
-    return terrain(result.surface, graph.node_features, faces_of(graph.edges, graph.edge_features, graph.n_nodes))
+    return terrain(
+        result.surface,
+        graph.node_features,
+        faces_of(graph.edges, graph.edge_features, graph.n_nodes),
+        result.acquisition,
+    )
 
 
 @pytest.mark.parametrize("court", [0.0, 3.0, -3.0])
