@@ -11,17 +11,15 @@ from dataclasses import fields, replace
 import msgspec
 import numpy as np
 import pytest
-from clouds import box, patch
-from graphs import random_graph
+from scenes.graphs import random_graph
+from scenes.surfaces import patch
+from scenes.tables import VIEWPOINT, box
 
 import pcgraph
 from pcgraph.graph.adjacency import EdgeFeatures
 from pcgraph.tree.learned import EdgeModel, LearnedLinkage, edge_evidence, leaf_truth
 
 MODEL = EdgeModel(("concavity", "step_voxels"), (0.2, 1.0), (0.5, 2.0), (1.5, 0.25), -0.5, 0.4)
-
-
-VIEWPOINT = np.array([0.8, -1.0, 3.0])
 
 
 def _box_on_a_plane(shift=0.0):
