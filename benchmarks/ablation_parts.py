@@ -2,7 +2,7 @@
 """The parts of pcgraph's default segmentation, each with the code it is and how it is switched off.
 
 A part is switched off by patches: a name as it is looked up, such as `scan.detached_voxels`, gets another value, made
-of the one it has. What kernels hold cannot be patched so; `tests/pcgraph/test_ablation.py` sees to that.
+of the one it has. What kernels hold cannot be patched so; `tests/benchmarks/test_ablation.py` sees to that.
 """
 
 from __future__ import annotations

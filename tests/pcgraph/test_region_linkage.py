@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from clouds import two_boxes_on_a_plane
-from graphs import random_graph
+from scenes.graphs import random_graph
+from scenes.tables import two_boxes_on_a_plane
 from scipy.spatial.transform import Rotation
 from tiers import draws
 

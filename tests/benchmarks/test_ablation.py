@@ -8,11 +8,14 @@ import pytest
 from ablation import Reference, markdown, measure, table
 from ablation_cost import Code, Source
 from ablation_parts import PARTS, Part, Target, jointly, switched_off
-from clouds import two_boxes_on_a_plane
 from domain_clouds import Domain, Sample
+from scenes.tables import two_boxes_on_a_plane
 
 import pcgraph
 import pcgraph.scan as scan_module
+
+SHAPE = "tree.region_linkage._SHAPE"
+"""The constants of `RegionLinkage`, of which several parts set one each."""
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +61,10 @@ def test_a_part_is_back_after_it_was_switched_off():
 
 
 def test_parts_that_patch_one_name_are_off_together():
-    shape = Target.of("tree.region_linkage._SHAPE").value
+    shape = Target.of(SHAPE).value
     both = jointly(part for part in PARTS if part.name.endswith(("(c1)", "(k1)", "(m0)")))
     with switched_off(both):
-        found = Target.of("tree.region_linkage._SHAPE").value
+        found = Target.of(SHAPE).value
     assert found == shape._replace(c1=0.0, k1=0.0, m0=0.0)
 
 
