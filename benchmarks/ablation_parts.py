@@ -17,17 +17,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.acquisition import Acquisition, Evidence, MovingScanner, Scanner
-from pcgraph.adapted_size import VOXELS_PER_SEED
+from pcgraph.acquisition import spacing_law
+from pcgraph.acquisition.kinds import Acquisition, Evidence, MovingScanner, Scanner, acquisition_of
+from pcgraph.acquisition.spacing_law import SpacingLaw
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Bridges, Gaps
 from pcgraph.graph.contacts import edge_features, facing_sides
 from pcgraph.graph.continuations import Continuations, continuations_of
+from pcgraph.inputs import CleanCloud
 from pcgraph.supervoxels.method import SupervoxelMethod
-from pcgraph.voxels import spacing_law
+from pcgraph.voxelisation.adapted_size import VOXELS_PER_SEED
 from pcgraph.voxels.grid import VoxelGrid, boundary_voxels
 from pcgraph.voxels.ground_and_rooms import SupportingPlane
-from pcgraph.voxels.spacing_law import SpacingLaw
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.visibility import VisibleSides
 from pcgraph.voxels.warp import NormalTransform
@@ -177,6 +178,11 @@ def _no_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | None =
     return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
+def _no_camera(cloud: CleanCloud, viewpoint: Any, camera: bool | None, growth: float | None) -> Acquisition:
+    """What the pixels tell but that a camera took them."""
+    return acquisition_of(cloud, viewpoint, bool(camera), growth)
+
+
 def _on_the_move(scanner: Scanner, grid: VoxelGrid) -> Acquisition:
     """A scanner whose place counts for the growth of voxels alone, unless it was given."""
     if scanner.told.evidence not in (Evidence.SPACING, Evidence.RINGS):
@@ -226,33 +232,39 @@ def _by_weight(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray
 
 _NOWHERE = SupportingPlane(np.array([0.0, 0.0, 1.0]), -np.inf, False)
 _NO_BRIDGES = Bridges(np.empty((0, 2), np.int32), np.empty(0), np.empty(0), np.empty(0, np.bool_))
-_NO_OUTLIERS: dict[str, Replacement] = {"voxelisation.outlier_voxels": _is(_no_voxels)}
-_NO_DETACHED: dict[str, Replacement] = {"voxelisation.detached_voxels": _is(_no_voxels)}
+_NO_OUTLIERS: dict[str, Replacement] = {"voxelisation.voxelised.outlier_voxels": _is(_no_voxels)}
+_NO_DETACHED: dict[str, Replacement] = {"voxelisation.voxelised.detached_voxels": _is(_no_voxels)}
 _NO_CLOSER_LOOK: dict[str, Replacement] = {
-    "voxelisation.is_full_of_noise": _gives(False),
-    "voxelisation._NOISY": _is(-1.0),
+    "voxelisation.voxelised.is_full_of_noise": _gives(False),
+    "voxelisation.voxelised._NOISY": _is(-1.0),
 }
 _NO_CONTINUATIONS: dict[str, Replacement] = {"scan.continuations": _is(_no_continuations)}
 _NO_PLANES: dict[str, Replacement] = {"scan.bounding_planes": _is(_no_continuations)}
 _NO_TERRAIN: dict[str, Replacement] = {"scan.terrain": _is(_no_continuations)}
 _NO_PIXELS: dict[str, Replacement] = {"scan.with_pixels": _keeps(0)}
-_NO_LAW: dict[str, Replacement] = {"acquisition.spacing_law": _is(_no_law), "acquisition.law_on_rings": _keeps(1)}
+_NO_LAW: dict[str, Replacement] = {
+    "acquisition.kinds.spacing_law": _is(_no_law),
+    "acquisition.kinds.law_on_rings": _keeps(1),
+}
 _UP: dict[str, Replacement] = {
-    "acquisition.visible_sides": _is(_from_above),
-    "acquisition.virtual_viewpoints": _gives(None),
+    "acquisition.kinds.visible_sides": _is(_from_above),
+    "acquisition.kinds.virtual_viewpoints": _gives(None),
 }
 _OUTWARDS: dict[str, Replacement] = {
-    "acquisition.visible_sides": _is(_from_outside),
-    "acquisition.virtual_viewpoints": _gives(None),
+    "acquisition.kinds.visible_sides": _is(_from_outside),
+    "acquisition.kinds.virtual_viewpoints": _gives(None),
 }
 _SIDES = ("voxels/virtual_viewpoints.py", "voxels/visibility.py:visible_sides", "voxels/visibility.py:VisibleSides")
 
 # Short names of files
-_SCAN, _LINK, _LAW, _SIZE = "scan.py", "tree/region_linkage.py", "voxels/spacing_law.py", "adapted_size.py"
-_ACQUISITION, _VOXELS = "acquisition.py", "voxelisation.py"
+_SCAN, _LINK, _SIZE = "scan.py", "tree/region_linkage.py", "voxelisation/adapted_size.py"
+_LAW, _RINGS, _PIXELS, _LATTICE = (
+    f"acquisition/{name}.py" for name in ("spacing_law", "rings", "pixels", "pixel_lattice")
+)
+_ACQUISITION, _VOXELS = "acquisition/kinds.py", "voxelisation/voxelised.py"
 _NOISE, _VIEW, _SIDE = "voxels/outliers.py", "voxels/virtual_viewpoints.py", "voxels/visibility.py"
 _IMAGE, _GROW, _GAPS, _BEHIND = (
-    "depth_image.py",
+    "acquisition/depth_image.py",
     "supervoxels/surface_growth.py",
     "graph/gaps.py",
     "graph/continuations.py",
@@ -279,10 +291,17 @@ def _function(name: str, file: str, function: str, replacement: Replacement, *co
 GROUPS = (
     Part(
         "all: where it was seen from",
-        ("pixels.py", _LAW, "voxels/rings.py", f"{_IMAGE}:image_view", f"{_ACQUISITION}:Scanner.confirmed", *_SIDES),
-        _NO_PIXELS | _NO_LAW | _UP | {"acquisition.image_view": _gives(None)},
+        (
+            _PIXELS,
+            _LAW,
+            _RINGS,
+            f"{_IMAGE}:image_view",
+            f"{_ACQUISITION}:Scanner.confirmed",
+            *_SIDES,
+        ),
+        _NO_PIXELS | _NO_LAW | _UP | {"acquisition.kinds.image_view": _gives(None)},
     ),
-    Part("all: law of spacing and rings", (_LAW, "voxels/rings.py", f"{_ACQUISITION}:Scanner.confirmed"), _NO_LAW),
+    Part("all: law of spacing and rings", (_LAW, _RINGS, f"{_ACQUISITION}:Scanner.confirmed"), _NO_LAW),
     Part("all: outside from what is visible; else upwards", _SIDES, _UP),
     Part("all: outside from what is visible; else outwards", _SIDES, _OUTWARDS),
     Part(
@@ -298,7 +317,7 @@ GROUPS = (
     Part(
         "all: adapted voxel size",
         (_SIZE, "voxels/grading.py", f"{_VOXELS}:_adapted", f"{_SCAN}:_oriented"),
-        {"voxelisation._adapted": lambda f: lambda found, *others: (found, found.grid.size)},
+        {"voxelisation.voxelised._adapted": lambda f: lambda found, *others: (found, found.grid.size)},
     ),
     Part(
         "all: colours",
@@ -309,13 +328,22 @@ GROUPS = (
 )
 
 CAMERAS = (
-    Part("pixels of a list", ("pixels.py", "pixel_lattice.py"), _NO_PIXELS),
-    _function("pixels of a list, in any frame", "pixels.py", "_image_in_any_frame", _gives(None)),
-    _function("pixels of a list, in its own frame", "pixels.py", "_image_in_own_frame", _gives(None)),
-    _function("pixels of depths in steps", "pixel_lattice.py", "_alike", lambda f: lambda camera, *others: [camera]),
+    Part("pixels of a list", (_PIXELS, _LATTICE), _NO_PIXELS),
+    _function("pixels of a list, in any frame", _PIXELS, "_image_in_any_frame", _gives(None)),
+    _function("pixels of a list, in its own frame", _PIXELS, "_image_in_own_frame", _gives(None)),
+    _function(
+        "pixels of depths in steps",
+        _LATTICE,
+        "_alike",
+        lambda f: lambda camera, *others: [camera],
+    ),
     _function("camera of an image in any frame", _IMAGE, "_camera", _gives(None)),
-    _function("voxels grow with depth", _IMAGE, "is_camera_image", _gives(False)),
-    Part("spacing of a depth image", (f"{_IMAGE}:DepthImage.spacing",), {"depth_image.DepthImage.spacing": _keeps(1)}),
+    Part("voxels grow with depth", (f"{_ACQUISITION}:CameraImage",), {"scan.acquisition_of": _is(_no_camera)}),
+    Part(
+        "spacing of a depth image",
+        (f"{_IMAGE}:DepthImage.spacing",),
+        {"acquisition.depth_image.DepthImage.spacing": _keeps(1)},
+    ),
     _constant("spacing: steps of depth", _IMAGE, "_MAX_COARSENING", 0.0, "_step_along", "_MAX_STEP"),
     _constant("spacing: rows of an image", _IMAGE, "_MIN_PER_PITCH", 0.0),
     Part(
@@ -327,12 +355,12 @@ CAMERAS = (
 
 LAW = (
     _constant("voxels grow with range", _ACQUISITION, "RANGE_GROWTH", 0.0),
-    Part("rings", ("voxels/rings.py", f"{_LAW}:law_on_rings"), {"acquisition.law_on_rings": _keeps(1)}),
-    Part("law of spacing, but for rings", (_LAW,), {"acquisition.spacing_law": _is(_no_law)}),
+    Part("rings", (_RINGS, f"{_LAW}:law_on_rings"), {"acquisition.kinds.law_on_rings": _keeps(1)}),
+    Part("law of spacing, but for rings", (_LAW,), {"acquisition.kinds.spacing_law": _is(_no_law)}),
     Part(
         "scanner's position for normals",
         (f"{_ACQUISITION}:Scanner.confirmed",),
-        {"acquisition.Scanner.confirmed": _is(_on_the_move)},
+        {"acquisition.kinds.Scanner.confirmed": _is(_on_the_move)},
     ),
     _function("law: cosines of the surface", _LAW, "_fit_normals", lambda f: lambda *a: a[-1].fill(0.0)),
     _function(
@@ -350,22 +378,22 @@ LAW = (
     Part(
         "law: mirrored place",
         (f"{_SIDE}:likelier_viewpoint", f"{_LAW}:_mirrored", f"{_LAW}:SpacingLaw.mirrored"),
-        {"acquisition.likelier_viewpoint": _keeps(1)},
+        {"acquisition.kinds.likelier_viewpoint": _keeps(1)},
     ),
     Part(
         "law: best place beside the origin",
         (f"{_LAW}:SpacingLaw.best_viewpoint",),
-        {"acquisition.spacing_law": _then(lambda law: replace(law, best_viewpoint=None))},
+        {"acquisition.kinds.spacing_law": _then(lambda law: replace(law, best_viewpoint=None))},
     ),
     Part(
         "scanner moved: place must show all",
         (f"{_ACQUISITION}:_MIN_SHOWN", f"{_SIDE}:shown_fraction"),
-        {"acquisition._MIN_SHOWN": _is(0.0)},
+        {"acquisition.kinds._MIN_SHOWN": _is(0.0)},
     ),
     Part(
         "axis: level ground faces its scanner",
         (f"{_SIDE}:sides_towards", f"{_SIDE}:_upwards"),
-        {"acquisition.sides_towards": _keeps(1)},
+        {"acquisition.kinds.sides_towards": _keeps(1)},
     ),
 )
 
@@ -388,7 +416,7 @@ SIZES = (
     Part(
         "graded voxels",
         (f"{_SIZE}:adapted_grading", "voxels/grading.py:Grading"),
-        {"voxelisation.adapted_grading": _gives(None)},
+        {"voxelisation.voxelised.adapted_grading": _gives(None)},
     ),
     _function("graded: small grids less", _SIZE, "_sparse_below", _gives(0.6)),
     Part(
@@ -408,9 +436,15 @@ NOISE = (
         (f"{_VOXELS}:_without_near_outliers", f"{_NOISE}:is_full_of_noise", f"{_NOISE}:fill_the_volume"),
         _NO_CLOSER_LOOK,
     ),
-    Part("noise: full of it", (f"{_NOISE}:is_full_of_noise",), {"voxelisation.is_full_of_noise": _gives(False)}),
+    Part(
+        "noise: full of it", (f"{_NOISE}:is_full_of_noise",), {"voxelisation.voxelised.is_full_of_noise": _gives(False)}
+    ),
     _constant("noise: much was found", _VOXELS, "_NOISY", -1.0),
-    Part("noise fills the volume", (f"{_NOISE}:fill_the_volume",), {"voxelisation.fill_the_volume": _gives(True)}),
+    Part(
+        "noise fills the volume",
+        (f"{_NOISE}:fill_the_volume",),
+        {"voxelisation.voxelised.fill_the_volume": _gives(True)},
+    ),
     _constant("noise: scale estimated again", _VOXELS, "_FEW_OUTLIERS", 0.0),
     _function("noise: surfaces among it", _NOISE, "_surfaces_among", _none_of(0)),
     _constant("noise: within reach", _NOISE, "_VOLUME_OF_REACH", math.inf),

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pcgraph import detection as detection
     from pcgraph import learning as learning
     from pcgraph import metrics as metrics
-    from pcgraph.acquisition import Acquisition as Acquisition
+    from pcgraph.acquisition.kinds import Acquisition as Acquisition
     from pcgraph.cloud import Cloud as Cloud
     from pcgraph.columns import RobustScaling as RobustScaling
     from pcgraph.errors import CloudReadError as CloudReadError
@@ -66,7 +66,7 @@ else:
         __name__,
         submodules={"detection", "learning", "metrics"},
         submod_attrs={
-            "acquisition": ["Acquisition"],
+            "acquisition.kinds": ["Acquisition"],
             "cloud": ["Cloud"],
             "columns": ["RobustScaling"],
             "errors": ["CloudReadError", "CloudWriteError", "PcgraphError"],

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.acquisition import Acquisition, OrientedPlanes, acquisition_of
-from pcgraph.adapted_size import seed_spacing
+from pcgraph.acquisition.kinds import Acquisition, OrientedPlanes, acquisition_of
+from pcgraph.acquisition.pixels import with_pixels
 from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
@@ -25,7 +25,6 @@ from pcgraph.graph.gaps import gaps
 from pcgraph.graph.terrain import terrain
 from pcgraph.inputs import CleanCloud, Features, Points, as_arrays, clean_cloud, whole_number
 from pcgraph.parallel import side_by_side
-from pcgraph.pixels import with_pixels
 from pcgraph.plausibility import (
     warn_of_duplicates,
     warn_of_oversegmentation,
@@ -38,7 +37,8 @@ from pcgraph.segmentation import Segmentation, Settings
 from pcgraph.supervoxels.method import SupervoxelMethod, seed_size_for, supervoxels_by
 from pcgraph.tree.linkage import Linkage, checked_merges
 from pcgraph.tree.tree import segmentation_tree
-from pcgraph.voxelisation import Sizes, Voxelisation, Voxelised, voxelise, without_flying_pixels
+from pcgraph.voxelisation.adapted_size import seed_spacing
+from pcgraph.voxelisation.voxelised import Sizes, Voxelisation, Voxelised, voxelise, without_flying_pixels
 from pcgraph.voxels.column_evidence import color_evidence
 from pcgraph.voxels.grid import VoxelGrid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER

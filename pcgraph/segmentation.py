@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.acquisition import Acquisition
+from pcgraph.acquisition.kinds import Acquisition
 from pcgraph.columns import RobustScaling
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.moments import Moments

@@ -6,15 +6,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pcgraph.acquisition import OrientedPlanes, SeveralScans, acquisition_of, far_along
+from pcgraph.acquisition.kinds import OrientedPlanes, SeveralScans, acquisition_of, far_along
+from pcgraph.acquisition.pixels import with_pixels
 from pcgraph.inputs import Features, Points, as_arrays, clean_cloud
-from pcgraph.pixels import with_pixels
 from pcgraph.plausibility import warn_of_oversegmentation, warn_of_rounding, warn_of_viewpoint
 from pcgraph.scan import Scan, segment_scan
 from pcgraph.segmentation import Segmentation, Settings
 from pcgraph.supervoxels.method import SupervoxelMethod
 from pcgraph.tree.linkage import Linkage
-from pcgraph.voxelisation import Voxelised, voxelise_beside, without_flying_pixels
+from pcgraph.voxelisation.voxelised import Voxelised, voxelise_beside, without_flying_pixels
 from pcgraph.voxels.grid import grid_union
 from pcgraph.warmup import compile_in_two_processes
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.acquisition import Acquisition, Told, UnknownAcquisition
+from pcgraph.acquisition.kinds import Acquisition, Told, UnknownAcquisition
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.boundary import BoundaryStrength
 from pcgraph.plumbing.short_repr import ShortRepr

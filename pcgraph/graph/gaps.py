@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.acquisition import Acquisition
+from pcgraph.acquisition.kinds import Acquisition
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Gaps

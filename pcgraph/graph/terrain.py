@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pcgraph.acquisition import Acquisition
+from pcgraph.acquisition.kinds import Acquisition
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.bounding_planes import MIN_HIDDEN, Plane, borders_of, facing_ways, joining
 from pcgraph.graph.continuations import Continuations, continuations_of

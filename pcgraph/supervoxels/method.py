@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.adapted_size import seed_spacing_for
+from pcgraph.voxelisation.adapted_size import seed_spacing_for
 from pcgraph.voxels.grid import VoxelGrid
 from pcgraph.voxels.surface import LocalPlanes
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.voxels.cells import bounding_box, cell_keys, gallop, sorted_keys
-from pcgraph.voxels.rings import Rows
 from pcgraph.voxels.sampling import BLOCKS, blocks_of, each_place_once, some_places
 from pcgraph.voxels.warp import Warp
 
@@ -31,6 +30,13 @@ _ROW = 0.25  # of the way between a point's two nearest: it lies no farther off 
 _COPIES = 256  # of a place, at most: where cells hold more, they are things that lie far apart
 _THIN = 0.01  # of its extent: a cloud whose points, at their spacing, cover so little
 _TINY = float(np.finfo(np.float64).tiny)
+
+
+class Rows(NamedTuple):
+    """Points between two others, their nearest, (m, 3), and the unit directions along these, (m, 3), either way."""
+
+    points: NDArray[np.float64]
+    directions: NDArray[np.float64]
 
 
 def median_spacing(points: NDArray[np.float64], warp: Warp | None = None) -> float:

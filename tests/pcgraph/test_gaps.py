@@ -12,7 +12,7 @@ from scenes.surfaces import tile
 from tiers import draws
 
 import pcgraph
-from pcgraph.acquisition import Scanner, Told, UnknownAcquisition
+from pcgraph.acquisition.kinds import Scanner, Told, UnknownAcquisition
 from pcgraph.graph.gaps import gaps
 from pcgraph.graph.spherical_image import Surfels, seen_through, view_from
 from pcgraph.voxels.grid import Neighbourhood

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scenes.rooms import flat_ground, two_densities
 
 import pcgraph
-from pcgraph.acquisition import Scanner, Told, UnknownAcquisition
-from pcgraph.adapted_size import adapted_grading
+from pcgraph.acquisition.kinds import Scanner, Told, UnknownAcquisition
 from pcgraph.metrics import segmentation_covering
+from pcgraph.voxelisation.adapted_size import adapted_grading
 from pcgraph.voxels.grading import BLOCK, Grading
 from pcgraph.voxels.grid import VoxelGrid, at_ends, grid_union, grid_without, voxel_grid, voxels_within
 from pcgraph.voxels.outliers import far_from

@@ -10,10 +10,10 @@ from scenes.rays import turning
 from scipy.spatial.transform import Rotation
 
 import pcgraph
+from pcgraph.acquisition.pixels import with_pixels
+from pcgraph.acquisition.resection import NO_PLANE, resection
 from pcgraph.inputs import clean_cloud
 from pcgraph.metrics import weighted_overlap
-from pcgraph.pixels import with_pixels
-from pcgraph.resection import NO_PLANE, resection
 
 
 def in_world(points, seed):

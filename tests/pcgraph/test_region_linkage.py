@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from tiers import draws
 
 import pcgraph
-from pcgraph.acquisition import Told, UnknownAcquisition
+from pcgraph.acquisition.kinds import Told, UnknownAcquisition
 from pcgraph.tree.region_linkage import MergeEdges, RegionLinkage, region_linkage
 
 

@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 from tiers import draws
 
 import pcgraph
-from pcgraph.depth_image import DepthImage, image_view
+from pcgraph.acquisition.depth_image import DepthImage, image_view
+from pcgraph.acquisition.pixels import with_pixels
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.inputs import clean_cloud
 from pcgraph.metrics import weighted_overlap
-from pcgraph.pixels import with_pixels
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.warp import CameraWarp, RangeWarp, warped_normal
 

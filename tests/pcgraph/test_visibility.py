@@ -28,13 +28,13 @@ from scipy.spatial.transform import Rotation
 from tiers import draws, to_validate
 
 import pcgraph
+from pcgraph.acquisition.spacing_law import spacing_law
 from pcgraph.metrics import segmentation_covering
 from pcgraph.voxels import virtual_viewpoints
 from pcgraph.voxels.depth_buffer import visibility_from
 from pcgraph.voxels.grid import voxel_grid
 from pcgraph.voxels.ground_and_rooms import dominant_plane
 from pcgraph.voxels.spacing import median_spacing
-from pcgraph.voxels.spacing_law import spacing_law
 from pcgraph.voxels.visibility import shown_fraction
 from pcgraph.voxels.warp import Warp
 

@@ -20,14 +20,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.depth_image import DepthImage, axis_at, image_view, is_camera_image
+from pcgraph.acquisition.depth_image import DepthImage, axis_at, image_view, is_camera_image
+from pcgraph.acquisition.spacing_law import SpacingLaw, law_on_rings, spacing_law
 from pcgraph.inputs import CleanCloud, clean_viewpoint, fraction
 from pcgraph.parallel import side_by_side
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grid import VoxelGrid, voxel_means
 from pcgraph.voxels.sampling import farthest_points
 from pcgraph.voxels.spacing import spacing_and_rows
-from pcgraph.voxels.spacing_law import SpacingLaw, law_on_rings, spacing_law
 from pcgraph.voxels.surface import LocalPlanes
 from pcgraph.voxels.virtual_viewpoints import virtual_viewpoints
 from pcgraph.voxels.visibility import (

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.acquisition import Acquisition
-from pcgraph.adapted_size import adapted_grading, adapted_voxel_size, voxel_size_for
-from pcgraph.depth_image import DepthImage
+from pcgraph.acquisition.depth_image import DepthImage
+from pcgraph.acquisition.kinds import Acquisition
 from pcgraph.inputs import CleanCloud, positive
+from pcgraph.voxelisation.adapted_size import adapted_grading, adapted_voxel_size, voxel_size_for
 from pcgraph.voxels.grid import VoxelGrid, grid_without, voxel_grid, with_means
 from pcgraph.voxels.outliers import detached_voxels, far_from, fill_the_volume, is_full_of_noise, outlier_voxels
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING, median_spacing

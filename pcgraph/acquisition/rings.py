@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from pcgraph.voxels.spacing import Rows
+
 _MIN_ROWS, _SOME_ROWS, _MAX_ROWS = 40, 256, 512  # that are looked at: at first, and at last
 _NOT_PARALLEL = 0.15  # of the rows' squares, along the second of their principal directions
 _COARSE, _MIDDLE, _FINE = 0.2, 0.1, 0.02  # slopes of rows against their cones, radians
@@ -25,13 +27,6 @@ _SINGULAR = 1e4  # condition of the derivatives: with more, some line of places 
 _NEAR = 0.2  # median ranges
 _MIN_COSINE = 1e-3  # of an elevation
 _STEPS = 15  # of a search
-
-
-class Rows(NamedTuple):
-    """Points between two others, their nearest, (m, 3), and the unit directions along these, (m, 3), either way."""
-
-    points: NDArray[np.float64]
-    directions: NDArray[np.float64]
 
 
 class Scanner(NamedTuple):

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.acquisition.resection import NO_PLANE, is_far_off, resection
 from pcgraph.inputs import CleanCloud, ImageView, Pixels, unit_rows
 from pcgraph.parallel import MIN_ROWS, in_blocks, kernel, routine
-from pcgraph.resection import NO_PLANE, is_far_off, resection
 from pcgraph.voxels.outliers import MIN_POINTS
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING
 from pcgraph.voxels.warp import FORWARDS, Warp, along_axis

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.acquisition import Acquisition
+from pcgraph.acquisition.kinds import Acquisition
 from pcgraph.voxels.cells import UNIT_CELLS, cell_keys, sorted_keys, starts_of_runs
 from pcgraph.voxels.grading import BLOCK, Grading
 from pcgraph.voxels.grid import (

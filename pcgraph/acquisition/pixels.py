@@ -9,10 +9,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.acquisition.pixel_lattice import (
+    MAX_OFF_PIXEL,
+    MAX_PIXELS,
+    MIN_LINES,
+    are_whole,
+    likely_cameras,
+    step_between,
+)
+from pcgraph.acquisition.resection import PinholeCamera, is_far_off
 from pcgraph.inputs import CleanCloud, ImageView, Pixels
 from pcgraph.parallel import in_blocks, inlined, kernel
-from pcgraph.pixel_lattice import MAX_OFF_PIXEL, MAX_PIXELS, MIN_LINES, are_whole, likely_cameras, step_between
-from pcgraph.resection import PinholeCamera, is_far_off
 from pcgraph.voxels.outliers import MIN_POINTS
 
 _SOME = 4096  # values that are looked at first

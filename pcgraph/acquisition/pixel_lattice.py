@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from pcgraph.acquisition.resection import NO_PLANE, PinholeCamera, resection
 from pcgraph.parallel import in_blocks, kernel, routine
-from pcgraph.resection import NO_PLANE, PinholeCamera, resection
 from pcgraph.voxels.directions import plane_basis, sphere_directions
 from pcgraph.voxels.sampling import farthest_points
 

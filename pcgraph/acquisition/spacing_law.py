@@ -12,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pcgraph.acquisition.rings import scanner_of_rings
 from pcgraph.parallel import in_blocks, kernel, summing_routine
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.directions import sphere_directions
 from pcgraph.voxels.eigen import SYMMETRIC_INDICES, plane_normal
 from pcgraph.voxels.ground_and_rooms import dominant_plane
-from pcgraph.voxels.rings import Rows, scanner_of_rings
 from pcgraph.voxels.sampling import order_of_draw, sample
+from pcgraph.voxels.spacing import Rows
 
 _READINGS = 1 << 10  # how many readings of the spacing count
 _MIN_READINGS = 1 << 8  # with fewer the law is not looked for
