@@ -27,8 +27,8 @@ class CameraThresholds:
     min_rank_correlation: float = 0.95  # of columns and rows with x/z and y/z
     far_apart: float = 2.5  # median angles between neighbours: with more they do not lie side by side
     max_far_apart: float = 0.001  # fraction of the neighbours that do not lie side by side
-    max_residual: float = 1.0  # pixels, reprojection error,
-    min_inliers: float = 0.95  # of this fraction of the points
+    max_residual: float = 1.0  # pixels, reprojection error of an inlier, at most
+    min_inliers: float = 0.95  # fraction of the points that are inliers
     same_place: float = 0.02  # extents of the cloud between two places that are one
 
 

@@ -371,6 +371,7 @@ def _number(value: float) -> float:
 
 
 def _numbers(name: str, values: ArrayLike) -> NDArray[np.generic]:
+    """The values as an array of numbers, masked ones as NaN; ValueError if they are none."""
     values = without_mask(values)
     try:
         array = np.asarray(values)
@@ -382,6 +383,7 @@ def _numbers(name: str, values: ArrayLike) -> NDArray[np.generic]:
 
 
 def _same_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.generic]:
+    """Rows of three values, (n, 3), for points of a shape; ValueError if they have another."""
     array = _numbers(name, values)
     if array.shape != (*shape, 3):
         raise ValueError(f"expected {name} of the points' shape {(*shape, 3)}, got {array.shape}")
@@ -394,6 +396,7 @@ def _rows(values: NDArray[np.generic], kept: NDArray[np.int64]) -> NDArray[np.ge
 
 
 def _colors(colors: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """Colours of the points that are kept, (n, 3) float64, 0..1; ValueError if they are not as documented."""
     if colors is None:
         return None
     masked = np.ma.getmaskarray(colors) if isinstance(colors, np.ma.MaskedArray) else np.zeros(0, bool)
@@ -418,6 +421,7 @@ def _colors(colors: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.i
 
 
 def _normals(normals: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """Normals of the points that are kept, (n, 3) float64, of unit length, or zero where none is given."""
     if normals is None:
         return None
     with np.errstate(over="ignore", invalid="ignore"):  # long doubles, signalling NaN

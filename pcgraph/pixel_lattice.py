@@ -18,7 +18,7 @@ from pcgraph.rounding import TINY
 from pcgraph.voxels.directions import plane_basis, sphere_directions
 from pcgraph.voxels.sampling import farthest_points
 
-# Numbers without a reason were chosen by eye, on 84 made frames of depth cameras, and not varied.
+# Numbers without a reason were chosen by eye and not varied.
 
 # Kernels read these.
 MAX_OFF_PIXEL = 0.1
@@ -79,11 +79,11 @@ class CameraThresholds:
     growth: float = 1.4  # factor of the reach, each time
     max_fits: int = 4  # fits to the points within reach
     settled: float = 0.02  # fraction of the points that changed whether they count: with less, the fit ends
-    sure: float = 0.3  # quantile of the distances from pixels that is trusted,
-    max_sure: float = 0.1  # pixels, and has to be less than that
-    times: float = 8.0  # times that distance: points farther off do not count,
-    precise: float = 0.02  # pixels, unless they are less far off than that,
-    off: float = 0.25  # pixels, and never if they are farther off than that
+    sure: float = 0.3  # quantile of the distances from pixels by which a fit is judged
+    max_sure: float = 0.1  # pixels: if that quantile is more, the fit fails
+    times: float = 8.0  # multiple of that quantile: points farther off do not count
+    precise: float = 0.02  # pixels: points nearer than that always count
+    off: float = 0.25  # pixels: points farther off than that never count
     min_inliers: float = 0.4  # fraction of the points that count
     along: float = 1e-3  # weight of an affine camera's direction, which decides only if points are on one plane
     better: float = 0.7  # ratio of mean squares by which a pinhole camera has to beat an affine one

@@ -114,4 +114,5 @@ def warn_of_viewpoint(viewpoint: NDArray[np.float64], grid: VoxelGrid) -> None:
 
 
 def _warn(sentence: str) -> None:
-    warnings.warn(sentence, CloudWarning, stacklevel=4)  # where `segment` was called
+    """Warn with a sentence, as of the line that called `segment`."""
+    warnings.warn(sentence, CloudWarning, stacklevel=4)

@@ -73,30 +73,31 @@ class RefinementThresholds:
     large: int = 120_000  # voxels of a large grid, which costs time: it is refined only if all are joined
     max_voxels: int = 300_000  # voxels of a refined grid, about; at 480 000 a room of a million points takes 1.8 times
     slab: int = 1 << 14  # voxels, in the middle of the grid's order, off which all this is read
-    few: int = 750  # voxels of a grid whose voxels may be smaller although only `joined_of_few` are joined then;
-    enough: int = 40_000  # voxels from which on they may not; between, the fraction rises with the logarithm
+    few: int = 750  # voxels: if a grid has no more, it is enough that `joined_of_few` stay joined;
+    enough: int = 40_000  # voxels: from here on the rule for few ends; between, the fraction rises with the logarithm
     joined_of_few: float = 0.5  # fraction of the voxels; it rises to `all_joined`, or to 1 in one scan
     price_of_few: float = 1.0  # price of roughness for these; with a quarter of it heaps in noise fall apart
 
 
 @dataclass(frozen=True)
 class GradingThresholds:
-    """Enlargement of voxels by powers of two, block by block. Without this no half of a scene may be thinned (a law).
+    """Enlargement of voxels by powers of two, block by block.
 
-    Other values of the first three thresholds and of `min_voxels` were tried and given up: 0.5 or 0.75, two, and 80.
+    Without this a law fails: half of a scene may be thinned. Tried and given up: two doublings at most; asking blocks
+    of which fewer than 0.5, or 0.75, are joined; one block alone if it has 20 or 80 voxels; blocks of 8 voxels.
     """
 
     max_level: int = 3  # doublings of the edge
-    sparse_in_small: float = 0.2  # fraction: a block is sparse if fewer of its voxels are joined, in small grids;
-    sparse_in_large: float = 0.6  # the same in large ones, and interpolated between by the logarithm
+    sparse_in_small: float = 0.2  # joined fraction of a sparse block, at most, in a small grid
+    sparse_in_large: float = 0.6  # the same in a large one; between, it is interpolated by the logarithm
     small: int = 10_000  # voxels of a small grid, whose things have few
     large: int = 20_000  # voxels of a large one
     min_voxels: int = 20  # larger voxels in and around a block: with fewer it is not judged
     min_gain: float = 0.2  # fraction of the voxels that each doubling has to join, if half were joined at first
-    line_ratio: float = 0.65  # a block holds lines if doubled edges leave fewer of its voxels (lines 0.5, planes 0.76),
-    line_joined: float = 0.4  # and a smaller fraction of them is joined; 0.6 to 0.8 and 0.3 to 0.5 are as good
-    nearly_all_joined: float = 0.98  # fraction of all voxels: no grading from here on,
-    min_graded: float = 0.003  # nor if a smaller fraction of the voxels would be larger
+    line_ratio: float = 0.65  # fraction of a block's voxels that doubled edges leave of lines, at most; planes: 0.76
+    line_joined: float = 0.4  # joined fraction of these, at most; 0.3 to 0.5, and ratios of 0.6 to 0.8, are as good
+    nearly_all_joined: float = 0.98  # joined fraction of all voxels, from which on there is no grading
+    min_graded: float = 0.003  # fraction of the voxels that grading has to make larger
 
 
 _SEEDS = SeedThresholds()

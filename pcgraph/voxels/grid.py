@@ -293,6 +293,7 @@ def voxel_means(values: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.floa
 def _sorted_means(
     values: NDArray[np.float64], starts: NDArray[np.int64], order: NDArray[np.int64], steps: float
 ) -> NDArray[np.float64]:
+    """Means of vectors, (n, 3), by voxel, (v, 3), summed in so many steps per unit."""
     means = np.empty((len(starts) - 1, 3))
     in_blocks(_average, len(means), starts, order, values, steps, means)
     return means
@@ -584,6 +585,7 @@ def _find_ends(
     around: Neighbourhood,
     ends: NDArray[np.bool_],
 ) -> None:
+    """Set whether each of some voxels lies at the end of a surface."""
     taken = np.empty((3, 3, 3), np.bool_)  # places beside the voxel, as seen along each axis
     for m in range(start, stop):
         i = voxels[m]
@@ -780,6 +782,7 @@ def grid_union(a: VoxelGrid, b: VoxelGrid) -> GridUnion:
     counts[second] += b.counts
 
     def blend(of_a: NDArray[np.float64], of_b: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Means of both grids, weighted by points."""
         mean = np.zeros((len(counts), of_a.shape[1]))
         mean[first] = of_a
         fraction = (b.counts / counts[second])[:, None]

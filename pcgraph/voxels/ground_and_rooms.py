@@ -37,8 +37,8 @@ class GroundThresholds:
     min_one_sided: float = 0.8  # fraction of the rest, weighted by distance, that is on one side of the plane
     min_fraction: float = 0.1  # fraction of the cells on a plane that bears the rest
     min_fraction_of_ground: float = 0.25  # the same on the ground
-    min_off: float = 0.02  # fraction of the cells off the ground: something stands on it;
-    max_below: float = 0.02  # fraction of these that is below it, at most
+    min_off: float = 0.02  # fraction of the cells off the ground, at least: something stands on it
+    max_below: float = 0.02  # fraction of these that lies below it, at most
     quantiles: tuple[float, float] = (0.02, 0.98)  # along x and y, between which areas are measured
     max_area: float = 0.6  # area of what stands on the ground over that of the ground: it reaches beyond
 
@@ -59,12 +59,12 @@ class RoomThresholds:
     min_distance: float = 4.0  # cells between floor and ceiling
     min_fraction: float = 0.25  # fraction of the cells on either
     column: float = 1.5  # cell edges: width of the columns in which floor and ceiling are compared
-    min_covered: float = 0.7  # fraction of the columns with both, of those of the larger one,
-    min_covered_in_parts: float = 0.5  # or with such a part, if points lie densely at the same places nearly everywhere
-    min_in_one_piece: float = 0.9  # fraction of the columns with either that are connected, but in such a case
+    min_covered: float = 0.7  # fraction of the columns of the larger one that have both
+    min_covered_in_parts: float = 0.5  # the same if the densities of both agree nearly everywhere
+    min_in_one_piece: float = 0.9  # fraction of the columns with either that are connected, unless they agree so
     max_beyond: float = 0.02  # fraction of the cells below the floor or above the ceiling
-    min_correlation: float = 0.2  # correlation at which points lie densely on both at the same places,
-    min_correlation_in_parts: float = 0.8  # and nearly everywhere
+    min_correlation: float = 0.2  # correlation from which on densities agree near the scanners
+    min_correlation_in_parts: float = 0.8  # correlation from which on they agree nearly everywhere
 
 
 _PLANE = PlaneThresholds()

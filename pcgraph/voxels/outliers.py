@@ -127,6 +127,7 @@ def fill_the_volume(points: NDArray[np.float64], left: NDArray[np.float64]) -> b
     pitch = np.maximum(high - low, TINY) / _NOISE.parts
 
     def in_each(some: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Number of points in each part of the bounding box."""
         parts = np.minimum((some - low) / pitch, _NOISE.parts - 1).astype(np.int64)
         return np.bincount(parts @ np.array((_NOISE.parts**2, _NOISE.parts, 1)), minlength=_NOISE.parts**3)
 

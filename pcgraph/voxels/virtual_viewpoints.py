@@ -50,7 +50,8 @@ class ResolutionThresholds:
     """Resolution of the coarse grid on which places are compared.
 
     Cells are thicker than partitions, and as high as low rooms. So where there are rooms, a finer grid with more places
-    is tried until one agreement shows most of the surface. Without this, rooms side by side face inwards (a law).
+    is tried until one agreement shows most of the surface. Without this a law fails: floors and ceilings of rooms side
+    by side face inwards.
     """
 
     cells: int = 5000  # count, about: time grows with it
@@ -85,8 +86,8 @@ class PartThresholds:
 
     blocks_along: int = 16  # blocks along the bounding box: parts have an empty one between them
     min_fraction: float = 0.05  # fraction of the cells
-    max_parts: int = 3  # parts of any kind,
-    max_rooms: int = 8  # and parts in all, if those beyond these are rooms
+    max_parts: int = 3  # parts of any kind, at most
+    max_rooms: int = 8  # pieces that are asked: beyond `max_parts` they are parts only if they are rooms
     quantiles: tuple[float, float] = (0.05, 0.95)  # of a part's cells along each axis: its candidates lie between
     max_length: float = 0.5  # a longer part, in lengths of the bounding box, has no candidates of its own
 
@@ -104,15 +105,15 @@ class AgreementThresholds:
 class ScoreThresholds:
     """Weights and thresholds of an agreement's score, which starts with the fraction of the surface that it shows.
 
-    All weights are in that fraction, 1 being the whole surface.
+    All weights are fractions of the surface, too.
     """
 
     shown_tolerance: float = 0.004  # a difference below that does not count; gain 0.0060, all of it on one street
     unanimous: float = 0.02  # weight of how far each place sees one side only; gain 0.0076
     outside: float = 0.003  # weight of how much the places around the cloud see from its outer side
-    origin: float = 0.02  # weight of the same for the likely places, if these are the origin;
-    above_ground: float = 0.05  # or above the ground; more than differences in what is shown, as of a pit and a mound;
-    free_side: float = 0.002  # or on the free side of another supporting plane; gain 0.0042
+    origin: float = 0.02  # weight of how much likely places see so, if the frame's origin is likely
+    above_ground: float = 0.05  # the same for places above the ground; more than what a pit and a mound differ in shown
+    free_side: float = 0.002  # the same for places on the free side of another supporting plane; gain 0.0042
     room: float = 0.2  # weight of the fraction of the cells in a room (1 in a passage), for an enclosed agreement
     enclosed_for_room: float = 0.8  # weighted mean enclosure of the places of an enclosed agreement, at least
     min_shown_from_inside: float = 0.001  # fraction of the surface that enclosed agreements show more, in a passage

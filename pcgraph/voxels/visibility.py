@@ -258,6 +258,7 @@ def shown_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
 
 
 def _visible_fraction(grid: VoxelGrid, place: NDArray[np.float64], normals: NDArray[np.float64]) -> float:
+    """`visible_fraction`, given the normals of the voxels, of either sign."""
     return float(_visible(grid, place, normals).mean())
 
 

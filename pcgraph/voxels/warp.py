@@ -50,7 +50,7 @@ class Warp:
     Attributes
     ----------
     max_gap : float, voxel edges
-        Distance between the means of two voxels of either side of a gap, at most.
+        Distance between the means of two voxels on either side of a gap, at most.
     """
 
     max_gap: ClassVar[float] = 3.0
