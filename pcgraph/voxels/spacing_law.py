@@ -66,10 +66,16 @@ class SearchThresholds:
     readings: int = 1 << 10  # readings of the spacing that count
     min_readings: int = 1 << 8  # with fewer the law is not looked for
     min_block: int = 512  # places whose neighbours are sought in one thread, at least
+    max_spacing: float = 90.0  # percentile of the spacing: more counts as that, as points far off have
+    lattice_side: int = 5  # places along each side of a lattice within the box that are tried
+    n_outside: int = 40  # places at each distance around it that are tried
+    outside: tuple[float, float] = (1.2, 2.0)  # half diagonals: distances from its middle
     starts: int = 6  # places from which it starts: from one, 4 of 88 searches ended outside their room; gain 0.0002
     apart: float = 0.3  # half diagonals of the box between two starts, at least
     first_step: float = 0.1  # half diagonals: short, so that a search does not leave its room
     last_step: float = 0.1  # half extents: first step once readings off the line are left out
+    first_rounds: int = 5  # steps, or halvings of the step, from each start
+    last_rounds: int = 8  # the same from the best place
     min_improvement: float = 1e-4  # difference of `r_squared` by which a step must be better
     max_deviation: float = 2.5  # robust standard deviations off the line, at most, of a reading that counts
     min_deviation: float = 0.1  # of log spacing: least standard deviation, for readings that fit too well
@@ -168,7 +174,8 @@ def spacing_law(
     if viewpoint is None:
         place, mirrored = _best_scanner_positions(spread_out)
         near_line = spread_out.some(_on_line(spread_out, place))
-        place = _searched(near_line.some(slice(None, None, 2)), place[None], np.array([_SEARCH.last_step]), 8)[0][0]
+        some, step = near_line.some(slice(None, None, 2)), np.array([_SEARCH.last_step])
+        place = _searched(some, place[None], step, _SEARCH.last_rounds)[0][0]
         halved = every
     else:
         place = (viewpoint - middle) / reach
@@ -311,7 +318,7 @@ def _between_points_and_surface(readings: _Readings) -> NDArray[np.int64]:
     So their density is between that of the points and that of the surface. Points alone would mislead: at the pole of a
     scanner that turns by equal angles they are many, and nearer to each other than the law says.
     """
-    logs = np.minimum(readings.logs, np.percentile(readings.logs, 90))  # not for points far off
+    logs = np.minimum(readings.logs, np.percentile(readings.logs, _SEARCH.max_spacing))
     order = order_of_draw(np.arange(len(logs), dtype=np.uint64) + np.uint64(1), np.exp(0.5 * (logs - logs.max())))
     return np.sort(order[: _SEARCH.readings])
 
@@ -449,9 +456,10 @@ def _best_scanner_positions(readings: _Readings) -> tuple[NDArray[np.float64], N
     low, high = bounding_box(readings.places)
     reach = float(np.linalg.norm(high - low)) / 2.0
     some, half = readings.some(slice(None, None, 4)), readings.some(slice(None, None, 2))
-    steps = (np.arange(5) + 0.5) / 5
+    steps = (np.arange(_SEARCH.lattice_side) + 0.5) / _SEARCH.lattice_side
     inside = low + np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) * (high - low)
-    outside = [(low + high) / 2.0 + far * reach * sphere_directions(40) for far in (1.2, 2.0)]
+    directions = sphere_directions(_SEARCH.n_outside)
+    outside = [(low + high) / 2.0 + far * reach * directions for far in _SEARCH.outside]
     candidates = np.concatenate((inside, *outside))
     starts: list[NDArray[np.float64]] = []
     for place in candidates[np.argsort(-_regressions(some, candidates, _SEARCH.prior).r_squared, kind="stable")]:
@@ -459,11 +467,13 @@ def _best_scanner_positions(readings: _Readings) -> tuple[NDArray[np.float64], N
             starts.append(place)
             if len(starts) == _SEARCH.starts:
                 break
-    found, steps = _searched(some, np.stack(starts), np.full(len(starts), _SEARCH.first_step * reach), 5)
+    first_steps = np.full(len(starts), _SEARCH.first_step * reach)
+    found, steps = _searched(some, np.stack(starts), first_steps, _SEARCH.first_rounds)
     best = np.argmax(_regressions(half, found, _SEARCH.prior).r_squared, keepdims=True)
-    place = _searched(half, found[best], steps[best], 8)[0][0]
+    place = _searched(half, found[best], steps[best], _SEARCH.last_rounds)[0][0]
     other = _mirrored(place, half)
-    other = _searched(half, other[None], np.array([float(np.linalg.norm(other - place)) / 8.0]), 5)[0][0]
+    step = float(np.linalg.norm(other - place)) / 8.0  # an eighth of the way from one to the other
+    other = _searched(half, other[None], np.array([step]), _SEARCH.first_rounds)[0][0]
     first, second = _regressions(half, np.stack((place, other)), _SEARCH.prior).r_squared
     if second > first:
         place, other = other, place
