@@ -17,13 +17,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.acquisition import Acquisition, Evidence, MovingScanner, Scanner
+from pcgraph.adapted_size import VOXELS_PER_SEED
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Bridges, Gaps
 from pcgraph.graph.contacts import edge_features, facing_sides
 from pcgraph.graph.continuations import Continuations, continuations_of
 from pcgraph.supervoxels.method import SupervoxelMethod
 from pcgraph.voxels import spacing_law
-from pcgraph.voxels.adapted_size import VOXELS_PER_SEED
 from pcgraph.voxels.grid import VoxelGrid, boundary_voxels
 from pcgraph.voxels.ground_and_rooms import SupportingPlane
 from pcgraph.voxels.spacing_law import SpacingLaw
@@ -160,7 +161,12 @@ def _no_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
 def _no_gaps(surface: Surface, nodes: NodeFeatures, *others: object) -> Gaps:
     edges, none = np.empty((0, 2), np.int32), np.empty(0, np.int64)
     features = edge_features(nodes, facing_sides(surface, edges, none, none))
-    return Gaps(edges, features, np.empty(0), np.empty(0), surface.grid.warp.of_one_scan)
+    return Gaps(
+        edges,
+        features,
+        np.empty(0),
+        np.empty(0),
+    )
 
 
 def _no_continuations(surface: Surface, nodes: NodeFeatures, *others: object) -> Continuations:
@@ -169,6 +175,13 @@ def _no_continuations(surface: Surface, nodes: NodeFeatures, *others: object) ->
 
 def _no_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None, *others: object) -> SpacingLaw:
     return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def _on_the_move(scanner: Scanner, grid: VoxelGrid) -> Acquisition:
+    """A scanner whose place counts for the growth of voxels alone, unless it was given."""
+    if scanner.told.evidence not in (Evidence.SPACING, Evidence.RINGS):
+        return scanner
+    return MovingScanner(scanner.told, scanner.place, scanner.growth)
 
 
 def _from_above(grid: VoxelGrid, normals: NDArray[np.float64], *others: object) -> VisibleSides:
@@ -213,20 +226,30 @@ def _by_weight(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray
 
 _NOWHERE = SupportingPlane(np.array([0.0, 0.0, 1.0]), -np.inf, False)
 _NO_BRIDGES = Bridges(np.empty((0, 2), np.int32), np.empty(0), np.empty(0), np.empty(0, np.bool_))
-_NO_OUTLIERS: dict[str, Replacement] = {"scan.outlier_voxels": _is(_no_voxels)}
-_NO_DETACHED: dict[str, Replacement] = {"scan.detached_voxels": _is(_no_voxels)}
-_NO_CLOSER_LOOK: dict[str, Replacement] = {"scan.is_full_of_noise": _gives(False), "scan._NOISY": _is(-1.0)}
+_NO_OUTLIERS: dict[str, Replacement] = {"voxelisation.outlier_voxels": _is(_no_voxels)}
+_NO_DETACHED: dict[str, Replacement] = {"voxelisation.detached_voxels": _is(_no_voxels)}
+_NO_CLOSER_LOOK: dict[str, Replacement] = {
+    "voxelisation.is_full_of_noise": _gives(False),
+    "voxelisation._NOISY": _is(-1.0),
+}
 _NO_CONTINUATIONS: dict[str, Replacement] = {"scan.continuations": _is(_no_continuations)}
 _NO_PLANES: dict[str, Replacement] = {"scan.bounding_planes": _is(_no_continuations)}
 _NO_TERRAIN: dict[str, Replacement] = {"scan.terrain": _is(_no_continuations)}
 _NO_PIXELS: dict[str, Replacement] = {"scan.with_pixels": _keeps(0)}
-_NO_LAW: dict[str, Replacement] = {"scan.spacing_law": _is(_no_law), "scan.law_on_rings": _keeps(1)}
-_UP: dict[str, Replacement] = {"scan.visible_sides": _is(_from_above), "scan.virtual_viewpoints": _gives(None)}
-_OUTWARDS: dict[str, Replacement] = {"scan.visible_sides": _is(_from_outside), "scan.virtual_viewpoints": _gives(None)}
+_NO_LAW: dict[str, Replacement] = {"acquisition.spacing_law": _is(_no_law), "acquisition.law_on_rings": _keeps(1)}
+_UP: dict[str, Replacement] = {
+    "acquisition.visible_sides": _is(_from_above),
+    "acquisition.virtual_viewpoints": _gives(None),
+}
+_OUTWARDS: dict[str, Replacement] = {
+    "acquisition.visible_sides": _is(_from_outside),
+    "acquisition.virtual_viewpoints": _gives(None),
+}
 _SIDES = ("voxels/virtual_viewpoints.py", "voxels/visibility.py:visible_sides", "voxels/visibility.py:VisibleSides")
 
 # Short names of files
-_SCAN, _LINK, _LAW, _SIZE = "scan.py", "tree/region_linkage.py", "voxels/spacing_law.py", "voxels/adapted_size.py"
+_SCAN, _LINK, _LAW, _SIZE = "scan.py", "tree/region_linkage.py", "voxels/spacing_law.py", "adapted_size.py"
+_ACQUISITION, _VOXELS = "acquisition.py", "voxelisation.py"
 _NOISE, _VIEW, _SIDE = "voxels/outliers.py", "voxels/virtual_viewpoints.py", "voxels/visibility.py"
 _IMAGE, _GROW, _GAPS, _BEHIND = (
     "depth_image.py",
@@ -264,15 +287,15 @@ def _function(name: str, file: str, function: str, replacement: Replacement, *co
 GROUPS = (
     Part(
         "all: where it was seen from",
-        ("pixels.py", _LAW, "voxels/rings.py", f"{_IMAGE}:image_view", f"{_SCAN}:_scanner_position", *_SIDES),
-        _NO_PIXELS | _NO_LAW | _UP | {"scan.image_view": _gives(None)},
+        ("pixels.py", _LAW, "voxels/rings.py", f"{_IMAGE}:image_view", f"{_ACQUISITION}:Scanner.confirmed", *_SIDES),
+        _NO_PIXELS | _NO_LAW | _UP | {"acquisition.image_view": _gives(None)},
     ),
-    Part("all: law of spacing and rings", (_LAW, "voxels/rings.py", f"{_SCAN}:_scanner_position"), _NO_LAW),
+    Part("all: law of spacing and rings", (_LAW, "voxels/rings.py", f"{_ACQUISITION}:Scanner.confirmed"), _NO_LAW),
     Part("all: outside from what is visible; else upwards", _SIDES, _UP),
     Part("all: outside from what is visible; else outwards", _SIDES, _OUTWARDS),
     Part(
         "all: outliers",
-        (_NOISE, f"{_SCAN}:_without_near_outliers", f"{_SCAN}:_without"),
+        (_NOISE, f"{_VOXELS}:_without_near_outliers", f"{_VOXELS}:Voxelised.without"),
         _NO_OUTLIERS | _NO_DETACHED,
     ),
     Part(
@@ -282,8 +305,8 @@ GROUPS = (
     ),
     Part(
         "all: adapted voxel size",
-        (_SIZE, "voxels/grading.py", f"{_SCAN}:_with_adapted_size", f"{_SCAN}:_oriented_as_larger"),
-        {"scan._with_adapted_size": _keeps(0)},
+        (_SIZE, "voxels/grading.py", f"{_VOXELS}:_adapted", f"{_SCAN}:_oriented"),
+        {"voxelisation._adapted": lambda f: lambda found, *others: (found, found.grid.size)},
     ),
     Part(
         "all: colours",
@@ -299,7 +322,7 @@ CAMERAS = (
     _function("pixels of a list, in its own frame", "pixels.py", "_image_in_own_frame", _gives(None)),
     _function("pixels of depths in steps", "pixel_lattice.py", "_alike", lambda f: lambda camera, *others: [camera]),
     _function("camera of an image in any frame", _IMAGE, "_camera", _gives(None)),
-    _function("voxels grow with depth", _SCAN, "_grows_with_depth", _gives(False)),
+    _function("voxels grow with depth", _IMAGE, "is_camera_image", _gives(False)),
     Part("spacing of a depth image", (f"{_IMAGE}:DepthImage.spacing",), {"depth_image.DepthImage.spacing": _keeps(1)}),
     _threshold(
         "spacing: steps of depth", _IMAGE, "_STEPS", "_step_along", "StepThresholds.max_step", max_coarsening=0.0
@@ -307,16 +330,20 @@ CAMERAS = (
     _threshold("spacing: rows of an image", _IMAGE, "_STEPS", min_per_pitch=0.0),
     Part(
         "flying pixels",
-        (f"{_SCAN}:_without_flying_pixels", f"{_IMAGE}:DepthImage.flying"),
-        {"scan._without_flying_pixels": _keeps(0)},
+        (f"{_VOXELS}:without_flying_pixels", f"{_IMAGE}:DepthImage.flying"),
+        {"scan.without_flying_pixels": _keeps(0)},
     ),
 )
 
 LAW = (
-    _constant("voxels grow with range", _SCAN, "RANGE_GROWTH", 0.0),
-    Part("rings", ("voxels/rings.py", f"{_LAW}:law_on_rings"), {"scan.law_on_rings": _keeps(1)}),
-    Part("law of spacing, but for rings", (_LAW,), {"scan.spacing_law": _is(_no_law)}),
-    _function("scanner's position for normals", _SCAN, "_scanner_position", _gives(None)),
+    _constant("voxels grow with range", _ACQUISITION, "RANGE_GROWTH", 0.0),
+    Part("rings", ("voxels/rings.py", f"{_LAW}:law_on_rings"), {"acquisition.law_on_rings": _keeps(1)}),
+    Part("law of spacing, but for rings", (_LAW,), {"acquisition.spacing_law": _is(_no_law)}),
+    Part(
+        "scanner's position for normals",
+        (f"{_ACQUISITION}:Scanner.confirmed",),
+        {"acquisition.Scanner.confirmed": _is(_on_the_move)},
+    ),
     _function("law: cosines of the surface", _LAW, "_fit_normals", lambda f: lambda *a: a[-1].fill(0.0)),
     _function(
         "law: readings drawn by spacing",
@@ -333,22 +360,22 @@ LAW = (
     Part(
         "law: mirrored place",
         (f"{_SIDE}:likelier_viewpoint", f"{_LAW}:_mirrored", f"{_LAW}:SpacingLaw.mirrored"),
-        {"scan.likelier_viewpoint": _keeps(1)},
+        {"acquisition.likelier_viewpoint": _keeps(1)},
     ),
     Part(
         "law: best place beside the origin",
         (f"{_LAW}:SpacingLaw.best_viewpoint",),
-        {"scan.spacing_law": _then(lambda law: replace(law, best_viewpoint=None))},
+        {"acquisition.spacing_law": _then(lambda law: replace(law, best_viewpoint=None))},
     ),
     Part(
         "scanner moved: place must show all",
-        (f"{_SCAN}:_MIN_SHOWN", f"{_SIDE}:shown_fraction"),
-        {"scan._MIN_SHOWN": _is(0.0)},
+        (f"{_ACQUISITION}:_MIN_SHOWN", f"{_SIDE}:shown_fraction"),
+        {"acquisition._MIN_SHOWN": _is(0.0)},
     ),
     Part(
         "axis: level ground faces its scanner",
         (f"{_SIDE}:sides_towards", f"{_SIDE}:_upwards"),
-        {"scan.sides_towards": _keeps(1)},
+        {"acquisition.sides_towards": _keeps(1)},
     ),
 )
 
@@ -359,9 +386,9 @@ SIZES = (
         {"voxels.spacing._near": _then(lambda near: near._replace(distances=near.distances[[0, 0]]))},
     ),
     _threshold("spacing of copies", "voxels/spacing.py", "_READ", "_fullest", "SpacingThresholds.thin", max_copies=0),
-    _constant("sizes per octave", _SCAN, "_SIZES_PER_OCTAVE", 1 << 40),
-    _constant("offset of the grid", _SCAN, "_GRID_OFFSET", 0.0),
-    _constant("control: another offset of the grid", _SCAN, "_GRID_OFFSET", 0.618),  # as good: what luck makes
+    _constant("sizes per octave", _VOXELS, "_SIZES_PER_OCTAVE", 1 << 40),
+    _constant("offset of the grid", _VOXELS, "_GRID_OFFSET", 0.0),
+    _constant("control: another offset of the grid", _VOXELS, "_GRID_OFFSET", 0.618),  # as good: what luck makes
     _function("larger voxels", _SIZE, "_enlarged_size", lambda f: lambda points, grid, *others: grid.size),
     _threshold("larger: gain that is asked for", _SIZE, "_LARGER", min_gain=0.0),
     _threshold("larger: gain of sparse clouds", _SIZE, "_LARGER", min_gain_of_sparse=0.0),
@@ -371,16 +398,16 @@ SIZES = (
     Part(
         "graded voxels",
         (f"{_SIZE}:adapted_grading", "voxels/grading.py:Grading"),
-        {"scan.adapted_grading": _gives(None)},
+        {"voxelisation.adapted_grading": _gives(None)},
     ),
     _function("graded: small grids less", _SIZE, "_sparse_below", _gives(0.6)),
     Part(
         "seeds nearer where few",
         _constants(_SIZE, "seed_spacing", "_edges_per_seed"),
-        {"scan.seed_spacing": _is(lambda grid: VOXELS_PER_SEED * grid.size)},
+        {"scan.seed_spacing": _is(lambda grid, acquisition: VOXELS_PER_SEED * grid.size)},
     ),
     _threshold("seeds nearer on smooth surfaces", _SIZE, "_SEEDS", min_supervoxels_on_smooth=800),
-    _function("normals as of larger voxels", _SCAN, "_oriented_as_larger", _keeps(0)),
+    _constant("normals as of larger voxels", _SCAN, "_FLIP_COSINE", 2.0),
 )
 
 NOISE = (
@@ -388,13 +415,13 @@ NOISE = (
     Part("detached voxels", (f"{_NOISE}:detached_voxels",), _NO_DETACHED),
     Part(
         "noise looked at closer",
-        (f"{_SCAN}:_without_near_outliers", f"{_NOISE}:is_full_of_noise", f"{_NOISE}:fill_the_volume"),
+        (f"{_VOXELS}:_without_near_outliers", f"{_NOISE}:is_full_of_noise", f"{_NOISE}:fill_the_volume"),
         _NO_CLOSER_LOOK,
     ),
-    Part("noise: full of it", (f"{_NOISE}:is_full_of_noise",), {"scan.is_full_of_noise": _gives(False)}),
-    _constant("noise: much was found", _SCAN, "_NOISY", -1.0),
-    Part("noise fills the volume", (f"{_NOISE}:fill_the_volume",), {"scan.fill_the_volume": _gives(True)}),
-    _constant("noise: scale estimated again", _SCAN, "_FEW_OUTLIERS", 0.0),
+    Part("noise: full of it", (f"{_NOISE}:is_full_of_noise",), {"voxelisation.is_full_of_noise": _gives(False)}),
+    _constant("noise: much was found", _VOXELS, "_NOISY", -1.0),
+    Part("noise fills the volume", (f"{_NOISE}:fill_the_volume",), {"voxelisation.fill_the_volume": _gives(True)}),
+    _constant("noise: scale estimated again", _VOXELS, "_FEW_OUTLIERS", 0.0),
     _function("noise: surfaces among it", _NOISE, "_surfaces_among", _none_of(0)),
     _threshold("noise: within reach", _NOISE, "_NOISE", reach_volume=math.inf),
     _threshold("noise: of all two thirds at most", _NOISE, "_NOISE", max_fraction=1.0),
@@ -489,7 +516,7 @@ GRAPH = (
     _constant("continuations: open borders", _BEHIND, "_OPEN", math.inf, "_count_open", "_both_ways"),
     _constant("continuations: wide enough", _BEHIND, "_SUPPORT", 0.0),
     _function("continuations: level", _BEHIND, "_are_level", _is(_all_level)),
-    _constant("continuations: three places", _SCAN, "_MAX_VIEWPOINTS", 1),
+    _constant("continuations: three places", _ACQUISITION, "_MAX_PLACES", 1),
     Part("bounding planes", ("graph/bounding_planes.py:bounding_planes",), _NO_PLANES),
     _function("bounding planes: open gaps", "graph/bounding_planes.py", "_is_open", _none_of(3)),
     Part("terrain", ("graph/terrain.py",), _NO_TERRAIN),

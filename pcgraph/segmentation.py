@@ -9,12 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.acquisition import Acquisition
 from pcgraph.columns import RobustScaling
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.inputs import non_negative
 from pcgraph.supervoxels.method import SupervoxelMethod
+from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.linkage import Linkage
+from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import SegmentationTree
 from pcgraph.voxels.outliers import OUTLIER
 from pcgraph.voxels.surface import Surface
@@ -23,6 +27,33 @@ from pcgraph.voxels.warp import CameraWarp
 if TYPE_CHECKING:
     from pcgraph.features.primitives import Primitives
     from pcgraph.graph.occlusion import Occlusions
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Method, linkage and cut of a segmentation, checked."""
+
+    method: SupervoxelMethod
+    linkage: Linkage
+    object_altitude: float
+
+    @classmethod
+    def of(cls, method: SupervoxelMethod | None, linkage: Linkage | None, object_altitude: float | None) -> Settings:
+        """Settings, by default those of `pcgraph.segment`; without an altitude that of the linkage.
+
+        Raises
+        ------
+        ValueError
+            The method is no `SupervoxelMethod`, the linkage no `Linkage`, or the altitude negative.
+        """
+        method = SurfaceGrowth() if method is None else method
+        linkage = RegionLinkage() if linkage is None else linkage
+        if not isinstance(method, SupervoxelMethod):
+            raise ValueError(_refusal("method", "SupervoxelMethod", method))
+        if not isinstance(linkage, Linkage):
+            raise ValueError(_refusal("linkage", "Linkage", linkage))
+        altitude = linkage.default_object_altitude if object_altitude is None else object_altitude
+        return cls(method, linkage, non_negative("object_altitude", altitude))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -70,14 +101,19 @@ class Segmentation:
     feature_scaling: RobustScaling | None = None
 
     def __repr__(self) -> str:
-        """What there is, in one line."""
+        """Counts, sizes and the acquisition, in one line."""
         outliers = np.count_nonzero(self.outliers)
         beside = f" and {outliers} outliers" if outliers else ""
         return (
             f"Segmentation({np.count_nonzero(self.supervoxels >= 0)} points{beside}, {self.tree.n_leaves} supervoxels, "
             f"{len(self.graph.edges)} edges, {int(self.objects.max()) + 1} objects, "
-            f"voxels of {self.voxel_size:.3g} m, seeds every {self.seed_size:.3g} m)"
+            f"voxels of {self.voxel_size:.3g} m, seeds every {self.seed_size:.3g} m, {self.acquisition})"
         )
+
+    @property
+    def acquisition(self) -> Acquisition:
+        """What took the cloud, from where, and what tells so."""
+        return self.graph.acquisition
 
     @property
     def voxel_size(self) -> float:
@@ -222,3 +258,9 @@ def check_segmentation(given: object) -> None:
     """Raise ValueError unless this is a `Segmentation`."""
     if not isinstance(given, Segmentation):
         raise ValueError(f"expected a Segmentation, as pcgraph.segment returns it, got {type(given).__name__}")
+
+
+def _refusal(argument: str, family: str, given: object) -> str:
+    from pcgraph.families import refusal  # it loads the module inspect, which no valid argument needs
+
+    return refusal(argument, family, given)

@@ -26,6 +26,7 @@ from numba import config
 from numpy.typing import NDArray
 
 from pcgraph import pixel_lattice, pixels
+from pcgraph.acquisition import Scanner, Told
 from pcgraph.depth_image import DepthImage
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
@@ -155,7 +156,7 @@ def _compile_graph_and_tree() -> None:
     leaves = replace(moments_of_groups(places, places, labels, n), normals=normals)
     surface = Surface(grid, normals, labels)
     nodes, touching = node_features(leaves), contacts.contacts(surface)
-    near = gaps(surface, nodes, touching.edges, np.zeros(3))
+    near = gaps(surface, nodes, touching.edges, Scanner(Told(), np.zeros(3), 0.5))
     hidden = continuations(surface, nodes, labels, np.zeros((1, 3))).with_others(
         bounding_planes(surface, nodes, labels)
     )

@@ -184,6 +184,9 @@ STOREYS = [
     "depth_image",
     "pixel_lattice",
     "pixels",
+    "acquisition",
+    "adapted_size",
+    "voxelisation",
     "features",
     "supervoxels",
     "graph",
@@ -193,6 +196,7 @@ STOREYS = [
     "plausibility",
     "warmup",
     "scan",
+    "stream",
     "all_kernels",
 ]
 """Of pcgraph, from the ground up: nobody imports from above."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.acquisition import Acquisition, Told, UnknownAcquisition
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.boundary import BoundaryStrength
 from pcgraph.plumbing.short_repr import ShortRepr
@@ -86,16 +87,12 @@ class Gaps(ShortRepr):
         Least distance between centroids of their voxels.
     weights : (g,) float64
         Weight of the gap, comparable to `contact_voxels`: sum of e^(1 - width) over voxels that face the other side.
-    of_one_scan : bool
-        Whether all was seen from one place and voxels grow with the distance from it. Voxels then follow the spacing of
-        points, so a gap is stronger evidence of a boundary than among several scans.
     """
 
     edges: NDArray[np.int32]
     edge_features: EdgeFeatures
     widths: NDArray[np.float64]
     weights: NDArray[np.float64]
-    of_one_scan: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +142,8 @@ class AdjacencyGraph(ShortRepr):
     color_evidence : float, 0..1
         How much more colours change at creases than on smooth surfaces
         (`pcgraph.voxels.column_evidence.crease_contrast`); 0 where colours say nothing about shape.
-    sides_known : bool
-        Whether normals point to where the cloud is known to have been seen from, or were given. Else the outside was
-        found from what is visible, and which side of a bare sheet that is, is a guess.
+    acquisition : Acquisition
+        What took the cloud: whether gaps mean much, and whether the outer side of surfaces is known. Default: unknown.
     """
 
     edges: NDArray[np.int32]
@@ -157,7 +153,7 @@ class AdjacencyGraph(ShortRepr):
     continuations: Continuations | None = None
     bridges: Bridges | None = None
     color_evidence: float = 1.0
-    sides_known: bool = False
+    acquisition: Acquisition = field(default_factory=lambda: UnknownAcquisition(Told()))
 
     def _counts(self) -> str:
         return f"{self.n_nodes} nodes, {len(self.edges)} edges"

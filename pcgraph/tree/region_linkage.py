@@ -30,7 +30,7 @@ class RegionLinkage(Linkage):
     cost : BoundaryCost
         Cost of an edge, radians.
     gap : float, radians per voxel edge, >= 0
-        What a gap in one scan costs beyond one voxel edge; a third of that in other clouds (`Gaps.of_one_scan`).
+        What a gap in one scan costs beyond one voxel edge; a third of that in other clouds (`Acquisition.is_one_scan`).
     bridge : float, radians per voxel edge, >= 0
         What a bridge from a speck costs.
     color : float, voxel edges, >= 0
@@ -137,7 +137,7 @@ class RegionLinkage(Linkage):
         ways = [MergeEdges.of(graph.edges, self.cost(graph.edge_features), graph.edge_features.contact_voxels)]
         if (gaps := graph.gaps) is not None:
             beyond = np.maximum(gaps.widths - 1.0, 0.0)  # larger voxels' centroids can be nearer than their edge
-            price = (self.gap if gaps.of_one_scan else _OF_SEVERAL * self.gap) * beyond
+            price = (self.gap if graph.acquisition.is_one_scan else _OF_SEVERAL * self.gap) * beyond
             ways.append(MergeEdges.of(gaps.edges, self.cost(gaps.edge_features) + price, gaps.weights))
         if (hidden := graph.continuations) is not None:
             behind, ground = hidden.chosen(hidden.coplanar), hidden.chosen(~hidden.coplanar)
@@ -307,7 +307,7 @@ def region_linkage(
     in_blocks(_set_first_altitudes, len(edges), state, edges, sums, _SHAPE, altitudes)
     perimeters = np.bincount(edges.ravel(), np.repeat(weights, 2), graph.n_nodes)
     outward = state.masses[:, None] * graph.node_features.normal
-    outlines = _Outlines(perimeters.astype(np.float64), outward, graph.sides_known)
+    outlines = _Outlines(perimeters.astype(np.float64), outward, graph.acquisition.sides_known)
     contracted = ContractedGraph.of(graph.n_nodes, edges, altitudes, sums)
     _merge(state, outlines, relief, contracted, _SHAPE)
     merges = contracted.merges()

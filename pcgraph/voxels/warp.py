@@ -79,15 +79,9 @@ class Warp:
         """Transform of normals to the warped space."""
         return NormalTransform()
 
-    @property
-    def seen_from(self) -> NDArray[np.float64] | None:
-        """Place from which all points were seen, (3,) float64, metres; None if voxels do not grow with distance."""
-        return None
-
-    @property
-    def of_one_scan(self) -> bool:
-        """Whether all points were seen from one place, and voxels grow with the distance to it."""
-        return self.seen_from is not None
+    def from_corner(self, corner: NDArray[np.float64]) -> Warp:
+        """Voxels of one size counted from a corner, (3,) metres; where voxels grow about a place, the warp itself."""
+        return Shift(corner)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +133,22 @@ class CameraWarp(Warp):
     reference_depth: float
     axis: NDArray[np.float64] = field(default_factory=lambda: np.array(FORWARDS))
 
+    @classmethod
+    def about(
+        cls, points: NDArray[np.float64], viewpoint: NDArray[np.float64], axis: NDArray[np.float64] | None = None
+    ) -> CameraWarp:
+        """The warp that keeps lengths at the median depth of points, (n, 3); the axis is +z unless it is given.
+
+        Raises
+        ------
+        ValueError
+            A point does not lie in front of the camera.
+        """
+        axis = np.array(FORWARDS) if axis is None else axis
+        warp = cls(viewpoint, _median(along_axis(points, axis)) - float(viewpoint @ axis), axis)
+        warp.check(points)
+        return warp
+
     def check(self, points: NDArray[np.float64]) -> None:
         """ValueError if a point does not lie in front of the camera."""
         least, place = float(along_axis(points, self.axis).min()), float(self.viewpoint @ self.axis)
@@ -165,10 +175,8 @@ class CameraWarp(Warp):
         """Depth over reference depth, (n,) float64."""
         return (along_axis(points, self.axis) - self.viewpoint @ self.axis) / self.reference_depth
 
-    @property
-    def seen_from(self) -> NDArray[np.float64]:
-        """The camera's place."""
-        return self.viewpoint
+    def from_corner(self, corner: NDArray[np.float64]) -> Warp:
+        return self
 
     @property
     def slant(self) -> NormalTransform:
@@ -200,6 +208,15 @@ class RangeWarp(Warp):
     reference_range: float
     growth: float
 
+    @classmethod
+    def about(cls, points: NDArray[np.float64], viewpoint: NDArray[np.float64], growth: float) -> Warp:
+        """The warp that keeps lengths at the median range of points, (n, 3).
+
+        It is the identity for a growth of 0, or if the median range is 0.
+        """
+        median_range = _median(_ranges(points, viewpoint)) if growth else 0.0
+        return cls(viewpoint, median_range, growth) if median_range > _MIN_LENGTH else Warp()
+
     def forward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Warped positions, (n, 3) float64, about the viewpoint."""
         warped = np.empty((len(points), 3))
@@ -215,10 +232,8 @@ class RangeWarp(Warp):
         """(r / r0)^growth, (n,) float64."""
         return (_ranges(points, self.viewpoint) / self.reference_range) ** self.growth
 
-    @property
-    def seen_from(self) -> NDArray[np.float64]:
-        """The scanner's place."""
-        return self.viewpoint
+    def from_corner(self, corner: NDArray[np.float64]) -> Warp:
+        return self
 
     @property
     def slant(self) -> NormalTransform:
@@ -328,46 +343,3 @@ def _project(
         warped[p, 0] = (x - depth * axis[0]) * scale + along * axis[0]
         warped[p, 1] = (y - depth * axis[1]) * scale + along * axis[1]
         warped[p, 2] = (z - depth * axis[2]) * scale + along * axis[2]
-
-
-def choose_warp(
-    points: NDArray[np.float64],
-    viewpoint: NDArray[np.float64],
-    camera: bool,
-    range_growth: float = 0.0,
-    axis: NDArray[np.float64] | None = None,
-) -> Warp:
-    """The camera warp about the median depth, the range warp about the median range, or the identity.
-
-    Parameters
-    ----------
-    points : (n, 3) float64, metres
-        Finite, n >= 1.
-    viewpoint : (3,) float64, metres
-    camera : bool
-        Whether a camera at the viewpoint took the points.
-    range_growth : float, 0..1, without 1
-        Power of the range with which voxels grow; 0 for voxels of one size.
-    axis : (3,) float64, optional
-        Direction in which the camera looks, of unit length. Default: +z.
-
-    Raises
-    ------
-    ValueError
-        `camera` is true and a point does not lie in front of it, or voxels grow with range as well.
-    """
-    if not isinstance(camera, (bool, np.bool_)):
-        raise ValueError(f"expected camera as True, False or None, got {camera!r}")
-    if (camera or range_growth) and viewpoint.ndim != 1:
-        raise ValueError("expected one viewpoint where voxels grow with depth or range, got one per point")
-    if camera and range_growth:
-        raise ValueError("expected camera=True or a range_growth above 0, got both; voxels grow in one way")
-    if range_growth:
-        distance = _median(_ranges(points, viewpoint))
-        return RangeWarp(viewpoint, distance, range_growth) if distance > _MIN_LENGTH else Warp()
-    if not camera:
-        return Warp()
-    axis = np.array(FORWARDS) if axis is None else axis
-    warp = CameraWarp(viewpoint, _median(along_axis(points, axis)) - float(viewpoint @ axis), axis)
-    warp.check(points)
-    return warp

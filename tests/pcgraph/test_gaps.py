@@ -10,6 +10,7 @@ import pytest
 from tiers import draws
 
 import pcgraph
+from pcgraph.acquisition import Scanner, Told, UnknownAcquisition
 from pcgraph.graph.gaps import gaps
 from pcgraph.graph.spherical_image import Surfels, seen_through, view_from
 from pcgraph.voxels.grid import Neighbourhood
@@ -64,14 +65,14 @@ def test_a_gap_costs_more_in_one_scan():
     points = np.concatenate((sheet(0.0, 1.0), sheet(1.0 + VOXEL, 2.0, VOXEL)))
     settings = {"voxel_size": VOXEL, "seed_size": 6 * VOXEL, "viewpoint": (1.0, 0.5, 5.0)}
     several = pcgraph.segment(points, range_growth=0.0, **settings)
-    one = dataclasses.replace(several.graph, gaps=dataclasses.replace(several.graph.gaps, of_one_scan=True))
-    assert not several.graph.gaps.of_one_scan
+    one = dataclasses.replace(several.graph, acquisition=Scanner(Told(), np.zeros(3), 0.5))
+    assert not several.acquisition.is_one_scan
     altitudes = [
         pcgraph.RegionLinkage(gap=gap).merges(graph, several.leaves).altitudes.max()
         for graph, gap in ((several.graph, 0.15), (one, 0.15), (several.graph, 0.45))
     ]
     assert altitudes[0] < altitudes[1] == pytest.approx(altitudes[2], abs=1e-5)
-    assert pcgraph.segment(points, range_growth=0.5, **settings).graph.gaps.of_one_scan
+    assert pcgraph.segment(points, range_growth=0.5, **settings).acquisition.is_one_scan
 
 
 def test_a_linkage_of_contacts_alone_merges_across_no_gap():
@@ -83,7 +84,7 @@ def test_gaps_are_those_of_a_search_of_all_pairs():
     points = np.concatenate((sheet(0.0, 1.0), sheet(1.1, 1.6), sheet(0.3, 0.9, 0.12), rng.uniform(0, 1.5, (40, 3))))
     result = pcgraph.segment(points, voxel_size=VOXEL, viewpoint=(1.0, 0.5, 5.0), range_growth=0.0)
     grid, labels = result.surface.grid, result.surface.supervoxels
-    found = gaps(result.surface, result.graph.node_features, result.graph.edges)
+    found = gaps(result.surface, result.graph.node_features, result.graph.edges, UnknownAcquisition(Told()))
     touching = {tuple(pair) for pair in result.graph.edges.tolist()}
     degree = np.diff(grid.indptr)
     a, b = np.tril_indices(grid.n_voxels, -1)

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from test_guarantees import assert_covered_and_connected
 
 import pcgraph
+from pcgraph.acquisition import Scanner, Told, UnknownAcquisition
+from pcgraph.adapted_size import adapted_grading
 from pcgraph.metrics import segmentation_covering
-from pcgraph.voxels.adapted_size import adapted_grading
 from pcgraph.voxels.grading import BLOCK, Grading
 from pcgraph.voxels.grid import VoxelGrid, at_ends, grid_union, grid_without, voxel_grid, voxels_within
 from pcgraph.voxels.outliers import is_near
-from pcgraph.voxels.warp import Warp, choose_warp
+from pcgraph.voxels.warp import RangeWarp, Warp
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -182,15 +183,16 @@ def test_few_voxels_stay_small_where_some_of_them_are_joined() -> None:
         dense, thin = plain(rng, 8 * n, (0.0, 0.0), (side, side)), plain(rng, n // 2, (side, 0.0), (2.0 * side, side))
         grid = voxel_grid(np.concatenate((dense, thin)), 0.05, Warp())
         assert 0.2 < np.mean(grid.joined[grid.centroids[:, 0] > side]) < 0.4
-        assert (adapted_grading(grid) is not None) == is_graded
+        assert (adapted_grading(grid, UnknownAcquisition(Told())) is not None) == is_graded
 
 
 def test_voxels_of_one_scan_grow_already() -> None:
     """With the distance, and what of it lies in rows far apart is no surface at any size."""
-    points = two_densities(20.0)[0]
-    scanned = choose_warp(points, np.array([2.0, 2.0, 1.0]), False, 0.5)
-    assert adapted_grading(voxel_grid(points, 0.05, scanned)) is None
-    assert adapted_grading(voxel_grid(points, 0.05, Warp())) is not None
+    points, place = two_densities(20.0)[0], np.array([2.0, 2.0, 1.0])
+    scanned = RangeWarp.about(points, place, 0.5)
+    scanner = Scanner(Told(), place, 0.5)
+    assert adapted_grading(voxel_grid(points, 0.05, scanned), scanner) is None
+    assert adapted_grading(voxel_grid(points, 0.05, Warp()), UnknownAcquisition(Told())) is not None
 
 
 def test_wires_and_strays_are_no_surfaces_at_any_size() -> None:
@@ -199,7 +201,7 @@ def test_wires_and_strays_are_no_surfaces_at_any_size() -> None:
     strays = rng.uniform(-20.0, 20.0, (1000, 3))
     floor = plain(rng, 60_000, (0.0, -3.0), (8.0, 3.0))
     grid = voxel_grid(np.concatenate((floor, wire, strays)), 0.1, Warp())
-    assert adapted_grading(grid) is None
+    assert adapted_grading(grid, UnknownAcquisition(Told())) is None
 
 
 @pytest.mark.parametrize("apart", [0.5, 0.9, 1.4])
@@ -210,7 +212,7 @@ def test_wires_that_larger_voxels_would_join_are_no_surface(apart: float) -> Non
     ]
     floor = plain(rng, 120_000, (0.0, -3.0), (16.0, 3.0))
     points, wire = np.concatenate((floor, *wires)), np.repeat(np.arange(-1, 5), [len(floor), *map(len, wires)])
-    assert adapted_grading(voxel_grid(points, 0.1, Warp())) is None
+    assert adapted_grading(voxel_grid(points, 0.1, Warp()), UnknownAcquisition(Told())) is None
     supervoxels = pcgraph.segment(points).supervoxels
     pairs = np.unique(np.column_stack((supervoxels, wire))[wire >= 0], axis=0)
     assert len(pairs) == len(np.unique(pairs[:, 0]))

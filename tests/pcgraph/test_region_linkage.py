@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from tiers import draws
 
 import pcgraph
+from pcgraph.acquisition import Told, UnknownAcquisition
 from pcgraph.tree.region_linkage import MergeEdges, RegionLinkage, region_linkage
 
 
@@ -39,7 +40,7 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     unit = float(np.median(graph.edge_features.voxel_edge))
     leaves.scatters[grown.argmax()] += uneven * unit**2 * grown.max() * np.eye(3)
     nodes = replace(graph.node_features, normal=_normals_towards_the_smaller(leaves, side))
-    graph = replace(graph, node_features=nodes, sides_known=known)
+    graph = replace(graph, node_features=nodes, acquisition=UnknownAcquisition(Told(normals=known)))
     leaves = replace(
         leaves, normals=nodes.normal * [[1.0], [0.95]], colors=np.array([[0.9, 0.2, 0.1], [0.5, 0.3, 0.3]])
     )
@@ -130,7 +131,7 @@ def test_turning_a_sheet_seen_from_who_knows_where_changes_no_object(turn):
     """Which of its sides is the outer one, nothing tells."""
     points, truth = _wall(0.02)
     found = pcgraph.segment(points @ Rotation.from_euler("x", turn, degrees=True).as_matrix().T)
-    assert not found.graph.sides_known
+    assert not found.acquisition.sides_known
     assert pcgraph.metrics.segmentation_covering(found.labels, truth) > 0.97
 
 

@@ -20,7 +20,7 @@ from pcgraph.inputs import clean_cloud
 from pcgraph.metrics import weighted_overlap
 from pcgraph.pixels import with_pixels
 from pcgraph.voxels.spacing import median_spacing
-from pcgraph.voxels.warp import CameraWarp, RangeWarp, choose_warp, warped_normal
+from pcgraph.voxels.warp import CameraWarp, RangeWarp, warped_normal
 
 
 def plate():
@@ -96,12 +96,13 @@ def test_sides_are_known_where_all_scans_tell_them():
     told, by_normals, bare = (
         pcgraph.segment(points, **given) for given in ({"viewpoint": seen_from}, {"normals": normals}, {})
     )
-    assert [result.graph.sides_known for result in (told, by_normals, bare)] == [True, True, False]
+    assert [result.acquisition.sides_known for result in (told, by_normals, bare)] == [True, True, False]
     after = [
-        pcgraph.update(first, points + 1.0, normals=normals).graph.sides_known for first in (told, by_normals, bare)
+        pcgraph.update(first, points + 1.0, normals=normals).acquisition.sides_known
+        for first in (told, by_normals, bare)
     ]
     assert after == [True, True, False]
-    assert not pcgraph.update(told, points + 1.0).graph.sides_known
+    assert not pcgraph.update(told, points + 1.0).acquisition.sides_known
 
 
 def test_an_image_takes_a_viewpoint_per_pixel():
@@ -224,7 +225,7 @@ def image_of_a_hall(end, noise=0.0, step=0.0, shape=(240, 320)):
 def test_steps_of_depth_are_read_off_an_image(noise):
     points, _ = image_of_a_hall(4.0, noise, 2.85e-3)
     cloud = clean_cloud(points, None, None)
-    warp = choose_warp(cloud.points, np.zeros(3), True, 0.0)
+    warp = CameraWarp.about(cloud.points, np.zeros(3))
     far = np.quantile(cloud.points[:, 2], 0.8)
     needed = 2.85e-3 * far * warp.reference_depth / 0.75 / 3.5
     assert DepthImage.of(cloud.points, cloud.image, np.zeros(3), None).spacing(
@@ -681,7 +682,7 @@ def test_viewpoints_that_hardly_differ_are_one():
     drifting = rng.normal(0.0, 1e-6, points.shape)
     one, each = pcgraph.segment(points, viewpoint=np.zeros(3)), pcgraph.segment(points, viewpoint=drifting)
     assert each.viewpoint == pytest.approx(np.zeros(3), abs=1e-5)
-    assert each.surface.grid.warp.of_one_scan
+    assert each.acquisition.is_one_scan
     assert each.labels.max() == pytest.approx(one.labels.max(), rel=0.1)
     apart = np.where(np.arange(len(points))[:, None] % 2 == 0, (3.0, 0.0, 0.0), (-3.0, 0.0, 0.0))
     assert pcgraph.segment(points, viewpoint=apart).viewpoint.ndim == 2

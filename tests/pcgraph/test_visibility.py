@@ -501,7 +501,7 @@ def pole_says_nothing(seed):
     if not (spacing_law(points).holds and spacing_law(points, place).holds):
         return False
     told, found = pcgraph.segment(points, viewpoint=place), pcgraph.segment(points)
-    is_one_scan = told.surface.grid.warp.of_one_scan and found.surface.grid.warp.of_one_scan
+    is_one_scan = told.acquisition.is_one_scan and found.acquisition.is_one_scan
     return is_one_scan and told.labels.max() <= found.labels.max() + 2
 
 

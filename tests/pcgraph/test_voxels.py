@@ -22,7 +22,7 @@ from pcgraph.voxels.eigen import least_root, plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import voxel_grid, with_means
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.surface import local_planes
-from pcgraph.voxels.warp import Warp, choose_warp, warped_normal
+from pcgraph.voxels.warp import CameraWarp, RangeWarp, Warp, warped_normal
 
 
 def six(matrix):
@@ -179,7 +179,7 @@ def test_the_spacing_of_an_image_is_that_of_its_pixels_at_the_median_depth(shape
     pitch = 1.0 / width
     u, v = np.meshgrid(pitch * (np.arange(width) - width / 2), np.linspace(0.05, 1.0, height))
     points = np.stack((u, v, np.ones_like(u)), axis=-1) / v[..., None]  # 1 m below the camera
-    warp = choose_warp(points.reshape(-1, 3), np.zeros(3), camera=True)
+    warp = CameraWarp.about(points.reshape(-1, 3), np.zeros(3))
     expected = pitch * float(np.median(points[..., 2]))
     assert median_spacing(points.reshape(-1, 3), warp) == pytest.approx(expected, rel=1e-6)
     assert pcgraph.segment(points).surface.grid.size == pytest.approx(3.5 * expected, rel=RUNG)
@@ -264,11 +264,11 @@ def test_supervoxels_are_smaller_on_smooth_surfaces(noise: float, edges: float) 
     assert result.seed_size / result.voxel_size == pytest.approx(edges, rel=0.05)
 
 
-@pytest.mark.parametrize("growth", [{"camera": False}, {"camera": True}, {"camera": False, "range_growth": 0.7}])
-def test_a_warped_normal_tells_how_far_a_step_in_the_warped_space_leaves_the_plane(growth):
+@pytest.mark.parametrize("about", [lambda *_: Warp(), CameraWarp.about, lambda *a: RangeWarp.about(*a, 0.7)])
+def test_a_warped_normal_tells_how_far_a_step_in_the_warped_space_leaves_the_plane(about):
     random = np.random.default_rng(0)
     points, normals, steps = random.uniform(1.0, 6.0, (50, 3)), *random.standard_normal((2, 50, 3))
-    warp = choose_warp(points, np.array([0.1, 0.3, -2.0]), **growth)
+    warp = about(points, np.array([0.1, 0.3, -2.0]))
     step = warp.forward(points + 1e-5 * steps) - warp.forward(points - 1e-5 * steps)
     warped = [warped_normal.py_func(warp.slant, *x, *n) for x, n in zip(warp.forward(points), normals, strict=True)]
     off = warp.scale(points) * np.einsum("ij,ij->i", warped, step)

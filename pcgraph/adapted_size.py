@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.acquisition import Acquisition
 from pcgraph.voxels.cells import UNIT_CELLS, cell_keys, sorted_keys, starts_of_runs
 from pcgraph.voxels.grading import BLOCK, Grading
 from pcgraph.voxels.grid import (
@@ -24,7 +25,6 @@ from pcgraph.voxels.grid import (
     touching_voxels,
     voxel_grid,
 )
-from pcgraph.voxels.spacing_law import SpacingLaw
 from pcgraph.voxels.surface import roughness
 
 # Gains are those of docs/pcgraph_experiments.md: the mean of all scores, less the mean without the rule.
@@ -106,7 +106,7 @@ _SMALLER = RefinementThresholds()
 _GRADED = GradingThresholds()
 
 
-def seed_spacing(grid: VoxelGrid) -> float:
+def seed_spacing(grid: VoxelGrid, acquisition: Acquisition) -> float:
     """Spacing of seeds, metres: five voxel edges; less, but at least three, if that gives few supervoxels.
 
     On the smooth surfaces of meshes and of thinned clouds more supervoxels are better: normals are exact there, and
@@ -114,7 +114,7 @@ def seed_spacing(grid: VoxelGrid) -> float:
     """
     few, many = _SEEDS.min_supervoxels, _SEEDS.min_supervoxels_on_smooth
     usual = _edges_per_seed(grid, few)
-    may_be_closer = _edges_per_seed(grid, many) < usual and not grid.warp.of_one_scan
+    may_be_closer = _edges_per_seed(grid, many) < usual and not acquisition.is_one_scan
     if may_be_closer and _joined(np.diff(grid.indptr)) >= _SEEDS.min_joined:
         fraction = min(max((_SEEDS.rough - roughness(grid)) / (_SEEDS.rough - _SEEDS.smooth), 0.0), 1.0)
         usual = _edges_per_seed(grid, few * (many / few) ** fraction)
@@ -151,7 +151,7 @@ def seed_spacing_for(n_supervoxels: float, grid: VoxelGrid) -> float:
 
 
 def adapted_voxel_size(
-    points: NDArray[np.float64], grid: VoxelGrid, law: SpacingLaw | None, largest: float = math.inf
+    points: NDArray[np.float64], grid: VoxelGrid, acquisition: Acquisition, largest: float = math.inf
 ) -> tuple[float, float]:
     """Size of the voxels, metres: larger than now if surfaces fall apart, smaller if they would stay whole.
 
@@ -165,32 +165,32 @@ def adapted_voxel_size(
         The points in the grid.
     grid : VoxelGrid
         Its voxels are of one size.
-    law : SpacingLaw, optional
-        The law of spacing over range, if the cloud was asked for it.
+    acquisition : Acquisition
     largest : float, metres
         Upper limit of an enlarged size.
     """
     degrees = np.diff(grid.indptr)
-    joined, of_few = _joined(degrees), _enough_of_few(grid, law)
+    joined, of_few = _joined(degrees), _enough_of_few(grid, acquisition)
     is_fragmented = joined < min(_MIN_JOINED, of_few)
-    larger = _enlarged_size(points, grid, degrees, largest) if is_fragmented else grid.size
-    usual = _refined_size(points, grid, degrees) if larger == grid.size else larger
-    if usual == grid.size and joined >= of_few and adapted_grading(grid) is None:
+    larger = _enlarged_size(points, grid, degrees, largest, acquisition.is_one_scan) if is_fragmented else grid.size
+    usual = _refined_size(points, grid, degrees, acquisition.is_one_scan) if larger == grid.size else larger
+    if usual == grid.size and joined >= of_few and adapted_grading(grid, acquisition) is None:
         return _finest(points, grid, slice(0, grid.n_voxels), _SMALLER.max_steps, of_few, _SMALLER.price_of_few), usual
     return usual, usual
 
 
-def _enough_of_few(grid: VoxelGrid, law: SpacingLaw | None) -> float:
+def _enough_of_few(grid: VoxelGrid, acquisition: Acquisition) -> float:
     """Joined fraction, less roughness, that has to be left when few voxels are made smaller; infinite for many voxels.
 
     The fewer voxels there are, the fewer each thing has; so the fewer of them have to stay joined. It is infinite for
     images, too, whose spacing along rows may differ from that along columns.
     """
-    n, of_one_scan = grid.n_voxels, grid.warp.of_one_scan
-    if n >= _SMALLER.enough or (of_one_scan and law is None):
+    n = grid.n_voxels
+    if n >= _SMALLER.enough or acquisition.has_pixels:
         return math.inf
     fraction = _log_interpolated(n, _SMALLER.few, _SMALLER.enough)
-    return _SMALLER.joined_of_few + fraction * ((1.0 if of_one_scan else _SMALLER.all_joined) - _SMALLER.joined_of_few)
+    most = 1.0 if acquisition.is_one_scan else _SMALLER.all_joined
+    return _SMALLER.joined_of_few + fraction * (most - _SMALLER.joined_of_few)
 
 
 def _joined(degrees: NDArray[np.int64]) -> float:
@@ -198,7 +198,9 @@ def _joined(degrees: NDArray[np.int64]) -> float:
     return float(np.mean(degrees >= MIN_NEIGHBOURS_ON_SURFACE))
 
 
-def _enlarged_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray[np.int64], largest: float) -> float:
+def _enlarged_size(
+    points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray[np.int64], largest: float, of_one_scan: bool
+) -> float:
     """The size, or a larger one by half powers of two, enough to join what falls apart.
 
     - If at least half of the voxels are joined at first, the size is the first at which three quarters are, provided
@@ -212,7 +214,7 @@ def _enlarged_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArra
     """
     cells, size, joined, joined_at_first = [grid.cells, grid.cells], grid.size, 0.0, _joined(degrees)
     is_sparse, best = joined_at_first < _HALF_JOINED, grid.size
-    few_beams = grid.warp.of_one_scan and is_sparse
+    few_beams = of_one_scan and is_sparse
     least, much = (math.inf, _LARGER.min_gain_of_sparse) if is_sparse else (grid.size, _LARGER.min_gain)
     for step in range(1, _LARGER.max_steps + 1):
         size *= math.sqrt(2.0)
@@ -236,7 +238,7 @@ def _enlarged_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArra
     return best
 
 
-def _refined_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray[np.int64]) -> float:
+def _refined_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray[np.int64], of_one_scan: bool) -> float:
     """The size, or a smaller one by quarters of a power of two, down to a half, at which nearly all voxels stay joined.
 
     So the size follows how evenly points lie, not only how near to each other: the evenly spaced vertices of a mesh
@@ -251,7 +253,7 @@ def _refined_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray
     - To save time, no grid gets more than some 300 000 voxels, and large grids that are not all joined keep their size.
     """
     n, size, joined = grid.n_voxels, grid.size, _joined(degrees)
-    if grid.warp.of_one_scan or joined < _HALF_JOINED:
+    if of_one_scan or joined < _HALF_JOINED:
         return size
     steps = min(_SMALLER.max_steps, int(2.0 * math.log2(_SMALLER.max_voxels / n)))  # 4 steps: 4 times as many
     if steps < 1 or (n > _SMALLER.large and joined < _SMALLER.all_joined):
@@ -280,7 +282,7 @@ def _finest(points: NDArray[np.float64], grid: VoxelGrid, slab: slice, steps: in
     return size
 
 
-def adapted_grading(grid: VoxelGrid) -> Grading | None:
+def adapted_grading(grid: VoxelGrid, acquisition: Acquisition) -> Grading | None:
     """Blocks in which voxels are larger by powers of two, because points lie far apart there; None if there are few.
 
     Spacing was read near one of several tripods; far from them surfaces fall apart. That is asked of each block with
@@ -293,9 +295,10 @@ def adapted_grading(grid: VoxelGrid) -> Grading | None:
     ----------
     grid : VoxelGrid
         Its voxels are of one size.
+    acquisition : Acquisition
     """
     joined = grid.joined
-    if grid.warp.of_one_scan or np.mean(joined) >= _GRADED.nearly_all_joined:
+    if acquisition.is_one_scan or np.mean(joined) >= _GRADED.nearly_all_joined:
         return None
     keys, pitch = cell_keys(grid.cells / BLOCK, grid.size)
     ordered, order = sorted_keys(keys)
