@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.acquisition import spacing_law
-from pcgraph.acquisition.kinds import Acquisition, Evidence, MovingScanner, Scanner, acquisition_of
+from pcgraph.acquisition.kinds import Acquisition, Evidence, MovingScanner, Scanner, acquisition_of, spacing_law
 from pcgraph.acquisition.spacing_law import SpacingLaw
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Bridges, Gaps
@@ -208,7 +207,7 @@ def _every_reading(readings: Any, place: NDArray[np.float64]) -> NDArray[np.bool
 
 
 def _first_readings(readings: Any) -> NDArray[np.int64]:
-    return np.arange(min(len(readings.logs), spacing_law._READINGS))
+    return np.arange(min(len(readings.logs), spacing_law._SEARCH.readings))
 
 
 def _one_part(coarse: VoxelGrid, *others: object) -> tuple[NDArray[np.int64], list[Any]]:
@@ -282,6 +281,14 @@ def _constant(name: str, file: str, constant: str, value: Any, *more: str) -> Pa
     return Part(name, (f"{file}:{constant}", *(f"{file}:{one}" for one in more)), {f"{module}.{constant}": _is(value)})
 
 
+def _threshold(name: str, file: str, settings: str, *more: str, **fields: Any) -> Part:
+    """A part that fields of a dataclass of thresholds switch off, which a file holds under a name."""
+    path = f"{file.removesuffix('.py').replace('/', '.')}.{settings}"
+    kind = type(Target.of(path).value).__name__
+    code = _constants(file, *(f"{kind}.{field}" for field in fields), *more)
+    return Part(name, code, {path: lambda held: replace(held, **fields)})
+
+
 def _function(name: str, file: str, function: str, replacement: Replacement, *constants: str) -> Part:
     """A part that is a function of a file."""
     module = file.removesuffix(".py").replace("/", ".")
@@ -344,8 +351,10 @@ CAMERAS = (
         (f"{_IMAGE}:DepthImage.spacing",),
         {"acquisition.depth_image.DepthImage.spacing": _keeps(1)},
     ),
-    _constant("spacing: steps of depth", _IMAGE, "_MAX_COARSENING", 0.0, "_step_along", "_MAX_STEP"),
-    _constant("spacing: rows of an image", _IMAGE, "_MIN_PER_PITCH", 0.0),
+    _threshold(
+        "spacing: steps of depth", _IMAGE, "_STEPS", "_step_along", "StepThresholds.max_step", max_coarsening=0.0
+    ),
+    _threshold("spacing: rows of an image", _IMAGE, "_STEPS", min_per_pitch=0.0),
     Part(
         "flying pixels",
         (f"{_VOXELS}:without_flying_pixels", f"{_IMAGE}:DepthImage.flying"),
@@ -370,11 +379,11 @@ LAW = (
         _is(_first_readings),
     ),
     _function("law: readings off the line", _LAW, "_on_line", _is(_every_reading)),
-    _constant("law: near and far half", _LAW, "_MIN_EXPONENT_OF_HALF", -math.inf, "_least_exponent"),
-    _constant("law: middling ranges", _LAW, "_MIN_OF_MOST", -math.inf, "_exponent_of_most"),
-    _constant("law: origin as good", _LAW, "_OWN_ORIGIN", -math.inf),
-    _constant("law: prior of the exponent", _LAW, "_PRIOR", 0.0),
-    _constant("law: several starts", _LAW, "_STARTS", 1, "_APART"),
+    _threshold("law: near and far half", _LAW, "_LAW", "_least_exponent", min_exponent_of_half=-math.inf),
+    _threshold("law: middling ranges", _LAW, "_LAW", "_exponent_of_most", min_trimmed=-math.inf),
+    _threshold("law: origin as good", _LAW, "_LAW", better_than_origin=-math.inf),
+    _threshold("law: prior of the exponent", _LAW, "_SEARCH", prior=0.0),
+    _threshold("law: several starts", _LAW, "_SEARCH", "SearchThresholds.apart", starts=1),
     Part(
         "law: mirrored place",
         (f"{_SIDE}:likelier_viewpoint", f"{_LAW}:_mirrored", f"{_LAW}:SpacingLaw.mirrored"),
@@ -403,15 +412,15 @@ SIZES = (
         ("voxels/spacing.py:_NEIGHBOUR",),
         {"voxels.spacing._near": _then(lambda near: near._replace(distances=near.distances[[0, 0]]))},
     ),
-    _constant("spacing of copies", "voxels/spacing.py", "_COPIES", 0, "_fullest", "_THIN"),
+    _threshold("spacing of copies", "voxels/spacing.py", "_READ", "_fullest", "SpacingThresholds.thin", max_copies=0),
     _constant("sizes per octave", _VOXELS, "_SIZES_PER_OCTAVE", 1 << 40),
     _constant("offset of the grid", _VOXELS, "_GRID_OFFSET", 0.0),
     _constant("control: another offset of the grid", _VOXELS, "_GRID_OFFSET", 0.618),  # as good: what luck makes
     _function("larger voxels", _SIZE, "_enlarged_size", lambda f: lambda points, grid, *others: grid.size),
-    _constant("larger: gain that is asked for", _SIZE, "_MIN_GAIN", 0.0),
-    _constant("larger: gain of sparse clouds", _SIZE, "_MIN_GAIN_OF_SPARSE", 0.0),
+    _threshold("larger: gain that is asked for", _SIZE, "_LARGER", min_gain=0.0),
+    _threshold("larger: gain of sparse clouds", _SIZE, "_LARGER", min_gain_of_sparse=0.0),
     _function("smaller voxels", _SIZE, "_refined_size", lambda f: lambda points, grid, *others: grid.size),
-    _constant("smaller: price of roughness", _SIZE, "_PRICE_OF_ROUGHNESS", (0.0, 0.0)),
+    _threshold("smaller: price of roughness", _SIZE, "_SMALLER", price=0.0, price_of_large=0.0),
     _function("smaller: few voxels", _SIZE, "_enough_of_few", _gives(math.inf)),
     Part(
         "graded voxels",
@@ -424,7 +433,7 @@ SIZES = (
         _constants(_SIZE, "seed_spacing", "_edges_per_seed"),
         {"scan.seed_spacing": _is(lambda grid, acquisition: VOXELS_PER_SEED * grid.size)},
     ),
-    _constant("seeds nearer on smooth surfaces", _SIZE, "_MIN_SUPERVOXELS_ON_SMOOTH", 800),
+    _threshold("seeds nearer on smooth surfaces", _SIZE, "_SEEDS", min_supervoxels_on_smooth=800),
     _constant("normals as of larger voxels", _SCAN, "_FLIP_COSINE", 2.0),
 )
 
@@ -447,25 +456,32 @@ NOISE = (
     ),
     _constant("noise: scale estimated again", _VOXELS, "_FEW_OUTLIERS", 0.0),
     _function("noise: surfaces among it", _NOISE, "_surfaces_among", _none_of(0)),
-    _constant("noise: within reach", _NOISE, "_VOLUME_OF_REACH", math.inf),
-    _constant("noise: of all two thirds at most", _NOISE, "_MAX_FRACTION", 1.0),
+    _threshold("noise: within reach", _NOISE, "_NOISE", reach_volume=math.inf),
+    _threshold("noise: of all two thirds at most", _NOISE, "_NOISE", max_fraction=1.0),
 )
 
 SIDES = (
     _function("visible: carried over edges", _SIDE, "_carry_over", _gives(None)),
     _function("visible: votes smoothed", _SIDE, "_smoothed_votes", _keeps(2)),
-    _constant("virtual: finer cells of rooms", _VIEW, "_FINER", (1,), "_SHOWS_MOST", "_SHOWS_NEARLY_ALL"),
+    _threshold(
+        "virtual: finer cells of rooms",
+        _VIEW,
+        "_RESOLUTION",
+        "ResolutionThresholds.shows_most",
+        "ResolutionThresholds.shows_nearly_all",
+        finer=(1,),
+    ),
     _function("virtual: layers", _VIEW, "_is_layered", _gives(False)),
     _function("virtual: rooms", _VIEW, "_is_room", _gives(False)),
     _function("virtual: parts far apart", _VIEW, "_parts", _is(_one_part)),
     _function("virtual: partitions", _VIEW, "_without_partitions", _keeps(0)),
-    _constant("virtual: passages", _VIEW, "_MIN_SHOWN_FROM_INSIDE", math.inf),
-    _constant("virtual: planes from behind", _VIEW, "_MAX_FROM_BEHIND", math.inf),
-    _constant("virtual: differences that do not count", _VIEW, "_SHOWN_TOLERANCE", 0.0),
-    _constant("virtual: unanimous", _VIEW, "_W_UNANIMOUS", 0.0),
-    _constant("virtual: seen from outside", _VIEW, "_W_OUTSIDE", 0.0),
-    _constant("virtual: above the ground", _VIEW, "_W_ABOVE_GROUND", 0.002),
-    _constant("virtual: free side of a plane", _VIEW, "_W_FREE_SIDE", 0.0),
+    _threshold("virtual: passages", _VIEW, "_SCORE", min_shown_from_inside=math.inf),
+    _threshold("virtual: planes from behind", _VIEW, "_SCORE", max_from_behind=math.inf),
+    _threshold("virtual: differences that do not count", _VIEW, "_SCORE", shown_tolerance=0.0),
+    _threshold("virtual: unanimous", _VIEW, "_SCORE", unanimous=0.0),
+    _threshold("virtual: seen from outside", _VIEW, "_SCORE", outside=0.0),
+    _threshold("virtual: above the ground", _VIEW, "_SCORE", above_ground=0.002),
+    _threshold("virtual: free side of a plane", _VIEW, "_SCORE", free_side=0.0),
     Part(
         "virtual: plane that bears things",
         ("voxels/ground_and_rooms.py:supporting_plane",),
@@ -473,9 +489,9 @@ SIDES = (
     ),
     _function("virtual: origin as a camera's place", _VIEW, "_has_in_view", _gives(False)),
     _function("virtual: origin sees as much", _VIEW, "_sees_as_much", _gives(True)),
-    _constant("virtual: box along principal axes", _VIEW, "_MAX_TURNED_BOX", 0.0),
+    _threshold("virtual: box along principal axes", _VIEW, "_CANDIDATES", max_turned_box=0.0),
     _function("virtual: choice spread out", _VIEW, "_spread_choice", _is(_by_weight)),
-    _constant("virtual: places not in corners", _VIEW, "_MIN_SURROUNDED", 0.0),
+    _threshold("virtual: places not in corners", _VIEW, "_CANDIDATES", min_surrounded=0.0),
 )
 
 SUPERVOXELS = (

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pinhole camera that took a mere list of points, in whatever frame: found by the lattice of its pixels."""
+"""The pinhole camera that took a list of points, in whatever frame, found by the lattice of its pixels."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -13,67 +14,125 @@ from scipy.spatial.distance import cdist
 
 from pcgraph.acquisition.resection import NO_PLANE, PinholeCamera, resection
 from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.rounding import TINY
 from pcgraph.voxels.directions import plane_basis, sphere_directions
 from pcgraph.voxels.sampling import farthest_points
 
-_TINY = float(np.finfo(np.float64).tiny)
-MAX_OFF_PIXEL = 0.1
-"""Pixels by which a ray may be off its own."""
-MIN_LINES, MAX_PIXELS = 8, 1 << 20
-"""Rows, or columns, of an image, at least and at most."""
+# Numbers without a reason were chosen by eye and not varied.
 
-# Patches
-_SOME, _LOOKED_AT = 1 << 11, 64  # of some points of a sample, the density around so many is asked for
-_PATCHES, _PATCH, _AROUND = 6, 48, 1 << 10  # patches that are tried, their points, and those around, about
-_DULL, _VIEWS, _GREW = 2, 12, 4  # patches that look like no lattice, views, cameras of all: then no more are tried
-# Directions
-_DIRECTIONS = sphere_directions(600)[:300]  # half of those all around
-_APART, _SAME, _TRIED = 0.95, 0.995, 8  # cosines between those that are looked at again, and of one; and their number
-_FIRST_STEP, _LAST_STEP = 0.08, 0.004  # by which they are turned, radians
-_DENSE, _SPARSE = 0.1, 0.9  # quantiles of the distances to the nearest, which are alike on a lattice:
-_SHARP, _VERY_SHARP = 0.7, 0.8  # the one over the other, at first, and when turned
-_BESIDE, _NOT_ACROSS = 1.25, 1.9  # distances between neighbours on a lattice, over the least
-_SINE, _ON_LATTICE = 0.5, 0.15  # between its two steps, at least; and steps by which most points are off it, at most
-# Cameras
-_MORE, _COUNTED, _ENOUGH = 1 << 13, 300, 100  # points of a sample, those that count, and for a pinhole camera
-_GROWTH, _FITS = 1.4, 4  # of the reach, each time, and how often a camera is fitted to the points within,
-_SETTLED = 0.02  # if so many of them count now and did not, or the other way round
-_SURE, _ON_PIXEL = 0.3, 0.1  # so many have to be off their pixels by less than that;
-_TIMES, _PRECISE, _OFF_PIXEL = 8.0, 0.02, 0.25  # so many times as far off is not counted,
-_MIN_INLIERS = 0.4  # if so many are left
-_ALONG = 1e-3  # what an affine camera sees from its direction weighs, where points lie on one plane
-_BETTER = 0.7  # a pinhole camera leaves that much of the squares that an affine one leaves, at most
-_SKEW, _REDUCED = 0.02, 32  # cosine between rows and columns, at most; and changes after which no shortest steps come
-# Steps
-_LEAST, _ADJACENT = 2e-5, 0.1  # of all they span, at least; and quantile of those that is one between neighbours
-_SLANT, _SLANTED = 32, 100  # rows, or columns, per step of inverse depth, at most; and how many images are looked at
-_ALL = 0.97  # of an image's rows and columns lie between the first and last of a sample, at least
+# Kernels read these.
+MAX_OFF_PIXEL = 0.1
+"""Pixels by which a ray may be off its own, at most: single precision leaves a thousandth; chosen by eye."""
+MAX_PIXELS = 1 << 20
+"""Rows, or columns, of an image, at most: the longest side that is taken for an image in pixels; chosen by eye."""
+MIN_LINES = 8
+"""Rows, or columns, of pixels in an image, at least, as few lines are even by accident; chosen by eye."""
+_NEAR_QUANTILE = 0.1
+"""Quantile of the distances of a patch's points to their nearest, as seen, that is the least one; chosen by eye."""
+_FAR_QUANTILE = 0.9
+"""Quantile of these distances that is the largest one, a fraction: on a lattice both are alike; chosen by eye."""
+_FIRST_TURN = 0.08
+"""Radians by which a direction is turned first, half of those between neighbouring directions, about; chosen by eye."""
+_LAST_TURN = 0.004
+"""Radians: a turn by less does not make a patch look sharper; chosen by eye."""
+
+_DIRECTIONS = sphere_directions(600)[:300]  # half of those all around, 8 degrees apart
+
+
+@dataclass(frozen=True)
+class PatchThresholds:
+    """Numbers of patches of neighbours that are looked at, and of their points."""
+
+    sample: int = 1 << 11  # points among which patches are sought
+    asked: int = 64  # points of these whose surroundings are asked how dense they are
+    tried: int = 6  # patches, at most
+    points: int = 48  # points of a patch
+    around: int = 1 << 10  # points around it from which a camera grows, about
+    max_dull: int = 2  # patches that look like no lattice: then no more are tried
+    max_views: int = 12  # views of patches as lattices: then no more are tried
+    max_grown: int = 4  # cameras that grew to all points: then no more are tried
+
+
+@dataclass(frozen=True)
+class LatticeThresholds:
+    """Conditions for a patch, seen from a direction, to be a lattice. `_sharpness` tells how it looks."""
+
+    sharp: float = 0.7  # sharpness, 0..1, of a direction that is looked at again
+    very_sharp: float = 0.8  # the same once it was turned to the sharpest nearby
+    same_peak: float = 0.95  # cosine between two directions of which one is looked at again, 18 degrees
+    same_direction: float = 0.995  # cosine between two turned directions that are one, 6 degrees
+    max_directions: int = 8  # directions that are looked at again
+    beside: float = 1.25  # distance to a point over the least: with less it is a neighbour along the shortest step
+    beyond: float = 1.9  # distance to a point over the least: with more it is no neighbour
+    min_sine: float = 0.5  # sine of the angle between the two steps, 30 degrees
+    max_off: float = 0.15  # steps: median distance of the points from the lattice
+    like: float = 0.3  # of a step: steps that differ by less are averaged
+
+
+@dataclass(frozen=True)
+class CameraThresholds:
+    """Growth of a camera from a patch to all points, and conditions for it to fit."""
+
+    sample: int = 1 << 13  # points to which it grows
+    counted: int = 300  # points it is fitted to, each time, at most
+    min_pinhole: int = 100  # points for a pinhole camera; fewer fit an affine one
+    growth: float = 1.4  # factor of the reach, each time
+    max_fits: int = 4  # fits to the points within reach
+    settled: float = 0.02  # fraction of the points that changed whether they count: with less, the fit ends
+    sure: float = 0.3  # quantile of the distances from pixels by which a fit is judged
+    max_sure: float = 0.1  # pixels: if that quantile is more, the fit fails
+    times: float = 8.0  # multiple of that quantile: points farther off do not count
+    precise: float = 0.02  # pixels: points nearer than that always count
+    off: float = 0.25  # pixels: points farther off than that never count
+    min_inliers: float = 0.4  # fraction of the points that count
+    along: float = 1e-3  # weight of an affine camera's direction, which decides only if points are on one plane
+    better: float = 0.7  # ratio of mean squares by which a pinhole camera has to beat an affine one
+    max_skew: float = 0.02  # cosine between rows and columns
+    max_reductions: int = 32  # steps of Lagrange's reduction: a guard
+
+
+@dataclass(frozen=True)
+class StepThresholds:
+    """Reading of the step between even values, and choice among cameras that differ by steps of inverse depth."""
+
+    min_step: float = 2e-5  # of the span: differences below it are rounding
+    adjacent: float = 0.1  # quantile of the differences that is one step
+    max_slant: int = 32  # rows, or columns, that a camera may count more per step of inverse depth
+    tried: int = 100  # images that are looked at, the smallest first
+    max_cameras: int = 8  # cameras that are given back, at most
+    min_area: float = 0.97  # of the points: an image of a sample's rows and columns has at least so many pixels
+
+
+_PATCH = PatchThresholds()
+_LATTICE = LatticeThresholds()
+_CAMERA = CameraThresholds()
+_STEP = StepThresholds()
 
 
 def likely_cameras(points: NDArray[np.float64], sample: NDArray[np.float64]) -> Iterator[PinholeCamera]:
     """The cameras that may have seen each of n points, (n, 3), at its own pixel, the likeliest first.
 
-    A sample of the points, (m, 3), tells where to look. Rows and columns are counted from anywhere, and either may be
-    the other, or run backwards.
+    Patches are sought in a sample of the points, (m, 3). Rows and columns of a camera start anywhere; they may be
+    exchanged, or run backwards.
 
     Notes
     -----
-    Seen from its camera, a patch of a depth image is a lattice, whatever noise its depths have, as that is along the
-    rays; seen from any other direction noise blurs it. So a patch of neighbours in space is looked at from everywhere.
-    Where it is a lattice, whole numbers tell each point's pixel, and an affine camera fits them. It says at which
-    pixels the points around are, to a fraction, so that they can be counted, too, and by more and more points it
-    becomes the pinhole camera of all.
+    Noise of a depth image is along its rays. So a patch of it, seen from the camera, is a lattice; seen from any other
+    direction it is blurred. A patch of neighbours in space is looked at from all directions. Seen as a lattice, its
+    points have pixels in whole numbers, and an affine camera is fitted to them. That tells the pixels of the points
+    around to a fraction, so that these can be numbered, too. With more and more points it becomes the pinhole camera of
+    all.
     """
-    more, some = sample[:_MORE], sample[:_SOME]
-    if len(some) < _PATCH:
+    more, some = sample[: _CAMERA.sample], sample[: _PATCH.sample]
+    if len(some) < _PATCH.points:
         return
-    nearest = min(math.ceil(_AROUND * len(some) / len(points)) + 1, len(some) - 1)
+    nearest = min(math.ceil(_PATCH.around * len(some) / len(points)) + 1, len(some) - 1)
     grew = dull = views = 0
     for seed, reach in zip(*_seeds(some, nearest), strict=True):
         near = np.concatenate(in_blocks(_find_near, len(points), points, seed, reach))
         around = _by_distance(points[near], seed)
         together = None
-        for view in _sharp_views(around[:_PATCH]) if len(around) >= _PATCH else ():
+        for view in _sharp_views(around[: _PATCH.points]) if len(around) >= _PATCH.points else ():
             if together is None:
                 farther = _by_distance(more, seed)
                 beyond = np.linalg.norm(farther - seed, axis=1) > np.linalg.norm(around[-1] - seed)
@@ -83,19 +142,19 @@ def likely_cameras(points: NDArray[np.float64], sample: NDArray[np.float64]) -> 
             if camera is not None:
                 yield from _alike(camera, more, len(points))
             views, grew = views + 1, grew + (grown is not None)
-            if views == _VIEWS or grew == _GREW:
+            if views == _PATCH.max_views or grew == _PATCH.max_grown:
                 return
         dull += together is None
-        if dull == _DULL:
+        if dull == _PATCH.max_dull:
             return
 
 
 def _seeds(places: NDArray[np.float64], nearest: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Some of the first of places, (k, 3), around which these are dense, far from each other; and how far off so many
-    others are, (k,)."""
-    reach = np.partition(cdist(places[:_LOOKED_AT], places), nearest, axis=1)[:, nearest]
+    """Centres of patches, (k, 3), far from each other where places are dense, and the distance to the neighbour of a
+    given rank of each, (k,)."""
+    reach = np.partition(cdist(places[: _PATCH.asked], places), nearest, axis=1)[:, nearest]
     dense = np.argsort(reach, kind="stable")[: len(reach) // 4]
-    chosen = dense[farthest_points(places[dense], 0, _PATCHES)]
+    chosen = dense[farthest_points(places[dense], 0, _PATCH.tried)]
     return places[chosen], reach[chosen]
 
 
@@ -103,7 +162,7 @@ def _seeds(places: NDArray[np.float64], nearest: int) -> tuple[NDArray[np.float6
 def _find_near(
     start: int, stop: int, points: NDArray[np.float64], seed: NDArray[np.float64], reach: float
 ) -> NDArray[np.int64]:
-    """Those of some points that lie no farther from a place than its reach."""
+    """Numbers of the points within reach of a place."""
     found, n = np.empty(stop - start + 1, np.int64), np.int64(0)
     x, y, z = seed
     for i in range(start, stop):
@@ -113,7 +172,7 @@ def _find_near(
 
 
 def _by_distance(points: NDArray[np.float64], seed: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points by their distance from one of them, those as far by their coordinates."""
+    """Points sorted by their distance from one of them, then by their coordinates."""
     ways = points - seed
     return points[np.lexsort((*points.T, np.einsum("ij,ij->i", ways, ways)))]
 
@@ -124,9 +183,9 @@ class _View(NamedTuple):
     Attributes
     ----------
     direction : (3,) float64
-        From which it is seen, of unit length.
+        Direction from which it is seen, of unit length.
     steps : (k, 2) int64
-        Of its points on the lattice, from any of its places.
+        Row and column of its points on the lattice, counted from any of its places.
     """
 
     direction: NDArray[np.float64]
@@ -140,13 +199,14 @@ def _sharp_views(patch: NDArray[np.float64]) -> Iterator[_View]:
     tried: list[int] = []
     known: list[NDArray[np.float64]] = []
     for number in np.argsort(-sharpness, kind="stable"):
-        if not sharpness[number] >= _SHARP or len(tried) == _TRIED:
+        if not sharpness[number] >= _LATTICE.sharp or len(tried) == _LATTICE.max_directions:
             return
-        if (np.abs(_DIRECTIONS[tried] @ _DIRECTIONS[number]) > _APART).any():
+        if (np.abs(_DIRECTIONS[tried] @ _DIRECTIONS[number]) > _LATTICE.same_peak).any():
             continue
         tried.append(int(number))
         direction = _DIRECTIONS[number].copy()
-        if _sharpen(patch, direction) >= _VERY_SHARP and not any(abs(other @ direction) > _SAME for other in known):
+        is_sharp = _sharpen(patch, direction) >= _LATTICE.very_sharp
+        if is_sharp and not any(abs(other @ direction) > _LATTICE.same_direction for other in known):
             known.append(direction)
             steps = _steps_on_lattice(patch, direction)
             if steps is not None:
@@ -155,7 +215,10 @@ def _sharp_views(patch: NDArray[np.float64]) -> Iterator[_View]:
 
 @kernel
 def _sharpness(patch: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How much alike the distances of k points to their nearest are as seen from directions, (m,), 0..1."""
+    """Sharpness of a patch as seen from m directions, (m,), 0..1: 1 for a perfect lattice.
+
+    It is the ratio of a low to a high quantile of the distances of its points to their nearest neighbours.
+    """
     k = len(patch)
     found, nearest, seen = np.empty(len(directions)), np.empty(k), np.empty((k, 2))
     for m in range(len(directions)):
@@ -166,14 +229,14 @@ def _sharpness(patch: NDArray[np.float64], directions: NDArray[np.float64]) -> N
                 off = (seen[i, 0] - seen[j, 0]) ** 2 + (seen[i, 1] - seen[j, 1]) ** 2
                 nearest[i], nearest[j] = min(nearest[i], off), min(nearest[j], off)
         ascending = np.sort(nearest)
-        sparse = ascending[int(_SPARSE * k)]
-        found[m] = math.sqrt(ascending[int(_DENSE * k)] / sparse) if sparse > 0.0 else 0.0
+        sparse = ascending[int(_FAR_QUANTILE * k)]
+        found[m] = math.sqrt(ascending[int(_NEAR_QUANTILE * k)] / sparse) if sparse > 0.0 else 0.0
     return found
 
 
 @routine
 def _look_from(patch: NDArray[np.float64], direction: NDArray[np.float64], seen: NDArray[np.float64]) -> None:
-    """Set where points lie on the plane across a direction, (k, 2)."""
+    """Set the projections of points on the plane across a direction, (k, 2)."""
     (ax, ay, az), (bx, by, bz) = _basis(direction)
     for i in range(len(patch)):
         x, y, z = patch[i]
@@ -182,7 +245,7 @@ def _look_from(patch: NDArray[np.float64], direction: NDArray[np.float64], seen:
 
 @routine
 def _basis(direction: NDArray[np.float64]) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Two unit vectors across a direction and each other: `plane_basis`, for kernels."""
+    """Two unit vectors at right angles to a direction and to each other: `plane_basis`, for kernels."""
     least = int(np.argmin(np.abs(direction)))
     x, y, z = direction
     ax, ay, az = (0.0, -z, y) if least == 0 else (z, 0.0, -x) if least == 1 else (-y, x, 0.0)
@@ -193,10 +256,10 @@ def _basis(direction: NDArray[np.float64]) -> tuple[tuple[float, float, float], 
 
 @kernel
 def _sharpen(patch: NDArray[np.float64], direction: NDArray[np.float64]) -> float:
-    """Turn a direction to the one nearby from which a patch looks sharpest; how sharp."""
-    step, best = _FIRST_STEP, _sharpness(patch, direction.reshape(1, 3))[0]
+    """Turn a direction to the one nearby from which a patch looks sharpest; return the sharpness."""
+    step, best = _FIRST_TURN, _sharpness(patch, direction.reshape(1, 3))[0]
     others = np.empty((8, 3))
-    while step > _LAST_STEP:
+    while step > _LAST_TURN:
         (x, y, z), ((ax, ay, az), (bx, by, bz)) = direction, _basis(direction)
         for k in range(8):
             c, s = step * math.cos(k * math.pi / 4.0), step * math.sin(k * math.pi / 4.0)
@@ -213,23 +276,25 @@ def _sharpen(patch: NDArray[np.float64], direction: NDArray[np.float64]) -> floa
 
 
 def _steps_on_lattice(patch: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.int64] | None:
-    """Whole numbers of the two shortest steps of a lattice from one of its places to each point, (k, 2), as seen from a
-    direction; None if the points are none, or two are at one place."""
+    """Row and column of each point of a patch on a lattice, (k, 2), as seen from a direction; None if it is no lattice.
+
+    They count its two shortest steps from one of the points. No two points share a place.
+    """
     seen = patch @ plane_basis(direction).T
     seen = seen - seen[int(np.argmin(np.linalg.norm(seen, axis=1)))]
     ways = (seen[:, None] - seen)[~np.eye(len(seen), dtype=bool)]
     lengths = np.linalg.norm(ways, axis=1)
     pitch = float(np.median(lengths.reshape(len(seen), -1).min(axis=1)))
-    ways, lengths = ways[lengths < _NOT_ACROSS * pitch], lengths[lengths < _NOT_ACROSS * pitch]
+    ways, lengths = ways[lengths < _LATTICE.beyond * pitch], lengths[lengths < _LATTICE.beyond * pitch]
     if not pitch > 0.0:
         return None
-    first = _common_way(ways, lengths, lengths < _BESIDE * pitch)
-    across = np.abs(ways @ [-first[1], first[0]]) > _SINE * lengths * np.linalg.norm(first)
+    first = _common_way(ways, lengths, lengths < _LATTICE.beside * pitch)
+    across = np.abs(ways @ [-first[1], first[0]]) > _LATTICE.min_sine * lengths * np.linalg.norm(first)
     if not across.any():
         return None
     basis = np.stack((first, _common_way(ways, lengths, across)))
     for fits_left in (2, 1, 0):
-        if abs(np.linalg.det(basis)) < _SINE / 2.0 * pitch * pitch:
+        if abs(np.linalg.det(basis)) < _LATTICE.min_sine / 2.0 * pitch * pitch:
             return None
         at = seen @ np.linalg.inv(basis)
         steps = np.rint(at)
@@ -238,58 +303,66 @@ def _steps_on_lattice(patch: NDArray[np.float64], direction: NDArray[np.float64]
             basis, seen = fitted[:2], seen - fitted[2]
     alone = len(np.unique(steps, axis=0)) == len(steps)
     off = float(np.median(np.abs(at - steps).max(axis=1)))
-    return steps.astype(np.int64) if alone and off <= _ON_LATTICE else None
+    return steps.astype(np.int64) if alone and off <= _LATTICE.max_off else None
 
 
 def _common_way(
     ways: NDArray[np.float64], lengths: NDArray[np.float64], among: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """The mean of the ways, (m, 2), that are much like the shortest but few among some, either way."""
+    """Mean of the ways, (m, 2), that are nearly the same: like the one at the eighth of the shortest of `among`.
+
+    Opposite ways count as the same.
+    """
     shortest = np.flatnonzero(among)[np.argsort(lengths[among], kind="stable")]
     one = ways[shortest[len(shortest) // 8]]
     alike = ways * np.sign(ways @ one)[:, None]
-    return alike[np.linalg.norm(alike - one, axis=1) < 0.3 * np.linalg.norm(one)].mean(axis=0)
+    return alike[np.linalg.norm(alike - one, axis=1) < _LATTICE.like * np.linalg.norm(one)].mean(axis=0)
 
 
 def _grown(view: _View, points: NDArray[np.float64]) -> PinholeCamera | None:
-    """The camera of all of some points, (m, 3), that lie ever farther from the patch that comes first; None if the
-    pixels of those around are not those that it says."""
+    """The camera of a patch, grown to all points, (m, 3), which are sorted by their distance from it, the patch first.
+
+    None if, on the way, the points around are not at whole pixels.
+    """
     k = len(view.steps)
     far = np.linalg.norm(points - points[0], axis=1)
     camera = _affine(points[:k], view.steps.astype(np.float64), view.direction)
     known, reach = k, float(far[k - 1])
     while True:
-        among = np.linspace(0, known - 1, min(known, _COUNTED)).astype(np.int64)
+        among = np.linspace(0, known - 1, min(known, _CAMERA.counted)).astype(np.int64)
         counted = np.zeros(len(among), bool)
-        for _ in range(_FITS):
+        for _ in range(_CAMERA.max_fits):
             at, depths = camera.pixels(points[among])
             pixels = np.rint(at)
             off = np.abs(at - pixels).max(axis=1)
-            most = float(np.partition(off, int(_SURE * len(off)))[int(_SURE * len(off))])
-            on = (off < min(max(_TIMES * most, _PRECISE), _OFF_PIXEL)) & (depths * depths[0] > 0.0)
-            if not most < _ON_PIXEL or np.mean(on) < _MIN_INLIERS:
+            most = float(np.partition(off, int(_CAMERA.sure * len(off)))[int(_CAMERA.sure * len(off))])
+            on = (off < min(max(_CAMERA.times * most, _CAMERA.precise), _CAMERA.off)) & (depths * depths[0] > 0.0)
+            if not most < _CAMERA.max_sure or np.mean(on) < _CAMERA.min_inliers:
                 return None
-            if np.mean(on != counted) < _SETTLED:
+            if np.mean(on != counted) < _CAMERA.settled:
                 break
             camera, counted = _fitted(camera, points[among[on]], pixels[on], view.direction), on
         if known == len(points):
             return camera
-        reach = max(reach * _GROWTH, float(far[known]))
+        reach = max(reach * _CAMERA.growth, float(far[known]))
         known = int(np.searchsorted(far, reach, "right"))
 
 
 def _of_all(camera: PinholeCamera, points: NDArray[np.float64]) -> PinholeCamera | None:
-    """The pinhole camera that sees points at the pixels of another, by the two shortest steps between these; None if
-    all is a plane, so that there are many, if one without a place does as well, or if rows are not across columns."""
+    """The pinhole camera that sees points at the pixels of a given one, with rows at right angles to columns.
+
+    None if all points are on a plane, so that many cameras do; if an affine camera does nearly as well; or if no rows
+    are at right angles to columns.
+    """
     pixels = np.rint(camera.pixels(points)[0])
     pinhole = resection(points, pixels, NO_PLANE)
     if pinhole is None:
         return None
     affine = _affine(points, pixels, pinhole.matrix[2, :3])
-    if not _misses(pinhole, points, pixels) <= _BETTER * _misses(affine, points, pixels):
+    if not _misses(pinhole, points, pixels) <= _CAMERA.better * _misses(affine, points, pixels):
         return None
     across = pinhole.matrix[:2, :3] - np.outer(pinhole.matrix[:2, :3] @ pinhole.matrix[2, :3], pinhole.matrix[2, :3])
-    across = across / max(float(np.abs(across).max()), _TINY)
+    across = across / max(float(np.abs(across).max()), TINY)
     change = _to_shortest(np.linalg.pinv(across @ across.T).astype(np.float64))
     if change is None:
         return None
@@ -299,19 +372,19 @@ def _of_all(camera: PinholeCamera, points: NDArray[np.float64]) -> PinholeCamera
 
 
 def _to_shortest(products: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """The two shortest steps of a lattice, columns in whole numbers of two others, whose scalar products are given,
-    (2, 2); None if they are not at right angles.
+    """The two shortest steps of a lattice, columns of (2, 2) in whole numbers of two other steps; None if they are not
+    at right angles. The scalar products of the other steps are given, (2, 2).
 
     Notes
     -----
     Lagrange's reduction.
     """
     change = np.eye(2)
-    for _ in range(_REDUCED):
+    for _ in range(_CAMERA.max_reductions):
         longer, shorter = (0, 1) if products[0, 0] > products[1, 1] else (1, 0)
         times = np.rint(products[0, 1] / products[shorter, shorter])
         if times == 0.0:
-            across = abs(products[0, 1]) <= _SKEW * math.sqrt(products[0, 0] * products[1, 1])
+            across = abs(products[0, 1]) <= _CAMERA.max_skew * math.sqrt(products[0, 0] * products[1, 1])
             return change if across else None
         one = np.eye(2)
         one[shorter, longer] = -times
@@ -320,23 +393,26 @@ def _to_shortest(products: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 def _alike(camera: PinholeCamera, points: NDArray[np.float64], n: int) -> list[PinholeCamera]:
-    """The cameras that see points, some of n, at whole pixels, if one does: where inverse depth comes in steps, some
-    more pixels for each of them, or fewer, are whole, too. Of these those with the least pixels, but enough for n."""
+    """The cameras that see some of n points at whole pixels as a given one does, those of the smallest images first.
+
+    If inverse depth comes in steps, a camera that counts some more rows or columns per step sees whole pixels, too.
+    Images need a pixel for each of the n points.
+    """
     at, depths = camera.pixels(points)
     inverse = np.sort(np.abs(1.0 / depths))
     step = step_between(inverse)
     if step <= 0.0 or not are_whole((inverse - inverse[0]) / step):
         return [camera]
     steps, pixels = np.rint(np.sign(depths[0]) / (step * depths)), np.rint(at)
-    slants = np.arange(-_SLANT, _SLANT + 1)
+    slants = np.arange(-_STEP.max_slant, _STEP.max_slant + 1)
     rows, columns = (1.0 + np.ptp(line[:, None] - steps[:, None] * slants, axis=0) for line in pixels.T)
     areas = np.outer(rows, columns)
-    areas[areas < _ALL * n] = np.inf
+    areas[areas < _STEP.min_area * n] = np.inf
     found: list[PinholeCamera] = []
-    for best in np.argsort(areas, axis=None, kind="stable")[:_SLANTED]:
+    for best in np.argsort(areas, axis=None, kind="stable")[: _STEP.tried]:
         slant = slants[np.array(np.unravel_index(best, areas.shape))]
         row, column = (pixels - steps[:, None] * slant).T
-        if len(found) < _TRIED and len(np.unique(row * (2 * MAX_PIXELS) + column)) == len(points):
+        if len(found) < _STEP.max_cameras and len(np.unique(row * (2 * MAX_PIXELS) + column)) == len(points):
             matrix = camera.matrix.copy()
             matrix[:2, 3] -= slant * (np.sign(depths[0]) / step)
             found.append(PinholeCamera(matrix))
@@ -344,46 +420,52 @@ def _alike(camera: PinholeCamera, points: NDArray[np.float64], n: int) -> list[P
 
 
 def step_between(ascending: NDArray[np.float64]) -> float:
-    """The distance between neighbours, if values are even: the mean, once known by how many each is from the last."""
+    """Step between values, if these are whole multiples of one step; 0 if there are too few, or too many steps.
+
+    It is the mean, once a low quantile of their differences has told how many steps each difference has.
+    """
     span = float(ascending[-1] - ascending[0]) if len(ascending) else 0.0
     steps = np.diff(ascending)
-    steps = steps[steps > _LEAST * span]
+    steps = steps[steps > _STEP.min_step * span]
     if len(steps) < MIN_LINES - 1:
         return 0.0
-    step = span / float(np.rint(steps / np.quantile(steps, _ADJACENT)).sum())
+    step = span / float(np.rint(steps / np.quantile(steps, _STEP.adjacent)).sum())
     if not span <= MAX_PIXELS * step:
         return 0.0
-    return step * int(np.gcd.reduce(np.rint((ascending - ascending[0]) / step).astype(np.int64)))  # it may be a half
+    return step * int(np.gcd.reduce(np.rint((ascending - ascending[0]) / step).astype(np.int64)))  # or half a step
 
 
 def are_whole(values: NDArray[np.float64]) -> bool:
-    """Whether all of some values are whole numbers, to a tenth."""
+    """Whether all values are whole numbers, to a tenth."""
     return bool((np.abs(values - np.rint(values)) <= MAX_OFF_PIXEL).all())
 
 
 def _fitted(
     before: PinholeCamera, points: NDArray[np.float64], pixels: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> PinholeCamera:
-    """The affine camera that sees points at pixels, or if that is better and they are many, or if it was before, the
-    pinhole camera."""
-    pinhole = resection(points, pixels) if len(points) >= _ENOUGH else None
+    """The camera that sees points at pixels: a pinhole camera if the one before was, or if there are many points and it
+    is better than an affine one; else an affine camera."""
+    pinhole = resection(points, pixels) if len(points) >= _CAMERA.min_pinhole else None
     if pinhole is not None and before.matrix[2, :3].any():
         return pinhole
     affine = _affine(points, pixels, direction)
-    better = pinhole is not None and _misses(pinhole, points, pixels) <= _BETTER * _misses(affine, points, pixels)
-    return pinhole if pinhole is not None and better else affine
+    if pinhole is None:
+        return affine
+    is_better = _misses(pinhole, points, pixels) <= _CAMERA.better * _misses(affine, points, pixels)
+    return pinhole if is_better else affine
 
 
 def _misses(camera: PinholeCamera, points: NDArray[np.float64], pixels: NDArray[np.float64]) -> float:
-    """Mean square distance between where points are seen and their pixels."""
+    """Mean squared distance between the pixels at which points are seen and their own."""
     return float(np.square(camera.pixels(points)[0] - pixels).sum(axis=1).mean())
 
 
 def _affine(points: NDArray[np.float64], pixels: NDArray[np.float64], direction: NDArray[np.float64]) -> PinholeCamera:
-    """The camera without a place that sees points at pixels, by least squares; along a direction, if on one plane."""
+    """The affine camera that sees points at pixels, by least squares; if they are on one plane, it looks along
+    `direction`."""
     middle = points.mean(axis=0)
     ways = points - middle
-    weight = _ALONG * float(np.sqrt(np.square(ways).sum()))
+    weight = _CAMERA.along * float(np.sqrt(np.square(ways).sum()))
     sides = np.vstack((ways, weight * direction))
     linear = np.linalg.lstsq(sides, np.vstack((pixels - pixels.mean(axis=0), np.zeros(2))), rcond=None)[0].T
     offset = pixels.mean(axis=0) - linear @ middle

@@ -13,23 +13,27 @@ from numpy.typing import NDArray
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.voxels.cells import Lattice
 
-_SOME = 2048  # values
-_MIN_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are still finite
+_MEDIAN_SAMPLE = 2048
+"""Count of values off which bounds of the median are read, about; chosen by eye, for speed."""
+_MIN_LENGTH = 1e-150
+"""Metres, least range: squares of lesser ones are zero, and powers of it are still finite."""
 FORWARDS = (0.0, 0.0, 1.0)
-"""Where a camera looks in its own frame."""
+"""Direction in which a camera looks in its own frame, of length 1: +z, as in OpenCV."""
 
 
 class NormalTransform(NamedTuple):
-    """Transform of normals to the warped space: a plane's n becomes m = n + ray (n . r) r + depth (n . w) a.
+    """Transform of normals to the warped space: a normal n becomes m = n + ray (n . r) r + depth (n . w) a.
 
-    r is the direction of the warped place, w what of it lies across the axis a. Then a step dX in the warped space
-    leaves the plane by m . dX, in metres of the warped space: scale(p) m = J^-T n, J being the derivative of
-    `Warp.forward` at p.
+    Here a is an axis, r the direction of the warped place, and w the part of that place across the axis. A step dX in
+    the warped space leaves the plane by m . dX, in metres of the warped space: scale(p) m = J^-T n, where J is the
+    derivative of `Warp.forward` at p.
 
     Attributes
     ----------
     ray : float
+        0 unless voxels grow with range.
     depth : float, 1 / metres
+        0 unless voxels grow with depth.
     axis : three floats
         Of unit length.
     """
@@ -46,7 +50,7 @@ class Warp:
     Attributes
     ----------
     max_gap : float, voxel edges
-        Distance between the means of two voxels, at most, that a gap lies between.
+        Distance between the means of two voxels on either side of a gap, at most.
     """
 
     max_gap: ClassVar[float] = 3.0
@@ -59,7 +63,7 @@ class Warp:
         return points
 
     def on_lattice(self, points: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], Lattice]:
-        """Places, (n, 3) float64, metres, and the lattice on which they are in voxels of a size, metres."""
+        """Places, (n, 3) float64, metres, and the lattice of voxels of a size, metres, in which they lie."""
         return self.forward(points), Lattice(np.zeros(3), size)
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -72,7 +76,7 @@ class Warp:
 
     @property
     def slant(self) -> NormalTransform:
-        """How normals lie in the warped space."""
+        """Transform of normals to the warped space."""
         return NormalTransform()
 
     def from_corner(self, corner: NDArray[np.float64]) -> Warp:
@@ -96,7 +100,7 @@ class Shift(Warp):
         return points - self.corner
 
     def on_lattice(self, points: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], Lattice]:
-        """The points as they are: the lattice starts at the corner."""
+        """The points themselves, and a lattice that starts at the corner."""
         return points, Lattice(self.corner, size)
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -176,7 +180,7 @@ class CameraWarp(Warp):
 
     @property
     def slant(self) -> NormalTransform:
-        """A step along the axis moves along the ray of the pixel."""
+        """The transform of a camera: a step along the axis of the warped space moves along the ray of a pixel."""
         x, y, z = self.axis.tolist()
         return NormalTransform(depth=1.0 / self.reference_depth, axis=(x, y, z))
 
@@ -233,17 +237,17 @@ class RangeWarp(Warp):
 
     @property
     def slant(self) -> NormalTransform:
-        """A step along the ray is shorter than one across it."""
+        """The transform of a scanner: a step along the ray is shorter than one across it."""
         return NormalTransform(ray=self.growth / (1.0 - self.growth))
 
 
 def _median(values: NDArray[np.float64]) -> float:
-    """Median of values, (n,), of many in a third of the time: only those near it, as some tell, are put in order."""
+    """Median of values, (n,). Of many values only those near it are put in order, which takes a third of the time."""
     n = len(values)
-    some = np.sort(values[:: n // _SOME + 1])
+    some = np.sort(values[:: n // _MEDIAN_SAMPLE + 1])
     low, high = some[[int(0.45 * len(some)), int(0.55 * len(some))]]
     near, at = values[(values >= low) & (values <= high)], n // 2 - np.count_nonzero(values < low)
-    if n < 4 * _SOME or not 1 <= at < len(near):
+    if n < 4 * _MEDIAN_SAMPLE or not 1 <= at < len(near):
         return float(np.median(values))
     near.partition((at - 1, at))
     return float(near[at] if n % 2 else near[at - 1 : at + 1].mean())
@@ -265,7 +269,7 @@ def _ranges(points: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> NDAr
 
 @routine
 def _ray(points: NDArray[np.float64], p: int, viewpoint: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """From a viewpoint to point p: x, y, z, and the range, at least `_MIN_LENGTH`."""
+    """Vector from a viewpoint to point p, x, y, z, and its length, at least `_MIN_LENGTH`, metres."""
     x, y, z = points[p, 0] - viewpoint[0], points[p, 1] - viewpoint[1], points[p, 2] - viewpoint[2]
     return x, y, z, max(math.sqrt(x * x + y * y + z * z), _MIN_LENGTH)
 
@@ -274,7 +278,7 @@ def _ray(points: NDArray[np.float64], p: int, viewpoint: NDArray[np.float64]) ->
 def warped_normal(
     slant: NormalTransform, x: float, y: float, z: float, a: float, b: float, c: float
 ) -> tuple[float, float, float]:
-    """The normal (a, b, c) in the warped space at the warped place (x, y, z); see `NormalTransform`."""
+    """Transform of the normal (a, b, c) of a plane at the warped place (x, y, z); see `NormalTransform`."""
     if slant.ray > 0.0:
         square = max(x * x + y * y + z * z, _MIN_LENGTH)
         along = slant.ray * (a * x + b * y + c * z) / square
@@ -289,7 +293,7 @@ def warped_normal(
 def _multiply(
     start: int, stop: int, points: NDArray[np.float64], axis: NDArray[np.float64], along: NDArray[np.float64]
 ) -> None:
-    """Set coordinates of points along an axis."""
+    """Set the coordinates of points along an axis."""
     for p in range(start, stop):
         along[p] = points[p, 0] * axis[0] + points[p, 2] * axis[2] + points[p, 1] * axis[1]  # as NumPy adds them
 
@@ -298,7 +302,7 @@ def _multiply(
 def _measure(
     start: int, stop: int, points: NDArray[np.float64], viewpoint: NDArray[np.float64], ranges: NDArray[np.float64]
 ) -> None:
-    """Set ranges of points."""
+    """Set the ranges of points from a viewpoint."""
     for p in range(start, stop):
         _, _, _, ranges[p] = _ray(points, p, viewpoint)
 
@@ -313,7 +317,7 @@ def _draw_near(
     growth: float,
     warped: NDArray[np.float64],
 ) -> None:
-    """Set places of points, about the viewpoint, as far away as `RangeWarp` says."""
+    """Set the warped positions of points about the viewpoint, as `RangeWarp` says."""
     for p in range(start, stop):
         x, y, z, distance = _ray(points, p, viewpoint)
         scale = (distance / reference_range) ** -growth
@@ -330,7 +334,7 @@ def _project(
     reference_depth: float,
     warped: NDArray[np.float64],
 ) -> None:
-    """Set places of points as a camera sees them, in metres at the reference depth."""
+    """Set the warped positions of points as `CameraWarp` says."""
     for p in range(start, stop):
         x, y, z = points[p, 0] - viewpoint[0], points[p, 1] - viewpoint[1], points[p, 2] - viewpoint[2]
         depth = x * axis[0] + y * axis[1] + z * axis[2]
