@@ -25,8 +25,9 @@ import numpy as np
 from numba import config
 from numpy.typing import NDArray
 
+from pcgraph.acquisition import pixel_lattice, pixels
 from pcgraph.acquisition.depth_image import DepthImage
-from pcgraph.acquisition.kinds import Scanner, Told, pixel_lattice, pixels
+from pcgraph.acquisition.kinds import Scanner, Told
 from pcgraph.acquisition.pixels import even_steps
 from pcgraph.acquisition.spacing_law import spacing_law
 from pcgraph.features.moments import moments_of_groups
