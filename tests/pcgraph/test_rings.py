@@ -13,9 +13,9 @@ from scipy.optimize import approx_fprime
 from tiers import draws
 
 import pcgraph
-from pcgraph.acquisition.rings import Rows, _slopes, scanner_of_rings
+from pcgraph.acquisition.rings import _slopes, scanner_of_rings
 from pcgraph.acquisition.spacing_law import law_on_rings, spacing_law
-from pcgraph.voxels.spacing import spacing_and_rows
+from pcgraph.voxels.spacing import Rows, spacing_and_rows
 
 NOWHERE = np.zeros((1, 3))
 
