@@ -431,7 +431,11 @@ SUPERVOXELS = (
         ("voxels/surface.py:_take_best", "voxels/surface.py:_OWN_BONUS"),
         {"supervoxels.surface_growth.local_planes": lambda f: lambda grid, places, reach: f(grid, places, 0)},
     ),
-    Part("distance off the plane", ("supervoxels/clustering.py:_off_plane", f"{_GROW}:_SLACK"), _metric(plane=0.0)),
+    Part(
+        "distance off the plane",
+        ("supervoxels/clustering.py:_off_plane", f"{_GROW}:_NOISE_OFF_PLANE"),
+        _metric(plane=0.0),
+    ),
     Part("distance of normals", (f"{_GROW}:SurfaceGrowth.normal_weight",), _metric(normal=0.0)),
     Part("distance of colours", (f"{_GROW}:SurfaceGrowth.color_weight",), _metric(color=0.0)),
     Part(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Disjoint sets as one array of links: each element leads to another of its set, the representative to itself."""
+"""Disjoint sets as one array of links: each element is linked to another of its set, the representative to itself."""
 
 from __future__ import annotations
 
@@ -20,6 +20,6 @@ def root_of(links: NDArray[np.integer], element: int) -> int:
 
 
 def connected_components(edges: NDArray[np.integer], n: int) -> NDArray[np.int32]:
-    """Component of each of n nodes that edges, (m, 2) int, join, (n,) int32, numbered in the order of first nodes."""
+    """Connected component of each of n nodes, (n,) int32, by edges, (m, 2) int; numbered in order of first nodes."""
     matrix = coo_array((np.ones(len(edges), np.bool_), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return np.asarray(csgraph.connected_components(matrix, directed=False)[1], np.int32)

@@ -17,7 +17,7 @@ from pcgraph.voxels.surface import Surface
 
 @dataclass(frozen=True)
 class BridgeThresholds:
-    """Which components a bridge joins, and which bridges hold a thinly sampled surface together.
+    """Thresholds that choose the components around a speck, and bridges within a thinly sampled surface.
 
     Attributes
     ----------
