@@ -22,8 +22,8 @@ class BridgeThresholds:
     Attributes
     ----------
     n_nearest : int, count
-        Nearest supervoxels of each supervoxel of a speck, among which the components around it are. Chosen by eye; not
-        varied.
+        Nearest supervoxels of each supervoxel of a speck; the components around the speck hold one of them. Chosen by
+        eye; not varied.
     max_width : float, voxel edges
         Width that is recorded at most, so that costs stay finite where a component is very far off.
     max_points : int, points

@@ -93,9 +93,8 @@ def _parse_header(content: bytes) -> tuple[str, list[PlyElement], bytes]:
         raise CloudReadError("expected a PLY header from 'ply' to 'end_header', but found none")
     code = ""
     elements: list[PlyElement] = []
-    for line in content[:end].split(b"\n")[
-        1:
-    ]:  # bytes: str has line ends and blanks that are parts of letters in UTF-8
+    # Of bytes, because str has line ends and blanks that are parts of letters in UTF-8.
+    for line in content[:end].split(b"\n")[1:]:
         words = [word.decode("latin-1") for word in line.split()]
         if words[:1] == ["format"] and len(words) == 3:
             if code:

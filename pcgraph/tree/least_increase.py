@@ -50,7 +50,7 @@ class WardLinkage(Linkage):
     default_part_altitude = 0.5  # the same; the seven faces of two synthetic boxes on a plane are the parts
 
     def __post_init__(self) -> None:
-        check_non_negative(self)
+        check_non_negative(self, "position", "normal", "color")
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the smallest increase first."""
@@ -84,7 +84,7 @@ class MumfordShahLinkage(Linkage):
     default_part_altitude = 0.1  # the same; the seven faces of two synthetic boxes on a plane are the parts
 
     def __post_init__(self) -> None:
-        check_non_negative(self)
+        check_non_negative(self, "plane", "normal", "color")
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the smallest scale first."""
