@@ -21,8 +21,9 @@ TextField = tuple[str, DTypeLike, int]
 """A field of a text file: its name, its type, and the count of its numbers for each point."""
 
 MAX_HEADER_BYTES = 1 << 16
-"""Bytes in which the header of a file must end: far more than any header has, so that a file that is none is refused
+"""Bytes in which the header of a file must end: far more than headers have, so that a file without one is refused
 before all of it is searched. Chosen by eye; not varied."""
+
 NORMAL_NAMES = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
 PACKED_NAMES = ("rgb", "rgba")
 COLOR_NAMES = ("red", "green", "blue")

@@ -14,12 +14,12 @@ CLIP = 4.0
 """Spreads from the median, at most, of a scaled value: 1 in 16 000 normally distributed values lies farther off, so
 that only outliers are clipped. Chosen by eye; not varied."""
 _STEPS = 4096.0
-"""Steps per spread of a scaled value: 2^12, so that sums over 10^11 points are exact in float64,
-and do not depend on the points' order."""
+"""Steps per spread of a scaled value: 2^12, so that sums over 10^11 points are exact in float64, and do not depend on
+the points' order."""
 _RANGES = ((0.25, 0.75, 1.349), (0.05, 0.95, 3.290), (0.01, 0.99, 4.653), (0.0, 1.0, 2.0 * CLIP))
-"""Two quantiles, fractions, and their distance in standard deviations: that of a normal distribution. The whole range
-counts as that of clipped values. The first range that is not 0 tells the spread, so that columns most of which is equal
-have one."""
+"""Two quantiles, fractions, and their distance in standard deviations: that of a normal distribution, or of clipped
+values for the whole range. The first range that is not 0 gives the spread, so that a column of mostly equal values has
+one."""
 
 
 @dataclass(frozen=True, eq=False)

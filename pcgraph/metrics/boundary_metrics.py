@@ -190,7 +190,7 @@ class NeighbourGraph(ShortRepr):
         return (own[self.neighbours] != own[:, None]).any(axis=1)
 
     def within_hops(self, marked: NDArray[np.bool_], hops: int) -> NDArray[np.bool_]:
-        """Whether each point of the graph is within so many steps of a marked one, (m,) bool, as `marked` is."""
+        """Whether each point reaches one of `marked`, (m,) bool, in at most `hops` steps to neighbours; (m,) bool."""
         check_nearness(hops)
         for _ in range(hops):
             marked = marked | marked[self.neighbours].any(axis=1)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.disjoint_sets import root_of
+from pcgraph.disjoint_sets import renumbered, root_of
 from pcgraph.parallel import in_blocks, inlined, kernel, routine
 from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
 from pcgraph.voxels.column_evidence import autocorrelation
@@ -544,19 +544,7 @@ def enforce_connectivity(
     names = np.full(n_supervoxels, -1, np.int32)
     n_initial = int(initial.max()) + 1
     names[:n_initial] = np.arange(n_initial)
-    return _renumber(kept, names, n_initial)
-
-
-@kernel
-def _renumber(labels: NDArray[np.int32], names: NDArray[np.int32], used: int) -> NDArray[np.int32]:
-    """Labels renamed by `names`, (n_supervoxels,) int32; those named -1 get new names, in the order of voxels."""
-    numbered = np.empty(len(labels), np.int32)
-    for i in range(len(labels)):
-        if names[labels[i]] < 0:
-            names[labels[i]] = used
-            used += 1
-        numbered[i] = names[labels[i]]
-    return numbered
+    return renumbered(kept, names, n_initial)
 
 
 @kernel

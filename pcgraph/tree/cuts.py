@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.disjoint_sets import renumbered
 from pcgraph.hierarchy import binary_children, num_leaves, propagate_sequential, propagation_sources
 from pcgraph.inputs import whole_number
 from pcgraph.parallel import kernel
@@ -65,25 +66,16 @@ def _merges(
     return int(np.searchsorted(merge_altitudes, float(level), side="right"))
 
 
-@kernel
 def numbered_segments(nodes: NDArray[np.int32], n_nodes: int) -> NDArray[np.int32]:
     """Segment of each leaf, (n_leaves,) int32, numbered from 0 in the order of their first leaf.
 
     Parameters
     ----------
     nodes : (n_leaves,) int32, 0..n_nodes - 1
-        Leaves with the same node share a segment.
+        Leaves with the same node are one segment.
     n_nodes : int
     """
-    number = np.full(n_nodes, -1, np.int32)
-    segments = np.empty(len(nodes), np.int32)
-    used = 0
-    for leaf in range(len(nodes)):
-        if number[nodes[leaf]] < 0:
-            number[nodes[leaf]] = used
-            used += 1
-        segments[leaf] = number[nodes[leaf]]
-    return segments
+    return renumbered(nodes, np.full(n_nodes, -1, np.int32), 0)
 
 
 # --- cores: segments of a least size ----------------------------------------------------------------------------------

@@ -19,8 +19,8 @@ from pcgraph.tree.linkage import Linkage, Merges
 from pcgraph.tree.single_linkage import single_linkage
 
 _MAX_STEP = 0.1
-"""Step, voxel edges, up to which an edge may be smooth beside what its angle explains: the default of PCL, from which
-the rule is (`setSmoothnessCheck`)."""
+"""Step, voxel edges, that a smooth edge may have beyond the step that its angle explains: the default of PCL, source of
+the rule (`setSmoothnessCheck`)."""
 
 
 @dataclass(frozen=True)

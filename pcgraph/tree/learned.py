@@ -35,8 +35,7 @@ peak itself is luck. Chosen by eye; not varied."""
 _MAX_NUMBER = 1e100
 """Largest number of a model, of any unit, and one over its least scale, so that a product of three is still finite."""
 _ALTITUDES = np.linspace(0.05, 0.95, 37)
-"""Altitudes, probabilities, among which that of objects is chosen: steps of 0.025, from boundaries that hardly any to
-those that nearly all edges are below."""
+"""Altitudes, probabilities, from which that of objects is chosen: steps of 0.025 over nearly all of 0..1."""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -78,6 +81,16 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     assert found == pytest.approx(evidence * weighed, rel=1e-5, abs=2e-6)
     assert found > 1e-3
     assert relief < 1000.0 or (known and side < 0.0) or stands_out > 0.1 * evidence
+
+
+def test_the_documentation_has_the_constants():
+    text = (Path(__file__).parents[2] / "docs" / "tree.md").read_text(encoding="utf-8")
+    table = text[text.index("| constant | | constant |") : text.index("**Terms.**")]
+    found = {
+        name: float(Fraction(value)) for name, value in re.findall(r"\| (\w\d?) \| ([\d./]+)(?: rad)? (?=\|)", table)
+    }
+    assert found == {name: getattr(K, name) for name in found}
+    assert set(found) == {"c0", "c1", "c2", "k1", "s0", "v1", "e0", "e1", "q0", "l0", "r", "m0", "m2"}
 
 
 def _normals_towards_the_smaller(leaves, side):
