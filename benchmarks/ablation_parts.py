@@ -242,17 +242,18 @@ def _altitude_part(name: str, **fields: float) -> Part:
     return Part(f"linkage: {name}", code, _altitude(**fields))
 
 
-def _threshold(name: str, file: str, thresholds: str, instance: str, *more: str, **fields: Any) -> Part:
-    """A part that fields of a dataclass of thresholds, of which a file has one instance, switch off."""
-    module = file.removesuffix(".py").replace("/", ".")
-    code = _constants(file, *(f"{thresholds}.{field}" for field in fields), *more)
-    return Part(name, code, {f"{module}.{instance}": lambda original: replace(original, **fields)})
-
-
 def _constant(name: str, file: str, constant: str, value: Any, *more: str) -> Part:
     """A part that a constant of a file switches off."""
     module = file.removesuffix(".py").replace("/", ".")
     return Part(name, (f"{file}:{constant}", *(f"{file}:{one}" for one in more)), {f"{module}.{constant}": _is(value)})
+
+
+def _threshold(name: str, file: str, settings: str, *more: str, **fields: Any) -> Part:
+    """A part that fields of a dataclass of thresholds switch off, which a file holds under a name."""
+    path = f"{file.removesuffix('.py').replace('/', '.')}.{settings}"
+    kind = type(Target.of(path).value).__name__
+    code = _constants(file, *(f"{kind}.{field}" for field in fields), *more)
+    return Part(name, code, {path: lambda held: replace(held, **fields)})
 
 
 def _function(name: str, file: str, function: str, replacement: Replacement, *constants: str) -> Part:
@@ -493,7 +494,6 @@ GRAPH = (
     _threshold(
         "bridges between specks",
         "graph/bridges.py",
-        "BridgeThresholds",
         "_THRESHOLDS",
         "_are_near",
         "BridgeThresholds.times_nearest",
@@ -512,15 +512,12 @@ LINKAGE = (
     _threshold(
         "cost: narrow valleys",
         "graph/boundary.py",
-        "NarrowValleys",
         "_NARROW",
-        "NarrowValleys.per_room",
-        "NarrowValleys.noise",
+        "ValleyThresholds.per_room",
+        "ValleyThresholds.noise",
         per_opening=1e9,
     ),
-    _threshold(
-        "cost: room in a valley", "graph/boundary.py", "NarrowValleys", "_NARROW", "NarrowValleys.noise", per_room=0.0
-    ),
+    _threshold("cost: room in a valley", "graph/boundary.py", "_NARROW", "ValleyThresholds.noise", per_room=0.0),
     Part(
         "linkage: relief R",
         (

@@ -174,6 +174,7 @@ STOREYS = [
     "kernel_cache",
     "io",
     "parallel",
+    "rounding",
     "disjoint_sets",
     "pairs",
     "hierarchy",

@@ -25,7 +25,7 @@ def in_whole_steps(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class NarrowValleys:
+class ValleyThresholds:
     """Cost of valleys into which hardly anything looks, since they are narrower than 45 degrees.
 
     Where normals differ by more than 135 degrees, a sheet was seen from both sides, or one normal is turned round. So
@@ -48,7 +48,7 @@ class NarrowValleys:
     noise: float = 0.7
 
 
-_NARROW = NarrowValleys()
+_NARROW = ValleyThresholds()
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class BoundaryCost:
     With h the step in voxel edges, at most `step_limit`::
 
         cost = (1 - contact) V(convexity) + contact V(contact_convexity) + step h
-        V    = min(a, 3 (pi - a) + 3 max(h - 0.7, 0))  of an edge that is concave by a, see `NarrowValleys`
+        V    = min(a, 3 (pi - a) + 3 max(h - 0.7, 0))  of an edge that is concave by a, see `ValleyThresholds`
         V    = convex a                                of an edge that is convex by a
 
     Attributes

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import EdgeFeatures
 from pcgraph.parallel import kernel, routine
+from pcgraph.rounding import NEARLY_ZERO
 from pcgraph.voxels.grid import Neighbourhood, most_around
 from pcgraph.voxels.surface import Surface
 
@@ -82,7 +83,7 @@ def facing_sides(
         edges=edges,
         voxels=voxels.reshape(-1, 2),
         positions=(places / voxels[:, None]).reshape(-1, 2, 3),
-        normals=(directions / np.maximum(norms, 1e-12)[:, None]).reshape(-1, 2, 3),  # normals may cancel
+        normals=(directions / np.maximum(norms, NEARLY_ZERO)[:, None]).reshape(-1, 2, 3),  # normals may cancel
         lengths=lengths,
     )
 

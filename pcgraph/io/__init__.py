@@ -46,7 +46,6 @@ def read_cloud(path: str | PathLike[str]) -> Cloud:
     try:
         return reader(content)
     except CloudReadError as error:
-        said = "".join(
-            c if c.isprintable() else ascii(c)[1:-1] for c in str(error)
-        )  # names of fields may have any characters
+        # Names of fields may have any characters.
+        said = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(error))
         raise CloudReadError(f"{path}: {said[:MAX_REASON]}") from None

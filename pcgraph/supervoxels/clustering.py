@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pcgraph.disjoint_sets import renumbered, root_of
 from pcgraph.parallel import in_blocks, inlined, kernel, routine
+from pcgraph.rounding import NEARLY_ZERO
 from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
 from pcgraph.voxels.column_evidence import autocorrelation
 from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
@@ -181,7 +182,8 @@ def set_means(sums: NDArray[np.float64], means: NDArray[np.float64], slant: Norm
     across = sums.shape[1] - 1
     for s in range(len(sums)):
         if sums[s, 9] > 0.0:
-            length = max(np.sqrt(sums[s, 3] ** 2 + sums[s, 4] ** 2 + sums[s, 5] ** 2), 1e-12)  # normals may cancel
+            # The sum is nearly zero if the normals cancel.
+            length = max(np.sqrt(sums[s, 3] ** 2 + sums[s, 4] ** 2 + sums[s, 5] ** 2), NEARLY_ZERO)
             for column in range(9):
                 means[s, column] = sums[s, column] / (length if 3 <= column < 6 else sums[s, 9])
             for column in range(9, across):

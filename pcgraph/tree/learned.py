@@ -19,6 +19,7 @@ from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import in_whole_steps
 from pcgraph.graph.contacts import angle_between
 from pcgraph.plumbing.plain_files import read_file, write_file
+from pcgraph.rounding import TINY
 from pcgraph.tree.average_linkage import average_linkage
 from pcgraph.tree.linkage import Linkage, Merges
 from pcgraph.tree.tree import segmentation_tree
@@ -131,7 +132,7 @@ def edge_evidence(graph: AdjacencyGraph) -> dict[str, NDArray[np.float64]]:
     i, j = graph.edges.T
     apart = nodes.centroid[i] - nodes.centroid[j]
     crease = angle_between(np.cross(nodes.normal[i], nodes.normal[j]), apart)
-    apart /= np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    apart /= np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), TINY)
     rise_i = np.einsum("ij,ij->i", apart, nodes.normal[i])
     rise_j = -np.einsum("ij,ij->i", apart, nodes.normal[j])
     return {
