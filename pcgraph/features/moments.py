@@ -175,9 +175,9 @@ def moments_up_tree(leaves: Moments, parents: NDArray[np.int32]) -> Moments:
     if leaves.colors is not None:
         again, colors = _with_room(leaves.counts, len(parents)), _with_room(leaves.colors, len(parents))
         spread = np.zeros((len(leaves), 3, 3)) if leaves.color_scatters is None else leaves.color_scatters
-        pooled = _with_room(spread, len(parents))
-        accumulate_moments(parents, again, colors, pooled)
-        color_scatters = None if leaves.color_scatters is None else pooled
+        spreads = _with_room(spread, len(parents))
+        accumulate_moments(parents, again, colors, spreads)
+        color_scatters = None if leaves.color_scatters is None else spreads
     if leaves.normals is not None:
         normals = _with_room(leaves.normals, len(parents))
         accumulate_means(parents, counts, len(leaves), normals)

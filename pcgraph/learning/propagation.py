@@ -67,15 +67,15 @@ def accumulate(
     if weights is not None and reduce != "mean":
         raise ValueError(f"expected no weights for reduce={reduce!r}; only a mean weighs")
     if reduce == "mean":
-        pooled = _mean_up(tree, table, _weights(weights, tree))
+        accumulated = _mean_up(tree, table, _weights(weights, tree))
     elif reduce == "sum":
-        pooled = _sum_up(tree, table)
+        accumulated = _sum_up(tree, table)
     else:
         known = ~np.isnan(table)
         least = -np.inf if reduce == "max" else np.inf
         extreme = accumulate_sequential(tree.parents, np.where(known, table, least), reduce)
-        pooled = np.where(_sum_up(tree, known) > 0, extreme, np.nan)
-    return pooled[:, 0] if flat else pooled
+        accumulated = np.where(_sum_up(tree, known) > 0, extreme, np.nan)
+    return accumulated[:, 0] if flat else accumulated
 
 
 def accumulate_points(segmentation: Segmentation, values: ArrayLike, reduce: Reduction = "mean") -> NDArray[Any]:
@@ -106,14 +106,14 @@ def accumulate_points(segmentation: Segmentation, values: ArrayLike, reduce: Red
     if reduce in ("max", "min"):
         extreme = np.full((tree.n_leaves, table.shape[1]), np.nan)
         (np.fmax if reduce == "max" else np.fmin).at(extreme, leaf, table.astype(np.float64))
-        pooled = accumulate(tree, extreme, reduce=reduce)
+        accumulated = accumulate(tree, extreme, reduce=reduce)
     else:
         values = _summable(np.where(known, table, 0)) if reduce == "sum" else np.where(known, table, 0.0)
-        pooled = _sum_up(tree, _sums(leaf, values, tree.n_leaves))
+        accumulated = _sum_up(tree, _sums(leaf, values, tree.n_leaves))
         if reduce == "mean":
             with np.errstate(invalid="ignore"):
-                pooled = pooled / _sum_up(tree, _sums(leaf, known.astype(np.int64), tree.n_leaves))
-    return pooled[:, 0] if flat else pooled
+                accumulated = accumulated / _sum_up(tree, _sums(leaf, known.astype(np.int64), tree.n_leaves))
+    return accumulated[:, 0] if flat else accumulated
 
 
 def unpool(segmentation: Segmentation, values: ArrayLike, nodes: ArrayLike | None = None) -> NDArray[Any]:
