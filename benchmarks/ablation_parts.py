@@ -134,8 +134,8 @@ def _with(**fields: float) -> Replacement:
     return lambda original: lambda self, *arguments: original(replace(self, **fields), *arguments)
 
 
-def _shape(**fields: float) -> dict[str, Replacement]:
-    return {"tree.region_linkage._SHAPE": lambda shape: shape._replace(**fields)}
+def _altitude(**fields: float) -> dict[str, Replacement]:
+    return {"tree.region_linkage._CONSTANTS": lambda constants: constants._replace(**fields)}
 
 
 def _linkage(**fields: float) -> dict[str, Replacement]:
@@ -271,8 +271,9 @@ _IMAGE, _GROW, _GAPS, _BEHIND = (
 _V = "voxels.virtual_viewpoints."
 
 
-def _shape_part(name: str, **fields: float) -> Part:
-    return Part(f"linkage: {name}", _constants(_LINK, *(f"_Shape.{field}" for field in fields)), _shape(**fields))
+def _altitude_part(name: str, **fields: float) -> Part:
+    code = _constants(_LINK, *(f"AltitudeConstants.{field}" for field in fields))
+    return Part(f"linkage: {name}", code, _altitude(**fields))
 
 
 def _constant(name: str, file: str, constant: str, value: Any, *more: str) -> Part:
@@ -328,10 +329,10 @@ GROUPS = (
     ),
     Part(
         "all: colours",
-        ("voxels/column_evidence.py:color_evidence", f"{_LINK}:RegionLinkage.color", f"{_LINK}:_Shape.k1"),
+        ("voxels/column_evidence.py:color_evidence", f"{_LINK}:RegionLinkage.color", f"{_LINK}:AltitudeConstants.k1"),
         {"scan.clean_cloud": lambda f: lambda points, colors, *others: f(points, None, *others)},
     ),
-    Part("all: relief and heaps", (f"{_LINK}:_standing_out",), _linkage(relief=0.0) | _shape(h1=0.0)),
+    Part("all: relief and heaps", (f"{_LINK}:_standing_out",), _linkage(relief=0.0) | _altitude(h1=0.0)),
 )
 
 CAMERAS = (
@@ -500,7 +501,11 @@ SUPERVOXELS = (
         ("voxels/surface.py:_take_best", "voxels/surface.py:_OWN_BONUS"),
         {"supervoxels.surface_growth.local_planes": lambda f: lambda grid, places, reach: f(grid, places, 0)},
     ),
-    Part("distance off the plane", ("supervoxels/clustering.py:_off_plane", f"{_GROW}:_SLACK"), _metric(plane=0.0)),
+    Part(
+        "distance off the plane",
+        ("supervoxels/clustering.py:_off_plane", f"{_GROW}:_NOISE_OFF_PLANE"),
+        _metric(plane=0.0),
+    ),
     Part("distance of normals", (f"{_GROW}:SurfaceGrowth.normal_weight",), _metric(normal=0.0)),
     Part("distance of colours", (f"{_GROW}:SurfaceGrowth.color_weight",), _metric(color=0.0)),
     Part(
@@ -543,8 +548,8 @@ GRAPH = (
         {"graph.gaps._ends_of_surfaces": lambda f: lambda grid, *others: np.flatnonzero(boundary_voxels(grid))},
     ),
     Part("gaps: wider in one scan", ("voxels/warp.py:RangeWarp.max_gap",), {"voxels.warp.RangeWarp.max_gap": _is(3.0)}),
-    Part("gaps: price", (f"{_LINK}:RegionLinkage.gap", f"{_LINK}:_OF_SEVERAL"), _linkage(gap=0.0)),
-    _constant("gaps: cheaper in several scans", _LINK, "_OF_SEVERAL", 1.0),
+    Part("gaps: price", (f"{_LINK}:RegionLinkage.gap", f"{_LINK}:_GAP_OF_SEVERAL_SCANS"), _linkage(gap=0.0)),
+    _constant("gaps: cheaper in several scans", _LINK, "_GAP_OF_SEVERAL_SCANS", 1.0),
     Part("continuations", (f"{_BEHIND}:continuations",), _NO_CONTINUATIONS),
     _constant("continuations: open borders", _BEHIND, "_OPEN", math.inf, "_count_open", "_both_ways"),
     _constant("continuations: wide enough", _BEHIND, "_SUPPORT", 0.0),
@@ -555,7 +560,15 @@ GRAPH = (
     Part("terrain", ("graph/terrain.py",), _NO_TERRAIN),
     _function("terrain: pieces that touch", "graph/terrain.py", "_touching", _gives(np.empty((0, 2), np.int64))),
     Part("bridges", ("graph/bridges.py", f"{_LINK}:RegionLinkage.bridge"), {"scan.bridges": _gives(_NO_BRIDGES)}),
-    _constant("bridges between specks", "graph/bridges.py", "_FEW", 0, "_are_near", "_AS_NEAR", "_MAX_WIDTH_BETWEEN"),
+    _threshold(
+        "bridges between specks",
+        "graph/bridges.py",
+        "_THRESHOLDS",
+        "_are_near",
+        "BridgeThresholds.times_nearest",
+        "BridgeThresholds.max_width_of_surface",
+        max_points=0,
+    ),
 )
 
 LINKAGE = (
@@ -565,33 +578,43 @@ LINKAGE = (
     Part(
         "cost: steps", _constants("graph/boundary.py", "BoundaryCost.step", "BoundaryCost.step_limit"), _cost(step=0.0)
     ),
-    _constant("cost: narrow valleys", "graph/boundary.py", "_AS_IT_CLOSES", 1e9, "_WITH_ROOM", "_NO_ROOM"),
-    _constant("cost: room in a valley", "graph/boundary.py", "_WITH_ROOM", 0.0, "_NO_ROOM"),
+    _threshold(
+        "cost: narrow valleys",
+        "graph/boundary.py",
+        "_NARROW",
+        "ValleyThresholds.per_room",
+        "ValleyThresholds.noise",
+        per_opening=1e9,
+    ),
+    _threshold("cost: room in a valley", "graph/boundary.py", "_NARROW", "ValleyThresholds.noise", per_room=0.0),
     Part(
         "linkage: relief R",
-        (f"{_LINK}:RegionLinkage.relief", *_constants(_LINK, "_Shape.b1", "_Shape.d1", "_Shape.v0")),
+        (
+            f"{_LINK}:RegionLinkage.relief",
+            *_constants(_LINK, *(f"AltitudeConstants.{field}" for field in ("b1", "d1", "v0"))),
+        ),
         _linkage(relief=0.0),
     ),
-    _shape_part("heaps H", h1=0.0, h0=0.0),
+    _altitude_part("heaps H", h1=0.0, h0=0.0),
     Part(
         "linkage: relief only outwards",
         (f"{_LINK}:_Outlines.sides_known",),
         {"tree.region_linkage._Outlines": _then(lambda outlines: outlines._replace(sides_known=False))},
     ),
-    _shape_part("relief: far off the plane counts less (d1)", d1=math.inf),
-    _shape_part("relief: noise v0", v0=0.0),
+    _altitude_part("relief: far off the plane counts less (d1)", d1=math.inf),
+    _altitude_part("relief: noise v0", v0=0.0),
     Part("linkage: colours", (f"{_LINK}:RegionLinkage.color",), _linkage(color=0.0)),
-    _shape_part("valley where colours change (k1)", k1=0.0),
-    _shape_part("least evidence c0", c0=0.0),
-    _shape_part("increase in the evidence (c1)", c1=0.0),
-    _shape_part("steep valleys (c2, s0, u)", c2=math.inf, s0=0.5),
+    _altitude_part("valley where colours change (k1)", k1=0.0),
+    _altitude_part("least evidence c0", c0=0.0),
+    _altitude_part("increase in the evidence (c1)", c1=0.0),
+    _altitude_part("steep valleys (c2, s0, u)", c2=math.inf, s0=0.5),
     _function("linkage: smoothness u of what is steep", _LINK, "_smoothness", _is(_all_smooth)),
-    _shape_part("same plane first: e0", e0=1e-9),
-    _shape_part("uneven surfaces (e1, q0)", e1=0.0, q0=2.0),
-    _shape_part("much larger surfaces late (r)", r=1e12),
-    _shape_part("small pieces early (m0)", m0=0.0),
-    _shape_part("specks early (m1)", m1=0.0),
-    _shape_part("small masses (m2)", m2=0.0),
+    _altitude_part("same plane first: e0", e0=1e-9),
+    _altitude_part("uneven surfaces (e1, q0)", e1=0.0, q0=2.0),
+    _altitude_part("much larger surfaces late (r)", r=1e12),
+    _altitude_part("small pieces early (m0)", m0=0.0),
+    _altitude_part("specks early (m1)", m1=0.0),
+    _altitude_part("small masses (m2)", m2=0.0),
 )
 
 PARTS: tuple[Part, ...] = (*GROUPS, *CAMERAS, *LAW, *SIZES, *NOISE, *SIDES, *SUPERVOXELS, *GRAPH, *LINKAGE)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from os import PathLike
 from typing import NamedTuple
@@ -343,6 +343,12 @@ def non_negative(name: str, value: float) -> float:
     if not 0.0 <= number < float("inf"):
         raise ValueError(f"expected {name} to be a finite number, not negative, got {value!r}")
     return number
+
+
+def check_non_negative(settings: object, *names: str) -> None:
+    """Raise ValueError unless `non_negative` takes these attributes of a dataclass; by default all its fields."""
+    for name in names or [field.name for field in fields(settings)]:  # type: ignore[arg-type]
+        non_negative(name, getattr(settings, name))
 
 
 def fraction(name: str, value: float) -> float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a method of grouping voxels has to provide."""
+"""The interface of methods that group voxels."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _NEAR = 0.02
 
 
 class SupervoxelMethod(ABC):
-    """How voxels become supervoxels.
+    """A method that groups voxels into supervoxels.
 
-    A method is a frozen dataclass of its settings, in a file of its own: `Vccs` is the shortest example. The steps in
-    `pcgraph.supervoxels.clustering` may be used or not.
+    A method is a frozen dataclass of its settings, in a file of its own; `Vccs` is the shortest example. It may use the
+    steps in `pcgraph.supervoxels.clustering`.
     """
 
     @abstractmethod
     def planes(self, grid: VoxelGrid, viewpoints: NDArray[np.float64]) -> LocalPlanes:
-        """The plane on which each voxel lies, seen from (3,) or (v, 3) float64, metres."""
+        """Plane of each voxel, whose normal points to the viewpoints, (3,) or (v, 3) float64, metres."""
 
     @abstractmethod
     def supervoxels(
@@ -36,8 +36,8 @@ class SupervoxelMethod(ABC):
     ) -> NDArray[np.int32]:
         """Supervoxel of each voxel, (v,) int32, numbered from 0 without gaps.
 
-        Every voxel has one, and every supervoxel is connected in the 26-neighbourhood. Initial labels keep their
-        numbers and voxels; others follow in the order of their first voxel.
+        Every voxel has a supervoxel, and every supervoxel is connected in the 26-neighbourhood. Initial supervoxels
+        keep their numbers and voxels; others follow in the order of their first voxel.
 
         Parameters
         ----------
@@ -53,17 +53,17 @@ class SupervoxelMethod(ABC):
     def supervoxel_of_point(
         self, points: NDArray[np.float64], grid: VoxelGrid, planes: LocalPlanes, supervoxels: NDArray[np.int32]
     ) -> NDArray[np.int32]:
-        """Supervoxel of each point, (n,) int32, given that of each voxel, (v,) int32: that of the point's voxel."""
+        """Supervoxel of each point, (n,) int32, given those of voxels, (v,) int32: here that of the point's voxel."""
         return supervoxels[grid.voxel_of_point]
 
 
 def checked_supervoxels(found: NDArray[np.int32], n_voxels: int, method: object) -> NDArray[np.int32]:
-    """The supervoxels that a method made of so many voxels, (v,) int32.
+    """The supervoxels that a method made of `n_voxels` voxels, (v,) int32, checked.
 
     Raises
     ------
     ValueError
-        They are not one whole number per voxel, 0..k - 1, with none left out.
+        They are not one whole number per voxel, 0..k - 1 without gaps.
     """
     name = f"{type(method).__name__}.supervoxels"
     labels = np.asarray(found)
