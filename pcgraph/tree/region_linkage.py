@@ -464,7 +464,7 @@ def _standing_out(
     constants: AltitudeConstants,
     normal: NDArray[np.float64],
 ) -> float:
-    """Evidence, radians, that the smaller region at an edge stands out of the larger one: relief R + H of docs/pcgraph_method.md.
+    """Evidence, radians, that the smaller region at an edge stands out of the larger: R + H of docs/pcgraph_method.md.
 
     `normal` is scratch.
     """
