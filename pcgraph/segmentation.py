@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a cloud becomes: supervoxels, graph, tree and objects."""
+"""Segmentation of a cloud: its supervoxels, graph, tree and objects."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class Segmentation:
 
     @property
     def acquisition(self) -> Acquisition:
-        """What took the cloud, from where, and what tells so."""
+        """The sensor that took the cloud, its place, and the evidence for both."""
         return self.graph.acquisition
 
     @property
@@ -199,7 +199,7 @@ class Segmentation:
         return self._in_input_shape(point_saliency(self.tree, self.surface), np.nan)
 
     def occlusions(self) -> Occlusions:
-        """Which supervoxels hide which from the viewpoint, and what may go on behind them.
+        """Pairs of supervoxels of which one hides the other from the viewpoint, and surfaces that may go on behind it.
 
         Neighbours in an organised input's image, or in bearing where there is no image. After an update the
         viewpoint, and the image, are those of the last scan.

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What took a cloud, from where, and what tells so."""
+"""Acquisition of a cloud: the sensor, its place, and the evidence for both."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Acquisition: what took a cloud, from where, and what says so.
+"""Kinds of acquisition: what took a cloud, from where, and which evidence says so.
 
 `acquisition_of` looks at what the caller gave and at the pixels; `Acquisition.with_spacing` at how the spacing of
 points grows with range; `Acquisition.confirmed` at what is visible. After that nothing asks again. Each kind of
@@ -40,16 +40,18 @@ from pcgraph.voxels.visibility import (
 from pcgraph.voxels.warp import FORWARDS, CameraWarp, RangeWarp, Warp
 
 RANGE_GROWTH = 0.5
-"""Power of the range with which voxels of one scan grow by default: near detail and far surfaces stay in one piece."""
+"""Power of the range with which voxels of one scan grow by default, dimensionless. Near detail and far surfaces stay in
+one piece. Without the growth, scores lose 0.008 in the mean (docs/pcgraph_experiments.md)."""
 _MIN_SHOWN = 0.8
 """Fraction of the surface that a scanner's estimated position must see. What a moving scanner passed has sides that the
 middle of its way does not see. Without this check two mobile scans lose 0.18 of their facing (ablation)."""
 _MAX_PLACES = 3
-"""Number of places from which continuations are sought, where the cloud was not seen from one. Not varied."""
+"""Count of places from which continuations are sought, where the cloud was not seen from one: chosen by eye; one place
+changes no score (docs/pcgraph_experiments.md)."""
 _SAMPLED_VOXELS = 64
-"""Number of voxels whose points' viewpoints are candidates for these places. Not varied."""
+"""Count of voxels whose points' viewpoints are candidates for these places: chosen by eye, not varied."""
 _FAR_AWAY = 1e3
-"""Distance, in voxel edges, of the points that fix the sign of a plane's normal: so far that all rays are parallel."""
+"""Distance, in voxel edges, of the points that fix the sign of a plane's normal: so far that rays are parallel."""
 _UPWARDS = np.array([0.0, 0.0, 1.0])
 
 PlanesFrom = Callable[[VoxelGrid, NDArray[np.float64]], LocalPlanes]
@@ -57,7 +59,7 @@ PlanesFrom = Callable[[VoxelGrid, NDArray[np.float64]], LocalPlanes]
 
 
 class Evidence(Enum):
-    """What tells where a cloud was seen from, and whether that is sure."""
+    """Evidence of the place from which a cloud was seen."""
 
     GIVEN = "sure: it was given"
     PIXELS = "sure: the order of its pixels tells"
@@ -67,7 +69,7 @@ class Evidence(Enum):
 
     @property
     def is_sure(self) -> bool:
-        """Whether it leaves no doubt."""
+        """True if the evidence leaves no doubt."""
         return self in (Evidence.GIVEN, Evidence.PIXELS, Evidence.RINGS)
 
 
@@ -86,12 +88,12 @@ class OrientedPlanes(NamedTuple):
 
 
 class Told(NamedTuple):
-    """What the caller and the pixels tell of an acquisition.
+    """Facts about an acquisition that the caller gave or the pixels tell.
 
     Attributes
     ----------
     evidence : Evidence
-        What tells the viewpoint.
+        Evidence of the viewpoint.
     image : DepthImage, or None
         What a camera measured, pixel by pixel, if the points are pixels of one.
     normals : bool
@@ -108,12 +110,12 @@ class Told(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Acquisition(ABC):
-    """How a cloud was taken.
+    """The acquisition of a cloud: by which sensor it was taken, and from where.
 
     Attributes
     ----------
     told : Told
-        What the caller and the pixels tell.
+        Facts that the caller gave or the pixels tell.
 
     Examples
     --------
@@ -130,7 +132,7 @@ class Acquisition(ABC):
 
     @property
     def viewpoint(self) -> NDArray[np.float64] | None:
-        """Where the sensor stood, metres, the points' frame: (3,), or (n, 3) for n points; None if that is unknown."""
+        """Position of the sensor, (3,) or for each of n points (n, 3), metres, the points' frame; None if unknown."""
         return None
 
     def viewpoint_of(self, cloud: CleanCloud) -> NDArray[np.float64] | None:
@@ -145,7 +147,7 @@ class Acquisition(ABC):
 
     @property
     def is_one_scan(self) -> bool:
-        """Whether one sensor took all points from about one place, and voxels grow with the distance from it.
+        """True if one sensor took all points from about one place, and voxels grow with the distance from it.
 
         Voxels then follow the spacing of the points, so that a gap between voxels means more than among several scans.
         """
@@ -153,12 +155,12 @@ class Acquisition(ABC):
 
     @property
     def has_pixels(self) -> bool:
-        """Whether the points are pixels of a camera, whose spacing along rows and along columns may differ."""
+        """True if the points are pixels of a camera, whose spacing along rows and along columns may differ."""
         return False
 
     @property
     def sides_known(self) -> bool:
-        """Whether it is known, and not guessed, on which side of a surface the outside is."""
+        """True if the outer side of surfaces is known, and not guessed."""
         return self.told.normals or self.viewpoint is not None
 
     def with_spacing(self, cloud: CleanCloud) -> tuple[Acquisition, float | None]:
@@ -170,7 +172,7 @@ class Acquisition(ABC):
         return self
 
     def warp(self, points: NDArray[np.float64]) -> Warp:
-        """How voxels of these points, (n, 3), grow; the identity if they do not."""
+        """The warp by which voxels of points, (n, 3), grow; the identity if they do not."""
         return Warp()
 
     @abstractmethod
@@ -179,7 +181,7 @@ class Acquisition(ABC):
 
     @abstractmethod
     def __str__(self) -> str:
-        """What took the cloud and from where, as in "seen by one camera at (0, 0, 0) m"."""
+        """The acquisition in words, as in "seen by one camera at (0, 0, 0) m"."""
 
     def __repr__(self) -> str:
         return f"Acquisition({self}; {self.told.evidence.value})"
@@ -412,7 +414,7 @@ class SeveralScans(Acquisition):
 
     @property
     def viewpoint(self) -> NDArray[np.float64] | None:
-        """That of the last scan."""
+        """The viewpoint of the last scan."""
         return self.scans[-1].viewpoint
 
     def viewpoint_of(self, cloud: CleanCloud) -> NDArray[np.float64] | None:
@@ -424,7 +426,7 @@ class SeveralScans(Acquisition):
 
     @property
     def is_one_scan(self) -> bool:
-        """Whether the first scan, by which voxels grow, is one."""
+        """True if the first scan is one, as voxels grow by that."""
         return self.scans[0].is_one_scan
 
     @property

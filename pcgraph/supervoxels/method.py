@@ -14,9 +14,9 @@ from pcgraph.voxels.grid import VoxelGrid
 from pcgraph.voxels.surface import LocalPlanes
 
 _MAX_TRIES = 8
-"""Number of spacings that are tried for a number of supervoxels. Not varied."""
+"""Count of spacings that are tried for a number of supervoxels: chosen by eye, not varied."""
 _NEAR = 0.02
-"""Logarithm of the ratio of supervoxels to those asked for at which the search ends: 2 per cent."""
+"""Logarithm of the ratio of supervoxels to those asked for at which the search ends, so 2 %: chosen by eye."""
 
 
 class SupervoxelMethod(ABC):

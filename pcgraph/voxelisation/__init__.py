@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From points to voxels: how large voxels are, and which points are noise."""
+"""Voxels of a cloud: their size, and the points that are noise."""

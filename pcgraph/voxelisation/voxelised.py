@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From points to voxels: how large voxels are, and which points are noise."""
+"""A cloud in voxels: their size by the spacing of points and the surfaces, and no noise."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from pcgraph.voxels.spacing import VOXELS_PER_SPACING, median_spacing
 from pcgraph.voxels.warp import Warp
 
 _SIZES_PER_OCTAVE = 16
-"""Number of default voxel sizes per octave of the cloud's extent, so that a few points more or less change no voxel.
-Its effect on the scores is noise (ablation)."""
+"""Count of default voxel sizes per octave of the cloud's extent, so that a few points more or less change no voxel. Its
+effect on the scores is noise (docs/pcgraph_experiments.md)."""
 _GRID_OFFSET = 0.382
 """Distance, in voxel edges, from the grid's origin to the lowest corner of the cloud. It is no simple fraction, so that
 points on a lattice, and walls a whole number of voxels apart, are not on a border between cells. 0.618 is as good."""
 _FEW_OUTLIERS = 0.95
-"""Fraction of the points left from which on scale and acquisition are not estimated again. Not varied."""
+"""Fraction of the points left from which on scale and acquisition are not estimated again: chosen by eye."""
 _NOISY = 0.9
 """Fraction of the points left up to which outliers are also sought in voxels half as large. At 10 % of noise that costs
 marinas 0.04 of covering, so that it is not done for less."""
@@ -93,7 +93,7 @@ class Voxelised:
 
 
 class Voxelisation(NamedTuple):
-    """What becomes of a cloud in voxels.
+    """A cloud in voxels, and the numbers by which they were chosen.
 
     Attributes
     ----------
@@ -155,7 +155,7 @@ def without_flying_pixels(cloud: CleanCloud, image: DepthImage | None) -> CleanC
 
 
 class _Noise(NamedTuple):
-    """What was found to be noise.
+    """The noise that was found.
 
     Attributes
     ----------

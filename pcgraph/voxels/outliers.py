@@ -215,7 +215,7 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
 
 
 def far_from(other: VoxelGrid, grid: VoxelGrid, voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Those of some voxels of a grid, (v,) bool, that have no voxel of another grid within three edges of the larger.
+    """Voxels of a grid, out of some, (v,) bool, that have no voxel of another grid within three edges of the larger.
 
     Both grids have the same size and warp.
     """
