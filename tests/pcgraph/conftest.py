@@ -6,6 +6,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -26,7 +27,7 @@ FIRST = (
     *("test_properties",),
 )
 HERE = Path(__file__).parent
-REAL_CLOUDS = Path(__file__).resolve().parents[3] / "shared" / "data" / "mosd"
+REAL_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -53,7 +54,16 @@ def rooms():
 @pytest.fixture(scope="session")
 def real_clouds() -> list[Path]:
     """Paths of the labelled real clouds."""
-    paths = sorted(REAL_CLOUDS.glob("*.pcd"))
+    paths = sorted((REAL_DATA / "mosd").glob("*.pcd"))
     if not paths:
-        pytest.skip(f"the real clouds are not here: {REAL_CLOUDS}")
+        pytest.skip(f"the real clouds are not here: {REAL_DATA / 'mosd'}")
     return paths
+
+
+@pytest.fixture(scope="session")
+def real_sweep() -> np.ndarray:
+    """Points (n, 3) that a 64-beam LiDAR on a car sees ahead of it, the scanner at 0."""
+    path = REAL_DATA / "lidar" / "kitti_000008.bin"
+    if not path.exists():
+        pytest.skip(f"the real sweep is not here: {path}")
+    return np.fromfile(path, np.float32).reshape(-1, 4)[:, :3]
