@@ -103,8 +103,8 @@ def find_planes(
     up : (3,) float, optional
         Against gravity, in the points' frame; decides roles only. Default: the normal of the largest plane.
     tolerance : float, metres, optional
-        Largest root mean square distance of a supervoxel to its plane; whole regions join within 0.3 of it. Default:
-        0.7 of the mean edge of its voxels, which grow with range where the points of a scan lie further apart.
+        Largest root mean square distance of a supervoxel to its plane; planes of whole regions join within 0.4 of
+        it. Default: 0.7 of the mean edge of its voxels, which grow with range where points lie further apart.
     angle : float, radians, 0..pi/2
         Largest angle between a supervoxel and its plane.
     min_area : float, square metres, optional
