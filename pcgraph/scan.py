@@ -20,12 +20,10 @@ from pcgraph.depth_image import DepthImage, axis_at, image_view, is_camera_image
 from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.graph.bounding_planes import bounding_planes
 from pcgraph.graph.bridges import bridges
 from pcgraph.graph.contacts import contacts, edge_features
 from pcgraph.graph.continuations import continuations, faces_of
 from pcgraph.graph.gaps import gaps
-from pcgraph.graph.terrain import terrain
 from pcgraph.inputs import (
     CleanCloud,
     Features,
@@ -449,14 +447,11 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     faces = faces_of(touching.edges, features, len(leaves))
     # no place saw all of several scans
     seen_from = grid.warp.seen_from if earlier is None else None
+    places = scan.oriented.viewpoints if scan.oriented.viewpoint_known else np.empty((0, 3))
     near, hidden = side_by_side(
-        lambda: gaps(surface, nodes, touching.edges, seen_from),
-        lambda: continuations(surface, nodes, faces, scan.oriented.viewpoints),
+        lambda: gaps(surface, nodes, touching.edges, seen_from), lambda: continuations(surface, nodes, faces, places)
     )
-    of_planes, of_ground = side_by_side(
-        lambda: bounding_planes(surface, nodes, faces), lambda: terrain(surface, nodes, faces)
-    )
-    hidden = hidden.with_others(of_planes).without(touching.edges).without(near.edges).with_others(of_ground)
+    hidden = hidden.without_coplanar(touching.edges).without_coplanar(near.edges)
     graph = AdjacencyGraph(
         touching.edges, features, nodes, near, hidden, color_evidence=evidence, sides_known=scan.sides_known
     )

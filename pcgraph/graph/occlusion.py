@@ -13,11 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.nodes import NodeFeatures
-from pcgraph.graph.continuations import MIN_GAP, REACH, Continuations, continuations_of
+from pcgraph.graph.continuations import Continuations, continuations_of
 from pcgraph.graph.spherical_image import SphericalImage, View, depth_jumps, spherical_image, surfels_of, view_from
 from pcgraph.pairs import distinct_pairs
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.surface import Surface
+
+REACH, MIN_GAP = 8.0, 3.0
+"""How wide a gap without data is looked across, and what difference of range parts surfaces, in voxels."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -102,9 +102,8 @@ class RegionLinkage(Linkage):
 
     - contacts: voxels that touch;
     - gaps, at a price (`pcgraph.graph.gaps.gaps`);
-    - continuations behind what hides a surface, and of planes that bound the scene, at no cost
-      (`pcgraph.graph.continuations.continuations`, `pcgraph.graph.bounding_planes.bounding_planes`);
-    - terrain, at the altitude of objects if they do no sooner (`pcgraph.graph.terrain.terrain`);
+    - continuations of a plane behind what hides it, at no cost (`pcgraph.graph.continuations.continuations`);
+    - those of terrain, at the altitude of objects if they do no sooner;
     - bridges from specks (`pcgraph.graph.bridges.bridges`): where nothing else joins two regions, above the altitude of
       objects, at their mean cost times m / (m + 1), so that specks are the first to go in coarser cuts. Bridges between
       specks of a few points that lie about as near to each other as to anything count as contacts at 3 rad, so that a

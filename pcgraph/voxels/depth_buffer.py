@@ -18,7 +18,7 @@ _MAX_BINS = 512  # along each side: a map that stays in the cache
 _SLANTED = np.float32(8.0)  # widths between surfels of one surface of which one may seem to hide the other
 _STEEPEST = np.float32(4.0)  # of a surfel that is seen at a slant: tangent of its angle
 _TINY = 1e-12
-_NOTHING = np.iinfo(np.int64).max
+_NOTHING = (0x7F800000 << 32) + (1 << 32) - 1  # a bin with no surfel: its range is the infinity of float32
 _NUMBER = (1 << 32) - 1
 _FAR = np.float32(np.inf)
 
@@ -29,6 +29,7 @@ def visibility_from(
     widths: NDArray[np.float64],
     normals: NDArray[np.float64],
     stretch: float = 1.0,
+    n_hiding: int | None = None,
 ) -> NDArray[np.bool_]:
     """Whether each of n surfels is visible from each of k places, (k, n) bool: none is in front by more than its depth.
 
@@ -42,14 +43,17 @@ def visibility_from(
         Towards either side. A surfel that is seen at a slant hides little of what lies beside it on the same surface.
     stretch : float, >= 1
         Widths over depths: surfels that stand for others beside them are wider, but no deeper.
+    n_hiding : int, optional
+        How many of them hide others, the first ones; default all.
     """
     seen = np.empty((len(places), len(centres)), np.bool_)
-    some = slice(None, None, max(1, len(centres) // 200))  # to know how fine a map it takes
+    n_hiding = len(centres) if n_hiding is None else n_hiding
+    some = slice(None, n_hiding, max(1, n_hiding // 200))  # to know how fine a map it takes
     ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)
     typical = np.median(widths[some] / np.maximum(ranges, 1e-12), axis=1)
     bins = np.clip(1.0 / (_BINS_PER_RADIAN * typical), 64, _MAX_BINS).astype(np.int64)
     surfels = _Surfels(_columns(centres), _columns(normals), widths.astype(np.float32), np.float32(1.0 / stretch))
-    in_blocks(_look, len(places), places.astype(np.float32), bins, surfels, seen, smallest=1)
+    in_blocks(_look, len(places), places.astype(np.float32), bins, surfels, n_hiding, seen, smallest=1)
     return seen
 
 
@@ -166,6 +170,7 @@ def _look(
     places: NDArray[np.float32],
     bins_of: NDArray[np.int64],
     surfels: _Surfels,
+    n_hiding: int,
     seen: NDArray[np.bool_],
 ) -> None:
     """Set what is seen from each place, by the least range in each bin of directions that a surfel may cover.
@@ -197,6 +202,8 @@ def _look(
                 continue
             u, v, half = views.u[i], views.v[i], views.halves[i]
             at[i] = min(int(u), last) * bins + min(int(v), last)
+            if i >= n_hiding:
+                continue
             first, final = min(int(max(v - half, nothing)), last), min(int(v + half), last)
             for p in range(min(int(max(u - half, nothing)), last), min(int(u + half), last) + 1):
                 off = max(abs(np.float32(p) + half_bin - u) - half_bin, nothing)

@@ -199,6 +199,34 @@ def _spread_votes(grid: VoxelGrid, alike: NDArray[np.int8], votes: NDArray[np.fl
     return votes
 
 
+def visible_points(
+    grid: VoxelGrid,
+    normals: NDArray[np.float64],
+    places: NDArray[np.float64],
+    points: NDArray[np.float64],
+    point_normals: NDArray[np.float64],
+    widths: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Whether each of n points is visible from each of k places, (k, n) bool, past the surface of v voxels.
+
+    Parameters
+    ----------
+    grid : VoxelGrid of v voxels
+    normals : (v, 3) float64
+    places : (k, 3) float64, metres
+    points, point_normals : (n, 3) float64
+        Points on surfaces that are not in the cloud.
+    widths : (n,) float64, metres
+        Of the piece of surface around each.
+    """
+    middle, reach = unit_frame(grid, np.concatenate((grid.centroids, places)))
+    some, stretch = occluder_subset(grid)
+    centres = (np.concatenate((grid.centroids[some], points)) - middle) / reach
+    of_all = np.concatenate((stretch * grid.edge_lengths[some], widths)) / reach
+    facing = np.concatenate((normals[some], point_normals))
+    return visibility_from((places - middle) / reach, centres, of_all, facing, stretch, len(some))[:, len(some) :]
+
+
 def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
     """Fraction of the voxels that are visible from a place, (3,) float64, metres."""
     return _visible_fraction(grid, place, either_normals(grid))

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import pcgraph
-from pcgraph.graph.bounding_planes import bounding_planes
-from pcgraph.graph.continuations import faces_of
+from pcgraph.graph.continuations import continuations, faces_of
 from pcgraph.tree.tree import segmentation_tree
 
 STEP = 0.02  # metres between points
+NOWHERE = np.empty((0, 3))  # from where the cloud was seen: nobody says
 
 
 def sheet(corner, first, second):
@@ -61,7 +61,7 @@ def pairs_of(result):
     """Means of the supervoxels of each pair on bounding planes, (r, 2, 3), that the segmentation took."""
     graph = result.graph
     faces = faces_of(graph.edges, graph.edge_features, graph.n_nodes)
-    found = bounding_planes(result.surface, graph.node_features, faces)
+    found = continuations(result.surface, graph.node_features, faces, NOWHERE)
     assert found.coplanar.all()
     taken = {tuple(pair) for pair in graph.joined.tolist()}
     assert {tuple(pair) for pair in found.pairs.tolist()} <= taken
@@ -198,5 +198,5 @@ def test_many_pieces_take_little_time():
     faces = faces_of(graph.edges, graph.edge_features, graph.n_nodes)
     assert np.count_nonzero(np.bincount(faces[result.surface.supervoxels]) >= 40) > 1500
     begun = time.process_time()
-    bounding_planes(result.surface, graph.node_features, faces)
+    continuations(result.surface, graph.node_features, faces, NOWHERE)
     assert time.process_time() - begun < 10.0
