@@ -12,9 +12,16 @@ from pcgraph.graph.adjacency import Bridges
 from pcgraph.parallel import kernel, routine
 from pcgraph.voxels.surface import Surface
 
-_NEAR = 8  # supervoxels around one
-_MAX_WIDTH = 1e6  # voxel edges
-_FEW, _AS_NEAR, _MAX_WIDTH_BETWEEN = 4, 2.0, 30.0  # points, times the nearest of all, voxel edges: of one thin surface
+_NEAR = 8
+"""Supervoxels nearest to one of a speck that it may lead to, a count. Chosen, not varied."""
+_MAX_WIDTH = 1e6
+"""Largest width of a bridge, voxel edges, so that costs stay finite."""
+_FEW = 4
+"""Most points of specks that may be of one surface sampled too thinly, a count. Chosen by eye."""
+_AS_NEAR = 2.0
+"""Largest width between two such, over that to the nearest of all, a ratio. Chosen by eye."""
+_MAX_WIDTH_BETWEEN = 30.0
+"""Largest width between two such, voxel edges. Chosen by eye."""
 
 
 def bridges(surface: Surface, counts: NDArray[np.int64], joined: NDArray[np.int32]) -> Bridges:

@@ -26,43 +26,93 @@ from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.directions import plane_basis
 from pcgraph.voxels.grid import VoxelGrid, voxel_grid
 from pcgraph.voxels.surface import Surface
-from pcgraph.voxels.visibility import visible_points
+from pcgraph.voxels.visibility import depth_order_at
 from pcgraph.voxels.warp import Warp
 
-_SMOOTH_RAD = 0.2
-_SMOOTH_EDGES = 1.0
-_INTERIOR_NEIGHBOURS = 8  # of the same piece, from which on a voxel is on no border
-_MIN_TRIANGULATED = 4  # places
-_FACING = 2.0  # borders face each other where they are at most so many times as far apart as at the nearest
-_MAX_GAP = 0.75  # widths of the larger piece
+# Two parts of one smooth surface
+_MAX_ANGLE = 0.2
+"""Largest angle between the normals, radians, 0.98 as a cosine. Chosen, not varied."""
+_MAX_OFFSET = 1.0
+"""Largest distance of one from the plane of the other, voxel edges, because the grid tells no less."""
+MAX_RESIDUAL = 0.5
+"""Largest RMS distance of what is flat from its own plane, voxel edges. XXX"""
+
+# Ways across a gap
+_INTERIOR_NEIGHBOURS = 8
+"""Voxels of its own piece around a voxel that is on no border, a count, as seen on a plane."""
+_MIN_TRIANGULATED = 4
+"""Fewest voxels on the borders of a group that are triangulated, because Qhull refuses fewer."""
+_FACING = 2.0
+"""Longest way that faces the other border, over the shortest of its pair, a ratio. Chosen by eye."""
 _MIN_HIDDEN = 0.5
+"""Least fraction of the ways that are hidden, for a pair to join: most of them."""
+_MAX_GAP = 0.75
+"""Widest gap over the width of the larger piece, a ratio: in a row of equal things, nothing else tells that they are
+several, if something stands before each gap."""
 _MIN_CROSSINGS = 2
+"""Fewest ways between two supervoxels on one plane, a count. Measured: with one, ISPRS 31 loses 0.015 of ground."""
+_NEAREST = 8
+"""Supervoxels nearest to the middle of a way that are asked whether they hide it, a count. Chosen, not varied."""
 
-_MIN_VOXELS = 40  # of a piece, some two supervoxels
-_MAX_RESIDUAL = 0.7  # voxel edges, RMS distance of a piece to its plane
-_LEVEL = 3.0  # times what two faces are uneven by they may lie off each other's planes,
-_EVEN = 0.05  # voxel edges at least
-_MIN_DEPTH = 3.0
+# Pieces of one plane
+_MIN_VOXELS = 40
+"""Fewest voxels of a piece, some two supervoxels. Chosen, not varied."""
+_SIGMAS = 3.0
+"""Standard deviations that two pieces may lie off each other's planes, a ratio: the usual three."""
+_MIN_NOISE = 0.05
+"""Least noise of a supervoxel, voxel edges, because simulated planes have none."""
 _ALONG_WAY = (0.25, 0.5, 0.75)
-_OFF_PLANE = 2.5  # voxel edges from which on something is behind or in front of a plane
-_MAX_BEHIND, _MIN_IN_FRONT = 0.005, 0.2  # fraction of all voxels, for a plane that bounds the scene
-_SAMPLED_SUPERVOXELS = 20_000  # on which that is judged
-_MAX_HEIGHT = 2.0  # of what hides such a line, in lengths of the line
-_MIN_ALONG = 0.5  # cosine between the normals of plane and of what hides it, either way
-_NEAREST = 8  # supervoxels in front of a gap that are looked at
+"""Places along a way that are asked, each a fraction of its length, because any thin pole hides its middle."""
+_MIN_DEPTH = 3.0
+"""Depth by which what hides a way lies nearer, voxel edges. Measured: with one, tops of equal cartons in a row join in
+one draw of four."""
+_OFF_PLANE = 2.5
+"""Distance from which on something is behind or in front of a plane, voxel edges. Chosen by eye."""
+_MAX_BEHIND = 0.005
+"""Largest fraction of the voxels behind a plane that bounds the scene. Chosen by eye."""
+_MIN_IN_FRONT = 0.2
+"""Least fraction of the voxels in front of it. Chosen by eye: boards with little before them are several."""
+_SAMPLED_SUPERVOXELS = 20_000
+"""Supervoxels on which that is judged, a count, because each is compared with each plane."""
+_MAX_HEIGHT = 2.0
+"""Largest height of what hides a way straight before it, over the length of the way, a ratio, because a ceiling
+hides no floor."""
+_MIN_ALONG = 0.5
+"""Least cosine between its normal and the plane's, because a partition, across the floor, parts it."""
 
-_SOME = 20_000  # voxels that are asked whether all was seen from far above:
-_LEVEL_COSINE, _MOSTLY = 0.5, 0.93  # cosine of normals to one axis, and of so many at least; and
-_STEEP, _HARDLY = 0.3, 0.05  # of what is across that, hardly any is seen from far above
-_MIN_GROUND = 20  # of a piece, some supervoxel,
-_ON_AVERAGE = 0.7  # whose normals have such a cosine to that axis
-_COLUMN = 1.5  # voxel edges: of columns that are compared with those beside them
-_STEP = 2.0  # voxel edges by which one lies below another, at least
-_UPWARD_STEPS = 5  # at the border of the ground, at least;
-_DOWNWARDS = 0.1  # and of all there, at most, lead downwards
-_THINNED = 3.0  # voxel edges: of cells that have one place on the border of each piece
-_WIDE, _HIGH = 6.0, 2.5  # voxel edges, at least, is what stands between two pieces,
-_LEVELS = 0.25  # and so many times as far as it rises above both may one lie above the other
+# Ground from far above
+_SAMPLED_VOXELS = 20_000
+"""Voxels that are asked whether all was seen from far above, a count. Chosen for speed."""
+_UPRIGHT = 0.5
+"""Least cosine of an upright normal to the axis from which all was seen: within 60 degrees."""
+_MIN_UPRIGHT = 0.93
+"""Least fraction of the voxels with such normals. Measured: airborne clouds have 0.94 to 0.99, bins 0.78
+to 0.91."""
+_STEEP = 0.3
+"""Largest cosine of what lies across the axis, as walls do, of a normal to it. Chosen by eye."""
+_MAX_STEEP = 0.05
+"""Largest fraction of the voxels across it. Measured: airborne clouds have 0.004 to 0.04."""
+_MIN_GROUND_VOXELS = 20
+"""Fewest voxels of a piece of the ground, some supervoxel. Chosen, not varied."""
+_MIN_MEAN_COSINE = 0.7
+"""Least mean cosine of its normals to the axis: level on average, within 45 degrees."""
+_COLUMN = 1.5
+"""Width of columns whose tops are compared with those beside them, voxel edges. Chosen by eye."""
+_STEP = 2.0
+"""Least height of a step between two tops, voxel edges. Chosen by eye."""
+_MIN_STEPS_UP = 5
+"""Fewest steps that lead up from a piece of the ground, a count. Chosen by eye."""
+_MAX_STEPS_DOWN = 0.1
+"""Largest fraction of the steps that lead down from it. Chosen by eye."""
+_BORDER_CELL = 3.0
+"""Edge of the cells of a border of which one voxel counts, voxel edges. Chosen for speed."""
+_MIN_WIDTH = 6.0
+"""Least width of what ground goes on under, voxel edges, because the rim of a crate is narrower. Measured: with 4.5 its
+bottom is the table, though ISPRS 23 gains 0.02 of ground."""
+_MIN_RISE = 2.5
+"""Least height of that above the ground, voxel edges. Chosen by eye."""
+_MAX_LEVELS = 0.25
+"""Largest difference of height of two pieces, over that height, a ratio, because a terrace differs more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +152,7 @@ class Continuations(ShortRepr):
         return Continuations(*(getattr(self, name)[some] for name in self.__dataclass_fields__))
 
     def with_others(self, others: Continuations) -> Continuations:
-        """These rows and those of others whose pairs are not among them."""
+        """The rows of both, of others without the pairs that are here."""
         columns = self.__dataclass_fields__
         others = others.without(self.pairs)
         both = Continuations(*(np.concatenate((getattr(self, name), getattr(others, name))) for name in columns))
@@ -110,7 +160,7 @@ class Continuations(ShortRepr):
         return Continuations(*(getattr(both, name)[order] for name in columns))
 
     def without(self, pairs: NDArray[np.int32]) -> Continuations:
-        """Those that are not among these pairs, (m, 2) int32, the smaller first, in ascending order."""
+        """The rows that are not among these pairs, (m, 2) int32, the smaller first, in ascending order."""
         return self.chosen(not_among(self.pairs, pairs))
 
     def without_coplanar(self, pairs: NDArray[np.int32]) -> Continuations:
@@ -153,7 +203,7 @@ def _on_one_surface(
     angle: NDArray[np.float64], offset: NDArray[np.float64], edge: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Whether pairs lie on one smooth surface, by their normals' angle, radians, and what one lies off the other."""
-    return (angle <= _SMOOTH_RAD) & (offset <= _SMOOTH_EDGES * edge)
+    return (angle <= _MAX_ANGLE) & (offset <= _MAX_OFFSET * edge)
 
 
 def continuations_of(surface: Surface, nodes: NodeFeatures, spans: NDArray[np.integer]) -> Continuations:
@@ -199,7 +249,7 @@ class _Plane(NamedTuple):
         return np.einsum("ij,j->i", places - self.origin, self.normal)
 
     def project(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where on the plane the places lie, (n, 2)."""
+        """Coordinates of places, (n, 3), on the plane, (n, 2)."""
         return np.einsum("ij,kj->ik", places - self.origin, self.axes)
 
 
@@ -384,7 +434,7 @@ def _flat_pieces(scene: _Scene, nodes: NodeFeatures, faces: NDArray[np.int32]) -
     parts = Moments(voxels, nodes.centroid[on], voxels[:, None, None] * nodes.covariance[on], None)
     planes = node_features(grouped_moments(replace(parts, normals=nodes.normal[on]), face, n))
     edges = np.bincount(face, voxels * scene.edges[on], n) / planes.size
-    variances = np.square(nodes.residual[on]) + np.square(_EVEN * scene.edges[on])
+    variances = np.square(nodes.residual[on]) + np.square(_MIN_NOISE * scene.edges[on])
     noise = np.sqrt(np.bincount(face, voxels * variances, n) / planes.size)
     areas = np.bincount(face, scene.areas[on], n).astype(np.float64)
     bounding = np.empty(n, np.bool_)
@@ -392,7 +442,7 @@ def _flat_pieces(scene: _Scene, nodes: NodeFeatures, faces: NDArray[np.int32]) -
     others = scene.places[scattered], _OFF_PLANE * scene.edges[scattered], scene.voxels[scattered]
     in_blocks(_bound, n, planes.centroid, planes.normal, *others, bounding)
     of_supervoxel = np.full(len(faces), -1)
-    of_supervoxel[on] = np.where(planes.residual <= _MAX_RESIDUAL * edges, np.arange(n), -1)[face]
+    of_supervoxel[on] = np.where(planes.residual <= MAX_RESIDUAL * edges, np.arange(n), -1)[face]
     return _Pieces(planes, edges, areas, noise, bounding, of_supervoxel)
 
 
@@ -460,7 +510,7 @@ def _are_level(grid: VoxelGrid, pieces: _Pieces, ways: _Ways) -> NDArray[np.bool
         reach = (np.square(off) / np.maximum(spreads, variances[:, None]))[:, 1:].sum(axis=1)
         curvature = np.sqrt(np.maximum(spreads[:, 0] - variances, 0.0))
         uneven = pieces.noise[own] * (1.0 + np.sqrt(reach)) + curvature * (1.0 + reach) + pieces.noise[other]
-        level &= np.abs(off[:, 0]) <= _LEVEL * uneven
+        level &= np.abs(off[:, 0]) <= _SIGMAS * uneven
     return level
 
 
@@ -472,9 +522,9 @@ def _unseen(surface: Surface, places: NDArray[np.float64], ways: _Ways) -> NDArr
     start, stop = np.moveaxis(grid.centroids[ways.ends], 1, 0)
     points = (start + np.array(_ALONG_WAY)[:, None, None] * (stop - start)).reshape(-1, 3)
     normals, depths = surface.normals[ways.ends[:, 0]], _MIN_DEPTH * grid.edge_lengths[ways.ends].max(axis=1)
-    seen = visible_points(grid, surface.normals, places, points, np.tile(normals, (n, 1)), np.tile(depths, n))
+    order = depth_order_at(grid, surface.normals, places, points, np.tile(normals, (n, 1)), np.tile(depths, n))
     before = np.einsum("kcj,cj->kc", places[:, None] - start, normals) > 0.0
-    hidden = ~(seen.reshape(-1, n, c) & before[:, None]).any(axis=0) & before.any(axis=0)
+    hidden = ~((order >= 0).reshape(-1, n, c) & before[:, None]).any(axis=0) & before.any(axis=0)
     return np.asarray(hidden.mean(axis=0))
 
 
@@ -491,12 +541,12 @@ def _behind_something(
     before = np.flatnonzero((heights > scene.edges) & (np.abs(cosines) >= _MIN_ALONG))
     if not len(before) or not len(middles):
         return np.zeros(len(middles), np.bool_)
-    parallel = np.flatnonzero(cosines >= np.cos(_SMOOTH_RAD))
+    parallel = np.flatnonzero(cosines >= np.cos(_MAX_ANGLE))
     parallel = parallel[np.argsort(heights[parallel], kind="stable")]
     sums = np.concatenate((np.zeros(1), np.cumsum(scene.areas[parallel])))
     bands = heights[before] + np.array([[-1.0], [1.0]]) * scene.edges[before]
     low, high = sums[np.searchsorted(heights[parallel], bands)]
-    sets_in = np.where(cosines[before] >= np.cos(_SMOOTH_RAD), high - low, 0.0)
+    sets_in = np.where(cosines[before] >= np.cos(_MAX_ANGLE), high - low, 0.0)
     some = np.arange(1, min(_NEAREST, len(before)) + 1)
     distance, number = cKDTree(plane.project(scene.places[before])).query(middles, k=some)
     nearest, larger = before[number], areas[ways.pieces].max(axis=1)[:, None]
@@ -547,21 +597,21 @@ def _ground_from_far_above(
     """
     if surface.grid.warp.of_one_scan:
         return None
-    some = surface.normals[:: max(1, surface.grid.n_voxels // _SOME)]
+    some = surface.normals[:: max(1, surface.grid.n_voxels // _SAMPLED_VOXELS)]
     axis = np.linalg.eigh(np.einsum("ij,ik->jk", some, some))[1][:, 2]
     cosines = np.einsum("ij,j->i", some, axis)
-    if np.mean(np.abs(cosines) > _LEVEL_COSINE) < _MOSTLY or np.mean(np.abs(cosines) < _STEEP) > _HARDLY:
+    if np.mean(np.abs(cosines) > _UPRIGHT) < _MIN_UPRIGHT or np.mean(np.abs(cosines) < _STEEP) > _MAX_STEEP:
         return None
     cosines = np.einsum("ij,j->i", surface.normals, axis)
     axis = axis * (1.0 if cosines.sum() >= 0.0 else -1.0)
     face, n_faces = faces[surface.supervoxels], int(faces.max()) + 1
     voxels = np.bincount(face, minlength=n_faces)
-    level = np.bincount(face, np.abs(cosines), n_faces) >= _ON_AVERAGE * voxels
+    level = np.bincount(face, np.abs(cosines), n_faces) >= _MIN_MEAN_COSINE * voxels
     down, up = _steps(surface, face, axis)  # the other way along it but for columns of several layers
     for upwards, to_lower, to_higher in ((axis, down, up), (-axis, up, down)):
-        ground = level & (to_higher >= _UPWARD_STEPS) & (to_lower <= _DOWNWARDS * (to_lower + to_higher))
+        ground = level & (to_higher >= _MIN_STEPS_UP) & (to_lower <= _MAX_STEPS_DOWN * (to_lower + to_higher))
         if ground[np.argmax(voxels)]:
-            ground &= voxels >= _MIN_GROUND
+            ground &= voxels >= _MIN_GROUND_VOXELS
             return (upwards, ground) if np.count_nonzero(ground) > 1 else None
     return None
 
@@ -569,8 +619,8 @@ def _ground_from_far_above(
 def _steps(
     surface: Surface, face: NDArray[np.int32], axis: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """How many steps at the border of each face, between tops of columns beside each other along an axis, lead down
-    and up, (f,) each."""
+    """Numbers of steps at the border of each face, between tops of columns beside each other, that lead down and up
+    along an axis, (f,) each."""
     plane, edge = _Plane.through(surface.grid.centroids[0], axis), surface.grid.size
     heights, flat = plane.heights(surface.grid.centroids), np.zeros((surface.grid.n_voxels, 3))
     flat[:, :2] = plane.project(surface.grid.centroids)
@@ -601,7 +651,7 @@ def _under(
     """Voxels at both ends of the ways, (c, 2), under what stands between pieces that are one."""
     grid, of_voxel = surface.grid, of_supervoxel[surface.supervoxels]
     edge, plane = grid.size, _Plane.through(grid.centroids[0], upwards)
-    projected = plane.project(grid.centroids[border]) / (_THINNED * edge)
+    projected = plane.project(grid.centroids[border]) / (_BORDER_CELL * edge)
     cells = voxel_grid(np.column_stack((projected, of_voxel[border].astype(np.float64))), 1.0, Warp())
     border = border[np.sort(cells.order[cells.starts[:-1]])]
     ways = _facing_ways(grid, plane, border, of_voxel[border])
@@ -611,8 +661,9 @@ def _under(
         heights = plane.heights(ends.reshape(-1, 3)).reshape(-1, 2)
         some = np.arange(1, min(_NEAREST, len(others)) + 1)
         distance, near = cKDTree(plane.project(others)).query(plane.project(ends.mean(axis=1)), k=some)
-        over = distance <= np.maximum(0.5 * ways.lengths, _HIGH * edge)[:, None]
+        over = distance <= np.maximum(0.5 * ways.lengths, _MIN_RISE * edge)[:, None]
         rise = plane.heights(others)[near] - heights.max(axis=1)[:, None]
-        hidden = (over & (rise > _HIGH * edge) & (np.ptp(heights, axis=1)[:, None] < _LEVELS * rise)).any(axis=1)
+        levels = np.ptp(heights, axis=1)[:, None]
+        hidden = (over & (rise > _MIN_RISE * edge) & (levels < _MAX_LEVELS * rise)).any(axis=1)
     areas = np.bincount(of_voxel + 1, np.square(grid.edge_lengths))[1:].astype(np.float64)
-    return ways.joined((ways.means(hidden) >= _MIN_HIDDEN) & (ways.widths >= _WIDE * edge), areas)
+    return ways.joined((ways.means(hidden) >= _MIN_HIDDEN) & (ways.widths >= _MIN_WIDTH * edge), areas)

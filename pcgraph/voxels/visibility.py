@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.plumbing.short_repr import ShortRepr
-from pcgraph.voxels.depth_buffer import SAME_SURFACE_COSINE, cosines_towards, visibility_from
+from pcgraph.voxels.depth_buffer import SAME_SURFACE_COSINE, cosines_towards, depth_order, visibility_from
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 from pcgraph.voxels.virtual_viewpoints import (
     VirtualViewpoints,
@@ -199,32 +199,37 @@ def _spread_votes(grid: VoxelGrid, alike: NDArray[np.int8], votes: NDArray[np.fl
     return votes
 
 
-def visible_points(
+def depth_order_at(
     grid: VoxelGrid,
     normals: NDArray[np.float64],
     places: NDArray[np.float64],
     points: NDArray[np.float64],
     point_normals: NDArray[np.float64],
-    widths: NDArray[np.float64],
-) -> NDArray[np.bool_]:
-    """Whether each of n points is visible from each of k places, (k, n) bool, past the surface of v voxels.
+    depths: NDArray[np.float64],
+    finer: float = 1.0,
+) -> NDArray[np.int8]:
+    """Whether what is seen in the direction of each of n points is nearer, -1, farther, 1, or neither, 0; (k, n) int8.
 
     Parameters
     ----------
     grid : VoxelGrid of v voxels
     normals : (v, 3) float64
     places : (k, 3) float64, metres
-    points, point_normals : (n, 3) float64
-        Points on surfaces that are not in the cloud.
-    widths : (n,) float64, metres
-        Of the piece of surface around each.
+        From where it is seen.
+    points, point_normals : (n, 3) float64, metres
+        Points where nothing need be, and normals of the surface that may be there: it does not hide itself.
+    depths : (n,) float64, metres
+        Difference of depth from which on something is nearer or farther.
+    finer : float, >= 1
+        Times by which voxels are drawn smaller than they are, in as many more bins, to see what lies between them.
     """
     middle, reach = unit_frame(grid, np.concatenate((grid.centroids, places)))
     some, stretch = occluder_subset(grid)
     centres = (np.concatenate((grid.centroids[some], points)) - middle) / reach
-    of_all = np.concatenate((stretch * grid.edge_lengths[some], widths)) / reach
-    facing = np.concatenate((normals[some], point_normals))
-    return visibility_from((places - middle) / reach, centres, of_all, facing, stretch, len(some))[:, len(some) :]
+    widths = np.concatenate((stretch / finer * grid.edge_lengths[some], depths)) / reach
+    facing, n_drawn = np.concatenate((normals[some], point_normals)), len(some)
+    order = depth_order((places - middle) / reach, centres, widths, facing, stretch, n_drawn, finer)
+    return order[:, n_drawn:]
 
 
 def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
