@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
+from pcgraph.graph.continuations import MAX_RESIDUAL
 from pcgraph.pairs import not_among
 from pcgraph.parallel import in_blocks, inlined, kernel, routine
 from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
@@ -192,9 +193,9 @@ _MAY_WAIT = 0.25
 lose 0.07 of their covering, at 0.25 0.015; at 0.4, balls of a dumbbell join the table before the bar between them."""
 _WHOLE = 3.0
 """Least mass in mean supervoxels of regions that wait or are waited for, because smaller ones are parts of surfaces."""
-_FLAT = 0.25
-"""Largest mean square distance of a support from its plane, squared voxel edges: half an edge is what voxels make of a
-plane. Terrain is less flat; its patches lie off each other's planes without standing on each other."""
+_FLAT = MAX_RESIDUAL**2
+"""Largest mean square distance of a support from its plane, squared voxel edges, so that it is flat. Terrain is
+less flat; its patches lie off each other's planes without standing on each other."""
 _CLEAR = 1.0
 """Least distance from the plane of the support, voxel edges, because less is the noise of the support itself."""
 _MAX_WAITS = 64

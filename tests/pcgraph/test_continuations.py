@@ -116,6 +116,17 @@ def test_of_boards_whose_gap_is_hidden_all_along_only_wide_ones_are_one(width, o
     assert (objects_of(result.labels, thing, 0) == objects_of(result.labels, thing, 1)) is one
 
 
+@pytest.mark.parametrize(("beside", "one"), [(0.0, True), (1.5, False)])
+def test_what_one_of_the_places_sees_past_is_no_gap_in_the_data(beside, one):
+    """Half of the points were seen from another place: the same, or one that sees between the boards."""
+    boards = [(-1.4, -0.2, -2.0, 2.0, 2.0), (0.2, 1.4, -2.0, 2.0, 2.0)]
+    points, thing = seen([*boards, (-0.16, 0.16, -2.0, 2.0, 1.0)], np.inf)
+    places = np.zeros_like(points)
+    places[1::2, :, 0] = beside
+    result = pcgraph.segment(points, viewpoint=places)
+    assert (objects_of(result.labels, thing, 0) == objects_of(result.labels, thing, 1)) is one
+
+
 def rectangle(origin, first, second, spacing, rng):
     """Points at random on a parallelogram, `spacing` apart on average."""
     first, second = np.array(first, float), np.array(second, float)
