@@ -196,8 +196,8 @@ def _one_part(coarse: VoxelGrid, *others: object) -> tuple[NDArray[np.int64], li
     return np.zeros(coarse.n_voxels, np.int64), []
 
 
-def _none_hidden(surface: Surface, places: object, ways: Any) -> NDArray[np.float64]:
-    return np.zeros(len(ways.ends))
+def _none_hidden(surface: Surface, places: object, ways: Any) -> list[NDArray[np.bool_]]:
+    return [np.zeros(len(some.ends), np.bool_) for some in ways]
 
 
 def _all_level(grid: VoxelGrid, pieces: object, ways: Any) -> NDArray[np.bool_]:

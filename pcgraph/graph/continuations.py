@@ -62,7 +62,7 @@ _SIGMAS = 3.0
 """Standard deviations that two pieces may lie off each other's planes, a ratio: the usual three."""
 _MIN_NOISE = 0.05
 """Least noise of a supervoxel, voxel edges, because simulated planes have none."""
-_ALONG_WAY = (0.25, 0.5, 0.75)
+_ALONG_WAY = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Places along a way that are asked, each a fraction of its length, because any thin pole hides its middle."""
 _MIN_DEPTH = 3.0
 """Depth by which what hides a way lies nearer, voxel edges. Measured: with one, tops of equal cartons in a row join in
@@ -279,7 +279,7 @@ class _Ways(NamedTuple):
     lengths: NDArray[np.float64]
     widths: NDArray[np.float64]
 
-    def means(self, values: NDArray[np.bool_ | np.float64]) -> NDArray[np.float64]:
+    def means(self, values: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Means over the ways of each pair, (q,), of values of the ways, (c,)."""
         n_pairs = len(self.pairs)
         return np.bincount(self.pair, values, n_pairs) / np.bincount(self.pair, minlength=n_pairs)
@@ -377,8 +377,6 @@ class _Pieces(NamedTuple):
     areas : (p,) float64, square metres
     noise : (p,) float64, metres
         RMS distance of points from the planes of their supervoxels.
-    bounding : (p,) bool
-        Whether their planes bound the scene.
     of_supervoxel : (k,) int64
         Piece of each supervoxel, -1 of those on none.
     """
@@ -387,7 +385,6 @@ class _Pieces(NamedTuple):
     edges: NDArray[np.float64]
     areas: NDArray[np.float64]
     noise: NDArray[np.float64]
-    bounding: NDArray[np.bool_]
     of_supervoxel: NDArray[np.int64]
 
 
@@ -402,15 +399,19 @@ def _of_planes(
     grid, scene = surface.grid, _scene(surface, nodes)
     pieces = _flat_pieces(scene, nodes, faces)
     of_voxel, groups = pieces.of_supervoxel[surface.supervoxels], list(_on_one_plane(pieces))
-    spans = [np.empty((0, 2), np.int64)]
-    for group, border in zip(groups, _borders(surface, pieces.of_supervoxel, groups), strict=True):
-        plane = _Plane.through(pieces.planes.centroid[group[0]], pieces.planes.normal[group[0]])
-        ways = _facing_ways(grid, plane, border, of_voxel[border])
+    if not len(places):
+        groups = _bounding(scene, pieces, groups)
+    planes = [_Plane.through(pieces.planes.centroid[group[0]], pieces.planes.normal[group[0]]) for group in groups]
+    borders = _borders(surface, pieces.of_supervoxel, groups)
+    ways = [_facing_ways(grid, *one, of_voxel[one[1]]) for one in zip(planes, borders, strict=True)]
+    if len(places):
         hidden = _unseen(surface, places, ways)
-        if pieces.bounding[group[0]]:
-            hidden = np.maximum(hidden, _behind_something(surface, scene, plane, ways, pieces.areas))
-        hidden *= _are_level(grid, pieces, ways)
-        spans.append(ways.joined(ways.means(hidden) >= _MIN_HIDDEN, pieces.areas))
+    else:
+        hidden = [_behind_something(surface, scene, *one, pieces.areas) for one in zip(planes, ways, strict=True)]
+    spans = [np.empty((0, 2), np.int64)]
+    for some, some_hidden in zip(ways, hidden, strict=True):
+        may_join = some.means(some_hidden & _are_level(grid, pieces, some)) >= _MIN_HIDDEN
+        spans.append(some.joined(may_join, pieces.areas))
     spans_of_all = np.concatenate(spans)
     ends, edges = grid.warped[spans_of_all], grid.warped_edges[spans_of_all].max(axis=1)
     far = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > grid.warp.max_gap * edges  # else gaps join them
@@ -438,13 +439,18 @@ def _flat_pieces(scene: _Scene, nodes: NodeFeatures, faces: NDArray[np.int32]) -
     variances = np.square(nodes.residual[on]) + np.square(_MIN_NOISE * scene.edges[on])
     noise = np.sqrt(np.bincount(face, voxels * variances, n) / planes.size)
     areas = np.bincount(face, scene.areas[on], n).astype(np.float64)
-    bounding = np.empty(n, np.bool_)
-    scattered = np.random.default_rng(0).permutation(len(faces))[:_SAMPLED_SUPERVOXELS]
-    others = scene.places[scattered], _OFF_PLANE * scene.edges[scattered], scene.voxels[scattered]
-    in_blocks(_bound, n, planes.centroid, planes.normal, *others, bounding)
     of_supervoxel = np.full(len(faces), -1)
     of_supervoxel[on] = np.where(planes.residual <= MAX_RESIDUAL * edges, np.arange(n), -1)[face]
-    return _Pieces(planes, edges, areas, noise, bounding, of_supervoxel)
+    return _Pieces(planes, edges, areas, noise, of_supervoxel)
+
+
+def _bounding(scene: _Scene, pieces: _Pieces, groups: list[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
+    """The groups of pieces whose planes bound the scene."""
+    first, bounding = np.array([group[0] for group in groups], np.int64), np.empty(len(groups), np.bool_)
+    some = np.random.default_rng(0).permutation(len(scene.places))[:_SAMPLED_SUPERVOXELS]
+    others = scene.places[some], _OFF_PLANE * scene.edges[some], scene.voxels[some]
+    in_blocks(_bound, len(groups), pieces.planes.centroid[first], pieces.planes.normal[first], *others, bounding)
+    return [group for group, bounds in zip(groups, bounding.tolist(), strict=True) if bounds]
 
 
 @kernel
@@ -515,18 +521,19 @@ def _are_level(grid: VoxelGrid, pieces: _Pieces, ways: _Ways) -> NDArray[np.bool
     return level
 
 
-def _unseen(surface: Surface, places: NDArray[np.float64], ways: _Ways) -> NDArray[np.float64]:
-    """Fraction of each way that the cloud hides from all places before it, (c,); 0 where there are none."""
-    grid, (c, _), n = surface.grid, ways.ends.shape, len(_ALONG_WAY)
-    if not (c and len(places)):
-        return np.zeros(c)
-    start, stop = np.moveaxis(grid.centroids[ways.ends], 1, 0)
-    points = (start + np.array(_ALONG_WAY)[:, None, None] * (stop - start)).reshape(-1, 3)
-    normals, depths = surface.normals[ways.ends[:, 0]], _MIN_DEPTH * grid.edge_lengths[ways.ends].max(axis=1)
-    order = depth_order_at(grid, surface.normals, places, points, np.tile(normals, (n, 1)), np.tile(depths, n))
+def _unseen(surface: Surface, places: NDArray[np.float64], ways: list[_Ways]) -> list[NDArray[np.bool_]]:
+    """Whether the cloud hides each way from all places before it, (c,) for each of the groups of ways."""
+    grid, ends = surface.grid, np.concatenate([np.empty((0, 2), np.int64), *(some.ends for some in ways)])
+    if not len(ends):
+        return [np.empty(0, np.bool_) for _ in ways]
+    start, stop = np.moveaxis(grid.centroids[ends], 1, 0)
+    n, points = len(_ALONG_WAY), start + np.array(_ALONG_WAY)[:, None, None] * (stop - start)
+    normals, depths = surface.normals[ends[:, 0]], _MIN_DEPTH * grid.edge_lengths[ends].max(axis=1)
+    facing = np.tile(normals, (n, 1)), np.tile(depths, n)
+    seen = depth_order_at(grid, surface.normals, places, points.reshape(-1, 3), *facing).reshape(-1, n, len(ends)) >= 0
     before = np.einsum("kcj,cj->kc", places[:, None] - start, normals) > 0.0
-    hidden = ~((order >= 0).reshape(-1, n, c) & before[:, None]).any(axis=0) & before.any(axis=0)
-    return np.asarray(hidden.mean(axis=0))
+    hidden = ~(seen & before[:, None]).any(axis=(0, 1)) & before.any(axis=0)
+    return np.split(hidden, np.cumsum([len(some.ends) for some in ways])[:-1])
 
 
 def _behind_something(

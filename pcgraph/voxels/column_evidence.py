@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.parallel import kernel
+from pcgraph.voxels.directions import CREASE_COSINE, SAME_SURFACE_COSINE
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 
-_SMOOTH, _CREASED = 0.9, 0.5  # cosines between normals, more than and less than
 _TELLING = 1 << 13  # voxels, about
 _ROUNDING = 1e-24  # of squares
 _DOUBT = 64  # pairs across creases that count as much as what is known without any
@@ -70,11 +70,11 @@ def _squared_distances(
             j, cosine, square = neighbours[a], 0.0, 0.0
             for axis in range(3):
                 cosine += normals[i, axis] * normals[j, axis]
-            if _CREASED <= cosine <= _SMOOTH:
+            if CREASE_COSINE <= cosine <= SAME_SURFACE_COSINE:
                 continue
             for column in range(values.shape[1]):
                 square += (values[i, column] - values[j, column]) ** 2
-            kind = 0 if cosine > _SMOOTH else 1
+            kind = 0 if cosine > SAME_SURFACE_COSINE else 1
             sums[kind] += square * counts[i] * counts[j] / (counts[i] + counts[j])
             pairs[kind] += 1
     return sums, pairs

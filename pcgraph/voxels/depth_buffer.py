@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.voxels.directions import SAME_SURFACE_COSINE
 
-SAME_SURFACE_COSINE = np.float32(0.8)
-"""Least cosine between the normals of two voxels on one surface."""
 _COARSENESS = 0.35
 """One over the bins along the map, for surfels of a radian: a bin is 1.24 surfels wide on average. Chosen by eye."""
 _MIN_BINS = 64

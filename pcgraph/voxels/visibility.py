@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.plumbing.short_repr import ShortRepr
-from pcgraph.voxels.depth_buffer import SAME_SURFACE_COSINE, cosines_towards, depth_order, visibility_from
+from pcgraph.voxels.depth_buffer import cosines_towards, depth_order, visibility_from
+from pcgraph.voxels.directions import CREASE_COSINE, SAME_SURFACE_COSINE
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 from pcgraph.voxels.virtual_viewpoints import (
     VirtualViewpoints,
@@ -27,7 +28,7 @@ _NEARLY_LEVEL, _LEVEL_INDEED, _FEW_LEVEL = 0.9, 0.97, 20  # cosines to the axis,
 _MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at
 _SMOOTHING = 4  # rounds of votes by the voxels around
 _CLEAR = 0.3  # votes for a side that need no others, where all voxels are looked at
-_PATCH, _CREASE = 10, 0.5  # voxels of a patch, at least, and the cosine between normals at its edges, at most
+_PATCH = 10  # voxels of a patch, at least
 _OFF_PATCH = 0.7  # edge lengths between planes of touching voxels: so many, and they are two surfaces
 _HARDLY, _MOSTLY = 0.05, 0.3  # what votes that are not clear count beside edges; and how much more must agree than not
 
@@ -372,7 +373,7 @@ def _alike_sides(
     least, most = min(abs(ahead_of_i), abs(ahead_of_j)) / edge, max(abs(ahead_of_i), abs(ahead_of_j)) / edge
     if abs(cosine) > SAME_SURFACE_COSINE and most <= _OFF_PATCH:
         return 1.0 if cosine > 0.0 else -1.0, True
-    if abs(cosine) < _CREASE:
+    if abs(cosine) < CREASE_COSINE:
         return min(least, 1.0) * (1.0 if (ahead_of_i > 0.0) == (ahead_of_j > 0.0) else -1.0), False
     return 0.0, False
 
