@@ -52,7 +52,7 @@ def visibility_from(
     stretch : float, >= 1
         Widths over depths: surfels that stand for others beside them are wider, but no deeper.
     """
-    return depth_order(places, centres, widths, normals, stretch, len(centres)) >= 0
+    return _depth_order(places, centres, widths, normals, stretch, len(centres), 0, 1.0) >= 0
 
 
 def depth_order(
@@ -60,22 +60,36 @@ def depth_order(
     centres: NDArray[np.float64],
     widths: NDArray[np.float64],
     normals: NDArray[np.float64],
-    stretch: float,
-    n_drawn: int,
+    n_points: int,
     finer: float = 1.0,
 ) -> NDArray[np.int8]:
-    """Whether what is seen in the direction of each of n surfels is nearer, -1, itself, 0, or farther, 1; (k, n) int8.
+    """Whether what is seen in the direction of each of m points is nearer, -1, farther, 1, or neither, 0; (k, m) int8.
 
     Parameters
     ----------
-    places, centres, widths, normals, stretch
-        As for `visibility_from`. Widths are also the difference of depth that counts.
-    n_drawn : int
-        How many of the surfels are there, and hide others: the first ones. Where the others are, nothing need be.
+    places, centres, widths, normals
+        As for `visibility_from`. Widths of points are the difference of depth that counts.
+    n_points : int
+        How many of the surfels, the last ones, are points where nothing need be, which hide nothing.
     finer : float, >= 1
         Times as many bins along the map as usual, at most, for surfels that are drawn smaller.
     """
-    order = np.empty((len(places), len(centres)), np.int8)
+    n_drawn = len(centres) - n_points
+    return _depth_order(places, centres, widths, normals, 1.0, n_drawn, n_drawn, finer)
+
+
+def _depth_order(
+    places: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    widths: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    stretch: float,
+    n_drawn: int,
+    first: int,
+    finer: float,
+) -> NDArray[np.int8]:
+    """The same for the surfels from the first on, given how many are drawn."""
+    order = np.empty((len(places), len(centres) - first), np.int8)
     some = slice(None, n_drawn, max(1, n_drawn // 200))  # to know how fine a map it takes
     ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)
     typical = np.median(widths[some] / np.maximum(ranges, _TINY), axis=1)
@@ -205,9 +219,9 @@ def _look(
 
     A bin holds the range, whose bits as a float32 sort as it does, above the number of the surfel that has it.
     """
-    n, nothing = surfels.centres.shape[1], np.float32(0.0)
+    n, m, nothing = surfels.centres.shape[1], order.shape[1], np.float32(0.0)
     depth = surfels.depth  # read here: a field read where surfels are compared costs that loop half its time again
-    at, doubtful, nearest = np.empty(n, np.int64), np.empty(n + 1, np.int64), np.empty(0, np.int64)
+    at, doubtful, nearest = np.empty(m, np.int64), np.empty(m + 1, np.int64), np.empty(0, np.int64)
     views = _Views(
         np.empty(n, np.float32),
         np.empty(n, np.float32),
@@ -218,25 +232,25 @@ def _look(
     )
     for k in range(start, stop):
         _view(places[k], bins_of[k], surfels, views)
-        box = _box_of(views, bins_of[k])
+        box = _box_of(views, n - m, bins_of[k])
         if box.height * box.width > len(nearest):
             nearest = np.empty(box.height * box.width, np.int64)
         _draw(views, box, n_drawn, nearest, at)
         n_doubtful = 0
-        for i in range(n):  # branch-free: it would often be mispredicted
-            found = np.int32(nearest[at[i]] >> 32).view(np.float32)
+        for j in range(m):  # branch-free: it would often be mispredicted
+            i, found = n - m + j, np.int32(nearest[at[j]] >> 32).view(np.float32)
             too_far = views.limits[i] - found
             farther = (found > views.ranges[i] + surfels.widths[i]) & (found < _FAR) & (views.ranges[i] > nothing)
-            order[k, i] = np.int8(farther) - np.int8(too_far > nothing)
-            doubtful[n_doubtful] = i
+            order[k, j] = np.int8(farther) - np.int8(too_far > nothing)
+            doubtful[n_doubtful] = j
             n_doubtful += farther | ((too_far > nothing) & (too_far < _SLANTED * surfels.widths[i]))
-        for i in doubtful[:n_doubtful]:
-            if _on_one_surface(i, nearest[at[i]] & _NUMBER, surfels, depth):
-                order[k, i] = 0
+        for j in doubtful[:n_doubtful]:
+            if _on_one_surface(n - m + j, nearest[at[j]] & _NUMBER, surfels, depth):
+                order[k, j] = 0
 
 
 class _Box(NamedTuple):
-    """The bins of an octahedral map in which there is something: from where on, along u and v, and how many."""
+    """The bins of an octahedral map that are looked at: from where on, along u and v, and how many."""
 
     u: int
     v: int
@@ -245,11 +259,11 @@ class _Box(NamedTuple):
 
 
 @routine
-def _box_of(views: _Views, bins: int) -> _Box:
-    """The bins in which the centres of all surfels lie."""
+def _box_of(views: _Views, first: int, bins: int) -> _Box:
+    """The bins in which the centres of surfels lie, from the first on."""
     low_u = low_v = np.float32(bins)
     high_u = high_v = nothing = np.float32(0.0)
-    for i in range(len(views.u)):
+    for i in range(first, len(views.u)):
         if views.ranges[i] > nothing:
             low_u, high_u = min(low_u, views.u[i]), max(high_u, views.u[i])
             low_v, high_v = min(low_v, views.v[i]), max(high_v, views.v[i])
@@ -259,16 +273,18 @@ def _box_of(views: _Views, bins: int) -> _Box:
 
 @routine
 def _draw(views: _Views, box: _Box, n_drawn: int, nearest: NDArray[np.int64], at: NDArray[np.int64]) -> None:
-    """Set the nearest of the first surfels in each bin of a box, and the bin in which each surfel is."""
+    """Set the nearest of the surfels that are there in each bin of a box, and the bin in which each of the last is."""
     nothing, half_bin = np.float32(0.0), np.float32(0.5)
     last_u, last_v = box.u + box.height - 1, box.v + box.width - 1
     nearest[: box.height * box.width] = _NOTHING
-    for i in range(len(at)):
-        at[i] = 0
+    at[:] = 0
+    first_asked = len(views.u) - len(at)
+    for i in range(len(views.u)):
         if views.ranges[i] <= nothing:
             continue
         u, v, half = views.u[i], views.v[i], views.halves[i]
-        at[i] = (min(int(u), last_u) - box.u) * box.width + min(int(v), last_v) - box.v
+        if i >= first_asked:
+            at[i - first_asked] = (min(int(u), last_u) - box.u) * box.width + min(int(v), last_v) - box.v
         if i >= n_drawn:
             continue
         first, final = max(int(max(v - half, nothing)), box.v), min(int(v + half), last_v)

@@ -222,16 +222,17 @@ def depth_order_at(
     depths : (n,) float64, metres
         Difference of depth from which on something is nearer or farther.
     finer : float, >= 1
-        Times by which voxels are drawn smaller than they are, in as many more bins, to see what lies between them;
-        above 1 all of them, else a subset of many (`occluder_subset`).
+        Times by which voxels are drawn smaller than they are, in as many more bins, to see what lies between them.
     """
-    middle, reach = unit_frame(grid, np.concatenate((grid.centroids, places)))
-    some, stretch = occluder_subset(grid) if finer == 1.0 else (np.arange(grid.n_voxels), 1.0)
-    centres = (np.concatenate((grid.centroids[some], points)) - middle) / reach
-    widths = np.concatenate((stretch / finer * grid.edge_lengths[some], depths)) / reach
-    facing, n_drawn = np.concatenate((normals[some], point_normals)), len(some)
-    order = depth_order((places - middle) / reach, centres, widths, facing, stretch, n_drawn, finer)
-    return order[:, n_drawn:]
+    centres, k = np.concatenate((grid.centroids, points, places)), len(places)
+    middle, reach = unit_frame(grid, centres)
+    centres -= middle  # in place: there may be many
+    centres /= reach
+    widths, facing = (
+        np.concatenate((grid.edge_lengths / finer, depths)) / reach,
+        np.concatenate((normals, point_normals)),
+    )
+    return depth_order(centres[-k:], centres[:-k], widths, facing, len(points), finer)
 
 
 def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
