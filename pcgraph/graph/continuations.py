@@ -26,7 +26,7 @@ from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.directions import plane_basis
 from pcgraph.voxels.grid import VoxelGrid, voxel_grid
 from pcgraph.voxels.surface import Surface
-from pcgraph.voxels.visibility import depth_order_at
+from pcgraph.voxels.visibility import depth_order_along
 from pcgraph.voxels.warp import Warp
 
 # Two parts of one smooth surface
@@ -526,12 +526,9 @@ def _unseen(surface: Surface, places: NDArray[np.float64], ways: list[_Ways]) ->
     grid, ends = surface.grid, np.concatenate([np.empty((0, 2), np.int64), *(some.ends for some in ways)])
     if not len(ends):
         return [np.empty(0, np.bool_) for _ in ways]
-    start, stop = np.moveaxis(grid.centroids[ends], 1, 0)
-    n, points = len(_ALONG_WAY), start + np.array(_ALONG_WAY)[:, None, None] * (stop - start)
-    normals, depths = surface.normals[ends[:, 0]], _MIN_DEPTH * grid.edge_lengths[ends].max(axis=1)
-    facing = np.tile(normals, (n, 1)), np.tile(depths, n)
-    seen = depth_order_at(grid, surface.normals, places, points.reshape(-1, 3), *facing).reshape(-1, n, len(ends)) >= 0
-    before = np.einsum("kcj,cj->kc", places[:, None] - start, normals) > 0.0
+    seen = depth_order_along(grid, surface.normals, places, ends, _ALONG_WAY, _MIN_DEPTH) >= 0
+    ways_to = places[:, None] - grid.centroids[ends[:, 0]]
+    before = np.einsum("kcj,cj->kc", ways_to, surface.normals[ends[:, 0]]) > 0.0
     hidden = ~(seen & before[:, None]).any(axis=(0, 1)) & before.any(axis=0)
     return np.split(hidden, np.cumsum([len(some.ends) for some in ways])[:-1])
 

@@ -14,14 +14,14 @@ from pcgraph.graph.continuations import MAX_RESIDUAL
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.voxels.grid import VoxelGrid, at_ends, boundary_voxels, voxels_within
 from pcgraph.voxels.surface import Surface
-from pcgraph.voxels.visibility import depth_order_at
+from pcgraph.voxels.visibility import depth_order_along
 
 _SHORTEST = 8
 """Most ways across a gap that are looked through, the shortest ones, a count, because a long boundary has thousands."""
 _SEEN_THROUGH = 0.5
 """Least fraction of these through which something is seen, where nothing is missing: half of them."""
 _BEHIND = 1.5
-"""Least depth by which what is seen lies behind both ends of a way, voxel edges. Chosen by eye."""
+"""Least depth by which what is seen through a gap lies behind it, voxel edges. Chosen by eye."""
 _MIDDLE = (0.3, 0.4, 0.5, 0.6, 0.7)
 """Places along a way, each a fraction of its length, because its ends cover what is seen near them."""
 _FINER = 2.5
@@ -111,7 +111,8 @@ def _open_ways(
     pair = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(key)))
     shortest = np.arange(len(key)) - starts[pair] < _SHORTEST
     some, of_pair = order[shortest], pair[shortest]
-    through, supervoxels = seen_between(surface, place, source[some], target[some]), surface.supervoxels
+    through = seen_between(surface, place, np.stack((source[some], target[some]), axis=1))
+    supervoxels = surface.supervoxels
     is_smooth = nodes.residual <= MAX_RESIDUAL * surface.mean_edge_lengths(len(nodes.size))
     is_open = np.bincount(of_pair, through) >= _SEEN_THROUGH * np.bincount(of_pair)
     is_open &= (is_smooth[supervoxels[source]] & is_smooth[supervoxels[target]])[order[starts]]
@@ -120,19 +121,10 @@ def _open_ways(
     return opened
 
 
-def seen_between(
-    surface: Surface, place: NDArray[np.float64], source: NDArray[np.int64], target: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """Whether something behind both is seen from a place in the middle between two voxels, for m pairs, (m,) bool."""
-    grid, n, m = surface.grid, len(_MIDDLE), len(source)
-    start, stop = grid.centroids[source] - place, grid.centroids[target] - place
-    middles = start + np.array(_MIDDLE)[:, None, None] * (stop - start)
-    farther = np.maximum(np.linalg.norm(start, axis=1), np.linalg.norm(stop, axis=1))
-    middles *= (farther / np.maximum(np.linalg.norm(middles, axis=2), np.finfo(np.float64).tiny))[..., None]
-    depths = np.tile(_BEHIND * np.maximum(grid.edge_lengths[source], grid.edge_lengths[target]), n)
-    points, normals = place + middles.reshape(-1, 3), np.tile(surface.normals[source], (n, 1))
-    order = depth_order_at(grid, surface.normals, place[None], points, normals, depths, _FINER)
-    return np.asarray((order.reshape(n, m) > 0).any(axis=0))
+def seen_between(surface: Surface, place: NDArray[np.float64], ends: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether something farther off is seen from a place in the middle between two voxels, (m, 2); (m,) bool."""
+    order = depth_order_along(surface.grid, surface.normals, place[None], ends, _MIDDLE, _BEHIND, _FINER)
+    return np.asarray((order[0] > 0).any(axis=0))
 
 
 def _ends_of_surfaces(

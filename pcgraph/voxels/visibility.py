@@ -200,16 +200,16 @@ def _spread_votes(grid: VoxelGrid, alike: NDArray[np.int8], votes: NDArray[np.fl
     return votes
 
 
-def depth_order_at(
+def depth_order_along(
     grid: VoxelGrid,
     normals: NDArray[np.float64],
     places: NDArray[np.float64],
-    points: NDArray[np.float64],
-    point_normals: NDArray[np.float64],
-    depths: NDArray[np.float64],
+    ends: NDArray[np.integer],
+    fractions: tuple[float, ...],
+    depth: float,
     finer: float = 1.0,
 ) -> NDArray[np.int8]:
-    """Whether what is seen in the direction of each of n points is nearer, -1, farther, 1, or neither, 0; (k, n) int8.
+    """Whether what is seen past ways between voxels is nearer, -1, farther, 1, or neither, 0; (k, n, c) int8.
 
     Parameters
     ----------
@@ -217,22 +217,26 @@ def depth_order_at(
     normals : (v, 3) float64
     places : (k, 3) float64, metres
         From where it is seen.
-    points, point_normals : (n, 3) float64, metres
-        Points where nothing need be, and normals of the surface that may be there: it does not hide itself.
-    depths : (n,) float64, metres
+    ends : (c, 2) int
+        Voxels at both ends of each way. A surface from one to the other would not hide itself.
+    fractions : n floats, 0..1
+        Where along the ways it is asked.
+    depth : float, voxel edges
         Difference of depth from which on something is nearer or farther.
     finer : float, >= 1
         Times by which voxels are drawn smaller than they are, in as many more bins, to see what lies between them.
     """
-    centres, k = np.concatenate((grid.centroids, points, places)), len(places)
+    start, stop = np.moveaxis(grid.centroids[ends], 1, 0)
+    points = start + np.array(fractions)[:, None, None] * (stop - start)
+    k, n, c = len(places), len(fractions), len(ends)
+    centres = np.concatenate((grid.centroids, points.reshape(-1, 3), places))
     middle, reach = unit_frame(grid, centres)
     centres -= middle  # in place: there may be many
     centres /= reach
-    widths, facing = (
-        np.concatenate((grid.edge_lengths / finer, depths)) / reach,
-        np.concatenate((normals, point_normals)),
-    )
-    return depth_order(centres[-k:], centres[:-k], widths, facing, len(points), finer)
+    depths = np.tile(depth * grid.edge_lengths[ends].max(axis=1), n)
+    widths = np.concatenate((grid.edge_lengths / finer, depths)) / reach
+    facing = np.concatenate((normals, np.tile(normals[ends[:, 0]], (n, 1))))
+    return depth_order(centres[-k:], centres[:-k], widths, facing, n * c, finer).reshape(k, n, c)
 
 
 def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:

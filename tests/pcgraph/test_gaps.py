@@ -132,7 +132,7 @@ def test_between_two_voxels_is_seen_what_lies_farther_off_near_the_middle():
         assert grid.n_voxels == len(places)
         rows = grid.voxel_of_point
         surface = Surface(grid, facing[grid.order], rows)
-        return seen_between(surface, np.array(place), rows[source], rows[target]).tolist()
+        return seen_between(surface, np.array(place), np.stack((rows[source], rows[target]), axis=1)).tolist()
 
     places = np.array(
         [[-0.1, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 1.0, 1.0], [0.2, 1.0, 1.0], [0.2, 1.0, 3.0]]
@@ -141,11 +141,10 @@ def test_between_two_voxels_is_seen_what_lies_farther_off_near_the_middle():
     assert seen(places, source, target) == [True, False, False]  # the last is farther off, but not in the middle
     no_farther = places[:3] * [[1.0], [1.0], [0.53]]  # than by an edge and a half
     assert seen(no_farther, source[:1], target[:1]) == [False]
-    facing = np.tile([0.0, 0.0, -1.0], (3, 1))
-    steps = places[:3] * [[1.0], [1.0], [0.6]]
-    assert seen(steps, source[:1], target[:1]) == [True]
-    slanted = np.where(np.arange(3)[:, None] == 0, [1.0, 0.0, -0.1], facing)
-    slanted[2] = slanted[0]  # its plane goes on there
+    farther = places[:3] * [[1.0], [1.0], [0.6]]
+    assert seen(farther, source[:1], target[:1]) == [True]
+    edge_on = np.tile([0.0, 1.0, 0.0], (3, 1))  # a plane that goes on there
+    assert seen(farther, source[:1], target[:1], edge_on) == [False]
     one = np.zeros(1, np.int64)
     assert seen(places[:1], one, one, place=places[0]) == [False]
 
