@@ -87,7 +87,7 @@ _FLIP_COSINE = 0.5  # a normal is flipped if its cosine with that of larger voxe
 _FEW_OUTLIERS = 0.95  # fraction of the points left from which on scale and viewpoint are not estimated again
 _NOISY = 0.9  # fraction left up to which outliers are sought in voxels half as large, too
 _MIN_SHOWN = 0.8  # fraction of the surface that an estimated scanner position must see
-_MAX_VIEWPOINTS = 3  # from which continuations are sought, where the cloud was not seen from one
+_MAX_VIEWPOINTS = 3  # from which continuations are sought, where each point has its own
 _SAMPLED_VOXELS = 64  # whose points' viewpoints are candidates for these
 _MAX_TRIES, _NEAR = 8, 0.02  # spacings tried for a number of supervoxels; logarithm of what it may be off by
 
@@ -318,7 +318,7 @@ def update(
     viewpoint_of_voxel[union.second] = _far_along(grid, oriented.planes.normals)
     viewpoint_of_voxel[union.first] = _far_along(before.grid, before.normals)
     viewpoints = oriented.viewpoints
-    if earlier.viewpoint.ndim == 1:
+    if len(viewpoints) and earlier.viewpoint.ndim == 1:
         viewpoints = np.concatenate((viewpoints, earlier.viewpoint[None]))
     scan = Scan(
         cloud,
@@ -447,9 +447,9 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     faces = faces_of(touching.edges, features, len(leaves))
     # no place saw all of several scans
     seen_from = grid.warp.seen_from if earlier is None else None
-    places = scan.oriented.viewpoints if scan.oriented.viewpoint_known else np.empty((0, 3))
     near, hidden = side_by_side(
-        lambda: gaps(surface, nodes, touching.edges, seen_from), lambda: continuations(surface, nodes, faces, places)
+        lambda: gaps(surface, nodes, touching.edges, seen_from),
+        lambda: continuations(surface, nodes, faces, scan.oriented.viewpoints),
     )
     hidden = hidden.without_coplanar(touching.edges).without_coplanar(near.edges)
     graph = AdjacencyGraph(
@@ -772,7 +772,7 @@ class OrientedPlanes(NamedTuple):
     viewpoint : (3,) or (n, 3) float64, metres
         Sensor position, given or estimated, of all n points or of each.
     viewpoints : (p, 3) float64, metres
-        From which continuations are sought: the viewpoint, some of the points', or virtual ones that see the outside.
+        From which continuations are sought: the viewpoint, or some of the points'; none if nobody knows.
     viewpoint_known : bool
         Whether the viewpoint was given, or told by pixels or spacing.
     planes : LocalPlanes
@@ -819,7 +819,7 @@ def _oriented_planes(
         )
         sides = visible_sides(grid, planes.normals, virtual)
         planes = replace(planes, normals=sides.normals)
-        return OrientedPlanes(sides.places[0], sides.places[:_MAX_VIEWPOINTS], False, planes)
+        return OrientedPlanes(sides.places[0], np.empty((0, 3)), False, planes)
     if viewpoint.ndim == 1:
         planes = method.planes(grid, viewpoint)
         if law is not None and law.axis is not None:
