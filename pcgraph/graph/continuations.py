@@ -68,7 +68,7 @@ _MIN_DEPTH = 3.0
 """Depth by which what hides a way lies nearer, voxel edges. Measured: with one, tops of equal cartons in a row join in
 one draw of four."""
 _OFF_PLANE = 2.5
-"""Distance from which on something is behind or in front of a plane, voxel edges. Chosen by eye."""
+"""Distance from which on something lies behind or before a plane, or above the ground, voxel edges. Chosen by eye."""
 _MAX_BEHIND = 0.005
 """Largest fraction of the voxels behind a plane that bounds the scene. Chosen by eye."""
 _MIN_IN_FRONT = 0.2
@@ -110,8 +110,6 @@ _BORDER_CELL = 3.0
 _MIN_WIDTH = 6.0
 """Least width of what ground goes on under, voxel edges, because the rim of a crate is narrower. Measured: with 4.5 its
 bottom is the table, though ISPRS 23 gains 0.02 of ground."""
-_MIN_RISE = 2.5
-"""Least height of that above the ground, voxel edges. Chosen by eye."""
 _MAX_LEVELS = 0.25
 """Largest difference of height of two pieces, over that height, a ratio, because a terrace differs more."""
 
@@ -533,6 +531,20 @@ def _unseen(surface: Surface, places: NDArray[np.float64], ways: list[_Ways]) ->
     return np.split(hidden, np.cumsum([len(some.ends) for some in ways])[:-1])
 
 
+def _beside_middles(
+    scene: _Scene,
+    some: NDArray[np.int64],
+    plane: _Plane,
+    middles: NDArray[np.float64],
+    lengths: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The nearest of some supervoxels to the middle of each way, as projected on a plane, (c, q) rows of `some`, and
+    whether they are within half its length."""
+    numbers = np.arange(1, min(_NEAREST, len(some)) + 1)
+    distance, nearest = cKDTree(plane.project(scene.places[some])).query(middles, k=numbers)
+    return nearest, distance <= np.maximum(0.5 * lengths[:, None], _OFF_PLANE * scene.edges[some[nearest]])
+
+
 def _behind_something(
     surface: Surface, scene: _Scene, plane: _Plane, ways: _Ways, areas: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
@@ -552,10 +564,8 @@ def _behind_something(
     bands = heights[before] + np.array([[-1.0], [1.0]]) * scene.edges[before]
     low, high = sums[np.searchsorted(heights[parallel], bands)]
     sets_in = np.where(cosines[before] >= np.cos(_MAX_ANGLE), high - low, 0.0)
-    some = np.arange(1, min(_NEAREST, len(before)) + 1)
-    distance, number = cKDTree(plane.project(scene.places[before])).query(middles, k=some)
+    number, over = _beside_middles(scene, before, plane, middles, ways.lengths)
     nearest, larger = before[number], areas[ways.pieces].max(axis=1)[:, None]
-    over = distance <= np.maximum(0.5 * lengths, _OFF_PLANE * scene.edges[nearest])
     hides = over & (heights[nearest] > _OFF_PLANE * scene.edges[nearest]) & (heights[nearest] <= _MAX_HEIGHT * lengths)
     hidden = hides.any(axis=1) & ~(over & (sets_in[number] > larger)).any(axis=1)
     behind = scene.places[heights < -_OFF_PLANE * scene.edges]
@@ -660,15 +670,13 @@ def _under(
     cells = voxel_grid(np.column_stack((projected, of_voxel[border].astype(np.float64))), 1.0, Warp())
     border = border[np.sort(cells.order[cells.starts[:-1]])]
     ways = _facing_ways(grid, plane, border, of_voxel[border])
-    ends, others = grid.centroids[ways.ends], nodes.centroid[of_supervoxel < 0]
+    ends, others, scene = grid.centroids[ways.ends], np.flatnonzero(of_supervoxel < 0), _scene(surface, nodes)
     hidden = np.zeros(len(ends), np.bool_)
     if len(others) and len(ends):
         heights = plane.heights(ends.reshape(-1, 3)).reshape(-1, 2)
-        some = np.arange(1, min(_NEAREST, len(others)) + 1)
-        distance, near = cKDTree(plane.project(others)).query(plane.project(ends.mean(axis=1)), k=some)
-        over = distance <= np.maximum(0.5 * ways.lengths, _MIN_RISE * edge)[:, None]
-        rise = plane.heights(others)[near] - heights.max(axis=1)[:, None]
-        levels = np.ptp(heights, axis=1)[:, None]
-        hidden = (over & (rise > _MIN_RISE * edge) & (levels < _MAX_LEVELS * rise)).any(axis=1)
+        number, over = _beside_middles(scene, others, plane, plane.project(ends.mean(axis=1)), ways.lengths)
+        rise = plane.heights(scene.places)[others[number]] - heights.max(axis=1)[:, None]
+        over &= (rise > _OFF_PLANE * edge) & (np.ptp(heights, axis=1)[:, None] < _MAX_LEVELS * rise)
+        hidden[:] = over.any(axis=1)
     areas = np.bincount(of_voxel + 1, np.square(grid.edge_lengths))[1:].astype(np.float64)
     return ways.joined((ways.means(hidden) >= _MIN_HIDDEN) & (ways.widths >= _MIN_WIDTH * edge), areas)
