@@ -239,9 +239,9 @@ def _look(
         n_doubtful = 0
         for j in range(m):  # branch-free: it would often be mispredicted
             i, found = n - m + j, np.int32(nearest[at[j]] >> 32).view(np.float32)
-            too_far = views.limits[i] - found
-            farther = (found > views.ranges[i] + surfels.widths[i]) & (found < _FAR) & (views.ranges[i] > nothing)
-            order[k, j] = np.int8(farther) - np.int8(too_far > nothing)
+            too_far, is_here = views.limits[i] - found, views.ranges[i] <= nothing  # what is at the place is not seen
+            farther = (found > views.ranges[i] + surfels.widths[i]) & (found < _FAR) & (not is_here)
+            order[k, j] = np.int8(farther) - np.int8((too_far > nothing) | is_here)
             doubtful[n_doubtful] = j
             n_doubtful += farther | ((too_far > nothing) & (too_far < _SLANTED * surfels.widths[i]))
         for j in doubtful[:n_doubtful]:

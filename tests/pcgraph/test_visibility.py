@@ -826,6 +826,12 @@ def test_a_closed_bottle_of_few_points_is_seen_from_outside(seed):
     assert fraction_outward(points, outwards) > 0.9
 
 
+def test_what_lies_at_the_place_is_not_seen_from_there():
+    places = np.array([[0.0, 0.0, 0.0], [0.3, 0.2, 0.9]])
+    seen = visibility_from(places, places, np.full(2, 0.02), np.tile([0.0, 0.0, 1.0], (2, 1)))
+    assert seen.tolist() == [[False, True], [True, False]]
+
+
 def test_past_a_point_is_seen_what_is_nearer_or_farther():
     """A wall of surfels of 0.02 at z = 0.5; points before it, on it, behind it, a little behind it, and aside."""
     x, y = (0.02 * np.mgrid[-10:11, -10:11]).reshape(2, -1)
