@@ -40,7 +40,7 @@ Measured: with 0.4 for gaps and 0.7 for pieces no score differs by 0.003."""
 
 # Ways across a gap
 _INTERIOR_NEIGHBOURS = 8
-"""Voxels of its own piece around a voxel that is on no border, a count, as seen on a plane."""
+"""Voxels of its own piece around a voxel that is on no border, a count, because on a plane eight others touch it."""
 _MIN_TRIANGULATED = 4
 """Fewest voxels on the borders of a group that are triangulated, because Qhull refuses fewer."""
 _FACING = 2.0
