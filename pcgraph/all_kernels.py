@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiling every kernel of `pcgraph.segment` ahead, for where times are measured.
+"""Compiling every kernel of `pcgraph.segment` ahead, for benchmarks of time.
 
-`pcgraph.segment` compiles on its first call only what its defaults need, by way of `pcgraph.warmup`.
+On its first call `pcgraph.segment` compiles only the kernels that its defaults need, with `pcgraph.warmup`.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from pcgraph.warmup import compile_levels, compile_the_rest, compile_voxels, ima
 
 
 def compile_kernels() -> None:
-    """Compile what `pcgraph.segment` would otherwise compile in its first calls.
+    """Compile the kernels that `pcgraph.segment` would otherwise compile in its first calls.
 
-    It segments two small clouds, one as a list and one as a camera's image, and calls what these two do not reach.
-    Needed only where times are measured: results are the same without it.
+    It segments two small clouds, one as a list and one as a camera's image, and calls the kernels that these two do not
+    reach. Only measurements of time need it: results are the same without it.
     """
     image, normals = image_of_a_step()
     segment(image, np.full(image.shape, 0.5), normals, (0.0, 0.0, 0.0))

@@ -25,8 +25,11 @@ import numpy as np
 from numba import config
 from numpy.typing import NDArray
 
-from pcgraph import pixel_lattice, pixels
-from pcgraph.depth_image import DepthImage
+from pcgraph.acquisition import pixel_lattice, pixels
+from pcgraph.acquisition.depth_image import DepthImage
+from pcgraph.acquisition.kinds import Scanner, Told
+from pcgraph.acquisition.pixels import even_steps
+from pcgraph.acquisition.spacing_law import spacing_law
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph import contacts
@@ -36,7 +39,6 @@ from pcgraph.graph.continuations import continuations
 from pcgraph.graph.gaps import gaps
 from pcgraph.inputs import Pixels, clean_cloud
 from pcgraph.kernel_cache import is_sound
-from pcgraph.pixels import even_steps
 from pcgraph.supervoxels import clustering
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.region_linkage import RegionLinkage
@@ -48,7 +50,6 @@ from pcgraph.voxels.grid import VoxelGrid, at_ends, voxel_grid, with_means
 from pcgraph.voxels.outliers import outlier_voxels
 from pcgraph.voxels.sampling import some_blocks, thinned
 from pcgraph.voxels.spacing import median_spacing
-from pcgraph.voxels.spacing_law import spacing_law
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.visibility import visible_fraction, visible_sides
 from pcgraph.voxels.warp import CameraWarp, Warp
@@ -154,8 +155,9 @@ def _compile_graph_and_tree() -> None:
     leaves = replace(moments_of_groups(places, places, labels, n), normals=normals)
     surface = Surface(grid, normals, labels)
     nodes, touching = node_features(leaves), contacts.contacts(surface)
-    near = gaps(surface, nodes, touching.edges, np.zeros(3))
-    hidden = continuations(surface, nodes, labels, np.zeros((1, 3)))
+    scanner = Scanner(Told(), np.zeros(3), 0.5)
+    near = gaps(surface, nodes, touching.edges, scanner)
+    hidden = continuations(surface, nodes, labels, scanner, np.zeros((1, 3)))
     graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes, near, hidden)
     graph = replace(graph, bridges=bridges(surface, leaves.counts, graph.joined))
     segmentation_tree(RegionLinkage().merges(graph, leaves), leaves).cut(altitude=0.5)

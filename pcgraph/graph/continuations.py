@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, cKDTree
 
+from pcgraph.acquisition.kinds import Acquisition
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.moments import Moments, grouped_moments
 from pcgraph.features.nodes import NodeFeatures, node_features
@@ -168,7 +169,11 @@ class Continuations(ShortRepr):
 
 
 def continuations(
-    surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32], places: NDArray[np.float64]
+    surface: Surface,
+    nodes: NodeFeatures,
+    faces: NDArray[np.int32],
+    acquisition: Acquisition,
+    places: NDArray[np.float64],
 ) -> Continuations:
     """Supervoxels on the borders that pieces of one surface turn to each other, where what parts them is hidden.
 
@@ -178,8 +183,9 @@ def continuations(
     nodes : NodeFeatures of the k supervoxels
     faces : (k,) int32
         Which of them lie on one face (`faces_of`).
+    acquisition : Acquisition
     places : (p, 3) float64, metres
-        From where the cloud was seen; none, if nobody knows.
+        Places from which the cloud was seen, if the acquisition tells any: others are not asked.
 
     Notes
     -----
@@ -189,7 +195,10 @@ def continuations(
 
     Completion behind what hides a surface: Kellman and Shipley 1991.
     """
-    return _of_terrain(surface, nodes, faces).with_others(_of_planes(surface, nodes, faces, places))
+    places = places[:0] if acquisition.viewpoint is None else places
+    of_planes = _of_planes(surface, nodes, faces, places)
+    # What one scanner did not see is told by its place, and no terrain.
+    return of_planes if acquisition.is_one_scan else _of_terrain(surface, nodes, faces).with_others(of_planes)
 
 
 def faces_of(edges: NDArray[np.int32], features: EdgeFeatures, k: int) -> NDArray[np.int32]:
@@ -610,8 +619,6 @@ def _ground_from_far_above(
 
     Nothing that touches nothing tells the others' sides, so normals may point either way.
     """
-    if surface.grid.warp.of_one_scan:
-        return None
     some = surface.normals[:: max(1, surface.grid.n_voxels // _SAMPLED_VOXELS)]
     axis = np.linalg.eigh(np.einsum("ij,ik->jk", some, some))[1][:, 2]
     cosines = np.einsum("ij,j->i", some, axis)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unit directions: evenly over the sphere, and two along a plane; which normals are those of one surface."""
+"""Unit vectors spread evenly over the sphere, and along a plane; which normals are those of one surface."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 SAME_SURFACE_COSINE = np.float32(0.8)
-"""Least cosine between the normals of two voxels on one surface. Measured: with 0.9 for colours no score
+"""Least cosine between the normals of two voxels on one surface, 37 degrees. Measured: with 0.9 for colours no score
 differs by 0.004."""
 CREASE_COSINE = 0.5
-"""Largest cosine between the normals of two voxels at a crease, 60 degrees. Chosen by eye."""
+"""Largest cosine between the normals of two voxels at a crease, 60 degrees. Chosen by eye, not varied."""
 
 
 def sphere_directions(n: int) -> NDArray[np.float64]:

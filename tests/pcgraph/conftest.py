@@ -3,15 +3,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from clouds import two_boxes_on_a_plane
-from simulated_rooms import room
+from scenes.rooms import view_of_a_room
+from scenes.tables import two_boxes_on_a_plane
 
 import pcgraph
 from pcgraph.detection import find_planes
@@ -22,7 +18,7 @@ from pcgraph.detection import find_planes
 FIRST = (
     *("test_warmup", "test_real", "test_surface", "test_learning_classifier", "test_learning_transfer"),
     *("test_linkage_learned", "test_plain_files", "test_metrics_peers", "test_docs", "test_short_repr"),
-    *("test_detection_objects", "test_detection_planes", "test_plausibility", "test_benchmarks", "test_files"),
+    *("test_detection_objects", "test_detection_planes", "test_plausibility", "test_files"),
     *("test_properties",),
 )
 HERE = Path(__file__).parent
@@ -45,7 +41,7 @@ def boxes():
 @pytest.fixture(scope="session")
 def rooms():
     """Four simulated rooms with their segmentations and planes."""
-    views = [room(seed) for seed in range(4)]
+    views = [view_of_a_room(seed) for seed in range(4)]
     results = [pcgraph.segment(r.points, r.colors) for r in views]
     return [(r, s, find_planes(s, up=r.up)) for r, s in zip(views, results, strict=True)]
 

@@ -8,8 +8,9 @@ import time
 
 import numpy as np
 import pytest
-from clouds import refines, two_boxes_on_a_plane
-from graphs import hand_graph, hand_tree, leaf_sets, random_graph, tree_of
+from checks import refines
+from scenes.graphs import hand_graph, hand_tree, leaf_sets, random_graph, tree_of
+from scenes.tables import two_boxes_on_a_plane
 
 from pcgraph import segment
 from pcgraph.features.moments import Moments

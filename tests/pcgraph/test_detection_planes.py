@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import SPACING, VIEWPOINT, patch, two_boxes_on_a_plane
+from scenes.images import at_depths
+from scenes.rooms import CLASSES
+from scenes.surfaces import SPACING, patch, sphere
+from scenes.tables import VIEWPOINT, two_boxes_on_a_plane
 from scipy.spatial.transform import Rotation
-from simulated_rooms import CLASSES
-from solids import sphere
 
 import pcgraph
 from pcgraph.detection import find_planes, object_labels, objects_on
@@ -93,7 +94,7 @@ def test_pieces_of_a_table_are_one_plane_if_asked():
 
 
 def test_missing_points_belong_to_nothing():
-    points = np.dstack([*np.meshgrid(np.linspace(-0.5, 0.5, 80), np.linspace(-0.4, 0.4, 60)), np.full((60, 80), 2.0)])
+    points = at_depths((60, 80), 160.0, np.full((60, 80), 2.0))
     points[10:20, 30:40] = np.nan
     result = pcgraph.segment(points)
     planes = find_planes(result)

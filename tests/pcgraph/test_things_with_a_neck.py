@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scenes.bodies import bolt, bottle, box, dumbbell, lamp, on_a_table
 from tiers import to_validate
-from turned_bodies import bolt, bottle, box, dumbbell, lamp, on_a_table
 
 import pcgraph
 from pcgraph.detection.objects import MAX_MISS

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import networkx
 import numpy as np
 import pytest
-from clouds import refines
-from graphs import SHAPES, leaf_sets, random_graph, tree_of
+from checks import refines
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes.graphs import SHAPES, leaf_sets, made, random_graph, tree_of
 
 from pcgraph.features.moments import Moments
 from pcgraph.features.nodes import node_features
@@ -198,8 +198,6 @@ def test_a_long_chain_neither_recurses_nor_hangs(linkage):
 
 
 def long_chain(n, rng):
-    from graphs import made
-
     ends = np.arange(n - 1)
     rows = {"convexity": -np.arange(1.0, n) / n, "contact_convexity": -np.arange(1.0, n) / n}
     rows |= {"contact_voxels": np.full(n - 1, 2), "contact_length": np.ones(n - 1)}
