@@ -14,7 +14,7 @@ from pcgraph.acquisition.resection import NO_PLANE, is_far_off, resection
 from pcgraph.inputs import CleanCloud, ImageView, Pixels, unit_rows
 from pcgraph.parallel import MIN_ROWS, in_blocks, kernel, routine
 from pcgraph.voxels.outliers import MIN_POINTS
-from pcgraph.voxels.spacing import VOXELS_PER_SPACING
+from pcgraph.voxels.spacing import VOXELS_PER_SPACING, median_spacing
 from pcgraph.voxels.warp import FORWARDS, Warp, along_axis
 
 
@@ -83,7 +83,7 @@ def image_view(cloud: CleanCloud) -> ImageView | None:
     far_apart = _neighbours_far_apart(cloud, cloud.image)
     told = max(far_apart, default=0.0) <= _CAMERA.max_far_apart
     if told and is_camera_image(cloud, origin.place):
-        return origin
+        return ImageView(origin.place, np.array(FORWARDS))
     camera = _camera(cloud, cloud.image)
     if told:
         if camera is None or not _is_same_place(camera.place, origin.place, cloud):
@@ -188,6 +188,8 @@ class DepthImage(NamedTuple):
         Step, or noise, of the inverse depth of far pixels; 0 if it is too small to show.
     pitch : (2,) float64
         Median distance of neighbours in a row, and in a column, at a depth of 1; 0 if there are none.
+    nearest : float
+        Median distance of pixels from the nearest of their four neighbours, over depth; 0 if many have none.
     middle, far : float, metres
         Median of the depths, and the depth that a fifth of them exceed; 0 if there are none.
     """
@@ -198,6 +200,7 @@ class DepthImage(NamedTuple):
     depths: NDArray[np.float64]
     step: float
     pitch: NDArray[np.float64]
+    nearest: float
     middle: float
     far: float
 
@@ -219,14 +222,16 @@ class DepthImage(NamedTuple):
         with np.errstate(over="ignore"):  # the tiniest depths
             steps = [_step_along(rows[:: max(1, rows.size // _STEPS.sample)], far) for rows in (depths, depths.T)]
         pitch = np.array([_pitch(points, place, along, image, one) for one in (1, image.shape[1])])
-        return cls(place, axis, image, depths, min(filter(None, steps), default=0.0), pitch, middle, far)
+        nearest = _nearest(points, place, along, image)
+        return cls(place, axis, image, depths, min(filter(None, steps), default=0.0), pitch, nearest, middle, far)
 
-    def spacing(self, of_points: float, warp: Warp) -> float:
-        """Spacing by which voxels are sized, metres in the space of a warp: that of the points, or more.
+    def spacing(self, points: NDArray[np.float64], warp: Warp) -> float:
+        """Spacing by which voxels are sized, metres in the space of a warp: that of the points, (n, 3), or more.
 
-        It is more, up to four times `of_points`, if steps of depth at the far depth are coarser than the voxels would
-        be. And it is at least 0.4 of the distance between rows, or columns, so that a voxel holds more than one row of
-        pixels that are far from square.
+        The spacing of the points is that of neighbouring pixels, unless pixels are missing. It is more, up to four
+        times that, if steps of depth at the far depth are coarser than the voxels would be. And it is at least 0.4 of
+        the distance between rows, or columns, so that a voxel holds more than one row of pixels that are far from
+        square.
 
         Notes
         -----
@@ -234,9 +239,10 @@ class DepthImage(NamedTuple):
         2012), while the distance of pixels grows with z. So far off a surface is a stack of sheets that do not touch.
         """
         if self.far == 0.0:
-            return of_points
+            return median_spacing(points, warp)
         depths = np.array([self.middle, self.far])
         of_middle, of_far = (depths / warp.scale(self.place + depths[:, None] * self.axis)).tolist()
+        of_points = self.nearest * of_middle if self.nearest > 0.0 else median_spacing(points, warp)
         coarse, across = self.step * self.far * of_far, float(self.pitch.max()) * of_middle
         return max(
             of_points,
@@ -279,6 +285,27 @@ def _pitch(
         (points[at] - place) / depths[at, None] for at in _pairs_beside(image, _some_of(image, _CAMERA.sample), step)
     )
     return float(np.median(np.linalg.norm(other - one, axis=1))) if len(one) else 0.0
+
+
+def _nearest(
+    points: NDArray[np.float64], place: NDArray[np.float64], depths: NDArray[np.float64], image: Pixels
+) -> float:
+    """Median distance of some pixels from the nearest of their four neighbours, in depths; 0 if many have none.
+
+    Distances are those of a camera's warp: along the axis, differences of the logarithm of depth count.
+    """
+    some, (h, w) = _some_of(image, _CAMERA.sample), image.shape
+    row, column = np.divmod(image.at[some], w)
+    nearest = np.full(len(some), np.inf)
+    for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        inside = (row + down >= 0) & (row + down < h) & (column + right >= 0) & (column + right < w)
+        beside = np.where(inside, image.point_at[np.where(inside, image.at[some] + down * w + right, 0)], -1)
+        one, other = some[beside >= 0], beside[beside >= 0]
+        ways = (points[other] - place) / depths[other, None] - (points[one] - place) / depths[one, None]
+        squares = np.einsum("ij,ij->i", ways, ways) + np.log(depths[other] / depths[one]) ** 2
+        nearest[beside >= 0] = np.fmin(nearest[beside >= 0], np.sqrt(squares))
+    found = np.isfinite(nearest)
+    return float(np.median(nearest[found])) if np.mean(found) >= _FLYING.min_with_neighbour else 0.0
 
 
 def _step_along(rows: NDArray[np.float64], far: float) -> float:

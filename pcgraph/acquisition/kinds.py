@@ -476,10 +476,10 @@ def acquisition_of(
         places[cloud.kept] = place
         return SeveralPlaces(told, places)
     if camera is None:
-        camera = not growth and (axis is not None or is_camera_image(cloud, place))
-    if cloud.image is not None and (camera or axis is not None):
+        camera = axis is not None or is_camera_image(cloud, place)
+    if camera and cloud.image is not None:
         told = told._replace(image=DepthImage.of(cloud.points, cloud.image, place, axis))
-    if camera:
+    if camera and not growth:
         return CameraImage(told, place, np.array(FORWARDS) if axis is None else axis)
     return Scanner(told, place, growth) if growth else OnePlace(told, place)
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cuts of a tree: the node that each leaf ends up in, by altitude, number, size or stability.
+"""Cuts of a tree: the node that each leaf ends up in, by altitude, number and size.
 
 A cut chooses nodes, none above another. A leaf goes to the chosen node above it. If there is none, because the nodes
-above the leaf are too small or do not last, the leaf goes to the chosen node with which the tree would have merged it.
+above the leaf are too small, the leaf goes to the chosen node with which the tree would have merged it.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def _cores_below(
     return core
 
 
-# --- stability: what lasts longest ------------------------------------------------------------------------------------
+# --- persistence ------------------------------------------------------------------------------------------------------
 
 
 def persistences(parents: NDArray[np.int32], altitudes: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -166,78 +166,3 @@ def persistences(parents: NDArray[np.int32], altitudes: NDArray[np.float64]) -> 
     above[-1] = np.inf
     born = np.isfinite(altitudes)
     return np.subtract(above, altitudes, out=np.zeros(len(parents)), where=born)
-
-
-def stable_cut(
-    parents: NDArray[np.int32], altitudes: NDArray[np.float64], counts: NDArray[np.int64], min_size: int
-) -> NDArray[np.int32]:
-    """Node of each leaf, (n_leaves,) int32, in the most stable segmentation: see `SegmentationTree.cut_stable`."""
-    least = min(whole_number("min_size", min_size), int(counts[-1]))
-    chosen = stable_nodes(parents, altitudes, counts, least)
-    if not chosen.any():  # all parts that touch nothing else are too small
-        chosen[-1] = True
-    return core_of_leaf(parents, counts, chosen)
-
-
-def stable_nodes(
-    parents: NDArray[np.int32], altitudes: NDArray[np.float64], counts: NDArray[np.int64], min_size: int
-) -> NDArray[np.bool_]:
-    """Whether each node is chosen, (k,) bool: the set of nodes, none above another, of the largest total stability.
-
-    A branch is a segment as it grows by merges with parts of fewer than `min_size` points, from where it first has
-    `min_size` points itself. Its stability is the sum of points x life over its nodes. Life is the difference of the
-    square roots of two altitudes; of the altitudes themselves the highest lie so far apart that a scene in two pieces
-    would last longest. Life ends at the largest finite altitude at which two parts of `min_size` points merge, because
-    smaller parts may come in at any altitude (a voxel far off at pi). The chosen nodes are the tops of branches. Of
-    equal stability the coarser one is chosen. Leaves below no chosen node are left to the caller.
-
-    Parameters
-    ----------
-    parents, altitudes : (k,)
-        As in `SegmentationTree`.
-    counts : (k,) int64
-        Points of each node.
-    min_size : int
-
-    Notes
-    -----
-    Source: Campello et al. 2015 (excess of mass, HDBSCAN), with the square root of altitude in place of 1 / density.
-    """
-    across_gap, pairs = np.isinf(altitudes), binary_children(parents)
-    smaller = np.where(pairs[:, 0] >= 0, counts[pairs].min(axis=1), 0)
-    levels = np.sqrt(np.minimum(altitudes, altitudes[~across_gap & (smaller >= min_size)].max(initial=0.0)))
-    life = levels[parents] - levels
-    taken = _more_stable(pairs, life, counts, (counts >= min_size) & ~across_gap, min_size)
-    taken = propagate_sequential(parents, taken, ~taken)
-    below = taken[parents]
-    below[-1] = False
-    return taken & ~below  # the highest of each chain of taken nodes
-
-
-@kernel
-def _more_stable(
-    children: NDArray[np.int32],
-    persistence: NDArray[np.float64],
-    counts: NDArray[np.int64],
-    eligible: NDArray[np.bool_],
-    min_size: int,
-) -> NDArray[np.bool_]:
-    """Whether each eligible node's branch has at least the stability of the best choice below it."""
-    k = len(children)
-    own, best = np.zeros(k), np.zeros(k)
-    taken = np.zeros(k, np.bool_)
-    for node in range(k):
-        a, b = children[node]
-        below = 0.0
-        if a >= 0:
-            below = best[a] + best[b]
-        if not eligible[node]:
-            best[node] = below
-            continue
-        if a >= 0 and (counts[a] < min_size) != (counts[b] < min_size):
-            own[node] = own[a] if counts[a] >= min_size else own[b]  # the branch goes on
-        own[node] += counts[node] * persistence[node]
-        # Where a branch goes on, the node above has all of this stability and more, so it is chosen in its place.
-        taken[node] = own[node] >= below
-        best[node] = max(own[node], below)
-    return taken

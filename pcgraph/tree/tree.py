@@ -15,7 +15,7 @@ from pcgraph.features.nodes import NodeFeatures, node_features, rows, scalar_col
 from pcgraph.hierarchy import lowest_common_ancestors, roots
 from pcgraph.inputs import non_negative
 from pcgraph.plumbing.short_repr import ShortRepr
-from pcgraph.tree.cuts import horizontal_cut, numbered_segments, persistences, stable_cut
+from pcgraph.tree.cuts import horizontal_cut, numbered_segments, persistences
 from pcgraph.tree.linkage import Merges
 from pcgraph.tree.optimal_cut import Energy, appearance_scales
 
@@ -114,30 +114,6 @@ class SegmentationTree(ShortRepr):
         """
         columns = [self.cut(altitude=level) for level in np.ravel(altitudes).tolist()]
         return np.stack(columns, axis=1) if columns else np.empty((self.n_leaves, 0), np.int32)
-
-    def cut_stable(self, min_size: int = 1) -> NDArray[np.int32]:
-        """Segment of each leaf in the most stable segmentation, (n_leaves,) int32, numbered as in `cut`.
-
-        Of all ways to choose nodes, none above another, it is the one with the largest sum of points x life (excess of
-        mass, Campello et al. 2015). Life is the difference of the square roots of the altitudes at which a node comes
-        to be and ends. Segments may come from different altitudes. Life ends at the largest finite altitude at which
-        two parts of `min_size` points merge, so a scene is not one segment only because it is one piece.
-
-        Parameters
-        ----------
-        min_size : int, points
-            A merge with fewer points does not end a segment's life, and no segment has fewer.
-
-        Raises
-        ------
-        ValueError
-            `min_size` is not a whole number of at least 1.
-        """
-        return self._segments(self.cut_stable_nodes(min_size))
-
-    def cut_stable_nodes(self, min_size: int = 1) -> NDArray[np.int32]:
-        """Node of the tree for each leaf, (n_leaves,) int32; as `cut_stable`."""
-        return stable_cut(self.parents, self.altitudes, self.moments.counts, min_size)
 
     def cut_optimal(self, energy: Energy, scale: float) -> NDArray[np.int32]:
         """Segment of each leaf in the cut of least energy, (n_leaves,) int32, numbered as in `cut`.

@@ -221,9 +221,11 @@ def _scale(cloud: CleanCloud, assumed: Acquisition, sizes: Sizes) -> tuple[float
     warp = acquisition.warp(cloud.points)
     size = sizes.voxel
     if size is None:
-        spacing = median_spacing(cloud.points, warp) if spacing is None else spacing
-        image = assumed.told.image
-        size = VOXELS_PER_SPACING * (spacing if image is None else image.spacing(spacing, warp))
+        if assumed.told.image is not None:
+            spacing = assumed.told.image.spacing(cloud.points, warp)
+        elif spacing is None:
+            spacing = median_spacing(cloud.points, warp)
+        size = VOXELS_PER_SPACING * spacing
         extent = float(np.ptp(cloud.bounds, axis=0).max())
         if 0.0 < extent < math.inf and 0.0 < size < math.inf:
             size = extent * 2.0 ** (round(_SIZES_PER_OCTAVE * math.log2(size / extent)) / _SIZES_PER_OCTAVE)

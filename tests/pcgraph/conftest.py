@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from scenes.rooms import view_of_a_room
 from scenes.tables import two_boxes_on_a_plane
@@ -22,7 +23,7 @@ FIRST = (
     *("test_properties",),
 )
 HERE = Path(__file__).parent
-REAL_CLOUDS = Path(__file__).resolve().parents[3] / "shared" / "data" / "mosd"
+REAL_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -49,7 +50,16 @@ def rooms():
 @pytest.fixture(scope="session")
 def real_clouds() -> list[Path]:
     """Paths of the labelled real clouds."""
-    paths = sorted(REAL_CLOUDS.glob("*.pcd"))
+    paths = sorted((REAL_DATA / "mosd").glob("*.pcd"))
     if not paths:
-        pytest.skip(f"the real clouds are not here: {REAL_CLOUDS}")
+        pytest.skip(f"the real clouds are not here: {REAL_DATA / 'mosd'}")
     return paths
+
+
+@pytest.fixture(scope="session")
+def real_sweep() -> np.ndarray:
+    """Points (n, 3) that a 64-beam LiDAR on a car sees ahead of it, the scanner at 0."""
+    path = REAL_DATA / "lidar" / "kitti_000008.bin"
+    if not path.exists():
+        pytest.skip(f"the real sweep is not here: {path}")
+    return np.fromfile(path, np.float32).reshape(-1, 4)[:, :3]

@@ -113,10 +113,9 @@ def assert_cuts_of_a_least_size_have_it_and_never_cross(case):
     finest = int(tree.cut(altitude=-1.0, min_size=least).max()) + 1
     by_number = [tree.cut(n=count, min_size=least) for count in range(finest, 0, -1)]
     assert [int(cut.max()) + 1 for cut in by_number] == list(range(finest, 0, -1))
-    stable = tree.cut_stable(least)
     for family in (cuts, by_number):
         assert all(refines(fine, coarse) for fine, coarse in pairwise(family))
-    for cut in (*cuts, *by_number, stable):
+    for cut in (*cuts, *by_number):
         assert np.bincount(cut, leaves.counts).min() >= min(least, leaves.counts.sum())
 
 
@@ -193,7 +192,6 @@ def test_a_long_chain_neither_recurses_nor_hangs(linkage):
     tree = tree_of(linkage, graph, leaves)
     assert tree.altitudes[-1] < np.inf
     assert tree.cut(n=7).max() == 6
-    assert tree.cut_stable().max() >= 0
     assert tree.cut_optimal(plane_energy(tree, graph), 1.0).max() >= 0
 
 
