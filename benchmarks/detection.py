@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Planes and objects found by pcgraph.detection, on real tables (mOSD) and in simulated rooms.
 
-    python benchmarks/detection.py [--rooms 12] [--first 200]
+    python benchmarks/detection.py [--rooms 12] [--first 200] [--streets]
 
 Real clouds: the table against Open3D's RANSAC plane, objects by IoU. Rooms: planes and shapes against the exact ones.
-The last line is JSON.
+Streets: the road's plane against RANSAC's. The last line is JSON.
 """
 
 from __future__ import annotations
@@ -12,16 +12,23 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 from mosd import load_clouds
 from numpy.typing import NDArray
+from ouster_sweeps import read
+from scanned_scenes import scan, sphere_of_rays
+from scanned_streets import Street, place_over_lane, street, sweep
 from simulated_rooms import CLASSES, Room, room
 
 import pcgraph
 from pcgraph.detection import DetectedObject, Planes, find_planes, object_labels, objects_on
 
 RANSAC_DISTANCE = 0.01  # metres: the best for the table of 0.003, 0.005, 0.01 on these clouds
+RANSAC_OF_ROADS = 0.1  # metres
+LIDAR = Path(__file__).resolve().parents[2] / "shared" / "data" / "lidar"
 
 
 def overlaps(labels: NDArray[np.int32], n: int, truth: NDArray[np.int32]) -> NDArray[np.float64]:
@@ -35,12 +42,14 @@ def iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
     return float((a & b).sum() / (a | b).sum())
 
 
-def ransac(points: NDArray[np.float32], finite: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def ransac(
+    points: NDArray[np.floating], finite: NDArray[np.bool_], distance: float = RANSAC_DISTANCE
+) -> NDArray[np.bool_]:
     import open3d
 
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points[finite].astype(float)))
     open3d.utility.random.seed(0)
-    _, inside = cloud.segment_plane(RANSAC_DISTANCE, 3, 1000)
+    _, inside = cloud.segment_plane(distance, 3, 1000)
     found = np.zeros(int(finite.sum()), bool)
     found[inside] = True
     mask = np.zeros(finite.shape, bool)
@@ -149,13 +158,57 @@ def on_the_table(
     return found, overlaps(object_labels(result, found), len(found), truth)
 
 
+def sweeps() -> Iterator[tuple[str, NDArray[np.floating], NDArray[np.bool_] | None]]:
+    """Name, points (n, 3) and, where known, which of them are on the road."""
+    yield "KITTI 8", np.fromfile(LIDAR / "kitti_000008.bin", np.float32).reshape(-1, 4)[:, :3], None
+    for seed in (1, 7, 11, 12):
+        made = street(seed)
+        found = sweep(made, seed)
+        yield f"street {seed}", found.points, _on_road(made, found.points + place_over_lane(made), found.things)
+    for seed, beams, lowest, highest in ((31, 32, -30.0, 10.0), (32, 16, -15.0, 15.0), (33, 128, -12.0, 12.0)):
+        made = street(seed)
+        rng = np.random.default_rng(seed)
+        rays = sphere_of_rays(np.arange(0.0, 360.0, 0.2), np.linspace(lowest, highest, beams))
+        found = scan(made.scene, place_over_lane(made)[None], [rays], 0.02, rng)
+        yield f"street {seed}, {beams} beams", found.points, _on_road(made, found.points, found.things)
+    for file in sorted(LIDAR.glob("*.pcap")):
+        points = read(file)[0]
+        yield file.stem, points[np.isfinite(points).all(axis=-1)], None
+
+
+def _on_road(made: Street, points: NDArray[np.floating], things: NDArray[np.integer]) -> NDArray[np.bool_]:
+    return (things == 0) & (np.abs(points[:, 1]) < made.half_width)
+
+
+def streets() -> dict[str, dict[str, float]]:
+    """Of each sweep, the plane of most points that is level: its rank, and the fractions of points and road in it."""
+    report = {}
+    for name, points, road in sweeps():
+        result = pcgraph.segment(points)
+        planes = find_planes(result, up=(0.0, 0.0, 1.0))
+        level = np.flatnonzero(planes.roles == "horizontal")
+        best = int(level[np.argmax(planes.counts[level])])
+        inside = result.on_points(planes.plane_of_supervoxel) == best
+        theirs = ransac(points, np.ones(len(points), np.bool_), RANSAC_OF_ROADS)
+        row = {"rank": best + 1, "points": inside.mean(), "ransac_points": theirs.mean()}
+        if road is not None:
+            row |= {"road": inside[road].mean(), "ransac_road": theirs[road].mean()}
+        report[name] = {key: float(value) for key, value in row.items()}
+        print(name, {key: round(value, 3) for key, value in report[name].items()}, flush=True)
+    return report
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rooms", type=int, default=12)
     parser.add_argument(
         "--first", type=int, default=200, help="seed of the first; those below were used to choose settings"
     )
+    parser.add_argument("--streets", action="store_true", help="planes of roads alone")
     arguments = parser.parse_args()
+    if arguments.streets:
+        print(json.dumps(streets()))
+        return
     report = {"mosd": real_tables(), "rooms": rooms(range(arguments.first, arguments.first + arguments.rooms))}
     for name, values in report.items():
         print(name, {key: round(float(value), 4) for key, value in values.items()})
