@@ -97,7 +97,7 @@ def update(
     places = places if earlier.viewpoint.ndim > 1 else np.vstack((places, earlier.viewpoint))
     scan = Scan(
         Voxelised(found.cloud, union.grid),
-        SeveralScans.of(earlier.acquisition, last),
+        SeveralScans.of(earlier.acquisition, last.without_image()),
         OrientedPlanes(settings.method.planes(union.grid, viewpoint_of_voxel), np.unique(places, axis=0)),
         initial_labels=labels,
         seed_size=earlier.seed_size,

@@ -171,6 +171,10 @@ class Acquisition(ABC):
         """The acquisition after a check of its viewpoint against what is visible from there."""
         return self
 
+    def without_image(self) -> Acquisition:
+        """The acquisition without its depth image, which takes memory and is used for voxels alone."""
+        return replace(self, told=self.told._replace(image=None))
+
     def warp(self, points: NDArray[np.float64]) -> Warp:
         """The warp by which voxels of points, (n, 3), grow; the identity if they do not."""
         return Warp()
@@ -400,25 +404,32 @@ class SeveralScans(Acquisition):
 
     Attributes
     ----------
-    scans : tuple of Acquisition
-        In the order of `pcgraph.update`.
+    number : int
+        Count of the scans.
+    first, last : Acquisition
+        The first scan, by which voxels grow, and the last one.
+    all_sides_known : bool
+        Whether each scan tells the outer side of surfaces.
     """
 
-    scans: tuple[Acquisition, ...]
+    number: int
+    first: Acquisition
+    last: Acquisition
+    all_sides_known: bool
 
     @classmethod
     def of(cls, earlier: Acquisition, last: Acquisition) -> SeveralScans:
         """The scans so far and one more."""
-        scans = (*(earlier.scans if isinstance(earlier, SeveralScans) else (earlier,)), last)
-        return cls(last.told, scans)
+        number, first = (earlier.number, earlier.first) if isinstance(earlier, SeveralScans) else (1, earlier)
+        return cls(last.told, number + 1, first, last, earlier.sides_known and last.sides_known)
 
     @property
     def viewpoint(self) -> NDArray[np.float64] | None:
         """The viewpoint of the last scan."""
-        return self.scans[-1].viewpoint
+        return self.last.viewpoint
 
     def viewpoint_of(self, cloud: CleanCloud) -> NDArray[np.float64] | None:
-        return self.scans[-1].viewpoint_of(cloud)
+        return self.last.viewpoint_of(cloud)
 
     @property
     def one_viewpoint(self) -> NDArray[np.float64] | None:
@@ -427,17 +438,17 @@ class SeveralScans(Acquisition):
     @property
     def is_one_scan(self) -> bool:
         """True if the first scan is one, as voxels grow by that."""
-        return self.scans[0].is_one_scan
+        return self.first.is_one_scan
 
     @property
     def sides_known(self) -> bool:
-        return all(scan.sides_known for scan in self.scans)
+        return self.all_sides_known
 
     def oriented(self, cloud: CleanCloud, grid: VoxelGrid, planes_from: PlanesFrom) -> OrientedPlanes:
-        return self.scans[-1].oriented(cloud, grid, planes_from)
+        return self.last.oriented(cloud, grid, planes_from)
 
     def __str__(self) -> str:
-        return f"{len(self.scans)} scans, the last {self.scans[-1]}"
+        return f"{self.number} scans, the last {self.last}"
 
 
 def acquisition_of(

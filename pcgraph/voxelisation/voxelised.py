@@ -133,7 +133,7 @@ def voxelise(cloud: CleanCloud, assumed: Acquisition, sizes: Sizes) -> Voxelisat
         size = voxel_size_for(sizes.n_supervoxels, found.cloud.points, found.grid)
         found = found if size == found.grid.size else found.resized(size)
     found = found.with_means()
-    return Voxelisation(found, acquisition.confirmed(found.grid), spacing, orienting_size)
+    return Voxelisation(found, acquisition.confirmed(found.grid).without_image(), spacing, orienting_size)
 
 
 def voxelise_beside(cloud: CleanCloud, earlier: VoxelGrid) -> Voxelised:

@@ -108,7 +108,7 @@ def test_scans_are_known_as_far_as_each_of_them_is() -> None:
     known, unknown = pcgraph.update(result, points + 0.001, viewpoint=(3.0, 0.1, 1.0)), pcgraph.update(result, points)
     for found, sides_known in ((known.acquisition, True), (unknown.acquisition, False)):
         assert isinstance(found, SeveralScans)
-        assert len(found.scans) == 2
+        assert found.number == 2
         assert found.sides_known == sides_known
         assert found.one_viewpoint is None
     third = pcgraph.update(known, points).acquisition
