@@ -233,7 +233,9 @@ class DepthImage(NamedTuple):
             return np.zeros(len(self.pixels.at), np.bool_)
         flying = np.empty(self.depths.shape, np.bool_)
         least = _MIN_SLOPE * float(self.pitch[0])
-        in_blocks(_find_flying, len(flying), self.depths, least, _MIN_STEPS * self.step, flying, smallest=MIN_ROWS)
+        depths = np.ascontiguousarray(self.depths)
+        of_steps = least, _MIN_STEPS * self.step
+        in_blocks(_find_flying, len(flying), depths, depths.reshape(-1), *of_steps, flying, smallest=MIN_ROWS)
         found = flying.reshape(-1)[self.pixels.at]
         some_fly = len(found) >= MIN_POINTS and _MIN_FLYING <= np.mean(found) <= _MAX_FLYING
         return found if some_fly else np.zeros_like(found)
@@ -269,11 +271,12 @@ def _find_flying(
     start: int,
     stop: int,
     depths: NDArray[np.float64],
+    pixels: NDArray[np.float64],
     least_slope: float,
     least_step: float,
     flying: NDArray[np.bool_],
 ) -> None:
-    """Set which pixels of some rows fly."""
+    """Set which pixels of some rows fly, of depths (h, w) and the same in a row, (h w,)."""
     h, w = depths.shape
     for i in range(start, stop):
         for j in range(w):
@@ -281,29 +284,41 @@ def _find_flying(
             limit = max(least_slope * own, least_step * own * own)
             beside = abs(depths[i, max(j - 1, 0)] - own) > limit or abs(depths[i, min(j + 1, w - 1)] - own) > limit
             above = abs(depths[max(i - 1, 0), j] - own) > limit or abs(depths[min(i + 1, h - 1), j] - own) > limit
-            flying[i, j] = (beside and _is_mixed(depths[i], j, limit)) or (above and _is_mixed(depths[:, j], i, limit))
+            flying[i, j] = (beside and _is_mixed(pixels, i * w, np.int64(1), w, j, limit)) or (
+                above and _is_mixed(pixels, j, w, h, i, limit)
+            )
 
 
 @routine
-def _is_mixed(line: NDArray[np.float64], at: int, limit: float) -> bool:
-    """Whether a pixel of a line lies behind one neighbour and before the other by more than a limit, or the other is
-    NaN; and whether such a slope ends on both sides."""
-    before = line[at - 1] - line[at] if at > 0 else 0.0
-    after = line[at + 1] - line[at] if at + 1 < len(line) else 0.0
+def _is_mixed(pixels: NDArray[np.float64], first: int, step: int, length: int, at: int, limit: float) -> bool:
+    """Whether a pixel of a line, a row or a column, lies behind one neighbour and before the other by more than a
+    limit, or the other is NaN; and whether such a slope ends on both sides.
+
+    The line is ``pixels[first : first + step * length : step]``.
+    """
+    own = pixels[first + step * at]
+    before = pixels[first + step * (at - 1)] - own if at > 0 else 0.0
+    after = pixels[first + step * (at + 1)] - own if at + 1 < length else 0.0
     between = min(before, after) < -limit and max(before, after) > limit
     at_hole = (abs(before) > limit and math.isnan(after)) or (abs(after) > limit and math.isnan(before))
-    return bool((between or at_hole) and _ends(line, at, -1) and _ends(line, at, 1))
+    if not (between or at_hole):
+        return False
+    ends = True
+    for way in (-1, 1):
+        ends = ends and _ends(pixels, first, step, length, at, way)
+    return ends
 
 
 @routine
-def _ends(line: NDArray[np.float64], at: int, way: int) -> bool:
+def _ends(pixels: NDArray[np.float64], first: int, step: int, length: int, at: int, way: int) -> bool:
     """Whether a slope ends some pixels along a line, in a hole or on a surface: on a plane inverse depth goes on as it
     went, be it seen edge-on."""
     for _ in range(_MAX_SLOPE_PIXELS):
         following = at + 2 * way
-        if following < 0 or following >= len(line):
+        if following < 0 or following >= length:
             return False
-        here, there, beyond = line[at], line[at + way], line[following]
+        here, there = pixels[first + step * at], pixels[first + step * (at + way)]
+        beyond = pixels[first + step * following]
         if math.isnan(there) or math.isnan(beyond):
             return True
         if abs(1.0 / beyond - 1.0 / there) < _END_OF_SLOPE * abs(1.0 / there - 1.0 / here):

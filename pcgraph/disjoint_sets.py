@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csgraph
 
-from pcgraph.parallel import kernel
+from pcgraph.parallel import routine
 
 
-@kernel
+@routine
 def root_of(links: NDArray[np.integer], element: int) -> int:
     """Representative of an element's set; paths are halved on the way (Tarjan and van Leeuwen 1984)."""
     while links[element] != element:

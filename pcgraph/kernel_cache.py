@@ -52,7 +52,7 @@ def _seal(content: bytes) -> bytes:
 
 
 class _Compiler(Compiler):  # type: ignore[misc]
-    """Numba's compiler, without collections of cyclic garbage: its many small objects make them an eighth of the time."""
+    """Numba's compiler without collecting cyclic garbage, which takes an eighth of its time for its many objects."""
 
     def compile_extra(self, func: Callable[..., Any]) -> Any:
         enabled = gc.isenabled()
@@ -144,6 +144,6 @@ def _say_once() -> None:
     if not _said:
         _said = True
         logging.getLogger(_PACKAGE).warning(
-            "pcgraph compiles its kernels before their first use, once per installation, which takes up to half a "
-            "minute; `pcgraph compile` does it ahead"
+            "pcgraph: compiling kernels before their first use, once per installation, which takes up to half a "
+            "minute; `pcgraph compile` does it ahead."
         )

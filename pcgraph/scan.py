@@ -78,7 +78,6 @@ from pcgraph.voxels.visibility import (
     visible_sides,
 )
 from pcgraph.voxels.warp import Shift, Warp, choose_warp
-from pcgraph.warmup import compile_in_two_processes
 
 RANGE_GROWTH = 0.5
 """Default of `range_growth` for a cloud that is one scan."""
@@ -197,7 +196,6 @@ def segment(
     n_supervoxels = None if n_supervoxels is None else min(n_supervoxels, len(cloud.points))
     is_given = viewpoint is not None
     viewpoint, axis = _viewpoint_and_axis(viewpoint, cloud, bool(camera))
-    compile_in_two_processes()
     camera = _grows_with_depth(cloud, viewpoint, axis, range_growth) if camera is None else camera
     image = _depth_image(cloud, viewpoint, axis, camera)
     asked = _Asked(image, camera, range_growth, voxel_size, seed_size)
@@ -292,7 +290,6 @@ def update(
     cloud = with_pixels(clean_cloud(points, colors, normals, features, earlier.feature_scaling))
     is_given = viewpoint is not None
     viewpoint, axis = _viewpoint_and_axis(viewpoint, cloud, False)
-    compile_in_two_processes()
     warn_of_rounding(points, cloud, None)  # type: ignore[arg-type]
     before = earlier.surface
     before.grid.warp.check(cloud.points)

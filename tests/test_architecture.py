@@ -190,7 +190,6 @@ STOREYS = [
     "families",
     "segmentation",
     "plausibility",
-    "warmup",
     "scan",
     "all_kernels",
 ]

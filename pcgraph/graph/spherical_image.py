@@ -162,25 +162,14 @@ def _lattice(view: View, of_width: float) -> tuple[_Lattice, NDArray[np.int64], 
 
 def _frame(bearings: NDArray[np.float64], seen: NDArray[np.int64]) -> NDArray[np.float64]:
     """Forward, sideways and polar direction, rows of (3, 3)."""
-    mean, scatter = _moments(bearings, seen)
-    pole = np.linalg.eigh(scatter)[1][:, 0]
+    directions = bearings[seen]
+    mean = directions.mean(axis=0)
+    pole = np.linalg.eigh(np.einsum("ij,ik->jk", directions, directions))[1][:, 0]
     forward = mean - pole * (pole @ mean)
     if np.linalg.norm(forward) < 1e-6:  # as much on one side as on the other: any forward will do
         forward = np.cross(pole, np.eye(3)[np.abs(pole).argmin()])
     forward /= np.linalg.norm(forward)
     return np.stack((forward, np.cross(pole, forward), pole))
-
-
-@kernel
-def _moments(bearings: NDArray[np.float64], seen: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean of some directions, (3,), and the sum of their products, (3, 3)."""
-    mean, scatter = np.zeros(3), np.zeros((3, 3))
-    for i in seen:
-        for a in range(3):
-            mean[a] += bearings[i, a] / len(seen)
-            for b in range(3):
-                scatter[a, b] += bearings[i, a] * bearings[i, b]
-    return mean, scatter
 
 
 @kernel

@@ -148,7 +148,7 @@ def sum_features(features: NDArray[np.float64], labels: NDArray[np.int32], n_lab
     return sums
 
 
-@inlined
+@routine
 def add_features(features: NDArray[np.float64], i: int, sums: NDArray[np.float64], s: int, sign: float) -> None:
     """Update the sums: voxel i joins supervoxel s (sign 1) or leaves it (sign -1)."""
     for column in range(9):
@@ -345,7 +345,7 @@ def _expand(
                 j = neighbours[a]
                 if labels[j] == s or claim[j] == s or (labels[j] >= 0 and sweep >= early_sweeps):
                     continue
-                d = distance(features, j, means, s, metric)
+                d = distance(features, np.int64(j), means, s, metric)
                 if d < best[j] or (d == best[j] and claim[j] > s):
                     if claim[j] < 0:
                         touched[n_touched] = j
@@ -357,7 +357,7 @@ def _expand(
                 touched[n_touched] = j
                 n_touched += claim[j] >= 0
         for t in range(n_touched):
-            j = touched[t]
+            j = np.int64(touched[t])
             if labels[j] >= 0:
                 add_features(features, j, sums, labels[j], -1.0)
             add_features(features, j, sums, claim[j], 1.0)
@@ -447,7 +447,7 @@ def _choose(
     features, indptr, neighbours, metric, _ = voxels
     around = np.empty(MAX_NEIGHBOURS + 1, np.int32)
     for q in range(start, stop):
-        i = active[q]
+        i = np.int64(active[q])
         own = nearest = last = labels[i]
         n = 0
         for a in range(indptr[i], indptr[i + 1]):  # branch-free: it would often be mispredicted
@@ -485,7 +485,7 @@ def _move(
     following = np.empty(len(labels), np.int32)
     used = 0
     for q in range(len(active)):
-        i = active[q]
+        i = np.int64(active[q])
         if labels[i] != chosen[q]:
             add_features(features, i, sums, labels[i], -1.0)
             add_features(features, i, sums, chosen[q], 1.0)
@@ -522,28 +522,29 @@ def enforce_connectivity(
     initial : (v,) int32
         Supervoxels that exist already, each in one piece, and keep their numbers and voxels; -1 elsewhere.
     """
-    n_supervoxels = int(labels.max()) + 1
-    kept = _largest_pieces(voxels, labels, n_supervoxels, initial >= 0)
-    _adopt(voxels, kept, n_supervoxels)
-    names = np.full(n_supervoxels, -1, np.int32)
+    names = np.full(int(labels.max()) + 1, -1, np.int32)
     n_initial = int(initial.max()) + 1
     names[:n_initial] = np.arange(n_initial)
-    return _renumber(kept, names, n_initial)
+    return _connect(voxels, labels, initial >= 0, names, n_initial)
 
 
 @kernel
-def _renumber(labels: NDArray[np.int32], names: NDArray[np.int32], used: int) -> NDArray[np.int32]:
-    """Labels by their names, (n_supervoxels,) int32; those still without one, -1, get the next in order of voxels."""
-    numbered = np.empty(len(labels), np.int32)
-    for i in range(len(labels)):
-        if names[labels[i]] < 0:
-            names[labels[i]] = used
+def _connect(
+    voxels: VoxelGraph, labels: NDArray[np.int32], fixed: NDArray[np.bool_], names: NDArray[np.int32], used: int
+) -> NDArray[np.int32]:
+    """Connected labels by their names, (n_supervoxels,) int32; the `used` first have one, the others, -1, get the next
+    in the order of voxels."""
+    connected = _largest_pieces(voxels, labels, len(names), fixed)
+    _adopt(voxels, connected, len(names))
+    for i in range(len(connected)):
+        if names[connected[i]] < 0:
+            names[connected[i]] = used
             used += 1
-        numbered[i] = names[labels[i]]
-    return numbered
+        connected[i] = names[connected[i]]
+    return connected
 
 
-@kernel
+@routine
 def _largest_pieces(
     voxels: VoxelGraph, labels: NDArray[np.int32], n_supervoxels: int, fixed: NDArray[np.bool_]
 ) -> NDArray[np.int32]:
@@ -573,7 +574,7 @@ def _largest_pieces(
     return piece
 
 
-@kernel
+@routine
 def _adopt(
     voxels: VoxelGraph,
     labels: NDArray[np.int32],
@@ -591,7 +592,7 @@ def _adopt(
             n_waiting += 1
     while n_waiting > 0:
         for w in range(n_waiting):
-            adopted[w] = _nearest_label(waiting[w], features, metric, indptr, neighbours, labels, means)
+            adopted[w] = _nearest_label(np.int64(waiting[w]), features, metric, indptr, neighbours, labels, means)
         left = 0
         for w in range(n_waiting):
             if adopted[w] >= 0:

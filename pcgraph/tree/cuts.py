@@ -65,7 +65,6 @@ def _merges(
     return int(np.searchsorted(merge_altitudes, float(level), side="right"))
 
 
-@kernel
 def numbered_segments(nodes: NDArray[np.int32], n_nodes: int) -> NDArray[np.int32]:
     """Segment of each leaf, (n_leaves,) int32, numbered from 0 in the order of their first leaf.
 
@@ -75,15 +74,11 @@ def numbered_segments(nodes: NDArray[np.int32], n_nodes: int) -> NDArray[np.int3
         Leaves with the same node share a segment.
     n_nodes : int
     """
-    number = np.full(n_nodes, -1, np.int32)
-    segments = np.empty(len(nodes), np.int32)
-    used = 0
-    for leaf in range(len(nodes)):
-        if number[nodes[leaf]] < 0:
-            number[nodes[leaf]] = used
-            used += 1
-        segments[leaf] = number[nodes[leaf]]
-    return segments
+    leaves, first, number = np.arange(len(nodes)), np.empty(n_nodes, np.int64), np.empty(n_nodes, np.int32)
+    first[nodes[::-1]] = leaves[::-1]  # of equal nodes the last one written stays
+    firsts = nodes[first[nodes] == leaves]
+    number[firsts] = np.arange(len(firsts))
+    return number[nodes]
 
 
 # --- cores: segments of a least size ----------------------------------------------------------------------------------

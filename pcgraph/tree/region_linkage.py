@@ -14,8 +14,8 @@ from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
 from pcgraph.pairs import not_among
-from pcgraph.parallel import in_blocks, inlined, kernel, routine
-from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
+from pcgraph.parallel import kernel, routine
+from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update, insert_edges
 from pcgraph.tree.least_increase import RegionState, energy_increase, regions_of, set_residuals, squared_distance, unite
 from pcgraph.tree.linkage import Linkage, Merges, check_cost, check_numbers
 from pcgraph.voxels.eigen import plane_normal
@@ -302,14 +302,11 @@ def region_linkage(
         (costs * weights, weights, _smoothness(leaves, edges) * weights, bridges * weights, terrain)
     )
     sums = sums[: (_TERRAIN if terrain.any() else _BRIDGE if bridges.any() else _SMOOTHNESS) + 1]
-    set_residuals(state)
-    altitudes = np.empty(len(edges))
-    in_blocks(_set_first_altitudes, len(edges), state, edges, sums, _SHAPE, altitudes)
     perimeters = np.bincount(edges.ravel(), np.repeat(weights, 2), graph.n_nodes)
     outward = state.masses[:, None] * graph.node_features.normal
     outlines = _Outlines(perimeters.astype(np.float64), outward, graph.sides_known)
-    contracted = ContractedGraph.of(graph.n_nodes, edges, altitudes, sums)
-    _merge(state, outlines, relief, contracted, _SHAPE)
+    contracted = ContractedGraph.of(graph.n_nodes, len(edges), sums)
+    _merge(state, outlines, relief, contracted, edges, np.empty(len(edges)), np.empty((2, 3)))
     merges = contracted.merges()
     return Merges(merges.pairs, np.maximum.accumulate(merges.altitudes))
 
@@ -324,48 +321,45 @@ def _smoothness(leaves: Moments, edges: NDArray[np.int32]) -> NDArray[np.float64
 
 
 @kernel
-def _set_first_altitudes(
-    start: int,
-    stop: int,
+def _merge(
     state: RegionState,
+    outlines: _Outlines,
+    relief: float,
+    graph: ContractedGraph,
     edges: NDArray[np.int32],
-    sums: NDArray[np.float64],
-    shape: _Shape,
     altitudes: NDArray[np.float64],
+    scratch: NDArray[np.float64],
 ) -> None:
-    """Set the altitude of each edge before the first merge, without relief."""
-    for edge in range(start, stop):
-        altitudes[edge] = _altitude(state, sums, edge, edges[edge, 0], edges[edge, 1], 0.0, shape)
-
-
-@kernel
-def _merge(state: RegionState, outlines: _Outlines, relief: float, graph: ContractedGraph, shape: _Shape) -> None:
-    """Merge along the lowest edge until there is none.
+    """Merge along the lowest edge until there is none. The altitudes before the first merge, (m,), are set here.
 
     After a merge all edges of the merged region get new altitudes; of a region with many, whose altitudes each merge
     hardly changes, an edge gets it when it comes up. Then, too, it is seen whether one stands out, which raises it.
     """
     heap, halves, clusters, sums = graph.heap, graph.halves, graph.clusters, graph.sums
     perimeters, outward, _ = outlines
-    # After how many merges each region changed, each altitude was computed, and it was last asked what stands out.
+    # After how many merges each region changed, each altitude was computed, and, plus 1, it was asked what stands out.
     changed, computed = np.zeros(len(clusters), np.int64), np.zeros(len(heap.edges), np.int64)
-    asked, normal = np.full(len(heap.edges), -1), np.empty(3)
-    waits = np.zeros(len(heap.edges), np.int64)  # how often each merge has waited for another
+    asked, waits = np.zeros(len(heap.edges), np.int64), np.zeros(len(heap.edges), np.int64)  # and how often it waited
+    normal, normal_of_other = scratch[0], scratch[1]
+    set_residuals(state)
+    for edge in range(len(edges)):
+        altitudes[edge] = _altitude(state, sums, edge, np.int64(edges[edge, 0]), np.int64(edges[edge, 1]), 0.0)
+    insert_edges(graph, edges, altitudes)
     while heap.size[0] > 0:
         edge = heap.order[0]
         a, b = halves[2 * edge].end, halves[2 * edge + 1].end
         if computed[edge] < max(changed[a], changed[b]):
             computed[edge] = graph.done[0]
-            heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0, shape))
+            heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0))
             continue
-        if asked[edge] < computed[edge]:
-            asked[edge] = computed[edge]
-            stands_out = _standing_out(state, outlines, sums, edge, a, b, relief, shape, normal)
+        if asked[edge] <= computed[edge]:
+            asked[edge] = computed[edge] + 1
+            stands_out = _standing_out(state, outlines, sums, edge, a, b, relief, normal)
             if stands_out > 0.0:
-                heap_update(heap, edge, _altitude(state, sums, edge, a, b, stands_out, shape))
+                heap_update(heap, edge, _altitude(state, sums, edge, a, b, stands_out))
                 continue
         if heap.edges[edge].cost > _MAY_WAIT and waits[edge] < _MAX_WAITS:
-            later = _awaited(state, graph, a, b, normal)
+            later = _awaited(state, graph, a, b, normal, normal_of_other)
             if later >= heap.edges[edge].cost:
                 waits[edge] += 1
                 heap_update(heap, edge, later + 1.0 / _STEPS)
@@ -381,28 +375,35 @@ def _merge(state: RegionState, outlines: _Outlines, relief: float, graph: Contra
         while half != NONE:
             edge = half >> 1
             computed[edge] = graph.done[0]
-            heap_update(heap, edge, _altitude(state, sums, edge, kept, halves[half ^ 1].end, 0.0, shape))
+            heap_update(heap, edge, _altitude(state, sums, edge, kept, halves[half ^ 1].end, 0.0))
             half = halves[half].after
         for edge in graph.parallel[:n_parallel]:
             if computed[edge] < graph.done[0]:  # two became one: both old altitudes say little
                 computed[edge] = graph.done[0]
                 a, b = halves[2 * edge].end, halves[2 * edge + 1].end
-                heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0, shape))
+                heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0))
 
 
-@kernel
-def _awaited(state: RegionState, graph: ContractedGraph, a: int, b: int, normal: NDArray[np.float64]) -> float:
+@routine
+def _awaited(
+    state: RegionState,
+    graph: ContractedGraph,
+    a: int,
+    b: int,
+    normal: NDArray[np.float64],
+    normal_of_other: NDArray[np.float64],
+) -> float:
     """Altitude of the first merge that the smaller of two regions has with a third that stands on the larger one, too,
     or above it on nothing; -1 if there is none, or if the smaller one does not stand on the larger one.
 
-    `normal` is scratch.
+    The normals are scratch.
     """
     if state.masses[b] < state.masses[a]:
         a, b = b, a
     side = _side_on(state, a, b, normal)
     if state.masses[a] < _WHOLE or side == 0.0:
         return -1.0
-    heap, halves, clusters, normal_of_other = graph.heap, graph.halves, graph.clusters, np.empty(3)
+    heap, halves, clusters = graph.heap, graph.halves, graph.clusters
     least, half = np.inf, clusters[a].first
     while half != NONE:
         c, cost = halves[half ^ 1].end, heap.edges[half >> 1].cost
@@ -434,11 +435,10 @@ def _height(state: RegionState, a: int, b: int, normal: NDArray[np.float64]) -> 
     return height
 
 
-@inlined
-def _altitude(
-    state: RegionState, sums: NDArray[np.float64], edge: int, a: int, b: int, stands_out: float, shape: _Shape
-) -> float:
+@routine
+def _altitude(state: RegionState, sums: NDArray[np.float64], edge: int, a: int, b: int, stands_out: float) -> float:
     """Altitude at which the two regions at an edge merge, radians, in whole steps, as energies of nothing are noise."""
+    shape = _SHAPE
     cost, length = sums[_COST, edge] / sums[_WEIGHT, edge], 0.5 * sums[_WEIGHT, edge]
     smaller, larger = min(state.masses[a], state.masses[b]), max(state.masses[a], state.masses[b])
     objects, is_terrain = round(shape.objects * _STEPS), len(sums) > _TERRAIN and sums[_TERRAIN, edge] > 0.0
@@ -472,13 +472,13 @@ def _standing_out(
     a: int,
     b: int,
     relief: float,
-    shape: _Shape,
     normal: NDArray[np.float64],
 ) -> float:
     """How much the smaller region at an edge stands out of the larger one, radians: relief R + H of `RegionLinkage`.
 
     `normal` is scratch.
     """
+    shape = _SHAPE
     if state.masses[b] < state.masses[a]:
         a, b = b, a
     smaller, larger, contact = state.masses[a], state.masses[b], sums[_WEIGHT, edge]

@@ -23,20 +23,21 @@ def bounding_box(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDAr
     """Lowest and highest coordinates, (3,) each, of points (n, 3), n >= 1; NaN if one is."""
     of_blocks = in_blocks(_bounds, len(points), np.ascontiguousarray(points, np.float64), smallest=_POINTS_OF_BLOCK)
     bounds = np.array(of_blocks)
-    return bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+    return bounds[:, :3].min(axis=0), bounds[:, 3:].max(axis=0)
 
 
 @kernel
-def _bounds(start: int, stop: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lowest and highest coordinates, (2, 3), of some of the points."""
-    low_x, low_y, low_z = high_x, high_y, high_z = points[start]
+def _bounds(start: int, stop: int, points: NDArray[np.float64]) -> tuple[float, float, float, float, float, float]:
+    """Lowest and highest coordinates of some of the points."""
+    low_x, low_y, low_z = points[start, 0], points[start, 1], points[start, 2]
+    high_x, high_y, high_z = low_x, low_y, low_z
     for p in range(start, stop):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
         low_x, low_y, low_z = x if x < low_x else low_x, y if y < low_y else low_y, z if z < low_z else low_z
         high_x, high_y, high_z = x if x > high_x else high_x, y if y > high_y else high_y, z if z > high_z else high_z
         if math.isnan(x + y + z) and (math.isnan(x) or math.isnan(y) or math.isnan(z)):
-            return np.full((2, 3), np.nan)
-    return np.array(((low_x, low_y, low_z), (high_x, high_y, high_z)))
+            return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
+    return low_x, low_y, low_z, high_x, high_y, high_z
 
 
 class Lattice(NamedTuple):
@@ -185,7 +186,7 @@ def _sort_by_digits(
     ordered = keys
     for digit in range(n_digits):
         start, shift = starts[digit], place_bits + digit * digit_bits
-        if start.max() == n:
+        if start[(ordered[0] >> shift) & mask] == n:
             continue  # all have the same
         total = 0
         for value in range(len(start)):

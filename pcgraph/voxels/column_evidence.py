@@ -38,7 +38,8 @@ def crease_contrast(values: NDArray[np.float64], grid: VoxelGrid, normals: NDArr
     autocorrelation of Geary 1954). Every so many voxels tell, some 8000.
     """
     step = -(-grid.n_voxels // _TELLING)
-    sums, pairs = _squared_distances(values, grid.counts, normals, grid.neighbourhood, step)
+    sums, pairs = np.zeros(2), np.zeros(2, np.int64)
+    _add_squared_distances(values, grid.counts, normals, grid.neighbourhood, step, sums, pairs)
     some, counts = values[::step], grid.counts[::step]
     mean = np.average(some, axis=0, weights=counts)
     any_two = float((counts @ np.square(some - mean)).sum()) / len(some)
@@ -55,16 +56,17 @@ def color_evidence(grid: VoxelGrid, normals: NDArray[np.float64]) -> float:
 
 
 @kernel
-def _squared_distances(
+def _add_squared_distances(
     values: NDArray[np.float64],
     counts: NDArray[np.int64],
     normals: NDArray[np.float64],
     around: Neighbourhood,
     step: int,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Weighted sums of squared distances of touching voxels, and their numbers, on smooth surfaces and at creases."""
+    sums: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+) -> None:
+    """Add the weighted squared distances of touching voxels, and their numbers, on smooth surfaces and at creases."""
     indptr, neighbours = around
-    sums, pairs = np.zeros(2), np.zeros(2, np.int64)
     for i in range(0, len(values), step):
         for a in range(indptr[i], indptr[i + 1]):
             j, cosine, square = neighbours[a], 0.0, 0.0
@@ -73,11 +75,11 @@ def _squared_distances(
             if _CREASED <= cosine <= _SMOOTH:
                 continue
             for column in range(values.shape[1]):
-                square += (values[i, column] - values[j, column]) ** 2
+                gap = values[i, column] - values[j, column]
+                square += gap * gap
             kind = 0 if cosine > _SMOOTH else 1
             sums[kind] += square * counts[i] * counts[j] / (counts[i] + counts[j])
             pairs[kind] += 1
-    return sums, pairs
 
 
 def autocorrelation(values: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:
