@@ -22,3 +22,27 @@ def not_among(pairs: NDArray[np.int32], others: NDArray[np.int32]) -> NDArray[np
     """Which of r pairs, (r, 2), are not among m others, (m, 2), the smaller first and in ascending order; (r,) bool."""
     keys, known = pair_keys(*pairs.T), pair_keys(*others.T)
     return np.searchsorted(known, keys, "left") == np.searchsorted(known, keys, "right")
+
+
+_FEW_DISTANCES = 1 << 20
+"""Distances that are computed one by one in less time than it takes to import SciPy's trees, a quarter of a second."""
+
+
+def nearest(
+    places: NDArray[np.float64], sought: NDArray[np.float64], n: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Distances to the n nearest of k places and their numbers, (q, n) each, from q other places, the nearest first.
+
+    Parameters
+    ----------
+    places, sought : (k, 3), (q, 3) float64
+    n : int, 1..k
+    """
+    if len(places) * len(sought) > _FEW_DISTANCES:
+        from scipy.spatial import cKDTree
+
+        distances, numbers = cKDTree(places).query(sought, np.arange(1, n + 1))
+        return distances, np.asarray(numbers, np.int64)
+    squares = sum(np.square(sought[:, axis, None] - places[:, axis]) for axis in range(3))
+    numbers = np.argsort(squares, axis=1, kind="stable")[:, :n]
+    return np.sqrt(np.take_along_axis(squares, numbers, axis=1)), numbers

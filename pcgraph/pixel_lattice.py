@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.resection import NO_PLANE, PinholeCamera, resection
@@ -93,6 +92,8 @@ def likely_cameras(points: NDArray[np.float64], sample: NDArray[np.float64]) -> 
 def _seeds(places: NDArray[np.float64], nearest: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Some of the first of places, (k, 3), around which these are dense, far from each other; and how far off so many
     others are, (k,)."""
+    from scipy.spatial.distance import cdist
+
     reach = np.partition(cdist(places[:_LOOKED_AT], places), nearest, axis=1)[:, nearest]
     dense = np.argsort(reach, kind="stable")[: len(reach) // 4]
     chosen = dense[farthest_points(places[dense], 0, _PATCHES)]

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay, cKDTree
 
 from pcgraph.features.moments import Moments, grouped_moments
 from pcgraph.features.nodes import NodeFeatures, node_features
@@ -240,6 +239,8 @@ def facing_ways(places: NDArray[np.float64], projected: NDArray[np.float64], pie
     """
     triangles = np.empty((0, 3), np.int32)
     if len(places) >= _MIN_TRIANGULATED:
+        from scipy.spatial import Delaunay
+
         triangles = Delaunay(projected, qhull_options="QJ").simplices
     sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     ends, _ = distinct_pairs(*np.sort(sides[piece[sides[:, 0]] != piece[sides[:, 1]]], axis=1).T)
@@ -309,6 +310,8 @@ def _is_hidden(
     bands = heights[before] + np.array([[-1.0], [1.0]]) * scene.edges[before]
     low, high = areas[np.searchsorted(heights[parallel], bands)]
     sets_in = np.where(cosines[before] >= _MIN_COSINE, high - low, 0.0)
+    from scipy.spatial import cKDTree
+
     some = np.arange(1, min(_NEAREST, len(before)) + 1)
     distance, number = cKDTree(plane.project(scene.places[before])).query(middles, k=some)
     nearest, ways = before[number], lengths[:, None]
@@ -328,6 +331,8 @@ def _is_open(
     behind = scene.places[heights < -_OFF_PLANE * scene.edges]
     if not len(behind):
         return np.zeros(len(middles), np.bool_)
+    from scipy.spatial import cKDTree
+
     return cKDTree(plane.project(behind)).query(middles)[0] <= 0.5 * lengths
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.bounding_planes import MIN_HIDDEN, Plane, borders_of, facing_ways, joining
@@ -143,6 +142,8 @@ def _under(
     ends = plane.heights(places)[ways.ends]
     hidden = np.zeros(len(ways.ends), np.bool_)
     if len(others) and len(ways.ends):
+        from scipy.spatial import cKDTree
+
         some = np.arange(1, min(_NEAR, len(others)) + 1)
         distance, near = cKDTree(plane.project(others)).query(projected[ways.ends].mean(axis=1), k=some)
         over = distance <= np.maximum(0.5 * ways.lengths, _HIGH * edge)[:, None]

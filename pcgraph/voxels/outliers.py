@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from scipy.special import pdtrc
 
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.parallel import in_blocks, kernel
@@ -116,6 +116,8 @@ def _surfaces_among(voxels: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.bo
     alone = np.flatnonzero(voxels)
     if len(alone) < 2 * _NEAREST:
         return found
+    from scipy.spatial import cKDTree
+
     places = grid.warped[alone] / grid.size
     near = cKDTree(places, balanced_tree=False).query(places, _NEAREST)[1]
     flat = np.empty(len(alone), np.bool_)
@@ -186,6 +188,8 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
 def is_near(grid: VoxelGrid, other: VoxelGrid) -> NDArray[np.bool_]:
     """Whether each voxel lies within three edges, of the larger one, of a voxel of another grid of the same size and
     warp, (v,) bool."""
+    from scipy.spatial import cKDTree
+
     near = np.zeros(grid.n_voxels, np.bool_)
     for of_level, level in other.of_levels():
         edges = np.maximum(grid.warped_edges, level.size)
@@ -196,8 +200,9 @@ def is_near(grid: VoxelGrid, other: VoxelGrid) -> NDArray[np.bool_]:
 
 def _least_significant(expected: float) -> int:
     """Least number of points that noise, of which so many are expected, reaches with a chance below `_CHANCE`."""
-    number = 1
-    while pdtrc(number - 1, expected) >= _CHANCE:
+    number, chance = 1, -math.expm1(-expected)  # of so many or more, by the law of Poisson
+    while chance >= _CHANCE:
+        chance -= math.exp(number * math.log(expected) - expected - math.lgamma(number + 1))
         number += 1
     return number
 

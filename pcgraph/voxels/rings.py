@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 _MIN_ROWS, _SOME_ROWS, _MAX_ROWS = 40, 256, 512  # that are looked at: at first, and at last
 _NOT_PARALLEL = 0.15  # of the rows' squares, along the second of their principal directions
@@ -96,6 +95,8 @@ def _is_certain(rows: Rows, frame: NDArray[np.float64], unknown: NDArray[np.floa
 
 def _flattest(rows: Rows, frame: NDArray[np.float64], start: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
     """Place and tilts of the axis, (5,), of the least slopes in reach of some others."""
+    from scipy.optimize import least_squares
+
     slopes, derivatives = (partial(_either, rows, frame, which) for which in (0, 1))
     return least_squares(slopes, start, derivatives, loss="cauchy", f_scale=scale, max_nfev=_STEPS).x
 

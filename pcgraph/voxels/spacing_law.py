@@ -6,11 +6,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pcgraph.parallel import in_blocks, kernel, summing_routine
 from pcgraph.plumbing.short_repr import ShortRepr
@@ -20,6 +19,9 @@ from pcgraph.voxels.eigen import SYMMETRIC_INDICES, plane_normal
 from pcgraph.voxels.ground_and_rooms import dominant_plane
 from pcgraph.voxels.rings import Rows, scanner_of_rings
 from pcgraph.voxels.sampling import order_of_draw, sample
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 _READINGS = 1 << 10  # how many readings of the spacing count
 _MIN_READINGS = 1 << 8  # with fewer the law is not looked for
@@ -223,6 +225,8 @@ def _readings(chosen: NDArray[np.float64], number: int) -> _Readings:
     """Readings at so many places of a sample, the first."""
     if len(chosen) <= _NEIGHBOUR:
         return _Readings(chosen[:0], chosen[:0], np.empty(0))
+    from scipy.spatial import cKDTree
+
     some, tree = chosen[:number], cKDTree(chosen, 24, balanced_tree=False, compact_nodes=False)
     of_blocks = in_blocks(partial(_spacing_and_normals, tree, some), len(some), smallest=_MIN_SAMPLE)
     usable, spacing, normals = (np.concatenate(column) for column in zip(*of_blocks, strict=True))
