@@ -122,7 +122,8 @@ def _bounding_pieces(scene: _Scene, nodes: NodeFeatures, faces: NDArray[np.int32
     flat = np.flatnonzero(planes.residual <= _MAX_RESIDUAL * edges)
     bounding = np.empty(len(flat), np.bool_)
     scattered = np.random.default_rng(0).permutation(len(faces))[:_SAMPLED_SUPERVOXELS]
-    others = scene.places[scattered], _OFF_PLANE * scene.edges[scattered], scene.voxels[scattered]
+    held = scene.voxels[scattered]
+    others = scene.places[scattered], _OFF_PLANE * scene.edges[scattered], held, int(held.sum())
     in_blocks(_bound, len(flat), planes.centroid[flat], planes.normal[flat], *others, bounding)
     kept = flat[bounding]
     number, areas = np.full(n, -1), np.bincount(face, scene.areas[on], n).astype(np.float64)
@@ -141,10 +142,11 @@ def _bound(
     places: NDArray[np.float64],
     beyond: NDArray[np.float64],
     voxels: NDArray[np.int64],
+    total: int,
     found: NDArray[np.bool_],
 ) -> None:
-    """Set which planes have nearly nothing behind them and much before them, given the supervoxels."""
-    total = voxels.sum()
+    """Set which planes have nearly nothing behind them and much before them, given the supervoxels and the total of
+    their voxels."""
     for plane in range(start, stop):
         behind = before = 0
         for s in range(len(places)):

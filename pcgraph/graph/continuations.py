@@ -129,10 +129,12 @@ def continuations(
     sides = np.sort(faces[found.pairs], axis=1)
     between, pair = distinct_pairs(sides[:, 0], sides[:, 1])
     hidden, opened = np.bincount(pair, found.crossings, len(between)), np.zeros(len(between), np.int64)
-    both_ways, face = _both_ways(between, int(faces.max()) + 1), faces[surfels.supervoxels]
+    n_faces, face = int(faces.max()) + 1, faces[surfels.supervoxels]
+    both_ways = _both_ways(between, n_faces)
     for view, image in zip(views, images, strict=True):
         for lines, wraps in image.lines:
-            _count_open(lines, wraps, view, face, both_ways, opened)
+            last, ends_open = np.full(n_faces, -1), np.zeros(n_faces, np.bool_)
+            _count_open(lines, wraps, view, face, both_ways, last, ends_open, line_buffers(lines), opened)
     one_face = between[:, 0] == between[:, 1]
     areas = np.bincount(faces[surface.supervoxels], np.square(surface.grid.edge_lengths / surface.grid.size))
     wide = np.sqrt(areas[faces[found.pairs]].max(axis=1)) >= _SUPPORT * found.width / surface.grid.size
@@ -186,16 +188,18 @@ def _count_open(
     view: View,
     face: NDArray[np.int32],
     ways: _Ways,
+    last: NDArray[np.int64],
+    ends_open: NDArray[np.bool_],
+    buffers: NDArray[np.int32],
     opened: NDArray[np.int64],
 ) -> None:
     """Add how often, along the rows of an image, one face of each pair ends in the open on the way to the other.
 
     A face, `face` says which of each surfel, ends or begins in the open where something farther, or nothing, or the
-    other face itself lies beside it.
+    other face itself lies beside it. Where each face was last, -1 at first, and whether it ended in the open are kept
+    in `last` and `ends_open`.
     """
-    n_faces, widths, around = len(ways.starts) - 1, view.surfels.widths, image.shape[1]
-    last, ends_open = np.full(n_faces, -1, np.int64), np.zeros(n_faces, np.bool_)
-    line, columns = line_buffers(image)
+    widths, around, line, columns = view.surfels.widths, image.shape[1], buffers[0], buffers[1]
     farthest = around // 2 if wraps else around  # the way from one to the other is no more than half a turn
     for row in range(image.shape[0]):
         stop, lap = surfels_along(image[row], wraps, line, columns)

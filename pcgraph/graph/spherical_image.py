@@ -162,9 +162,9 @@ def _lattice(view: View, of_width: float) -> tuple[_Lattice, NDArray[np.int64], 
 
 def _frame(bearings: NDArray[np.float64], seen: NDArray[np.int64]) -> NDArray[np.float64]:
     """Forward, sideways and polar direction, rows of (3, 3)."""
-    directions = bearings[seen]
-    mean = directions.mean(axis=0)
-    pole = np.linalg.eigh(np.einsum("ij,ik->jk", directions, directions))[1][:, 0]
+    along = np.ascontiguousarray(bearings[seen].T)
+    mean = along.mean(axis=1)
+    pole = np.linalg.eigh(np.einsum("ik,jk->ij", along, along))[1][:, 0]
     forward = mean - pole * (pole @ mean)
     if np.linalg.norm(forward) < 1e-6:  # as much on one side as on the other: any forward will do
         forward = np.cross(pole, np.eye(3)[np.abs(pole).argmin()])
@@ -332,25 +332,34 @@ def depth_jumps(view: View, image: SphericalImage, reach: float, least_gap: floa
     least_gap : float, voxel edges
         Difference of range above which surfaces are apart.
     """
-    found = [_scan(voxels, wraps, view, reach, least_gap) for voxels, wraps in image.lines]
+    found = []
+    for voxels, wraps in image.lines:
+        jumps = Jumps(np.empty((voxels.size, 2), np.int32), np.empty((voxels.size, 2), np.int32))
+        n_edges, n_spans = _scan(voxels, wraps, view, reach, least_gap, line_buffers(voxels), jumps)
+        found.append((jumps.edges[:n_edges], jumps.occluded_spans[:n_spans]))
     edges, occluded_spans = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return Jumps(edges, occluded_spans)
 
 
 @kernel
-def _scan(  # type: ignore[no-untyped-def]
-    image: NDArray[np.int32], wraps: bool, view: View, reach: float, least_gap: float
-):
-    """Depth edges (e, 2), front and behind, and occluded spans (c, 2), both int32 surfels, along the image's rows.
+def _scan(
+    image: NDArray[np.int32],
+    wraps: bool,
+    view: View,
+    reach: float,
+    least_gap: float,
+    buffers: NDArray[np.int32],
+    jumps: Jumps,
+) -> tuple[int, int]:
+    """Set the jumps along the image's rows; how many depth edges and occluded spans there are.
 
     Where a line passes from far to near, the far surface goes into hiding; where it passes from near to far, what
     comes out is paired with what went in last. A hole in the data ends all hiding.
     """
     ranges, edge_lengths, supervoxels = view.ranges, view.surfels.edge_lengths, view.surfels.supervoxels
     indptr, neighbours = view.surfels.neighbourhood
-    depth_edges = np.empty((image.size, 2), np.int32)
-    occluded_spans = np.empty((image.size, 2), np.int32)
-    hidden, (line, columns) = np.empty(_MAX_DEPTH, np.int32), line_buffers(image)
+    depth_edges, occluded_spans = jumps
+    line, columns, hidden = buffers[0], buffers[1], buffers[2]  # a line is longer than what is hidden at once
     n_edges = n_spans = 0
     for row in range(image.shape[0]):
         stop, lap = surfels_along(image[row], wraps, line, columns)
@@ -369,9 +378,10 @@ def _scan(  # type: ignore[no-untyped-def]
                 continue
             if beyond >= 0 and apart(behind, beyond, view, reach):
                 beyond = -1
-            first, last = np.int64(indptr[front]), np.int64(indptr[front + 1])
-            stands_off = _stands_off(front, behind, beyond, view, least_gap * edge)
-            if not stands_off or np.any(neighbours[first:last] == behind):
+            touches = False
+            for a in range(indptr[front], indptr[front + 1]):
+                touches = touches or neighbours[a] == behind
+            if touches or not _stands_off(front, behind, beyond, view, least_gap * edge):
                 continue
             if at < lap or not wraps:
                 depth_edges[n_edges, 0], depth_edges[n_edges, 1] = front, behind
@@ -386,13 +396,12 @@ def _scan(  # type: ignore[no-untyped-def]
                 if known and ranges[entered] > ranges[front] and supervoxels[entered] != supervoxels[behind]:
                     occluded_spans[n_spans, 0], occluded_spans[n_spans, 1] = entered, behind
                     n_spans += 1
-    return depth_edges[:n_edges].copy(), occluded_spans[:n_spans].copy()
+    return n_edges, n_spans
 
 
-@routine
-def line_buffers(image: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Buffers for what `surfels_along` sets."""
-    return np.empty(2 * image.shape[1] + 4, np.int32), np.empty(2 * image.shape[1] + 4, np.int32)
+def line_buffers(image: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Buffers for what `surfels_along` sets, and one more as long, as rows."""
+    return np.empty((3, max(2 * image.shape[1] + 4, _MAX_DEPTH)), np.int32)
 
 
 @routine

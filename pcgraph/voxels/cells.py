@@ -117,7 +117,8 @@ def sorted_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
     if key_bits <= low_bits:
         n_digits = max(-(-key_bits // (_DIGIT if len(keys) > _FEW else _DIGIT_OF_FEW)), 1)
         room = np.empty(len(keys), np.int64)  # here, as NumPy asks for huge pages and kernels do not
-        return _sort_by_digits(keys, room, place_bits, n_digits, max(-(-key_bits // n_digits), 1))
+        digit_bits = max(-(-key_bits // n_digits), 1)
+        return _sort_by_digits(keys, room, np.zeros((n_digits, 1 << digit_bits), np.int64), place_bits, digit_bits)
     order = sorted_keys(keys & ((1 << low_bits) - 1))[1]
     order = order[sorted_keys(keys[order] >> low_bits)[1]]
     return keys[order], order
@@ -171,14 +172,14 @@ def fetch_batch(
 
 @kernel
 def _sort_by_digits(
-    keys: NDArray[np.int64], room: NDArray[np.int64], place_bits: int, n_digits: int, digit_bits: int
+    keys: NDArray[np.int64], room: NDArray[np.int64], starts: NDArray[np.int64], place_bits: int, digit_bits: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Keys in ascending order, and where each was (radix sort; Knuth, The Art of Computer Programming 3, 5.2.5).
 
     A key and its place, of so many bits, are moved as one number, to and fro between the array and a room for as many.
+    `starts`, zero at first, has a row for each digit and a column for each of its values.
     """
-    n, mask = len(keys), (1 << digit_bits) - 1
-    starts = np.zeros((n_digits, 1 << digit_bits), np.int64)
+    n, n_digits, mask = len(keys), len(starts), (1 << digit_bits) - 1
     for i in range(n):
         for digit in range(n_digits):
             starts[digit, (keys[i] >> (digit * digit_bits)) & mask] += 1
