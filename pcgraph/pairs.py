@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of nodes as sorted keys: distinct ones, and those that are not among others."""
+"""Pairs of nodes as sorted keys, distinct ones and those that are not among others; and pairs of near places."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def not_among(pairs: NDArray[np.int32], others: NDArray[np.int32]) -> NDArray[np
 
 
 _FEW_DISTANCES = 1 << 18
-"""Distances that are computed one by one in 4 ms; importing SciPy's trees takes a process a quarter of a second, once."""
+"""Distances that are computed one by one, which takes 4 ms; to import SciPy's trees takes a quarter of a second."""
 
 
 def nearest(
