@@ -55,7 +55,7 @@ def surfels_of(surface: Surface, some: bool = False) -> Surfels:
     edges = grid.edge_lengths
     if len(voxels) == grid.n_voxels:
         return Surfels(voxels, grid.centroids, normals, edges, edges, labels, grid.neighbourhood)
-    none_touch = Neighbourhood(np.zeros(len(voxels) + 1, np.int64), np.empty(0, np.int32))
+    none_touch = Neighbourhood(np.zeros(len(voxels) + 1, np.uint64), np.empty(0, np.uint32))
     edges = edges[voxels]
     return Surfels(voxels, grid.centroids[voxels], normals[voxels], edges, stretch * edges, labels[voxels], none_touch)
 
