@@ -8,7 +8,7 @@ DEMO_OUT := out/demo
 export PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-pcgraph test-rangesim validate coverage fuzz kernels lint format constraints audit clean system
+.PHONY: help demo test test-pcgraph test-rangesim test-benchmarks validate coverage fuzz kernels lint format constraints audit clean system
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /|/' | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
@@ -28,7 +28,10 @@ test-pcgraph: $(VENV)/.installed-test kernels ## the tests of pcgraph alone
 	$(BIN)/python -m pytest $(PARALLEL) -m "not validation" tests/pcgraph
 
 test-rangesim: $(VENV)/.installed-test kernels ## the tests of rangesim alone
-	$(BIN)/python -m pytest $(PARALLEL) -m "not validation" --ignore tests/pcgraph
+	$(BIN)/python -m pytest $(PARALLEL) -m "not validation" --ignore tests/pcgraph --ignore tests/benchmarks
+
+test-benchmarks: $(VENV)/.installed-test kernels ## the tests of what the benchmarks of pcgraph stand on
+	$(BIN)/python -m pytest $(PARALLEL) -m "not validation" tests/benchmarks
 
 validate: $(VENV)/.installed-test kernels ## long comparisons and statistics, before a release: docs/validation.md
 	$(BIN)/python -m pytest $(PARALLEL) -m validation

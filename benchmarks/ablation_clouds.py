@@ -92,9 +92,22 @@ def _by_camera(kind: str) -> list[Sample]:
             else:
                 inverse = 1.0 / depths[..., 0] + random.normal(0.0, 0.3 * STEP_PER_M, depths.shape[:2])
                 depth = 1.0 / (STEP_PER_M * np.rint(inverse / STEP_PER_M))
-            points = depth[..., None] * _rays(1).reshape(HEIGHT, WIDTH, 3)
+            points = depth[..., None] * pixel_rays()
             found.append(Sample(points.astype(np.float32), np.where(np.isfinite(depth), things, -1).astype(np.int32)))
     return found
+
+
+def axes_of_a_look(ahead: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Axes (3, 3), rows, of a camera that looks along a level direction and somewhat down: right, down, forwards."""
+    level = ahead[:2] / np.linalg.norm(ahead[:2])
+    forward = np.array([*(level * np.sqrt(1.0 - TILT**2)), TILT])
+    right = np.array([level[1], -level[0], 0.0])
+    return np.stack((right, np.cross(forward, right), forward))
+
+
+def pixel_rays() -> NDArray[np.float64]:
+    """Directions (h, w, 3) of a depth of 1 through the pixels; x right, y down, z forwards."""
+    return _rays(1).reshape(HEIGHT, WIDTH, 3)
 
 
 def _rays(finer: int) -> NDArray[np.float64]:
@@ -112,10 +125,7 @@ def _cast(
     import open3d as o3d
 
     caster, part = caster_of(scene)
-    level = ahead[:2] / np.linalg.norm(ahead[:2])
-    forward = np.array([*(level * np.sqrt(1.0 - TILT**2)), TILT])
-    right = np.array([level[1], -level[0], 0.0])
-    directions = _rays(2) @ np.stack((right, np.cross(forward, right), forward))
+    directions = _rays(2) @ axes_of_a_look(ahead)
     rays = np.concatenate((np.broadcast_to(place, directions.shape), directions), axis=-1).astype(np.float32)
     hits = caster.cast_rays(o3d.core.Tensor(rays.reshape(-1, 6)))
     depths = hits["t_hit"].numpy().reshape(directions.shape[:3]).astype(np.float64)  # directions have a depth of 1

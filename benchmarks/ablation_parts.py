@@ -2,7 +2,7 @@
 """The parts of pcgraph's default segmentation, each with the code it is and how it is switched off.
 
 A part is switched off by patches: a name as it is looked up, such as `scan.detached_voxels`, gets another value, made
-of the one it has. What kernels hold cannot be patched so; `tests/pcgraph/test_ablation.py` sees to that.
+of the one it has. What kernels hold cannot be patched so; `tests/benchmarks/test_ablation.py` sees to that.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.acquisition.kinds import Acquisition, Evidence, MovingScanner, Scanner, acquisition_of, spacing_law
+from pcgraph.acquisition.spacing_law import SpacingLaw
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Bridges, Gaps
 from pcgraph.graph.contacts import edge_features, facing_sides
 from pcgraph.graph.continuations import Continuations, continuations_of
+from pcgraph.inputs import CleanCloud
 from pcgraph.supervoxels.method import SupervoxelMethod
-from pcgraph.voxels import spacing_law
-from pcgraph.voxels.adapted_size import VOXELS_PER_SEED
+from pcgraph.voxelisation.adapted_size import VOXELS_PER_SEED
 from pcgraph.voxels.grid import VoxelGrid, boundary_voxels
 from pcgraph.voxels.ground_and_rooms import SupportingPlane
-from pcgraph.voxels.spacing_law import SpacingLaw
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.visibility import VisibleSides
 from pcgraph.voxels.warp import NormalTransform
@@ -133,8 +134,8 @@ def _with(**fields: float) -> Replacement:
     return lambda original: lambda self, *arguments: original(replace(self, **fields), *arguments)
 
 
-def _shape(**fields: float) -> dict[str, Replacement]:
-    return {"tree.region_linkage._SHAPE": lambda shape: shape._replace(**fields)}
+def _altitude(**fields: float) -> dict[str, Replacement]:
+    return {"tree.region_linkage._CONSTANTS": lambda constants: constants._replace(**fields)}
 
 
 def _linkage(**fields: float) -> dict[str, Replacement]:
@@ -160,7 +161,12 @@ def _no_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
 def _no_gaps(surface: Surface, nodes: NodeFeatures, *others: object) -> Gaps:
     edges, none = np.empty((0, 2), np.int32), np.empty(0, np.int64)
     features = edge_features(nodes, facing_sides(surface, edges, none, none))
-    return Gaps(edges, features, np.empty(0), np.empty(0), surface.grid.warp.of_one_scan)
+    return Gaps(
+        edges,
+        features,
+        np.empty(0),
+        np.empty(0),
+    )
 
 
 def _no_continuations(surface: Surface, nodes: NodeFeatures, *others: object) -> Continuations:
@@ -169,6 +175,18 @@ def _no_continuations(surface: Surface, nodes: NodeFeatures, *others: object) ->
 
 def _no_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None, *others: object) -> SpacingLaw:
     return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def _no_camera(cloud: CleanCloud, viewpoint: Any, camera: bool | None, growth: float | None) -> Acquisition:
+    """What the pixels tell but that a camera took them."""
+    return acquisition_of(cloud, viewpoint, bool(camera), growth)
+
+
+def _on_the_move(scanner: Scanner, grid: VoxelGrid) -> Acquisition:
+    """A scanner whose place counts for the growth of voxels alone, unless it was given."""
+    if scanner.told.evidence not in (Evidence.SPACING, Evidence.RINGS):
+        return scanner
+    return MovingScanner(scanner.told, scanner.place, scanner.growth)
 
 
 def _from_above(grid: VoxelGrid, normals: NDArray[np.float64], *others: object) -> VisibleSides:
@@ -189,7 +207,7 @@ def _every_reading(readings: Any, place: NDArray[np.float64]) -> NDArray[np.bool
 
 
 def _first_readings(readings: Any) -> NDArray[np.int64]:
-    return np.arange(min(len(readings.logs), spacing_law._READINGS))
+    return np.arange(min(len(readings.logs), spacing_law._SEARCH.readings))
 
 
 def _one_part(coarse: VoxelGrid, *others: object) -> tuple[NDArray[np.int64], list[Any]]:
@@ -213,23 +231,39 @@ def _by_weight(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray
 
 _NOWHERE = SupportingPlane(np.array([0.0, 0.0, 1.0]), -np.inf, False)
 _NO_BRIDGES = Bridges(np.empty((0, 2), np.int32), np.empty(0), np.empty(0), np.empty(0, np.bool_))
-_NO_OUTLIERS: dict[str, Replacement] = {"scan.outlier_voxels": _is(_no_voxels)}
-_NO_DETACHED: dict[str, Replacement] = {"scan.detached_voxels": _is(_no_voxels)}
-_NO_CLOSER_LOOK: dict[str, Replacement] = {"scan.is_full_of_noise": _gives(False), "scan._NOISY": _is(-1.0)}
+_NO_OUTLIERS: dict[str, Replacement] = {"voxelisation.voxelised.outlier_voxels": _is(_no_voxels)}
+_NO_DETACHED: dict[str, Replacement] = {"voxelisation.voxelised.detached_voxels": _is(_no_voxels)}
+_NO_CLOSER_LOOK: dict[str, Replacement] = {
+    "voxelisation.voxelised.is_full_of_noise": _gives(False),
+    "voxelisation.voxelised._NOISY": _is(-1.0),
+}
 _NO_CONTINUATIONS: dict[str, Replacement] = {"scan.continuations": _is(_no_continuations)}
 _NO_PLANES: dict[str, Replacement] = {"scan.bounding_planes": _is(_no_continuations)}
 _NO_TERRAIN: dict[str, Replacement] = {"scan.terrain": _is(_no_continuations)}
 _NO_PIXELS: dict[str, Replacement] = {"scan.with_pixels": _keeps(0)}
-_NO_LAW: dict[str, Replacement] = {"scan.spacing_law": _is(_no_law), "scan.law_on_rings": _keeps(1)}
-_UP: dict[str, Replacement] = {"scan.visible_sides": _is(_from_above), "scan.virtual_viewpoints": _gives(None)}
-_OUTWARDS: dict[str, Replacement] = {"scan.visible_sides": _is(_from_outside), "scan.virtual_viewpoints": _gives(None)}
+_NO_LAW: dict[str, Replacement] = {
+    "acquisition.kinds.spacing_law": _is(_no_law),
+    "acquisition.kinds.law_on_rings": _keeps(1),
+}
+_UP: dict[str, Replacement] = {
+    "acquisition.kinds.visible_sides": _is(_from_above),
+    "acquisition.kinds.virtual_viewpoints": _gives(None),
+}
+_OUTWARDS: dict[str, Replacement] = {
+    "acquisition.kinds.visible_sides": _is(_from_outside),
+    "acquisition.kinds.virtual_viewpoints": _gives(None),
+}
 _SIDES = ("voxels/virtual_viewpoints.py", "voxels/visibility.py:visible_sides", "voxels/visibility.py:VisibleSides")
 
 # Short names of files
-_SCAN, _LINK, _LAW, _SIZE = "scan.py", "tree/region_linkage.py", "voxels/spacing_law.py", "voxels/adapted_size.py"
+_SCAN, _LINK, _SIZE = "scan.py", "tree/region_linkage.py", "voxelisation/adapted_size.py"
+_LAW, _RINGS, _PIXELS, _LATTICE = (
+    f"acquisition/{name}.py" for name in ("spacing_law", "rings", "pixels", "pixel_lattice")
+)
+_ACQUISITION, _VOXELS = "acquisition/kinds.py", "voxelisation/voxelised.py"
 _NOISE, _VIEW, _SIDE = "voxels/outliers.py", "voxels/virtual_viewpoints.py", "voxels/visibility.py"
 _IMAGE, _GROW, _GAPS, _BEHIND = (
-    "depth_image.py",
+    "acquisition/depth_image.py",
     "supervoxels/surface_growth.py",
     "graph/gaps.py",
     "graph/continuations.py",
@@ -237,14 +271,23 @@ _IMAGE, _GROW, _GAPS, _BEHIND = (
 _V = "voxels.virtual_viewpoints."
 
 
-def _shape_part(name: str, **fields: float) -> Part:
-    return Part(f"linkage: {name}", _constants(_LINK, *(f"_Shape.{field}" for field in fields)), _shape(**fields))
+def _altitude_part(name: str, **fields: float) -> Part:
+    code = _constants(_LINK, *(f"AltitudeConstants.{field}" for field in fields))
+    return Part(f"linkage: {name}", code, _altitude(**fields))
 
 
 def _constant(name: str, file: str, constant: str, value: Any, *more: str) -> Part:
     """A part that a constant of a file switches off."""
     module = file.removesuffix(".py").replace("/", ".")
     return Part(name, (f"{file}:{constant}", *(f"{file}:{one}" for one in more)), {f"{module}.{constant}": _is(value)})
+
+
+def _threshold(name: str, file: str, settings: str, *more: str, **fields: Any) -> Part:
+    """A part that fields of a dataclass of thresholds switch off, which a file holds under a name."""
+    path = f"{file.removesuffix('.py').replace('/', '.')}.{settings}"
+    kind = type(Target.of(path).value).__name__
+    code = _constants(file, *(f"{kind}.{field}" for field in fields), *more)
+    return Part(name, code, {path: lambda held: replace(held, **fields)})
 
 
 def _function(name: str, file: str, function: str, replacement: Replacement, *constants: str) -> Part:
@@ -256,15 +299,22 @@ def _function(name: str, file: str, function: str, replacement: Replacement, *co
 GROUPS = (
     Part(
         "all: where it was seen from",
-        ("pixels.py", _LAW, "voxels/rings.py", f"{_IMAGE}:image_view", f"{_SCAN}:_scanner_position", *_SIDES),
-        _NO_PIXELS | _NO_LAW | _UP | {"scan.image_view": _gives(None)},
+        (
+            _PIXELS,
+            _LAW,
+            _RINGS,
+            f"{_IMAGE}:image_view",
+            f"{_ACQUISITION}:Scanner.confirmed",
+            *_SIDES,
+        ),
+        _NO_PIXELS | _NO_LAW | _UP | {"acquisition.kinds.image_view": _gives(None)},
     ),
-    Part("all: law of spacing and rings", (_LAW, "voxels/rings.py", f"{_SCAN}:_scanner_position"), _NO_LAW),
+    Part("all: law of spacing and rings", (_LAW, _RINGS, f"{_ACQUISITION}:Scanner.confirmed"), _NO_LAW),
     Part("all: outside from what is visible; else upwards", _SIDES, _UP),
     Part("all: outside from what is visible; else outwards", _SIDES, _OUTWARDS),
     Part(
         "all: outliers",
-        (_NOISE, f"{_SCAN}:_without_near_outliers", f"{_SCAN}:_without"),
+        (_NOISE, f"{_VOXELS}:_without_near_outliers", f"{_VOXELS}:Voxelised.without"),
         _NO_OUTLIERS | _NO_DETACHED,
     ),
     Part(
@@ -274,39 +324,54 @@ GROUPS = (
     ),
     Part(
         "all: adapted voxel size",
-        (_SIZE, "voxels/grading.py", f"{_SCAN}:_with_adapted_size", f"{_SCAN}:_oriented_as_larger"),
-        {"scan._with_adapted_size": _keeps(0)},
+        (_SIZE, "voxels/grading.py", f"{_VOXELS}:_adapted", f"{_SCAN}:_oriented"),
+        {"voxelisation.voxelised._adapted": lambda f: lambda found, *others: (found, found.grid.size)},
     ),
     Part(
         "all: colours",
-        ("voxels/column_evidence.py:color_evidence", f"{_LINK}:RegionLinkage.color", f"{_LINK}:_Shape.k1"),
+        ("voxels/column_evidence.py:color_evidence", f"{_LINK}:RegionLinkage.color", f"{_LINK}:AltitudeConstants.k1"),
         {"scan.clean_cloud": lambda f: lambda points, colors, *others: f(points, None, *others)},
     ),
-    Part("all: relief and heaps", (f"{_LINK}:_standing_out",), _linkage(relief=0.0) | _shape(h1=0.0)),
+    Part("all: relief and heaps", (f"{_LINK}:_standing_out",), _linkage(relief=0.0) | _altitude(h1=0.0)),
 )
 
 CAMERAS = (
-    Part("pixels of a list", ("pixels.py", "pixel_lattice.py"), _NO_PIXELS),
-    _function("pixels of a list, in any frame", "pixels.py", "_image_in_any_frame", _gives(None)),
-    _function("pixels of a list, in its own frame", "pixels.py", "_image_in_own_frame", _gives(None)),
-    _function("pixels of depths in steps", "pixel_lattice.py", "_alike", lambda f: lambda camera, *others: [camera]),
+    Part("pixels of a list", (_PIXELS, _LATTICE), _NO_PIXELS),
+    _function("pixels of a list, in any frame", _PIXELS, "_image_in_any_frame", _gives(None)),
+    _function("pixels of a list, in its own frame", _PIXELS, "_image_in_own_frame", _gives(None)),
+    _function(
+        "pixels of depths in steps",
+        _LATTICE,
+        "_alike",
+        lambda f: lambda camera, *others: [camera],
+    ),
     _function("camera of an image in any frame", _IMAGE, "_camera", _gives(None)),
-    _function("voxels grow with depth", _SCAN, "_grows_with_depth", _gives(False)),
-    Part("spacing of a depth image", (f"{_IMAGE}:DepthImage.spacing",), {"depth_image.DepthImage.spacing": _keeps(1)}),
-    _constant("spacing: steps of depth", _IMAGE, "_MAX_COARSENING", 0.0, "_step_along", "_MAX_STEP"),
-    _constant("spacing: rows of an image", _IMAGE, "_MIN_PER_PITCH", 0.0),
+    Part("voxels grow with depth", (f"{_ACQUISITION}:CameraImage",), {"scan.acquisition_of": _is(_no_camera)}),
+    Part(
+        "spacing of a depth image",
+        (f"{_IMAGE}:DepthImage.spacing",),
+        {"acquisition.depth_image.DepthImage.spacing": _keeps(1)},
+    ),
+    _threshold(
+        "spacing: steps of depth", _IMAGE, "_STEPS", "_step_along", "StepThresholds.max_step", max_coarsening=0.0
+    ),
+    _threshold("spacing: rows of an image", _IMAGE, "_STEPS", min_per_pitch=0.0),
     Part(
         "flying pixels",
-        (f"{_SCAN}:_without_flying_pixels", f"{_IMAGE}:DepthImage.flying"),
-        {"scan._without_flying_pixels": _keeps(0)},
+        (f"{_VOXELS}:without_flying_pixels", f"{_IMAGE}:DepthImage.flying"),
+        {"scan.without_flying_pixels": _keeps(0)},
     ),
 )
 
 LAW = (
-    _constant("voxels grow with range", _SCAN, "RANGE_GROWTH", 0.0),
-    Part("rings", ("voxels/rings.py", f"{_LAW}:law_on_rings"), {"scan.law_on_rings": _keeps(1)}),
-    Part("law of spacing, but for rings", (_LAW,), {"scan.spacing_law": _is(_no_law)}),
-    _function("scanner's position for normals", _SCAN, "_scanner_position", _gives(None)),
+    _constant("voxels grow with range", _ACQUISITION, "RANGE_GROWTH", 0.0),
+    Part("rings", (_RINGS, f"{_LAW}:law_on_rings"), {"acquisition.kinds.law_on_rings": _keeps(1)}),
+    Part("law of spacing, but for rings", (_LAW,), {"acquisition.kinds.spacing_law": _is(_no_law)}),
+    Part(
+        "scanner's position for normals",
+        (f"{_ACQUISITION}:Scanner.confirmed",),
+        {"acquisition.kinds.Scanner.confirmed": _is(_on_the_move)},
+    ),
     _function("law: cosines of the surface", _LAW, "_fit_normals", lambda f: lambda *a: a[-1].fill(0.0)),
     _function(
         "law: readings drawn by spacing",
@@ -315,30 +380,30 @@ LAW = (
         _is(_first_readings),
     ),
     _function("law: readings off the line", _LAW, "_on_line", _is(_every_reading)),
-    _constant("law: near and far half", _LAW, "_MIN_EXPONENT_OF_HALF", -math.inf, "_least_exponent"),
-    _constant("law: middling ranges", _LAW, "_MIN_OF_MOST", -math.inf, "_exponent_of_most"),
-    _constant("law: origin as good", _LAW, "_OWN_ORIGIN", -math.inf),
-    _constant("law: prior of the exponent", _LAW, "_PRIOR", 0.0),
-    _constant("law: several starts", _LAW, "_STARTS", 1, "_APART"),
+    _threshold("law: near and far half", _LAW, "_LAW", "_least_exponent", min_exponent_of_half=-math.inf),
+    _threshold("law: middling ranges", _LAW, "_LAW", "_exponent_of_most", min_trimmed=-math.inf),
+    _threshold("law: origin as good", _LAW, "_LAW", better_than_origin=-math.inf),
+    _threshold("law: prior of the exponent", _LAW, "_SEARCH", prior=0.0),
+    _threshold("law: several starts", _LAW, "_SEARCH", "SearchThresholds.apart", starts=1),
     Part(
         "law: mirrored place",
         (f"{_SIDE}:likelier_viewpoint", f"{_LAW}:_mirrored", f"{_LAW}:SpacingLaw.mirrored"),
-        {"scan.likelier_viewpoint": _keeps(1)},
+        {"acquisition.kinds.likelier_viewpoint": _keeps(1)},
     ),
     Part(
         "law: best place beside the origin",
         (f"{_LAW}:SpacingLaw.best_viewpoint",),
-        {"scan.spacing_law": _then(lambda law: replace(law, best_viewpoint=None))},
+        {"acquisition.kinds.spacing_law": _then(lambda law: replace(law, best_viewpoint=None))},
     ),
     Part(
         "scanner moved: place must show all",
-        (f"{_SCAN}:_MIN_SHOWN", f"{_SIDE}:shown_fraction"),
-        {"scan._MIN_SHOWN": _is(0.0)},
+        (f"{_ACQUISITION}:_MIN_SHOWN", f"{_SIDE}:shown_fraction"),
+        {"acquisition.kinds._MIN_SHOWN": _is(0.0)},
     ),
     Part(
         "axis: level ground faces its scanner",
         (f"{_SIDE}:sides_towards", f"{_SIDE}:_upwards"),
-        {"scan.sides_towards": _keeps(1)},
+        {"acquisition.kinds.sides_towards": _keeps(1)},
     ),
 )
 
@@ -348,29 +413,29 @@ SIZES = (
         ("voxels/spacing.py:_NEIGHBOUR",),
         {"voxels.spacing._near": _then(lambda near: near._replace(distances=near.distances[[0, 0]]))},
     ),
-    _constant("spacing of copies", "voxels/spacing.py", "_COPIES", 0, "_fullest", "_THIN"),
-    _constant("sizes per octave", _SCAN, "_SIZES_PER_OCTAVE", 1 << 40),
-    _constant("offset of the grid", _SCAN, "_GRID_OFFSET", 0.0),
-    _constant("control: another offset of the grid", _SCAN, "_GRID_OFFSET", 0.618),  # as good: what luck makes
+    _threshold("spacing of copies", "voxels/spacing.py", "_READ", "_fullest", "SpacingThresholds.thin", max_copies=0),
+    _constant("sizes per octave", _VOXELS, "_SIZES_PER_OCTAVE", 1 << 40),
+    _constant("offset of the grid", _VOXELS, "_GRID_OFFSET", 0.0),
+    _constant("control: another offset of the grid", _VOXELS, "_GRID_OFFSET", 0.618),  # as good: what luck makes
     _function("larger voxels", _SIZE, "_enlarged_size", lambda f: lambda points, grid, *others: grid.size),
-    _constant("larger: gain that is asked for", _SIZE, "_MIN_GAIN", 0.0),
-    _constant("larger: gain of sparse clouds", _SIZE, "_MIN_GAIN_OF_SPARSE", 0.0),
+    _threshold("larger: gain that is asked for", _SIZE, "_LARGER", min_gain=0.0),
+    _threshold("larger: gain of sparse clouds", _SIZE, "_LARGER", min_gain_of_sparse=0.0),
     _function("smaller voxels", _SIZE, "_refined_size", lambda f: lambda points, grid, *others: grid.size),
-    _constant("smaller: price of roughness", _SIZE, "_PRICE_OF_ROUGHNESS", (0.0, 0.0)),
+    _threshold("smaller: price of roughness", _SIZE, "_SMALLER", price=0.0, price_of_large=0.0),
     _function("smaller: few voxels", _SIZE, "_enough_of_few", _gives(math.inf)),
     Part(
         "graded voxels",
         (f"{_SIZE}:adapted_grading", "voxels/grading.py:Grading"),
-        {"scan.adapted_grading": _gives(None)},
+        {"voxelisation.voxelised.adapted_grading": _gives(None)},
     ),
     _function("graded: small grids less", _SIZE, "_sparse_below", _gives(0.6)),
     Part(
         "seeds nearer where few",
         _constants(_SIZE, "seed_spacing", "_edges_per_seed"),
-        {"scan.seed_spacing": _is(lambda grid: VOXELS_PER_SEED * grid.size)},
+        {"scan.seed_spacing": _is(lambda grid, acquisition: VOXELS_PER_SEED * grid.size)},
     ),
-    _constant("seeds nearer on smooth surfaces", _SIZE, "_MIN_SUPERVOXELS_ON_SMOOTH", 800),
-    _function("normals as of larger voxels", _SCAN, "_oriented_as_larger", _keeps(0)),
+    _threshold("seeds nearer on smooth surfaces", _SIZE, "_SEEDS", min_supervoxels_on_smooth=800),
+    _constant("normals as of larger voxels", _SCAN, "_FLIP_COSINE", 2.0),
 )
 
 NOISE = (
@@ -378,33 +443,46 @@ NOISE = (
     Part("detached voxels", (f"{_NOISE}:detached_voxels",), _NO_DETACHED),
     Part(
         "noise looked at closer",
-        (f"{_SCAN}:_without_near_outliers", f"{_NOISE}:is_full_of_noise", f"{_NOISE}:fill_the_volume"),
+        (f"{_VOXELS}:_without_near_outliers", f"{_NOISE}:is_full_of_noise", f"{_NOISE}:fill_the_volume"),
         _NO_CLOSER_LOOK,
     ),
-    Part("noise: full of it", (f"{_NOISE}:is_full_of_noise",), {"scan.is_full_of_noise": _gives(False)}),
-    _constant("noise: much was found", _SCAN, "_NOISY", -1.0),
-    Part("noise fills the volume", (f"{_NOISE}:fill_the_volume",), {"scan.fill_the_volume": _gives(True)}),
-    _constant("noise: scale estimated again", _SCAN, "_FEW_OUTLIERS", 0.0),
+    Part(
+        "noise: full of it", (f"{_NOISE}:is_full_of_noise",), {"voxelisation.voxelised.is_full_of_noise": _gives(False)}
+    ),
+    _constant("noise: much was found", _VOXELS, "_NOISY", -1.0),
+    Part(
+        "noise fills the volume",
+        (f"{_NOISE}:fill_the_volume",),
+        {"voxelisation.voxelised.fill_the_volume": _gives(True)},
+    ),
+    _constant("noise: scale estimated again", _VOXELS, "_FEW_OUTLIERS", 0.0),
     _function("noise: surfaces among it", _NOISE, "_surfaces_among", _none_of(0)),
-    _constant("noise: within reach", _NOISE, "_VOLUME_OF_REACH", math.inf),
-    _constant("noise: of all two thirds at most", _NOISE, "_MAX_FRACTION", 1.0),
+    _threshold("noise: within reach", _NOISE, "_NOISE", reach_volume=math.inf),
+    _threshold("noise: of all two thirds at most", _NOISE, "_NOISE", max_fraction=1.0),
 )
 
 SIDES = (
     _function("visible: carried over edges", _SIDE, "_carry_over", _gives(None)),
     _function("visible: votes smoothed", _SIDE, "_smoothed_votes", _keeps(2)),
-    _constant("virtual: finer cells of rooms", _VIEW, "_FINER", (1,), "_SHOWS_MOST", "_SHOWS_NEARLY_ALL"),
+    _threshold(
+        "virtual: finer cells of rooms",
+        _VIEW,
+        "_RESOLUTION",
+        "ResolutionThresholds.shows_most",
+        "ResolutionThresholds.shows_nearly_all",
+        finer=(1,),
+    ),
     _function("virtual: layers", _VIEW, "_is_layered", _gives(False)),
     _function("virtual: rooms", _VIEW, "_is_room", _gives(False)),
     _function("virtual: parts far apart", _VIEW, "_parts", _is(_one_part)),
     _function("virtual: partitions", _VIEW, "_without_partitions", _keeps(0)),
-    _constant("virtual: passages", _VIEW, "_MIN_SHOWN_FROM_INSIDE", math.inf),
-    _constant("virtual: planes from behind", _VIEW, "_MAX_FROM_BEHIND", math.inf),
-    _constant("virtual: differences that do not count", _VIEW, "_SHOWN_TOLERANCE", 0.0),
-    _constant("virtual: unanimous", _VIEW, "_W_UNANIMOUS", 0.0),
-    _constant("virtual: seen from outside", _VIEW, "_W_OUTSIDE", 0.0),
-    _constant("virtual: above the ground", _VIEW, "_W_ABOVE_GROUND", 0.002),
-    _constant("virtual: free side of a plane", _VIEW, "_W_FREE_SIDE", 0.0),
+    _threshold("virtual: passages", _VIEW, "_SCORE", min_shown_from_inside=math.inf),
+    _threshold("virtual: planes from behind", _VIEW, "_SCORE", max_from_behind=math.inf),
+    _threshold("virtual: differences that do not count", _VIEW, "_SCORE", shown_tolerance=0.0),
+    _threshold("virtual: unanimous", _VIEW, "_SCORE", unanimous=0.0),
+    _threshold("virtual: seen from outside", _VIEW, "_SCORE", outside=0.0),
+    _threshold("virtual: above the ground", _VIEW, "_SCORE", above_ground=0.002),
+    _threshold("virtual: free side of a plane", _VIEW, "_SCORE", free_side=0.0),
     Part(
         "virtual: plane that bears things",
         ("voxels/ground_and_rooms.py:supporting_plane",),
@@ -412,9 +490,9 @@ SIDES = (
     ),
     _function("virtual: origin as a camera's place", _VIEW, "_has_in_view", _gives(False)),
     _function("virtual: origin sees as much", _VIEW, "_sees_as_much", _gives(True)),
-    _constant("virtual: box along principal axes", _VIEW, "_MAX_TURNED_BOX", 0.0),
+    _threshold("virtual: box along principal axes", _VIEW, "_CANDIDATES", max_turned_box=0.0),
     _function("virtual: choice spread out", _VIEW, "_spread_choice", _is(_by_weight)),
-    _constant("virtual: places not in corners", _VIEW, "_MIN_SURROUNDED", 0.0),
+    _threshold("virtual: places not in corners", _VIEW, "_CANDIDATES", min_surrounded=0.0),
 )
 
 SUPERVOXELS = (
@@ -423,7 +501,11 @@ SUPERVOXELS = (
         ("voxels/surface.py:_take_best", "voxels/surface.py:_OWN_BONUS"),
         {"supervoxels.surface_growth.local_planes": lambda f: lambda grid, places, reach: f(grid, places, 0)},
     ),
-    Part("distance off the plane", ("supervoxels/clustering.py:_off_plane", f"{_GROW}:_SLACK"), _metric(plane=0.0)),
+    Part(
+        "distance off the plane",
+        ("supervoxels/clustering.py:_off_plane", f"{_GROW}:_NOISE_OFF_PLANE"),
+        _metric(plane=0.0),
+    ),
     Part("distance of normals", (f"{_GROW}:SurfaceGrowth.normal_weight",), _metric(normal=0.0)),
     Part("distance of colours", (f"{_GROW}:SurfaceGrowth.color_weight",), _metric(color=0.0)),
     Part(
@@ -466,19 +548,27 @@ GRAPH = (
         {"graph.gaps._ends_of_surfaces": lambda f: lambda grid, *others: np.flatnonzero(boundary_voxels(grid))},
     ),
     Part("gaps: wider in one scan", ("voxels/warp.py:RangeWarp.max_gap",), {"voxels.warp.RangeWarp.max_gap": _is(3.0)}),
-    Part("gaps: price", (f"{_LINK}:RegionLinkage.gap", f"{_LINK}:_OF_SEVERAL"), _linkage(gap=0.0)),
-    _constant("gaps: cheaper in several scans", _LINK, "_OF_SEVERAL", 1.0),
+    Part("gaps: price", (f"{_LINK}:RegionLinkage.gap", f"{_LINK}:_GAP_OF_SEVERAL_SCANS"), _linkage(gap=0.0)),
+    _constant("gaps: cheaper in several scans", _LINK, "_GAP_OF_SEVERAL_SCANS", 1.0),
     Part("continuations", (f"{_BEHIND}:continuations",), _NO_CONTINUATIONS),
     _constant("continuations: open borders", _BEHIND, "_OPEN", math.inf, "_count_open", "_both_ways"),
     _constant("continuations: wide enough", _BEHIND, "_SUPPORT", 0.0),
     _function("continuations: level", _BEHIND, "_are_level", _is(_all_level)),
-    _constant("continuations: three places", _SCAN, "_MAX_VIEWPOINTS", 1),
+    _constant("continuations: three places", _ACQUISITION, "_MAX_PLACES", 1),
     Part("bounding planes", ("graph/bounding_planes.py:bounding_planes",), _NO_PLANES),
     _function("bounding planes: open gaps", "graph/bounding_planes.py", "_is_open", _none_of(3)),
     Part("terrain", ("graph/terrain.py",), _NO_TERRAIN),
     _function("terrain: pieces that touch", "graph/terrain.py", "_touching", _gives(np.empty((0, 2), np.int64))),
     Part("bridges", ("graph/bridges.py", f"{_LINK}:RegionLinkage.bridge"), {"scan.bridges": _gives(_NO_BRIDGES)}),
-    _constant("bridges between specks", "graph/bridges.py", "_FEW", 0, "_are_near", "_AS_NEAR", "_MAX_WIDTH_BETWEEN"),
+    _threshold(
+        "bridges between specks",
+        "graph/bridges.py",
+        "_THRESHOLDS",
+        "_are_near",
+        "BridgeThresholds.times_nearest",
+        "BridgeThresholds.max_width_of_surface",
+        max_points=0,
+    ),
 )
 
 LINKAGE = (
@@ -488,33 +578,43 @@ LINKAGE = (
     Part(
         "cost: steps", _constants("graph/boundary.py", "BoundaryCost.step", "BoundaryCost.step_limit"), _cost(step=0.0)
     ),
-    _constant("cost: narrow valleys", "graph/boundary.py", "_AS_IT_CLOSES", 1e9, "_WITH_ROOM", "_NO_ROOM"),
-    _constant("cost: room in a valley", "graph/boundary.py", "_WITH_ROOM", 0.0, "_NO_ROOM"),
+    _threshold(
+        "cost: narrow valleys",
+        "graph/boundary.py",
+        "_NARROW",
+        "ValleyThresholds.per_room",
+        "ValleyThresholds.noise",
+        per_opening=1e9,
+    ),
+    _threshold("cost: room in a valley", "graph/boundary.py", "_NARROW", "ValleyThresholds.noise", per_room=0.0),
     Part(
         "linkage: relief R",
-        (f"{_LINK}:RegionLinkage.relief", *_constants(_LINK, "_Shape.b1", "_Shape.d1", "_Shape.v0")),
+        (
+            f"{_LINK}:RegionLinkage.relief",
+            *_constants(_LINK, *(f"AltitudeConstants.{field}" for field in ("b1", "d1", "v0"))),
+        ),
         _linkage(relief=0.0),
     ),
-    _shape_part("heaps H", h1=0.0, h0=0.0),
+    _altitude_part("heaps H", h1=0.0, h0=0.0),
     Part(
         "linkage: relief only outwards",
         (f"{_LINK}:_Outlines.sides_known",),
         {"tree.region_linkage._Outlines": _then(lambda outlines: outlines._replace(sides_known=False))},
     ),
-    _shape_part("relief: far off the plane counts less (d1)", d1=math.inf),
-    _shape_part("relief: noise v0", v0=0.0),
+    _altitude_part("relief: far off the plane counts less (d1)", d1=math.inf),
+    _altitude_part("relief: noise v0", v0=0.0),
     Part("linkage: colours", (f"{_LINK}:RegionLinkage.color",), _linkage(color=0.0)),
-    _shape_part("valley where colours change (k1)", k1=0.0),
-    _shape_part("least evidence c0", c0=0.0),
-    _shape_part("increase in the evidence (c1)", c1=0.0),
-    _shape_part("steep valleys (c2, s0, u)", c2=math.inf, s0=0.5),
+    _altitude_part("valley where colours change (k1)", k1=0.0),
+    _altitude_part("least evidence c0", c0=0.0),
+    _altitude_part("increase in the evidence (c1)", c1=0.0),
+    _altitude_part("steep valleys (c2, s0, u)", c2=math.inf, s0=0.5),
     _function("linkage: smoothness u of what is steep", _LINK, "_smoothness", _is(_all_smooth)),
-    _shape_part("same plane first: e0", e0=1e-9),
-    _shape_part("uneven surfaces (e1, q0)", e1=0.0, q0=2.0),
-    _shape_part("much larger surfaces late (r)", r=1e12),
-    _shape_part("small pieces early (m0)", m0=0.0),
-    _shape_part("specks early (m1)", m1=0.0),
-    _shape_part("small masses (m2)", m2=0.0),
+    _altitude_part("same plane first: e0", e0=1e-9),
+    _altitude_part("uneven surfaces (e1, q0)", e1=0.0, q0=2.0),
+    _altitude_part("much larger surfaces late (r)", r=1e12),
+    _altitude_part("small pieces early (m0)", m0=0.0),
+    _altitude_part("specks early (m1)", m1=0.0),
+    _altitude_part("small masses (m2)", m2=0.0),
 )
 
 PARTS: tuple[Part, ...] = (*GROUPS, *CAMERAS, *LAW, *SIZES, *NOISE, *SIDES, *SUPERVOXELS, *GRAPH, *LINKAGE)

@@ -135,8 +135,6 @@ def _measure_cuts(cases: list[Case]) -> dict[str, dict[str, float]]:
     cuts = {
         f"altitude {altitude:g} rad": lambda tree: tree.cut(altitude=altitude),
         f"the same, min_size {MIN_SIZE}": lambda tree: tree.cut(altitude=altitude, min_size=MIN_SIZE),
-        "stable": lambda tree: tree.cut_stable(),
-        f"stable, min_size {MIN_SIZE}": lambda tree: tree.cut_stable(MIN_SIZE),
         f"optimal, planes, scale {PLANE_SCALE:g}": lambda tree: tree.cut_optimal(plane_energy(tree), PLANE_SCALE),
     }
     for name, cut in cuts.items():

@@ -90,8 +90,8 @@ def measure(folder: Path, pictures: Path | None) -> None:
     from scores import fraction_facing
 
     import pcgraph
+    from pcgraph.acquisition.spacing_law import law_on_rings, spacing_law
     from pcgraph.voxels.spacing import spacing_and_rows
-    from pcgraph.voxels.spacing_law import law_on_rings, spacing_law
 
     warnings.simplefilter("ignore")  # of viewpoints edge-on and the like: none is given here
     print(f"{'':42s}{'beams':>6s}{'points':>8s}{'told':>9s}{'off':>7s}{'worst':>7s}{'facing':>8s}   objects")

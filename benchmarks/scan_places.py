@@ -44,9 +44,9 @@ from scanned_streets import place_over_lane, street
 from scores import fraction_facing
 
 import pcgraph
+from pcgraph.acquisition.spacing_law import law_on_rings, spacing_law
 from pcgraph.metrics import weighted_overlap
 from pcgraph.voxels.spacing import spacing_and_rows
-from pcgraph.voxels.spacing_law import law_on_rings, spacing_law
 
 Kept = NDArray[np.int64] | NDArray[np.bool_]
 

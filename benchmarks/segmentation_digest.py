@@ -80,8 +80,6 @@ def of_tree(name: str, result: Segmentation) -> Iterator[tuple[str, Any]]:
 def of_more(name: str, result: Segmentation) -> Iterator[tuple[str, Any]]:
     """What else a tree is asked for."""
     tree = result.tree
-    yield f"{name}/stable cut", tree.cut_stable()
-    yield f"{name}/stable cut of 100", tree.cut_stable(min_size=100)
     energy = pcgraph.plane_energy(tree, result.graph)
     yield from parts(f"{name}/energy", energy)
     yield f"{name}/optimal cut", tree.cut_optimal(energy, 1e-3)

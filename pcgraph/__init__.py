@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from pcgraph import detection as detection
     from pcgraph import learning as learning
     from pcgraph import metrics as metrics
+    from pcgraph.acquisition.kinds import Acquisition as Acquisition
     from pcgraph.cloud import Cloud as Cloud
     from pcgraph.columns import RobustScaling as RobustScaling
     from pcgraph.errors import CloudReadError as CloudReadError
@@ -34,8 +35,8 @@ if TYPE_CHECKING:
     from pcgraph.io import write_segmentation as write_segmentation
     from pcgraph.plausibility import CloudWarning as CloudWarning
     from pcgraph.scan import segment as segment
-    from pcgraph.scan import update as update
     from pcgraph.segmentation import Segmentation as Segmentation
+    from pcgraph.stream import update as update
     from pcgraph.supervoxels.method import SupervoxelMethod as SupervoxelMethod
     from pcgraph.supervoxels.surface_growth import SurfaceGrowth as SurfaceGrowth
     from pcgraph.supervoxels.vccs import Vccs as Vccs
@@ -65,6 +66,7 @@ else:
         __name__,
         submodules={"detection", "learning", "metrics"},
         submod_attrs={
+            "acquisition.kinds": ["Acquisition"],
             "cloud": ["Cloud"],
             "columns": ["RobustScaling"],
             "errors": ["CloudReadError", "CloudWriteError", "PcgraphError"],
@@ -77,8 +79,9 @@ else:
             "graph.occlusion": ["Occlusions"],
             "io": ["read_cloud", "write_segmentation"],
             "plausibility": ["CloudWarning"],
-            "scan": ["segment", "update"],
+            "scan": ["segment"],
             "segmentation": ["Segmentation"],
+            "stream": ["update"],
             "supervoxels.method": ["SupervoxelMethod"],
             "supervoxels.surface_growth": ["SurfaceGrowth"],
             "supervoxels.vccs": ["Vccs"],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m pcgraph``, and the script ``pcgraph``: signals are taken care of before anything else is imported."""
+"""``python -m pcgraph``, and the script ``pcgraph``: handlers of signals come before all other imports."""
 
 from __future__ import annotations
 

@@ -12,8 +12,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph import pixel_lattice, pixels
-from pcgraph.depth_image import DepthImage
+from pcgraph.acquisition import pixel_lattice, pixels
+from pcgraph.acquisition.depth_image import DepthImage
+from pcgraph.acquisition.kinds import Scanner, Told
+from pcgraph.acquisition.pixels import even_steps
+from pcgraph.acquisition.spacing_law import spacing_law
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph import contacts
@@ -23,7 +26,6 @@ from pcgraph.graph.bridges import bridges
 from pcgraph.graph.continuations import continuations
 from pcgraph.graph.gaps import gaps
 from pcgraph.inputs import Pixels, clean_cloud
-from pcgraph.pixels import even_steps
 from pcgraph.scan import segment
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
@@ -33,7 +35,6 @@ from pcgraph.voxels.grading import Grading
 from pcgraph.voxels.grid import VoxelGrid, at_ends, voxel_grid, with_means
 from pcgraph.voxels.outliers import outlier_voxels
 from pcgraph.voxels.sampling import some_blocks, thinned
-from pcgraph.voxels.spacing_law import spacing_law
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.visibility import visible_fraction, visible_sides
 from pcgraph.voxels.warp import CameraWarp, Warp
@@ -102,7 +103,7 @@ def _compile_graph_and_tree() -> None:
     leaves = replace(moments_of_groups(places, places, labels, n), normals=normals)
     surface = Surface(grid, normals, labels)
     nodes, touching = node_features(leaves), contacts.contacts(surface)
-    near = gaps(surface, nodes, touching.edges, np.zeros(3))
+    near = gaps(surface, nodes, touching.edges, Scanner(Told(), np.zeros(3), 0.5))
     hidden = continuations(surface, nodes, labels, np.zeros((1, 3))).with_others(
         bounding_planes(surface, nodes, labels)
     )

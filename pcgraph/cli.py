@@ -112,8 +112,8 @@ def segment(
     """Segment a point cloud into objects, and write labels, supervoxels, graph and tree.
 
     Writes NAME.segments.ply (points coloured by object, with labels and supervoxels) and NAME.segments.npz
-    (labels in the input's shape, graph and tree). What the file says of its points is kept under its names: beside
-    colours and labels of its own, the result's are called segment_red and so on, and segment_labels.
+    (labels in the input's shape, graph and tree). The columns of the input keep their names: if it has colours or
+    labels of its own, the result's are called segment_red and so on, and segment_labels.
 
     Example: pcgraph segment scan.pcd --out results/ --voxel-size 0.005 --seed-size 0.03
     """
@@ -170,7 +170,7 @@ def main() -> None:
     """Run the command line."""
     try:
         app(prog_name="pcgraph")
-    except OSError as error:  # those of files are told by the commands
+    except OSError as error:  # the commands catch errors of files themselves
         typer.echo(f"pcgraph: cannot print: {one_line(said(error))}.", err=True)
         raise SystemExit(1) from None
 
@@ -194,7 +194,7 @@ def _targets(cloud: Path, out: Path | None) -> list[Path]:
 
 
 def _check_targets(targets: list[Path]) -> None:
-    """Refuse to write where a file of the user's is, or where nothing can be written; this writes nothing."""
+    """Raise CloudWriteError if a target is a file of the user's, or cannot be written; this writes nothing."""
     from pcgraph.io.segmentation_files import is_segmentation
 
     for target in targets:
@@ -242,7 +242,7 @@ def _write(targets: list[Path], cloud: Cloud, result: Segmentation, labels: NDAr
     from pcgraph.plumbing.plain_files import write_files
 
     contents = {target: encode_segmentation(target.name, cloud, result, labels) for target in targets}
-    _check_targets(targets)  # the segmentation took its time
+    _check_targets(targets)  # again, as files may have appeared during the segmentation
     write_files(contents, CloudWriteError, make_parents=True)
 
 

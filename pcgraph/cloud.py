@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The point cloud as files hold it, and how their named columns become one."""
+"""The point cloud as files hold it, and its making from the files' named columns."""
 
 from __future__ import annotations
 
@@ -18,7 +18,11 @@ Columns = Mapping[str, NDArray[np.generic]]
 """One array per field of a file."""
 
 TextField = tuple[str, DTypeLike, int]
-"""Name, type and numbers of each point in a field of a text."""
+"""A field of a text file: its name, its type, and the count of its numbers for each point."""
+
+MAX_HEADER_BYTES = 1 << 16
+"""Bytes in which the header of a file must end: far more than headers have, so that a file without one is refused
+before all of it is searched. Chosen by eye; not varied."""
 
 NORMAL_NAMES = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
 PACKED_NAMES = ("rgb", "rgba")
@@ -28,24 +32,24 @@ LABEL_NAMES = ("label", "labels")
 
 @dataclass(frozen=True, eq=False)
 class Cloud(ShortRepr):
-    """Points with what a file says about each of them.
+    """Points, and the columns that a file has for them.
 
     Attributes
     ----------
     points : (n, 3) or (h, w, 3) float32 or float64, metres, the file's frame
-        Organised when the file is (PCD with HEIGHT > 1). NaN where the sensor saw nothing. Read as float64 where the
-        file has float64, integers of 64 bits, or whole numbers beyond 2**24, which float32 would round.
+        Organised if the file is (PCD with HEIGHT > 1). NaN where the sensor saw nothing. They are float64 if the file
+        has float64, integers of 64 bits, or whole numbers beyond 2**24, which float32 would round.
     colors : same leading shape + (3,), uint8, 0..255, or None
-        Red, green, blue. Black where a text has nan for a packed colour; None if it has nothing else.
+        Red, green, blue. Black where a text file has nan for a packed colour; None if it has nothing else.
     normals : same leading shape + (3,), float32 or float64, or None
         As stored; not checked for unit length.
     labels : same leading shape, int32, or None
-        The file's own ``label`` or ``labels`` field, for example ground truth. Those of unsigned 32 bits keep their
-        bits: 4294967295, how PCL stores -1, is -1. A field of 64 bits that int32 does not hold stays in `columns`.
+        The file's own ``label`` or ``labels`` field, for example ground truth. Labels of unsigned 32 bits keep their
+        bits: 4294967295, as PCL stores -1, is -1. A field of 64 bits that int32 does not hold stays in `columns`.
     viewpoint : (3,) float64, metres, or None
-        Where the sensor stood, from the PCD header; None if the format does not say.
+        Position of the sensor, from the PCD header; None if the format has none.
     columns : dict of name to array of the same leading shape, or that + (c,), of any dtype of numbers
-        All else that the file says of each point, as stored: intensity, ring, time, classification and the like.
+        All other fields of the file, as stored: intensity, ring, time, classification and the like.
         `pcgraph.segment` takes them as `features` by name; `write_segmentation` writes them back.
     """
 
@@ -68,10 +72,10 @@ def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDAr
     Parameters
     ----------
     columns : mapping of field name to (n,) or (n, c) array
-        Must hold ``x``, ``y``, ``z``; colours (``rgb``/``rgba`` packed, or ``red``/``green``/``blue``),
-        normals and labels are picked up under the names that PCL, Open3D and MeshLab write, in upper or lower case.
-        Colours run to 65535 in unsigned 16 bits, to 1 in floats none of which is larger, else to 255. The others, and
-        fields of several numbers for each point, are kept as they are, but for ``_``, the name of padding in PCD files.
+        Must hold ``x``, ``y``, ``z``. Colours (``rgb``/``rgba`` packed, or ``red``/``green``/``blue``), normals and
+        labels are found under the names that PCL, Open3D and MeshLab write, in upper or lower case. White is 65535 in
+        unsigned 16 bits, 1 in floats of at most 1, else 255. All other fields, and those of several numbers for each
+        point, are kept as they are, but for ``_``, the name of padding in PCD files.
     shape : (n,) or (h, w)
         Leading shape of the result.
     viewpoint : (3,) float64, metres, optional
@@ -79,7 +83,7 @@ def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDAr
     Raises
     ------
     CloudReadError
-        A coordinate is missing or is not one number for each point.
+        A coordinate is missing, or is not one number for each point.
     """
     stored, names = columns, _names_by_lower_case(columns)
     columns = {lower: stored[name] for lower, name in names.items() if stored[name].ndim == 1}
@@ -114,7 +118,7 @@ def _stack(columns: Columns, names: tuple[str, ...], shape: tuple[int, ...]) -> 
 
 
 def _is_wide(column: NDArray[np.generic]) -> bool:
-    """Whether float32 does not hold the column as it is: by its type, or by whole numbers beyond 2**24."""
+    """Whether float32 would round the column: because of its type, or of whole numbers beyond 2**24."""
     if column.dtype.itemsize > 4:
         return True
     return column.dtype.kind in "iu" and max(abs(int(column.min(initial=0))), int(column.max(initial=0))) > 1 << 24
@@ -160,7 +164,7 @@ def _label_name(columns: Columns) -> tuple[str, ...]:
 
 
 def _are_labels(column: NDArray[np.generic]) -> bool:
-    """Whether a column holds whole numbers of which int32 makes no two the same."""
+    """Whether a column holds whole numbers that stay distinct as int32."""
     if column.dtype.kind not in "iu" or column.dtype.itemsize <= 4:
         return column.dtype.kind in "iu"
     limits = np.iinfo(np.int32)
@@ -168,7 +172,7 @@ def _are_labels(column: NDArray[np.generic]) -> bool:
 
 
 def _names_by_lower_case(columns: Columns) -> dict[str, str]:
-    """The name of each column by that name in lower case; of two, the one that is written so."""
+    """Names of columns by their lower-case forms; if two names have one form, the lower-case name counts."""
     found: dict[str, str] = {}
     for name in sorted(columns, key=lambda name: name != name.lower()):
         found.setdefault(name.lower(), name)
@@ -176,22 +180,22 @@ def _names_by_lower_case(columns: Columns) -> dict[str, str]:
 
 
 def _kept(column: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.generic]:
-    """A copy of its own, so that the file's bytes need not stay in memory."""
+    """A copy of a column in a shape, so that the file's bytes need not stay in memory."""
     return column.reshape(*shape, *column.shape[1:]).copy()
 
 
 def columns_from_text(table: NDArray[np.float64], fields: Iterable[TextField]) -> dict[str, NDArray[np.generic]]:
-    """One array per field of the numbers of a text, in the types that the header names.
+    """One array per field of a text file, in the types that the header names.
 
-    A packed colour that is nan says that there is none, as a text does not keep the bits of a nan: it becomes 0, black,
-    and the field is left out where it holds no other. One in whole numbers of 32 bits may be written with a sign or
-    without, whatever the header says.
+    A packed colour of nan means no colour, because a text does not keep the bits of a nan. It becomes 0, black; a field
+    with no other colours is left out. Packed colours in whole numbers of 32 bits may have a sign or not, whatever the
+    header says.
 
     Parameters
     ----------
     table : (n, m) float64
-        Numbers of each row.
-    fields : (name, dtype, count) of each, whose counts add up to m
+        Numbers of the text, row by row.
+    fields : (name, dtype, count) of each field; the counts add up to m
 
     Returns
     -------
@@ -200,7 +204,7 @@ def columns_from_text(table: NDArray[np.float64], fields: Iterable[TextField]) -
     Raises
     ------
     CloudReadError
-        A field of integers has a number that is not whole, or that its type does not hold.
+        A field of integers has a number that is not whole, or out of the range of its type.
     """
     columns: dict[str, NDArray[np.generic]] = {}
     end = 0
@@ -225,7 +229,7 @@ def columns_from_text(table: NDArray[np.float64], fields: Iterable[TextField]) -
 
 
 def _check_whole(name: str, numbers: NDArray[np.float64], least: int, most: int) -> None:
-    """Refuse numbers, (n,) or (n, c), that a field of integers cannot hold."""
+    """Raise CloudReadError if a field of integers cannot hold one of the numbers, (n,) or (n, c)."""
     wrong = ~((numbers >= float(least)) & (numbers <= float(most)) & (numbers == np.rint(numbers)))
     if wrong.any():
         row = int(np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))[0])
@@ -237,15 +241,15 @@ def _check_whole(name: str, numbers: NDArray[np.float64], least: int, most: int)
 
 
 def numbers_from_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> NDArray[np.float64]:
-    """First `n_rows` rows of numbers of a text, a row in each line; empty lines do not count.
+    """The first `n_rows` rows of numbers in a text, one row per line; empty lines do not count.
 
     Parameters
     ----------
     body : bytes
-        Lines that end in a line feed. What follows the last row is not read.
+        Lines that end in a line feed. Text after the last row is not read.
     n_rows, n_columns : int
     first_line : int
-        Number of the body's first line in its file, from 1, for messages.
+        Number of the body's first line in the file, from 1, for messages.
 
     Returns
     -------
@@ -258,7 +262,7 @@ def numbers_from_text(body: bytes, n_rows: int, n_columns: int, first_line: int)
         Too few rows, a row of more or fewer words than columns, or a word that is not a number.
     """
     needed = n_rows * n_columns
-    if needed > len(body):  # a number takes a byte at least: refuse before allocating what a header invents
+    if needed > len(body):  # a number takes at least a byte: no memory for numbers that only the header has
         raise CloudReadError(f"the header promises {needed} numbers, but only {len(body)} bytes follow")
     rows = _rows_of_text(body, n_rows, n_columns, first_line)
     # Not through an array of the words: each would take as many bytes as the longest.
@@ -276,7 +280,7 @@ def _rows_of_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> 
         words = line.split(None, n_columns)
         if not words:
             continue
-        if b"_" in line:  # Python reads 1_000 as a number, nobody else does
+        if b"_" in line:  # only Python reads 1_000 as a number
             word = next((word for word in words if b"_" in word), line).decode("latin-1")
             raise CloudReadError(f"expected numbers only in the ascii data, got in line {number}: {word[:80]!r}")
         if len(words) != n_columns:
@@ -294,7 +298,7 @@ def _rows_of_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> 
 
 
 def without_mask(values: ArrayLike) -> ArrayLike:
-    """Numbers as they are; of a masked array floats, NaN where it is masked."""
+    """The numbers unchanged; a masked array becomes floats, with NaN where it is masked."""
     if not isinstance(values, np.ma.MaskedArray):
         return values
     if values.dtype.kind not in "fiu" or not np.ma.getmaskarray(values).any():

@@ -11,23 +11,29 @@ from numpy.typing import NDArray
 from pcgraph.plumbing.short_repr import ShortRepr
 
 CLIP = 4.0
-"""Scaled values are clipped to plus and minus this many spreads from the median."""
-_STEPS = 4096.0  # of a spread: sums of whole steps do not depend on the points' order
+"""Spreads from the median, at most, of a scaled value: 1 in 16 000 normally distributed values lies farther off, so
+that only outliers are clipped. Chosen by eye; not varied."""
+_STEPS = 4096.0
+"""Steps per spread of a scaled value: 2^12, so that sums over 10^11 points are exact in float64, and do not depend on
+the points' order."""
 _RANGES = ((0.25, 0.75, 1.349), (0.05, 0.95, 3.290), (0.01, 0.99, 4.653), (0.0, 1.0, 2.0 * CLIP))
+"""Two quantiles, fractions, and their distance in standard deviations: that of a normal distribution, or of clipped
+values for the whole range. The first range that is not 0 gives the spread, so that a column of mostly equal values has
+one."""
 
 
 @dataclass(frozen=True, eq=False)
 class RobustScaling(ShortRepr):
-    """How d columns are brought to one scale, whatever their unit: (value - center) / spread.
+    """Scaling of d columns to a common range, whatever their unit: (value - center) / spread.
 
     Attributes
     ----------
     centers : (d,) float64, each column's unit
         Medians.
     spreads : (d,) float64, each column's unit
-        Inter-quartile ranges over 1.349, which are standard deviations where values are normally distributed. Where
-        half of the values are equal, the range of the middle 90 % over 3.290 takes its place, then that of the middle
-        98 % over 4.653, then that of all over 8; 0 where all values are equal.
+        Inter-quartile ranges over 1.349, which are standard deviations of normally distributed values. If half of the
+        values are equal, it is the range of the middle 90 % over 3.290, else that of the middle 98 % over 4.653, else
+        that of all values over 8. It is 0 if all values are equal.
     """
 
     centers: NDArray[np.float64]
@@ -39,7 +45,7 @@ class RobustScaling(ShortRepr):
 
     @classmethod
     def of(cls, values: NDArray[np.float64]) -> RobustScaling:
-        """Scaling of the columns of a table, (n, d), NaN left out."""
+        """Scaling of the columns of a table, (n, d); NaN do not count."""
         centers, spreads = np.zeros(values.shape[1]), np.zeros(values.shape[1])
         for column in range(values.shape[1]):
             known = 0.5 * values[~np.isnan(values[:, column]), column]  # halves, whose differences do not overflow
@@ -57,7 +63,7 @@ class RobustScaling(ShortRepr):
 
 
 def _spread(halves: NDArray[np.float64]) -> float:
-    """Spread of numbers, given their halves."""
+    """Spread of a column, given halves of its values."""
     for low, high, deviations in _RANGES:
         width = float(np.subtract(*np.quantile(halves, (high, low))))
         if width > 0.0:
@@ -66,11 +72,11 @@ def _spread(halves: NDArray[np.float64]) -> float:
 
 
 def group_means(values: NDArray[np.float32], groups: NDArray[np.int32], n_groups: int) -> NDArray[np.float64]:
-    """Means over groups of points, (n_groups, d), of scaled columns, (n, d); the same in any order of the points.
+    """Means over groups of points, (n_groups, d), of scaled columns, (n, d); they do not depend on the points' order.
 
     Parameters
     ----------
-    values : (n, d) float32, as `RobustScaling.scaled` makes them
+    values : (n, d) float32, of `RobustScaling.scaled`
     groups : (n,) int32, 0..n_groups - 1
     n_groups : int
     """

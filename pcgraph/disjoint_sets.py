@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Disjoint sets as one array of links: each element leads to another of its set, the representative to itself."""
+"""Disjoint sets as one array of links: each element is linked to another of its set, the representative to itself."""
 
 from __future__ import annotations
 
@@ -18,8 +18,21 @@ def root_of(links: NDArray[np.integer], element: int) -> int:
     return element
 
 
+@routine
+def renumber(labels: NDArray[np.int32], names: NDArray[np.int32], used: int) -> None:
+    """Rename labels by `names`, one per label; those named -1 get new names from `used` on, in the order of elements.
+
+    `names` is overwritten.
+    """
+    for i in range(len(labels)):
+        if names[labels[i]] < 0:
+            names[labels[i]] = used
+            used += 1
+        labels[i] = names[labels[i]]
+
+
 def connected_components(edges: NDArray[np.integer], n: int) -> NDArray[np.int32]:
-    """Component of each of n nodes that edges, (m, 2) int, join, (n,) int32, numbered in the order of first nodes."""
+    """Connected component of each of n nodes, (n,) int32, by edges, (m, 2) int; numbered in order of first nodes."""
     links, component = np.arange(n, dtype=np.int32), np.empty(n, np.int32)
     _connect(np.ascontiguousarray(edges, np.int64), links, component)
     return component

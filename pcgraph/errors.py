@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exceptions of pcgraph that are not a plain ``ValueError``: those about files; and how text of others is shown."""
+"""Exceptions about files; and how foreign text, such as a file's name, is printed safely."""
 
 from __future__ import annotations
 
 import re
 
 MAX_WORD = 160
-"""Characters of a word in a message: paths are seldom longer, and two of them still make a message that can be read."""
+"""Characters of a word in a message, count: paths are seldom longer, and a message with two of them can still be read.
+Chosen by eye; not varied."""
 
 
 class PcgraphError(Exception):
@@ -22,20 +23,20 @@ class CloudWriteError(PcgraphError):
 
 
 def one_line(text: object) -> str:
-    """Text of others, such as a file's name, for one line of a terminal: as `visible`, line ends and tabs too."""
+    """Foreign text for one line of a terminal: control characters, line ends and tabs are spelt out."""
     return visible(str(text)).replace("\n", "\\n").replace("\t", "\\t")
 
 
 def without_long_words(message: str) -> str:
-    """A message on one line, the middles of its longest words left out: names may have thousands of letters."""
+    """A message on one line, without the middles of very long words: names may have thousands of letters."""
     words = message.split()
     return " ".join(w if len(w) <= MAX_WORD else f"{w[: MAX_WORD // 2]}...{w[3 - MAX_WORD // 2 :]}" for w in words)
 
 
 def visible(text: str) -> str:
-    """Text whose control characters, but line ends and tabs, are spelt out, as `\\u202e`.
+    """Text with its control characters spelt out, such as `\\u202e`; line ends and tabs stay.
 
-    They would turn round, break or hide the text beside them, or give orders to a terminal; and half a surrogate pair
+    Control characters would reverse, break or hide the text beside them, or command the terminal. Half a surrogate pair
     cannot be written at all.
     """
     return _CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}", text)

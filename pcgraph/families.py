@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linkages and supervoxel methods by name: those of the package, those loaded since, and those of files of a user's."""
+"""Linkages and supervoxel methods by name: those of the package, those loaded since, and those in a user's files."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from pcgraph.plumbing.python_files import run_python_file
 
 _SEPARATOR = ".py:"
 _HOMES = {"Linkage": "pcgraph.tree.linkage", "SupervoxelMethod": "pcgraph.supervoxels.method"}
-"""The module of each family's base class. The members that pcgraph brings along stand in the same room."""
+"""The module of each family's base class. pcgraph's own members are in the same subpackage."""
 
 
 def members(family: str) -> dict[str, type[Any]]:
-    """Classes of a family of pcgraph by name, those that need no argument: MumfordShahLinkage is mumford-shah.
+    """Classes of a family by name, if they need no argument; `MumfordShahLinkage` is called mumford-shah.
 
     Parameters
     ----------
@@ -41,15 +41,15 @@ def members(family: str) -> dict[str, type[Any]]:
 
 
 def member(family: str, name: str) -> Any:
-    """A member of a family: by name, by a beginning of it that fits no other, or as FILE.py:NAME.
+    """A member of a family: by its name, by an unambiguous beginning of the name, or as FILE.py:NAME.
 
-    NAME is a class of the family, or an object of one, in a Python file; a relative FILE counts from the current
-    folder. Loading a file runs it, so only name files that you trust.
+    NAME is a class of the family, or an object of such a class, in a Python file. A relative FILE is relative to the
+    current folder. Loading a file runs it, so only name files that you trust.
 
     Raises
     ------
     ValueError
-        There is none of that name.
+        No member has that name.
     PcgraphError
         The file is missing or fails, or NAME is no member of the family.
     """
@@ -64,7 +64,7 @@ def member(family: str, name: str) -> Any:
 
 
 def refusal(argument: str, family: str, given: object) -> str:
-    """What to say of an argument that is no member of its family: which classes there are, and which may be meant."""
+    """Message about an argument that is no member of its family: the classes there are, and one that may be meant."""
     known = members(family)
     own = {name: kind for name, kind in known.items() if kind.__module__.startswith("pcgraph.")}
     own = {name: kind for name, kind in own.items() if not kind.__module__.startswith("pcgraph.user_modules.")}
@@ -86,7 +86,7 @@ def _member_in(family: str, path: Path, attribute: str) -> Any:
     if isinstance(found, type) and issubclass(found, base):
         try:
             found = found()
-        except Exception as error:  # whatever a class of somebody's raises
+        except Exception as error:  # a user's class may raise anything
             raise PcgraphError(f"{path}: {attribute}: {type(error).__name__}: {_brief(error)}") from error
     if not isinstance(found, base):
         raise PcgraphError(f"{path}: expected {attribute} to be a {family} or a class of them, got {_brief(found)}")
@@ -94,7 +94,7 @@ def _member_in(family: str, path: Path, attribute: str) -> Any:
 
 
 def _module(path: Path) -> ModuleType:
-    """The module of a Python file, which runs."""
+    """The module of a Python file, which this runs."""
     if not path.is_file():
         raise PcgraphError(f"{path} does not exist; expected a Python file")
     try:
@@ -104,5 +104,5 @@ def _module(path: Path) -> ModuleType:
 
 
 def _brief(thing: object) -> str:
-    """A few words in place of what somebody's file holds or says."""
+    """A short and printable form of an object, or a message, of a user's file."""
     return " ".join(ascii(str(thing))[1:-1].split())[:200]

@@ -4,7 +4,7 @@
 A hierarchy of k nodes is one array `parents`, (k,) int32: leaves first, every parent after its children, the last
 node the root and its own parent. So one pass in ascending order meets children before parents, and one in
 descending order parents before children. Trees, metrics and learning rest on these functions, named after those of
-Higra. They do not check their input: `checked_parents` does that once, at the door.
+Higra. They do not check their input: callers do so once, with `checked_parents`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.parallel import kernel
 
+NONE = -1
+"""Number that stands for no node, no edge, or the end of a list: -1, because real ones have numbers from 0 on."""
 Reduction = Literal["sum", "max", "min"]
 _REDUCTIONS: tuple[Reduction, ...] = ("sum", "max", "min")
 
@@ -43,7 +45,7 @@ def checked_parents(parents: ArrayLike) -> NDArray[np.int32]:
 
 
 def num_leaves(parents: NDArray[np.int32]) -> int:
-    """Number of nodes without children: all before the first that is a parent."""
+    """Number of nodes without children, which come before the first node that is a parent."""
     return int(parents.min()) if len(parents) > 1 else 1
 
 
@@ -80,19 +82,19 @@ def child_lists(parents: NDArray[np.int32]) -> ChildLists:
 
 
 def accumulate_sequential(parents: NDArray[np.int32], values: NDArray[Any], reduce: Reduction = "sum") -> NDArray[Any]:
-    """Values of all nodes from those of the leaves: the sum, largest or smallest of everything at and below a node.
+    """Values of all nodes from those of the leaves: the sum, the largest or the smallest of all at or below a node.
 
     Parameters
     ----------
     parents : (k,) int32
     values : (n_leaves, ...) or (k, ...) bool, int or float, without NaN
-        Given for all nodes, those of inner nodes count too.
+        If given for all nodes, the values of inner nodes count too.
     reduce : "sum", "max" or "min"
 
     Returns
     -------
     (k, ...) int64 or float64
-        Sums add the children in ascending order to the node's own value.
+        Sums add the children, in ascending order, to the node's own value.
     """
     dtype = np.dtype(np.float64 if values.dtype.kind == "f" else np.int64)
     totals = np.full((len(parents), *values.shape[1:]), _neutral(reduce, dtype), dtype)
@@ -102,7 +104,7 @@ def accumulate_sequential(parents: NDArray[np.int32], values: NDArray[Any], redu
 
 
 def _neutral(reduce: Reduction, dtype: np.dtype[Any]) -> float:
-    """Value that changes nothing."""
+    """Value that changes no result of the reduction."""
     if reduce == "sum":
         return 0
     if dtype.kind == "f":
@@ -135,13 +137,13 @@ def propagate_sequential(
     parents : (k,) int32
     node_values : (k, ...) any dtype
     condition : (k,) bool
-        A root keeps its value in any case.
+        The root keeps its value in any case.
     """
     return node_values[propagation_sources(parents, condition)]
 
 
 def roots(parents: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Root above each node, (k,) int32, of a forest: several hierarchies in one array, each root its own parent."""
+    """Root above each node, (k,) int32, of a forest, which is several hierarchies in one array."""
     return propagation_sources(parents, np.ones(len(parents), np.bool_))
 
 
@@ -161,17 +163,17 @@ def _set_sources(parents: NDArray[np.int32], condition: NDArray[np.bool_], sourc
 
 
 class AncestorIndex(NamedTuple):
-    """What finds lowest common ancestors in a time that does not depend on the hierarchy's depth.
+    """Index that finds lowest common ancestors in a time that does not depend on the hierarchy's depth.
 
-    Where parts merge, the representative leaf of the smaller one is linked to that of the largest. A leaf's part at
-    least doubles with each link, so no chain of links is longer than log2 of the number of leaves.
+    Where parts merge, the representative leaf of each smaller part is linked to that of the largest part. With each
+    link a leaf's part at least doubles, so no chain of links is longer than log2 of the number of leaves.
 
     Attributes
     ----------
     links : (n_leaves,) int32
-        Representative to which a leaf's representative was linked; its own for the last one.
+        Representative to which each representative was linked; itself for the last one.
     merges : (n_leaves,) int32
-        Node at which that happened; k, larger than any node, for the last one.
+        Node at which it was linked; k, larger than any node, for the last one.
     """
 
     links: NDArray[np.int32]
@@ -199,7 +201,7 @@ def lowest_common_ancestors(
 
 @kernel
 def lowest_common_ancestor(index: AncestorIndex, a: int, b: int) -> int:
-    """Lowest common ancestor of two leaves: the one whose part was linked first climbs until both meet."""
+    """Lowest common ancestor of two leaves: the one that was linked first climbs, until both meet."""
     node = a
     while a != b:
         if index.merges[a] < index.merges[b]:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checking what callers hand in, and bringing it to one form."""
+"""The points and arguments that callers hand in, checked and brought to one form."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from os import PathLike
 from typing import NamedTuple
@@ -16,14 +16,22 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.cloud import Cloud, without_mask
 from pcgraph.columns import RobustScaling
 from pcgraph.plumbing.short_repr import ShortRepr
+from pcgraph.rounding import TINY
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.sampling import sample
 
-_MAX_ZEROS, _MAX_ZEROS_ONE_IN = 1000, 1000  # points of a list at (0, 0, 0), or one in so many; more are holes
+_MAX_ZEROS = 1000
+"""Points of a list at (0, 0, 0), at most, if these are points: if more are there, they are holes; chosen by eye."""
+_MAX_ZEROS_ONE_IN = 1000
+"""Points of a list per point at (0, 0, 0), at least, in the same way; chosen by eye."""
 _MIN_LENGTH_M = 1e-250
-_MAX_LENGTH_M = 1e100  # metres; far beyond it squares of distances overflow
-_SAME_PLACE = 0.02  # of the median range: viewpoints no farther from each other are one
-_SOME_RANGES = 1 << 12
+"""Metres: lengths that are given are no less; chosen by eye, so that voxels of 1e-200 still work."""
+_MAX_LENGTH_M = 1e100
+"""Metres: coordinates and lengths are no larger, because far beyond it squares of distances overflow."""
+_SAME_PLACE = 0.02
+"""Median ranges between viewpoints that are one, at most, as of a sweep whose scanner moved a little; chosen by eye."""
+_RANGE_SAMPLE = 1 << 12
+"""Points off which the median range is read, about; chosen by eye, for the time's sake."""
 
 
 Points = ArrayLike | Cloud | PathLike[str]
@@ -35,7 +43,7 @@ Features = ArrayLike | str | Sequence[str] | None
 
 
 class Arrays(NamedTuple):
-    """Points and what is known of each."""
+    """Points, and the further values that are known of each; None for those that are not."""
 
     points: ArrayLike
     colors: ArrayLike | None
@@ -51,16 +59,16 @@ def as_arrays(
     viewpoint: ArrayLike | None,
     features: Features = None,
 ) -> Arrays:
-    """Points, colours, normals and viewpoint as they are, or those of a cloud or a file where none are given beside it.
+    """The arguments as arrays; those that are None are taken from the cloud or the file, if `points` is such.
 
-    Features are what is given, or the columns of the cloud that they name.
+    Features that are names are replaced by the columns of the cloud that have these names.
 
     Raises
     ------
     CloudReadError
         `points` names a file that cannot be read as a cloud.
     ValueError
-        Features name a column that is not there, or one of another shape.
+        `features` names a column that is not there, or that has another shape.
     """
     if isinstance(points, (str, PathLike)):
         from pcgraph.io import read_cloud
@@ -86,14 +94,14 @@ def as_arrays(
 
 
 def _names(features: Features) -> list[str]:
-    """The names, if features are such."""
+    """The names of columns, if features are such; else none."""
     if isinstance(features, str):
         return [features]
     return list(features) if isinstance(features, (list, tuple)) and all(isinstance(f, str) for f in features) else []
 
 
 def _columns(cloud: Cloud, names: list[str]) -> NDArray[np.float64]:
-    """The columns of these names, of vectors one per element, side by side: points' leading shape + (d,)."""
+    """The columns of these names side by side, points' leading shape + (d,); a vector gives one for each element."""
     shape = np.shape(cloud.points)[:-1]
     columns = []
     for name in names:
@@ -109,13 +117,13 @@ def _columns(cloud: Cloud, names: list[str]) -> NDArray[np.float64]:
 
 
 class ImageView(NamedTuple):
-    """From where an image was seen.
+    """The place and the axis from which an image was seen.
 
     Attributes
     ----------
     place : (3,) float64, metres
     axis : (3,) float64, or None
-        Of unit length, forwards, of the camera that took it; None if that may have been any other sensor.
+        Optical axis of the camera that took it, of unit length, forwards; None if it may have been another sensor.
     """
 
     place: NDArray[np.float64]
@@ -129,11 +137,11 @@ class Pixels:
     Attributes
     ----------
     shape : (h, w)
-        Rows and columns of their image.
+        Numbers of rows and columns of the image.
     at : (n,) int64
         Flat index of each point's pixel.
     view : ImageView, or None
-        Of the camera, if they came as a list that tells it; None of organised points.
+        View of the camera that was found if the points came as a list; None if they came organised.
     """
 
     shape: tuple[int, int]
@@ -142,7 +150,7 @@ class Pixels:
 
     @cached_property
     def point_at(self) -> NDArray[np.int32]:
-        """The point of each pixel, (h * w,), -1 of those that are none."""
+        """The point of each pixel, (h * w,); -1 if there is none."""
         points = np.full(self.shape[0] * self.shape[1], -1, np.int32)
         points[self.at] = np.arange(len(self.at), dtype=np.int32)
         return points
@@ -163,17 +171,16 @@ class CleanCloud(ShortRepr):
     colors : (n, 3) float64, 0..1, or None
     normals : (n, 3) float64, unit length, or zero where none was given, or None
     shape : (s,) or (h, w)
-        Leading shape of what came in.
+        Leading shape of the points as given.
     kept : (n,) int64
-        Flat indices of those points.
+        Flat indices of the finite points among these.
     outliers : (o,) int64
         Flat indices of finite points that were left out as outliers.
     features : (n, d) float32, -4..4, or None
-        Scaled.
+        Features, scaled by `scaling`.
     scaling : RobustScaling of d columns, or None
-        By which they were.
     image : Pixels, or None
-        Which pixels of an image the points are; None if they are a mere list.
+        Pixels of the points in their image; None if they are a mere list.
     """
 
     points: NDArray[np.float64]
@@ -206,7 +213,7 @@ class CleanCloud(ShortRepr):
         return full
 
     def without(self, outliers: NDArray[np.bool_]) -> CleanCloud:
-        """The points but for some, (n,) bool; as a mere list."""
+        """The cloud without some points, (n,) bool, which become outliers; a mere list without pixels."""
         left = np.flatnonzero(~outliers)
         return replace(
             self,
@@ -227,7 +234,9 @@ def clean_cloud(
     features: ArrayLike | None = None,
     scaling: RobustScaling | None = None,
 ) -> CleanCloud:
-    """Finite points with their colours, normals and features, these scaled as told or else by what they are.
+    """The finite points with their colours, normals and features.
+
+    Features are scaled by `scaling` if it is given, else by their own medians and spreads.
 
     Raises
     ------
@@ -251,7 +260,7 @@ def clean_cloud(
     if not len(kept):
         no_points = "NaN or infinite" + (", or (0, 0, 0) as holes are" if len(shape) == 2 else "")
         raise ValueError(f"expected at least one finite point, but all {len(flat)} points are {no_points}")
-    with np.errstate(over="ignore"):  # long doubles
+    with np.errstate(over="ignore"):  # long doubles may be too large
         places = _rows(flat, kept).astype(np.float64, order="C")
     none = np.empty(0, np.int64)
     clean = CleanCloud(places, _colors(colors, shape, kept), _normals(normals, shape, kept), shape, kept, none)
@@ -271,8 +280,10 @@ def clean_cloud(
 
 
 def _is_measured(points: NDArray[np.generic], organised: bool) -> NDArray[np.bool_]:
-    """Whether each of n points, (n, 3), was measured: it is finite, and not one of many at (0, 0, 0), which is what
-    drivers write for holes."""
+    """Whether each of n points, (n, 3), was measured: it is finite, and not one of many at (0, 0, 0).
+
+    Drivers write (0, 0, 0) for holes.
+    """
     is_point = np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2])
     zeros = np.flatnonzero(points[:, 0] == 0)
     zeros = zeros[(points[zeros, 1] == 0) & (points[zeros, 2] == 0)]
@@ -283,9 +294,9 @@ def _is_measured(points: NDArray[np.generic], organised: bool) -> NDArray[np.boo
 
 
 def clean_viewpoint(viewpoint: ArrayLike, cloud: CleanCloud) -> NDArray[np.float64]:
-    """The viewpoint that was given, (3,) or (n, 3) float64, metres.
+    """The viewpoint as given, (3,) or (n, 3) float64, metres.
 
-    Nearly the same place for each point is one viewpoint, as of a sweep whose scanner moved a little.
+    Viewpoints of the points that are nearly one place become one, as of a sweep whose scanner moved a little.
     """
     given = _numbers("viewpoint", viewpoint).astype(np.float64)
     per_point = given.ndim > 1 and given.shape == (*cloud.shape, 3)
@@ -299,17 +310,17 @@ def clean_viewpoint(viewpoint: ArrayLike, cloud: CleanCloud) -> NDArray[np.float
 
 
 def _one_place(places: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The middle of places, (n, 3), that are one for what lies as far off as most points, (n, 3); else the places."""
+    """The middle of places, (n, 3), if they lie near each other against the ranges of the points; else the places."""
     low, high = bounding_box(places)
     if (low == high).all():
         return places[0]
     middle = low + (high - low) / 2.0
-    ranges = np.linalg.norm(points[:: len(points) // _SOME_RANGES + 1] - middle, axis=1)
+    ranges = np.linalg.norm(points[:: len(points) // _RANGE_SAMPLE + 1] - middle, axis=1)
     return middle if (high - low).max() <= _SAME_PLACE * np.median(ranges) else places
 
 
 def _excerpt(values: NDArray[np.float64]) -> str:
-    """What is wrong with a viewpoint."""
+    """The part of a message that tells the fault of a viewpoint."""
     if values.size <= 4:
         return f" of {values.tolist()}"
     if values.shape == (4, 4):
@@ -332,6 +343,12 @@ def non_negative(name: str, value: float) -> float:
     if not 0.0 <= number < float("inf"):
         raise ValueError(f"expected {name} to be a finite number, not negative, got {value!r}")
     return number
+
+
+def check_non_negative(settings: object, *names: str) -> None:
+    """Raise ValueError unless `non_negative` takes these attributes of a dataclass; by default all its fields."""
+    for name in names or [field.name for field in fields(settings)]:  # type: ignore[arg-type]
+        non_negative(name, getattr(settings, name))
 
 
 def fraction(name: str, value: float) -> float:
@@ -360,6 +377,7 @@ def _number(value: float) -> float:
 
 
 def _numbers(name: str, values: ArrayLike) -> NDArray[np.generic]:
+    """The values as an array of numbers, masked ones as NaN; ValueError if they are none."""
     values = without_mask(values)
     try:
         array = np.asarray(values)
@@ -371,6 +389,7 @@ def _numbers(name: str, values: ArrayLike) -> NDArray[np.generic]:
 
 
 def _same_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.generic]:
+    """Rows of three values, (n, 3), for points of a shape; ValueError if they have another."""
     array = _numbers(name, values)
     if array.shape != (*shape, 3):
         raise ValueError(f"expected {name} of the points' shape {(*shape, 3)}, got {array.shape}")
@@ -378,11 +397,12 @@ def _same_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray
 
 
 def _rows(values: NDArray[np.generic], kept: NDArray[np.int64]) -> NDArray[np.generic]:
-    """Rows of these numbers, ascending; a view where they are all."""
+    """The rows whose indices are kept, which ascend; a view if these are all rows."""
     return values if len(kept) == len(values) else values.take(kept, axis=0)
 
 
 def _colors(colors: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """Colours of the points that are kept, (n, 3) float64, 0..1; ValueError if they are not as documented."""
     if colors is None:
         return None
     masked = np.ma.getmaskarray(colors) if isinstance(colors, np.ma.MaskedArray) else np.zeros(0, bool)
@@ -407,6 +427,7 @@ def _colors(colors: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.i
 
 
 def _normals(normals: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """Normals of the points that are kept, (n, 3) float64, of unit length, or zero where none is given."""
     if normals is None:
         return None
     with np.errstate(over="ignore", invalid="ignore"):  # long doubles, signalling NaN
@@ -416,13 +437,13 @@ def _normals(normals: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np
 
 
 def unit_rows(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows, (n, 3), of length 1, however tiny or large they are; of zeros zeros."""
-    scaled = rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    return scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    """Rows, (n, 3), scaled to length 1, however small or large they are; rows of zeros stay."""
+    scaled = rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True), TINY)
+    return scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), TINY)
 
 
 def _features(features: ArrayLike, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The columns at finite points, (n, d)."""
+    """The features of the points that are kept, (n, d)."""
     array = _numbers("features", features)
     if array.shape[: len(shape)] != shape or array.ndim > len(shape) + 1 or array.shape[len(shape) :] == (0,):
         wanted = f"{shape} or {shape} + (d,)"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a cloud becomes: supervoxels, graph, tree and objects."""
+"""Segmentation of a cloud: its supervoxels, graph, tree and objects."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.acquisition.kinds import Acquisition
 from pcgraph.columns import RobustScaling
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.inputs import non_negative
 from pcgraph.supervoxels.method import SupervoxelMethod
+from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.linkage import Linkage
+from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import SegmentationTree
 from pcgraph.voxels.outliers import OUTLIER
 from pcgraph.voxels.surface import Surface
@@ -23,6 +27,33 @@ from pcgraph.voxels.warp import CameraWarp
 if TYPE_CHECKING:
     from pcgraph.features.primitives import Primitives
     from pcgraph.graph.occlusion import Occlusions
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Method, linkage and cut of a segmentation, checked."""
+
+    method: SupervoxelMethod
+    linkage: Linkage
+    object_altitude: float
+
+    @classmethod
+    def of(cls, method: SupervoxelMethod | None, linkage: Linkage | None, object_altitude: float | None) -> Settings:
+        """Settings, by default those of `pcgraph.segment`; without an altitude that of the linkage.
+
+        Raises
+        ------
+        ValueError
+            The method is no `SupervoxelMethod`, the linkage no `Linkage`, or the altitude negative.
+        """
+        method = SurfaceGrowth() if method is None else method
+        linkage = RegionLinkage() if linkage is None else linkage
+        if not isinstance(method, SupervoxelMethod):
+            raise ValueError(_refusal("method", "SupervoxelMethod", method))
+        if not isinstance(linkage, Linkage):
+            raise ValueError(_refusal("linkage", "Linkage", linkage))
+        altitude = linkage.default_object_altitude if object_altitude is None else object_altitude
+        return cls(method, linkage, non_negative("object_altitude", altitude))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -38,7 +69,8 @@ class Segmentation:
         Supervoxel of each point, that is leaf of the tree and node of the graph; -1 where nothing was measured,
         and of outliers.
     objects : (k,) int32
-        Object of each supervoxel, also of those that hold no point of the last scan.
+        Object of each supervoxel, also of those that hold no point of the last scan. After an update some numbers may
+        be missing, as those of objects that have joined another.
     graph : AdjacencyGraph
     tree : SegmentationTree
     surface : Surface
@@ -70,14 +102,19 @@ class Segmentation:
     feature_scaling: RobustScaling | None = None
 
     def __repr__(self) -> str:
-        """What there is, in one line."""
+        """Counts, sizes and the acquisition, in one line."""
         outliers = np.count_nonzero(self.outliers)
         beside = f" and {outliers} outliers" if outliers else ""
         return (
             f"Segmentation({np.count_nonzero(self.supervoxels >= 0)} points{beside}, {self.tree.n_leaves} supervoxels, "
-            f"{len(self.graph.edges)} edges, {int(self.objects.max()) + 1} objects, "
-            f"voxels of {self.voxel_size:.3g} m, seeds every {self.seed_size:.3g} m)"
+            f"{len(self.graph.edges)} edges, {len(np.unique(self.objects))} objects, "
+            f"voxels of {self.voxel_size:.3g} m, seeds every {self.seed_size:.3g} m, {self.acquisition})"
         )
+
+    @property
+    def acquisition(self) -> Acquisition:
+        """The sensor that took the cloud, its place, and the evidence for both."""
+        return self.graph.acquisition
 
     @property
     def voxel_size(self) -> float:
@@ -106,7 +143,8 @@ class Segmentation:
         Objects are connected by the graph's contacts, gaps and continuations.
         """
         k = len(self.objects)
-        first = np.unique(self.objects, return_index=True)[1][self.objects]
+        _, first, object_of = np.unique(self.objects, return_index=True, return_inverse=True)
+        first = first[object_of]
         whole = np.stack((np.arange(k), first), axis=1).astype(np.int32)
         return self._segments_on_points(connected_components(np.concatenate((self.graph.joined, whole)), k))
 
@@ -161,7 +199,7 @@ class Segmentation:
         return self._in_input_shape(point_saliency(self.tree, self.surface), np.nan)
 
     def occlusions(self) -> Occlusions:
-        """Which supervoxels hide which from the viewpoint, and what may go on behind them.
+        """Pairs of supervoxels of which one hides the other from the viewpoint, and surfaces that may go on behind it.
 
         Neighbours in an organised input's image, or in bearing where there is no image. After an update the
         viewpoint, and the image, are those of the last scan.
@@ -222,3 +260,9 @@ def check_segmentation(given: object) -> None:
     """Raise ValueError unless this is a `Segmentation`."""
     if not isinstance(given, Segmentation):
         raise ValueError(f"expected a Segmentation, as pcgraph.segment returns it, got {type(given).__name__}")
+
+
+def _refusal(argument: str, family: str, given: object) -> str:
+    from pcgraph.families import refusal  # it loads the module inspect, which no valid argument needs
+
+    return refusal(argument, family, given)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
+from scenes.rays import to_ball
 
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
@@ -29,11 +30,8 @@ def range_image(z: np.ndarray, T: np.ndarray | None = None, camera: Intrinsics =
 
 def sphere_depth(camera: Intrinsics, T: np.ndarray, centre: tuple[float, float, float], radius: float) -> np.ndarray:
     """(h, w) depth of a sphere, closed form; NaN beside it."""
-    rays = camera.directions(camera.pixel_centres())
-    c = T[:3, :3].T @ (np.asarray(centre) - T[:3, 3])
-    a, b = (rays**2).sum(axis=-1), rays @ c
-    inside = b * b - a * (c @ c - radius**2)
-    return np.where(inside > 0, (b - np.sqrt(np.maximum(inside, 0))) / a, np.nan)
+    distance = to_ball(camera.directions(camera.pixel_centres()), T[:3, :3].T @ (centre - T[:3, 3]), radius)
+    return np.where(np.isfinite(distance), distance, np.nan)
 
 
 def mesh_depth(mesh: TriangleMesh, camera: Intrinsics, T: np.ndarray) -> np.ndarray:

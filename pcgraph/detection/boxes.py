@@ -16,12 +16,13 @@ from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.directions import plane_basis
 
 FLAT = 1e-7
-"""Width over length below which points lie on a line (or, a dimension up, in a plane): Qhull needs more than that."""
+"""Ratio of width to length below which points lie on a line (or, a dimension up, in a plane), because Qhull needs
+more."""
 _NORMAL_STEPS = 1e6
-"""Steps per unit in which normals of facets are told apart: Qhull cuts one flat side into triangles with equal normals
-up to rounding."""
+"""Steps per unit in which normals of facets are told apart, because Qhull cuts one flat side into triangles with equal
+normals up to rounding."""
 _MAX_FACETS = 64
-"""The largest facets are tried; noise makes hundreds of small ones."""
+"""Count of facets that are tried, the largest first, because noise makes hundreds of small ones. Not varied."""
 
 
 @dataclass(frozen=True, eq=False)

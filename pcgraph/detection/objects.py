@@ -25,12 +25,14 @@ from pcgraph.segmentation import Segmentation, check_segmentation
 from pcgraph.voxels.directions import plane_basis
 
 MIN_HEIGHT = 3.0
-"""Voxel edges: least height of an object unless given. What is lower is mostly the support's noise and sag."""
+"""Least height of an object in voxel edges, unless given, because what is lower is mostly the support's noise and
+sag."""
 MIN_SUPERVOXELS = 0.5
-"""Median supervoxels, in points: least size of an object unless given, so that one whole supervoxel is enough."""
+"""Least number of points of an object in those of the median supervoxel, unless given, so that one supervoxel is
+enough."""
 MIN_CLEARANCE = 0.5
-"""Voxel edges between the support and the centroid of a supervoxel above it: half a voxel is what rounding to voxels
-may lift the support's own."""
+"""Least height in voxel edges of a supervoxel's centroid above the support, because rounding to voxels may lift the
+support's own by half of one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,7 @@ class DetectedObject(ShortRepr):
 
     @property
     def height(self) -> float:
-        """Of its highest point above the support, metres."""
+        """Height of its highest point above the support, metres."""
         return float(self.box.size[2])
 
 
@@ -258,7 +260,7 @@ class Piece:
 
     @cached_property
     def convexity(self) -> float:
-        """How the normals spread with their places, over the root mean square radius, -1..1.
+        """Spread of the normals with their places over the root mean square radius, -1..1.
 
         About 0.5 to 1 for what is seen of a sphere or a box, 0 for a plane, negative where hollow.
         """
@@ -295,30 +297,46 @@ def connected_pieces(segmentation: Segmentation, support: _Support, above: NDArr
 # ------------------------------------------------------------------------------------------------ parts of one object
 
 MIN_INSIDE = 0.5
-"""Fraction of a piece within the box of a larger one above which it belongs to it: most of it."""
-MAX_CUP_GAP = 8.0
-"""Voxel edges, across which the inside of a cup may belong to its outside: what its wall and a depth edge take. On mOSD
-from 8 to 32 nothing changes; at 4 three cups of 32 objects fall apart."""
-MAX_GAP_FRACTION = 0.5
-"""The same, in lengths of the larger one's footprint, for things of few voxels: an opening reaches to half the cup at
-most. On mOSD from 0.25 to 2 nothing changes; at 0.125 cups fall apart."""
-MAX_TOP_DIFFERENCE = 2.0
-"""Voxel edges by which the tops of the inside and the outside of a cup may differ: a voxel of each. On mOSD from 1 to 4
-nothing changes."""
-MIN_CONVEXITY = 0.05
-"""Below this a piece is hollow or flat: between the 0 of a plane, with what noise does to it, and the 0.5 of a sphere.
-On mOSD from -0.1 to 0.2 nothing changes."""
+"""Least fraction of a piece within the box of a larger one for it to belong to that, because the box holds most of
+it."""
 
 
-MAX_MISS = 0.35
-"""Distance from the axis by which half of the normals of each part of a turned body may miss it, as a fraction of the
-root mean square distance of that part's places from it. Those of a hexagon, as the head of a bolt, miss it by 0.27,
-those of a square by 0.43 (closed forms)."""
-MIN_AROUND = 0.25
-"""Least fraction of a piece whose normals point away from the axis. Tops of boxes, which have none, are parallel planes
-and fit any axis across them."""
-MAX_ALONG = 0.5
-"""Cosine between axis and normal up to which a normal points away from the axis: 60 degrees."""
+@dataclass(frozen=True)
+class CupLimits:
+    """Conditions on which the inside of a cup, which a depth edge separates from its outside, joins it."""
+
+    max_gap: float = 8.0
+    """Voxel edges between the two: what the wall and a depth edge take. On mOSD from 8 to 32 nothing changes; at 4
+    three cups of 32 objects fall apart."""
+    max_gap_fraction: float = 0.5
+    """Lengths of the larger one's footprint between the two, for things of few voxels: an opening reaches to half the
+    cup at most. On mOSD from 0.25 to 2 nothing changes; at 0.125 cups fall apart."""
+    max_top_difference: float = 2.0
+    """Voxel edges by which their tops may differ: a voxel of each. On mOSD from 1 to 4 nothing changes."""
+    min_convexity: float = 0.05
+    """Convexity below which a piece is hollow or flat: between the 0 of a plane, with what noise does to it, and the
+    0.5 of a sphere. On mOSD from -0.1 to 0.2 nothing changes."""
+
+
+CUP = CupLimits()
+
+
+@dataclass(frozen=True)
+class TurnedBodyLimits:
+    """Conditions on which two pieces are parts of one surface of revolution."""
+
+    max_miss: float = 0.35
+    """Distance from the axis by which half of the normals of each part may miss it, as a fraction of the root mean
+    square distance of that part's places from it. Those of a hexagon, as the head of a bolt, miss it by 0.27, those of
+    a square by 0.43 (closed forms)."""
+    min_around: float = 0.25
+    """Least fraction of a piece whose normals point away from the axis, because tops of boxes, which have no such axis,
+    are parallel planes and fit any axis across them. Not varied."""
+    max_cosine: float = 0.5
+    """Cosine between axis and normal up to which a normal points away from the axis: 60 degrees. Not varied."""
+
+
+TURNED_BODY = TurnedBodyLimits()
 
 
 def touching_pieces(segmentation: Segmentation, pieces: list[Piece]) -> NDArray[np.int64]:
@@ -335,12 +353,12 @@ def is_turned_body(first: Piece, second: Piece) -> bool:
     places, normals = (np.concatenate((getattr(first, n), getattr(second, n))) for n in ("places", "normals"))
     axis = revolution_axis(places, normals)
     off = np.linalg.norm(np.cross(places - axis.origin, axis.direction), axis=1)
-    is_around = np.abs(normals @ axis.direction) < MAX_ALONG
+    is_around = np.abs(normals @ axis.direction) < TURNED_BODY.max_cosine
     for part in np.split(np.arange(len(places)), [len(first.places)]):
         around = part[is_around[part]]
-        if len(around) < MIN_AROUND * len(part):
+        if len(around) < TURNED_BODY.min_around * len(part):
             return False
-        if np.median(axis.misses[around]) > MAX_MISS * np.sqrt(np.mean(off[around] ** 2)):
+        if np.median(axis.misses[around]) > TURNED_BODY.max_miss * np.sqrt(np.mean(off[around] ** 2)):
             return False
     return True
 
@@ -371,20 +389,19 @@ def linked_pieces(pieces: list[Piece], edge: float, touching: NDArray[np.int64])
     around = _containing_pieces(pieces, edge)
     top = np.array([float((piece.places @ piece.up).max()) for piece in pieces])
     floating = np.array([piece.floating for piece in pieces])
-    hollow = np.array([piece.convexity < MIN_CONVEXITY for piece in pieces])
+    hollow = np.array([piece.convexity < CUP.min_convexity for piece in pieces])
     low = np.array([piece.places.min(axis=0) for piece in pieces])
     high = np.array([piece.places.max(axis=0) for piece in pieces])
     links = [(i, j) for i, j in enumerate(around) if j >= 0]
     links += [(int(i), int(j)) for i, j in touching if is_turned_body(pieces[i], pieces[j])]
     free = around < 0
     for i in np.flatnonzero(free):
-        cup = (
-            free & (hollow[i] | hollow) & (floating[i] | floating) & (np.abs(top - top[i]) <= MAX_TOP_DIFFERENCE * edge)
-        )
+        level = np.abs(top - top[i]) <= CUP.max_top_difference * edge
+        cup = free & level & (hollow[i] | hollow) & (floating[i] | floating)
         cup[i] = False
         others = np.flatnonzero(cup)
         apart = np.maximum(np.maximum(low[others] - high[i], low[i] - high[others]), 0.0)
-        others = others[np.linalg.norm(apart, axis=1) <= 1.001 * MAX_CUP_GAP * edge]  # the others are too far off
+        others = others[np.linalg.norm(apart, axis=1) <= 1.001 * CUP.max_gap * edge]  # the others are too far off
         gaps = [_gap(pieces[i], pieces[j], edge) for j in others]
         if gaps and np.isfinite(min(gaps)):
             links.append((int(i), int(others[int(np.argmin(gaps))])))
@@ -392,7 +409,7 @@ def linked_pieces(pieces: list[Piece], edge: float, touching: NDArray[np.int64])
 
 
 def _containing_pieces(pieces: list[Piece], edge: float) -> NDArray[np.int64]:
-    """For each piece the first, so the largest, whose box contains most of it, (q,) int64; -1 for none.
+    """First, and so largest, piece whose box contains most of each piece, (q,) int64; -1 for none.
 
     A box that contains most of a piece contains the median of its coordinates along any direction, or would if it were
     extended along that direction. So boxes are drawn, and points looked at, only where the medians lie within reach: a
@@ -421,5 +438,5 @@ def _containing_pieces(pieces: list[Piece], edge: float) -> NDArray[np.int64]:
 def _gap(first: Piece, second: Piece, edge: float) -> float:
     """Distance of two pieces, metres; infinite where it is too wide for two parts of one object."""
     length = max(first.box.size[0], second.box.size[0])
-    limit = min(MAX_CUP_GAP * edge, MAX_GAP_FRACTION * length)
+    limit = min(CUP.max_gap * edge, CUP.max_gap_fraction * length)
     return float(second.neighbours.query(first.places, distance_upper_bound=limit)[0].min())

@@ -24,28 +24,38 @@ from pcgraph.voxels.directions import plane_basis
 Kind = Literal["plane", "box", "sphere", "cylinder"]
 
 ROUNDS = 6
-"""Of Gauss-Newton on a circle, and of moving the sides of a box. On mOSD three rounds give the same kinds, and
-residuals within 5 %."""
-MIN_SIDE_FRACTION = 0.05
-"""Fraction of the points that a side of a box, or the end of a cylinder, needs to be moved to them: fewer are noise."""
-MAX_WALL_COSINE = 0.5
-"""|normal . axis| below which a point counts to the wall of a cylinder, above to its ends: 30 degrees off the wall's
-normals, 60 off those of the ends, as normals at the edge between them lean to the wall."""
-MIN_THICKNESS = 2.0
-"""Thickness of a box over the residual of its plane, at least: a flat patch has room for a flat box in its noise."""
-MIN_GAIN = 0.7
-"""A plane is given up only for a shape of less than this times its residual: boxes, spheres and cylinders contain
-planes as limits, and so always fit a little better."""
-MIN_WALL_POINTS = 5
-"""Points for a circle, which has three parameters, to say more than that it can be drawn."""
-MAX_RADIUS = 100.0
-"""Radius of a circle over the size of its points above which they are straight: the arc rises by half a percent of its
-length."""
+"""Number of Gauss-Newton steps on a circle, and of moves of the sides of a box. Measured on mOSD: three rounds give the
+same kinds, and residuals within 5 %."""
+
+
+@dataclass(frozen=True)
+class ShapeLimits:
+    """Least and largest numbers for points to be a shape, and for a shape to beat a plane. None was varied."""
+
+    min_side_fraction: float = 0.05
+    """Fraction of the points that a side of a box, or the end of a cylinder, needs to be moved to them: fewer are
+    noise."""
+    max_wall_cosine: float = 0.5
+    """|normal . axis| below which a point counts to the wall of a cylinder, above to its ends: 30 degrees off the
+    wall's normals, 60 off those of the ends, as normals at the edge between them lean to the wall."""
+    min_thickness: float = 2.0
+    """Least thickness of a box over the residual of its plane: a flat patch has room for a flat box in its noise."""
+    min_gain: float = 0.7
+    """Ratio of residuals below which a shape is better than a plane: boxes, spheres and cylinders contain planes as
+    limits, and so always fit a little better."""
+    min_wall_points: int = 5
+    """Points for a circle, which has three parameters, to say more than that it can be drawn."""
+    max_radius: float = 100.0
+    """Radius of a circle over the size of its points above which they are straight: the arc rises by half a percent of
+    its length."""
+
+
+LIMITS = ShapeLimits()
 
 
 @dataclass(frozen=True, eq=False)
 class Shape(ShortRepr):
-    """What fits points best.
+    """Shape that fits points best.
 
     Attributes
     ----------
@@ -105,7 +115,7 @@ def fit_shape(points: ArrayLike, normals: ArrayLike, up: ArrayLike | None = None
         None,
     )
     boxes = _boxes(places, upwards)
-    found = [flat, *(b for b in boxes if b.box is not None and b.box.size.min() > MIN_THICKNESS * flat.residual)]
+    found = [flat, *(b for b in boxes if b.box is not None and b.box.size.min() > LIMITS.min_thickness * flat.residual)]
     center, radius = fits.sphere_center[0], float(fits.sphere_radius[0])
     if np.isfinite(radius):
         distance = np.linalg.norm(places - center, axis=1) - radius
@@ -116,7 +126,7 @@ def fit_shape(points: ArrayLike, normals: ArrayLike, up: ArrayLike | None = None
     residuals: dict[Kind, float] = {}
     for shape in found:
         residuals[shape.kind] = min(shape.residual, residuals.get(shape.kind, np.inf))
-    best = min(found, key=lambda shape: shape.residual * (MIN_GAIN if shape.kind == "plane" else 1.0))
+    best = min(found, key=lambda shape: shape.residual * (LIMITS.min_gain if shape.kind == "plane" else 1.0))
     return Shape(best.kind, best.residual, residuals, best.center, best.axis, best.radius, best.box)
 
 
@@ -139,7 +149,7 @@ def _fitted_box(points: NDArray[np.float64], box: OrientedBox) -> OrientedBox:
         for axis in range(3):
             for limits, number in ((low, axis), (high, axis + 3)):
                 near = local[side == number, axis]
-                if len(near) >= MIN_SIDE_FRACTION * len(local):
+                if len(near) >= LIMITS.min_side_fraction * len(local):
                     limits[axis] = float(np.median(near))
         low, high = np.minimum(low, high), np.maximum(low, high)
     return OrientedBox(box.center + (low + high) / 2.0 @ box.axes, box.axes, high - low)
@@ -147,10 +157,10 @@ def _fitted_box(points: NDArray[np.float64], box: OrientedBox) -> OrientedBox:
 
 def _cylinder(points: NDArray[np.float64], normals: NDArray[np.float64], axis: NDArray[np.float64]) -> list[Shape]:
     """Closed cylinder about an axis of this direction; none if no wall is seen."""
-    wall = np.abs(normals @ axis) < MAX_WALL_COSINE
+    wall = np.abs(normals @ axis) < LIMITS.max_wall_cosine
     basis = plane_basis(axis)
     flat = points @ basis.T
-    if wall.sum() < MIN_WALL_POINTS:
+    if wall.sum() < LIMITS.min_wall_points:
         return []
     circle = _circle(flat[wall])
     if circle is None:
@@ -159,7 +169,7 @@ def _cylinder(points: NDArray[np.float64], normals: NDArray[np.float64], axis: N
     height = points @ axis
     low, high = float(height.min()), float(height.max())
     capped = ~wall & (height > (low + high) / 2.0)
-    if capped.sum() >= MIN_SIDE_FRACTION * len(points):
+    if capped.sum() >= LIMITS.min_side_fraction * len(points):
         high = float(np.median(height[capped]))
     across = np.linalg.norm(flat - center, axis=1) - radius
     along = np.abs(height - (low + high) / 2.0) - (high - low) / 2.0
@@ -191,7 +201,7 @@ def _circle(flat: NDArray[np.float64]) -> tuple[NDArray[np.float64], float] | No
         slope = toward - toward.mean(axis=0)
         center = center + np.linalg.lstsq(slope, distance - distance.mean(), rcond=1e-3)[0]
     radius = float(np.linalg.norm(local - center, axis=1).mean())
-    if not radius < MAX_RADIUS:
+    if not radius < LIMITS.max_radius:
         return None
     return mean + scale * center, scale * radius
 

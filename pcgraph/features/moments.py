@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Moments of groups of points: number, means and scatters, and how they add up over groups and up a tree."""
+"""Moments of groups of points: number, means and scatters, which add up over groups and up a tree."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from pcgraph.voxels.eigen import SYMMETRIC_INDICES
 class Moments(ShortRepr):
     """Number, means and scatter of k groups of points.
 
-    Scatter is kept about each group's own centroid, not about the origin, so nothing cancels when a cloud
-    lies far from its frame's origin.
+    Scatter is about each group's own centroid, not about the origin, so no digits cancel if a cloud lies far from the
+    origin of its frame.
 
     Attributes
     ----------
     counts : (k,) int64
-        Points per group, >= 1.
+        Number of points of each group, >= 1.
     centroids : (k, 3) float64, metres
     scatters : (k, 3, 3) float64, square metres
         Sum over the points of (x - centroid)(x - centroid)^T.
@@ -35,9 +35,9 @@ class Moments(ShortRepr):
     color_scatters : (k, 3, 3) float64, or None
         Sum over the points of (c - mean colour)(c - mean colour)^T.
     normals : (k, 3) float64, or None
-        Mean of the unit normals of the surface, on its outer side; short where they point in many directions.
+        Mean of the surface's unit normals, on its outer side; it is short if they point in many directions.
     features : (k, d) float64, -4..4, or None
-        Means of the points' features, scaled (`pcgraph.columns.RobustScaling`).
+        Means of the points' scaled features (`pcgraph.columns.RobustScaling`).
     """
 
     counts: NDArray[np.int64]
@@ -57,18 +57,18 @@ class Moments(ShortRepr):
         return replace(self, **{name: values[groups] for name, values in self.columns().items()})
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """The arrays that are there, by name."""
+        """The arrays by name, without those that are None."""
         columns = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: values for name, values in columns.items() if values is not None}
 
     @property
     def covariances(self) -> NDArray[np.float64]:
-        """Scatter over number of points, (k, 3, 3) float64, square metres."""
+        """Scatters over numbers of points, (k, 3, 3) float64, square metres."""
         return self.scatters / self.counts[:, None, None]
 
     @property
     def color_covariances(self) -> NDArray[np.float64] | None:
-        """Scatter of colours over number of points, (k, 3, 3) float64, or None."""
+        """Scatters of colours over numbers of points, (k, 3, 3) float64, or None."""
         return None if self.color_scatters is None else self.color_scatters / self.counts[:, None, None]
 
 
@@ -86,7 +86,7 @@ def moments_of_groups(
     points : (n, 3) float64, metres
     colors : (n, 3) float64, 0..1, or None
     groups : (n,) int32, 0..n_groups - 1
-        Every group has a point at least.
+        Every group has at least one point.
     n_groups : int
     features : (n, d) float32, scaled, or None
     """
@@ -104,7 +104,7 @@ def moments_of_groups(
 def _mean_and_scatter(
     values: NDArray[np.float64], groups: NDArray[np.int32], n_groups: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Counts (k,), means (k, 3) and scatters (k, 3, 3): in one pass, about each group's first value, then its mean."""
+    """Counts (k,), means (k, 3) and scatters (k, 3, 3), from sums about each group's first value."""
     counts, sums, first = np.zeros(n_groups, np.int64), np.zeros((n_groups, 9)), np.empty((n_groups, 3))
     _sum_up(values, groups, counts, first, sums)
     scatters = np.empty((n_groups, 3, 3))
@@ -122,7 +122,7 @@ def _sum_up(
     first: NDArray[np.float64],
     sums: NDArray[np.float64],
 ) -> None:
-    """Sum up numbers, and differences from the first value of each group, and their products xx, yy, zz, xy, xz, yz."""
+    """Add up counts, differences from each group's first value, and their products xx, yy, zz, xy, xz, yz."""
     for i in range(len(groups)):
         s = groups[i]
         if counts[s] == 0:
@@ -146,7 +146,7 @@ def moments_up_tree(leaves: Moments, parents: NDArray[np.int32]) -> Moments:
     Parameters
     ----------
     leaves : Moments
-        Of the first nodes, in order.
+        Moments of the first nodes, in order.
     parents : (k,) int32
         Parent of each node; larger than the node's own number, except for the root, which is its own parent.
     """
@@ -157,9 +157,9 @@ def moments_up_tree(leaves: Moments, parents: NDArray[np.int32]) -> Moments:
     if leaves.colors is not None:
         again, colors = _with_room(leaves.counts, len(parents)), _with_room(leaves.colors, len(parents))
         spread = np.zeros((len(leaves), 3, 3)) if leaves.color_scatters is None else leaves.color_scatters
-        pooled = _with_room(spread, len(parents))
-        accumulate_moments(parents, again, colors, pooled)
-        color_scatters = None if leaves.color_scatters is None else pooled
+        spreads = _with_room(spread, len(parents))
+        accumulate_moments(parents, again, colors, spreads)
+        color_scatters = None if leaves.color_scatters is None else spreads
     if leaves.normals is not None:
         normals = _with_room(leaves.normals, len(parents))
         accumulate_means(parents, counts, len(leaves), normals)
@@ -170,15 +170,15 @@ def moments_up_tree(leaves: Moments, parents: NDArray[np.int32]) -> Moments:
 
 
 def joined_moments(first: Moments, second: Moments, groups: NDArray[np.integer], n_groups: int) -> Moments:
-    """Moments of `n_groups` groups: those of the first, in their order, and of the second, in these groups.
+    """Moments of two sets of groups as one set: the first keep their numbers, and the second are added to `groups`.
 
     Parameters
     ----------
     first : Moments of k groups, k <= n_groups
     second : Moments of q groups
-        With colours, normals and features as the first has them.
+        They have colours, normals and features if the first have.
     groups : (q,) int
-        Distinct; numbers from k on are new groups. All n_groups occur in one of the two.
+        Distinct; numbers from k on are new groups. Each of the n_groups occurs in one of the two sets.
     """
     columns = {name: np.concatenate((values, getattr(second, name))) for name, values in first.columns().items()}
     both = replace(first, **columns)
@@ -186,13 +186,13 @@ def joined_moments(first: Moments, second: Moments, groups: NDArray[np.integer],
 
 
 def grouped_moments(parts: Moments, groups: NDArray[np.integer], n_groups: int) -> Moments:
-    """Moments of groups of parts, exactly those of all their points.
+    """Moments of groups of parts, which are those of all their points.
 
     Parameters
     ----------
     parts : Moments of q parts
     groups : (q,) int, 0..n_groups - 1
-        Every group has a part at least.
+        Every group has at least one part.
     n_groups : int
     """
     above = len(parts) + np.concatenate((groups, np.arange(n_groups)))
@@ -216,13 +216,13 @@ def add_moments(counts, means, scatters, to, source):  # type: ignore[no-untyped
     Parameters
     ----------
     counts, means, scatters : (k,) numbers, (k, 3) float64, (k, 3, 3) float64
-        Row `to` is overwritten. Rows are given by number, since rows handed on as views cost six times the time.
+        Row `to` is overwritten. Rows are given by number, because views of rows take six times as long.
     to, source : int
 
     Notes
     -----
-    Source: Chan, Golub and LeVeque 1979, pairwise update of sums of squares. An empty group becomes an exact copy: a
-    mean must not move by rounding where there is one part only.
+    Source: Chan, Golub and LeVeque 1979, pairwise update of sums of squares. An empty group becomes an exact copy,
+    because the mean of a single part must not move by rounding.
     """
     before = counts[to]
     total = before + counts[source]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Features of nodes: what a group of points looks like, read off its moments; and tables of features."""
+"""Features of nodes, which are groups of points, from their moments; and tables of features."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from pcgraph.parallel import kernel, routine
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.eigen import symmetric_eigen
 
-_NO_PLANE = 1e-5  # second over first standard deviation below which points lie on a line
+_MAX_WIDTH_OF_LINE = 1e-5
+"""Ratio of the second to the first standard deviation up to which points lie on a line: well above the rounding of
+float32, 6e-8. Chosen by eye; not varied."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,23 +28,23 @@ class NodeFeatures(ShortRepr):
         Number of points.
     centroid : (k, 3) float64, metres, the points' frame
     normal : (k, 3) float64
-        Unit normal of the least-squares plane, on the outer side of the surface, that is the side of the mean of
-        its voxels' normals; of points on a line, the direction across it that is nearest to that mean.
+        Unit normal of the least-squares plane, on the outer side of the surface, to which the mean of its voxels'
+        normals points. For points on a line it is the direction across the line that is nearest to that mean.
     covariance : (k, 3, 3) float64, square metres
     linearity, planarity, scattering : (k,) float64, 0..1
-        (s1 - s2) / s1, (s2 - s3) / s1 and s3 / s1 for standard deviations s1 >= s2 >= s3; their sum is 1, and
-        all are 0 where the points coincide. Source: Demantke et al. 2011.
+        (s1 - s2) / s1, (s2 - s3) / s1 and s3 / s1 of the standard deviations s1 >= s2 >= s3. Their sum is 1; all are 0
+        if the points coincide. Source: Demantke et al. 2011.
     residual : (k,) float64, metres
-        Root mean square distance to the plane, s3.
+        Root mean square distance from the plane, s3.
     color : (k, 3) float64, 0..1
         Mean colour; NaN if the cloud has none.
     color_covariance : (k, 3, 3) float64
         Covariance of the points' colours; NaN if the cloud has none.
     deviations : (k, 3) float64, metres
-        s3, s2 and s1: square roots of the covariance's eigenvalues, ascending. No column of its own.
+        s3, s2 and s1: square roots of the covariance's eigenvalues, ascending. They are not among the `columns`.
     features : (k, d) float64, -4..4
-        Means of the columns given as `features`, in robust spreads from their medians; d = 0 if there are none, and
-        no column then.
+        Means of the columns given as `features`, in robust spreads from their medians. If there are none, d = 0, and
+        they are not among the `columns`.
     """
 
     size: NDArray[np.int64]
@@ -64,12 +66,12 @@ class NodeFeatures(ShortRepr):
         return {name: getattr(self, name) for name in names if name != "features" or self.features.size}
 
     def verticality(self, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
-        """How steep each node's plane stands, (k,) float64: 0 a floor, 1 a wall, 1 - |normal . up|.
+        """Steepness of each node's plane, 1 - |normal . up|, (k,) float64: 0 for a floor, 1 for a wall.
 
         Parameters
         ----------
         up : (3,) float, the points' frame, any length but zero
-            Against gravity. A level camera with y down, as organised clouds have it, needs (0, -1, 0).
+            Direction against gravity. For organised clouds of a level camera, whose y points down, it is (0, -1, 0).
 
         Raises
         ------
@@ -78,7 +80,7 @@ class NodeFeatures(ShortRepr):
 
         Notes
         -----
-        Source: Hackel et al. 2016. It is no moment, but follows from one, so merged nodes have it too.
+        Source: Hackel et al. 2016. It follows from the moments, so merged nodes have it, too.
         """
         return np.maximum(1.0 - np.abs(self.normal @ unit_vector("up", up)), 0.0)
 
@@ -91,7 +93,7 @@ def unit_vector(name: str, vector: ArrayLike) -> NDArray[np.float64]:
         direction = np.empty(0)
     if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
         raise ValueError(f"expected {name} as three finite numbers, not all zero, got {vector!r}")
-    direction = direction / np.abs(direction).max()  # so that its square neither overflows nor vanishes
+    direction = direction / np.abs(direction).max()  # so that squares neither overflow nor become 0
     return direction / np.linalg.norm(direction)
 
 
@@ -101,7 +103,7 @@ def node_features(moments: Moments) -> NodeFeatures:
     Parameters
     ----------
     moments : Moments of k groups
-        Without normals the signs of the planes' normals are arbitrary.
+        Without normals, the signs of the planes' normals are arbitrary.
     """
     covariance = moments.covariances
     towards = np.zeros_like(moments.centroids) if moments.normals is None else moments.normals
@@ -160,10 +162,10 @@ def _plane_normal(
     towards: NDArray[np.float64],
     normal: NDArray[np.float64],
 ) -> None:
-    """Set `normal` to the axis of least spread on the outer side, or, of a line, one across it."""
+    """Set `normal` to the axis of least spread, or for a line to an axis across it, on the outer side."""
     for i in range(3):
         normal[i] = axes[0, i]
-    if middle <= _NO_PLANE * high:
+    if middle <= _MAX_WIDTH_OF_LINE * high:
         along = 0.0
         if high > 0.0:
             for i in range(3):
@@ -172,7 +174,7 @@ def _plane_normal(
         for i in range(3):
             squares += (towards[i] - along * axes[2, i]) ** 2
             reach += towards[i] ** 2
-        if squares > 1e-24 * reach:
+        if squares > 1e-24 * reach:  # else `towards` lies along the line, but for rounding
             for i in range(3):
                 normal[i] = (towards[i] - along * axes[2, i]) / np.sqrt(squares)
     facing = 0.0
@@ -187,17 +189,17 @@ def _plane_normal(
 
 
 def rows(columns: dict[str, NDArray[np.generic]] | dict[str, NDArray[np.float64]], n: int) -> list[dict[str, object]]:
-    """One dict per row from one array per column; scalars become Python numbers, vectors stay arrays."""
+    """One dict per row, from one array per column; scalars become Python numbers, vectors stay arrays."""
     names = list(columns)
     lists = [column.tolist() if column.ndim == 1 else list(column) for column in columns.values()]
     return [dict(zip(names, (values[i] for values in lists), strict=True)) for i in range(n)]
 
 
 def scalar_columns(columns: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
-    """The same table with one column per number: vectors split into x, y, z, colours into r, g, b, matrices too.
+    """The same table with one column per number: vectors become x, y, z, colours r, g, b, matrices xx, xy and so on.
 
-    Features are numbered: feature_0, feature_1 and so on. Symmetric matrices keep their upper triangle. Columns of
-    NaN, which the cloud knows nothing of, are left out.
+    Features are numbered: feature_0, feature_1 and so on. Symmetric matrices keep their upper triangle. Columns that
+    are all NaN, as colours of a cloud without any, are left out.
     """
     split: dict[str, NDArray[np.generic]] = {}
     for name, column in columns.items():

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Planes, spheres and cylinders that fit groups of points best, from the groups' moments alone.
 
-The moments, sums of powers up to the fourth order, are additive; so every node of a tree has its best shapes.
+The moments are sums of powers up to the fourth order, and additive, so every node of a tree has its best shapes.
 """
 
 from __future__ import annotations
@@ -16,12 +16,16 @@ from pcgraph.features.moments import accumulate_moments, moments_of_groups
 from pcgraph.parallel import kernel, routine
 from pcgraph.plumbing.short_repr import ShortRepr
 
-_STRAIGHT = 1e7  # radius over size above which a round shape is a plane
-_EXACT = 1e-6  # residual over size below which a fit counts as perfect: powers resolve no less
+_MAX_RADIUS = 1e7
+"""Ratio of the radius of a round shape to the size of its group above which the shape counts as a plane. Chosen by eye;
+not varied."""
+_MIN_RESIDUAL = 1e-6
+"""Ratio of the residual of a fit to the size of its group below which the fit counts as perfect, because powers resolve
+no less. Chosen by eye; not varied."""
 
 
 class Primitive(IntEnum):
-    """Which shape a group of points has."""
+    """Kind of shape of a group of points."""
 
     PLANE = 0
     SPHERE = 1
@@ -30,33 +34,33 @@ class Primitive(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Primitives(ShortRepr):
-    """The best plane, sphere and cylinder of every one of k groups of points.
+    """The best plane, sphere and cylinder of each of k groups of points.
 
-    Where a group is flat, so that no sphere or cylinder is better than its plane, the radius is infinite and centre
-    or point are NaN.
+    If a group is flat, so that no sphere or cylinder fits better than the plane, radii are infinite, and centre and
+    point NaN.
 
     Attributes
     ----------
     plane_normal : (k, 3) float64
-        Unit, on the side of the points' normals.
+        Unit normal, on the side of the points' normals.
     plane_offset : (k,) float64, metres
-        normal . x of the plane's points.
+        normal . x of the plane's points x.
     plane_residual : (k,) float64, metres
-        Root mean square distance to the plane, exactly.
+        Root mean square distance from the plane, exactly.
     sphere_center : (k, 3) float64, metres
     sphere_radius : (k,) float64, metres
     sphere_residual : (k,) float64, metres
-        Root mean square of Taubin's algebraic distance (d^2 - R^2) / (2 rms d), d the distance from the centre. Equals
-        the geometric one, rms of d - R, up to the square of residual over radius.
+        Root mean square of Taubin's algebraic distance (d^2 - R^2) / (2 rms d), with d the distance from the centre. It
+        equals the geometric one, rms of d - R, up to the square of residual over radius.
     cylinder_axis : (k, 3) float64
-        Unit, its largest component positive.
+        Unit vector, its largest component positive.
     cylinder_point : (k, 3) float64, metres
-        Point of the axis nearest to the centroid.
+        Point of the axis that is nearest to the centroid.
     cylinder_radius : (k,) float64, metres
     cylinder_residual : (k,) float64, metres
         As for spheres, with d the distance from the axis.
     best : (k,) int8
-        A `Primitive`: the simplest one that no other beats by the factor `gain`.
+        A `Primitive`: the simplest shape that no other beats by the factor `gain`.
     """
 
     plane_normal: NDArray[np.float64]
@@ -83,10 +87,10 @@ def fit_primitives(moments: PrimitiveMoments, *, gain: float = 2.0, noise: float
     ----------
     moments : PrimitiveMoments of k groups
     gain : float, >= 1
-        Factor by which a sphere has to lower the residual of the plane, and a cylinder that of the sphere (and of the
-        plane), before it counts as the better description.
+        Factor by which a sphere has to lower the residual of the plane, and a cylinder those of sphere and plane, to
+        count as the better shape.
     noise : float, metres, >= 0
-        Residuals below the sensor's noise count as that noise, so that no shape is preferred for fitting it.
+        Noise of the sensor. Smaller residuals count as this noise, so that no shape is preferred for fitting noise.
 
     Raises
     ------
@@ -95,9 +99,9 @@ def fit_primitives(moments: PrimitiveMoments, *, gain: float = 2.0, noise: float
 
     Notes
     -----
-    Sphere: Taubin 1991, smallest eigenvector of the covariance of (q, x) with q = |x|^2 over its gradient; no
-    iteration, and unlike Kasa's fit hardly biased to small radii on caps. Cylinder: the axis is the direction with the
-    least scatter of normals; the circle across it is fitted as the sphere is.
+    Sphere: Taubin 1991, the eigenvector of the least eigenvalue of the covariance of (q, x), with q = |x|^2 over its
+    gradient. It needs no iteration, and unlike Kasa's fit it is hardly biased to small radii on caps. Cylinder: the
+    axis is the direction with the least scatter of normals; the circle across it is fitted as the sphere is.
     """
     if not 1.0 <= gain < np.inf:
         raise ValueError(f"expected a finite gain of at least 1, got {gain!r}")
@@ -118,10 +122,10 @@ def fit_primitives(moments: PrimitiveMoments, *, gain: float = 2.0, noise: float
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
     ball, ball_radius, ball_residual = _round(second, third, fourth, everywhere, moments.scales)
     tube, tube_radius, tube_residual = _round(second, third, fourth, across, moments.scales)
-    # A round shape may be as straight as it likes, so it is never worse than the plane but by rounding.
+    # A round shape can be nearly straight, so it is worse than the plane only by rounding.
     sphere_residual = np.minimum(ball_residual, flatness)
     cylinder_residual = np.where(np.isfinite(tube_radius), tube_residual, np.maximum(tube_residual, flatness))
-    floor = np.maximum(noise, _EXACT * size)
+    floor = np.maximum(noise, _MIN_RESIDUAL * size)
     return Primitives(
         plane_normal=normal,
         plane_offset=np.einsum("ki,ki->k", normal, centroid),
@@ -140,11 +144,11 @@ def fit_primitives(moments: PrimitiveMoments, *, gain: float = 2.0, noise: float
 
 
 def _central(moments: PrimitiveMoments) -> tuple[NDArray[np.float64], ...]:
-    """Mean, and the means of products of two, three and four coordinates about it, in the groups' units."""
+    """Mean, and means of products of two, three and four coordinates about the mean, in the groups' units."""
     first, second, third, fourth = (
         tensor(moments.powers, r) / moments.counts.reshape(-1, *[1] * r) for r in range(1, 5)
     )
-    # The origin is the centroid up to its rounding, so the mean is tiny and its second powers vanish.
+    # The origin is the rounded centroid, so the mean is tiny, and its second powers are left out.
     second = second - np.einsum("ki,kj->kij", first, first)
     turns = np.einsum("ki,kjl->kijl", first, second)
     third = third - turns - turns.transpose(0, 2, 1, 3) - turns.transpose(0, 3, 2, 1)
@@ -156,7 +160,7 @@ def _central(moments: PrimitiveMoments) -> tuple[NDArray[np.float64], ...]:
 
 
 def _axis(normal_scatters: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Direction across which normals turn, (k, 3), its largest component positive."""
+    """Direction about which normals turn, (k, 3), its largest component positive."""
     axis = np.linalg.eigh(normal_scatters)[1][:, :, 0]
     largest = np.take_along_axis(axis, np.abs(axis).argmax(axis=1)[:, None], axis=1)
     return axis * np.where(largest < 0.0, -1.0, 1.0)
@@ -175,7 +179,7 @@ def _round(
     covariance of ((q - mean q) / (2 sqrt(mean q)), u).
     """
     k = len(second)
-    row, column = across.reshape(k, 1, 9), across.reshape(k, 9, 1)  # of these, one product sums over two indices
+    row, column = across.reshape(k, 1, 9), across.reshape(k, 9, 1)  # products with these sum over two indices
     mean_q = (row @ second.reshape(k, 9, 1))[:, 0, 0]
     unit = 2.0 * np.sqrt(np.where(mean_q > 0.0, mean_q, 1.0))
     inside = across @ second @ across
@@ -187,7 +191,7 @@ def _round(
     covariance[:, 1:, 1:] = inside + outside * (np.eye(3) - across)  # keeps the fit within the subspace
     values, vectors = np.linalg.eigh(covariance)
     alpha, slope = vectors[:, 0, 0], vectors[:, 1:, 0]
-    straight = (np.abs(alpha) * _STRAIGHT <= np.linalg.norm(slope, axis=1)) | (mean_q <= 0.0)
+    straight = (np.abs(alpha) * _MAX_RADIUS <= np.linalg.norm(slope, axis=1)) | (mean_q <= 0.0)
     bend = np.where(straight, np.nan, 2.0 * alpha / unit)
     center = -slope / bend[:, None]
     radius = np.where(straight, np.inf, np.sqrt(np.einsum("ki,ki->k", center, center) + mean_q))
@@ -213,23 +217,23 @@ class PrimitiveMoments(ShortRepr):
     Attributes
     ----------
     counts : (k,) int64
-        Points per group, >= 1.
+        Number of points of each group, >= 1.
     centers : (k, 3) float64, metres
-        The group's centroid as rounded to float64: origin of its powers.
+        Centroid of each group, rounded to float64: the origin of its powers.
     scales : (k,) float64, metres
-        Unit of its powers: a power of two near the group's root mean square radius, 1 if that is 0.
+        Unit of each group's powers: a power of two near the group's root mean square radius, or 1 if that is 0.
     powers : (k, 35) float64, dimensionless
-        Sums over the points of x^a y^b z^c, with (x, y, z) = (point - center) / scale, for a + b + c <= 4, rows in the
-        order of `EXPONENTS`.
+        Sums over the points of x^a y^b z^c, with (x, y, z) = (point - center) / scale and a + b + c <= 4, in the order
+        of `EXPONENTS`.
     normal_sums : (k, 3) float64
         Sum of the points' normals.
     normal_scatters : (k, 3, 3) float64
-        Sum of n n^T.
+        Sum of n n^T over the points' normals n.
 
     Notes
     -----
-    Groups only ever get larger up a tree, so nothing cancels. Do not subtract a small group from one far larger or
-    far away: fourth powers lose four times as many digits as distances do.
+    Up a tree groups only get larger, so no digits cancel. Do not subtract a group from a far larger or distant one:
+    fourth powers lose four times as many digits as distances do.
     """
 
     counts: NDArray[np.int64]
@@ -253,9 +257,9 @@ def primitive_moments(
     ----------
     points : (n, 3) float64, metres
     normals : (n, 3) float64
-        Unit normals; those of the points' voxels will do: ``surface.normals[surface.grid.voxel_of_point]``.
+        Unit normals; those of the points' voxels suffice: ``surface.normals[surface.grid.voxel_of_point]``.
     groups : (n,) int32, 0..n_groups - 1
-        Every group has a point at least.
+        Every group has at least one point.
     n_groups : int
 
     Raises
@@ -294,7 +298,7 @@ def primitive_moments_up_tree(leaves: PrimitiveMoments, parents: NDArray[np.int3
     Parameters
     ----------
     leaves : PrimitiveMoments
-        Of the first nodes, in order.
+        Moments of the first nodes, in order.
     parents : (k,) int32
         Parent of each node; larger than the node's own number, except for the root, which is its own parent.
     """
@@ -302,7 +306,7 @@ def primitive_moments_up_tree(leaves: PrimitiveMoments, parents: NDArray[np.int3
     counts, centers, scatters = np.zeros(k, np.int64), np.zeros((k, 3)), np.zeros((k, 3, 3))
     counts[:n], centers[:n] = leaves.counts, leaves.centers
     scatters[:n] = tensor(leaves.powers, 2) * (leaves.scales**2)[:, None, None]
-    # Where inner nodes are, and how large, before their powers are summed:
+    # Centres and scales of inner nodes are needed before their powers are summed.
     accumulate_moments(parents, counts, centers, scatters)
     scales = np.concatenate((leaves.scales, _scales(counts[n:], scatters[n:])))
     powers = np.zeros((k, N_POWERS))
@@ -313,7 +317,7 @@ def primitive_moments_up_tree(leaves: PrimitiveMoments, parents: NDArray[np.int3
 
 
 def _scales(counts: NDArray[np.int64], scatters: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Powers of two, by which a product is exact, next above the root mean square radius."""
+    """Powers of two next above the root mean square radii; products with powers of two are exact."""
     radius = np.sqrt(np.trace(scatters, axis1=1, axis2=2) / counts)
     return np.where(radius > 0.0, np.ldexp(1.0, np.frexp(radius)[1]), 1.0)
 
@@ -322,7 +326,7 @@ def _scales(counts: NDArray[np.int64], scatters: NDArray[np.float64]) -> NDArray
 def _normal_moments(  # type: ignore[no-untyped-def]
     normals: NDArray[np.float64], groups: NDArray[np.int32], n_groups: int
 ):
-    """Sum of n and sum of n n^T by group."""
+    """Sums of n, and of n n^T, by group."""
     sums, scatters = np.zeros((n_groups, 3)), np.zeros((n_groups, 3, 3))
     for i in range(len(groups)):
         for a in range(3):
@@ -334,7 +338,7 @@ def _normal_moments(  # type: ignore[no-untyped-def]
 
 @kernel
 def _accumulate(parents, centers, scales, powers, normal_sums, normal_scatters):  # type: ignore[no-untyped-def]
-    """Add every node's sums to its parent's, children first."""
+    """Add each node's sums to those of its parent, children first."""
     for node in range(len(parents)):
         up = parents[node]
         if up == node:
@@ -346,9 +350,9 @@ def _accumulate(parents, centers, scales, powers, normal_sums, normal_scatters):
                 normal_scatters[up, a, b] += normal_scatters[node, a, b]
 
 
-# --- sums of powers, and how they move to another origin and unit ---
+# --- sums of powers, and their change to another origin and unit ---
 
-# Row t stands for x^a y^b z^c; ascending in order a + b + c: 1, 3, 6, 10 and 15 rows of order 0, 1, 2, 3 and 4.
+# Row t stands for x^a y^b z^c. Rows ascend in order a + b + c: 1, 3, 6, 10 and 15 rows have order 0, 1, 2, 3 and 4.
 EXPONENTS = np.array(
     [(a, b, order - a - b) for order in range(5) for a in range(order, -1, -1) for b in range(order - a, -1, -1)],
     dtype=np.int64,
@@ -398,20 +402,20 @@ def sums_of_powers(
 def add_moved(
     target: NDArray[np.float64], source: NDArray[np.float64], offset: NDArray[np.float64], ratio: float
 ) -> None:
-    """Add the points that `source` sums to `target`, in the target's coordinates.
+    """Add the points of the sums `source` to the sums `target`, in the target's coordinates.
 
     Parameters
     ----------
     target, source : (35,) float64
-        Sums of powers; the target's are changed.
+        Sums of powers; `target` is changed.
     offset : (3,) float64
-        The source's origin in the target's coordinates.
+        Origin of the source in the target's coordinates.
     ratio : float
-        The source's unit in the target's.
+        Unit of the source over that of the target.
 
     Notes
     -----
-    By the binomial theorem, hence exact but for rounding.
+    It applies the binomial theorem, so the result is exact but for rounding.
     """
     ladder = np.ones((3, 5))
     units = np.ones(5)

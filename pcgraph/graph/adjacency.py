@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.acquisition.kinds import Acquisition, Told, UnknownAcquisition
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.boundary import BoundaryStrength
 from pcgraph.plumbing.short_repr import ShortRepr
@@ -30,22 +31,21 @@ class EdgeFeatures(ShortRepr):
     Attributes
     ----------
     convexity : (m,) float64, radians
-        Angle between the nodes' normals, positive where the two bend away from the viewer (convex), negative
-        where they form a valley (concave): the sign of (n_j - n_i) . (x_j - x_i). Source: LCCP, Stein et al.
-        2014.
+        Angle between the nodes' normals: positive where the two bend away from the viewer (convex), negative where they
+        form a valley (concave). The sign is that of (n_j - n_i) . (x_j - x_i). Source: LCCP, Stein et al. 2014.
     contact_convexity : (m,) float64, radians
-        The same from the normals and positions of the voxels on either side that touch.
+        The same, from the normals and positions of the touching voxels on either side.
     normal_angle : (m,) float64, radians, 0..pi
         Angle between the nodes' normals.
     color_contrast : (m,) float64, 0..sqrt(3)
         Distance of the nodes' mean colours; 0 if the cloud has none.
     contact_voxels : (m,) int64
-        Voxels of either side that touch the other side.
+        Number of voxels, on both sides, that touch the other side.
     contact_length : (m,) float64, metres
         Mean over both sides of the number of touching voxels times their edge length.
     step : (m,) float64, metres
-        Offset between the surfaces at the contact: distance of each side's boundary to the other node's plane, the
-        smaller of the two. Near 0 where surfaces meet in a crease, the height of the step where one lies
+        Offset between the surfaces at the contact: the distance of each side's boundary from the other node's plane,
+        the smaller of the two. It is near 0 where surfaces meet in a crease, and the height of the step where one lies
         before the other.
     """
 
@@ -64,7 +64,7 @@ class EdgeFeatures(ShortRepr):
 
     @property
     def boundary_strength(self) -> NDArray[np.float64]:
-        """How probably each edge is an object's boundary, (m,) float64, 0..1; `BoundaryStrength` says how."""
+        """Strength of each edge as an object's boundary, (m,) float64, 0..1, of the default `BoundaryStrength`."""
         return BoundaryStrength()(self)
 
     def columns(self) -> dict[str, NDArray[np.generic]]:
@@ -85,17 +85,14 @@ class Gaps(ShortRepr):
     widths : (g,) float64, voxel edges
         Least distance between centroids of their voxels.
     weights : (g,) float64
-        Weight of the gap, comparable to `contact_voxels`: sum of e^(1 - width) over voxels that face the other side.
-    of_one_scan : bool
-        Whether all was seen from one place and voxels grow with the distance from it. Voxels then follow the spacing of
-        points, so a gap is stronger evidence of a boundary than among several scans.
+        Weight of the gap, comparable to `contact_voxels`: the sum of e^(1 - width) over voxels that face the other
+        side.
     """
 
     edges: NDArray[np.int32]
     edge_features: EdgeFeatures
     widths: NDArray[np.float64]
     weights: NDArray[np.float64]
-    of_one_scan: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +110,8 @@ class Bridges(ShortRepr):
     voxel_edge : (b,) float64, metres
         Mean edge length of the voxels of both.
     between_specks : (b,) bool
-        Whether both ends are specks of at most four points that lie about as near to each other as to anything, as
-        those of a surface do that was sampled too thinly for the voxels.
+        Whether both ends are specks of at most four points that lie about as near to each other as to anything. Specks
+        of a surface that was sampled too thinly for the voxels do.
     """
 
     edges: NDArray[np.int32]
@@ -138,16 +135,15 @@ class AdjacencyGraph(ShortRepr):
     gaps : Gaps, optional
         Supervoxels that nearly touch. They are no edges, but a linkage may merge across them.
     continuations : Continuations, optional
-        Flat surfaces that go on behind what hides them, and pieces of one bounding plane or terrain. They are no edges
-        either.
+        Flat surfaces that go on behind an object that hides a part of them, and pieces of one bounding plane or
+        terrain. They are no edges either.
     bridges : Bridges, optional
-        Edges from specks to what is around them, for the tree alone.
+        Edges from specks to the components around them, for the tree alone.
     color_evidence : float, 0..1
-        How much more colours change at creases than on smooth surfaces
-        (`pcgraph.voxels.column_evidence.crease_contrast`); 0 where colours say nothing about shape.
-    sides_known : bool
-        Whether normals point to where the cloud is known to have been seen from, or were given. Else the outside was
-        found from what is visible, and which side of a bare sheet that is, is a guess.
+        Evidence of colours about shape: how much more they change at creases than on smooth surfaces
+        (`pcgraph.voxels.column_evidence.crease_contrast`).
+    acquisition : Acquisition
+        What took the cloud: whether gaps mean much, and whether the outer side of surfaces is known. Default: unknown.
     """
 
     edges: NDArray[np.int32]
@@ -157,7 +153,7 @@ class AdjacencyGraph(ShortRepr):
     continuations: Continuations | None = None
     bridges: Bridges | None = None
     color_evidence: float = 1.0
-    sides_known: bool = False
+    acquisition: Acquisition = field(default_factory=lambda: UnknownAcquisition(Told()))
 
     def _counts(self) -> str:
         return f"{self.n_nodes} nodes, {len(self.edges)} edges"
@@ -169,9 +165,9 @@ class AdjacencyGraph(ShortRepr):
 
     @property
     def voxel_edge(self) -> float:
-        """Edge length of a voxel, metres: median over contacts, or where there are none over gaps, or over bridges.
+        """Edge length of a voxel, metres: the median over contacts, else over gaps, else over bridges.
 
-        1 where there are none of these, and the graph tells no length.
+        It is 1 if there are none of these, as the graph has no length then.
         """
         gaps = None if self.gaps is None else self.gaps.edge_features
         for beside in (self.edge_features, gaps, self.bridges):
@@ -181,22 +177,22 @@ class AdjacencyGraph(ShortRepr):
 
     @property
     def joined(self) -> NDArray[np.int32]:
-        """Pairs of supervoxels that touch or nearly touch, or go on behind what hides them, (m + g + r, 2) int32."""
+        """Pairs of supervoxels joined by an edge, a gap or a continuation, (m + g + r, 2) int32."""
         beside = [] if self.gaps is None else [self.gaps.edges]
         hidden = [] if self.continuations is None else [self.continuations.pairs]
         return np.concatenate((self.edges, *beside, *hidden))
 
     def to_networkx(self, occlusions: Occlusions | None = None) -> networkx.Graph:
-        """The graph as ``networkx.Graph``; features, and `boundary_strength`, as attributes of the same names.
+        """The graph as ``networkx.Graph``, with features and `boundary_strength` as attributes of the same names.
 
-        Vectors are split (``normal_x``) and all numbers are Python's, so that JSON, GEXF and GraphML take the graph;
-        features that the cloud knows nothing of are left out.
+        Vectors are split (``normal_x``), and all numbers are Python's, so that JSON, GEXF and GraphML take the graph.
+        Features without a value, as colours of a cloud without any, are left out.
 
         Parameters
         ----------
         occlusions : Occlusions, optional
-            `Segmentation.occlusions()`. With them it is a ``MultiGraph``: edges of the kind (an attribute) "contact",
-            and edges of the kind "occlusion" with their features and the supervoxel in `front`.
+            `Segmentation.occlusions()`. With them the graph is a ``MultiGraph``. The attribute `kind` of an edge is
+            then "contact" or "occlusion"; occlusions have their own features, and the supervoxel in `front`.
 
         Raises
         ------
@@ -222,9 +218,8 @@ class AdjacencyGraph(ShortRepr):
 
         Notes
         -----
-        Weights of zero are stored, and `connected_components` and `dijkstra` of `scipy.sparse.csgraph` take them for
-        edges; but `minimum_spanning_tree` leaves them out of its result. Pass ``weights + 1`` there: the tree is the
-        same.
+        Weights of zero are stored: for `connected_components` and `dijkstra` of `scipy.sparse.csgraph` they are edges.
+        But `minimum_spanning_tree` leaves them out of its result. Pass ``weights + 1`` there: the tree is the same.
         """
         from pcgraph.graph.export import csr
 
@@ -234,15 +229,15 @@ class AdjacencyGraph(ShortRepr):
         """Arrays named as PyTorch Geometric names them; every edge occurs in both directions.
 
         ``x`` (k, f) float32: size, normal, covariance, linearity, planarity, scattering, residual, and, if known,
-        verticality and colours; ``x_names``, a list of f. ``pos`` (k, 3) float32, metres: centroids from the origin
-        ``pos_origin`` (3,) float64, their mean, for float32 holds no far-away frame. ``edge_index`` (2, 2 m) int64:
-        first all edges as they are, then all reversed. ``edge_attr`` (2 m, g) float32, ``edge_attr_names``: all edge
-        features and `boundary_strength`, none of which has a direction.
+        verticality and colours. ``x_names``: a list of their f names. ``pos`` (k, 3) float32, metres: centroids less
+        their mean ``pos_origin`` (3,) float64, because float32 rounds coordinates far from the origin. ``edge_index``
+        (2, 2 m) int64: first all edges as they are, then all reversed. ``edge_attr`` (2 m, g) float32 and
+        ``edge_attr_names``: all edge features and `boundary_strength`, none of which has a direction.
 
         Parameters
         ----------
         up : (3,) float, the points' frame, optional
-            Against gravity; for verticality, which is left out without it.
+            Direction against gravity, for verticality, which is left out without it.
         occlusions : Occlusions, optional
             Adds ``occlusion_index`` (2, q) int64, from front to behind, ``occlusion_attr`` (q, c) float32 and
             ``occlusion_attr_names``.
@@ -257,7 +252,7 @@ class AdjacencyGraph(ShortRepr):
         return pyg(self, up, occlusions)
 
     def write_graphml(self, path: str | PathLike[str], occlusions: Occlusions | None = None) -> None:
-        """Write the graph with all features, vectors as scalars (``normal_x``), whole or not at all.
+        """Write the graph as GraphML with all features, vectors as scalars (``normal_x``): the whole file, or none.
 
         An older file of that name is replaced. ``networkx.read_graphml(path, node_type=int)`` reads it back.
 

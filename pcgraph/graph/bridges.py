@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bridges: ways from specks to what is around them, as nothing near joins them."""
+"""Bridges: ways from specks, which touch nothing, to the components around them."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +14,42 @@ from pcgraph.pairs import nearest
 from pcgraph.parallel import kernel, routine
 from pcgraph.voxels.surface import Surface
 
-_NEAR = 8  # supervoxels around one
-_MAX_WIDTH = 1e6  # voxel edges
-_FEW, _AS_NEAR, _MAX_WIDTH_BETWEEN = 4, 2.0, 30.0  # points, times the nearest of all, voxel edges: of one thin surface
+
+@dataclass(frozen=True)
+class BridgeThresholds:
+    """Thresholds that choose the components around a speck, and bridges within a thinly sampled surface.
+
+    Attributes
+    ----------
+    n_nearest : int, count
+        Nearest supervoxels of each supervoxel of a speck; the components around the speck hold one of them. Chosen by
+        eye; not varied.
+    max_width : float, voxel edges
+        Width that is recorded at most, so that costs stay finite where a component is very far off.
+    max_points : int, points
+        Points of a speck, at most, that may be a part of a surface sampled too thinly for the voxels. Chosen on a house
+        seen through a window, which fell into thousands of objects; the same of the next two.
+    times_nearest : float, times
+        Width, at most, over the way from one of the two specks to anything.
+    max_width_of_surface : float, voxel edges
+        Width, at most, between two points of one surface.
+    """
+
+    n_nearest: int = 8
+    max_width: float = 1e6
+    max_points: int = 4
+    times_nearest: float = 2.0
+    max_width_of_surface: float = 30.0
+
+
+_THRESHOLDS = BridgeThresholds()
 
 
 def bridges(surface: Surface, counts: NDArray[np.int64], joined: NDArray[np.int32]) -> Bridges:
-    """Edges from specks, components of fewer points than a mean supervoxel, to those around them.
+    """Edges from specks, components of fewer points than a mean supervoxel, to the components around them.
 
-    Around a speck are those that hold one of the eight supervoxels nearest to one of its own; the way is that
-    between the two supervoxels of both nearest to each other.
+    The components around a speck are those that hold one of the eight supervoxels nearest to one of the speck's own. A
+    bridge joins the two supervoxels of both components that are nearest to each other.
 
     Parameters
     ----------
@@ -33,8 +61,8 @@ def bridges(surface: Surface, counts: NDArray[np.int64], joined: NDArray[np.int3
 
     Notes
     -----
-    Distances are those of the warped space, in voxel edges: between means of supervoxels to find a pair, between two
-    of their voxels, each the other's nearest, for its width.
+    Distances are in the warped space, in voxel edges. To find a pair they are measured between means of supervoxels;
+    the width is the distance of two of their voxels, each the other's nearest.
     """
     grid, supervoxels, k = surface.grid, surface.supervoxels, len(counts)
     component = connected_components(joined, k)
@@ -46,8 +74,8 @@ def bridges(surface: Surface, counts: NDArray[np.int64], joined: NDArray[np.int3
     n_voxels = np.bincount(supervoxels, minlength=k)
     means = np.stack([np.bincount(supervoxels, x, k) / n_voxels for x in places.T], axis=1)
     means -= means[0]
-    means /= max(float(np.abs(means).max()), 1.0)  # which are nearer is all that counts, and squares stay finite
-    distance, found = nearest(means, means[specks], min(_NEAR + 1, k))
+    means /= max(float(np.abs(means).max()), 1.0)  # squares stay finite, and only the order of distances counts
+    distance, found = nearest(means, means[specks], min(_THRESHOLDS.n_nearest + 1, k))
     row, column = np.nonzero(component[found] != component[specks][:, None])
     edges = _closest_pairs(component, specks[row], found[row, column].astype(np.int64), distance[row, column])
     involved = np.zeros(k, np.bool_)
@@ -57,23 +85,25 @@ def bridges(surface: Surface, counts: NDArray[np.int64], joined: NDArray[np.int3
     starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(np.where(involved, n_voxels, 0))))
     larger = np.ones(k)
     np.maximum.at(larger, supervoxels[voxels], (grid.warped_edges / grid.size)[voxels])
-    widths = np.minimum(_widths(edges, starts, places[voxels]) / larger[edges].max(axis=1), _MAX_WIDTH)
+    widths = _widths(edges, starts, places[voxels]) / larger[edges].max(axis=1)
+    widths = np.minimum(widths, _THRESHOLDS.max_width)
     edge_lengths = surface.mean_edge_lengths(k)
-    of_few = (sizes <= _FEW)[component[edges]].all(axis=1)
+    of_few = (sizes <= _THRESHOLDS.max_points)[component[edges]].all(axis=1)
     return Bridges(edges, widths, edge_lengths[edges].mean(axis=1), of_few & _are_near(component[edges], widths))
 
 
 def _are_near(pairs: NDArray[np.int32], widths: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether the components of each pair, (b, 2), lie about as near to each other as one of them to any other."""
+    """Whether the components of each pair, (b, 2), lie about as near to each other as one of them to anything."""
     nearest = np.full(int(pairs.max(initial=-1)) + 1, np.inf)
     np.minimum.at(nearest, pairs, widths[:, None])
-    return np.asarray(widths <= np.minimum(_AS_NEAR * nearest[pairs].max(axis=1), _MAX_WIDTH_BETWEEN))
+    limit = _THRESHOLDS.times_nearest * nearest[pairs].max(axis=1)
+    return np.asarray(widths <= np.minimum(limit, _THRESHOLDS.max_width_of_surface))
 
 
 def _closest_pairs(
     component: NDArray[np.int32], source: NDArray[np.int64], target: NDArray[np.int64], distance: NDArray[np.float64]
 ) -> NDArray[np.int32]:
-    """The shortest way of each pair of components, (b, 2) int32, the smaller supervoxel first, ascending."""
+    """Ends of the shortest way between each pair of components, (b, 2) int32, ascending, the smaller first."""
     a, b = np.minimum(source, target), np.maximum(source, target)
     low, high = np.minimum(component[a], component[b]).astype(np.int64), np.maximum(component[a], component[b])
     pair = low * len(component) + high
@@ -85,9 +115,10 @@ def _closest_pairs(
 
 @kernel
 def _widths(edges: NDArray[np.int32], starts: NDArray[np.int64], places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance, for each pair, of two places that are nearest to each other, (b,).
+    """Distance of two places of each pair of supervoxels, each the other's nearest, (b,).
 
-    ``places[starts[i]:starts[i + 1]]`` are those of supervoxel i. It starts from the one nearest to the other's first.
+    ``places[starts[i]:starts[i + 1]]`` are those of supervoxel i. The search begins at the first place of one
+    supervoxel, and goes to the nearest place of the other, and back, as long as that is nearer.
     """
     widths = np.empty(len(edges))
     for edge in range(len(edges)):
@@ -103,7 +134,7 @@ def _widths(edges: NDArray[np.int32], starts: NDArray[np.int64], places: NDArray
 
 @routine
 def _nearest(places: NDArray[np.float64], at: int, start: int, stop: int) -> tuple[float, int]:
-    """Squared distance of a place to the nearest of some, and that one."""
+    """Squared distance from a place to the nearest of those from start to stop, and the number of that one."""
     least, found = np.inf, start
     for other in range(start, stop):
         x, y, z = places[at, 0] - places[other, 0], places[at, 1] - places[other, 1], places[at, 2] - places[other, 2]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contacts: where two supervoxels touch, and how they lie to each other there (features of edges)."""
+"""Contacts: where two supervoxels touch, and the features of the edge between them."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ from numpy.typing import NDArray
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import EdgeFeatures
 from pcgraph.parallel import kernel, routine
+from pcgraph.rounding import NEARLY_ZERO
 from pcgraph.voxels.grid import Neighbourhood, most_around
 from pcgraph.voxels.surface import Surface
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Pairs of touching supervoxels and what their boundaries look like; m pairs, side 0 is the smaller number.
+    """Pairs of touching supervoxels, and means over the voxels at their contact; m pairs, side 0 is the smaller number.
 
     Attributes
     ----------
     edges : (m, 2) int32
         Supervoxels, the smaller first, rows in ascending order.
     voxels : (m, 2) int64
-        Voxels of each side that touch the other side.
+        Number of voxels of each side that touch the other side.
     positions : (m, 2, 3) float64, metres
         Mean centroid of those voxels.
     normals : (m, 2, 3) float64
-        Unit mean of their normals (zero if they cancel).
+        Mean of their normals, of unit length (zero if they cancel).
     lengths : (m,) float64, metres
         Sum of those voxels' edge lengths, mean of both sides.
     """
@@ -59,16 +60,16 @@ def facing_sides(
     voxel: NDArray[np.integer],
     side: NDArray[np.int64],
 ) -> Contacts:
-    """Contacts from the voxels on either side of them.
+    """Contacts, given the voxels on either side of each.
 
     Parameters
     ----------
     surface : Surface
     edges : (m, 2) int32
     voxel : (b,) int
-        A voxel that faces the other side, once per side of a contact.
+        Voxels that face the other side of a contact; a voxel may occur once for each contact.
     side : (b,) int64
-        2 e of edge e where it lies on the side of the smaller supervoxel, else 2 e + 1.
+        2 e for a voxel on the smaller supervoxel's side of edge e, 2 e + 1 for one on the other side.
     """
     grid, n_sides = surface.grid, 2 * len(edges)
     voxels, lengths = np.zeros(n_sides, np.int64), np.zeros(len(edges))
@@ -81,7 +82,7 @@ def facing_sides(
         edges=edges,
         voxels=voxels.reshape(-1, 2),
         positions=(places / voxels[:, None]).reshape(-1, 2, 3),
-        normals=(directions / np.maximum(norms, 1e-12)[:, None]).reshape(-1, 2, 3),
+        normals=(directions / np.maximum(norms, NEARLY_ZERO)[:, None]).reshape(-1, 2, 3),  # normals may cancel
         lengths=lengths,
     )
 
@@ -93,9 +94,9 @@ class _Sides(NamedTuple):
     ----------
     voxels : (s,) int64
     places, directions : (s, 3) float64
-        Of centroids and normals.
+        Sums of centroids and of normals.
     lengths : (s / 2,) float64
-        Of both sides of a contact.
+        Edge lengths of both sides of a contact, halved.
     """
 
     voxels: NDArray[np.int64]
@@ -125,20 +126,20 @@ def _sum_up_sides(
 
 @kernel
 def _boundary_voxels(around: Neighbourhood, supervoxels: NDArray[np.int32]):  # type: ignore[no-untyped-def]
-    """Each voxel on a boundary, once per other supervoxel it touches: voxel, other, pair; and the pairs' keys.
+    """Voxels on boundaries, once per other supervoxel that each touches: voxel, other, pair; and the pairs' keys.
 
-    Pairs are numbered as they come up; their key is (smaller << 32) + larger.
+    Pairs are numbered in the order in which they are found; their key is (smaller << 32) + larger.
     """
     indptr, neighbours = around
     voxel, other = np.empty(len(neighbours), np.int32), np.empty(len(neighbours), np.int32)
     pair = np.empty(len(neighbours), np.int32)
-    keys, slots = np.empty(512, np.int64), np.full(2048, -1, np.int32)
+    keys, slots = np.empty(512, np.int64), np.full(2048, -1, np.int32)  # a hash table, at most a quarter full
     seen = np.empty(most_around(indptr) + 1, np.int32)
     used = n_keys = 0
     for i in range(len(supervoxels)):
         own = last = supervoxels[i]
         n_seen = 0
-        for a in range(indptr[i], indptr[i + 1]):  # branch-free: it would often be mispredicted
+        for a in range(indptr[i], indptr[i + 1]):  # without a branch, which would often be mispredicted
             seen[n_seen] = supervoxels[neighbours[a]]
             n_seen += (seen[n_seen] != own) & (seen[n_seen] != last)
             last = supervoxels[neighbours[a]]
@@ -161,8 +162,9 @@ def _boundary_voxels(around: Neighbourhood, supervoxels: NDArray[np.int32]):  # 
 
 @routine
 def _slot(key: int, keys: NDArray[np.int64], slots: NDArray[np.int32]) -> int:
-    """Place of a key in the hash table, or the empty place where it belongs."""
+    """Slot of a key in the hash table, or the empty slot where it belongs."""
     mask = len(slots) - 1
+    # Multiplicative hashing by the golden ratio (Knuth 1973, 6.4).
     at = ((key * 0x9E3779B97F4A7C1) >> 32) & mask
     while slots[at] >= 0 and keys[slots[at]] != key:
         at = (at + 1) & mask
@@ -171,7 +173,7 @@ def _slot(key: int, keys: NDArray[np.int64], slots: NDArray[np.int32]) -> int:
 
 @routine
 def _grown(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """The same keys with room for as many again, and their hash table, a quarter full."""
+    """The same keys in an array twice as long, and their hash table of four slots per place."""
     wide, slots = np.empty(2 * len(keys), np.int64), np.full(8 * len(keys), -1, np.int32)
     for number in range(len(keys)):
         wide[number] = keys[number]
@@ -188,7 +190,7 @@ def edge_features(nodes: NodeFeatures, contacts: Contacts) -> EdgeFeatures:
     Parameters
     ----------
     nodes : NodeFeatures of k supervoxels
-    contacts : Contacts, m of them, between these
+    contacts : Contacts, m of them, between these supervoxels
     """
     i, j = contacts.edges.T
     at_i, at_j = contacts.positions[:, 0], contacts.positions[:, 1]
@@ -208,7 +210,7 @@ def edge_features(nodes: NodeFeatures, contacts: Contacts) -> EdgeFeatures:
 
 
 def angle_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angle, radians, 0..pi, (m,), between rows; by the tangent, which stays exact for small angles."""
+    """Angle between rows, radians, 0..pi, (m,); by the arc tangent, which is exact for small angles, too."""
     (ax, ay, az), (bx, by, bz) = a.T, b.T
     x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
     return np.arctan2(np.sqrt(x * x + y * y + z * z), _dot(a, b))
@@ -217,7 +219,7 @@ def angle_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.
 def _turn(
     normal_i: NDArray[np.float64], normal_j: NDArray[np.float64], at_i: NDArray[np.float64], at_j: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """1 where the surface bends away from its outside on the way from i to j, -1 where towards it, 0 where neither."""
+    """1 if the surface bends away from its outside on the way from i to j, -1 if it bends towards it, else 0; (m,)."""
     return np.sign(_dot(normal_j - normal_i, at_j - at_i))
 
 

@@ -38,7 +38,7 @@ def network(graph: AdjacencyGraph, occlusions: Occlusions | None) -> networkx.Gr
     columns = {"front": _checked(graph, occlusions)[:, 0], **occlusions.columns()}
     hidden = _joined(occlusions.pairs, scalar_columns(columns))
     both = [("contact", edge) for edge in contacts] + [("occlusion", edge) for edge in hidden]
-    # One key per edge: they are the edges' ids in GraphML, where programs take two of one id for one edge.
+    # One key per edge: keys are the edges' ids in GraphML, and programs merge edges of one id.
     result.add_edges_from((i, j, key, {"kind": kind, **row}) for key, (kind, (i, j, row)) in enumerate(both))
     return result
 
@@ -51,7 +51,7 @@ def csr(graph: AdjacencyGraph, weights: str | ArrayLike | None) -> csr_array:
     source, target = _both_ways(graph.edges)
     order = np.lexsort((target, source))
     indptr = np.concatenate(([0], np.cumsum(np.bincount(source, minlength=graph.n_nodes)))).astype(np.int32)
-    columns = target[order].astype(np.int32)  # csgraph copies wider ones
+    columns = target[order].astype(np.int32)  # csgraph would copy wider ones
     return csr_array((both[order], columns, indptr), shape=(graph.n_nodes, graph.n_nodes))
 
 
@@ -95,12 +95,12 @@ def graphml(graph: AdjacencyGraph, occlusions: Occlusions | None) -> bytes:
 def _joined(
     pairs: NDArray[np.int32], columns: dict[str, NDArray[np.generic]]
 ) -> list[tuple[int, int, dict[str, object]]]:
-    """Each pair with its row of the columns."""
+    """Pairs, each with its row of the columns."""
     return [(i, j, row) for (i, j), row in zip(pairs.tolist(), rows(columns, len(pairs)), strict=True)]
 
 
 def _checked(graph: AdjacencyGraph, occlusions: Occlusions) -> NDArray[np.int32]:
-    """The pairs of the occlusions; raises ValueError if one is none of the graph's nodes."""
+    """The pairs of the occlusions; raises ValueError if one of them is not a node of the graph."""
     last = int(occlusions.pairs.max(initial=0))
     if last >= graph.n_nodes:
         raise ValueError(f"expected occlusions between the graph's {graph.n_nodes} nodes, got one of node {last}")
@@ -123,7 +123,7 @@ def _weights(graph: AdjacencyGraph, weights: str | ArrayLike | None) -> NDArray[
 
 
 def _both_ways(edges: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Sources and targets, (2, 2 m): the edges, then the same reversed."""
+    """Sources and targets, (2, 2 m): the edges, then the reversed edges."""
     return np.concatenate((edges, edges[:, ::-1])).T.astype(np.int64)
 
 
@@ -135,7 +135,7 @@ def _table(columns: dict[str, NDArray[np.generic]], n: int) -> NDArray[np.float3
 
 
 def _single(name: str, values: NDArray[np.generic]) -> NDArray[np.float32]:
-    """The values as float32; raises ValueError where it does not hold them."""
+    """The values as float32; raises ValueError if they are too large for it."""
     with np.errstate(over="ignore"):
         single = values.astype(np.float32)
     lost = np.isinf(single)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.acquisition.kinds import Acquisition
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Gaps
@@ -23,7 +24,7 @@ def gaps(
     surface: Surface,
     nodes: NodeFeatures,
     touching: NDArray[np.int32],
-    place: NDArray[np.float64] | None = None,
+    acquisition: Acquisition,
 ) -> Gaps:
     """Pairs of supervoxels that do not touch, but whose boundary voxels come near each other.
 
@@ -36,9 +37,9 @@ def gaps(
     nodes : NodeFeatures of k supervoxels
     touching : (m, 2) int32
         Pairs of supervoxels that touch, the smaller first, ascending.
-    place : (3,) float64, metres, optional
-        From where all was seen, if from one place. Where something behind is seen from there between two smooth
-        supervoxels, as the floor between equal desks in a row, nothing of either is hidden, or missing: they are apart.
+    acquisition : Acquisition
+        If it is one scan from one place, and something behind is seen from there between two smooth supervoxels, as the
+        floor between equal desks in a row, nothing of either is hidden or missing: they are apart.
 
     Notes
     -----
@@ -59,7 +60,8 @@ def gaps(
     larger = grid.warped_edges
     larger = np.maximum(larger[source], larger[target])
     width = np.linalg.norm((grid.warped[source] - grid.warped[target]) / larger[:, None], axis=1)
-    if place is not None and len(source):
+    place = acquisition.one_viewpoint
+    if place is not None and acquisition.is_one_scan and len(source):
         closed = ~_open_ways(surface, nodes, place, source, target.astype(np.int64), key, width)
         source, target, key, width = source[closed], target[closed], key[closed], width[closed]
     key, width = np.tile(key, 2), np.tile(width, 2)  # each side of each pair
@@ -79,7 +81,7 @@ def gaps(
     shortest = np.full(len(edges), np.inf)
     np.minimum.at(shortest, edge, width)
     weights = np.bincount(edge, np.exp(1.0 - width), len(edges)).astype(np.float64)
-    return Gaps(edges, edge_features(nodes, facing), shortest, weights, grid.warp.of_one_scan)
+    return Gaps(edges, edge_features(nodes, facing), shortest, weights)
 
 
 def _open_ways(

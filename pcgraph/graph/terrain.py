@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.acquisition.kinds import Acquisition
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.bounding_planes import MIN_HIDDEN, Plane, borders_of, facing_ways, joining
 from pcgraph.graph.continuations import Continuations, continuations_of
@@ -31,7 +32,7 @@ _LEVELS = 0.25  # and so many times as far as it rises above both may one lie ab
 _NEAR = 8  # supervoxels beside a way that are looked at
 
 
-def terrain(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> Continuations:
+def terrain(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32], acquisition: Acquisition) -> Continuations:
     """Supervoxels on the borders that pieces of the ground turn to each other, under what stands between.
 
     From far above, as from an aircraft, roofs are seen, and streets, but no walls: the ground of a courtyard touches
@@ -50,6 +51,7 @@ def terrain(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> 
     nodes : NodeFeatures of the k supervoxels
     faces : (k,) int32
         Which of them lie on one face.
+    acquisition : Acquisition
 
     Returns
     -------
@@ -57,6 +59,8 @@ def terrain(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> 
         None coplanar; some may touch. There are none unless nearly all normals lie along one axis, and no single
         scanner took the cloud: then what is hidden is known from its place.
     """
+    if acquisition.is_one_scan:
+        return continuations_of(surface, nodes, np.empty((0, 2), np.int64))
     found = _ground_from_far_above(surface, faces)
     if found is None:
         return continuations_of(surface, nodes, np.empty((0, 2), np.int64))
@@ -78,8 +82,6 @@ def _ground_from_far_above(
 
     Nothing that touches nothing tells the others' sides, so normals may point either way.
     """
-    if surface.grid.warp.of_one_scan:
-        return None
     some = surface.normals[:: max(1, surface.grid.n_voxels // _SOME)]
     axis = np.linalg.eigh(np.einsum("ij,ik->jk", some, some))[1][:, 2]
     cosines = np.einsum("ij,j->i", some, axis)

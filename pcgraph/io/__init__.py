@@ -17,12 +17,13 @@ from pcgraph.plumbing.plain_files import read_file
 __all__ = ["read_cloud", "write_segmentation"]
 
 MAX_REASON = 300
-"""Characters of what is wrong with a file, that a damaged file may make as long as it likes."""
+"""Characters of a message about a damaged file, count: such files can make messages of any length. Chosen by eye; not
+varied."""
 _READERS = {".pcd": read_pcd, ".ply": read_ply}
 
 
 def read_cloud(path: str | PathLike[str]) -> Cloud:
-    """Cloud held by a PCD or PLY file, in the file's own frame and unit (metres assumed elsewhere).
+    """Cloud of a PCD or PLY file, in the file's own frame and unit; all other functions assume metres.
 
     Parameters
     ----------
@@ -32,10 +33,11 @@ def read_cloud(path: str | PathLike[str]) -> Cloud:
     Raises
     ------
     CloudReadError
-        No such file, a directory, another extension, or content that is truncated or contradicts its header.
+        There is no such file, it is a directory, it has another extension, or its content is cut off or contradicts its
+        header.
     """
     path = Path(path)
-    if os.path.isdir(path):  # also of a name that cannot be
+    if os.path.isdir(path):  # unlike Path.is_dir it takes names that no file can have
         raise CloudReadError(f"{path} is a directory: expected a file ending in {' or '.join(_READERS)}")
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
@@ -44,5 +46,6 @@ def read_cloud(path: str | PathLike[str]) -> Cloud:
     try:
         return reader(content)
     except CloudReadError as error:
-        said = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(error))  # names of fields may be anything
+        # Names of fields may have any characters.
+        said = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(error))
         raise CloudReadError(f"{path}: {said[:MAX_REASON]}") from None

@@ -10,32 +10,33 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.cloud import Cloud, cloud_from_columns, columns_from_text, numbers_from_text
+from pcgraph.cloud import MAX_HEADER_BYTES, Cloud, cloud_from_columns, columns_from_text, numbers_from_text
 from pcgraph.errors import CloudReadError
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _REQUIRED = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA")
-_MAX_HEADER_BYTES = 1 << 16
-_MAX_NUMBER = 10**15  # no file holds as many points, and arrays of nothing may still be that wide
+_MAX_NUMBER = 10**15
+"""Largest number of a header, count of points and the like: no file holds as many, and numpy still takes it as the
+length of an array of no bytes. Chosen by eye; not varied."""
 
 
 @dataclass(frozen=True, eq=False)
 class PcdHeader:
-    """What a PCD header promises.
+    """The fields, size and coding of a PCD file, as its header says.
 
     Attributes
     ----------
     names, dtypes, counts : one per field
-        Field name, little-endian scalar type, elements per point.
+        Name, little-endian scalar type, and count of numbers per point.
     width, height : int
-        Lattice size; height 1 means unorganised.
+        Size of the lattice; an unorganised cloud has the height 1.
     viewpoint : (3,) float64, metres
-        Sensor position.
+        Position of the sensor.
     data : str
         ``ascii``, ``binary`` or ``binary_compressed``.
     n_lines : int
-        Lines that the header takes in its file.
+        Number of lines of the header.
     """
 
     names: tuple[str, ...]
@@ -59,12 +60,12 @@ class PcdHeader:
 
 
 def read_pcd(content: bytes) -> Cloud:
-    """Cloud held by the bytes of a PCD file; organisation, NaN, colours, normals and labels kept.
+    """Cloud of a PCD file, given the file's bytes, with organisation, NaN, colours, normals and labels.
 
     Raises
     ------
     CloudReadError
-        The header is incomplete or contradicts itself, the data is shorter than the header says, or a row of text has
+        The header is incomplete or contradicts itself, the data are shorter than the header says, or a row of text has
         more or fewer numbers than the header has fields.
     """
     header, body = _parse_header(content)
@@ -78,10 +79,10 @@ def _parse_header(content: bytes) -> tuple[PcdHeader, bytes]:
     entries: dict[str, list[str]] = {}
     position = 0
     while "DATA" not in entries:
-        end = content.find(b"\n", position, _MAX_HEADER_BYTES)
+        end = content.find(b"\n", position, MAX_HEADER_BYTES)
         if end < 0:
             raise CloudReadError("expected a PCD header that ends in a DATA line, but found none")
-        words = [word.decode("latin-1") for word in content[position:end].split()]  # not at blanks of other codes
+        words = [word.decode("latin-1") for word in content[position:end].split()]  # str.split knows more blanks
         position = end + 1
         if words and not words[0].startswith("#"):
             key = words[0].upper()
@@ -106,7 +107,7 @@ def _checked_header(entries: dict[str, list[str]], n_lines: int) -> PcdHeader:
             f"expected as many SIZE, TYPE and COUNT entries as FIELDS ({len(names)}), "
             f"got {len(sizes)}, {len(kinds)} and {len(counts)}"
         )
-    fields = [name for name in names if name != "_"]  # padding may come several times
+    fields = [name for name in names if name != "_"]  # there may be padding in several places
     if len(set(fields)) != len(fields):
         raise CloudReadError(f"expected distinct FIELDS in the PCD header, got {' '.join(names)[:80]}")
     dtypes = []
@@ -170,7 +171,7 @@ def _compressed_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.
         raise CloudReadError("the compressed PCD data is cut off before its two sizes")
     packed, unpacked = (int(size) for size in np.frombuffer(body, "<u4", count=2))
     _check_length(unpacked, header.n_points * per_point, header)
-    # LZF shrinks by at most 264 bytes to 3, so a size far above that is a lie and is not worth allocating.
+    # LZF shrinks at most 264 bytes to 3. No memory is allocated for a size above that, which must be wrong.
     if packed > len(body) - 8 or unpacked > 88 * packed + 264:
         raise CloudReadError(f"the PCD data promises {packed} compressed bytes, but {len(body) - 8} are left")
     target = np.empty(unpacked, np.uint8)
@@ -186,26 +187,27 @@ def _compressed_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.
 
 
 def _without_axis(values: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Columns (n, c) of a field, (n,) where it has but one element."""
+    """Columns (n, c) of a field; (n,) if it has one number per point."""
     return values[:, 0] if values.shape[1] == 1 else values
 
 
 def _exact(values: NDArray[np.generic], body: bytes, place: tuple[int, int, int]) -> NDArray[np.generic]:
-    """Whole numbers of 64 bits as the text has them, where doubles have rounded them.
+    """Exact whole numbers of 64 bits of a text, in place of those that doubles have rounded.
 
     Parameters
     ----------
     values : (n,) or (n, c) int64 or uint64
-        Rounded.
-    body : the text
-    place : first column, column after the last, columns
+        Rounded numbers.
+    body : bytes
+        The text.
+    place : first column, column after the last, number of columns of the text
     """
     first, end, width = place
     words = body.split(None, len(values) * width)[: len(values) * width]
     rows = [words[row + first : row + end] for row in range(0, len(words), width)]
     try:
         return np.array([[_whole(word) for word in row] for row in rows], values.dtype).reshape(values.shape)
-    except OverflowError:  # by less than a double tells
+    except OverflowError:  # a number beyond the limits by less than a double resolves
         limits = np.iinfo(values.dtype.name)
         raise CloudReadError(f"expected whole numbers from {limits.min} to {limits.max}, as the header says") from None
 
@@ -224,32 +226,33 @@ def _check_length(available: int, needed: int, header: PcdHeader) -> None:
         )
 
 
-# ---- LZF, the coding of binary_compressed data ----------------------------------------------------------------------
+# ---- LZF, the coding of binary_compressed data -----------------------------------------------------------------------
 
 
 @cache
 def lzf_decompressor() -> Callable[[NDArray[np.uint8], NDArray[np.uint8]], int]:
-    """`decompress_lzf`, compiled; numba is imported only where a file is compressed."""
+    """The compiled `decompress_lzf`; only compressed files import numba."""
     from pcgraph.kernel_cache import cached_njit
 
     return cached_njit()(decompress_lzf)
 
 
 def decompress_lzf(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
-    """Number of bytes written to `target`, or -1 if the stream is broken or does not fit.
+    """Number of bytes written to `target`; -1 if the stream is broken or does not fit.
 
     Parameters
     ----------
     source : (c,) uint8
-        LZF stream: a control byte below 32 announces that many + 1 literal bytes; any other one a copy of
-        ``(control >> 5) + 2`` bytes (length 7 takes one byte more) from up to 8191 bytes back.
+        LZF stream. A control byte below 32 is followed by control + 1 literal bytes. Any other one stands for a copy of
+        ``(control >> 5) + 2`` bytes from up to 8191 bytes back; if ``control >> 5`` is 7, the next byte adds to the
+        length.
     target : (u,) uint8
         Filled from the front.
 
     Notes
     -----
-    Every read and write is bounds-checked and every step consumes input, so no stream can crash or hang it.
-    Source: M. Lehmann, liblzf, format as documented there; written anew.
+    Every read and write is checked against the bounds, and every step consumes input, so no stream can crash or hang
+    it. Source of the format: the documentation of M. Lehmann's liblzf; the code is new.
     """
     read, wrote = 0, 0
     n_source, n_target = source.size, target.size
@@ -260,7 +263,7 @@ def decompress_lzf(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
             length = control + 1
             if read + length > n_source or wrote + length > n_target:
                 return -1
-            for offset in range(length):  # as a loop, for slices take the compiler seconds
+            for offset in range(length):  # a loop, because slices take the compiler seconds
                 target[wrote + offset] = source[read + offset]
             read += length
         else:
@@ -275,7 +278,7 @@ def decompress_lzf(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
             length += 2
             if start < 0 or wrote + length > n_target:
                 return -1
-            for offset in range(length):  # copies may overlap themselves, so byte by byte
+            for offset in range(length):  # byte by byte, because a copy may overlap itself
                 target[wrote + offset] = target[start + offset]
         wrote += length
     return wrote

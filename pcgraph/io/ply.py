@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PLY files (Stanford polygon format 1.0): ascii and both binary byte orders; only the vertices are read."""
+"""PLY files (Stanford polygon format 1.0), ascii and both binary byte orders; only vertices are read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.cloud import Cloud, cloud_from_columns, columns_from_text, numbers_from_text
+from pcgraph.cloud import MAX_HEADER_BYTES, Cloud, cloud_from_columns, columns_from_text, numbers_from_text
 from pcgraph.errors import CloudReadError
 
 _TYPES = {
@@ -19,9 +19,8 @@ _TYPES = {
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
-_NAMES = {kind: name for name, kind in _TYPES.items() if not name[-1].isdecimal()}
+_NAMES = {kind: name for name, kind in _TYPES.items() if name.isalpha()}
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
-_MAX_HEADER_BYTES = 1 << 16
 
 
 @dataclass
@@ -35,13 +34,13 @@ class PlyElement:
 
 
 def read_ply(content: bytes) -> Cloud:
-    """Cloud held by the vertices of a PLY file; colours, normals and labels kept.
+    """Cloud of the vertices of a PLY file, given the file's bytes, with colours, normals and labels.
 
     Raises
     ------
     CloudReadError
-        The header is broken, there are no vertices' coordinates, the data is shorter than the header says, or a row of
-        text has more or fewer numbers than the header has properties.
+        The header is broken, vertices have no coordinates, the data are shorter than the header says, or a row of text
+        has more or fewer numbers than the header has properties.
     """
     code, elements, body = _parse_header(content)
     for element in elements:
@@ -67,9 +66,10 @@ def encode_ply(columns: dict[str, NDArray[np.generic]], comment: str = "") -> by
 
     Parameters
     ----------
-    columns : mapping of property name, a word of Latin-1, to (n,) array of a type that PLY has: integers of up to 32
-        bits, float32 or float64
-    comment : one line of the header; empty for none
+    columns : mapping of property name to (n,) array
+        Names are words of Latin-1. Types are those of PLY: integers of up to 32 bits, float32 or float64.
+    comment : str
+        A line of the header; none if empty.
     """
     record = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
     n_points = len(next(iter(columns.values())))
@@ -87,13 +87,14 @@ def encode_ply(columns: dict[str, NDArray[np.generic]], comment: str = "") -> by
 
 
 def _parse_header(content: bytes) -> tuple[str, list[PlyElement], bytes]:
-    end = content.find(b"\nend_header", 0, _MAX_HEADER_BYTES)
+    end = content.find(b"\nend_header", 0, MAX_HEADER_BYTES)
     newline = content.find(b"\n", end + 1)
     if not content.startswith(b"ply") or end < 0 or newline < 0:
         raise CloudReadError("expected a PLY header from 'ply' to 'end_header', but found none")
     code = ""
     elements: list[PlyElement] = []
-    for line in content[:end].split(b"\n")[1:]:  # as bytes: text has line ends and blanks that UTF-8 holds in letters
+    # Of bytes, because str has line ends and blanks that are parts of letters in UTF-8.
+    for line in content[:end].split(b"\n")[1:]:
         words = [word.decode("latin-1") for word in line.split()]
         if words[:1] == ["format"] and len(words) == 3:
             if code:
@@ -128,7 +129,7 @@ def _record(element: PlyElement, code: str) -> np.dtype[np.void]:
 
 
 def _skip(element: PlyElement, code: str, body: bytes) -> bytes:
-    """The bytes behind an element; in a text, the lines behind its rows, and empty lines are no rows."""
+    """The bytes after an element; of a text, the lines after its rows, where empty lines are no rows."""
     if code == "ascii":
         lines = BytesIO(body)
         rows = (line for line in lines if line.strip())

@@ -25,15 +25,17 @@ if TYPE_CHECKING:
 
 
 FORMAT = "pcgraph-segmentation"
-"""By which a file of ours is known, and the SHA-256 of its bytes: a comment in a PLY file or an .npz file.
+"""Mark of files that pcgraph wrote: a comment in the PLY or .npz file, followed by the SHA-256 of the file's bytes.
 
-The sum is that of the file with zeros in place of the sum. Who corrects labels by hand makes the file their own.
+The sum is taken with zeros in its place. A file that was edited, for example to correct labels, no longer has that sum:
+it is the user's own, and is not overwritten.
 """
-_INSTEAD = {"i8": "f8", "u8": "f8", "f2": "f4", "f16": "f8", "b1": "u1"}  # of types that PLY has not
+_INSTEAD = {"i8": "f8", "u8": "f8", "f2": "f4", "f16": "f8", "b1": "u1"}
+"""Types that PLY does not have, and those that are written in their place."""
 
 
 def is_segmentation(path: Path) -> bool:
-    """Whether a file is one that `write_segmentation` wrote, and nobody changed."""
+    """Whether `write_segmentation` wrote a file, and nobody has changed it."""
     return is_sealed(path, FORMAT, at_end=path.suffix.lower() != ".ply")
 
 
@@ -43,34 +45,38 @@ def write_segmentation(
     segmentation: Segmentation,
     labels: ArrayLike | None = None,
 ) -> None:
-    """Write a segmentation, the whole file or none; an older file of that name is replaced.
+    """Write a segmentation as a whole file, or none; an older file of that name is replaced.
 
     Parameters
     ----------
     path : str or path
         ``.ply``: the finite points, in input order, with a colour per label, the properties ``labels`` and
         ``supervoxels`` (int32), the cloud's own colours, normals and labels (``red`` and so on, ``nx`` and so on,
-        ``label``), and its further columns, vectors as ``name_0``, ``name_1`` and so on; PLY has no integers of 64
-        bits, so those become doubles. What the cloud has keeps its name: beside its own colours, labels or column
-        ``supervoxels``, the result's are called ``segment_red`` and so on, ``segment_labels``,
-        ``segment_supervoxels``; beside those, ``segment2_red`` and so on. ``.npz``: everything, in the input's shape:
-        ``format``, ``labels``, ``supervoxels``; ``edges`` and ``edge_<feature>``; ``node_<feature>``;
-        ``tree_parents``, ``tree_altitudes``; ``voxel_size``, ``seed_size``, ``viewpoint``; ``cloud_colors``,
-        ``cloud_normals``, ``cloud_labels``, the cloud's own if it has them; ``column_<name>``, the further columns.
+        ``label``), and its further columns, vectors as ``name_0``, ``name_1`` and so on. PLY has no integers of 64
+        bits, so those become doubles. The cloud's columns keep their names. If the cloud has colours, labels or a
+        column ``supervoxels`` of its own, the result's are called ``segment_red`` and so on, ``segment_labels``,
+        ``segment_supervoxels``; if these exist, too, ``segment2_red`` and so on.
+
+        ``.npz``: everything, in the input's shape: ``format``, ``labels``, ``supervoxels``; ``edges`` and
+        ``edge_<feature>``; ``node_<feature>``; ``tree_parents``, ``tree_altitudes``; ``voxel_size``, ``seed_size``,
+        ``viewpoint``; ``cloud_colors``, ``cloud_normals``, ``cloud_labels``, the cloud's own if it has them;
+        ``column_<name>``, the further columns.
     cloud : Cloud, or points (n, 3) or (h, w, 3)
-        What was segmented. A further column called as a coordinate or as what the cloud has besides, ``x`` or ``X``
-        for example, is left out of the ``.ply``.
+        The cloud that was segmented. A further column with the name of a coordinate, a colour, a normal or a label of
+        the cloud, for example ``x`` or ``X``, is left out of the ``.ply``.
     segmentation : Segmentation
     labels : the points' leading shape, whole numbers within 32 bits, optional
-        Labels to write instead of the default cut.
+        Labels to write in place of the default cut.
 
     Raises
     ------
     CloudWriteError
-        Another extension, or the place cannot be written; or a column is not of the points' shape, not of numbers, or
-        has a name that is not one word; or the cloud's colours, normals or labels are not what `Cloud` says of them.
+        The extension is another, or the place cannot be written; or a column has another shape than the points, is not
+        of numbers, or has a name that is not one word; or the cloud's colours, normals or labels are not as `Cloud` has
+        them.
     ValueError
-        Points or labels are not of the shape of what was segmented, or labels no whole numbers within 32 bits.
+        Points or labels have another shape than the points that were segmented, or labels are no whole numbers within
+        32 bits.
     """
     path = Path(path)
     write_file(path, encode_segmentation(path.name, cloud, segmentation, labels), CloudWriteError)
@@ -79,10 +85,10 @@ def write_segmentation(
 def encode_segmentation(
     name: str, cloud: Cloud | ArrayLike, segmentation: Segmentation, labels: ArrayLike | None = None
 ) -> bytes:
-    """What `write_segmentation` writes to a file of such a name."""
+    """Bytes that `write_segmentation` writes to a file of that name."""
     try:
         shape = segmentation.supervoxels.shape
-    except AttributeError:  # the class itself is above this module
+    except AttributeError:  # no isinstance, because the class is in a layer above this module
         kind = type(segmentation).__name__
         raise ValueError(f"expected a Segmentation, as pcgraph.segment returns it, got {kind}") from None
     cloud = cloud if isinstance(cloud, Cloud) else Cloud(np.asarray(without_mask(cloud)))
@@ -101,7 +107,7 @@ def encode_segmentation(
 
 
 def _whole_labels(labels: ArrayLike) -> NDArray[np.int32]:
-    """Labels as files hold them."""
+    """Labels as int32; raises ValueError if they are no whole numbers, or too large."""
     given, limits = np.asarray(labels), np.iinfo(np.int32)
     is_whole = given.dtype.kind in "iub" or (given.dtype.kind == "f" and bool((given == np.rint(given)).all()))
     if not is_whole:
@@ -112,7 +118,7 @@ def _whole_labels(labels: ArrayLike) -> NDArray[np.int32]:
 
 
 def label_colors(labels: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Colour of each label, (n, 3) uint8: hues a golden angle apart, so that close numbers differ; grey if negative."""
+    """Colour of each label, (n, 3) uint8: hues a golden angle apart, so that near numbers differ; grey if negative."""
     hue = labels * 0.618033988749895 % 1.0
     value = 0.95 - 0.25 * (labels // 8 % 3) / 2.0
     ramp = np.abs((hue[:, None] * 6.0 + np.array([0.0, 4.0, 2.0])) % 6.0 - 3.0) - 1.0
@@ -141,7 +147,7 @@ def _ply(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) ->
 
 
 def _ply_parts(cloud: Cloud, finite: NDArray[np.bool_]) -> dict[str, NDArray[np.generic]]:
-    """The cloud's further columns at the finite points, vectors in parts."""
+    """The cloud's further columns at the finite points, one column per number of a vector."""
     parts: dict[str, NDArray[np.generic]] = {}
     for name, stored in _further_columns(cloud).items():
         rows = _for_ply(name, stored.reshape(len(finite), -1)[finite])
@@ -154,7 +160,7 @@ def _ply_parts(cloud: Cloud, finite: NDArray[np.bool_]) -> dict[str, NDArray[np.
 def _ply_own(cloud: Cloud, finite: NDArray[np.bool_], taken: set[str]) -> dict[str, NDArray[np.generic]]:
     """The cloud's own colours, normals and labels at the finite points, under names that `read_cloud` knows.
 
-    Of the names for each, the first that no further column has; `taken` are those of the columns, in lower case.
+    Each gets the first of its names that no further column has; `taken` are the names of those columns, in lower case.
     """
     rows = {
         name: _for_ply(name, stored.reshape(len(finite), -1)[finite]) for name, stored in _own_arrays(cloud).items()
@@ -175,7 +181,7 @@ def _ply_own(cloud: Cloud, finite: NDArray[np.bool_], taken: set[str]) -> dict[s
 
 
 def _own_arrays(cloud: Cloud) -> dict[str, NDArray[np.generic]]:
-    """The cloud's own colours (uint8), normals and labels (int32), those that there are, checked."""
+    """The cloud's own colours (uint8), normals and labels (int32), if it has them, checked."""
     shape = cloud.points.shape[:-1]
     arrays: dict[str, NDArray[np.generic]] = {}
     for name, wanted in (("colors", (*shape, 3)), ("normals", (*shape, 3)), ("labels", shape)):
@@ -198,7 +204,7 @@ def _own_arrays(cloud: Cloud) -> dict[str, NDArray[np.generic]]:
 
 
 def _bytes_of(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Colours in floats from 0 to 1, as `segment` takes them too, as uint8; black where they are NaN."""
+    """Colours as uint8, from floats within 0..1, which `segment` takes, too; black where they are NaN."""
     shades = np.nan_to_num(colors.astype(np.float64)) if colors.dtype.kind == "f" else np.array([np.inf])
     if not ((shades >= 0.0) & (shades <= 1.0)).all():
         raise CloudWriteError(f"expected the cloud's colors as uint8 or as floats within 0..1, got {colors.dtype}")
@@ -208,7 +214,7 @@ def _bytes_of(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
 def _beside(
     taken: set[str], ours: dict[str, NDArray[np.generic]], names: tuple[str, ...]
 ) -> dict[str, NDArray[np.generic]]:
-    """Columns of ours; where one of `names` is taken, with ``segment_`` before each name, or else ``segment2_`` ..."""
+    """The result's columns; if one of `names` is taken, with a prefix ``segment_``, else ``segment2_`` and so on."""
     prefixes = ("", "segment_", *(f"segment{i}_" for i in range(2, len(taken) + 2)))
     free = next(prefix for prefix in prefixes if taken.isdisjoint(prefix + name for name in names))
     return {free + name: column for name, column in ours.items()}
@@ -249,13 +255,13 @@ def _further_columns(cloud: Cloud) -> dict[str, NDArray[np.generic]]:
 
 
 def _is_word(name: str) -> bool:
-    """Whether a name of Latin letters has no blank as the readers know it."""
+    """Whether a name of Latin letters is one word, as the readers of files split words."""
     encoded = name.encode("latin-1")
     return encoded.split() == [encoded]
 
 
 def _for_ply(name: str, values: NDArray[np.generic]) -> NDArray[np.generic]:
-    """The values in a type that PLY has, whose numbers are the same but for whole numbers beyond 2**53."""
+    """The values in a type that PLY has; only whole numbers beyond 2**53 are rounded."""
     instead = _INSTEAD.get(values.dtype.str[1:])
     if instead is None:
         return values

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values over the tree, classes of nodes, labels for new points; names load on first use. See docs/learning.md.
 
-`NodeClassifier` needs scikit-learn, and nothing else does: it is imported with that name alone.
+Only `NodeClassifier` needs scikit-learn, which is imported when that name is used.
 """
 
 from __future__ import annotations

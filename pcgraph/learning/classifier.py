@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Classes of supervoxels, learned from labelled clouds in scikit-learn's manner."""
+"""A classifier of supervoxels, learned from labelled clouds, with the interface of scikit-learn."""
 
 from __future__ import annotations
 
@@ -24,30 +24,28 @@ try:
 except ImportError as missing:
     raise ImportError("NodeClassifier needs scikit-learn; pip install 'rangesim[learn]'") from missing
 
-_TREES = 100
-
 
 class NodeClassifier(ClassifierMixin, BaseEstimator):
-    """Classifier of supervoxels, whose classes go to their points.
+    """Classifier of supervoxels, and so of their points.
 
-    A supervoxel is described by itself, its neighbours in the graph and its ancestors in the tree; an estimator of
-    scikit-learn does the rest. A sample, to scikit-learn, is a whole segmented cloud: `clone`, `cross_val_score` and
-    `GridSearchCV` take lists of segmentations and of true labels.
+    A supervoxel is described by its own features, those of its neighbours in the graph and those of its ancestors in
+    the tree. An estimator of scikit-learn classifies these descriptors. A sample, to scikit-learn, is a whole segmented
+    cloud: `clone`, `cross_val_score` and `GridSearchCV` take lists of segmentations and of true labels.
 
     Parameters
     ----------
     estimator : object with fit(X, y, sample_weight) and predict_proba(X), optional
         It is cloned, not changed. Default: a random forest of 100 trees.
     pose : bool
-        Whether height above the ground and slope are told.
+        Whether descriptors have height above the ground and slope.
     neighbours : int, >= 0
-        Rings of neighbours that are told; 0: none.
+        Number of rings of neighbours in the descriptors.
     ancestors : int, >= 0
-        Ancestors that are told; 0: none. See `pcgraph.learning.descriptors.leaf_descriptors`.
+        Number of ancestors in the descriptors. See `pcgraph.learning.descriptors.leaf_descriptors`.
     random_state : int
         Seed of the default estimator.
     unlabelled : int or str, optional
-        The label that means none. Default: -1, or "" where labels are text.
+        Label that means "no label". Default: -1, or "" if labels are text.
 
     Attributes
     ----------
@@ -86,10 +84,10 @@ class NodeClassifier(ClassifierMixin, BaseEstimator):
         ----------
         segmentations : Segmentation, or a list of them
         truths : the points' leading shape, int, bool or str, or a list of such
-            True label of each point; `unlabelled` where there is none. A supervoxel learns the label most of its
-            points have, and counts as many points as have it.
+            True label of each point; `unlabelled` if it has none. A supervoxel has the label of most of its points, and
+            counts as the number of points that have it.
         ups : (3,) float, or a list of such, optional
-            Against gravity, in each cloud's frame. Default: the normal of its largest plane.
+            Direction against gravity, in each cloud's frame. Default: the normal of its largest plane.
 
         Raises
         ------
@@ -124,7 +122,7 @@ class NodeClassifier(ClassifierMixin, BaseEstimator):
         sklearn.exceptions.NotFittedError
             A ValueError: `fit` was not called before.
         ValueError
-            The classifier was fitted on descriptors that this version does not know.
+            The classifier was fitted on descriptors that this version does not have.
         """
         check_is_fitted(self, msg="expected a fitted %(name)s, got a new one; call fit first")
         if not isinstance(segmentation, Segmentation):
@@ -137,8 +135,7 @@ class NodeClassifier(ClassifierMixin, BaseEstimator):
         return self.estimator_.predict_proba(table)
 
     def predict_proba(self, segmentation: Segmentation, up: ArrayLike | None = None) -> NDArray[np.float64]:
-        """Probability of each class at each point, the points' leading shape + (c,); NaN without a
-        supervoxel.
+        """Probability of each class at each point, the points' leading shape + (c,); NaN without a supervoxel.
 
         Parameters
         ----------
@@ -149,14 +146,14 @@ class NodeClassifier(ClassifierMixin, BaseEstimator):
         return unpool(segmentation, self.predict_nodes(segmentation, up))
 
     def predict(self, segmentation: Segmentation, up: ArrayLike | None = None) -> NDArray[Any]:
-        """Most probable label of each point, in the points' shape; `unlabelled` without a supervoxel.
+        """Label of the most probable class at each point, in the points' shape; `unlabelled` without a supervoxel.
 
         Parameters
         ----------
         segmentation, up : as for `predict_proba`
         """
         number = unpool(segmentation, self.predict_nodes(segmentation, up).argmax(axis=1))
-        none = np.asarray([self._none(self.classes_)])  # last, where the -1 of points without a supervoxel finds it
+        none = np.asarray([self._none(self.classes_)])  # last, where the -1 of points without a supervoxel points
         return np.concatenate((self.classes_, none))[number]
 
     def score(
@@ -178,14 +175,14 @@ class NodeClassifier(ClassifierMixin, BaseEstimator):
     def save(self, path: str | PathLike[str]) -> None:
         """Write the fitted classifier as JSON, the whole file or none; an older file of that name is replaced.
 
-        The file holds numbers and names, so loading it runs no code. `load` makes of it a classifier that predicts
-        the same; a given `estimator` is not in it, only what it learned.
+        The file holds numbers and names, so loading it runs no code. `load` makes a classifier of it that predicts the
+        same. A given `estimator` is not in the file, only the trees that it learned.
 
         Raises
         ------
         ValueError
-            The classifier is not fitted, or learned otherwise than by decision trees: a ``RandomForestClassifier``,
-            an ``ExtraTreesClassifier`` or a ``DecisionTreeClassifier``.
+            The classifier is not fitted, or its estimator is none of ``RandomForestClassifier``,
+            ``ExtraTreesClassifier`` and ``DecisionTreeClassifier``.
         CloudWriteError
             The place cannot be written.
         """
@@ -211,7 +208,7 @@ class NodeClassifier(ClassifierMixin, BaseEstimator):
         return loaded
 
     def _none(self, labels: NDArray[Any]) -> int | str:
-        """The label that means none, among such labels."""
+        """The label that means "no label", of the type of these labels."""
         text = labels.dtype.kind == "U"
         if self.unlabelled is None:
             return "" if text else -1
@@ -228,7 +225,8 @@ class NodeClassifier(ClassifierMixin, BaseEstimator):
             return clone(self.estimator)
         from sklearn.ensemble import RandomForestClassifier
 
-        return RandomForestClassifier(_TREES, min_samples_leaf=2, random_state=self.random_state)
+        # 100 is the default of scikit-learn; leaves of 2 samples were chosen by eye, and not varied.
+        return RandomForestClassifier(100, min_samples_leaf=2, random_state=self.random_state)
 
 
 def _listed(
@@ -236,7 +234,7 @@ def _listed(
     truths: ArrayLike | Sequence[ArrayLike],
     ups: ArrayLike | Sequence[ArrayLike] | None,
 ) -> tuple[list[Segmentation], list[NDArray[Any]], list[Any]]:
-    """Lists of segmentations, truths and directions, also of a single one of each."""
+    """Lists of segmentations, truths and directions; a single one of each becomes a list of one."""
     single = isinstance(segmentations, Segmentation)
     clouds: list[Segmentation] = [segmentations] if isinstance(segmentations, Segmentation) else list(segmentations)
     labels = [_labels(truth) for truth in ([truths] if single else list(truths))]  # type: ignore[arg-type]

@@ -18,7 +18,7 @@ _WRITE = "write it with NodeClassifier.save"
 
 @dataclass(frozen=True, eq=False)
 class StoredForest(ShortRepr):
-    """Decision trees whose mean says how probable each class is; predicts as the scikit-learn estimator did.
+    """Decision trees whose mean is the probability of each class; predicts as scikit-learn's estimator did.
 
     Attributes
     ----------
@@ -28,11 +28,11 @@ class StoredForest(ShortRepr):
     left, right : (n,) int64
         Children, numbered within their tree and larger than the node; -1 at leaves.
     features : (n,) int64
-        Column that a node asks for.
+        Column that each node compares.
     thresholds : (n,) float64
         Rows with at most this value in that column go left.
     fractions : (n, c) float64, 0..1
-        Of each class, at each node.
+        Fraction of each class at each node.
     """
 
     classes_: NDArray[Any]
@@ -45,7 +45,7 @@ class StoredForest(ShortRepr):
 
     @classmethod
     def of(cls, estimator: Any) -> StoredForest:
-        """Trees of a fitted estimator of scikit-learn, or of a stored forest; ValueError if it has none."""
+        """Trees of a fitted estimator of scikit-learn, or a stored forest itself; ValueError if it has no trees."""
         from sklearn.ensemble import ExtraTreesClassifier, RandomForestClassifier
         from sklearn.tree import DecisionTreeClassifier
 
@@ -73,7 +73,7 @@ class StoredForest(ShortRepr):
     def predict_proba(self, table: NDArray[np.float64]) -> NDArray[np.float64]:
         """Probability of each class for each row of descriptors, (m, c) float64."""
         with np.errstate(over="ignore"):
-            rows = table.astype(np.float32)  # as scikit-learn compares
+            rows = table.astype(np.float32)  # scikit-learn compares float32, too
         total = np.zeros((len(rows), len(self.classes_)))
         for first, last in zip(self.starts[:-1], self.starts[1:], strict=True):
             nodes = slice(first, last)
@@ -89,19 +89,19 @@ def _leaf(
     features: NDArray[np.int64],
     thresholds: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Leaf of one tree that each row ends up in, (m,); ends, for children have larger numbers."""
+    """Leaf of one tree for each row, (m,); the loop ends, because children have larger numbers."""
     node = np.zeros(len(rows), np.int64)
-    climbing = np.arange(len(rows)) if left[0] >= 0 else np.empty(0, np.int64)
-    while len(climbing):
-        at = node[climbing]
-        low = rows[climbing, features[at]] <= thresholds[at]
-        node[climbing] = np.where(low, left[at], right[at])
-        climbing = climbing[left[node[climbing]] >= 0]
+    descending = np.arange(len(rows)) if left[0] >= 0 else np.empty(0, np.int64)
+    while len(descending):
+        at = node[descending]
+        low = rows[descending, features[at]] <= thresholds[at]
+        node[descending] = np.where(low, left[at], right[at])
+        descending = descending[left[node[descending]] >= 0]
     return node
 
 
 class _Settings(msgspec.Struct, forbid_unknown_fields=True):
-    """Parameters of the constructor of `NodeClassifier`."""
+    """Arguments of the constructor of `NodeClassifier`."""
 
     pose: bool
     neighbours: int
@@ -111,7 +111,7 @@ class _Settings(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
-    """What the JSON holds; arrays as in `StoredForest`."""
+    """Contents of the JSON file; the lists are the arrays of `StoredForest`."""
 
     format: str
     settings: _Settings
@@ -136,9 +136,9 @@ def encode_classifier(settings: dict[str, Any], names: list[str], forest: Stored
 
 
 def decode_classifier(content: bytes, name: str) -> tuple[dict[str, Any], list[str], StoredForest]:
-    """Settings, names of descriptors and trees of a file; raises ValueError if it is none that `save` wrote."""
+    """Settings, names of descriptors and trees of a file; raises ValueError if `save` did not write it."""
     try:
-        # Of a later version other fields may be missing or new: its format says so first.
+        # The format is checked first, because a file of a later version may have other fields.
         said = msgspec.json.decode(content, type=dict[str, msgspec.Raw]).get("format")
         if said is None or msgspec.json.decode(said) != _FORMAT:
             raise ValueError(f"it is not of the format {_FORMAT!r}")
@@ -152,7 +152,7 @@ def decode_classifier(content: bytes, name: str) -> tuple[dict[str, Any], list[s
 
 
 def _forest(file: _File) -> StoredForest:
-    """The trees of a file, every index of which has been checked."""
+    """The trees of a file, after checks of every index."""
     starts, left, right, features = (
         np.array(column, np.int64).reshape(-1) for column in (file.starts, file.left, file.right, file.features)
     )

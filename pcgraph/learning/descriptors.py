@@ -13,7 +13,9 @@ from pcgraph.features.primitives import Primitives, fit_primitives, primitive_mo
 from pcgraph.hierarchy import accumulate_sequential, propagate_sequential
 from pcgraph.segmentation import Segmentation
 
-GROWTH = 4.0  # each ancestor that is asked has so many times the points of the one before
+GROWTH = 4.0
+"""Times the points of one ancestor that the next has at least, so that three reach 64 median supervoxels. Chosen by
+eye; not varied."""
 EDGE_COLUMNS = ("convexity", "contact_convexity", "normal_angle", "color_contrast", "step")
 
 
@@ -25,22 +27,22 @@ def leaf_descriptors(
     neighbours: int = 1,
     ancestors: int = 3,
 ) -> tuple[NDArray[np.float64], list[str]]:
-    """What is known of each supervoxel, (n_leaves, f) float64, finite, and the names of the columns.
+    """Descriptors of each supervoxel, (n_leaves, f) float64, finite, and the names of the columns.
 
     Parameters
     ----------
     segmentation : Segmentation
     up : (3,) float, optional
-        Against gravity, in the points' frame. Default: the normal of the largest plane.
+        Direction against gravity, in the points' frame. Default: the normal of the largest plane.
     pose : bool
-        Whether height and slope are told; height above the lowest supervoxel if `up` is given, above the largest
-        plane otherwise.
+        Whether there are columns of height and slope. Heights are above the lowest supervoxel if `up` is given, else
+        above the largest plane.
     neighbours : int, >= 0
-        Rings of the graph of which a supervoxel learns the mean, weighted by length of contact; with the first
-        also mean, smallest and largest of its edges' features.
+        Number of rings around a supervoxel in the graph. Each adds its mean, weighted by length of contact. The first
+        also adds the mean, least and most of the features of the supervoxel's edges.
     ancestors : int, >= 0
-        Nodes of the tree of which it learns all that it knows of itself: with 4, 16, 64, ... times the points of
-        the median supervoxel; with the first also its segment in `Segmentation.objects`.
+        Number of ancestors in the tree, with 4, 16, 64, ... times the points of the median supervoxel. Each adds the
+        same columns as the supervoxel's own. The first also adds those of its segment in `Segmentation.objects`.
 
     Raises
     ------
@@ -80,7 +82,7 @@ def leaf_descriptors(
 
 
 def _upright(segmentation: Segmentation, up: ArrayLike | None) -> tuple[NDArray[np.float64], float]:
-    """Unit vector against gravity, and the ground's position along it."""
+    """Unit vector against gravity, and position of the ground along it."""
     planes = find_planes(segmentation, up=up)
     centroids = segmentation.graph.node_features.centroid
     if up is not None or not len(planes):
@@ -92,7 +94,7 @@ def _upright(segmentation: Segmentation, up: ArrayLike | None) -> tuple[NDArray[
 def _node_descriptors(
     segmentation: Segmentation, up: NDArray[np.float64] | None, ground: float
 ) -> tuple[NDArray[np.float64], list[str]]:
-    """The same columns for all k nodes of the tree."""
+    """Descriptors of all k nodes of the tree, and the names of the columns."""
     features = segmentation.tree.features()
     deviations = features.deviations
     shades = np.sqrt(np.maximum(np.einsum("kii->ki", features.color_covariance), 0.0))
@@ -126,7 +128,7 @@ def _posed(features: NodeFeatures, up: NDArray[np.float64], ground: float) -> di
 def _primitives(segmentation: Segmentation) -> Primitives:
     """Planes, spheres and cylinders through the voxels of every node."""
     tree, surface, own = segmentation.tree, segmentation.surface, segmentation.graph.node_features
-    # Each supervoxel's centroid joins its voxels, so that none is without points.
+    # The centroid of each supervoxel is added to its voxels, so that none is without points.
     places = np.concatenate((surface.grid.centroids, own.centroid))
     normals = np.concatenate((surface.normals, own.normal))
     leaf = np.concatenate((surface.supervoxels, np.arange(tree.n_leaves, dtype=np.int32)))
@@ -136,7 +138,7 @@ def _primitives(segmentation: Segmentation) -> Primitives:
 
 
 def _curved(fits: Primitives, length: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """How round nodes are: residuals over length, and length over radius (0 where flat)."""
+    """Roundness of nodes: residuals over length, and length over radius, which is 0 if flat."""
     scale = np.where(length > 0.0, length, 1.0)
     return {
         "plane residual": fits.plane_residual / scale,
@@ -148,19 +150,19 @@ def _curved(fits: Primitives, length: NDArray[np.float64]) -> dict[str, NDArray[
 
 
 def _contact_means(segmentation: Segmentation) -> csr_array:
-    """Matrix, (n_leaves, n_leaves), that takes values to the mean over the neighbours; to 0 without any."""
+    """Matrix, (n_leaves, n_leaves), that maps values to means over neighbours; supervoxels without any keep theirs."""
     graph = segmentation.graph
     (i, j), weight = graph.edges.T, graph.edge_features.contact_length
     n = graph.n_nodes
     links = csr_array((np.tile(weight, 2), (np.append(i, j), np.append(j, i))), shape=(n, n))
     total = np.asarray(links.sum(axis=1)).ravel()
-    alone = total == 0.0  # they are their own neighbours, so that nothing differs
+    alone = total == 0.0  # these are their own neighbours
     links.data /= np.repeat(np.where(alone, 1.0, total), np.diff(links.indptr))
     return links + csr_array((alone.astype(float), (np.arange(n), np.arange(n))), shape=(n, n))
 
 
 def _edge_summary(segmentation: Segmentation) -> tuple[NDArray[np.float64], list[str]]:
-    """Mean, least and most of each feature over a supervoxel's edges; 0 without any."""
+    """Mean, least and most of each feature over a supervoxel's edges; 0 if it has none."""
     graph = segmentation.graph
     n, ends = graph.n_nodes, np.append(graph.edges[:, 0], graph.edges[:, 1])
     weight = np.tile(graph.edge_features.contact_length, 2)
@@ -184,7 +186,7 @@ def _segments(segmentation: Segmentation) -> NDArray[np.int32]:
 
 
 def _finite(altitudes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Altitudes with infinity twice as high as the highest finite one."""
+    """Altitudes, with twice the highest finite one in place of infinity."""
     known = np.isfinite(altitudes)
     return np.where(known, altitudes, 2.0 * altitudes[known].max(initial=0.0))
 
@@ -192,13 +194,13 @@ def _finite(altitudes: NDArray[np.float64]) -> NDArray[np.float64]:
 def _climb(
     parents: NDArray[np.int32], altitudes: NDArray[np.float64], counts: NDArray[np.int64], least: float
 ) -> NDArray[np.int32]:
-    """First node at or above each node with `least` points, short of those that join what does not touch, (k,)."""
+    """First node at or above each node with `least` points, (k,); else the highest below infinite altitude."""
     smaller = (counts < least) & np.isfinite(altitudes[parents])
     return propagate_sequential(parents, np.arange(len(parents), dtype=np.int32), smaller)
 
 
 def _uniform_tops(parents: NDArray[np.int32], values: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Highest node above each node, below which all leaves have one value, (k,); `values` are those of the leaves."""
+    """Highest node above each node whose leaves all have one value, (k,); `values` are those of the leaves."""
     lowest, highest = (accumulate_sequential(parents, values, extreme) for extreme in ("min", "max"))
     uniform = (lowest == highest)[parents]
     return propagate_sequential(parents, np.arange(len(parents), dtype=np.int32), uniform)

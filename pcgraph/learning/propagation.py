@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Values and labels between points, supervoxels and nodes of the tree: up it, down it, and to new points."""
+"""Values and labels of points, supervoxels and nodes: up the tree, down the tree, and to new points."""
 
 from __future__ import annotations
 
@@ -20,9 +20,16 @@ from pcgraph.voxels.surface import Surface
 Reduction = Literal["sum", "mean", "max", "min"]
 REDUCTIONS: tuple[Reduction, ...] = get_args(Reduction)
 CANDIDATES = 8
-NEARBY = 1.0  # voxel edges beyond the nearest voxel within which another one may be the better
-BLOCK = 1 << 16  # points at a time
-_MAX_SUM = 2.0**62  # half of what int64 holds, so that rounding decides nothing
+"""Count of nearest voxels of which a new point takes one. Chosen by eye; not varied."""
+NEARBY = 1.0
+"""Voxel edges beyond the distance of the nearest voxel within which others are candidates, as voxels beside a crease
+are. Chosen by eye; not varied."""
+BLOCK = 1 << 16
+"""Count of points that are looked up at a time, so that the tables of candidates take some 50 MB. Chosen by eye; not
+varied."""
+_MAX_SUM = 2.0**62
+"""Largest sum of the sizes of whole numbers, in any unit, per column: half of what int64 holds, because the check is
+in float64, which rounds."""
 
 
 # ---- Values ----------------------------------------------------------------------------------------------------------
@@ -37,22 +44,22 @@ def accumulate(
     ----------
     tree : SegmentationTree of k nodes
     values : (n_leaves,) or (n_leaves, c) bool, int or float
-        NaN stands for a missing value: it is left out.
+        NaN is a missing value, and is left out.
     weights : (n_leaves,) float or int, >= 0, optional
-        What a leaf counts in a mean; default: its number of points. The other reductions take none.
+        Weight of each leaf in a mean; default: its number of points. The other reductions take no weights.
     reduce : "mean", "sum", "max" or "min"
 
     Returns
     -------
     (k,) or (k, c)
-        The leaves come first, as they were. Sums of whole numbers are int64, and exact; all else is float64.
-        A node without any value has NaN (0 as a sum).
+        The leaves come first, unchanged. Sums of whole numbers are int64, and exact; all other results are float64. A
+        node without any value has NaN (0 as a sum).
 
     Raises
     ------
     ValueError
-        A shape does not fit the tree, a weight is negative, `reduce` is unknown, or whole numbers are too large to be
-        summed: their sizes may add up to 2**62.
+        A shape does not fit the tree, a weight is negative, `reduce` is unknown, or whole numbers are too large: their
+        sizes may add up to 2**62.
     """
     table, flat = _table(values, tree.n_leaves, "values", "leaves")
     if reduce not in REDUCTIONS:
@@ -60,15 +67,15 @@ def accumulate(
     if weights is not None and reduce != "mean":
         raise ValueError(f"expected no weights for reduce={reduce!r}; only a mean weighs")
     if reduce == "mean":
-        pooled = _mean_up(tree, table, _weights(weights, tree))
+        accumulated = _mean_up(tree, table, _weights(weights, tree))
     elif reduce == "sum":
-        pooled = _sum_up(tree, table)
+        accumulated = _sum_up(tree, table)
     else:
         known = ~np.isnan(table)
         least = -np.inf if reduce == "max" else np.inf
         extreme = accumulate_sequential(tree.parents, np.where(known, table, least), reduce)
-        pooled = np.where(_sum_up(tree, known) > 0, extreme, np.nan)
-    return pooled[:, 0] if flat else pooled
+        accumulated = np.where(_sum_up(tree, known) > 0, extreme, np.nan)
+    return accumulated[:, 0] if flat else accumulated
 
 
 def accumulate_points(segmentation: Segmentation, values: ArrayLike, reduce: Reduction = "mean") -> NDArray[Any]:
@@ -78,9 +85,9 @@ def accumulate_points(segmentation: Segmentation, values: ArrayLike, reduce: Red
     ----------
     segmentation : Segmentation
     values : the points' leading shape, or that + (c,); bool, int or float
-        One row per point that was segmented. Points without a supervoxel are left out, and so is NaN.
+        One row per point. Points without a supervoxel are left out, and so is NaN.
     reduce : "mean", "sum", "max" or "min"
-        Every point counts the same.
+        Every point has the same weight.
 
     Returns
     -------
@@ -90,7 +97,7 @@ def accumulate_points(segmentation: Segmentation, values: ArrayLike, reduce: Red
     Raises
     ------
     ValueError
-        The shape is not that of the points, `reduce` is unknown, or whole numbers are too large to be summed.
+        The shape is not that of the points, `reduce` is unknown, or whole numbers are too large.
     """
     if reduce not in REDUCTIONS:
         raise ValueError(f"expected reduce as one of {', '.join(REDUCTIONS)}, got {reduce!r}")
@@ -99,14 +106,14 @@ def accumulate_points(segmentation: Segmentation, values: ArrayLike, reduce: Red
     if reduce in ("max", "min"):
         extreme = np.full((tree.n_leaves, table.shape[1]), np.nan)
         (np.fmax if reduce == "max" else np.fmin).at(extreme, leaf, table.astype(np.float64))
-        pooled = accumulate(tree, extreme, reduce=reduce)
+        accumulated = accumulate(tree, extreme, reduce=reduce)
     else:
         values = _summable(np.where(known, table, 0)) if reduce == "sum" else np.where(known, table, 0.0)
-        pooled = _sum_up(tree, _sums(leaf, values, tree.n_leaves))
+        accumulated = _sum_up(tree, _sums(leaf, values, tree.n_leaves))
         if reduce == "mean":
             with np.errstate(invalid="ignore"):
-                pooled = pooled / _sum_up(tree, _sums(leaf, known.astype(np.int64), tree.n_leaves))
-    return pooled[:, 0] if flat else pooled
+                accumulated = accumulated / _sum_up(tree, _sums(leaf, known.astype(np.int64), tree.n_leaves))
+    return accumulated[:, 0] if flat else accumulated
 
 
 def unpool(segmentation: Segmentation, values: ArrayLike, nodes: ArrayLike | None = None) -> NDArray[Any]:
@@ -124,7 +131,7 @@ def unpool(segmentation: Segmentation, values: ArrayLike, nodes: ArrayLike | Non
     Returns
     -------
     the points' leading shape + s
-        Points without a supervoxel have NaN, or -1 where the values are whole numbers, or False.
+        Points without a supervoxel have NaN; -1 if the values are whole numbers; False if they are bool.
 
     Raises
     ------
@@ -189,7 +196,7 @@ def _weights(weights: ArrayLike | None, tree: SegmentationTree) -> NDArray[np.fl
 
 
 def _table(values: ArrayLike, rows: int, name: str, what: str) -> tuple[NDArray[Any], bool]:
-    """Values as (rows, c), and whether they came as (rows,)."""
+    """Values as (rows, c), and whether they were given as (rows,)."""
     array = np.asarray(values)
     if array.dtype.kind not in "buif" or array.ndim not in (1, 2) or len(array) != rows:
         raise ValueError(f"expected {name} of {rows} {what} as numbers, one row each, got {array.shape} {array.dtype}")
@@ -197,7 +204,7 @@ def _table(values: ArrayLike, rows: int, name: str, what: str) -> tuple[NDArray[
 
 
 def _on_finite_points(segmentation: Segmentation, values: ArrayLike) -> tuple[NDArray[np.int32], NDArray[Any], bool]:
-    """Leaf and values, (n, c), of the finite points, and whether there was one value per point."""
+    """Leaf, (n,), and values, (n, c), of the points with a supervoxel, and whether one value per point was given."""
     array, shape = np.asarray(values), segmentation.supervoxels.shape
     if array.shape[: len(shape)] != shape or array.ndim > len(shape) + 1:
         raise ValueError(f"expected values of the points' shape {shape} or {(*shape, 'c')}, got {array.shape}")
@@ -243,7 +250,7 @@ def votes(segmentation: Segmentation, labels: ArrayLike, n_classes: int | None =
 
 
 def majority(votes: ArrayLike) -> NDArray[np.int32]:
-    """Class with most votes, (k,) int32; of equals the smallest; -1 without any vote.
+    """Class with most votes, (k,) int32, the smallest of equals; -1 without any vote.
 
     Parameters
     ----------
@@ -252,7 +259,7 @@ def majority(votes: ArrayLike) -> NDArray[np.int32]:
     Raises
     ------
     ValueError
-        The shape or the type is another.
+        The shape or the type is not as above.
     """
     counts = np.asarray(votes)
     if counts.ndim != 2 or counts.dtype.kind not in "iu":
@@ -271,11 +278,11 @@ def pure_ancestors(
     ----------
     tree : SegmentationTree of k nodes
     votes : (k, c) int64
-        As `votes` counts them.
+        Votes of each node, of `votes`.
     fraction : float, 0..1
-        A node is pure if it has votes, and the largest class has this fraction of them at least.
+        A node is pure if it has votes, and the class with most votes has at least this fraction of them.
     altitude : float, the tree's unit
-        Nodes that came to be above this altitude are not taken.
+        Only nodes up to this altitude count.
 
     Raises
     ------
@@ -300,16 +307,16 @@ def propagate_labels(
     fraction: float = 0.95,
     altitude: float = np.inf,
 ) -> NDArray[np.int32]:
-    """Labels of all points from those of a few, in the points' shape, int32; -1: not known.
+    """Labels of all points from those of a few, in the points' shape, int32; -1 where unknown.
 
-    A supervoxel takes the majority of the highest node above it whose votes are pure; without such a node, the
-    majority of its own votes.
+    A supervoxel takes the majority of the highest node above it whose votes are pure. If there is no such node, it
+    takes the majority of its own votes.
 
     Parameters
     ----------
     segmentation, labels, n_classes : as for `votes`
     fraction, altitude : as for `pure_ancestors`
-        Where few points are labelled, `altitude` keeps a label within its object.
+        If few points are labelled, `altitude` keeps a label within its object.
 
     Raises
     ------
@@ -323,7 +330,7 @@ def propagate_labels(
 
 @kernel
 def _highest(parents: NDArray[np.int32], chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Highest chosen node on the way from each node to the root, -1 without; parents before children."""
+    """Highest chosen node at or above each node, -1 if there is none; the loop meets parents before children."""
     highest = np.full(len(parents), -1, np.int32)
     for node in range(len(parents) - 1, -1, -1):
         up = highest[parents[node]] if parents[node] != node else -1
@@ -337,19 +344,19 @@ def _highest(parents: NDArray[np.int32], chosen: NDArray[np.bool_]) -> NDArray[n
 def supervoxels_at(
     segmentation: Segmentation, points: ArrayLike, max_distance: float | None = None
 ) -> NDArray[np.int32]:
-    """Supervoxel of each of m new points, (m,) or their leading shape, int32; -1 if far from all, or not finite.
+    """Supervoxel of each new point, int32, in the points' leading shape; -1 if far from all, or not finite.
 
     Parameters
     ----------
     segmentation : Segmentation
     points : (m, 3) or (h, w, 3) float, metres, the segmented points' frame
     max_distance : float, metres, optional
-        How far the centroid of the nearest voxel may be. Default: twice that voxel's edge.
+        Largest distance from the centroid of the nearest voxel. Default: twice that voxel's edge.
 
     Returns
     -------
     int32
-        Anything known of supervoxels follows in one step: ``tree.cut(n=5)[leaf]`` where `leaf` is not -1.
+        Values of supervoxels follow in one step: ``tree.cut(n=5)[leaf]`` where `leaf` is not -1.
 
     Raises
     ------
@@ -358,11 +365,11 @@ def supervoxels_at(
 
     Notes
     -----
-    Of the voxels about as near as the nearest one (a voxel's edge further at most) the one is taken whose plane,
-    through its centroid across its normal, passes nearest to the point: beside a crease that is the right side.
-    It is not the rule by which `pcgraph.segment` gave points to supervoxels: of the segmented points 85 (simulated
-    rooms) to 91 % (real tables) get their own again, most others one beside it: for 99.5 % and more the object is
-    the same.
+    Candidates are the voxels about as near as the nearest one, at most a voxel's edge farther. The point takes the one
+    whose plane, through its centroid and across its normal, is nearest to the point: beside a crease that is the right
+    side. The rule by which `pcgraph.segment` gives points to supervoxels is another one. Of the segmented points 85 %
+    (simulated rooms) to 91 % (real tables) get their own supervoxel again, and most others one beside it. The object is
+    the same for at least 99.5 %.
     """
     array = np.asarray(points)
     if array.ndim not in (2, 3) or array.shape[-1] != 3 or array.dtype.kind not in "fiu":
@@ -379,12 +386,12 @@ def supervoxels_at(
 
 
 def _nearest(surface: Surface, tree: cKDTree, places: NDArray[np.float64], limit: float | None) -> NDArray[np.int32]:
-    """Supervoxel of each of m finite places, (m,) int32; -1 if far from all."""
+    """Supervoxel of each of m finite points, (m,) int32; -1 if it is far from all."""
     grid = surface.grid
     distance, voxel = tree.query(places, k=list(range(1, min(CANDIDATES, grid.n_voxels) + 1)))
     edge = grid.edge_lengths[voxel[:, 0]]
     offset = np.einsum("mka,mka->mk", places[:, None] - grid.centroids[voxel], surface.normals[voxel])
-    # Among equally near planes the nearer voxel: on a flat surface all planes are the same.
+    # Of equally near planes, as on a flat surface, the nearer voxel counts. The weight was chosen by eye; not varied.
     misfit = np.abs(offset) + 0.1 * distance
     misfit[distance > distance[:, :1] + NEARBY * edge[:, None]] = np.inf
     best = voxel[np.arange(len(places)), misfit.argmin(axis=1)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a segmentation fits a true one; names load on first use. Definitions and sources: docs/metrics.md."""
+"""Metrics of a segmentation against a true one; names load on first use. Definitions and sources: docs/metrics.md."""
 
 from __future__ import annotations
 

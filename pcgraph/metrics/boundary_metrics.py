@@ -22,23 +22,23 @@ def boundary_recall(
     k: int = 8,
     tolerance: float | None = None,
 ) -> float:
-    """Boundary recall BR, 0..1: fraction of true boundary points with a boundary point of the labels near.
+    """Boundary recall BR, 0..1: fraction of true boundary points that are near a boundary point of the labels.
 
-    A boundary point is one with another label among its k nearest neighbours. For many labellings of one cloud
-    build the graph once: ``NeighbourGraph.of(points, truth >= 0).recall(labels, truth)``.
+    A boundary point has another label among its k nearest neighbours. For many labellings of one cloud, build the graph
+    once: ``NeighbourGraph.of(points, truth >= 0).recall(labels, truth)``.
 
     Parameters
     ----------
     points : (n, 3) or (h, w, 3) float
-        Any frame; metres if `tolerance` is.
+        Any frame and unit.
     labels, truth : (n,) or (h, w) int
-        Points negative in either are left out, of the graph too.
+        Points negative in either are left out, also of the graph.
     hops : int, >= 0
-        Near is within as many steps from neighbour to neighbour, away from the true boundary point.
+        Points are near within so many steps from neighbour to neighbour, counted from the true boundary point.
     k : int, >= 1
-        Neighbours per point, the nearest ones, itself not counted.
+        Number of nearest neighbours per point, without the point itself.
     tolerance : float, the points' unit, optional
-        Near is within this distance instead.
+        If given, points are near within this distance.
 
     Returns
     -------
@@ -63,10 +63,10 @@ def boundary_precision(
     k: int = 8,
     tolerance: float | None = None,
 ) -> float:
-    """Boundary precision BP, 0..1: fraction of the labels' boundary points with a true boundary point near.
+    """Boundary precision BP, 0..1: fraction of the labels' boundary points that are near a true boundary point.
 
-    Parameters and errors as for `boundary_recall`; 1 if the labels have no boundary. Supervoxels cut where nothing
-    true ends, so theirs is low by design.
+    Parameters and errors are those of `boundary_recall`. BP is 1 if the labels have no boundary. That of supervoxels is
+    low by design, because they have boundaries within true segments.
     """
     return _graph_of_labelled(points, labels, truth, k).precision(labels, truth, hops=hops, tolerance=tolerance)
 
@@ -80,10 +80,10 @@ def _graph_of_labelled(points: ArrayLike, labels: ArrayLike, truth: ArrayLike, k
 
 @dataclass(frozen=True, eq=False)
 class NeighbourGraph(ShortRepr):
-    """The k nearest neighbours of each point of a cloud: computed once, good for any number of labellings.
+    """Graph of the k nearest neighbours of each point of a cloud: one serves any number of labellings.
 
-    The graph is directed: each point looks at its own k nearest neighbours, so that a boundary is equally thick
-    everywhere. Of neighbours at exactly equal distance any may be taken.
+    The graph is directed: each point has edges to its own k nearest neighbours, so a boundary is equally thick
+    everywhere. Of neighbours at exactly equal distance any may be chosen.
 
     Attributes
     ----------
@@ -92,9 +92,9 @@ class NeighbourGraph(ShortRepr):
     members : (m,) int64
         Flat indices of the points in the graph, ascending.
     points : (m, 3) float64
-        Their positions, in the unit and frame they came in.
+        Their positions, in the unit and frame of the input.
     neighbours : (m, k) int32
-        Rows of `members`: the nearest neighbours of each, itself left out; k is m - 1 in clouds that small.
+        Nearest neighbours of each point, without itself, as rows of `members`. In clouds of up to k points, k is m - 1.
     """
 
     shape: tuple[int, ...]
@@ -111,7 +111,7 @@ class NeighbourGraph(ShortRepr):
         points : (n, 3) or (h, w, 3) float
             Any unit and frame.
         valid : (n,) or (h, w) bool, optional
-            Points that take part, for example ``truth >= 0``; by default all finite points.
+            Points of the graph, for example ``truth >= 0``; by default all finite points.
         k : int, >= 1
 
         Raises
@@ -160,10 +160,11 @@ class NeighbourGraph(ShortRepr):
     def areas(self) -> NDArray[np.float64]:
         """Area of surface that each point of the graph represents, (m,), the points' unit squared.
 
-        12 sqrt(l1 l2) / (k (k + 1)), with l1, l2 the two larger eigenvalues of the sum of d d^T over the steps d to
-        the neighbours: noise across the surface drops out, and a slanted view changes nothing. Exact on a square
-        grid with k = 8 or 24; for points strewn at random 13 % too small with k = 8, 7 % with k = 24. Noise that
-        decides who is near makes it larger: on a Kinect cloud by 6 % with k = 8, and 1 % smaller with k = 24.
+        It is 12 sqrt(l1 l2) / (k (k + 1)), with l1 and l2 the two larger eigenvalues of the sum of d d^T over the steps
+        d to the neighbours. So noise across the surface does not count, and a slanted view changes nothing. It is exact
+        on a square grid with k = 8 or 24. For random points it is 13 % too small with k = 8, and 7 % with k = 24. If
+        noise changes which neighbours are nearest, the area changes: on a Kinect cloud it is 6 % larger with k = 8, and
+        1 % smaller with k = 24.
         """
         k = self.neighbours.shape[1]
         spread = np.zeros((len(self.points), 3, 3))
@@ -174,7 +175,7 @@ class NeighbourGraph(ShortRepr):
         return 12 * np.sqrt(larger.prod(axis=1)) / max(k * (k + 1), 1)
 
     def of_members(self, labels: ArrayLike) -> NDArray[np.int64]:
-        """Labels of the points in the graph, (m,) int64; raises as `boundary` does."""
+        """Labels of the points in the graph, (m,) int64; errors as of `boundary`."""
         given = as_labels(labels)
         if given.shape != self.shape:
             raise ValueError(f"expected labels of the points' shape {self.shape}, got {given.shape}")
@@ -184,19 +185,19 @@ class NeighbourGraph(ShortRepr):
         return own
 
     def boundary_of_members(self, labels: ArrayLike) -> NDArray[np.bool_]:
-        """Boundary points among the points in the graph, (m,) bool; raises as `boundary`."""
+        """Whether each point in the graph is a boundary point, (m,) bool; errors as of `boundary`."""
         own = self.of_members(labels)
         return (own[self.neighbours] != own[:, None]).any(axis=1)
 
     def within_hops(self, marked: NDArray[np.bool_], hops: int) -> NDArray[np.bool_]:
-        """Points of the graph from which a marked one is at most so many steps to a neighbour away, (m,) bool both."""
+        """Whether each point reaches one of `marked`, (m,) bool, in at most `hops` steps to neighbours; (m,) bool."""
         check_nearness(hops)
         for _ in range(hops):
             marked = marked | marked[self.neighbours].any(axis=1)
         return marked
 
     def _fraction_near(self, of: NDArray[np.bool_], to: NDArray[np.bool_], hops: int, tolerance: float | None) -> float:
-        """Fraction of the points `of` near a point of `to`; 1 if there are none, as then none is missed."""
+        """Fraction of the points `of` that are near a point of `to`; 1 if `of` is empty."""
         check_nearness(hops, tolerance)
         if not of.any():
             return 1.0
@@ -206,7 +207,7 @@ class NeighbourGraph(ShortRepr):
     def _within_distance(self, of: NDArray[np.bool_], to: NDArray[np.bool_], tolerance: float) -> NDArray[np.bool_]:
         if not to.any():
             return np.zeros(np.count_nonzero(of), bool)
-        bound = np.nextafter(tolerance, np.inf)  # the k-d tree finds what is nearer than the bound, not at it
+        bound = np.nextafter(tolerance, np.inf)  # the k-d tree leaves out points at the bound itself
         distances, _ = cKDTree(self.points[to]).query(self.points[of], distance_upper_bound=bound, workers=2)
         return np.isfinite(distances)
 
@@ -230,5 +231,5 @@ def _nearest(points: NDArray[np.float64], k: int) -> NDArray[np.int32]:
         return np.empty((len(points), 0), np.int32)
     _, found = cKDTree(points).query(points, k=k + 1, workers=2)
     itself = found == rows[:, None]
-    itself[~itself.any(axis=1), -1] = True  # among many duplicates a point need not be among its own nearest
+    itself[~itself.any(axis=1), -1] = True  # of many points at one place, each may find only others
     return found[~itself].reshape(len(points), k).astype(np.int32)

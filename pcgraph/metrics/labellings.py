@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two labellings of the same points: their contingency table and the metrics computed from it.
+"""Metrics of two labellings of the same points, from their contingency table.
 
-In the formulas S is a segment, G a true segment, N the number of points. The checks of labels at the end serve all
-metrics.
+In the formulas S is a segment, G a true segment, N the number of points. The checks of labels at the end are used by
+all metrics.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pcgraph.plumbing.short_repr import ShortRepr
 
 
 def contingency(labels: ArrayLike, truth: ArrayLike) -> coo_array:
-    """Contingency table: number of points per pair of segment and true segment, sparse (s, g) int64.
+    """Contingency table: number of points in each pair of a segment and a true segment, sparse (s, g) int64.
 
     Rows are segments, columns are true segments, both in ascending order of their labels.
 
@@ -59,7 +59,7 @@ def intersections_over_union(table: coo_array) -> NDArray[np.float64]:
 
 
 def largest_of_groups(values: NDArray[np.number], groups: NDArray[np.integer], n_groups: int) -> NDArray[np.float64]:
-    """Largest of the non-negative values of each group, (n_groups,) float64; 0 for groups without any."""
+    """Largest value of each group, (n_groups,) float64, of values >= 0; 0 for groups without any."""
     best = np.zeros(n_groups)
     np.maximum.at(best, groups, values)
     return best
@@ -77,8 +77,8 @@ def segmentation_covering(
     labels, truth : same shape, int
         Points negative in either are left out.
     matching : {"max", "one_to_one"}
-        "max": the match of a true segment is the segment of largest IoU.
-        "one_to_one": no segment matches twice; of such assignments the one with the largest sum.
+        "max": each true segment matches the segment of largest IoU.
+        "one_to_one": no segment matches twice; the assignment is the one with the largest sum.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def segmentation_covering(
 
 
 weighted_overlap = segmentation_covering
-"""Another name."""
+"""Another name of `segmentation_covering`."""
 
 
 def _best_assignment(table: coo_array, gains: NDArray[np.float64]) -> float:
@@ -103,8 +103,8 @@ def _best_assignment(table: coo_array, gains: NDArray[np.float64]) -> float:
     from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
     rows, columns = table.shape
-    # Each column (true segment) also gets a partner of its own that gains nothing, so that a full matching exists; one
-    # is added to every gain, which favours no pair, as SciPy takes a zero for a pair that does not exist.
+    # Each column (true segment) also has a partner of its own that gains nothing, so that a full matching exists. Gains
+    # are raised by one, which favours no pair, because SciPy takes a zero for a pair that does not exist.
     unmatched = np.arange(columns)
     scale = gains.max()
     weights = np.concatenate([1 + gains / scale, np.ones(columns)])
@@ -117,21 +117,21 @@ def _best_assignment(table: coo_array, gains: NDArray[np.float64]) -> float:
 def achievable_segmentation_accuracy(labels: ArrayLike, truth: ArrayLike) -> float:
     """Achievable segmentation accuracy ASA, 0..1 (Liu et al. 2011).
 
-    Fraction of points that are right if every segment is given the true segment that it overlaps most. 1 - ASA is the
-    undersegmentation error of Stutz et al. 2018. Raises as `contingency`.
+    It is the fraction of points that are right if every segment is assigned to the true segment that it overlaps most.
+    1 - ASA is the undersegmentation error of Stutz et al. 2018. Errors are those of `contingency`.
     """
     table = contingency(labels, truth)
     return float(largest_of_groups(table.data, table.row, table.shape[0]).sum() / table.data.sum())
 
 
 achievable_accuracy = achievable_segmentation_accuracy
-"""Another name."""
+"""Another name of `achievable_segmentation_accuracy`."""
 
 
 def oversegmentation_rate(labels: ArrayLike, truth: ArrayLike) -> float:
     """Oversegmentation rate Fos, 0..1: fraction of points outside the segment that overlaps their true segment most.
 
-    Richtsfeld et al. 2012. Raises as `contingency`.
+    Source: Richtsfeld et al. 2012. Errors are those of `contingency`.
     """
     table = contingency(labels, truth)
     return float(1 - largest_of_groups(table.data, table.col, table.shape[1]).sum() / table.data.sum())
@@ -140,9 +140,9 @@ def oversegmentation_rate(labels: ArrayLike, truth: ArrayLike) -> float:
 def undersegmentation_rate(labels: ArrayLike, truth: ArrayLike) -> float:
     """Undersegmentation rate Fus, >= 0 (Richtsfeld et al. 2012).
 
-    Points that the segment which overlaps a true segment most has outside of it, summed over the true segments, divided
-    by all points. Of segments that overlap equally the smallest counts. Can exceed 1: one segment of everything is
-    counted once per true segment. Raises as `contingency`.
+    For each true segment, the points outside of it count in the segment that overlaps it most; of segments that overlap
+    equally, in the smallest. Fus is the sum of these counts over the number of all points. It can exceed 1: one segment
+    of all points counts once per true segment. Errors are those of `contingency`.
     """
     table = contingency(labels, truth)
     found, true = segment_sizes(table)
@@ -189,8 +189,8 @@ def undersegmentation_error(
 def adjusted_rand_index(labels: ArrayLike, truth: ArrayLike) -> float:
     """Adjusted Rand index ARI, -0.5..1 (Hubert and Arabie 1985).
 
-    Agreement on which pairs of points share a segment, corrected for chance: 0 on average for random labels. Points
-    negative in either are left out. Raises as `contingency`.
+    It is the agreement on which pairs of points are in one segment, corrected for chance: 0 on average for random
+    labels. Points negative in either are left out. Errors are those of `contingency`.
     """
     table = contingency(labels, truth)
     found, true = segment_sizes(table)
@@ -201,11 +201,11 @@ def adjusted_rand_index(labels: ArrayLike, truth: ArrayLike) -> float:
 def adjusted_rand_from_pairs(
     together: NDArray[np.float64], found: NDArray[np.float64] | float, true: float, n_points: float
 ) -> NDArray[np.float64]:
-    """ARI from numbers of pairs of points: in one segment of both, of the labels, of the truth."""
+    """ARI from numbers of pairs of points: those in one segment of both labellings, of the labels, and of the truth."""
     everything = max(n_points * (n_points - 1) / 2, 1.0)
     chance = np.asarray(found * true / everything)
     best = np.asarray((found + true) / 2)
-    trivial = best == chance  # all in one segment, or each on its own, in both: they agree
+    trivial = best == chance  # in both all points are in one segment, or each is its own segment
     return np.where(trivial, 1.0, (together - chance) / np.where(trivial, 1.0, best - chance))
 
 
@@ -216,7 +216,7 @@ def count_point_pairs(counts: NDArray[np.int64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class VariationOfInformation:
-    """Variation of information VI as its two conditional entropies, bits, 0 at best.
+    """Variation of information VI, as its two conditional entropies, bits, 0 at best.
 
     Attributes
     ----------
@@ -238,7 +238,7 @@ class VariationOfInformation:
 def variation_of_information(labels: ArrayLike, truth: ArrayLike) -> VariationOfInformation:
     """Variation of information VI and its two conditional entropies, in bits (Meila 2007).
 
-    Points negative in either are left out. Raises as `contingency`.
+    Points negative in either are left out. Errors are those of `contingency`.
     """
     table = contingency(labels, truth)
     found, true = segment_sizes(table)
@@ -257,9 +257,9 @@ class PanopticQuality(ShortRepr):
     classes : (c,) int64
         Classes that occur in the labels or in the truth, ascending; one class 0 if none were given.
     matches, spurious, missed : (c,) int64
-        Pairs of one class with IoU > 0.5; segments and true segments in no such pair.
+        Number of pairs of one class with IoU > 0.5, of segments in no such pair, and of true segments in no such pair.
     overlap_sums : (c,) float64
-        Sum of the IoU of the matches.
+        Sums of the IoU of the matches.
     """
 
     classes: NDArray[np.int64]
@@ -269,7 +269,7 @@ class PanopticQuality(ShortRepr):
     overlap_sums: NDArray[np.float64]
 
     def __repr__(self) -> str:
-        """The three means, and how many classes."""
+        """The three means, and the number of classes."""
         return f"PanopticQuality(pq={self.pq:.3f}, sq={self.sq:.3f}, rq={self.rq:.3f}, classes={len(self.classes)})"
 
     @property
@@ -312,8 +312,8 @@ def panoptic_quality(
     labels, truth : same shape, int
         Points negative in either are left out.
     classes, true_classes : same shape, int, optional
-        Class of each point, >= 0, found and true; both or neither. Points of one label and two classes are two
-        segments. Without them all segments are of one class.
+        Found and true class of each point, >= 0; both or neither. Points of one label but two classes are two segments.
+        Without classes, all segments are of one class.
 
     Raises
     ------
@@ -355,7 +355,7 @@ def _checked_classes(classes: ArrayLike, inside: NDArray[np.bool_]) -> NDArray[n
 def _segments_of_one_class(
     labels: NDArray[np.int64], classes: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Number from 0 of each point's pair of label and class, (m,), and the class of each number."""
+    """Segment of each point, (m,), numbered from 0 by pairs of label and class; and the class of each segment."""
     label, _ = relabel_sequential(labels)
     class_rank, n_classes = relabel_sequential(classes)
     segment, n = relabel_sequential(label * n_classes + class_rank)
@@ -365,7 +365,7 @@ def _segments_of_one_class(
 
 
 def labelled(labels: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Labels and true labels, (m,) int64 each, of the points that have both; raises as `contingency`."""
+    """Labels and true labels, (m,) int64 each, of the points that have both; errors as of `contingency`."""
     found, true = as_labels(labels), as_labels(truth)
     if found.shape != true.shape:
         raise ValueError(f"expected labels and truth of one shape, got {found.shape} and {true.shape}")
@@ -376,7 +376,7 @@ def labelled(labels: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.int64], ND
 
 
 def as_labels(labels: ArrayLike) -> NDArray[np.int64]:
-    """Labels as int64, -1 where they are masked.
+    """Labels as int64; -1 where they are masked.
 
     Raises
     ------
@@ -393,7 +393,7 @@ def as_labels(labels: ArrayLike) -> NDArray[np.int64]:
 
 
 def as_floats(values: ArrayLike) -> NDArray[np.float64]:
-    """Values as float64, NaN where they are masked."""
+    """Values as float64; NaN where they are masked."""
     if isinstance(values, np.ma.MaskedArray):
         return np.ma.filled(values.astype(np.float64), np.nan)
     return np.asarray(values, np.float64)
@@ -401,7 +401,7 @@ def as_floats(values: ArrayLike) -> NDArray[np.float64]:
 
 def relabel_sequential(labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
     """Labels (m,) renumbered 0..s-1 in ascending order, and s."""
-    if labels.max() > 4 * len(labels) + 1024:  # sparse labels are sorted: a count of every number would take the memory
+    if labels.max() > 4 * len(labels) + 1024:  # sort sparse labels: a count of every number would take too much memory
         values, rank = np.unique(labels, return_inverse=True)
         return rank.astype(np.int64), len(values)
     present = np.bincount(labels) > 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scores and boundaries of all horizontal cuts of a tree at once; the best scales of several clouds, ODS and OIS."""
+"""Scores and boundaries of all horizontal cuts of a tree, in one pass; best scales of several clouds, ODS and OIS."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ class LevelCurve(ShortRepr):
     Attributes
     ----------
     score : str
-        Which score.
+        Name of the score.
     larger_is_better : bool
         False for errors.
     altitudes : (l,) float64, ascending
-        The cut from this altitude on, up to the next: all merges up to it are done. -inf for the leaves alone.
+        Altitude of each cut: all merges up to it are done. -inf for the leaves alone.
     regions : (l,) int64
-        Number of segments, those without labelled points counted.
+        Number of segments of each cut, also of those without labelled points.
     values : (l,) float64
-        The score.
+        Score of each cut.
     """
 
     score: str
@@ -50,18 +50,18 @@ class LevelCurve(ShortRepr):
 def level_curve(
     tree: TreeLike, leaves: ArrayLike, truth: ArrayLike, *, score: str = "segmentation_covering"
 ) -> LevelCurve:
-    """One score of every distinct horizontal cut, from one pass up the tree.
+    """One score of every distinct horizontal cut, by one pass up the tree.
 
     Parameters
     ----------
     tree : SegmentationTree, or pair (parents, altitudes)
         parents (k,) int: larger than the node's number, leaves first, the root its own parent. altitudes (k,) float:
-        not below those of the children; may be infinite. Those of the leaves do not matter.
+        not below those of the children; may be infinite. Altitudes of leaves do not count.
     leaves, truth : same shape, int
         Leaf and true label of each point; points negative in either are left out.
     score : str
         "segmentation_covering", "achievable_segmentation_accuracy", "undersegmentation_error", "adjusted_rand_index"
-        or "variation_of_information": the metric of that name, with its defaults. Or one of your own: `level_score`.
+        or "variation_of_information": the metric of that name, with its defaults. Or one of your own (`level_score`).
 
     Raises
     ------
@@ -84,13 +84,13 @@ class HorizontalCuts:
     Attributes
     ----------
     order : (t,) int64
-        Nodes other than leaves, in the order in which they are merged: by altitude, then by number.
+        Nodes other than leaves, in the order of merging: by altitude, then by number.
     n_merges : (l,) int64
-        Number of these merges that are done in each cut; 0 first.
+        Number of these merges that are done in each cut, from 0.
     altitudes : (l,) float64, ascending
-        A cut holds from its altitude on, up to the next; -inf first.
+        Altitude of each cut, up to the next; the first is -inf.
     regions : (l,) int64
-        Segments of each cut.
+        Number of segments of each cut.
     """
 
     order: NDArray[np.int64]
@@ -126,11 +126,11 @@ class HorizontalCuts:
 # Scores of levels -----------------------------------------------------------------------------------------------------
 
 AfterMerges = Callable[[NodeTable, NDArray[np.int64]], NDArray[np.float64]]
-"""Table and nodes in order of merging (t,) to the score before any merge and after each, (t + 1,) float64."""
+"""Function of a table and the nodes in order of merging, (t,): the score before any merge and after each, (t + 1,)."""
 
 
 class LevelScore(NamedTuple):
-    """A score that `level_curve` knows."""
+    """A score that `level_curve` can compute."""
 
     name: str
     larger_is_better: bool
@@ -138,15 +138,15 @@ class LevelScore(NamedTuple):
 
 
 LEVEL_SCORES: dict[str, LevelScore] = {}
-"""The scores by their names; `level_score` adds to them."""
+"""Scores by their names; `level_score` adds scores."""
 
 
 def level_score(name: str, *, larger_is_better: bool, alias: str | None = None) -> Callable[[AfterMerges], AfterMerges]:
-    """Decorator that adds a function to the scores of `level_curve`, under a name and an alias, if any.
+    """Decorator that adds a function to the scores of `level_curve`, under a name and perhaps an alias.
 
-    The function takes a `NodeTable` and the nodes other than leaves in the order in which they merge, (t,) int64. It
-    returns the score of the leaves and after each merge, (t + 1,) float64. A score that is a sum over segments takes
-    one line: ``return table.sums_over_cuts(order, values)`` with the values of all nodes, (k,).
+    The function takes a `NodeTable`, and the nodes other than leaves in the order of merging, (t,) int64. It returns
+    the score of the leaves alone and after each merge, (t + 1,) float64. A score that is a sum over segments is one
+    line: ``return table.sums_over_cuts(order, values)``, with the values of all nodes, (k,).
     """
 
     def add(after_merges: AfterMerges) -> AfterMerges:
@@ -175,7 +175,7 @@ def _undersegmentation_of_cuts(table: NodeTable, order: NDArray[np.int64]) -> ND
 
 @level_score("adjusted_rand_index", larger_is_better=True)
 def _rand_index_of_cuts(table: NodeTable, order: NDArray[np.int64]) -> NDArray[np.float64]:
-    """ARI from the pairs of points in one segment, and in one segment and one true segment."""
+    """ARI: a segment adds its pairs of points, and those of them that are in one true segment."""
     together = table.sums_over_cuts(order, table.sum_of_nodes(count_point_pairs(table.cells.counts)))
     found = table.sums_over_cuts(order, count_point_pairs(table.node_sizes))
     true = float(count_point_pairs(table.true_sizes).sum())
@@ -193,7 +193,7 @@ def _information_of_cuts(table: NodeTable, order: NDArray[np.int64]) -> NDArray[
 
 @level_score("segmentation_covering", larger_is_better=True, alias="weighted_overlap")
 def _covering_of_cuts(table: NodeTable, order: NDArray[np.int64]) -> NDArray[np.float64]:
-    """SC: not a sum over segments, but of the largest IoU of each true segment, which a segment tree keeps."""
+    """SC: a sum over true segments of their largest IoU, for which each true segment has a segment tree."""
     leaf_cells = table.cells.segments[: table.cells.starts[table.n_leaves]]
     places = np.empty(len(leaf_cells), np.int64)
     places[np.argsort(leaf_cells, kind="stable")] = np.arange(len(leaf_cells))
@@ -209,8 +209,8 @@ class SegmentTrees(NamedTuple):
     Attributes
     ----------
     maxima : (2 q,) float64
-        Tree i begins at 2 begins[i]: an unused place, the maximum of all, then the maxima of halves, quarters, ..., and
-        last its values. q is the number of values of all trees.
+        Tree i begins at 2 begins[i] with an unused place and the maximum of all of its values. Maxima of halves,
+        quarters and so on follow, and at the end the values. q is the number of values of all trees.
     begins : (g + 1,) int64
         Tree i has begins[i + 1] - begins[i] values.
     """
@@ -231,8 +231,8 @@ def _sums_of_best_overlaps(
 ) -> NDArray[np.float64]:
     """Sum of size times best overlap over the true segments, before any merge and after each, (t + 1,).
 
-    Each cell of the cut's nodes holds a place in the tree of its true segment: leaves have those given, and a merged
-    cell takes the place of one of the cells that it came from.
+    Each cell of the cut's nodes has a place in the tree of its true segment. The places of leaves are given. A merged
+    cell takes the place of one of the cells of which it is made.
     """
     places = np.full(len(cells.above), -1)
     places[: len(leaf_places)] = leaf_places
@@ -259,7 +259,7 @@ def _sums_of_best_overlaps(
 
 @kernel
 def _update(trees: SegmentTrees, segment: int, place: int, value: float) -> float:
-    """Set a value of a segment tree; returns the change of the tree's maximum."""
+    """Set a value of a segment tree, and return the change of the tree's maximum."""
     n = trees.begins[segment + 1] - trees.begins[segment]
     base = 2 * trees.begins[segment]
     at = n + place - trees.begins[segment]
@@ -281,11 +281,11 @@ class BoundaryCurve(ShortRepr):
     Attributes
     ----------
     altitudes : (l,) float64, ascending
-        As in `LevelCurve`.
+        Altitude of each cut, as in `LevelCurve`.
     regions : (l,) int64
-        Number of segments.
+        Number of segments of each cut.
     recall, precision : (l,) float64
-        0..1; as `boundary_recall` and `boundary_precision` of the cut.
+        `boundary_recall` and `boundary_precision` of each cut, 0..1.
     """
 
     altitudes: NDArray[np.float64]
@@ -308,19 +308,19 @@ def boundary_curve(
 ) -> BoundaryCurve:
     """Boundary recall and precision of every distinct horizontal cut.
 
-    A point is a boundary point of all cuts below its saliency, the altitude at which the last of its neighbours merges
-    with it; so one number per point answers for all cuts.
+    A point is a boundary point of all cuts below its saliency, which is the altitude at which the last of its
+    neighbours merges with it. So one number per point is enough for all cuts.
 
     Parameters
     ----------
     graph : NeighbourGraph
-        Of the points that have a leaf and a true label.
+        Graph of the points that have a leaf and a true label.
     tree : SegmentationTree, or pair (parents, altitudes)
         As for `level_curve`.
     leaves, truth : (n,) or (h, w) int
         Leaf and true label of each point, >= 0 for those in the graph.
     hops : int, >= 0
-        Near is within as many steps from neighbour to neighbour.
+        Points are near within so many steps from neighbour to neighbour.
 
     Raises
     ------
@@ -348,7 +348,7 @@ def boundary_curve(
 def _saliency(
     neighbours: NDArray[np.int32], leaf: NDArray[np.int64], parents: NDArray[np.int32], altitudes: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Altitude at which the last neighbour of each point merges with it, (m,); -inf if all are of its leaf."""
+    """Altitude at which the last neighbour of each point merges with it, (m,); -inf if all are in its leaf."""
     n_leaves = num_leaves(parents)
     saliency = np.full(len(leaf), -np.inf)
     point, side = np.nonzero(leaf[neighbours] != leaf[:, None])
@@ -373,13 +373,13 @@ class BestScales(ShortRepr):
     Attributes
     ----------
     ods, ois : float
-        Means over the clouds, each cloud counting once.
+        Means of the scores over the clouds.
     ods_altitude : float
-        The common altitude, the lowest of equally good ones.
+        The common altitude; of equally good ones the lowest.
     ois_altitudes : (c,) float64
-        The altitude of each cloud, likewise.
+        The best altitude of each cloud; of equally good ones the lowest.
     ois_values : (c,) float64
-        The score of each cloud there.
+        The score of each cloud at its best altitude.
     """
 
     ods: float
@@ -392,7 +392,7 @@ class BestScales(ShortRepr):
 def best_scales(curves: Sequence[LevelCurve]) -> BestScales:
     """Optimal dataset scale ODS and optimal image scale OIS of the curves of several clouds, over all distinct cuts.
 
-    Arbelaez et al. 2011; images are clouds here.
+    Source: Arbelaez et al. 2011, whose images are clouds here.
 
     Raises
     ------
@@ -412,5 +412,5 @@ def best_scales(curves: Sequence[LevelCurve]) -> BestScales:
 
 
 def _first_largest(values: NDArray[np.float64]) -> int:
-    """Index of the first value that is the largest, but for the rounding of sums."""
+    """Index of the first value that is the largest, up to 1e-12, which is well above the rounding of sums."""
     return int(np.argmax(values >= values.max() - 1e-12))

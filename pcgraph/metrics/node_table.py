@@ -26,18 +26,18 @@ class HasParentsAndAltitudes(Protocol):
 
 
 TreeLike = HasParentsAndAltitudes | tuple[ArrayLike, ArrayLike]
-"""What the metrics take as a tree: a `SegmentationTree`, or the pair (parents, altitudes).
+"""A tree, as metrics take it: a `SegmentationTree`, or the pair (parents, altitudes).
 
 parents : (k,) int
     Parent of each node, larger than the node's own number; the root, last, is its own parent. Leaves come first.
 altitudes : (k,) float
-    Not below those of the children; may be infinite. Those of the leaves do not matter. Metrics that score nodes rather
-    than cuts do not look at them.
+    Not below those of the children; may be infinite. Altitudes of leaves do not count. Metrics of nodes, in place of
+    cuts, use no altitudes.
 """
 
 
 def parents_and_altitudes(tree: TreeLike) -> tuple[NDArray[np.int32], ArrayLike]:
-    """Parents (k,) int32, checked, and altitudes of a tree, as they are.
+    """Parents of a tree, (k,) int32, checked, and its altitudes, unchecked.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def parents_and_altitudes(tree: TreeLike) -> tuple[NDArray[np.int32], ArrayLike]
 
 
 class Cells(NamedTuple):
-    """Cells of a sparse contingency table of nodes and true segments, p in the order of the nodes.
+    """Cells of a sparse contingency table of nodes and true segments: p cells, in the order of the nodes.
 
     Attributes
     ----------
@@ -65,9 +65,9 @@ class Cells(NamedTuple):
     segments : (p,) int32
         True segment of each cell, 0..g-1 in ascending order of the true labels.
     counts : (p,) int64
-        Points of the node in that segment, > 0.
+        Number of points of the node in that segment, > 0.
     above : (p,) int64
-        Cell of the parent that contains this one; -1 at the root.
+        Cell of the parent that contains each cell; -1 at the root.
     """
 
     starts: NDArray[np.int64]
@@ -78,9 +78,9 @@ class Cells(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class NodeTable:
-    """Number of points in each pair of a tree's node and a true segment, for all pairs that have any.
+    """Number of points in each pair of a tree's node and a true segment, for all pairs that have points.
 
-    There are at most k times g cells, for balanced trees far fewer.
+    There are at most k times g cells; balanced trees have far fewer.
 
     Attributes
     ----------
@@ -89,9 +89,9 @@ class NodeTable:
     children : ChildLists
     cells : Cells
     node_sizes : (k,) int64
-        Points per node.
+        Number of points of each node.
     true_sizes : (g,) int64
-        Points per true segment.
+        Number of points of each true segment.
     """
 
     parents: NDArray[np.int32]
@@ -159,12 +159,12 @@ class NodeTable:
         return largest_of_groups(values, self.nodes, len(self.parents))
 
     def sums_over_cuts(self, order: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sum of the nodes' values (k,) over the segments of a cut: of the leaves, and after each merge, (t + 1,).
+        """Sum of the nodes' values (k,) over the segments of each cut: the leaves, and after each merge, (t + 1,).
 
         Parameters
         ----------
         order : (t,) int64
-            Nodes other than leaves in the order in which they are merged.
+            Nodes other than leaves in the order of merging.
         values : (k,) float64
         """
         of_children = np.bincount(self.parents[:-1], values[:-1], len(values))
@@ -188,7 +188,7 @@ def _accumulate_cells(
     segments, counts = np.empty(capacity, np.int32), np.empty(capacity, np.int64)
     above = np.full(capacity, -1)
     segments[:end], counts[:end] = leaf_segments, leaf_counts
-    cell_of = np.full(n_true, -1)  # this node's cell of each true segment; a cell of an earlier node if below `start`
+    cell_of = np.full(n_true, -1)  # this node's cell of each true segment; numbers below `start` are of earlier nodes
     for node in range(n_leaves, k):
         start = end
         if end + n_true > capacity:

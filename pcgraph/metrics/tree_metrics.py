@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metrics of whole trees: the best nodes, the best cuts of any kind, and the purity of the nodes.
 
-Those of horizontal cuts are in `level_curves`.
+Metrics of horizontal cuts are in `level_curves`.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from pcgraph.plumbing.short_repr import ShortRepr
 def tree_oracle(tree: TreeLike, leaves: ArrayLike, truth: ArrayLike) -> float:
     """Segmentation covering, 0..1, if each true segment takes the node of largest IoU in the whole tree.
 
-    No cut does better, horizontal or not ("Best" of Arbelaez et al. 2011).
+    No cut has a higher covering, horizontal or not ("Best" of Arbelaez et al. 2011).
 
     Parameters
     ----------
     tree : SegmentationTree, or pair (parents, altitudes)
-        parents (k,) int: larger than the node's number, leaves first, the root its own parent. Altitudes do not matter.
+        parents (k,) int: larger than the node's number, leaves first, the root its own parent. Altitudes do not count.
     leaves, truth : same shape, int
         Leaf and true label of each point; points negative in either are left out.
 
@@ -42,11 +42,11 @@ def tree_oracle(tree: TreeLike, leaves: ArrayLike, truth: ArrayLike) -> float:
 
 
 def dendrogram_purity(tree: TreeLike, leaves: ArrayLike, truth: ArrayLike) -> float:
-    """Dendrogram purity, 0..1, its exact expectation (Heller and Ghahramani 2005).
+    """Dendrogram purity, 0..1 (Heller and Ghahramani 2005), exactly, without sampling of pairs.
 
-    Mean over all pairs of points of one true segment of the fraction of that segment in the lowest common ancestor of
-    the two points, which is the leaf for points of one leaf. 1 if there is no such pair. Parameters and errors as
-    `tree_oracle`.
+    For each pair of points of one true segment, take the fraction of that segment in the lowest common ancestor of the
+    two points, which is the leaf for points of one leaf. The purity is the mean over all such pairs, or 1 if there are
+    none. Parameters and errors are those of `tree_oracle`.
     """
     table = NodeTable.of(tree, leaves, truth)
     cells = table.cells
@@ -66,7 +66,7 @@ class FragmentationCurve(ShortRepr):
     Attributes
     ----------
     regions : (r,) int64, ascending from 1
-        Numbers of regions that some cut has; all from 1 on in a binary tree.
+        Numbers of regions that some cut has; in a binary tree all from 1 on.
     errors : (r,) float64
         Least error of a cut, horizontal or not, into exactly so many regions, 0..1.
     """
@@ -90,9 +90,9 @@ def fragmentation_curve(
     tree, leaves, truth
         As for `tree_oracle`.
     measure : {"consistency", "hamming", "covering"}
-        Error is 1 less the sum over regions S, over N, of: sum over G of n min(n / |S|, n / |G|) with n =
-        |S and G| (bidirectional consistency); max over G of n (directional Hamming); or |S| max over G of
-        IoU(S, G) (directional covering, of the regions by the truth).
+        The error is 1 less the sum of the terms of all regions S, over N. With n = |S and G|, the term is the sum over
+        G of n min(n / |S|, n / |G|) (bidirectional consistency), the maximum over G of n (directional Hamming), or |S|
+        times the maximum over G of IoU(S, G) (directional covering, of the regions by the truth).
     max_regions : int, >= 1
 
     Raises
@@ -111,7 +111,7 @@ def fragmentation_curve(
 
 
 def _scores_of_nodes(table: NodeTable, measure: str) -> NDArray[np.float64]:
-    """What each node adds to the measure as a region, (k,)."""
+    """Term of each node in the measure, as a region, (k,)."""
     counts = table.cells.counts.astype(np.float64)
     if measure == "hamming":
         return table.largest_of_nodes(counts)
@@ -127,10 +127,10 @@ def _scores_of_nodes(table: NodeTable, measure: str) -> NDArray[np.float64]:
 def _optimal_cuts(
     scores: NDArray[np.float64], children: ChildLists, leaf_counts: NDArray[np.int64], limit: int
 ) -> NDArray[np.float64]:
-    """Largest sum of scores of a cut into 1, 2, ... regions, (at most limit,); -inf where there is none.
+    """Largest sum of scores of a cut into 1, 2, ... regions, (at most limit,); -inf where there is no such cut.
 
-    A node with l leaves has at most l regions, so the results of all nodes in progress fit into n_leaves places: those
-    of a node begin at the first of its leaves in depth-first order.
+    A node with l leaves has at most l regions, so the results of all nodes in progress fit into n_leaves places. Those
+    of a node begin at the place of its first leaf in depth-first order.
     """
     k, n_leaves = len(scores), leaf_counts[-1]
     begins = np.zeros(k, np.int64)
@@ -156,7 +156,7 @@ def _optimal_cuts(
 
 @kernel
 def _combine(left: NDArray[np.float64], right: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """Write the best sums of a cut of one part with a cut of the other, by the number of regions of both."""
+    """Set `out` to the best sums of a cut of one part and a cut of the other, by the number of regions of both."""
     out[:] = -np.inf
     for i in range(len(left)):
         for j in range(min(len(right), len(out) - 1 - i)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of supervoxels that need no truth: compactness of their shape, variation of values that they explain."""
+"""Metrics of supervoxels that need no truth: compactness of shape, and explained variation of values."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from pcgraph.metrics.labellings import as_floats, as_labels, relabel_sequential
 
 
 def compactness(points: ArrayLike | NeighbourGraph, labels: ArrayLike, *, k: int = 24) -> float:
-    """Compactness CO, 0..1: mean over the points of how close their segment is to a disc of the same area.
+    """Compactness CO, 0..1: mean over the points of the circularity of their segment, which is 1 for a disc.
 
-    Schick et al. 2012 take 4 pi area / perimeter^2, but the perimeter of a patch of points, some of it at depth
-    edges, depends on the sampling. This takes the circularity of Zunic et al. 2010 from second moments instead:
-    area / (2 pi mean square distance from the centroid), 1 for a disc, 3 / pi for a square, less for anything
-    stretched, ragged, with holes or in pieces; every point counts with the area that it represents. Where bending
-    gives more than 1 (4 / 3 for a hemisphere), 1 is taken.
+    Schick et al. 2012 take 4 pi area / perimeter^2. But the perimeter of a patch of points, some of it at depth edges,
+    depends on the sampling. So this is the circularity of Zunic et al. 2010, from second moments: area / (2 pi mean
+    square distance from the centroid). It is 1 for a disc, 3 / pi for a square, and less for segments that are
+    stretched, ragged, with holes or in pieces. Every point is weighted by the area that it represents. Bent segments
+    can have more than 1 (a hemisphere 4 / 3), which counts as 1.
 
     Parameters
     ----------
     points : (n, 3) or (h, w, 3) float, or NeighbourGraph
-        Any frame and unit; a graph saves the search for neighbours, and its own k holds.
+        Any frame and unit. A graph, with its own k, saves the search for neighbours.
     labels : (n,) or (h, w) int
-        Points negative are left out; with a graph there must be none among its points.
+        Points with negative labels are left out; a graph must have none of them.
     k : int, >= 1
-        Neighbours from which areas are estimated, if no graph is given.
+        Number of neighbours from which areas are estimated, if no graph is given.
 
     Raises
     ------
     ValueError
-        The shapes differ, labels are not whole numbers, a point that takes part is not finite, or none takes part.
+        The shapes differ, labels are not whole numbers, a labelled point is not finite, or no point is labelled.
     """
     graph = points if isinstance(points, NeighbourGraph) else NeighbourGraph.of(points, as_labels(labels) >= 0, k)
     segment, n = relabel_sequential(graph.of_members(labels))
@@ -42,13 +42,13 @@ def compactness(points: ArrayLike | NeighbourGraph, labels: ArrayLike, *, k: int
 def _circularity(
     points: NDArray[np.float64], areas: NDArray[np.float64], segment: NDArray[np.int64], n: int
 ) -> NDArray[np.float64]:
-    """Circularity of each segment, (n,), 0..1; 0 for lines, and 1 where all points lie in one place."""
+    """Circularity of each segment, (n,), 0..1: 0 for a line, 1 for points at one place."""
     area = np.bincount(segment, areas, n)
     weights = np.where(area[segment] > 0, areas, 1.0)
     whole = np.bincount(segment, weights, n)
     centroids = np.stack([np.bincount(segment, weights * axis, n) for axis in points.T], axis=1) / whole[:, None]
     squares = ((points - centroids[segment]) ** 2).sum(axis=1)
-    # A point is a small disc of its area, with a second moment of its own.
+    # Each point is a small disc of its area, which has a second moment of its own.
     moment = np.bincount(segment, weights * (squares + areas / (2 * np.pi)), n) / whole
     somewhere = moment > 0
     return np.where(somewhere, np.minimum(1.0, area / (2 * np.pi * np.where(somewhere, moment, 1.0))), 1.0)
@@ -60,9 +60,9 @@ def explained_variation(values: ArrayLike, labels: ArrayLike) -> float:
     Parameters
     ----------
     values : (n,), (n, c), (h, w) or (h, w, c) float
-        Colours, normals or positions; the unit drops out if all channels share it.
+        Colours, normals or positions. The unit does not count, if all channels have the same.
     labels : (n,) or (h, w) int
-        Points negative are left out.
+        Points with negative labels are left out.
 
     Returns
     -------

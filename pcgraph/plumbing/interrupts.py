@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ending a command with one line on SIGINT, SIGTERM or SIGHUP, whatever it is doing.
+"""Ending a command on SIGINT, SIGTERM or SIGHUP, with one line of text, whatever the command is doing.
 
-Python runs signal handlers between two bytecodes of the main thread, and an exception that a handler raises can be
-swallowed: by an import half done, by a compiler that calls back, by a destructor. So the handlers here do nothing. A
+Python runs signal handlers between two bytecodes of the main thread. An exception that a handler raises can be
+swallowed by an unfinished import, a compiler that calls back, or a destructor. So the handlers here do nothing. A
 thread waits for the signal's number on a pipe (`signal.set_wakeup_fd`) and ends the process, also while the main thread
-is busy in compiled code that has released the interpreter lock.
+runs compiled code that has released the interpreter lock.
 
-A process whose work is done exits at once. Python's own shutdown takes up to half a second with large libraries and
-removes the handlers first, so a signal during it would kill the process without a word.
+A process whose work is done exits at once. Python's own shutdown takes up to half a second with large libraries, and
+removes the handlers first, so a signal during the shutdown would kill the process without a message.
 
-Only the standard library is imported, so that this can come before every other import.
+This module imports only the standard library, so that it can come before every other import.
 """
 
 from __future__ import annotations
@@ -24,23 +24,25 @@ import time
 from collections.abc import Callable, Iterator
 
 handled = False
-"""Whether a thread of this module ends the process on a signal, whatever the others do."""
+"""Whether a thread of this module ends the process on a signal."""
 removers: list[Callable[[], bool]] = []
 """Functions that remove work in progress, called before the process ends, the last one first. Each returns whether
 there was any."""
 LOST_OUTPUT = 120
-"""Exit status of a command whose last output could not be written; 120 is Python's own status for that."""
+"""Exit status of a command whose last output could not be written: 120, as in Python itself."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 """Signals that end a command. Windows has no SIGHUP."""
 
 
 def end_on_signals(program: str, writes: bool) -> None:
-    """Make the signals remove work in progress, print one line, and end the process with status 130, 143 or 129.
+    """Make signals remove work in progress, print one line, and end the process with status 130, 143 or 129.
 
     Parameters
     ----------
-    program : name at the beginning of the line. writes : whether the command writes files; if so, the line says what
-    became of them.
+    program : str
+        Name at the beginning of the line.
+    writes : bool
+        Whether the command writes files. If so, the line says what became of them.
     """
     _open_standard_streams()
     reader, writer = os.pipe()
@@ -49,16 +51,16 @@ def end_on_signals(program: str, writes: bool) -> None:
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:  # nohup and the like
             signal.signal(number, lambda *_: None)
-    atexit.register(_leave)  # before anybody else, so that it comes last
+    atexit.register(_leave)  # registered first, so that it is called last
     global handled
     handled = True
     threading.Thread(target=_wait, args=(reader, os.dup(2), program, writes), name="interrupts", daemon=True).start()
 
 
 def _open_standard_streams() -> None:
-    """Open the standard streams that the parent closed (`>&-`).
+    """Open the standard streams that the parent has closed (`>&-`).
 
-    Otherwise a file that is opened later takes the number of a stream, and what libraries print goes into the file.
+    Otherwise a file that is opened later gets the number of a stream, and libraries print into the file.
     """
     for descriptor in (0, 1, 2):
         try:
@@ -72,7 +74,7 @@ def _open_standard_streams() -> None:
 
 
 def run(command: Callable[[], None]) -> None:
-    """Run a command as the last thing that the process does, and keep its exit status for the end of the process."""
+    """Run a command, the last work of the process, and keep its exit status for the end of the process."""
     global _status
     try:
         command()
@@ -85,11 +87,11 @@ def run(command: Callable[[], None]) -> None:
 
 _ending = threading.Event()
 _end_lock = threading.Lock()
-"""The lock of whoever ends the process: the thread that waits for signals, or the main thread."""
+"""The lock of the thread that ends the process: the one that waits for signals, or the main thread."""
 _status: int | None = None
-"""Exit status of the process once its command has ended; None before, and after an error that Python has to print."""
+"""Exit status of the process after its command has ended; None before, and after an error that Python has to print."""
 _written = 0
-"""Files and directories that this process has written."""
+"""Count of the files and directories that this process has written, so that the last line can say if there are none."""
 
 
 def count() -> None:
@@ -100,7 +102,7 @@ def count() -> None:
 
 @contextlib.contextmanager
 def holding(lock: threading.RLock) -> Iterator[None]:
-    """Hold a lock; keep it for ever if the process is about to end, so that no other thread begins new work."""
+    """Hold a lock; never release it if the process is about to end, so that no other thread begins new work."""
     lock.acquire()
     try:
         yield
@@ -112,14 +114,14 @@ def holding(lock: threading.RLock) -> Iterator[None]:
 def _leave() -> None:
     """End the process if its command has ended and no signal has come; wait if one has.
 
-    Everything else that was registered with `atexit` has run by now. The main thread of an interrupted command fails,
-    because its work is removed: it must not end the process with an error of its own.
+    All other functions registered with `atexit` have run by now. The main thread of an interrupted command fails,
+    because its work is removed; it must not end the process with an error of its own.
     """
     status = _status
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
-        except (OSError, ValueError):  # nobody reads any more, or the disk is full
+        except (OSError, ValueError):  # the reader has closed the pipe, or the disk is full
             status = status or LOST_OUTPUT
     with _end_lock:
         if status is not None and not _ending.is_set():
@@ -137,13 +139,13 @@ def _wait(reader: int, screen: int, program: str, writes: bool) -> None:
 
 
 def _end(number: int, screen: int, program: str, writes: bool) -> None:
-    """End the process. `screen` is stderr as it was at the start: it may be redirected now to keep libraries quiet."""
+    """End the process; `screen` is the stderr of the start, since libraries may be kept quiet by another one."""
     with _end_lock:
         _ending.set()
     try:
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.flush()
-        clear = "\r\x1b[2K\x1b[?25h" if os.isatty(screen) else ""  # a progress bar hides the cursor
+        clear = "\r\x1b[2K\x1b[?25h" if os.isatty(screen) else ""  # a progress bar may have hidden the cursor
         _silence_others()
         began = sum(remove() for remove in reversed(removers))
         text = "; nothing was written" if writes and (began or not _written) else ""
@@ -154,7 +156,7 @@ def _end(number: int, screen: int, program: str, writes: bool) -> None:
 
 
 def _silence_others() -> None:
-    """Discard all further output: the main thread may fail and print an error, because its work is removed."""
+    """Discard all further output, because the main thread may fail, as its work is removed, and print an error."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)

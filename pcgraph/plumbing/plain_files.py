@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading single files only if they are plain, and writing them whole or not at all.
+"""Reading files only if they are plain, and writing them whole or not at all.
 
-Only the standard library is imported, as the entry points of both packages need this before anything else.
+This module imports only the standard library, because the entry points of both packages need it before anything else.
 """
 
 from __future__ import annotations
@@ -27,12 +27,14 @@ DISK = {errno.ENOSPC: "no space left on the device", errno.EDQUOT: "the disk quo
         errno.EFBIG: "the file would be larger than allowed", errno.EROFS: "the file system is read-only",
         errno.EIO: "the device fails"}  # fmt: skip
 """Reasons why a disk takes no more data, by error number."""
-_LONGEST_NAME = 255
-"""Bytes of a file's name that common file systems allow; a temporary file of a longer one is named by a digest."""
+_MAX_NAME = 255
+"""Most bytes of a file's name, from the limit of common file systems. If the name of a temporary file would be longer,
+it has a digest in place of the name."""
 _SEALED_WITHIN = 400
-"""Bytes at the beginning, or at the end, of a file in which its seal is searched: writers put it there."""
+"""Bytes at the beginning, or at the end, of a file that are searched for its seal, because writers put it there."""
 _BLOCK = 1 << 20
-"""Bytes that are read and hashed at a time, so that a large file does not have to fit into memory."""
+"""Bytes that are read and hashed at a time, so that a large file does not have to fit into memory. Chosen by eye; not
+varied."""
 _PART = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{16}\.part")
 
 
@@ -40,13 +42,13 @@ _PART = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{16}\.part")
 
 
 def check_file(path: str | Path, error: type[Exception]) -> None:
-    """Raise `error` unless `path` is a plain file or a link to one: a pipe may never answer, a device may never end."""
+    """Raise `error` unless `path` is a plain file, or a link to one: pipes may never answer, devices may never end."""
     path = Path(path)
     try:
         if path.is_file():
             return
         reason = "it is no plain file" if path.exists() else "No such file or directory"
-    except (OSError, ValueError) as problem:  # a loop of links; a name that cannot be
+    except (OSError, ValueError) as problem:  # a loop of links, or an impossible name
         reason = getattr(problem, "strerror", None) or str(problem)
     raise error(f"cannot read {path}: {reason}.")
 
@@ -74,7 +76,7 @@ def is_plain_file(path: Path) -> bool:
 
 
 def unsealed(mark: str) -> str:
-    """The text that stands in a file where `sealed` will put its seal; it has only letters that any format takes."""
+    """Text in the place where `sealed` will put the seal of a file; it has only characters that any format takes."""
     return f"{mark} sha256 {'0' * 64}"
 
 
@@ -96,7 +98,7 @@ def sealed(content: bytes, mark: str, at_end: bool = False) -> bytes:
 
 
 def is_sealed(path: Path, mark: str, at_end: bool = False) -> bool:
-    """Whether a file has a seal in its first 400 bytes, or its last with `at_end`, and the content that was sealed."""
+    """Whether a file has a seal in its first 400 bytes (with `at_end` in its last), and still the sealed content."""
     with path.open("rb") as stream:
         start = max(0, stream.seek(0, os.SEEK_END) - _SEALED_WITHIN) if at_end else 0
         stream.seek(start)
@@ -124,16 +126,16 @@ def write_file(path: Path, content: bytes, error: type[Exception], make_parents:
 
 
 def write_files(contents: Mapping[Path, bytes], error: type[Exception], make_parents: bool = False) -> None:
-    """Write files so that a reader finds the old content of each or the new one, never a part, also after a crash.
+    """Write files so that a reader finds the old or the new content of each, never a part, also after a crash.
 
-    Older files are replaced. So a caller passes names that the user gave; a caller that makes up names first checks
-    whose a file is. No file is replaced before all are on the disk, and a signal leaves all or none. Links are written
-    through. Temporary files that killed processes left beside the files are removed.
+    Older files are replaced. So names must come from the user, or the caller must first check that a file is its own.
+    No file is replaced before all are on the disk, and a signal leaves all or none. Links are followed. Temporary files
+    that killed processes left beside the files are removed.
 
     Raises
     ------
     error
-        A place is no plain file, there is no such directory, or the disk is full.
+        A path is no plain file, its directory does not exist, or the disk is full.
     """
     for path in contents:
         target = Path(os.path.realpath(path))
@@ -162,7 +164,7 @@ def write_files(contents: Mapping[Path, bytes], error: type[Exception], make_par
 
 
 def replace_file(target: Path, content: bytes) -> None:
-    """Put `content` in the place of a plain file, or where none is, whole or not at all; OSError if that fails."""
+    """Write `content` to a plain file, new or old, whole or not at all; OSError if that fails."""
     part = _Part(target)
     try:
         part.write(content)
@@ -172,20 +174,20 @@ def replace_file(target: Path, content: bytes) -> None:
 
 
 class _Part:
-    """A temporary file beside the place of a file, with its new content. It is locked while it is written."""
+    """A temporary file beside a file, with the file's new content; it is locked while it is written."""
 
     def __init__(self, named: Path) -> None:
         self.named, target = named, Path(os.path.realpath(named))
         digest = hashlib.sha256(os.fsencode(target.name)).hexdigest()
-        self.names = {target.name, digest}  # the names in the temporary files that killed processes may have left
+        self.names = {target.name, digest}  # names in temporary files that killed processes may have left
         self.target = target
         self.path = target.with_name(f".{target.name}.{os.urandom(8).hex()}.part")
-        if len(os.fsencode(self.path.name)) > _LONGEST_NAME:
+        if len(os.fsencode(self.path.name)) > _MAX_NAME:
             self.path = target.with_name(f".{digest}.{os.urandom(8).hex()}.part")
         self.made: list[Path] = []
 
     def write(self, content: bytes, make_parents: bool = False) -> None:
-        """Write and flush the file; its directory is made if need be."""
+        """Write and flush the temporary file; its directory is made if need be."""
         with _lock:
             if make_parents:
                 self.made = [parent for parent in self.target.parents if not parent.exists()]
@@ -204,16 +206,16 @@ class _Part:
             os.chmod(self.path, stat.S_IMODE(self.target.stat().st_mode))
 
     def place(self) -> None:
-        """Move the temporary file to its place."""
+        """Move the temporary file to the place of the file."""
         os.replace(self.path, self.target)
         flush(self.target.parent)
 
     def remove(self, and_directories: bool = False) -> None:
-        """Remove the temporary file, if it still exists, and on demand the empty directories that were made for it."""
+        """Remove the temporary file, if it still exists, and on request the empty directories that were made for it."""
         with _lock:
             if self in _parts:
                 _parts.remove(self)
-            with suppress(OSError):  # it took its place, was never made, or its directory is gone
+            with suppress(OSError):  # it was moved, was never made, or its directory is gone
                 self.path.unlink()
             if and_directories:
                 remove_empty(self.made)
@@ -222,7 +224,7 @@ class _Part:
 _parts: list[_Part] = []
 """Temporary files of this process."""
 _lock = threading.RLock()
-"""The lock that is held while temporary files are made, moved and removed; `_abandon` waits for it."""
+"""Lock that is held while temporary files are made, moved and removed; `_abandon` waits for it."""
 
 
 def _abandon() -> bool:
@@ -235,7 +237,7 @@ def _abandon() -> bool:
 
 
 def _forget_parts() -> None:
-    """Forget the temporary files in a forked child: they are its parent's."""
+    """Forget the temporary files in a forked child, because they are its parent's."""
     global _lock
     _lock = threading.RLock()
     _parts.clear()
@@ -247,7 +249,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def clear_parts(folder: Path, names: Set[str]) -> None:
-    """Remove the temporary files of these names in a folder whose writers have ended."""
+    """Remove temporary files of these names from a folder, if their writers have ended."""
     if fcntl is None:
         return
     for entry in folder.iterdir():
@@ -266,12 +268,12 @@ def clear_parts(folder: Path, names: Set[str]) -> None:
 
 
 def why(problem: OSError) -> str:
-    """The reason of an error of the operating system, in words."""
+    """Reason of an error of the operating system, in words."""
     return DISK.get(problem.errno or 0) or problem.strerror or str(problem)
 
 
 def said(problem: OSError) -> str:
-    """A sentence about an error of the operating system: which file, and why."""
+    """Sentence about an error of the operating system, with the file and the reason."""
     if problem.errno is None:
         return str(problem)
     if problem.filename is not None:
@@ -293,7 +295,7 @@ def flush(path: Path) -> None:
 
 
 def remove_empty(directories: Iterable[Path]) -> None:
-    """Remove those of the directories that are empty; the innermost comes first."""
+    """Remove the directories that are empty, in the given order: the innermost comes first."""
     for directory in directories:
-        with suppress(OSError):  # never made, or somebody else put something there meanwhile
+        with suppress(OSError):  # it was never made, or is no longer empty
             directory.rmdir()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Python file of a user, run as a module; it finds the files beside it, as with `python FILE.py`.
+"""Running a user's Python file as a module, which can import the files beside it, as with `python FILE.py`.
 
-A file that PACKAGE asks for becomes the module PACKAGE.user_modules.NAME, where NAME spells out the path of the file.
-So what the file defines can be pickled: another process imports that module, which runs the file.
+A file that PACKAGE runs becomes the module PACKAGE.user_modules.NAME, where NAME spells out the path of the file. So
+objects of the file's classes can be pickled: another process imports that module, which runs the file.
 """
 
 from __future__ import annotations
@@ -17,34 +17,34 @@ from pathlib import Path
 from types import ModuleType
 
 _NEIGHBOURS: dict[Path, dict[str, ModuleType]] = {}
-"""Modules that files of a folder imported from there, by their names."""
+"""Modules, by their names, that files of each folder imported from that folder."""
 _CHANGED: dict[Path, int] = {}
-"""When files of neighbours were last changed, as they were imported."""
+"""Times of the last change of neighbours' files, nanoseconds, when they were imported."""
 
 
 _RUN: dict[str, tuple[ModuleType, int]] = {}
-"""Modules of files that ran, by name, and when the file was last changed then."""
+"""Modules of files that ran, by name, and the time of the file's last change then, nanoseconds."""
 
 
 def module_of_file(path: Path, package: str) -> ModuleType:
-    """The module of a Python file, which runs once, and again when it has changed. Raises as `run_python_file`."""
+    """The module of a Python file, which runs once, and again after a change; errors as of `run_python_file`."""
     name, changed = _name_of(path, package), path.stat().st_mtime_ns
     module, ran = _RUN.get(name, (None, None))
     return module if module is not None and ran == changed else run_python_file(path, package)
 
 
 def run_python_file(path: Path, package: str) -> ModuleType:
-    """The module of a Python file, which runs, for the package that asks for it.
+    """The module of a Python file, which this runs for a package.
 
-    Imports find the folder of the file first; later ones, inside its functions, last. A name that files of two folders
-    use for a neighbour is for each that of its own folder, as long as it runs.
+    Imports of the file search the file's folder first; later imports, inside its functions, search it last. If files of
+    two folders use one name for a neighbour, each finds the one in its own folder, as long as it runs.
 
     Raises
     ------
     BaseException
-        What the file raises; it is no module then, nor is what it imported from its folder.
+        Any exception of the file. Then neither the file nor its imports from its folder stay modules.
     """
-    importlib.import_module(f"{package}.user_modules")  # the package around the module
+    importlib.import_module(f"{package}.user_modules")  # the module's package
     name, changed = _name_of(path, package), path.stat().st_mtime_ns
     spec = spec_from_file_location(name, path)
     assert spec is not None, path  # a .py file has one
@@ -53,9 +53,9 @@ def run_python_file(path: Path, package: str) -> ModuleType:
     folder = path.parent.absolute()
     _take_out_neighbours(folder)
     before = set(sys.modules)
-    sys.modules[name] = module  # dataclasses look their own module up
+    sys.modules[name] = module  # dataclasses look up their own module
     sys.path.insert(0, str(folder))
-    importlib.invalidate_caches()  # for files written since
+    importlib.invalidate_caches()  # files may be new
     try:
         spec.loader.exec_module(module)
     except BaseException:
@@ -79,7 +79,7 @@ def _name_of(path: Path, package: str) -> str:
 
 
 class FileImporter(MetaPathFinder, Loader):
-    """Imports PACKAGE.user_modules.NAME, by running the file that NAME spells out."""
+    """Importer of PACKAGE.user_modules.NAME, which runs the file whose path NAME spells out."""
 
     def __init__(self, package: str) -> None:
         self.package = package
@@ -100,7 +100,7 @@ class FileImporter(MetaPathFinder, Loader):
 
 
 def _take_out_neighbours(folder: Path) -> None:
-    """Leave those modules that files imported from `folder`, unless one changed, and none from other folders."""
+    """Remove modules that files imported from their folders, but keep those from `folder` if none has changed."""
     own = _NEIGHBOURS.get(folder, {})
     if any(_is_stale(Path(m.__file__)) for m in own.values() if m.__file__):
         _NEIGHBOURS.pop(folder)
@@ -117,9 +117,9 @@ def _is_stale(file: Path) -> bool:
 
 
 def _imported_from(folder: Path, before: set[str]) -> dict[str, ModuleType]:
-    """Modules and packages beside each other in `folder`, and theirs, unless they or their package were there before.
+    """New modules and packages in `folder`, and new modules of these packages; `before` are names of older modules.
 
-    What is installed below the folder, such as in an environment there, is not beside the file.
+    Modules installed below the folder, such as in an environment there, do not count.
     """
     found = {}
     for name, module in list(sys.modules.items()):
@@ -130,7 +130,7 @@ def _imported_from(folder: Path, before: set[str]) -> dict[str, ModuleType]:
 
 
 def _is_beside(folder: Path, top: str, module: ModuleType) -> bool:
-    """Whether a module is of the file or package `top` in the folder itself."""
+    """Whether a module is the file or package `top` in the folder itself, or a part of it."""
     places = [file] if (file := getattr(module, "__file__", None)) else list(getattr(module, "__path__", ()))
     for place in places:
         path = Path(place).absolute()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A `repr` of one to five lines for dataclasses of arrays."""
+"""A short `repr`, of one to five lines, for dataclasses of arrays."""
 
 from __future__ import annotations
 
@@ -11,20 +11,16 @@ from typing import Any
 import numpy as np
 
 MAX_LINES = 5
-"""Lines of one `repr`. What does not fit is counted: "and 4 more"."""
+"""Most lines of one `repr`, count; fields that do not fit are counted: "and 4 more". Chosen by eye."""
 MAX_COLUMNS = 100
-"""Characters of a line; a longer `repr` is broken into several lines."""
+"""Most characters of a line, count, so that lines fit on a terminal; a longer `repr` is broken into several lines.
+Chosen by eye."""
 MAX_ENTRIES = 3
-"""Entries of a dictionary of arrays that are shown; the others are counted."""
-SHORT = reprlib.Repr()
-"""`repr` of plain values, cut to a readable length: 100 characters, 8 entries, 3 levels."""
-SHORT.maxstring = SHORT.maxother = 100
-SHORT.maxlist = SHORT.maxtuple = SHORT.maxarray = 8
-SHORT.maxlevel = 3
+"""Most entries of a dictionary of arrays that are shown, count; the others are counted. Chosen by eye."""
 
 
 class ShortRepr:
-    """A mixin for dataclasses of arrays: its `repr` names shapes and types instead of a thousand numbers.
+    """A mixin for dataclasses of arrays: its `repr` names shapes and types in place of a thousand numbers.
 
     Examples
     --------
@@ -38,10 +34,10 @@ class ShortRepr:
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
         if cls.__repr__ is ShortRepr.__repr__:
-            cls.__repr__ = ShortRepr.__repr__  # type: ignore[method-assign]  # a class's own one is left by @dataclass
+            cls.__repr__ = ShortRepr.__repr__  # type: ignore[method-assign]  # @dataclass keeps a `repr` of the class itself
 
     def _counts(self) -> str:
-        """A few words that stand first, such as "3 regions"; empty unless a subclass says more."""
+        """A few words at the beginning, such as "3 regions"; empty unless a subclass overrides this."""
         return ""
 
     def __repr__(self) -> str:
@@ -53,7 +49,7 @@ class ShortRepr:
 
 
 def in_short(value: Any) -> str:
-    """A short `repr`: type and shape of an array, length of a long list and the type of its first entry."""
+    """A short `repr`: type and shape of an array, or length and type of the first entry of a long list."""
     if isinstance(value, np.ndarray) and value.size > 1:
         if value.ndim == 1 and value.size <= 4 and value.dtype.kind in "iufb":
             return np.array2string(value, precision=4, separator=", ")
@@ -71,8 +67,20 @@ def in_short(value: Any) -> str:
     return SHORT.repr(value) if not dataclasses.is_dataclass(value) else f"{type(value).__name__}(...)"
 
 
+def _plain_repr() -> reprlib.Repr:
+    """`repr` of plain values, cut to a readable length: 100 characters, 8 entries, 3 levels; chosen by eye."""
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = 100
+    short.maxlist = short.maxtuple = short.maxarray = 8
+    short.maxlevel = 3
+    return short
+
+
+SHORT = _plain_repr()
+
+
 def _filled(parts: list[str]) -> list[str]:
-    """The parts on indented lines, at most `MAX_LINES` of them; parts that do not fit are counted."""
+    """The parts on at most `MAX_LINES` indented lines; parts that do not fit are counted."""
     lines = ["   "]
     for number, part in enumerate(parts):
         if lines[-1].strip() and len(lines[-1]) + len(part) + 2 > MAX_COLUMNS:

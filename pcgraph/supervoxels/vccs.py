@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.inputs import non_negative
+from pcgraph.inputs import check_non_negative
 from pcgraph.supervoxels.clustering import EARLY_SWEEPS, Metric, enforce_connectivity, expand, seed_voxels, voxel_graph
 from pcgraph.supervoxels.method import SupervoxelMethod
 from pcgraph.voxels.grid import VoxelGrid
@@ -22,17 +22,17 @@ class Vccs(SupervoxelMethod):
     Attributes
     ----------
     color_weight, spatial_weight, normal_weight : float, >= 0
-        What counts in the distance of a voxel to a supervoxel: their w_c (colours in 0..1), w_s (metres over the
-        seed size) and w_n (one minus the cosine), equation 7.
+        Weights in the distance of a voxel to a supervoxel: their w_c (colours in 0..1), w_s (metres over the seed size)
+        and w_n (one minus the cosine), equation 7. The defaults are those of PCL's header.
     feature_weight : float, >= 0
-        The same for the features given to `pcgraph.segment`, which PCL does not know, as in `SurfaceGrowth`.
+        Weight of the features given to `pcgraph.segment`, as in `SurfaceGrowth`; PCL has none.
 
     Notes
     -----
-    Source: Papon et al. 2013. D = w_n (1 - |n . n'|) + w_c |c - c'| + w_s |x - x'| / R_seed. Two changes: expansion
-    does not stop at a number of steps, and what is cut off goes to a neighbour, so that all voxels are covered
-    and supervoxels connected; sweeps propose first and commit afterwards, so that no result depends on the order
-    in which supervoxels are visited.
+    Source: Papon et al. 2013. D = w_n (1 - |n . n'|) + w_c |c - c'| + w_s |x - x'| / R_seed. There are two changes.
+    Expansion does not stop at a number of steps, and pieces that are cut off go to a neighbour, so all voxels are
+    covered, and supervoxels are connected. Sweeps first propose all changes and then make them, so no result depends on
+    the order in which supervoxels are visited.
     """
 
     color_weight: float = 0.1
@@ -41,11 +41,10 @@ class Vccs(SupervoxelMethod):
     feature_weight: float = 0.1
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            non_negative(field.name, getattr(self, field.name))
+        check_non_negative(self)
 
     def planes(self, grid: VoxelGrid, viewpoints: NDArray[np.float64]) -> LocalPlanes:
-        """Planes of the windows around the voxels, two rings wide."""
+        """Planes of the windows of voxels and the two rings around them."""
         return local_planes(grid, viewpoints, reach=0)
 
     def supervoxels(

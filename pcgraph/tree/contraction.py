@@ -13,25 +13,24 @@ import numpy as np
 from numba import config
 from numpy.typing import NDArray
 
+from pcgraph.hierarchy import NONE
 from pcgraph.parallel import routine
 from pcgraph.tree.linkage import Merges
 
-NONE = -1
-
-# Tables of records: what is used together lies together, and a kernel takes one array for each.
+# Tables of records: fields that are used together lie side by side, and a kernel takes one array for each table.
 EDGE = np.dtype([("cost", np.float64), ("place", np.int64)])
 HALF_EDGE = np.dtype([("end", np.int64), ("after", np.int64), ("before", np.int64)])
 CLUSTER = np.dtype([("first", np.int64), ("degree", np.int64), ("tree_node", np.int64)])
 
 
 def _records(n: int, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """A table of n records, whose fields kernels name as attributes; so do they where they are not compiled."""
+    """A table of n records whose fields are attributes, in compiled kernels and where numba is switched off."""
     table = np.empty(n, dtype)
     return table.view(np.recarray) if config.DISABLE_JIT else table
 
 
 class EdgeHeap(NamedTuple):
-    """Binary heap of m edges whose costs may change: the cheapest on top, of equals the first in number.
+    """Binary heap of m edges whose costs may change: the cheapest on top; of equal ones that of the smallest number.
 
     Attributes
     ----------
@@ -55,15 +54,15 @@ class ContractedGraph(NamedTuple):
     heap : EdgeHeap
         Edges between clusters.
     halves : (2m,) HALF_EDGE
-        Edge e has the halves 2e and 2e + 1, one in the list of each cluster that it joins: that cluster, and the
-        neighbours in its list or -1. ``halves[half ^ 1].end`` is the cluster on the other side.
+        Edge e has the halves 2e and 2e + 1, one in the list of each cluster that it joins. A half holds that cluster
+        and its neighbours in the list, or -1. ``halves[half ^ 1].end`` is the cluster on the other side.
     clusters : (n,) CLUSTER
-        First half-edge of each cluster or -1, number of its edges, and its node of the tree. A cluster lives on in
-        the place of one of its nodes.
+        First half-edge of each cluster or -1, number of its edges, and its node of the tree. A merged cluster takes the
+        row of one of the two.
     sums : (r, m) float64
-        What adds up where two edges become one: weights, lengths.
+        Quantities that add up where two edges become one, such as weights and lengths.
     parallel : (m,) int64
-        Edges that the last merge made of two parallel ones.
+        Edges that the last merge made of two parallel edges.
     pairs, altitudes : (n - 1, 2) int32, (n - 1,) float64
         As in `Merges`; the first `done` of them.
     done : (1,) int64
@@ -118,10 +117,10 @@ def contract_cheapest(graph: ContractedGraph) -> tuple[int, int, int]:
     Returns
     -------
     kept, gone : int
-        Places of the two clusters: the merged one is in the first, and none is left in the second.
+        Rows of the two clusters: the merged one has the first, and the second is empty.
     n_parallel : int
-        Where both had an edge to the same third cluster, one edge stays, with the sums of both: those are
-        ``graph.parallel[:n_parallel]``. All costs but that of the edge in between are as before.
+        Where both clusters had an edge to the same third one, one edge stays, with the sums of both. These edges are
+        ``graph.parallel[:n_parallel]``. All costs are as before: the caller corrects them.
     """
     heap, halves, clusters, sums = graph.heap, graph.halves, graph.clusters, graph.sums
     edge, done = heap.order[0], graph.done[0]

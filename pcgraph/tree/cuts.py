@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cuts of a tree: the node that each leaf ends up in, by altitude, number, size or stability.
+"""Cuts of a tree: the node that each leaf ends up in, by altitude, number and size.
 
-A cut chooses nodes, none above another. A leaf goes to the chosen node above it; where it has none, because what is
-above it is too small or does not last, it goes to the core that the tree would have merged it with.
+A cut chooses nodes, none above another. A leaf goes to the chosen node above it. If there is none, because the nodes
+above the leaf are too small, the leaf goes to the chosen node with which the tree would have merged it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def horizontal_cut(
     least = f" of {min_size} points or more"
     merges = _merges(altitudes[n_leaves:], n, altitude, len(cores.joins) + 1, least)
     last = n_leaves + merges
-    if n is not None:  # so many of the merges that join cores
+    if n is not None:  # `merges` counts only those that join cores
         last = int(cores.joins[merges - 1]) + 1 if merges > 0 else 0
     return propagation_sources(parents, parents < last)[cores.of_leaf]
 
@@ -52,7 +52,7 @@ def horizontal_cut(
 def _merges(
     merge_altitudes: NDArray[np.float64], n: int | None, altitude: float | None, most: int, least: str = ""
 ) -> int:
-    """Number of merges that a cut does; of a tree with `most` segments at its finest, `least` says of which."""
+    """Number of merges of a cut; the finest cut has `most` segments, and `least` says in errors how large they are."""
     if n is not None and altitude is None:
         if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not 1 <= n <= most:
             raise ValueError(f"expected a whole number n of 1..{most} segments{least}, got {n!r}")
@@ -71,7 +71,7 @@ def numbered_segments(nodes: NDArray[np.int32], n_nodes: int) -> NDArray[np.int3
     Parameters
     ----------
     nodes : (n_leaves,) int32, 0..n_nodes - 1
-        Leaves with the same node share a segment.
+        Leaves with the same node are one segment.
     n_nodes : int
     """
     leaves, first, number = np.arange(len(nodes)), np.empty(n_nodes, np.int64), np.empty(n_nodes, np.int32)
@@ -86,7 +86,7 @@ def numbered_segments(nodes: NDArray[np.int32], n_nodes: int) -> NDArray[np.int3
 
 @dataclass(frozen=True, eq=False)
 class SizeCores:
-    """What remains of a tree when no segment may have fewer than some number of points.
+    """Cores of a tree: the segments of its finest cut in which none has fewer than some number of points.
 
     Attributes
     ----------
@@ -101,9 +101,9 @@ class SizeCores:
 
 
 def size_cores(parents: NDArray[np.int32], counts: NDArray[np.int64], min_size: int) -> SizeCores:
-    """Cores of a tree for a least number of points: nodes that have it, while neither child has.
+    """Cores of a tree for a least number of points: nodes that have so many, and no child that has.
 
-    Which segment a small leaf joins at one cut contains the one that it joins at a finer cut.
+    Cuts nest: the segment that a small leaf joins at one cut contains the one that it joins at a finer cut.
 
     Parameters
     ----------
@@ -126,8 +126,8 @@ def size_cores(parents: NDArray[np.int32], counts: NDArray[np.int64], min_size: 
 def core_of_leaf(parents: NDArray[np.int32], counts: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Chosen node of each leaf, (n_leaves,) int32.
 
-    A leaf below no chosen node climbs to the first node with a chosen node below, and from there descends into
-    the larger child that has one. So it goes where the tree would have merged it.
+    A leaf without a chosen node above it climbs to the first node with a chosen node below it. From there it descends
+    into the larger child that has one. So it goes where the tree would have merged it.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def core_of_leaf(parents: NDArray[np.int32], counts: NDArray[np.int64], chosen: 
 def _cores_below(
     children: NDArray[np.int32], counts: NDArray[np.int64], chosen: NDArray[np.bool_]
 ) -> NDArray[np.int32]:
-    """Chosen node at or below each node, that of the larger child where both have one; -1 without."""
+    """Chosen node at or below each node, that of the larger child if both have one; -1 if there is none."""
     core = np.full(len(children), -1, np.int32)
     for node in range(len(children)):
         a, b = children[node]
@@ -156,91 +156,16 @@ def _cores_below(
     return core
 
 
-# --- stability: what lasts longest ------------------------------------------------------------------------------------
+# --- persistence ------------------------------------------------------------------------------------------------------
 
 
 def persistences(parents: NDArray[np.int32], altitudes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Range of altitudes over which each node is a segment of the horizontal cuts, (k,) float64.
 
-    Parent's altitude less the node's own; infinite for what never merges below infinity, 0 for nodes that are
-    born at infinity.
+    It is the parent's altitude less the node's own: infinite for nodes that never merge below infinity, 0 for nodes
+    that come to be at infinity.
     """
     above = altitudes[parents]
     above[-1] = np.inf
     born = np.isfinite(altitudes)
     return np.subtract(above, altitudes, out=np.zeros(len(parents)), where=born)
-
-
-def stable_cut(
-    parents: NDArray[np.int32], altitudes: NDArray[np.float64], counts: NDArray[np.int64], min_size: int
-) -> NDArray[np.int32]:
-    """Node of each leaf, (n_leaves,) int32, in the most stable segmentation; see `SegmentationTree.cut_stable`."""
-    least = min(whole_number("min_size", min_size), int(counts[-1]))
-    chosen = stable_nodes(parents, altitudes, counts, least)
-    if not chosen.any():  # only parts that do not touch, each too small
-        chosen[-1] = True
-    return core_of_leaf(parents, counts, chosen)
-
-
-def stable_nodes(
-    parents: NDArray[np.int32], altitudes: NDArray[np.float64], counts: NDArray[np.int64], min_size: int
-) -> NDArray[np.bool_]:
-    """Whether each node is chosen, (k,) bool: nodes of the largest total stability, none above another.
-
-    A branch is a segment from where it first has `min_size` points; a merge with something smaller does not end
-    it. Its stability is the sum of points x life over its nodes, and life the difference of the square roots of two
-    altitudes: the highest merges lie far from each other, and would make a scene in two pieces last. Life ends at the
-    largest finite altitude at which two parts of `min_size` points merge: what is smaller may come in at any altitude
-    (a voxel far off at pi). The nodes chosen are the tops of branches; of equal stability the coarser one is taken.
-    Leaves below no chosen node are left to the caller.
-
-    Parameters
-    ----------
-    parents, altitudes : (k,)
-        As in `SegmentationTree`.
-    counts : (k,) int64
-        Points of each node.
-    min_size : int
-
-    Notes
-    -----
-    Source: Campello et al. 2015 (excess of mass, HDBSCAN), with the root of altitude in place of 1 / density.
-    """
-    across_gap, pairs = np.isinf(altitudes), binary_children(parents)
-    smaller = np.where(pairs[:, 0] >= 0, counts[pairs].min(axis=1), 0)
-    levels = np.sqrt(np.minimum(altitudes, altitudes[~across_gap & (smaller >= min_size)].max(initial=0.0)))
-    life = levels[parents] - levels
-    taken = _more_stable(pairs, life, counts, (counts >= min_size) & ~across_gap, min_size)
-    taken = propagate_sequential(parents, taken, ~taken)
-    below = taken[parents]
-    below[-1] = False
-    return taken & ~below  # the highest of each chain of taken nodes
-
-
-@kernel
-def _more_stable(
-    children: NDArray[np.int32],
-    persistence: NDArray[np.float64],
-    counts: NDArray[np.int64],
-    eligible: NDArray[np.bool_],
-    min_size: int,
-) -> NDArray[np.bool_]:
-    """Whether each eligible node's branch has at least the stability of the best choice below it."""
-    k = len(children)
-    own, best = np.zeros(k), np.zeros(k)
-    taken = np.zeros(k, np.bool_)
-    for node in range(k):
-        a, b = children[node]
-        below = 0.0
-        if a >= 0:
-            below = best[a] + best[b]
-        if not eligible[node]:
-            best[node] = below
-            continue
-        if a >= 0 and (counts[a] < min_size) != (counts[b] < min_size):
-            own[node] = own[a] if counts[a] >= min_size else own[b]  # the branch goes on
-        own[node] += counts[node] * persistence[node]
-        # Where a branch goes on, the node above has all of this and more, so it takes over by itself.
-        taken[node] = own[node] >= below
-        best[node] = max(own[node], below)
-    return taken

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Energies of a tree's nodes (Mumford and Shah's): what a segment costs by its points, and what by its outline."""
+"""Mumford and Shah's energies of a tree's nodes: the misfit of a segment's points, and the length of its outline."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def plane_energy(tree: SegmentationTree, graph: AdjacencyGraph | None = None) ->
     ----------
     tree : SegmentationTree
     graph : AdjacencyGraph, optional
-        Of the tree's leaves. With it complexity is the length of contact with other segments in metres, and the
-        scale has square metres x points per metre. Without it complexity counts segments, and the scale has
-        square metres x points.
+        Graph of the tree's leaves. With it, complexity is the length of contact with other segments in metres, and the
+        unit of the scale is square metres x points per metre. Without it, complexity counts segments, and the unit of
+        the scale is square metres x points.
 
     Raises
     ------
@@ -60,8 +60,7 @@ def boundary_lengths(tree: SegmentationTree, graph: AdjacencyGraph) -> NDArray[n
     Parameters
     ----------
     tree : SegmentationTree
-    graph : AdjacencyGraph
-        Of the tree's leaves.
+    graph : AdjacencyGraph of the tree's leaves
 
     Raises
     ------
@@ -72,7 +71,7 @@ def boundary_lengths(tree: SegmentationTree, graph: AdjacencyGraph) -> NDArray[n
         raise ValueError(f"expected a graph of the tree's {tree.n_leaves} leaves, got one of {graph.n_nodes} nodes")
     k, lengths = len(tree.parents), graph.edge_features.contact_length
     outlines = np.bincount(graph.edges.ravel(), np.repeat(lengths, 2), k).astype(np.float64)
-    # An edge is inside from the lowest common ancestor of its ends upwards: there both its sides leave the outline.
+    # An edge is inside the lowest common ancestor of its ends, and nodes above: both its sides leave the outline there.
     meeting = lowest_common_ancestors(tree.parents, *graph.edges.T)
     outlines -= 2.0 * np.bincount(meeting, lengths, k)
     return np.maximum(accumulate_sequential(tree.parents, outlines), 0.0)

@@ -13,38 +13,41 @@ from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.contacts import angle_between
 from pcgraph.hierarchy import roots
-from pcgraph.inputs import positive
+from pcgraph.inputs import check_non_negative, positive
 from pcgraph.tree.average_linkage import average_linkage
-from pcgraph.tree.linkage import Linkage, Merges, check_numbers
+from pcgraph.tree.linkage import Linkage, Merges
 from pcgraph.tree.single_linkage import single_linkage
 
-_SMOOTHNESS = 0.1  # voxels
+_MAX_STEP = 0.1
+"""Step, voxel edges, that a smooth edge may have beyond the step that its angle explains: the default of PCL, source of
+the rule (`setSmoothnessCheck`)."""
 
 
 @dataclass(frozen=True)
 class LccpLinkage(Linkage):
-    """LCCP (Stein et al. 2014): what is connected by convex edges is one object, the cut at altitude 1.
+    """LCCP (Stein et al. 2014): objects are the supervoxels that convex edges connect, the cut at altitude 1.
 
-    Below 1 the supervoxels of an object merge by single linkage over its convex edges at angle between normals /
-    pi. Above 1 objects merge by average linkage over their contact, at 1 + mean angle / pi: LCCP itself ends at 1.
+    Below 1, the supervoxels of an object merge by single linkage over its convex edges, at the angle between normals
+    over pi. Above 1, objects merge by average linkage over their contact, at 1 + mean angle / pi. LCCP itself ends at
+    1.
 
     Attributes
     ----------
     concavity_tolerance : float, radians, >= 0
         Concave edges of a smaller angle count as convex. Its default is LCCP's, 10 degrees.
     smoothness : bool
-        Whether an edge over a step is not convex: both distances to the other one's plane exceed
-        sin(angle) seed_size + 0.1 voxel.
+        Whether edges over steps are refused: those where both centroids' distances to the other one's plane exceed
+        sin(angle) seed_size + 0.1 voxel edges.
     sanity : bool
-        Whether an edge is not convex where the patches' planes meet along the line that joins them.
+        Whether edges are refused where the patches' planes meet along the line that joins the patches.
     common_neighbours : int, >= 0
-        Their k: number of common neighbours with convex edges to both that an edge needs.
+        Their k: number of common neighbours, with convex edges to both ends, that a convex edge needs.
     seed_size : float, metres, > 0, optional
         Spacing of the supervoxels; default: the median distance between the centroids of those that touch.
 
     Notes
     -----
-    Rules as in PCL's lccp_segmentation.hpp.
+    The rules are those of PCL's lccp_segmentation.hpp.
     """
 
     concavity_tolerance: float = math.radians(10.0)
@@ -57,7 +60,7 @@ class LccpLinkage(Linkage):
     default_part_altitude = 1.0 / 9.0  # convex edges of up to 20 degrees join parts
 
     def __post_init__(self) -> None:
-        check_numbers(self, "concavity_tolerance", "common_neighbours")
+        check_non_negative(self, "concavity_tolerance", "common_neighbours")
         if self.seed_size is not None:
             positive("seed_size", self.seed_size)
 
@@ -81,7 +84,7 @@ class LccpLinkage(Linkage):
         if self.smoothness and len(i):
             seed = self.seed_size if self.seed_size is not None else float(np.median(_length(towards_i)))
             offset = np.minimum(np.abs(_dot(towards_i, normal_i)), np.abs(_dot(towards_i, normal_j)))
-            convex &= offset <= np.sin(angle) * seed + _SMOOTHNESS * graph.edge_features.voxel_edge
+            convex &= offset <= np.sin(angle) * seed + _MAX_STEP * graph.edge_features.voxel_edge
         if self.sanity:
             convex &= _is_sane(np.cross(normal_i, normal_j), towards_i, angle)
         if self.common_neighbours > 0:
@@ -92,7 +95,10 @@ class LccpLinkage(Linkage):
 def _is_sane(
     crease: NDArray[np.float64], towards: NDArray[np.float64], angle: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Whether the crease of two planes lies across the line between the patches; parallel planes have none."""
+    """Whether the crease of two planes lies across the line between the patches; true of parallel planes.
+
+    The least angle, 60 / (1 + exp(-0.25 (angle - 25))) degrees, is PCL's.
+    """
     between = angle_between(crease, towards)
     folded = np.minimum(between, np.pi - between)
     least = np.deg2rad(60.0) / (1.0 + np.exp(-0.25 * (np.rad2deg(angle) - 25.0)))
@@ -112,7 +118,7 @@ def _common_neighbours(graph: AdjacencyGraph, convex: NDArray[np.bool_]) -> NDAr
 
 
 def _merges_between(graph: AdjacencyGraph, pairs: NDArray[np.int32]) -> Merges:
-    """Average linkage, by angle between normals over pi, of what earlier merges made."""
+    """Average linkage, by angle between normals over pi, of the clusters that earlier merges made."""
     n, done = graph.n_nodes, graph.n_nodes + len(pairs)
     parents = np.arange(done, dtype=np.int32)
     parents[pairs] = np.arange(n, done, dtype=np.int32)[:, None]

@@ -16,8 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.errors import CloudReadError, CloudWriteError
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.graph.boundary import in_whole_steps
 from pcgraph.graph.contacts import angle_between
 from pcgraph.plumbing.plain_files import read_file, write_file
+from pcgraph.rounding import TINY
 from pcgraph.tree.average_linkage import average_linkage
 from pcgraph.tree.linkage import Linkage, Merges
 from pcgraph.tree.tree import segmentation_tree
@@ -25,17 +27,21 @@ from pcgraph.tree.tree import segmentation_tree
 if TYPE_CHECKING:
     from pcgraph.segmentation import Segmentation
 
-_STEPS = float(1 << 20)
-_PURE = 0.8  # fraction of a supervoxel's points that must agree before an edge at it teaches anything
-_PLATEAU = 0.002  # covering below the best that still counts as best
-_LARGEST = 1e100
-"""Of a model's numbers, and one over the least scale: a product of three of them is still finite."""
+_MIN_AGREEING = 0.8
+"""Least fraction of a supervoxel's points that are of one object, so that its edges teach anything. Chosen by eye; not
+varied."""
+_COVERING_TOLERANCE = 0.002
+"""Covering, a fraction, below the best that still counts as best: the altitude is the median of a plateau, because the
+peak itself is luck. Chosen by eye; not varied."""
+_MAX_NUMBER = 1e100
+"""Largest number of a model, of any unit, and one over its least scale, so that a product of three is still finite."""
 _ALTITUDES = np.linspace(0.05, 0.95, 37)
+"""Altitudes, probabilities, from which that of objects is chosen: steps of 0.025 over nearly all of 0..1."""
 
 
 @dataclass(frozen=True)
 class LearnedLinkage(Linkage):
-    """Average linkage of the probability of a boundary, weighted by contact; altitudes are 0..1.
+    """Average linkage by the probability that an edge is a boundary, weighted by contact; altitudes are 0..1.
 
     Attributes
     ----------
@@ -61,23 +67,22 @@ class LearnedLinkage(Linkage):
 
     @property
     def default_part_altitude(self) -> float:
-        """Half of that: what is learned from are objects, so nothing was learned about parts."""
+        """Half of the altitude of objects: the truths are objects, so nothing was learned about parts."""
         return 0.5 * self.model.object_altitude
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the least likely boundary first."""
-        costs = np.rint(self.model(graph) * _STEPS) / _STEPS  # whole multiples, so that sums of them are exact
         weights = graph.edge_features.contact_voxels.astype(np.float64)
-        return average_linkage(graph.n_nodes, graph.edges, costs, weights)
+        return average_linkage(graph.n_nodes, graph.edges, in_whole_steps(self.model(graph)), weights)
 
     @classmethod
     def fit(cls, segmentations: Sequence[Segmentation], truths: Sequence[ArrayLike]) -> LearnedLinkage:
-        """Linkage fitted on labelled clouds; its altitude for objects is amid those with the best mean covering there.
+        """Linkage fitted on labelled clouds, with the altitude of objects that covers them best on average.
 
         Parameters
         ----------
         segmentations : sequence of Segmentation
-            Their graphs are what is learned from; the linkage that they were made with does not matter.
+            Only their graphs count; the linkage with which they were made does not matter.
         truths : sequence of int arrays
             True object of each point, in the shape of each segmentation's labels; negative where unknown.
 
@@ -102,7 +107,7 @@ class LearnedLinkage(Linkage):
             [t.covering(tree.cut(altitude=a)) for a in _ALTITUDES] for tree, t in zip(trees, tables, strict=True)
         ]
         mean = np.mean(coverings, axis=0)
-        best = float(np.median(_ALTITUDES[mean >= mean.max() - _PLATEAU]))  # not the peak: the peak is luck
+        best = float(np.median(_ALTITUDES[mean >= mean.max() - _COVERING_TOLERANCE]))
         return cls(msgspec.structs.replace(model, object_altitude=best))
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -119,15 +124,15 @@ class LearnedLinkage(Linkage):
 
 
 def edge_evidence(graph: AdjacencyGraph) -> dict[str, NDArray[np.float64]]:
-    """What a model sees of each edge: columns (m,) float64 by name, free of the scene's scale.
+    """Evidence about each edge: columns (m,) float64 by name, independent of the scene's scale.
 
-    Angles are in radians, steps in voxel edges, and nothing depends on which end of an edge comes first.
+    Angles are in radians, steps in voxel edges. No column depends on which end of an edge comes first.
     """
     features, nodes = graph.edge_features, graph.node_features
     i, j = graph.edges.T
     apart = nodes.centroid[i] - nodes.centroid[j]
     crease = angle_between(np.cross(nodes.normal[i], nodes.normal[j]), apart)
-    apart /= np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    apart /= np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), TINY)
     rise_i = np.einsum("ij,ij->i", apart, nodes.normal[i])
     rise_j = -np.einsum("ij,ij->i", apart, nodes.normal[j])
     return {
@@ -136,23 +141,23 @@ def edge_evidence(graph: AdjacencyGraph) -> dict[str, NDArray[np.float64]]:
         "contact_concavity": np.maximum(-features.contact_convexity, 0.0),
         "contact_convexity": np.maximum(features.contact_convexity, 0.0),
         "normal_angle": features.normal_angle,
-        "crease_angle": np.minimum(crease, np.pi - crease),  # between the planes' crease and the way across
+        "crease_angle": np.minimum(crease, np.pi - crease),  # between the planes' crease and the line of centroids
         "color_contrast": features.color_contrast,
         "step_voxels": features.step / features.voxel_edge,
-        "lower_rise": np.minimum(rise_i, rise_j),  # sines of the angles at which each sees the other
+        "lower_rise": np.minimum(rise_i, rise_j),  # sines of the angles of that line with the two planes
         "upper_rise": np.maximum(rise_i, rise_j),
     }
 
 
 class EdgeModel(msgspec.Struct, frozen=True):
-    """Logistic regression on standardised evidence; plain numbers, so that a file of it cannot run code.
+    """Logistic regression on standardised evidence, as plain numbers, so that a file of it cannot run code.
 
     Attributes
     ----------
     names : tuple of str
-        Columns of `edge_evidence` that are used.
+        Columns of `edge_evidence` that the model uses.
     means, scales, coefficients : tuple of float
-        One per name; evidence enters as coefficient x (value - mean) / scale.
+        One per name; a value adds coefficient x (value - mean) / scale to the logit.
     intercept : float
     object_altitude : float, 0..1
         Probability of a boundary above which two parts are two objects.
@@ -172,10 +177,11 @@ class EdgeModel(msgspec.Struct, frozen=True):
             raise ValueError(f"expected one finite mean, scale and coefficient for each of {len(self.names)} names")
         if not all(scale > 0.0 for scale in self.scales):
             raise ValueError("expected scales above 0; fit the model again")
-        bad = [value for value in numbers if abs(value) > _LARGEST] + [s for s in self.scales if s < 1.0 / _LARGEST]
+        bad = [value for value in numbers if abs(value) > _MAX_NUMBER]
+        bad += [scale for scale in self.scales if scale < 1.0 / _MAX_NUMBER]
         if bad:
             raise ValueError(
-                f"expected numbers up to {_LARGEST:g}, scales from {1.0 / _LARGEST:g}, got {bad[0]:g}; "
+                f"expected numbers up to {_MAX_NUMBER:g}, scales from {1.0 / _MAX_NUMBER:g}, got {bad[0]:g}; "
                 "fit the model again"
             )
 
@@ -232,7 +238,7 @@ class EdgeModel(msgspec.Struct, frozen=True):
 
 
 class _EdgeModelFile(EdgeModel, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What stands in a file of a model."""
+    """An `EdgeModel` as its file holds it."""
 
     format: Literal["pcgraph edge model 1"]
 
@@ -244,7 +250,7 @@ def _fit_edges(graphs: list[AdjacencyGraph], tables: list[LeafTruth]) -> EdgeMod
         raise ImportError("LearnedLinkage.fit needs scikit-learn; pip install 'rangesim[learn]'") from error
     evidence, answers = [], []
     for graph, table in zip(graphs, tables, strict=True):
-        sides = table.majority(_PURE)[graph.edges]
+        sides = table.majority(_MIN_AGREEING)[graph.edges]
         known = (sides >= 0).all(axis=1)
         columns = edge_evidence(graph)
         evidence.append(np.stack(list(columns.values()), axis=1)[known])
@@ -259,19 +265,19 @@ def _fit_edges(graphs: list[AdjacencyGraph], tables: list[LeafTruth]) -> EdgeMod
     return EdgeModel(tuple(columns), tuple(means.tolist()), tuple(scales.tolist()), tuple(weights), intercept, 0.5)
 
 
-# --- what is learned from ---------------------------------------------------------------------------------------------
+# --- true segments of leaves ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class LeafTruth:
-    """Points per pair of leaf and true segment; r pairs.
+    """Numbers of points in r pairs of a leaf and a true segment.
 
     Attributes
     ----------
     leaf, truth : (r,) int64
-        Leaf, and true segment numbered from 0 in ascending order of the true labels.
+        Leaf, and true segment, numbered from 0 in ascending order of the true labels.
     points : (r,) int64
-        Points that lie in both.
+        Number of points in both.
     n_leaves : int
     """
 
@@ -281,7 +287,7 @@ class LeafTruth:
     n_leaves: int
 
     def majority(self, fraction: float) -> NDArray[np.int64]:
-        """True segment of each leaf, (n_leaves,) int64; -1 where none holds this fraction of its points."""
+        """True segment of each leaf, (n_leaves,) int64; -1 where no segment has this fraction of the leaf's points."""
         order = np.argsort(self.points, kind="stable")
         best, most = np.full(self.n_leaves, -1, np.int64), np.zeros(self.n_leaves)
         best[self.leaf[order]] = self.truth[order]
@@ -292,7 +298,7 @@ class LeafTruth:
     def covering(self, segments: NDArray[np.int32]) -> float:
         """Segmentation covering, 0..1, of the true segments by the leaves' segments.
 
-        It is `pcgraph.metrics.weighted_overlap` of the points, without a pass over them.
+        It equals `pcgraph.metrics.weighted_overlap` of the points, without a pass over the points.
 
         Parameters
         ----------
@@ -309,14 +315,14 @@ class LeafTruth:
 
 
 def leaf_truth(supervoxels: NDArray[np.int32], truth: ArrayLike, n_leaves: int) -> LeafTruth:
-    """Points per pair of leaf and true segment.
+    """Numbers of points in each pair of a leaf and a true segment.
 
     Parameters
     ----------
     supervoxels : (n,) or (h, w) int32
-        Leaf of each point, negative where it has none.
+        Leaf of each point; negative if it has none.
     truth : same shape, int
-        True segment of each point, negative where unknown.
+        True segment of each point; negative if unknown.
     n_leaves : int
 
     Raises

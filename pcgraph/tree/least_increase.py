@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Least-increase linkage: what raises an energy least, per boundary removed, merges first (Ward, Mumford and Shah)."""
+"""Least-increase linkage: the merge that raises an energy least, per boundary removed, comes first.
+
+The energies are those of Ward, and of Mumford and Shah.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,11 @@ from numpy.typing import NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.hierarchy import NONE
+from pcgraph.inputs import check_non_negative
 from pcgraph.parallel import kernel, routine
-from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update, insert_edges
-from pcgraph.tree.linkage import Linkage, Merges, check_numbers
+from pcgraph.tree.contraction import ContractedGraph, contract_cheapest, heap_update, insert_edges
+from pcgraph.tree.linkage import Linkage, Merges
 from pcgraph.voxels.eigen import SYMMETRIC_INDICES, least_eigenvalue
 
 
@@ -24,7 +29,7 @@ class WardLinkage(Linkage):
     Attributes
     ----------
     position : float, per voxel, >= 0
-        Weight of places, in voxel edges.
+        Weight of positions, in voxel edges.
     normal : float, >= 0
         Weight of unit normals.
     color : float, >= 0
@@ -32,20 +37,20 @@ class WardLinkage(Linkage):
 
     Notes
     -----
-    A merge of A and B costs |A| |B| / (|A| + |B|) ||f_A - f_B||^2 (Ward 1963), where f are weighted means and
-    |A| is the number of points over the mean number of points of a supervoxel, so that altitudes do not depend
-    on the units of length or the density of points.
+    A merge of A and B costs |A| |B| / (|A| + |B|) ||f_A - f_B||^2 (Ward 1963), where f are weighted means. |A| is the
+    number of points over the mean number of points of a supervoxel, so altitudes depend neither on the unit of length
+    nor on the density of points.
     """
 
     position: float = 0.0
     normal: float = 1.0
     color: float = 0.0
 
-    default_object_altitude = 6.0  # increase of the sum of squares
-    default_part_altitude = 0.5
+    default_object_altitude = 6.0  # increase of the sum of squares; chosen on 12 clouds of tables (docs/tree.md)
+    default_part_altitude = 0.5  # the same; the seven faces of two synthetic boxes on a plane are the parts
 
     def __post_init__(self) -> None:
-        check_numbers(self, "position", "normal", "color")
+        check_non_negative(self, "position", "normal", "color")
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the smallest increase first."""
@@ -66,20 +71,20 @@ class MumfordShahLinkage(Linkage):
 
     Notes
     -----
-    Energy: sum over the regions of |A| (plane^2 mean d^2 + normal^2 var n + color^2 var c) + lambda x length of
-    boundaries, in voxel edges. Two regions merge at lambda = increase of the first / length of their contact, the
-    smallest first (Koepfler et al. 1994). |A| as for `WardLinkage`.
+    The energy is the sum over the regions of |A| (plane^2 mean d^2 + normal^2 var n + color^2 var c), plus lambda x
+    length of boundaries, in voxel edges. Two regions merge at lambda = increase of the first term / length of their
+    contact, the smallest first (Koepfler et al. 1994). |A| is that of `WardLinkage`.
     """
 
     plane: float = 1.0
     normal: float = 0.0
     color: float = 0.0
 
-    default_object_altitude = 10.0  # lambda
-    default_part_altitude = 0.1
+    default_object_altitude = 10.0  # lambda; chosen on 12 clouds of tables (docs/tree.md)
+    default_part_altitude = 0.1  # the same; the seven faces of two synthetic boxes on a plane are the parts
 
     def __post_init__(self) -> None:
-        check_numbers(self, "plane", "normal", "color")
+        check_non_negative(self, "plane", "normal", "color")
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the smallest scale first."""
@@ -103,15 +108,15 @@ def regions_of(
     if color > 0.0 and leaves.colors is not None:
         columns.append(color * leaves.colors)
     values = np.hstack(columns) if columns else np.zeros((len(leaves), 0))
-    scatters = leaves.scatters / unit / unit / mean_count  # the square of a tiny unit may be zero
+    scatters = leaves.scatters / unit / unit / mean_count  # not by the square, which may be 0 of a tiny unit
     return Regions(leaves.counts / mean_count, values, centroids, scatters, plane)
 
 
 class Regions(NamedTuple):
-    """What the energy of n regions is made of.
+    """Masses, values and moments of n regions, from which their energies follow.
 
-    The energy of a region is the sum over its mass of the squared distance of `values` to their mean, plus
-    `plane` times the sum over its mass of the squared distance to its least-squares plane.
+    The energy of a region is the sum over its mass of the squared distance of `values` to their mean, plus `plane`
+    times the sum over its mass of the squared distance to its least-squares plane.
 
     Attributes
     ----------
@@ -140,13 +145,14 @@ def least_increase_linkage(regions: Regions, edges: NDArray[np.int32], lengths: 
     edges : (m, 2) int32
         Pairs of distinct regions, each pair once.
     lengths : (m,) float64, > 0, or None
-        Boundary that a merge removes; lengths of edges to the same region add up. None: 1 for every merge.
+        Length of the boundary that a merge removes; lengths of edges to the same region add up. None: 1 for every
+        merge.
 
     Returns
     -------
     Merges
-        Altitudes are increases per length, made not to decrease: a merge below the altitude of an earlier one,
-        which a graph allows, takes that altitude. Of equal increases the first edge merges first.
+        Altitudes are increases per length. They do not decrease: a merge below the altitude of an earlier one, which a
+        graph allows, takes that altitude. Of equal increases that of the first edge comes first.
 
     Notes
     -----
@@ -164,8 +170,11 @@ def least_increase_linkage(regions: Regions, edges: NDArray[np.int32], lengths: 
 
 
 class RegionState(NamedTuple):
-    """Regions while they merge: scatters are (n, 6) xx, yy, zz, xy, xz, yz, residuals (n,) sums of squared distances
-    to their planes."""
+    """Regions while they merge.
+
+    Attributes are those of `Regions`, but for two: `scatters` are (n, 6) xx, yy, zz, xy, xz, yz, and `residuals`, (n,),
+    are sums of squared distances to the regions' planes.
+    """
 
     masses: NDArray[np.float64]
     values: NDArray[np.float64]
@@ -176,7 +185,7 @@ class RegionState(NamedTuple):
 
     @classmethod
     def of(cls, regions: Regions) -> RegionState:
-        """The regions before they merge; residuals are not set."""
+        """The regions before they merge, with residuals of 0 (`set_residuals`)."""
         masses, values, centroids, scatters = (np.array(column, np.float64, order="C") for column in regions[:4])
         upper = np.stack([scatters[:, i, j] for i, j in SYMMETRIC_INDICES], axis=1)
         return cls(masses, values, centroids, upper, np.zeros(len(masses)), float(regions.plane))
@@ -184,7 +193,7 @@ class RegionState(NamedTuple):
 
 @routine
 def set_residuals(state: RegionState) -> None:
-    """Set the sums of squared distances of regions to their planes, where these count."""
+    """Set the sums of squared distances of regions to their planes, if planes count."""
     if state.plane > 0.0:
         for a in range(len(state.masses)):
             s = state.scatters[a]
@@ -213,14 +222,14 @@ def _merge(
 
 @routine
 def _cost(state: RegionState, lengths: NDArray[np.float64], edge: int, a: int, b: int) -> float:
-    """Increase of energy by merging the two regions at an edge, per length where there are lengths."""
+    """Increase of energy by merging the two regions at an edge, per length if there are lengths."""
     increase = energy_increase(state, a, b, squared_distance(state.values, a, b))
     return increase / lengths[0, edge] if len(lengths) > 0 else increase
 
 
 @routine
 def energy_increase(state: RegionState, a: int, b: int, square: float) -> float:
-    """Energy of the union of two regions less the sum of theirs, given the square of their values' distance."""
+    """Energy of the union of two regions less the sum of theirs; `square` is the squared distance of their values."""
     reduced = state.masses[a] * state.masses[b] / (state.masses[a] + state.masses[b])
     increase = reduced * square
     if state.plane > 0.0:

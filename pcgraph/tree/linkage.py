@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
-from pcgraph.inputs import non_negative
 from pcgraph.plumbing.short_repr import ShortRepr
 
 
@@ -33,13 +32,13 @@ class Merges(ShortRepr):
 
 
 def checked_merges(merges: Merges, n_nodes: int, linkage: object) -> Merges:
-    """The merges that a linkage made of so many nodes.
+    """The merges that a linkage made of a graph of `n_nodes`, checked.
 
     Raises
     ------
     ValueError
-        They are no `Merges`, join what is not there or joined already, or altitudes are negative, not finite, or
-        decrease.
+        They are no `Merges`, join nodes that do not exist or are joined already, or altitudes are negative, not finite,
+        or decrease.
     """
     name = f"{type(linkage).__name__}.merges"
     if not isinstance(merges, Merges):
@@ -60,31 +59,25 @@ def checked_merges(merges: Merges, n_nodes: int, linkage: object) -> Merges:
 
 
 class Linkage(ABC):
-    """How a graph becomes a tree.
+    """A rule that makes a tree of a graph.
 
-    A linkage is a frozen dataclass of what decides its merges. Where its tree is cut is said where it is cut
-    (``segment(..., object_altitude=)``, `SegmentationTree.cut`); the class only knows the usual altitudes.
+    A linkage is a frozen dataclass of the settings that decide its merges. The altitude of a cut is an argument of the
+    cut (``segment(..., object_altitude=)``, `SegmentationTree.cut`); the class only knows the usual altitudes.
     """
 
     @property
     @abstractmethod
     def default_object_altitude(self) -> float:
-        """Altitude, in the linkage's unit, of the cut that is taken for objects where the caller names none."""
+        """Altitude, in the linkage's unit, of the cut into objects, if the caller names none."""
 
     @property
     @abstractmethod
     def default_part_altitude(self) -> float:
-        """Altitude, not above it, of the cut that is taken for parts: faces and smooth pieces of objects."""
+        """Altitude of the cut into parts, which are faces and smooth pieces; at most that of objects."""
 
     @abstractmethod
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
-        """Merges of the graph's nodes, whose points have these moments."""
-
-
-def check_numbers(linkage: Linkage, *names: str) -> None:
-    """Raise ValueError unless these attributes are finite numbers, not negative."""
-    for name in names:
-        non_negative(name, getattr(linkage, name))
+        """Merges of the graph's nodes; `leaves` are the moments of their points."""
 
 
 def check_cost(cost: BoundaryCost) -> None:

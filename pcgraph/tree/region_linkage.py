@@ -12,106 +12,45 @@ from numpy.typing import NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.graph.boundary import BoundaryCost
+from pcgraph.graph.boundary import COST_STEPS, BoundaryCost, in_whole_steps
+from pcgraph.hierarchy import NONE
+from pcgraph.inputs import check_non_negative
 from pcgraph.pairs import not_among
 from pcgraph.parallel import kernel, routine
-from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update, insert_edges
+from pcgraph.tree.contraction import ContractedGraph, contract_cheapest, heap_update, insert_edges
 from pcgraph.tree.least_increase import RegionState, energy_increase, regions_of, set_residuals, squared_distance, unite
-from pcgraph.tree.linkage import Linkage, Merges, check_cost, check_numbers
+from pcgraph.tree.linkage import Linkage, Merges, check_cost
 from pcgraph.voxels.eigen import plane_normal
 
 
 @dataclass(frozen=True)
 class RegionLinkage(Linkage):
-    """Merging by the concavity of contacts and by what the regions are as wholes: the default; altitudes in radians.
+    """Merging by the concavity of contacts and by the regions as wholes: the default; altitudes in radians.
 
     Attributes
     ----------
     cost : BoundaryCost
         Cost of an edge, radians.
     gap : float, radians per voxel edge, >= 0
-        What a gap in one scan costs beyond one voxel edge; a third of that in other clouds (`Gaps.of_one_scan`).
+        Cost of a gap for each voxel edge of width beyond the first, in one scan; a third of that in other clouds
+        (`Acquisition.is_one_scan`).
     bridge : float, radians per voxel edge, >= 0
-        What a bridge from a speck costs.
+        Cost of a bridge from a speck, for each voxel edge of its width.
     color : float, voxel edges, >= 0
-        Distance that a difference of 1 counts for, in a colour of 0..1, if colours change where surfaces do; less as
-        they do not (`AdjacencyGraph.color_evidence`).
+        Distance that a difference of 1 in a colour of 0..1 counts for. It is multiplied by how far colours change where
+        surfaces do (`AdjacencyGraph.color_evidence`).
     relief : float, radians, >= 0
-        What a region costs that stands in relief: a door on its wall, a picture, a roof above the ground.
+        Cost of a region that stands in relief, as a door on its wall, a picture, or a roof above the ground.
 
     Notes
     -----
-    Two regions merge at an altitude, in radians, of evidence times weight::
+    Two regions merge at the mean concavity of their contacts (LCCP, Stein et al. 2014), weighed by the increase of
+    their squared distances to planes and colours (Mumford and Shah's lambda, Koepfler et al. 1994), by the length of
+    their contact, and by their sizes. A region that stands in relief, or as a heap, out of a larger one around it
+    merges late.
 
-        evidence = (c + relief R + H + c0 + c1 ln(1 + l / l0)) s
-                   + max(c - c2, 0) max(s0 - s, 0) u
-                   + k1 c (1 - s) D m / (m + m2)
-        weight   = E / (E + e0)  (l / (l + l0))^1/2  (1 + M / (r m))^1/4  m / (m + m0)
-
-    Lengths are in voxel edges, masses in mean supervoxels:
-
-    - m, M: masses of the smaller and of the larger region.
-    - c: mean cost of their contacts, weighted by length: concavity as in LCCP (Stein et al. 2014).
-    - b, w: length of their contact, and width of the smaller region; s = (w / (b + w))^3/4, how short the contact is.
-    - E: increase of the squared distances to the regions' best planes and mean colours by the merge, at least
-      e1 m (q - q0), with q the mean square distance of the larger one from its own plane; l = E / b, lambda of Mumford
-      and Shah (Koepfler et al. 1994).
-    - u: mean over the contacts of 1 / (1 + (v / v1)^2), v being the circular variance of the rougher supervoxel's
-      normals, 1 less the length of their mean.
-    - D = d^2 / (1 + d^2), d being the distance of the two mean colours times `color`; 0 without colours.
-
-    What the terms do:
-
-    - E, l: what lies on one plane and has one colour merges first, whatever its normals; unless the larger region is so
-      uneven, as hills are, that its plane says nothing.
-    - m / (m + m0): a small piece merges early, as its contact says little, and a handful of points at once.
-    - M / (r m): a piece merges later with a surface a hundred times as large, so that a thing is whole before it joins
-      what it stands on.
-    - c s: a valley counts most between two large surfaces that meet along a line short for their size.
-    - c2, s0: what is steep of a valley counts half at least, however long the line, so that a heap is told from the
-      ground; but only as far as the surfaces beside it are smooth, so that the crown of a tree is not parted at its
-      clefts.
-    - k1: a valley along which colours change, as where a door or a curtain is before its wall, counts however long it
-      is. Prints and shadows, on one plane or over an edge, have no valley.
-
-    R, 0..1, says that the smaller region stands in relief: the larger one surrounds it, and it lies off the larger
-    one's plane by little, but as a whole. Normals of voxels do not show such a step: it is as high as a voxel or two::
-
-        R = (t^2 b / (b1 w))^2 (1 - r1 m / M) m / (m + m2) / (1 + (v / d^2)^8) / (1 + (d / d1)^2),  v = 4 p + q + v0
-
-    t is the fraction of the smaller region's contacts that are with the larger one, and b counts up to b1 w; d is the
-    distance of the smaller one's mean from the larger one's plane, p the variance of its own distances to that plane.
-    R is 0 where the larger one is not r1 times as large, and where the smaller one lies behind it: as with concavity,
-    what stands out of a surface is another thing, and what is sunk into it, as panes in a wall, is not. Where it is not
-    known from where the cloud was seen, either side counts, as which is the outer one of a bare sheet is a guess.
-
-    H, radians, says that the smaller region is a heap or a hump on the larger one: a valley runs all around it, so that
-    s is small, but there is no other way out of it::
-
-        H = h1 max(c - h0, 0) t^8 u m / (m + m2)
-
-    It is 0 where the larger one is not r1 times as large; and, whatever is known of the sides, where the smaller one
-    lies behind its plane, as the floor of a pit does.
-
-    What stands on a support is whole before it joins it, also where its parts meet at a neck that is a deeper valley
-    than the line along which they meet the support, as the balls of a dumbbell do: a merge above 0.25 rad of a region
-    with a flat one, twice as large or larger, waits for the first merge of the smaller one with a third that lies on
-    the same side of the flat one.
-
-    Regions merge along
-
-    - contacts: voxels that touch;
-    - gaps, at a price (`pcgraph.graph.gaps.gaps`);
-    - continuations behind what hides a surface, and of planes that bound the scene, at no cost
-      (`pcgraph.graph.continuations.continuations`, `pcgraph.graph.bounding_planes.bounding_planes`);
-    - terrain, at the altitude of objects if they do no sooner (`pcgraph.graph.terrain.terrain`);
-    - bridges from specks (`pcgraph.graph.bridges.bridges`): where nothing else joins two regions, above the altitude of
-      objects, at their mean cost times m / (m + 1), so that specks are the first to go in coarser cuts. Bridges between
-      specks of a few points that lie about as near to each other as to anything count as contacts at 3 rad, so that a
-      surface sampled too thinly for voxels does not fall apart.
-
-    The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
-    bins and airborne scans (docs/pcgraph_benchmarks.md); none is far from others that do as well.
+    The formula with all symbols, and what each term does: docs/pcgraph_method.md, "Tree". Its constants:
+    `AltitudeConstants`.
     """
 
     cost: BoundaryCost = field(default_factory=BoundaryCost)
@@ -120,12 +59,12 @@ class RegionLinkage(Linkage):
     color: float = 2.5
     relief: float = 15.0
 
-    default_object_altitude = 0.4
-    default_part_altitude = 0.06
+    default_object_altitude = 0.4  # radians; from 0.34 to 0.43 the mean of all scores changes by 0.003
+    default_part_altitude = 0.06  # radians; the seven faces of two synthetic boxes on a plane are the parts
 
     def __post_init__(self) -> None:
         check_cost(self.cost)
-        check_numbers(self, "gap", "bridge", "color", "relief")
+        check_non_negative(self, "gap", "bridge", "color", "relief")
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the least altitude first."""
@@ -136,8 +75,8 @@ class RegionLinkage(Linkage):
         """Edges along which regions merge: contacts, gaps, continuations, terrain, and bridges."""
         ways = [MergeEdges.of(graph.edges, self.cost(graph.edge_features), graph.edge_features.contact_voxels)]
         if (gaps := graph.gaps) is not None:
-            beyond = np.maximum(gaps.widths - 1.0, 0.0)  # larger voxels' centroids can be nearer than their edge
-            price = (self.gap if gaps.of_one_scan else _OF_SEVERAL * self.gap) * beyond
+            beyond = np.maximum(gaps.widths - 1.0, 0.0)  # centroids of larger voxels can be nearer than an edge
+            price = (self.gap if graph.acquisition.is_one_scan else _GAP_OF_SEVERAL_SCANS * self.gap) * beyond
             ways.append(MergeEdges.of(gaps.edges, self.cost(gaps.edge_features) + price, gaps.weights))
         if (hidden := graph.continuations) is not None:
             behind, ground = hidden.chosen(hidden.coplanar), hidden.chosen(~hidden.coplanar)
@@ -147,11 +86,11 @@ class RegionLinkage(Linkage):
                 for some in ways:
                     ground = ground.without(some.edges)
                 n, every = len(ground.pairs), np.ones(len(ground.pairs), np.bool_)
-                ways.append(MergeEdges(ground.pairs, np.zeros(n), np.full(n, _BRIDGE_VOXELS), every, every))
+                ways.append(MergeEdges(ground.pairs, np.zeros(n), np.full(n, _VOXELS_OF_BRIDGE), every, every))
         if (bridges := graph.bridges) is not None:
             order = np.argsort(~bridges.between_specks, kind="stable")
-            costs = np.where(bridges.between_specks, _BETWEEN_SPECKS, self.bridge * bridges.widths)
-            of_bridges = MergeEdges.of(bridges.edges[order], costs[order], np.full(len(order), _BRIDGE_VOXELS))
+            costs = np.where(bridges.between_specks, _COST_BETWEEN_SPECKS, self.bridge * bridges.widths)
+            of_bridges = MergeEdges.of(bridges.edges[order], costs[order], np.full(len(order), _VOXELS_OF_BRIDGE))
             ways.append(of_bridges._replace(bridges=~bridges.between_specks[order]))
         return MergeEdges(*(np.concatenate(columns) for columns in zip(*ways, strict=True)))
 
@@ -165,9 +104,9 @@ class MergeEdges(NamedTuple):
         Pairs of distinct regions, each pair once.
     costs : (m,) float64, radians, >= 0
     weights : (m,) float64, > 0
-        Contacts in voxels, of both sides.
+        Voxels of contact, of both sides.
     bridges, terrain : (m,) bool
-        Which are no contacts, and which lead from ground to ground.
+        Whether an edge is a bridge, not a contact; and whether it joins two pieces of terrain.
     """
 
     edges: NDArray[np.int32]
@@ -178,95 +117,121 @@ class MergeEdges(NamedTuple):
 
     @classmethod
     def of(cls, edges: NDArray[np.int32], costs: NDArray[np.float64], weights: NDArray[np.number]) -> MergeEdges:
-        """Contacts, neither bridges nor terrain."""
+        """Edges that are neither bridges nor terrain."""
         none = np.zeros(len(edges), np.bool_)
         return cls(edges, costs, weights.astype(np.float64), none, none)
 
 
-_COST, _WEIGHT, _SMOOTHNESS, _BRIDGE, _TERRAIN = range(5)  # rows of ContractedGraph.sums, over the merged edges
-_STEPS = float(1 << 20)
-_MANY = 40  # edges of a region
-_OF_SEVERAL = 1.0 / 3.0  # of the price of a gap, where scans lie over each other
-_BETWEEN_SPECKS = 3.0  # radians: as of a steep valley
-_MAY_WAIT = 0.25
-"""Altitude in radians from which on a merge waits for another. What lies on a surface joins it below that. At 0.1, bins
-lose 0.07 of their covering, at 0.25 0.015; at 0.4, balls of a dumbbell join the table before the bar between them."""
-_WHOLE = 3.0
-"""Least mass in mean supervoxels of regions that wait or are waited for, because smaller ones are parts of surfaces."""
-_FLAT = 0.25
-"""Largest mean square distance of a support from its plane, squared voxel edges: half an edge is what voxels make of a
-plane. Terrain is less flat; its patches lie off each other's planes without standing on each other."""
-_CLEAR = 1.0
-"""Least distance from the plane of the support, voxel edges, because less is the noise of the support itself."""
-_MAX_WAITS = 64
-"""Largest number of times that a merge waits, so that two that wait for each other come to an end."""
-_BRIDGE_VOXELS = 2.0  # that a bridge counts as a contact where others join it: one on each side
+_COST, _WEIGHT, _SMOOTHNESS, _BRIDGE, _TERRAIN = range(5)
+"""Rows of ``ContractedGraph.sums``, over the edges that have become one."""
+_GAP_OF_SEVERAL_SCANS = 1.0 / 3.0
+"""Fraction of the price of a gap that counts in several scans, where one scan leaves gaps and another is dense.
+Measured against the full price: cars bumper to bumper cover 0.99 for 0.78, forests 0.77 for 0.72, thinned streets lose
+0.02. In one scan the price stays: without it sweeps lose 0.01 of their things."""
+_COST_BETWEEN_SPECKS = 3.0
+"""Cost, radians, of a bridge between specks of a few points: as of a steep valley. For so few points that is below the
+altitude of objects. Chosen by eye; not varied."""
+_VOXELS_OF_BRIDGE = 2.0
+"""Voxels of contact as which a bridge, or a way between pieces of terrain, counts: one on each side, as in the least
+contact there can be."""
+_MAX_UPDATED_EDGES = 40
+"""Most edges of a merged region, count, that get new altitudes at once. Each merge hardly changes the altitudes of a
+region with more, so they are computed when they come up, and a hub does not cost the square of its degree. Why 40 is
+not recorded; not varied."""
 
 
-class _Shape(NamedTuple):
-    """Constants of the altitude, as in `RegionLinkage`; the width w of a region of mass m is `width` sqrt(m)."""
+class AltitudeConstants(NamedTuple):
+    """Constants of the altitude of a merge, named by the symbols of docs/pcgraph_method.md ("Tree").
 
-    c0: float
-    c1: float
-    c2: float
-    s0: float
-    v1: float
-    e0: float
-    e1: float
-    q0: float
-    l0: float
-    width: float
-    r: float
-    m0: float
-    m1: float
-    m2: float
-    b1: float
-    r1: float
-    v0: float
-    d1: float
-    h0: float
-    h1: float
-    k1: float
-    objects: float  # altitude of objects, radians
+    Lengths are in voxel edges, masses in mean supervoxels, altitudes in radians.
+
+    They were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets, bins and
+    airborne scans. When heaps were added, each constant but h0 and h1 was tried times 0.8 and 1.25: neither the mean of
+    these domains nor that of 27 further kinds of scene gained more than 0.0007. So a field that gives no other reason
+    has this one. What each term gains: docs/pcgraph_experiments.md.
+    """
+
+    c0: float = 0.08
+    """Evidence, radians, of two regions without a valley: without it 53 of 66 domains change, but not their mean."""
+    c1: float = 0.04
+    """Evidence, radians, per logarithm of the scale l: without it the mean of all scores loses 0.005."""
+    c2: float = 0.45
+    """Concavity, radians, above which a valley is steep."""
+    s0: float = 0.5
+    """Least shortness of contact, fraction, as which a steep valley counts: heaps are told from the ground."""
+    v1: float = 0.03
+    """Circular variance of the normals of a supervoxel, fraction, at which its surface counts as half smooth."""
+    e0: float = 1.0
+    """Increase of energy, squared voxel edges times mass, at which a merge costs half: what lies on one plane merges
+    first. With nearly none the mean loses 0.0056."""
+    e1: float = 0.3
+    """Fraction of the mean square distance from its plane of an uneven larger region that counts as increase."""
+    q0: float = 2.0
+    """Mean square distance from its plane, squared voxel edges, from which on a region counts as uneven: without e1 and
+    q0, hay bales on rolling ground lose 0.09 of their things."""
+    l0: float = 0.1
+    """Scale l, squared voxel edges times mass per voxel edge, well below which two regions are one surface."""
+    width: float = 7.7
+    """Width w, voxel edges, of a region of the mass of a mean supervoxel; of a region of mass m it is width sqrt(m)."""
+    r: float = 100.0
+    """Ratio of masses at which the smaller region merges 1.19 times as high, so that it is whole before it joins its
+    support."""
+    m0: float = 0.1
+    """Mass, mean supervoxels, at which the contact of a small region counts half: it says little."""
+    m1: float = 1.0
+    """Mass, mean supervoxels, at which a bridge costs half: specks merge early among bridges."""
+    m2: float = 10.0
+    """Mass, mean supervoxels, at which relief, heaps and colours along a valley count half: they are no specks."""
+    b1: float = 3.5
+    """Length of contact, in widths w of the smaller region, from which on relief does not grow; the outline of a disc
+    is 3.14 of its widths."""
+    r1: float = 2.0
+    """Least ratio of the masses of what surrounds or bears a thing, and the thing."""
+    v0: float = 0.075
+    """Variance of distances from a plane, squared voxel edges, that is noise in any case: 0.27 voxel edges, so that
+    ground whose heights are whole decimetres is one."""
+    d1: float = 3.0
+    """Distance from the plane, voxel edges, at which relief counts half: what stands farther off shows a valley."""
+    h0: float = 0.3
+    """Concavity, radians, above which a valley all around makes a heap. With 0.25 to 0.35, and 4 to 14 for h1, the mean
+    of all scores of 90 photogrammetric clouds is 0.812 to 0.819; without heaps 0.800."""
+    h1: float = 9.0
+    """Evidence of a heap, radians per radian of concavity above h0: see h0."""
+    k1: float = 8.0
+    """Times that a valley counts along which colours change: with 6 and 11 the covering of 31 flats changes by 0.003 at
+    most."""
+    objects: float = RegionLinkage.default_object_altitude
+    """Altitude of objects, radians: terrain merges there at the latest, and bridges above it. From 0.34 to 0.43 the
+    mean of all scores changes by 0.003."""
+    wait_above: float = 0.25
+    """Altitude, radians, from which on the merge of a thing with its support may wait for another. What lies on a
+    surface joins it below that. At 0.1 bins lose 0.07 of their covering, at 0.25 0.015; at 0.4 the balls of a dumbbell
+    join the table before the bar between them."""
+    max_waits: int = 64
+    """Most times, count, that a merge waits: two that wait for each other come to an end."""
+    whole: float = 3.0
+    """Least mass, mean supervoxels, of regions that wait or are waited for: smaller ones are parts of surfaces."""
+    flat: float = 0.25
+    """Most mean square distance of a support from its plane, squared voxel edges: half an edge is what voxels make of a
+    plane. Terrain is less flat; its pieces lie off each other's planes without standing on each other."""
+    clear: float = 1.0
+    """Least distance from the plane of a support, voxel edges, at which a region stands on it: less is noise."""
 
 
-_SHAPE = _Shape(
-    c0=0.08,
-    c1=0.04,
-    c2=0.45,
-    s0=0.5,
-    v1=0.03,
-    e0=1.0,
-    e1=0.3,
-    q0=2.0,
-    l0=0.1,
-    width=7.7,
-    r=100.0,
-    m0=0.1,
-    m1=1.0,
-    m2=10.0,
-    b1=3.5,
-    r1=2.0,
-    v0=0.075,
-    d1=3.0,
-    h0=0.3,
-    h1=9.0,
-    k1=8.0,
-    objects=RegionLinkage.default_object_altitude,
-)
+_CONSTANTS = AltitudeConstants()
 
 
 class _Outlines(NamedTuple):
-    """What relief asks of n regions beside their moments, while they merge.
+    """Outlines and outer sides of n regions while they merge, from which relief follows.
 
     Attributes
     ----------
     perimeters : (n,) float64
-        Contacts with all others, in voxels of both sides.
+        Contacts with all other regions, in voxels of both sides.
     outward : (n, 3) float64
-        Sums of their supervoxels' normals, by mass.
+        Sums of the normals of their supervoxels, weighted by mass.
     sides_known : bool
-        Whether it is known from where they were seen.
+        Whether it is known from where the regions were seen.
     """
 
     perimeters: NDArray[np.float64]
@@ -277,7 +242,7 @@ class _Outlines(NamedTuple):
 def region_linkage(
     graph: AdjacencyGraph, leaves: Moments, ways: MergeEdges, color: float = 0.0, relief: float = 0.0
 ) -> Merges:
-    """Merges of regions along edges, the least altitude of `RegionLinkage` first.
+    """Merges of regions along edges, those at the least altitude first.
 
     Parameters
     ----------
@@ -286,15 +251,15 @@ def region_linkage(
     leaves : Moments of k regions
     ways : MergeEdges
     color : float, voxel edges, >= 0
-        What colours count, if there are any.
+        Distance that a difference of 1 in colour counts for.
     relief : float, radians, >= 0
-        What a region costs that stands in relief.
+        Cost of a region that stands in relief.
 
     Returns
     -------
     Merges
-        Altitudes are made not to decrease: a merge below the altitude of an earlier one takes that. Of equal ones the
-        first edge merges first.
+        Altitudes do not decrease: a merge below the altitude of an earlier one takes that altitude. Of edges at equal
+        altitudes the first merges first.
     """
     edges, costs, weights, bridges, terrain = ways
     state = RegionState.of(regions_of(graph, leaves, 0.0, 0.0, color, 1.0))
@@ -304,20 +269,20 @@ def region_linkage(
     sums = sums[: (_TERRAIN if terrain.any() else _BRIDGE if bridges.any() else _SMOOTHNESS) + 1]
     perimeters = np.bincount(edges.ravel(), np.repeat(weights, 2), graph.n_nodes)
     outward = state.masses[:, None] * graph.node_features.normal
-    outlines = _Outlines(perimeters.astype(np.float64), outward, graph.sides_known)
-    contracted = ContractedGraph.of(graph.n_nodes, len(edges), sums)
-    _merge(state, outlines, relief, contracted, edges, np.empty(len(edges)), np.empty((2, 3)))
+    outlines = _Outlines(perimeters.astype(np.float64), outward, graph.acquisition.sides_known)
+    contracted, scratch = ContractedGraph.of(graph.n_nodes, len(edges), sums), np.empty((2, 3))
+    _merge(state, outlines, relief, contracted, _CONSTANTS, edges, np.empty(len(edges)), scratch)
     merges = contracted.merges()
     return Merges(merges.pairs, np.maximum.accumulate(merges.altitudes))
 
 
 def _smoothness(leaves: Moments, edges: NDArray[np.int32]) -> NDArray[np.float64]:
-    """How smooth the rougher region at each edge is, (m,) float64, 0..1: u of `RegionLinkage`, in whole steps."""
+    """Smoothness of the rougher region at each edge, (m,) float64, 0..1, in whole steps: the symbol u."""
     if leaves.normals is None:
         return np.ones(len(edges))
     spread = 1.0 - np.sqrt(np.einsum("ij,ij->i", leaves.normals, leaves.normals))
     rougher = np.maximum(spread[edges[:, 0]], spread[edges[:, 1]])
-    return np.rint(_STEPS / (1.0 + np.square(rougher / _SHAPE.v1))) / _STEPS
+    return in_whole_steps(1.0 / (1.0 + np.square(rougher / _CONSTANTS.v1)))
 
 
 @kernel
@@ -326,43 +291,46 @@ def _merge(
     outlines: _Outlines,
     relief: float,
     graph: ContractedGraph,
+    constants: AltitudeConstants,
     edges: NDArray[np.int32],
     altitudes: NDArray[np.float64],
     scratch: NDArray[np.float64],
 ) -> None:
-    """Merge along the lowest edge until there is none. The altitudes before the first merge, (m,), are set here.
+    """Merge along the lowest edge until no edge is left. The altitudes before the first merge, (m,), are set here.
 
-    After a merge all edges of the merged region get new altitudes; of a region with many, whose altitudes each merge
-    hardly changes, an edge gets it when it comes up. Then, too, it is seen whether one stands out, which raises it.
+    After a merge the edges of the merged region get new altitudes. Of a region with many edges, each gets its new
+    altitude when it comes up. Whether one region stands out of the other is also asked when their edge comes up; if so,
+    its altitude rises.
     """
     heap, halves, clusters, sums = graph.heap, graph.halves, graph.clusters, graph.sums
     perimeters, outward, _ = outlines
-    # After how many merges each region changed, each altitude was computed, and, plus 1, it was asked what stands out.
+    # Numbers of merges done as a region changed, an altitude was computed, and (plus 1) relief was asked for.
     changed, computed = np.zeros(len(clusters), np.int64), np.zeros(len(heap.edges), np.int64)
     asked, waits = np.zeros(len(heap.edges), np.int64), np.zeros(len(heap.edges), np.int64)  # and how often it waited
     normal, normal_of_other = scratch[0], scratch[1]
     set_residuals(state)
     for edge in range(len(edges)):
-        altitudes[edge] = _altitude(state, sums, edge, np.int64(edges[edge, 0]), np.int64(edges[edge, 1]), 0.0)
+        a, b = np.int64(edges[edge, 0]), np.int64(edges[edge, 1])
+        altitudes[edge] = _altitude(state, sums, edge, a, b, 0.0, constants)
     insert_edges(graph, edges, altitudes)
     while heap.size[0] > 0:
         edge = heap.order[0]
         a, b = halves[2 * edge].end, halves[2 * edge + 1].end
         if computed[edge] < max(changed[a], changed[b]):
             computed[edge] = graph.done[0]
-            heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0))
+            heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0, constants))
             continue
         if asked[edge] <= computed[edge]:
             asked[edge] = computed[edge] + 1
-            stands_out = _standing_out(state, outlines, sums, edge, a, b, relief, normal)
+            stands_out = _standing_out(state, outlines, sums, edge, a, b, relief, constants, normal)
             if stands_out > 0.0:
-                heap_update(heap, edge, _altitude(state, sums, edge, a, b, stands_out))
+                heap_update(heap, edge, _altitude(state, sums, edge, a, b, stands_out, constants))
                 continue
-        if heap.edges[edge].cost > _MAY_WAIT and waits[edge] < _MAX_WAITS:
-            later = _awaited(state, graph, a, b, normal, normal_of_other)
+        if heap.edges[edge].cost > constants.wait_above and waits[edge] < constants.max_waits:
+            later = _awaited(state, graph, a, b, constants, normal, normal_of_other)
             if later >= heap.edges[edge].cost:
                 waits[edge] += 1
-                heap_update(heap, edge, later + 1.0 / _STEPS)
+                heap_update(heap, edge, later + 1.0 / COST_STEPS)
                 continue
         inside = 2.0 * sums[_WEIGHT, edge]
         kept, gone, n_parallel = contract_cheapest(graph)
@@ -371,17 +339,17 @@ def _merge(
         for axis in range(3):
             outward[kept, axis] += outward[gone, axis]
         changed[kept] = graph.done[0]
-        half = clusters[kept].first if clusters[kept].degree <= _MANY else NONE
+        half = clusters[kept].first if clusters[kept].degree <= _MAX_UPDATED_EDGES else NONE
         while half != NONE:
             edge = half >> 1
             computed[edge] = graph.done[0]
-            heap_update(heap, edge, _altitude(state, sums, edge, kept, halves[half ^ 1].end, 0.0))
+            heap_update(heap, edge, _altitude(state, sums, edge, kept, halves[half ^ 1].end, 0.0, constants))
             half = halves[half].after
         for edge in graph.parallel[:n_parallel]:
-            if computed[edge] < graph.done[0]:  # two became one: both old altitudes say little
+            if computed[edge] < graph.done[0]:  # two edges became one, which changes its altitude at once
                 computed[edge] = graph.done[0]
                 a, b = halves[2 * edge].end, halves[2 * edge + 1].end
-                heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0))
+                heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0, constants))
 
 
 @routine
@@ -390,40 +358,44 @@ def _awaited(
     graph: ContractedGraph,
     a: int,
     b: int,
+    constants: AltitudeConstants,
     normal: NDArray[np.float64],
     normal_of_other: NDArray[np.float64],
 ) -> float:
-    """Altitude of the first merge that the smaller of two regions has with a third that stands on the larger one, too,
-    or above it on nothing; -1 if there is none, or if the smaller one does not stand on the larger one.
+    """Altitude at which the smaller of two regions, on its support, merges first with a third beside it; -1 if never.
 
-    The normals are scratch.
+    The larger region is the support. A third region counts if it lies on the same side of the support and is no support
+    of the smaller one itself. So a dumbbell is whole before it joins its table, though its bar is a deeper valley than
+    its feet. The normals are scratch.
     """
     if state.masses[b] < state.masses[a]:
         a, b = b, a
-    side = _side_on(state, a, b, normal)
-    if state.masses[a] < _WHOLE or side == 0.0:
+    side = _side_on(state, a, b, constants, normal)
+    if state.masses[a] < constants.whole or side == 0.0:
         return -1.0
     heap, halves, clusters = graph.heap, graph.halves, graph.clusters
     least, half = np.inf, clusters[a].first
     while half != NONE:
         c, cost = halves[half ^ 1].end, heap.edges[half >> 1].cost
-        is_whole = c != b and state.masses[c] >= _WHOLE
-        if is_whole and cost < least and side * _height(state, c, b, normal) > _CLEAR:
-            least = cost if _side_on(state, a, c, normal_of_other) == 0.0 else least
+        is_whole = c != b and state.masses[c] >= constants.whole
+        if is_whole and cost < least and side * _height(state, c, b, normal) > constants.clear:
+            least = cost if _side_on(state, a, c, constants, normal_of_other) == 0.0 else least
         half = halves[half].after
     return least if least < np.inf else -1.0
 
 
 @routine
-def _side_on(state: RegionState, a: int, b: int, normal: NDArray[np.float64]) -> float:
-    """On which side of region b region a stands, 1 or -1, where `normal` receives the normal of b; 0 if b is not flat
-    and much larger, or a is not clear of it."""
-    if _SHAPE.r1 * state.masses[a] >= state.masses[b] or state.residuals[b] > _FLAT * state.masses[b]:
+def _side_on(state: RegionState, a: int, b: int, constants: AltitudeConstants, normal: NDArray[np.float64]) -> float:
+    """Side of region b on which region a stands, 1 or -1; 0 if b is no support of a.
+
+    A support is flat and much larger, and a is clear of its plane. `normal` receives the normal of b.
+    """
+    if constants.r1 * state.masses[a] >= state.masses[b] or state.residuals[b] > constants.flat * state.masses[b]:
         return 0.0
     if plane_normal(state.scatters[b], normal) < 0.0:
         return 0.0
     height = _height(state, a, b, normal)
-    return np.sign(height) if abs(height) > _CLEAR else 0.0
+    return np.sign(height) if abs(height) > constants.clear else 0.0
 
 
 @routine
@@ -436,31 +408,43 @@ def _height(state: RegionState, a: int, b: int, normal: NDArray[np.float64]) -> 
 
 
 @routine
-def _altitude(state: RegionState, sums: NDArray[np.float64], edge: int, a: int, b: int, stands_out: float) -> float:
-    """Altitude at which the two regions at an edge merge, radians, in whole steps, as energies of nothing are noise."""
-    shape = _SHAPE
+def _altitude(
+    state: RegionState,
+    sums: NDArray[np.float64],
+    edge: int,
+    a: int,
+    b: int,
+    stands_out: float,
+    constants: AltitudeConstants,
+) -> float:
+    """Altitude at which the two regions at an edge merge, radians, evidence times weight of docs/pcgraph_method.md.
+
+    It is a whole number of steps, so that the rounding noise of energies near 0 does not order merges.
+    """
     cost, length = sums[_COST, edge] / sums[_WEIGHT, edge], 0.5 * sums[_WEIGHT, edge]
     smaller, larger = min(state.masses[a], state.masses[b]), max(state.masses[a], state.masses[b])
-    objects, is_terrain = round(shape.objects * _STEPS), len(sums) > _TERRAIN and sums[_TERRAIN, edge] > 0.0
+    objects, is_terrain = round(constants.objects * COST_STEPS), len(sums) > _TERRAIN and sums[_TERRAIN, edge] > 0.0
     if len(sums) > _BRIDGE and sums[_BRIDGE, edge] == sums[_WEIGHT, edge]:  # nothing but bridges
         if is_terrain:
-            return objects / _STEPS
-        return max(round(cost * smaller / (smaller + shape.m1) * _STEPS), objects + 1) / _STEPS
-    uneven = state.residuals[a if state.masses[a] == larger else b] / larger - shape.q0
+            return objects / COST_STEPS
+        return max(round(cost * smaller / (smaller + constants.m1) * COST_STEPS), objects + 1) / COST_STEPS
+    uneven = state.residuals[a if state.masses[a] == larger else b] / larger - constants.q0
     contrast = squared_distance(state.values, a, b)
-    increase = max(energy_increase(state, a, b, contrast), shape.e1 * smaller * uneven, 0.0)
+    increase = max(energy_increase(state, a, b, contrast), constants.e1 * smaller * uneven, 0.0)
     scale = increase / length
-    width = shape.width * math.sqrt(smaller)
+    width = constants.width * math.sqrt(smaller)
     shortness = width / (length + width)
-    shortness = math.sqrt(shortness * math.sqrt(shortness))
-    evidence = (cost + stands_out + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)) * shortness
-    if cost > shape.c2 and shortness < shape.s0:
-        evidence += (cost - shape.c2) * (shape.s0 - shortness) * sums[_SMOOTHNESS, edge] / sums[_WEIGHT, edge]
-    evidence += shape.k1 * cost * (1.0 - shortness) * contrast / (1.0 + contrast) * smaller / (smaller + shape.m2)
-    evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
-    evidence *= math.sqrt(math.sqrt(1.0 + larger / (shape.r * smaller))) * smaller / (smaller + shape.m0)
-    altitude = round(evidence * _STEPS)
-    return (min(altitude, objects) if is_terrain else altitude) / _STEPS
+    shortness = math.sqrt(shortness * math.sqrt(shortness))  # to the power of 3/4
+    evidence = (cost + stands_out + constants.c0 + constants.c1 * math.log(1.0 + scale / constants.l0)) * shortness
+    if cost > constants.c2 and shortness < constants.s0:
+        steep = (cost - constants.c2) * (constants.s0 - shortness)
+        evidence += steep * sums[_SMOOTHNESS, edge] / sums[_WEIGHT, edge]
+    of_colors = constants.k1 * cost * (1.0 - shortness) * contrast / (1.0 + contrast)
+    evidence += of_colors * smaller / (smaller + constants.m2)
+    evidence *= increase / (increase + constants.e0) * math.sqrt(scale / (scale + constants.l0))
+    evidence *= math.sqrt(math.sqrt(1.0 + larger / (constants.r * smaller))) * smaller / (smaller + constants.m0)
+    altitude = round(evidence * COST_STEPS)
+    return (min(altitude, objects) if is_terrain else altitude) / COST_STEPS
 
 
 @routine
@@ -472,35 +456,36 @@ def _standing_out(
     a: int,
     b: int,
     relief: float,
+    constants: AltitudeConstants,
     normal: NDArray[np.float64],
 ) -> float:
-    """How much the smaller region at an edge stands out of the larger one, radians: relief R + H of `RegionLinkage`.
+    """Evidence, radians, that the smaller region at an edge stands out of the larger: R + H of docs/pcgraph_method.md.
 
     `normal` is scratch.
     """
-    shape = _SHAPE
     if state.masses[b] < state.masses[a]:
         a, b = b, a
     smaller, larger, contact = state.masses[a], state.masses[b], sums[_WEIGHT, edge]
-    if shape.r1 * smaller >= larger or plane_normal(state.scatters[b], normal) < 0.0:
+    if constants.r1 * smaller >= larger or plane_normal(state.scatters[b], normal) < 0.0:
         return 0.0
     x, y, z = normal
     inner, outer = state.centroids[a], state.centroids[b]
     distance = x * (inner[0] - outer[0]) + y * (inner[1] - outer[1]) + z * (inner[2] - outer[2])
     outwards = x * outlines.outward[b, 0] + y * outlines.outward[b, 1] + z * outlines.outward[b, 2]
     enclosed, cost, heap = min(contact / outlines.perimeters[a], 1.0), sums[_COST, edge] / contact, 0.0
-    if cost > shape.h0 and distance * outwards >= 0.0:
-        heap = shape.h1 * (cost - shape.h0) * enclosed**8 * sums[_SMOOTHNESS, edge] / contact
+    if cost > constants.h0 and distance * outwards >= 0.0:
+        heap = constants.h1 * (cost - constants.h0) * enclosed**8 * sums[_SMOOTHNESS, edge] / contact
     elif outlines.sides_known and distance * outwards < 0.0:
         return 0.0  # it lies behind
-    width = shape.width * math.sqrt(smaller)
-    within = enclosed * enclosed * min(0.5 * contact / (shape.b1 * width), 1.0)
+    width = constants.width * math.sqrt(smaller)
+    within = enclosed * enclosed * min(0.5 * contact / (constants.b1 * width), 1.0)
     scatter = state.scatters[a]
     spread = x * x * scatter[0] + y * y * scatter[1] + z * z * scatter[2]
     spread += 2.0 * (x * y * scatter[3] + x * z * scatter[4] + y * z * scatter[5])
     square, off = distance * distance, 0.0
-    noise = shape.v0 + 4.0 * spread / smaller + state.residuals[b] / larger
-    if square >= 0.1 * noise:  # else it would be less than 1e-8
-        off = 1.0 / ((1.0 + (noise / square) ** 8) * (1.0 + square / (shape.d1 * shape.d1)))
-    in_relief = within * within * (1.0 - shape.r1 * smaller / larger) * off
-    return (relief * in_relief + heap) * smaller / (smaller + shape.m2)
+    # With 8 times the smaller region's variance in place of 4, windows of a house front are lost (IoU 0.54).
+    noise = constants.v0 + 4.0 * spread / smaller + state.residuals[b] / larger
+    if square >= 0.1 * noise:  # else `off` would be less than 1e-8
+        off = 1.0 / ((1.0 + (noise / square) ** 8) * (1.0 + square / (constants.d1 * constants.d1)))
+    in_relief = within * within * (1.0 - constants.r1 * smaller / larger) * off
+    return (relief * in_relief + heap) * smaller / (smaller + constants.m2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Saliency: how long a boundary lasts as segments merge (ultrametric contour map)."""
+"""Saliency: the altitude up to which a boundary lasts as segments merge (ultrametric contour map)."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from pcgraph.voxels.surface import Surface
 def voxel_saliency(tree: SegmentationTree, surface: Surface) -> NDArray[np.float64]:
     """Boundary strength of each voxel, (v,) float64, the altitudes' unit.
 
-    The largest altitude at which the voxel's supervoxel merges with another one that the voxel touches
-    (26-neighbourhood); 0 inside supervoxels. What remains above a level are the boundaries of the cut at that
-    altitude, two voxels wide.
+    It is the largest altitude at which the voxel's supervoxel merges with another one that the voxel touches
+    (26-neighbourhood), and 0 inside supervoxels. Voxels above a level are the boundaries of the cut at that altitude,
+    two voxels wide.
 
     Parameters
     ----------
     tree : SegmentationTree
-        Whose leaves are the surface's supervoxels.
+        Its leaves are the surface's supervoxels.
     surface : Surface of v voxels
 
     Raises

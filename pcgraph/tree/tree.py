@@ -15,14 +15,16 @@ from pcgraph.hierarchy import lowest_common_ancestors, roots
 from pcgraph.inputs import non_negative
 from pcgraph.pairs import nearest
 from pcgraph.plumbing.short_repr import ShortRepr
-from pcgraph.tree.cuts import horizontal_cut, numbered_segments, persistences, stable_cut
+from pcgraph.tree.cuts import horizontal_cut, numbered_segments, persistences
 from pcgraph.tree.linkage import Merges
 from pcgraph.tree.optimal_cut import Energy, appearance_scales
 
 if TYPE_CHECKING:
     import networkx
 
-_GAP_CANDIDATES = 8
+_N_NEAREST = 8
+"""Count of nearest leaves among which each leaf looks for one of a larger part: enough to look past its own part.
+Chosen by eye; not varied."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,13 +34,13 @@ class SegmentationTree(ShortRepr):
     Attributes
     ----------
     parents : (k,) int32
-        Parent of each node, larger than the node's own number; the root (last node) is its own parent. The
-        first `n_leaves` nodes are the supervoxels, in their order. k = 2 n_leaves - 1.
+        Parent of each node, larger than the node's own number; the root (last node) is its own parent. The first
+        `n_leaves` nodes are the supervoxels, in their order. k = 2 n_leaves - 1.
     altitudes : (k,) float64, the linkage's unit
-        Cost at which a node came to be: 0 for leaves, not decreasing with the node's number; infinite where
-        parts that do not touch were joined.
-    moments : Moments
-        k rows: additive moments of the points below each node.
+        Cost at which each node came to be: 0 for leaves, not decreasing with the node's number, infinite where parts
+        that do not touch were joined.
+    moments : Moments of k groups
+        Moments of the points below each node.
     """
 
     parents: NDArray[np.int32]
@@ -59,14 +61,15 @@ class SegmentationTree(ShortRepr):
     def persistence(self) -> NDArray[np.float64]:
         """Range of altitudes over which each node is a segment of the cuts, (k,) float64.
 
-        Infinite for what never merges below infinity; 0 for nodes born at infinity.
+        It is infinite for nodes that never merge below infinity, and 0 for nodes that come to be at infinity.
         """
         return persistences(self.parents, self.altitudes)
 
     def cut(self, n: int | None = None, altitude: float | None = None, min_size: int = 1) -> NDArray[np.int32]:
         """Segment of each leaf, (n_leaves,) int32, numbered from 0 in the order of their first leaf.
 
-        Points follow in one step: ``tree.cut(n=5)[supervoxels]``, or `Segmentation.cut`, which minds the -1.
+        Segments of points are ``tree.cut(n=5)[supervoxels]``, or `Segmentation.cut`, which keeps the -1 of points
+        without a supervoxel.
 
         Parameters
         ----------
@@ -75,15 +78,15 @@ class SegmentationTree(ShortRepr):
         altitude : float, the linkage's unit
             All merges up to and including this cost are done.
         min_size : int, points
-            No segment has fewer, unless the whole tree has. What is smaller goes where the tree would have
-            merged it: to the first node above with enough points, and from there down into the larger child.
-            Cuts with the same `min_size` nest.
+            No segment has fewer, unless the whole tree has. A smaller one goes where the tree would have merged it: to
+            the first node above with enough points, and from there down into the larger child. Cuts with the same
+            `min_size` nest.
 
         Raises
         ------
         ValueError
-            Not exactly one of the first two is given, n is out of range (for this `min_size`), altitude is not
-            a number, or `min_size` is not a whole number of at least 1.
+            Not exactly one of the first two is given, n is out of range (for this `min_size`), altitude is not a
+            number, or `min_size` is not a whole number of at least 1.
         """
         return self._segments(self.cut_nodes(n, altitude, min_size))
 
@@ -112,42 +115,18 @@ class SegmentationTree(ShortRepr):
         columns = [self.cut(altitude=level) for level in np.ravel(altitudes).tolist()]
         return np.stack(columns, axis=1) if columns else np.empty((self.n_leaves, 0), np.int32)
 
-    def cut_stable(self, min_size: int = 1) -> NDArray[np.int32]:
-        """Segment of each leaf in the most stable segmentation, (n_leaves,) int32, numbered as in `cut`.
-
-        Of all ways to choose nodes, none above another, the one with the largest sum of points x life (excess of mass,
-        Campello et al. 2015), the difference of the square roots of the altitudes at which a node comes to be and ends.
-        Segments may come from different altitudes. Life ends at the largest finite altitude at which two parts of
-        `min_size` points merge, so a scene that is one piece is never one segment for that alone.
-
-        Parameters
-        ----------
-        min_size : int, points
-            A merge with fewer points does not end a segment's life, and no segment has fewer.
-
-        Raises
-        ------
-        ValueError
-            `min_size` is not a whole number of at least 1.
-        """
-        return self._segments(self.cut_stable_nodes(min_size))
-
-    def cut_stable_nodes(self, min_size: int = 1) -> NDArray[np.int32]:
-        """Node of the tree for each leaf, (n_leaves,) int32; as `cut_stable`."""
-        return stable_cut(self.parents, self.altitudes, self.moments.counts, min_size)
-
     def cut_optimal(self, energy: Energy, scale: float) -> NDArray[np.int32]:
         """Segment of each leaf in the cut of least energy, (n_leaves,) int32, numbered as in `cut`.
 
-        Of all ways to cut the tree, at one altitude or at several, the one with the least sum over its segments
-        of data + scale x complexity. Cuts at rising scales nest. What joins at infinite altitude stays apart.
+        Of all ways to cut the tree, at one altitude or at several, it is the one with the least sum over its segments
+        of data + scale x complexity. Cuts at rising scales nest. Parts that join at infinite altitude stay apart.
 
         Parameters
         ----------
         energy : Energy
             k rows, for example `plane_energy(tree)`.
         scale : float, >= 0, finite
-            Their lambda.
+            Lambda of Guigues et al. 2006.
 
         Raises
         ------
@@ -157,10 +136,10 @@ class SegmentationTree(ShortRepr):
         return self.by_energy(energy).cut(altitude=non_negative("scale", scale))
 
     def by_energy(self, energy: Energy) -> SegmentationTree:
-        """The same merges with the scale as altitude: the persistent hierarchy of optimal cuts.
+        """Tree of the same merges with the scale as altitude: the persistent hierarchy of optimal cuts.
 
-        Its cut at an altitude is the optimal cut at that scale (Guigues et al. 2006). A node that belongs to no
-        optimal cut comes to be together with one above it. Inner nodes are renumbered in the order of scales.
+        Its cut at an altitude is the optimal cut at that scale (Guigues et al. 2006). A node that is in no optimal cut
+        has the altitude of one above it. Inner nodes are renumbered in the order of scales.
 
         Raises
         ------
@@ -178,12 +157,12 @@ class SegmentationTree(ShortRepr):
         return self.with_altitudes(appearance_scales(self.parents, data, energy.complexity.astype(np.float64)))
 
     def with_altitudes(self, altitudes: ArrayLike) -> SegmentationTree:
-        """The same merges at other altitudes; inner nodes are renumbered so that these do not decrease.
+        """Tree of the same merges at other altitudes; inner nodes are renumbered so that altitudes do not decrease.
 
         Parameters
         ----------
         altitudes : (k,) float
-            0 for leaves; a node's is not above its parent's. Of equal ones the order stays.
+            0 for leaves; a node's is not above its parent's. Nodes of equal altitudes keep their order.
 
         Raises
         ------
@@ -206,8 +185,8 @@ class SegmentationTree(ShortRepr):
     def edge_saliency(self, pairs: ArrayLike) -> NDArray[np.float64]:
         """Altitude at which the two leaves of each pair become one segment, (m,) float64, the linkage's unit.
 
-        On the edges of the graph this is the ultrametric contour map: edges above a level are the boundaries of
-        the cut at that altitude.
+        On the edges of the graph this is the ultrametric contour map: edges above a level are the boundaries of the cut
+        at that altitude.
 
         Parameters
         ----------
@@ -247,9 +226,10 @@ class SegmentationTree(ShortRepr):
         return node_features(self.moments)
 
     def to_networkx(self) -> networkx.DiGraph:
-        """The tree as ``networkx.DiGraph`` from parent to child; attributes ``altitude`` and features as numbers.
+        """The tree as ``networkx.DiGraph``, from parent to child, with ``altitude`` and features as attributes.
 
-        A node that joins parts across a gap, at infinite altitude, has no ``altitude``: JSON knows no infinity.
+        All attributes are numbers. A node at infinite altitude, which joins parts that do not touch, has no
+        ``altitude``, because JSON has no infinity.
         """
         from networkx import DiGraph
 
@@ -269,19 +249,18 @@ class SegmentationTree(ShortRepr):
 
 
 def segmentation_tree(merges: Merges, leaves: Moments) -> SegmentationTree:
-    """Tree over k leaves: a linkage's merges, then those across the gaps.
+    """Tree over k leaves: a linkage's merges, then merges of the parts that are left.
 
     Parameters
     ----------
-    merges : Merges of k leaves
-        Along the edges of their graph.
+    merges : Merges of k leaves, along the edges of their graph
     leaves : Moments of k leaves
 
     Notes
     -----
     Parts that the merges leave apart are joined at infinite altitude, the smallest (in points) first, each to the
-    nearest larger part. So cuts below infinity never mix them, and a cut into few segments keeps the large
-    parts apart. `RegionLinkage` has specks joined before, across bridges.
+    nearest larger part. So cuts below infinity never mix them, and a cut into few segments keeps the large parts apart.
+    `RegionLinkage` joins specks earlier, across bridges.
     """
     n_leaves, n_merges = len(leaves), len(merges.pairs)
     parents = np.arange(2 * n_leaves - 1, dtype=np.int32)
@@ -294,12 +273,12 @@ def segmentation_tree(merges: Merges, leaves: Moments) -> SegmentationTree:
 
 
 def _join_parts(parts: NDArray[np.int32], leaves: Moments, next_node: int) -> NDArray[np.int32]:
-    """Merges, (p - 1, 2) int32, of p parts, given by the root node of each leaf."""
+    """Merges, (p - 1, 2) int32, of p parts; `parts` is the root above each leaf."""
     tops, part = np.unique(parts, return_inverse=True)
     if len(tops) == 1:
         return np.empty((0, 2), np.int32)
     sizes = np.bincount(part, leaves.counts)
-    order = np.lexsort((-tops, sizes))  # ascending size; of equal parts the later one is absorbed first
+    order = np.lexsort((-tops, sizes))  # ascending size; of equal parts the later one merges first
     rank = np.empty(len(tops), np.int64)
     rank[order] = np.arange(len(tops))
     target = _nearest_larger(part, rank, leaves.centroids)
@@ -314,8 +293,8 @@ def _join_parts(parts: NDArray[np.int32], leaves: Moments, next_node: int) -> ND
 def _nearest_larger(
     part: NDArray[np.int64], rank: NDArray[np.int64], centroids: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """For each part the larger one with a leaf nearest to its own; the largest part if none is near."""
-    n_near = min(_GAP_CANDIDATES + 1, len(centroids))
+    """Larger part that has the leaf nearest to each part's own leaves, (p,) int64; the largest part if none is near."""
+    n_near = min(_N_NEAREST + 1, len(centroids))
     seeking = np.flatnonzero(rank[part] < len(rank) - 1)  # the largest part looks for none
     distance, leaf = nearest(centroids, centroids[seeking], n_near)
     row, column = np.nonzero(rank[part[leaf]] > rank[part[seeking]][:, None])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells of a cubic grid as whole numbers that sort: how points are brought to those beside them."""
+"""Keys of the cells of a cubic grid: whole numbers that sort like the cells, which brings points of a cell together."""
 
 from __future__ import annotations
 
@@ -12,16 +12,23 @@ from numpy.typing import NDArray
 from pcgraph.parallel import in_blocks, kernel, routine
 
 _MAX_KEY = float(1 << 62)
-_DIGIT, _DIGIT_OF_FEW = 12, 8  # bits, at most, as more digits take more rounds, and their tables time to fill;
-_FEW = 1 << 14  # of so many numbers and fewer
-_BITS = 63  # of a number that is not negative
-_AT_ONCE = 1024  # points, about
-_POINTS_OF_BLOCK = 1 << 16  # that are looked through in less time than it takes to start a thread
+_DIGIT_BITS = 12
+"""Bits per digit of the radix sort, at most: with less it takes more rounds, with more larger tables; chosen by eye."""
+_SHORT = 1 << 14
+"""Numbers of a short list, whose sort has smaller tables, as filling them takes most of its time; chosen by eye."""
+_DIGIT_BITS_OF_SHORT = 8
+"""Bits of a digit when a short list is sorted, at most; chosen by eye."""
+_KEY_BITS = 63
+"""Count of bits of a key, because an int64 has one more for the sign."""
+_BATCH = 1024
+"""Points that are fetched together, about, 24 kB of coordinates; chosen by eye, for speed."""
+_MIN_BLOCK = 1 << 16
+"""Points for a thread of its own, at least: its start takes longer than to look through fewer; chosen by eye."""
 
 
 def bounding_box(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lowest and highest coordinates, (3,) each, of points (n, 3), n >= 1; NaN if one is."""
-    of_blocks = in_blocks(_bounds, len(points), np.ascontiguousarray(points, np.float64), smallest=_POINTS_OF_BLOCK)
+    of_blocks = in_blocks(_bounds, len(points), np.ascontiguousarray(points, np.float64), smallest=_MIN_BLOCK)
     bounds = np.array(of_blocks)
     return bounds[:, :3].min(axis=0), bounds[:, 3:].max(axis=0)
 
@@ -41,48 +48,49 @@ def _bounds(start: int, stop: int, points: NDArray[np.float64]) -> tuple[float, 
 
 
 class Lattice(NamedTuple):
-    """A lattice of cubic cells: a place lies (place - corner) / edge cells off its corner, along each axis.
+    """A lattice of cubic cells: along each axis, a place lies (place - corner) / edge cells off its corner.
 
-    Kernels compute that where they need it, as it takes less time than to read it again.
+    Kernels compute that anew where they need it. That takes less time than to read it from memory.
 
     Attributes
     ----------
     corner : (3,) float64
     edge : float
+        Edge length of a cell, in the unit of the corner.
     """
 
     corner: NDArray[np.float64]
     edge: float
 
     def in_cells(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Places, (n, 3), in edges of cells off the corner; infinite beyond all numbers."""
+        """Places, (n, 3), in cell edges from the corner; infinite if that overflows."""
         counted = np.empty((len(places), 3))
         in_blocks(_count_from, len(places), places, *self, counted)
         return counted
 
 
 UNIT_CELLS = Lattice(np.zeros(3), 1.0)
-"""That of places which are in edges of cells already."""
+"""The lattice of places that are in cell edges already."""
 
 
 def cell_keys(
     places: NDArray[np.float64], size: float, spare: int = 2, rooms: int = 1, lattice: Lattice = UNIT_CELLS
 ) -> tuple[NDArray[np.int64], tuple[int, int]]:
-    """One whole number per place that sorts like its cell (x, y, z), and what a step in x and in y adds to it.
+    """A key per place, a whole number that sorts like its cell (x, y, z), and what a step in x and in y adds to it.
 
     Parameters
     ----------
     places : (n, 3) float64
         On the lattice, n >= 1.
     size : float, metres
-        Edge length of a cell, for the message.
+        Edge length of a cell, for the message of the error.
     spare : int, >= 2
-        Cells to spare at the end of every row: of those that are farther along it or beside it by so many, at most,
-        none is taken for one of the next row.
+        Unused cells at the end of every row, so that a cell up to so many steps beyond a row's end is not taken for one
+        of the next row.
     rooms : int
-        How many times as many numbers there have to be.
+        Number of such sets of keys that have to fit into int64, side by side.
     lattice : Lattice
-        Default: places are in edges of cells.
+        Default: places are in cell edges.
 
     Raises
     ------
@@ -107,17 +115,17 @@ def cell_keys(
 
 
 def sorted_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Keys, none negative, in ascending order, and where each was; equal ones stay in their order.
+    """Keys, none negative, in ascending order, and where each was; equal keys stay in their order.
 
-    The array that holds them is used up.
-    By their digits, the last first: keys span few bits, so this is four to seven times as fast as comparing them.
+    `keys` is overwritten. This is a radix sort, digit by digit from the last. As keys span few bits, it is four to
+    seven times as fast as comparing them.
     """
     place_bits, key_bits = len(keys).bit_length(), int(keys.max()).bit_length()
-    low_bits = _BITS - place_bits
+    low_bits = _KEY_BITS - place_bits
     if key_bits <= low_bits:
-        n_digits = max(-(-key_bits // (_DIGIT if len(keys) > _FEW else _DIGIT_OF_FEW)), 1)
-        room = np.empty(len(keys), np.int64)  # here, as NumPy asks for huge pages and kernels do not
+        n_digits = max(-(-key_bits // (_DIGIT_BITS if len(keys) > _SHORT else _DIGIT_BITS_OF_SHORT)), 1)
         digit_bits = max(-(-key_bits // n_digits), 1)
+        room = np.empty(len(keys), np.int64)  # not in the kernel: NumPy asks for huge pages
         return _sort_by_digits(keys, room, np.zeros((n_digits, 1 << digit_bits), np.int64), place_bits, digit_bits)
     order = sorted_keys(keys & ((1 << low_bits) - 1))[1]
     order = order[sorted_keys(keys[order] >> low_bits)[1]]
@@ -125,13 +133,13 @@ def sorted_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
 
 
 def starts_of_runs(ordered: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where each of m runs of equal keys starts, and where the last one ends, (m + 1,), of keys (n,), n >= 1."""
+    """Starts of the m runs of equal keys, and the end of the last, (m + 1,), of keys (n,), n >= 1."""
     return np.concatenate(([0], np.flatnonzero(ordered[1:] != ordered[:-1]) + 1, [len(ordered)]))
 
 
 @routine
 def gallop(keys: NDArray[np.int64], at: int, key: int) -> int:
-    """The first place from `at` on of a key not below one, in ascending keys: by steps that double, then halve."""
+    """The first index from `at` on of a key that is not below `key`; keys ascend. By steps that double, then halve."""
     n, step = len(keys), 1
     while at + step < n and keys[at + step] < key:
         at += step
@@ -152,18 +160,18 @@ def fetch_batch(
     stop: int,
     rows: NDArray[np.float64],
 ) -> tuple[int, NDArray[np.float64]]:
-    """Where a batch of voxels ends that starts with the first, and its points' rows, of which it needs the first ones.
+    """End of a batch of voxels that starts with `first`, and an array whose first rows are the values of its points.
 
-    ``order[starts[i]:starts[i + 1]]`` are the points of voxel i; a batch has about a thousand, or is one voxel. Rows
-    far apart in memory are fetched side by side, in half the time of one by one amid other work, and into the room of
-    those before where they fit.
+    ``order[starts[i]:starts[i + 1]]`` are the points of voxel i. A batch has about a thousand points, or is one voxel.
+    Rows far apart in memory are fetched together, in half of the time that it takes one by one amid other work. They
+    go into `rows` if they fit.
     """
     last = first
-    while last < stop and starts[last] - starts[first] < _AT_ONCE:
+    while last < stop and starts[last] - starts[first] < _BATCH:
         last += 1
     count = starts[last] - starts[first]
     if count > len(rows):
-        rows = np.empty((2 * max(count, _AT_ONCE), 3))
+        rows = np.empty((2 * max(count, _BATCH), 3))
     for m in range(count):
         p = order[starts[first] + m]
         rows[m, 0], rows[m, 1], rows[m, 2] = values[p, 0], values[p, 1], values[p, 2]
@@ -176,8 +184,8 @@ def _sort_by_digits(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Keys in ascending order, and where each was (radix sort; Knuth, The Art of Computer Programming 3, 5.2.5).
 
-    A key and its place, of so many bits, are moved as one number, to and fro between the array and a room for as many.
-    `starts`, zero at first, has a row for each digit and a column for each of its values.
+    A key and its index, of `place_bits` bits, are moved as one number, to and fro between `keys` and `room`. `starts`,
+    zero at first, has a row for each digit and a column for each of its values.
     """
     n, n_digits, mask = len(keys), len(starts), (1 << digit_bits) - 1
     for i in range(n):
@@ -214,7 +222,7 @@ def _count_from(
     edge: float,
     counted: NDArray[np.float64],
 ) -> None:
-    """Set places in edges of cells off the corner."""
+    """Set `counted`: places in cell edges from the corner."""
     for p in range(start, stop):
         for axis in range(3):
             counted[p, axis] = (places[p, axis] - corner[axis]) / edge
@@ -231,7 +239,7 @@ def _number_cells(
     pitch: tuple[int, int],
     keys: NDArray[np.int64],
 ) -> None:
-    """Set the keys of the places' cells, counted from the lowest."""
+    """Set the keys of the places' cells, which are counted from the lowest cell."""
     for p in range(start, stop):
         x = np.int64(np.floor((places[p, 0] - corner[0]) / edge) - low[0])
         y = np.int64(np.floor((places[p, 1] - corner[1]) / edge) - low[1])
@@ -239,10 +247,11 @@ def _number_cells(
 
 
 def _fits(span: NDArray[np.float64], spare: int, rooms: int) -> bool:
+    """Whether so many cells along each axis, spare ones included, have numbers that fit into int64, in so many sets."""
     return bool(span.max() < _MAX_KEY) and bool(rooms * np.prod(span + 1.0 + spare) < _MAX_KEY)
 
 
 def _without_gaps(cells: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Same order and same touching pairs, but no gap wider than one empty cell."""
+    """Numbers of cells along an axis, (n,), with the same order and the same touching pairs, but without wide gaps."""
     values, inverse = np.unique(cells, return_inverse=True)
     return np.concatenate(([0.0], np.cumsum(np.minimum(np.diff(values), 2.0))))[inverse]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What columns say: whether touching voxels are alike in them, and whether they change where surfaces do."""
+"""Evidence in columns, such as colours: whether touching voxels are alike, and whether values change at creases."""
 
 from __future__ import annotations
 
@@ -9,35 +9,41 @@ from numpy.typing import NDArray
 from pcgraph.parallel import kernel
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 
-_SMOOTH, _CREASED = 0.9, 0.5  # cosines between normals, more than and less than
-_TELLING = 1 << 13  # voxels, about
-_ROUNDING = 1e-24  # of squares
-_DOUBT = 64  # pairs across creases that count as much as what is known without any
+_SMOOTH_COSINE = 0.9
+"""Cosine between the normals of two touching voxels, 26 degrees, above which the surface is smooth; chosen by eye."""
+_CREASE_COSINE = 0.5
+"""Cosine between the normals of two touching voxels, 60 degrees, below which there is a crease; chosen by eye."""
+_SAMPLE = 1 << 13
+"""Voxels at which the contrast is read, about; chosen by eye, for the time's sake."""
+_ROUNDING = 1e-24
+"""Ratio of variance to mean square below which values differ by rounding alone; chosen above double precision's."""
+_PRIOR_PAIRS = 64
+"""Pairs of voxels across creases: with so many, they count half; chosen by eye, not varied."""
 
 
 def crease_contrast(values: NDArray[np.float64], grid: VoxelGrid, normals: NDArray[np.float64]) -> float:
-    """How much more something changes at creases than on smooth surfaces, 0..1.
+    """Contrast of values at creases against that on smooth surfaces, 0..1.
 
-    0 for noise, for a pattern that does not care for the shape below, and for what is the same everywhere; near 1 where
+    It is 0 for noise, for a pattern that does not depend on the shape below it, and for a constant. It is near 1 if
     each surface has a value of its own.
 
     Parameters
     ----------
     values : (v, d) float64
-        Such as colours, or one column of the features: means over the points of each voxel.
+        Means over the points of each voxel of, say, colours, or one column of the features.
     grid : VoxelGrid of v voxels
     normals : (v, 3) float64
         Unit normals of the voxels.
 
     Notes
     -----
-    1 - S / C, no less than 0, with mean squared distances between the values of touching voxels: S of those whose
-    normals are within 26 degrees, C of those whose normals are 60 degrees and more apart. Each counts by m n / (m + n),
-    m and n being the voxels' points, so that S and C of noise are alike, its variance. With few creases, as much as 64
-    pairs of voxels count whether S is small against any two voxels (1 - S / C with their distances is the spatial
-    autocorrelation of Geary 1954). Every so many voxels tell, some 8000.
+    It is 1 - S / C, or 0 if that is negative. S and C are mean squared differences of touching voxels: S of those whose
+    normals are within 26 degrees, C of those whose normals are more than 60 degrees apart. A pair counts by
+    m n / (m + n), where m and n are the points of its voxels, so that S and C of noise are both its variance. In case
+    of few creases, 1 - S / A counts as 64 pairs do, where A is the same as S for any two voxels: that is the spatial
+    autocorrelation of Geary 1954. Some 8000 evenly spaced voxels are read.
     """
-    step = -(-grid.n_voxels // _TELLING)
+    step = -(-grid.n_voxels // _SAMPLE)
     sums, pairs = np.zeros(2), np.zeros(2, np.int64)
     _add_squared_distances(values, grid.counts, normals, grid.neighbourhood, step, sums, pairs)
     some, counts = values[::step], grid.counts[::step]
@@ -47,7 +53,7 @@ def crease_contrast(values: NDArray[np.float64], grid: VoxelGrid, normals: NDArr
         return 0.0
     smooth, creased = sums / np.maximum(pairs, 1)
     at_creases, anywhere = (max(1.0 - smooth / other, 0.0) if other > 0.0 else 0.0 for other in (creased, any_two))
-    return (pairs[1] * at_creases + _DOUBT * anywhere) / (pairs[1] + _DOUBT)
+    return (pairs[1] * at_creases + _PRIOR_PAIRS * anywhere) / (pairs[1] + _PRIOR_PAIRS)
 
 
 def color_evidence(grid: VoxelGrid, normals: NDArray[np.float64]) -> float:
@@ -65,30 +71,30 @@ def _add_squared_distances(
     sums: NDArray[np.float64],
     pairs: NDArray[np.int64],
 ) -> None:
-    """Add the weighted squared distances of touching voxels, and their numbers, on smooth surfaces and at creases."""
+    """Add weighted squared differences of touching voxels, and numbers of pairs, to (2,) each: smooth, at creases."""
     indptr, neighbours = around
     for i in range(0, len(values), step):
         for a in range(indptr[i], indptr[i + 1]):
             j, cosine, square = neighbours[a], 0.0, 0.0
             for axis in range(3):
                 cosine += normals[i, axis] * normals[j, axis]
-            if _CREASED <= cosine <= _SMOOTH:
+            if _CREASE_COSINE <= cosine <= _SMOOTH_COSINE:
                 continue
             for column in range(values.shape[1]):
                 gap = values[i, column] - values[j, column]
                 square += gap * gap
-            kind = 0 if cosine > _SMOOTH else 1
+            kind = 0 if cosine > _SMOOTH_COSINE else 1
             sums[kind] += square * counts[i] * counts[j] / (counts[i] + counts[j])
             pairs[kind] += 1
 
 
 def autocorrelation(values: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:
-    """How alike touching voxels are in each of d columns, (v, d), (d,) float64: 0 for noise, near 1 for a smooth field.
+    """Spatial autocorrelation of each of d columns, (v, d), (d,) float64: 0 for noise, near 1 for a smooth field.
 
     Notes
     -----
-    1 - C, no less than 0, where C is the mean square difference of touching voxels over twice the variance of all
-    (Geary 1954); 0 where all are equal.
+    It is 1 - C, or 0 if that is negative. C is the mean squared difference of touching voxels over twice the variance
+    of all (Geary 1954). It is 0 for a column that is the same everywhere.
     """
     squares = _sums_of_squares(values, values.mean(axis=0), grid.neighbourhood)
     pairs = max(len(grid.neighbours), 1)

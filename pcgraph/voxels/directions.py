@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unit directions: evenly over the sphere, and two along a plane."""
+"""Unit vectors spread evenly over the sphere, and unit vectors along a plane."""
 
 from __future__ import annotations
 

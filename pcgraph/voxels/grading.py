@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Grading: larger voxels where points lie farther apart, as far from the tripods of several scans."""
+"""Grading: voxels are larger where points lie farther apart, as halfway between the tripods of several scans."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pcgraph.parallel import in_blocks, kernel
 from pcgraph.voxels.cells import cell_keys
 
 BLOCK = 16
-"""Edge of a block, in edges of voxels of level 0: all voxels in it are of one level, 4 at most."""
+"""Edge of a block, in voxel edges of level 0; all its voxels are of one level, 4 at most. Chosen: 8 was given up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,16 +22,16 @@ class Grading:
     Attributes
     ----------
     blocks : (b, 3) float64
-        Coordinates of the blocks, whole numbers: cells of level 0 over 16.
+        Grid coordinates of the blocks, whole numbers, in edges of blocks.
     levels : (b,) int8, 1..4
-        How many times edges are doubled in each.
+        Number of times that the voxel edges in each block are doubled.
     """
 
     blocks: NDArray[np.float64]
     levels: NDArray[np.int8]
 
     def levels_of(self, scaled: NDArray[np.float64]) -> NDArray[np.int8]:
-        """Level of each of n places, (n,) int8, given in units of a cell of level 0, (n, 3)."""
+        """Level of each of n places, (n,) int8; places, (n, 3), are in voxel edges of level 0."""
         keys = cell_keys(np.concatenate((self.blocks, np.floor(scaled / BLOCK))), float(BLOCK))[0]
         order = np.argsort(keys[: len(self.blocks)])
         levels = np.empty(len(scaled), np.int8)
@@ -40,7 +40,7 @@ class Grading:
 
 
 def enlarged(edges: NDArray[np.float64], levels: NDArray[np.int8] | None) -> NDArray[np.float64]:
-    """Edges of voxels of level 0, (v,), doubled as often as the levels say, (v,); not at all where there are none."""
+    """Edges of voxels, (v,), doubled as often as their levels say, (v,); unchanged if there are no levels."""
     return edges if levels is None else edges * np.exp2(levels.astype(np.float64))
 
 
@@ -53,7 +53,7 @@ def _look_up(
     levels: NDArray[np.int8],
     found: NDArray[np.int8],
 ) -> None:
-    """Set the level of each key, that of the same among ascending ones, else 0."""
+    """Set the level of each key: that of the same key among the known ones, which ascend, or 0 if it is not there."""
     for p in range(start, stop):
         low, high = 0, len(known)
         while low < high:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sparse voxel grid: which points share a voxel, which voxels touch, and what two grids occupy together."""
+"""The sparse voxel grid: which points share a voxel, which voxels touch, and the union of two grids."""
 
 from __future__ import annotations
 
@@ -18,25 +18,30 @@ from pcgraph.voxels.cells import UNIT_CELLS, Lattice, cell_keys, gallop, sorted_
 from pcgraph.voxels.grading import BLOCK, Grading, enlarged
 from pcgraph.voxels.warp import Warp
 
-# Offsets inside a voxel and colours are summed as whole numbers: such sums do not depend on the points' order.
 _STEPS_PER_VOXEL = float(1 << 20)
+"""Steps per voxel edge in which offsets are summed as whole numbers: such sums do not depend on the points' order."""
 _COLOR_STEPS = 65535.0
+"""Steps per unit in which colours are summed, for the same reason; 257 per step of 8 bits, which are exact so."""
 MAX_NEIGHBOURS = 26
-"""Most neighbours of a voxel in a grid of one size; a larger one beside smaller ones may have more."""
+"""Count of voxels around one of the same size, at most: 3^3 - 1, as in a cube. A larger one may have more."""
 MIN_NEIGHBOURS_ON_SURFACE = 5
-"""Neighbours from which on a voxel is joined: on a surface, and not on a line or alone."""
+"""Count of voxels around one from which on it is joined: so many are there on a surface, but not on a line."""
 MAX_GAP = Warp.max_gap
 """Widest gap, in voxel edges between centroids; `RangeWarp.max_gap` is wider."""
-_STRETCH = 1024  # cells in a row of which the cells around are counted,
-_COUNTED = 1 << 16  # and of how many they are, about
+_STRETCH = 1024
+"""Count of cells in a row whose neighbours are counted together; chosen by eye, for speed."""
+_COUNTED = 1 << 16
+"""Cells, about, that such stretches hold in all; chosen by eye, for the time's sake."""
 _END = np.iinfo(np.int64).max
-_NO_BUFFER = np.empty(0, np.int32)  # where lists are not wanted
-_INTERIOR_NEIGHBOURS = 8  # of a voxel amid a surface
-_OF_SURFACE = 6  # of eight places beside one, seen from the front of a surface that is as steep as may be
+_NO_BUFFER = np.empty(0, np.int32)  # stands for lists that are not wanted
+_INTERIOR_NEIGHBOURS = 8
+"""Count of voxels around one amid a surface, at least: 8 on a plane along two axes, fewer at its border."""
+_MIN_IN_PROJECTION = 6
+"""Count of the 8 places beside a voxel, seen along an axis, that a surface takes up at least, however steep it is."""
 
 
 class VoxelLists(NamedTuple):
-    """Voxels near each of v voxels, as CSR lists.
+    """Voxels near each of v voxels, as lists one after the other (CSR).
 
     Attributes
     ----------
@@ -52,8 +57,8 @@ class VoxelLists(NamedTuple):
 class Neighbourhood(NamedTuple):
     """The 26-neighbourhood of occupied voxels as kernels take it: `VoxelLists` of unsigned numbers.
 
-    Of unsigned indices it need not be asked whether they count from the end, which is up to a third of the time of a
-    loop over what is around.
+    An unsigned index cannot count from the end, so kernels do not test for that. The test takes up to a third of the
+    time of a loop over neighbours.
 
     Attributes
     ----------
@@ -74,7 +79,7 @@ class VoxelGrid(ShortRepr):
     size : float, metres
         Edge length of a voxel in the warped space, at level 0. The grid is aligned with the origin of that space.
     warp : Warp
-        To that space.
+        The transform to that space.
     cells : (v, 3) float64
         Grid coordinates, whole numbers, in edges of the voxel itself.
     voxel_of_point : (n,) int32
@@ -86,23 +91,23 @@ class VoxelGrid(ShortRepr):
     counts : (v,) int64
         Points per voxel.
     warped : (v, 3) float64, metres of the warped space
-        Mean of the voxel's points there, to 2**-21 of a voxel.
+        Mean of the voxel's points in the warped space, to 2**-21 of a voxel edge.
     centroids : (v, 3) float64, metres, the points' frame
-        The same place in the points' frame.
+        `warped` in the points' frame.
     edge_lengths : (v,) float64, metres
         Edge length of each voxel in the points' frame.
     colors : (v, 3) float64, 0..1, or None
         Mean colour of the voxel's points.
     indptr : (v + 1,) int64
     neighbours : (e,) int32
-        Which voxels touch: ``neighbours[indptr[i]:indptr[i + 1]]`` are the occupied among the 26 voxels around voxel
-        i, ascending.
+        ``neighbours[indptr[i]:indptr[i + 1]]`` are the voxels that touch voxel i: the occupied ones of the 26 around
+        it, ascending.
     features : (v, d) float64, -4..4, or None
         Means of the voxel's points' features, scaled.
     levels : (v,) int8, or None
-        How many times the edge of each voxel is doubled; None if that of none is.
+        Number of times that the edge of each voxel is doubled; None if none is.
     grading : Grading, or None
-        Where they are doubled.
+        Blocks in which edges are doubled; None if there are none.
     """
 
     size: float
@@ -133,7 +138,7 @@ class VoxelGrid(ShortRepr):
         return enlarged(np.full(self.n_voxels, self.size), self.levels)
 
     def of_levels(self) -> Iterator[tuple[NDArray[np.bool_], VoxelGrid]]:
-        """Which voxels are of each level, (v,) bool, and the grid of these alone, whose voxels have one size."""
+        """Voxels of each level, (v,) bool, and the grid of these alone, whose voxels have one size."""
         if self.levels is None:
             yield np.ones(self.n_voxels, np.bool_), self
             return
@@ -144,11 +149,11 @@ class VoxelGrid(ShortRepr):
 
     @property
     def joined(self) -> NDArray[np.bool_]:
-        """Whether each voxel has as many others around it as on a surface, (v,) bool."""
+        """Whether each voxel is joined, (v,) bool: at least five others are around it, as on a surface."""
         return np.diff(self.indptr) >= MIN_NEIGHBOURS_ON_SURFACE
 
     def around(self, voxels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """The voxels that touch some, (t,): the row of the one in `voxels`, (s,), and the other."""
+        """Pairs of touching voxels, (t,), the first of some, (s,): index in `voxels` of the first; the other."""
         degrees = np.diff(self.indptr)[voxels]
         row = np.repeat(np.arange(len(voxels)), degrees)
         return row, self.neighbours[_concatenated_ranges(self.indptr[voxels], degrees)]
@@ -160,7 +165,7 @@ class VoxelGrid(ShortRepr):
 
     @property
     def neighbourhood(self) -> Neighbourhood:
-        """Which voxels touch, as kernels take it."""
+        """The lists of touching voxels, in the form that kernels take."""
         return Neighbourhood(self.indptr.view(np.uint64), self.neighbours.view(np.uint32))
 
 
@@ -201,7 +206,8 @@ def _kept_neighbours(
     number: NDArray[np.int32],
     degrees: NDArray[np.int64],
 ) -> NDArray[np.int32]:
-    """New numbers of the neighbours that stay, one kept voxel after the other, and how many each has, in `degrees`."""
+    """Lists of the neighbours that stay, by their new numbers, one kept voxel after the other; set their lengths,
+    `degrees`."""
     most = np.int64(grid.indptr[kept[stop - 1] + 1] - grid.indptr[kept[start]]) if start < stop else 0
     found, n = np.empty(most, np.int32), 0
     for i in range(start, stop):
@@ -225,9 +231,9 @@ def voxel_grid(points: NDArray[np.float64], size: float, warp: Warp, grading: Gr
     size : float, metres
         Voxel edge length, > 0.
     warp : Warp
-        To the space in which voxels are cubes of this size.
+        Transform to the space in which voxels are cubes of this size.
     grading : Grading, optional
-        Where voxels are larger.
+        Blocks in which voxels are larger.
 
     Raises
     ------
@@ -287,6 +293,7 @@ def voxel_means(values: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.floa
 def _sorted_means(
     values: NDArray[np.float64], starts: NDArray[np.int64], order: NDArray[np.int64], steps: float
 ) -> NDArray[np.float64]:
+    """Means of vectors, (n, 3), by voxel, (v, 3), summed in so many steps per unit."""
     means = np.empty((len(starts) - 1, 3))
     in_blocks(_average, len(means), starts, order, values, steps, means)
     return means
@@ -328,7 +335,7 @@ def _gather(
 
 @routine
 def most_around(indptr: NDArray[np.uint64]) -> np.int64:
-    """Most voxels around any, given where the lists of a `Neighbourhood` start: 26, but of larger ones more."""
+    """Length of the longest list of a `Neighbourhood`, at least 26, given the starts of its lists."""
     most = np.int64(MAX_NEIGHBOURS)
     for i in range(len(indptr) - 1):
         most = max(most, np.int64(indptr[i + 1] - indptr[i]))
@@ -345,7 +352,7 @@ def _average(
     steps: float,
     means: NDArray[np.float64],
 ) -> None:
-    """Means of vectors by voxel, summed as whole numbers, as `_gather` does."""
+    """Set the means of vectors by voxel, summed as whole numbers, as in `_gather`."""
     for v in range(start, stop):
         x = y = z = 0.0
         for at in range(starts[v], starts[v + 1]):
@@ -363,10 +370,10 @@ def _average(
 def _keys_of_levels(
     places: NDArray[np.float64], levels: NDArray[np.int8] | None, size: float, lattice: Lattice = UNIT_CELLS
 ) -> tuple[NDArray[np.int64], tuple[int, int]]:
-    """`cell_keys` of places on a lattice, or, if they have levels, (n,), of such in edges of their own voxels, which
+    """`cell_keys` of places on a lattice. If they have levels, (n,), they are in edges of their own voxels, and keys
     sort by level first.
 
-    Cells of each level count from the first block: coordinates of a map, in cells of all levels, span all of it.
+    Cells of each level are counted from the first block, as their coordinates may be far from zero.
 
     Raises
     ------
@@ -379,14 +386,14 @@ def _keys_of_levels(
     whole = np.floor(places)
     whole -= per_block * np.floor(whole / per_block).min(axis=0)
     keys, pitch = cell_keys(whole, size, rooms=2 * (int(levels.max()) + 1))
-    of_level = keys.max() + 2 * pitch[0]  # cells of two levels never lie beside each other
+    of_level = keys.max() + 2 * pitch[0]  # so that cells of two levels never seem to touch
     return keys + levels * of_level, pitch
 
 
 def _touching(
     keys: NDArray[np.int64], pitch: tuple[int, int], cells: NDArray[np.float64], levels: NDArray[np.int8] | None
 ) -> VoxelLists:
-    """`touching_voxels`, with those of other levels."""
+    """`touching_voxels`, with the voxels of other levels that touch."""
     same = touching_voxels(keys, *pitch)
     if levels is None:
         return same
@@ -403,17 +410,14 @@ def _touching(
 
 
 def _concatenated_ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The ranges start..start + count - 1, one after the other."""
+    """Whole numbers of several ranges, start to start + count - 1 each, one range after the other."""
     return np.arange(counts.sum()) + np.repeat(starts - np.cumsum(counts) + counts, counts)
 
 
 def _touching_across(
     cells: NDArray[np.float64], levels: NDArray[np.int8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of voxels of two levels that touch, the finer ones and the coarser ones, (m,) each.
-
-    They lie at the borders of blocks.
-    """
+    """Pairs of touching voxels of two levels, finer and coarser ones, (m,) each. They lie at borders of blocks."""
     finer, coarser, present = [np.empty(0, np.int64)], [np.empty(0, np.int64)], np.unique(levels)
     for level in present[:-1]:
         per_block = float(BLOCK >> int(level))
@@ -439,7 +443,7 @@ def _touching_across(
 
 
 def _beside_blocks(blocks: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of n blocks, (n, 3), touch one of some others."""
+    """Whether each of n blocks, (n, 3), touches one of some others, (n,) bool."""
     steps = np.stack(np.meshgrid(*3 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(-1, 3)
     around = (np.unique(others, axis=0)[:, None] + steps).reshape(-1, 3)
     keys = cell_keys(np.concatenate((around, blocks)), 1.0)[0]
@@ -449,18 +453,18 @@ def _beside_blocks(blocks: NDArray[np.float64], others: NDArray[np.float64]) -> 
 def occupied_cells(
     places: NDArray[np.float64], size: float, lattice: Lattice = UNIT_CELLS
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Cells that hold places, (v, 3) float64, ascending, and how many of the 26 around some of them do, int64.
+    """Cells that hold places, (v, 3) float64, ascending, and the number of occupied cells around some of them, int64.
 
-    Of many cells these are those of some stretches, evenly spread.
+    If there are many cells, those around are counted for evenly spread stretches of cells.
 
     Parameters
     ----------
     places : (n, 3) float64
-        On the lattice.
+        Places on the lattice.
     size : float, metres
-        Edge length of a cell, for the message.
+        Edge length of a cell, for the message of the error.
     lattice : Lattice
-        Default: places are in edges of cells.
+        Default: places are in cell edges.
 
     Raises
     ------
@@ -485,19 +489,21 @@ def touching_voxels(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> Voxe
     Parameters
     ----------
     keys : (v,) int64
-        Ascending, x pitch_x + y pitch_y + z of each voxel, with two cells to spare at the end of every row.
+        Ascending keys, x pitch_x + y pitch_y + z of each voxel, with two cells to spare at the end of every row.
     pitch_x, pitch_y : int
         What a step in x and in y adds to a key.
     """
     counts = np.empty(len(keys), np.int64)
-    room = np.empty(len(keys) * MAX_NEIGHBOURS, np.int32)  # most is never touched; here, as for `sorted_keys`
+    room = np.empty(
+        len(keys) * MAX_NEIGHBOURS, np.int32
+    )  # most is never touched; not in the kernel, as in `sorted_keys`
     lists = in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, room)
     neighbours = lists[0] if len(lists) == 1 else np.concatenate(lists)
     return VoxelLists(np.concatenate((np.zeros(1, np.int64), np.cumsum(counts))), neighbours)
 
 
 def touching_counts(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> NDArray[np.int64]:
-    """How many of the 26 around each of some voxels are occupied, (v,); arguments as for `touching_voxels`."""
+    """Number of occupied voxels among the 26 around each voxel, (v,); arguments as for `touching_voxels`."""
     counts = np.empty(len(keys), np.int64)
     in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, _NO_BUFFER)
     return counts
@@ -513,8 +519,11 @@ def _walk(
     counts: NDArray[np.int64],
     room: NDArray[np.int32],
 ) -> NDArray[np.int32]:
-    """The lists, one after the other, if there is room for any, and how long each is, in `counts`: nine pointers walk
-    the sorted keys, each along one row of three voxels around. They are unsigned as those of `Neighbourhood` are."""
+    """Lists of touching voxels, one after the other, in `room`, if that is not empty; set their lengths, `counts`.
+
+    Nine pointers walk along the sorted keys, one for each row of three voxels around. They are unsigned as the numbers
+    of `Neighbourhood` are.
+    """
     with_lists, found, n_found = len(room) > 0, room[start * MAX_NEIGHBOURS :], 0
     pointers, end, one = np.empty(9, np.uint64), np.uint64(len(keys)), np.uint64(1)
     shifts = np.empty(9, np.int64)
@@ -551,14 +560,15 @@ def _walk(
 
 
 def boundary_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
-    """Whether each voxel lies where a surface ends, with fewer than eight around it, (v,) bool."""
+    """Whether each voxel lies at the end of a surface, with fewer than eight voxels around it, (v,) bool."""
     return np.diff(grid.indptr) < _INTERIOR_NEIGHBOURS
 
 
 def at_ends(grid: VoxelGrid, voxels: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether each of m voxels lies where a surface ends, though that be two voxels thick, (m,) bool.
+    """Whether each of m voxels lies at the end of a surface, (m,) bool, even if the surface is two voxels thick.
 
-    Seen along no axis are six of the eight places beside it taken, as they are on each surface seen from its front.
+    Amid a surface, six of the eight places beside a voxel are occupied, as seen along one of the axes. At an end there
+    is no such axis.
     """
     ends = np.empty(len(voxels), np.bool_)
     in_blocks(_find_ends, len(voxels), voxels, grid.cells, grid.levels, grid.neighbourhood, ends)
@@ -575,7 +585,8 @@ def _find_ends(
     around: Neighbourhood,
     ends: NDArray[np.bool_],
 ) -> None:
-    taken, side = np.empty((3, 9), np.int64), np.empty(3, np.int64)  # the places beside it, as seen along each axis
+    """Set whether each of some voxels lies at the end of a surface."""
+    taken, side = np.empty((3, 9), np.int64), np.empty(3, np.int64)  # places beside the voxel, as seen along each axis
     for m in range(start, stop):
         i, is_end = voxels[m], True
         for axis in range(3):
@@ -590,13 +601,13 @@ def _find_ends(
             n_taken = -taken[axis, 4]  # without its own place
             for place in range(9):
                 n_taken += taken[axis, place]
-            is_end = is_end and n_taken < _OF_SURFACE
+            is_end = is_end and n_taken < _MIN_IN_PROJECTION
         ends[m] = is_end
 
 
 @routine
 def _beside(cells: NDArray[np.float64], levels: NDArray[np.int8] | None, i: int, j: int, axis: int) -> int:
-    """0, 1 or 2: whether voxel j, which touches voxel i, lies before it, in line with it or behind it along an axis."""
+    """Position along an axis of voxel j, which touches voxel i: 0 before it, 1 in line with it, 2 behind it."""
     step = cells[j, axis] - cells[i, axis]
     if levels is not None and levels[i] != levels[j]:
         step = math.floor((cells[j, axis] + 0.5) * 2.0 ** (levels[j] - levels[i])) - cells[i, axis]
@@ -611,9 +622,9 @@ def voxels_within(
     *,
     later: bool = False,
 ) -> VoxelLists:
-    """The voxels whose points' mean lies within some voxel edges of that of each of m voxels, without itself.
+    """Voxels near each of m voxels, without itself: the means of their points lie within some voxel edges of its own.
 
-    Of two voxels of different levels the larger one's edge counts.
+    Of two voxels of different levels, the edge of the larger one counts.
 
     Parameters
     ----------
@@ -622,9 +633,9 @@ def voxels_within(
         Ascending.
     reach : float, voxel edges
     among : (a,) int64, optional
-        Which voxels may be found, ascending. Default: all.
+        Voxels that may be found, ascending. Default: all.
     later : bool
-        Whether only those of larger numbers than the voxel's own are sought: each pair once.
+        Whether only voxels of larger numbers are sought, so that each pair is found once.
     """
     if grid.levels is not None:
         return _within_of_levels(grid, voxels, reach, np.arange(grid.n_voxels) if among is None else among, later)
@@ -640,7 +651,7 @@ def voxels_within(
 def _within_of_levels(
     grid: VoxelGrid, voxels: NDArray[np.int64], reach: float, among: NDArray[np.int64], later: bool
 ) -> VoxelLists:
-    """`voxels_within` of voxels of several sizes: level by level, what lies within edges of voxels of that level."""
+    """`voxels_within` for a grid of several levels: pairs are sought level by level, by that of their larger voxel."""
     assert grid.levels is not None
     source, target = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for level in np.unique(grid.levels):
@@ -666,7 +677,15 @@ def _within_of_levels(
 
 
 class _Places(NamedTuple):
-    """Keys of voxels' cells, (n,) int64, ascending, and means of their points in voxel edges, (n, 3) float64."""
+    """Places of n voxels.
+
+    Attributes
+    ----------
+    keys : (n,) int64
+        Keys of their cells, ascending.
+    means : (n, 3) float64
+        Means of their points, in voxel edges.
+    """
 
     keys: NDArray[np.int64]
     means: NDArray[np.float64]
@@ -683,8 +702,10 @@ def _within(
     later: bool,
     counts: NDArray[np.int64],
 ) -> NDArray[np.int32]:
-    """The lists one after the other, and their lengths in `counts`: pointers gallop along the sorted keys, one per
-    row."""
+    """Lists of the voxels within reach of each, one after the other; set their lengths, `counts`.
+
+    Pointers gallop along the sorted keys, one for each row of cells.
+    """
     keys, places = sought.keys, sought.means
     n, cells, n_rows = len(keys), int(np.ceil(reach)), 0
     shifts = np.empty((2 * cells + 1) ** 2, np.int64)  # of the rows' middles, ascending
@@ -724,15 +745,15 @@ def _within(
 
 @dataclass(frozen=True, eq=False)
 class GridUnion:
-    """What two grids occupy together.
+    """The union of two grids.
 
     Attributes
     ----------
     grid : VoxelGrid of v voxels
-        Means weighted by points. Its `voxel_of_point`, `order` and `starts` speak of the second grid's points, its
-        `counts` of those of both.
+        Means are weighted by points. `counts` are of the points of both grids; `voxel_of_point`, `order` and `starts`
+        are of the second grid's points alone.
     first, second : (v1,), (v2,) int64
-        Where the voxels of either grid went.
+        Number in the union of each voxel of the two grids.
     """
 
     grid: VoxelGrid
@@ -762,6 +783,7 @@ def grid_union(a: VoxelGrid, b: VoxelGrid) -> GridUnion:
     counts[second] += b.counts
 
     def blend(of_a: NDArray[np.float64], of_b: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Means of both grids, weighted by points."""
         mean = np.zeros((len(counts), of_a.shape[1]))
         mean[first] = of_a
         fraction = (b.counts / counts[second])[:, None]

@@ -4,32 +4,55 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.parallel import in_blocks, kernel
+from pcgraph.rounding import TINY
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.eigen import least_eigenvalue
 from pcgraph.voxels.grid import MAX_GAP, MAX_NEIGHBOURS, Neighbourhood, VoxelGrid, boundary_voxels, voxels_within
 
 OUTLIER = -2
-"""Label of a point that belongs to nothing."""
+"""Label of a point that belongs to nothing; -1 is the label of holes."""
 MIN_POINTS = 1000
-"""Of fewer points none is called an outlier."""
+"""Points of a cloud: in a smaller one none is an outlier, as a thing may have few; chosen by eye, not varied."""
+_NEAREST = 16
+"""Outlier voxels nearest to one, with itself, that tell whether it lies on a surface; chosen by eye, not varied."""
+_FLAT = 0.05
+"""Fraction of the variance across a plane or a line, at most, of a surface: noise has 0.2. Chosen by eye, between."""
 
-_SPARSE = 0.25  # of the median number of points around a point
-_CHANCE = 1e-4  # with which noise alone is as dense as what is kept
-_MIN_EXTENT = 32.0  # voxels: noise fills a volume, and a flat cloud has none
-_VOLUME_OF_REACH = 4.0 / 3.0 * np.pi * MAX_GAP**3
-_MAX_FRACTION = 2.0 / 3.0
-_PIECE = 5  # points: fewer, all alone, are no object
-_MANY_DETACHED = 0.02  # of the points
-_FEW_HELD, _SURROUNDED, _FILLED = 2, 14, 0.4  # points in a voxel, at most; voxels around it, at least; of all voxels
-_PARTS, _OF_MEAN, _OF_PARTS = 4, 0.2, 0.95  # of the bounding box, along each axis; points in each; and of them
-_NEAREST = 16  # voxels of which
-_FLAT = 0.05  # of the variance is at most across a surface; of noise 0.2
+
+@dataclass(frozen=True)
+class NoiseThresholds:
+    """Conditions for voxels to hold noise, and for a cloud to be full of it. Chosen by eye; none was varied."""
+
+    sparse: float = 0.25  # of the median number of points around a point: with at most so many a voxel is sparse
+    chance: float = 1e-4  # probability that noise alone is as dense as a voxel that stays
+    min_extent: float = 32.0  # voxel edges: each side of the volume counts that long, as a flat cloud has no volume
+    reach_volume: float = 4.0 / 3.0 * np.pi * MAX_GAP**3  # voxels: sphere of the widest gap, within which nothing joins
+    max_fraction: float = 2.0 / 3.0  # fraction of the points that may be outliers: if more are, none is
+    max_held: int = 2  # points of a voxel that noise may fill
+    min_around: int = 14  # voxels around such a one; on a surface some 6 to 13 are
+    min_filled: float = 0.4  # fraction of such voxels from which on noise hides among them
+    parts: int = 4  # parts of the bounding box along each axis, of which noise fills all; leaves of trees do not
+    min_of_mean: float = 0.2  # of the mean number of outliers per part: so many fill a part
+    min_parts: float = 0.95  # fraction of the parts that are filled
+
+
+@dataclass(frozen=True)
+class DetachedThresholds:
+    """Conditions for pieces that touch nothing to be outliers. Chosen by eye; gain 0.0007."""
+
+    min_points: int = 5  # points of a piece that stays, as an object
+    few: float = 0.02  # fraction of the points: if such pieces hold more, those on surfaces of their own stay
+
+
+_NOISE = NoiseThresholds()
+_DETACHED = DetachedThresholds()
 
 
 def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
@@ -42,29 +65,29 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
 
     Notes
     -----
-    The density of noise is what sparse voxels hold, over the volume of the bounding box. A voxel is an outlier if noise
-    of this density had, with a chance of more than 1 in 10 000, as many points in the voxels around it. Where noise is
-    so thin that a reach of three voxel edges is nearly empty of it, there must be as few points within that reach, too,
-    so that the thin far end of a scan is not taken for noise. What has been found is then looked at alone: where most
-    of the 16 nearest of it lie about a plane or a line, they are a coarse scan beside a fine one, and stay. Clouds of
-    fewer than 1000 points, and those of which more than two thirds would be outliers, have none.
+    The density of noise is the number of points in sparse voxels, over the volume of the bounding box. A voxel is an
+    outlier if noise of this density would put as many points into the voxels around it, with a probability of more than
+    1 in 10 000. If noise is so thin that a sphere of three voxel edges would hold less than one point of it, there must
+    be as few points in that sphere, too: so the thin far end of a scan stays. Of the voxels found so far, those stay of
+    whose 16 nearest most lie about a plane or a line: they are a coarse scan beside a fine one. Clouds of fewer than
+    1000 points, and those of which more than two thirds would be outliers, have none.
     """
     nothing = np.zeros(grid.n_voxels, np.bool_)
     n_points = int(grid.counts.sum())
     around = np.empty(grid.n_voxels, np.int64)
     in_blocks(_count_around, grid.n_voxels, grid.neighbourhood, grid.counts, around)
-    if n_points < MIN_POINTS:  # only now: the cloud that kernels are warmed up on is small
+    if n_points < MIN_POINTS:  # not before: kernels are warmed up on a small cloud
         return nothing
     points = np.cumsum(np.bincount(around, grid.counts))
     typical = float(np.searchsorted(points, (n_points + 1) // 2))  # median over the points
-    sparse = around <= _SPARSE * typical
+    sparse = around <= _NOISE.sparse * typical
     low, high = bounding_box(grid.cells)
-    volume = float(np.prod(np.maximum(high - low + 1.0, _MIN_EXTENT)))
+    volume = float(np.prod(np.maximum(high - low + 1.0, _NOISE.min_extent)))
     density = float(grid.counts[sparse].sum()) / volume
     others = around - grid.counts
     outlier = sparse & (grid.counts <= _least_significant(density) + 1)
     outlier &= others < _least_significant(density * MAX_NEIGHBOURS)
-    background = density * _VOLUME_OF_REACH
+    background = density * _NOISE.reach_volume
     if background < 1.0 and outlier.any():
         alone = np.flatnonzero(outlier)
         near = voxels_within(grid, alone, MAX_GAP)
@@ -73,45 +96,50 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
         )
         outlier[alone] = held < _least_significant(background)
     outlier &= ~_surfaces_among(outlier, grid)
-    return outlier if grid.counts[outlier].sum() <= _MAX_FRACTION * n_points else nothing
+    return outlier if grid.counts[outlier].sum() <= _NOISE.max_fraction * n_points else nothing
 
 
 def is_full_of_noise(grid: VoxelGrid) -> bool:
-    """Whether noise is so dense that it hides among voxels of this size; smaller ones tell it from surfaces.
+    """Whether noise is so dense that it hides among voxels of this size, so that smaller ones are needed to find it.
 
-    A large part of them hold a point or two then, and still have others on most sides, as no surface does.
+    Then a large fraction of the voxels hold a point or two, and still have others on most sides. On a surface a voxel
+    with so many around it holds more points.
 
     Parameters
     ----------
     grid : VoxelGrid
         Of one size.
     """
-    return float(np.mean((np.diff(grid.indptr) >= _SURROUNDED) & (grid.counts <= _FEW_HELD))) >= _FILLED
+    may_be_noise = (np.diff(grid.indptr) >= _NOISE.min_around) & (grid.counts <= _NOISE.max_held)
+    return float(np.mean(may_be_noise)) >= _NOISE.min_filled
 
 
 def fill_the_volume(points: NDArray[np.float64], left: NDArray[np.float64]) -> bool:
-    """Whether those points that are gone are noise through the whole volume, and not what is sparse in part of it.
-
-    Noise is in all parts of the bounding box, the leaves of trees are not.
+    """Whether the outliers of a cloud are spread through its whole volume, as noise is and the leaves of trees are not.
 
     Parameters
     ----------
     points, left : (n, 3), (m, 3) float64, metres
-        All, and those of them that are left.
+        All points, and those that are no outliers.
     """
     low, high = bounding_box(points)
-    pitch = np.maximum(high - low, np.finfo(np.float64).tiny) / _PARTS
+    pitch = np.maximum(high - low, TINY) / _NOISE.parts
 
     def in_each(some: NDArray[np.float64]) -> NDArray[np.int64]:
-        parts = np.minimum((some - low) / pitch, _PARTS - 1).astype(np.int64)
-        return np.bincount(parts @ np.array((_PARTS**2, _PARTS, 1)), minlength=_PARTS**3)
+        """Number of points in each part of the bounding box."""
+        parts = np.minimum((some - low) / pitch, _NOISE.parts - 1).astype(np.int64)
+        return np.bincount(parts @ np.array((_NOISE.parts**2, _NOISE.parts, 1)), minlength=_NOISE.parts**3)
 
     gone = in_each(points) - in_each(left)
-    return float(np.mean(gone >= _OF_MEAN * gone.mean())) >= _OF_PARTS
+    return float(np.mean(gone >= _NOISE.min_of_mean * gone.mean())) >= _NOISE.min_parts
 
 
 def _surfaces_among(voxels: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.bool_]:
-    """Which of some voxels, (v,) bool, lie on a surface of those alone: flat about most of their nearest ones."""
+    """Whether each voxel lies on a surface that is made of some of the voxels alone, (v,) bool.
+
+    `voxels`, (v,) bool, are these. One is on a surface if most of its nearest ones lie about a plane or a line with
+    their own nearest ones.
+    """
     found = np.zeros(len(voxels), np.bool_)
     alone = np.flatnonzero(voxels)
     if len(alone) < 2 * _NEAREST:
@@ -130,7 +158,7 @@ def _surfaces_among(voxels: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.bo
 def _find_flat(
     start: int, stop: int, places: NDArray[np.float64], near: NDArray[np.int64], flat: NDArray[np.bool_]
 ) -> None:
-    """Set whether the places near each lie about a plane or a line."""
+    """Set whether the places near each place lie about a plane or a line."""
     n = near.shape[1]
     for i in range(start, stop):
         mean_x = mean_y = mean_z = 0.0
@@ -145,22 +173,22 @@ def _find_flat(
 
 
 def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
-    """Voxels of pieces of at most four points that have nothing else within three voxel edges, (v,) bool.
+    """Whether each voxel is of a detached piece, (v,) bool: at most four points, and nothing else within three edges.
 
-    No contact joins such a piece to anything, and no gap (`pcgraph.graph.gaps.gaps`) but a wider one, as between the
-    rows of a scan. Where they hold more than a fiftieth of the points, what lies on surfaces of its own, as a coarse
-    scan beside a fine one, stays. Clouds of fewer than 1000 points, and those that are such pieces to more than two
-    thirds, have none.
+    No contact joins such a piece to anything, and no gap (`pcgraph.graph.gaps.gaps`) does, but for the wider gaps
+    between the rows of a scan. If detached pieces hold more than a fiftieth of the points, those on surfaces of their
+    own stay, such as a coarse scan beside a fine one. Clouds of fewer than 1000 points have none. Neither have clouds
+    of which more than two thirds would be such pieces.
 
     Parameters
     ----------
     grid : VoxelGrid of v voxels
     """
     detached, degrees = np.zeros(grid.n_voxels, np.bool_), np.diff(grid.indptr)
-    is_few = (degrees < _PIECE) & (grid.counts < _PIECE)
+    is_few = (degrees < _DETACHED.min_points) & (grid.counts < _DETACHED.min_points)
     few = np.flatnonzero(is_few)
-    alone = np.ones(len(few), np.bool_)  # touching nothing larger; the others need no search
-    for slot in range(_PIECE - 1):
+    alone = np.ones(len(few), np.bool_)  # whether it touches no larger voxel; the others need no search
+    for slot in range(_DETACHED.min_points - 1):
         has = degrees[few] > slot
         alone[has] &= is_few[grid.neighbours[grid.indptr[few[has]] + slot]]
     few = few[alone]
@@ -168,7 +196,7 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
         return detached
     near = voxels_within(grid, few, MAX_GAP, np.flatnonzero(boundary_voxels(grid)))
     of, to = [np.repeat(few, np.diff(near.indptr))], [near.neighbours]
-    for slot in range(_PIECE - 1):  # touching voxels may have centroids farther apart
+    for slot in range(_DETACHED.min_points - 1):  # centroids of touching voxels may lie farther apart than that
         some = few[degrees[few] > slot]
         of.append(some)
         to.append(grid.neighbours[grid.indptr[some] + slot])
@@ -178,30 +206,36 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     inner = number[target] >= 0
     piece = connected_components(np.stack((number[source[inner]], number[target[inner]]), axis=1), len(few))
     held = np.bincount(piece, grid.counts[few])
-    held[piece[number[source[~inner]]]] = _PIECE
-    detached[few[held[piece] < _PIECE]] = True
-    if grid.counts[detached].sum() > _MANY_DETACHED * grid.counts.sum():
+    held[piece[number[source[~inner]]]] = _DETACHED.min_points
+    detached[few[held[piece] < _DETACHED.min_points]] = True
+    if grid.counts[detached].sum() > _DETACHED.few * grid.counts.sum():
         detached &= ~_surfaces_among(detached, grid)
-    return detached if grid.counts[detached].sum() <= _MAX_FRACTION * grid.counts.sum() else np.zeros_like(detached)
+    return (
+        detached if grid.counts[detached].sum() <= _NOISE.max_fraction * grid.counts.sum() else np.zeros_like(detached)
+    )
 
 
-def is_near(grid: VoxelGrid, other: VoxelGrid) -> NDArray[np.bool_]:
-    """Whether each voxel lies within three edges, of the larger one, of a voxel of another grid of the same size and
-    warp, (v,) bool."""
+def far_from(other: VoxelGrid, grid: VoxelGrid, voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Voxels of a grid, out of some, (v,) bool, that have no voxel of another grid within three edges of the larger.
+
+    Both grids have the same size and warp.
+    """
     from scipy.spatial import cKDTree
 
-    near = np.zeros(grid.n_voxels, np.bool_)
+    asked, far = np.flatnonzero(voxels), np.zeros(grid.n_voxels, np.bool_)
+    far[asked] = True
     for of_level, level in other.of_levels():
-        edges = np.maximum(grid.warped_edges, level.size)
-        distances = cKDTree(other.warped[of_level]).query(grid.warped)[0]
-        near |= distances <= MAX_GAP * edges
-    return near
+        edges = np.maximum(grid.warped_edges[asked], level.size)
+        far[asked] &= (
+            cKDTree(other.warped[of_level], balanced_tree=False).query(grid.warped[asked])[0] > MAX_GAP * edges
+        )
+    return far
 
 
 def _least_significant(expected: float) -> int:
-    """Least number of points that noise, of which so many are expected, reaches with a chance below `_CHANCE`."""
+    """Least number of points that noise reaches with a probability below 1 in 10 000, if so many are expected."""
     number, chance = 1, -math.expm1(-expected)  # of so many or more, by the law of Poisson
-    while chance >= _CHANCE:
+    while chance >= _NOISE.chance:
         chance -= math.exp(number * math.log(expected) - expected - math.lgamma(number + 1))
         number += 1
     return number

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of a cloud that do not depend on the order of its points: drawn by hashes of their places."""
+"""Samples of a cloud that do not depend on the order of its points, as they are drawn by hashes of the coordinates."""
 
 from __future__ import annotations
 
@@ -7,39 +7,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.rounding import TINY
 from pcgraph.voxels.cells import bounding_box, sorted_keys, starts_of_runs
 
 BLOCKS = 32
-"""Blocks of space along each axis."""
+"""Blocks of space along each axis, so that a block's number fits into an int16; chosen by eye, not varied."""
 
-_CROWD = 1 << 16  # points of a crowd, about
+_CROWD = 1 << 16
+"""Points of a crowd, some blocks of a large cloud with all their points, about; chosen by eye, for the time's sake."""
 _SAMPLE = 1 << 14
-_STEPS = 2.0**18  # along the longest side of a cloud's box: rounding of single precision changes few of them
-_TIMES = 1.5  # as many, or as few, as were asked for: then steps tell points from each other
+"""Points of a sample, about; chosen by eye, for the time's sake."""
+_STEPS = 2.0**18
+"""Steps along the longest side of a cloud's box: so coarse that rounding to single precision changes few of them."""
+_MAX_OFF = 1.5
+"""Ratio of the number of points drawn to that asked for, or its inverse, at most: else steps tell too few apart."""
 _SEED = np.uint64(0x9E3779B97F4A7C15)
-_TINY = float(np.finfo(np.float64).tiny)
+"""First value of a hash: 2^64 over the golden ratio."""
+_MULTIPLIER = np.uint64(0xD6E8FEB86659FD93)
+"""Odd factor of the hash, with well mixed bits."""
 
 Bounds = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Lowest and highest coordinates, (3,) each."""
 
 
 def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Whole numbers without a pattern, by one step of a multiplicative hash."""
-    spread = values * np.uint64(0xD6E8FEB86659FD93)
-    return (spread ^ (spread >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)
+    """Hashes of whole numbers, by one step of a multiplicative hash."""
+    spread = values * _MULTIPLIER
+    return (spread ^ (spread >> np.uint64(32))) * _MULTIPLIER
 
 
 _mix = routine(_mixed)  # of one number, for kernels
 
 
 def sample(points: NDArray[np.float64], bounds: Bounds) -> NDArray[np.float64]:
-    """Some 16 000 of a cloud's points, each place once, in an order as good as random, whatever the points' order."""
+    """Some 16 000 of a cloud's points, without duplicates, in a pseudo-random order that does not depend on theirs."""
     chosen = thinned(points, _SAMPLE, bounds)
     return each_place_once(chosen) if len(chosen) else chosen
 
 
 def each_place_once(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """One point per place, in the order of their hashes: the first are as good as random, yet the points' own."""
+    """The points without duplicates, in the order of their hashes, so that the first of them are a random sample."""
     hashes = np.empty(len(points), np.int64)
     in_blocks(_hash, len(points), points, *_lattice(bounding_box(points)), hashes)
     ordered, order = sorted_keys(hashes)
@@ -47,8 +54,8 @@ def each_place_once(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _lattice(bounds: Bounds) -> tuple[NDArray[np.float64], float]:
-    """Corner of the box around a cloud, and steps per metre, of which so many fit in it: both move with the cloud, and
-    grow with its unit. No steps where there is no such box."""
+    """Lattice that moves and scales with a cloud: the lowest corner of its box, and steps per metre, of which 2^18 span
+    the longest side. 0 steps if the box has no size."""
     low, high = bounds
     with np.errstate(over="ignore", divide="ignore"):
         scale = float(_STEPS / (high - low).max())
@@ -57,14 +64,14 @@ def _lattice(bounds: Bounds) -> tuple[NDArray[np.float64], float]:
 
 @routine
 def _mixed_in(h: np.uint64, number: np.uint64) -> np.uint64:
-    """A hash of what has been hashed so far and one number more."""
-    h = (h ^ number) * np.uint64(0xD6E8FEB86659FD93)
+    """Hash of a hash and one more number."""
+    h = (h ^ number) * _MULTIPLIER
     return h ^ (h >> np.uint64(32))
 
 
 @routine
 def _mixed_steps(point: NDArray[np.float64], low: NDArray[np.float64], scale: float) -> np.uint64:
-    """A whole number without a pattern, of the steps from a corner at which a point lies."""
+    """Hash of a point's place in whole steps from a corner."""
     h = _SEED
     for axis in range(3):
         h = _mixed_in(h, np.uint64(np.int64(np.rint((point[axis] - low[axis]) * scale))))
@@ -73,10 +80,10 @@ def _mixed_steps(point: NDArray[np.float64], low: NDArray[np.float64], scale: fl
 
 @routine
 def _mixed_bits(point: NDArray[np.float64]) -> np.uint64:
-    """A whole number without a pattern, of a point's place to the last bit."""
+    """Hash of a point's place to the last bit."""
     h = _SEED
     for axis in range(3):
-        h = _mixed_in(h, np.float64(point[axis] + 0.0).view(np.uint64))  # makes one zero of the two
+        h = _mixed_in(h, np.float64(point[axis] + 0.0).view(np.uint64))  # -0.0 becomes 0.0
     return _mix(h)
 
 
@@ -89,11 +96,11 @@ def _hash(
     scale: float,
     hashes: NDArray[np.int64],
 ) -> None:
-    """Set a whole number per point, 0 to 2**45 - 1, that depends on its place alone, and is hardly ever another's.
+    """Set a hash per point, 0 to 2**45 - 1, that depends on its place alone.
 
-    The first digits are of its place in steps, so that a cloud that is moved, or measured in another unit, has the same
-    order, whatever is rounded; the last ones part what lies in one step. Of two places in one step a millionth share a
-    hash, and count as one; of others hardly any.
+    Its high bits are a hash of the place in steps, so that a cloud that is moved, or measured in another unit, has the
+    same order in spite of rounding. Its low bits tell points in one step from each other. One in a million pairs in one
+    step share a hash, and count as duplicates; of other pairs hardly any.
     """
     for p in range(start, stop):
         first, last = _mixed_steps(points[p], low, scale) >> np.uint64(39), _mixed_bits(points[p]) >> np.uint64(44)
@@ -101,16 +108,17 @@ def _hash(
 
 
 def some_places(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """All points, or of large clouds those in some blocks of space."""
+    """All points of a cloud; of a large one those in some blocks of space."""
     while len(points) > 2 * _CROWD and len(smaller := some_blocks(points)) < len(points):
         points = smaller
     return points
 
 
 def some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The points of as many blocks of space as it takes for a crowd, the blocks by their hashes.
+    """All points of some blocks of space, about as many as a crowd has; blocks are drawn by their hashes.
 
-    A block is as likely as it holds points: the crowd is as dense as the cloud, however that lies to the axes.
+    The chance of a block is in proportion to its points. So the crowd is as dense as the cloud, however that lies to
+    the axes.
     """
     low, high = bounding_box(points)
     edge = float((high - low).max()) / BLOCKS
@@ -128,16 +136,19 @@ def some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def blocks_of(
     points: NDArray[np.float64], low: NDArray[np.float64], edge: float
 ) -> tuple[NDArray[np.int16], NDArray[np.int64]]:
-    """Number of the block of space in which each point lies, (n,), and how many points each block holds."""
+    """Number of the block of space in which each point lies, (n,), and the number of points in each block, (b,).
+
+    `low` is the lowest corner of the first block, `edge` the length of a block.
+    """
     block = np.empty(len(points), np.int16)
-    return block, sum(in_blocks(_find_block, len(points), points, low, 1.0 / max(edge, _TINY), block))
+    return block, sum(in_blocks(_find_block, len(points), points, low, 1.0 / max(edge, TINY), block))
 
 
 @kernel
 def _find_block(
     start: int, stop: int, points: NDArray[np.float64], low: NDArray[np.float64], scale: float, block: NDArray[np.int16]
 ) -> NDArray[np.int64]:
-    """Set the number of the block of space in which each point lies; how many each block holds."""
+    """Set the number of the block of space in which each point lies; return the number of points in each block."""
     last, counts = BLOCKS - 1, np.zeros(BLOCKS**3, np.int64)
     for p in range(start, stop):
         x = min(int((points[p, 0] - low[0]) * scale), last)
@@ -149,28 +160,28 @@ def _find_block(
 
 
 def order_of_draw(numbers: NDArray[np.uint64], weights: NDArray[np.number]) -> NDArray[np.int64]:
-    """Order in which things are drawn, each as likely the next as its weight says, by what their numbers hash to.
+    """Order of a weighted random draw without replacement, (n,), by the hashes of `numbers`, (n,), as random numbers.
 
     Notes
     -----
     Source: Efraimidis and Spirakis 2006.
     """
-    chances = (_mixed(numbers) >> np.uint64(11)) * 2.0**-53 + 2.0**-54  # 0..1, without both
+    chances = (_mixed(numbers) >> np.uint64(11)) * 2.0**-53 + 2.0**-54  # between 0 and 1, exclusive
     return np.argsort(-np.log(chances) / weights, kind="stable")
 
 
 def thinned(points: NDArray[np.float64], number: int, bounds: Bounds) -> NDArray[np.float64]:
-    """About so many of some points, those of least hash, or all where they are no more.
+    """About `number` of the points: those of the least hashes; all if there are no more.
 
-    Which these are does not depend on where the cloud lies, or on its unit, unless too many lie in one step of the
-    lattice that tells them apart, as beside a stray that lies very far off.
+    The draw does not depend on where the cloud lies, or on its unit. It does if too many points share a step of the
+    lattice, because a stray lies very far off: then they are drawn by their bits.
     """
     n = len(points)
     if n <= number:
         return points
     limit, (low, scale) = np.uint64(number / n * 2.0**64), _lattice(bounds)
     chosen = np.concatenate(in_blocks(_thin, n, points, low, scale, limit))
-    if not number / _TIMES <= len(chosen) <= number * _TIMES:
+    if not number / _MAX_OFF <= len(chosen) <= number * _MAX_OFF:
         chosen = np.concatenate(in_blocks(_thin, n, points, low, 0.0, limit))
     return points.take(chosen, axis=0)
 
@@ -179,7 +190,7 @@ def thinned(points: NDArray[np.float64], number: int, bounds: Bounds) -> NDArray
 def _thin(
     start: int, stop: int, points: NDArray[np.float64], low: NDArray[np.float64], scale: float, limit: np.uint64
 ) -> NDArray[np.int64]:
-    """Those of some points of which a hash lies below a limit: of their steps or, where there are none, their bits."""
+    """Numbers of the points whose hash is below a limit: that of their steps; if `scale` is 0, that of their bits."""
     found, n = np.empty(stop - start + 1, np.int64), np.int64(0)
     for p in range(start, stop):
         found[n] = p
@@ -188,7 +199,7 @@ def _thin(
 
 
 def farthest_points(places: NDArray[np.float64], first: int, n: int) -> list[int]:
-    """Indices of at most n of k places, (k, 3), by farthest point sampling from the place `first`."""
+    """Indices of n of k places, (k, 3), or of all if n > k, by farthest point sampling from the place `first`."""
     chosen, nearest = [first], np.full(len(places), np.inf)
     while len(chosen) < min(n, len(places)):
         ways = places - places[chosen[-1]]

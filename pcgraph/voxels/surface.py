@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The surface as its voxels sample it: the plane on which each voxel lies.
+"""The plane on which each voxel lies.
 
-Around each voxel a plane is fitted to a window of two rings of its neighbours; each voxel then takes, of the windows
-around it, the one that fits best.
+A window is a voxel with two rings of its neighbours. A plane is fitted to each window. Each voxel then takes the window
+that fits best among those around it.
 """
 
 from __future__ import annotations
@@ -18,8 +18,12 @@ from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.eigen import plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 
-_OWN_BONUS = 0.7  # the window around the voxel itself wins unless another is better by this factor
-_LOOKED_AT, _STRETCHES = 4096, 16  # voxels at which roughness is read, and how many stretches they make
+_OWN_BONUS = 0.7
+"""Factor on the squared residual of a voxel's own window, so that it wins on plain ground; chosen by eye."""
+_ROUGHNESS_SAMPLE = 4096
+"""Voxels at which roughness is read; chosen by eye, for the time's sake."""
+_STRETCHES = 16
+"""Stretches of the grid's order that these voxels make, at most, so that they are evenly spread; chosen by eye."""
 
 
 class Windows(NamedTuple):
@@ -28,10 +32,11 @@ class Windows(NamedTuple):
     Attributes
     ----------
     moments : (v, 10) float64
-        Number of voxels (each counts as often as there are ways to it in two steps, the inner ones more), mean,
-        and scatter (xx, yy, zz, xy, xz, yz) about the mean.
+        Number of voxels, mean, and scatter (xx, yy, zz, xy, xz, yz) about the mean. A voxel counts as often as there
+        are ways to it in two steps, so the inner ones count more.
     normals : (v, 3) float64
-        Unit directions of least spread, of either sign; across a line the one nearest to `towards`.
+        Unit directions of least spread, of either sign. Those of lines: the direction across that is nearest to
+        `towards`.
     residuals : (v,) float64, square metres
         Mean squared distance of the window's voxels to its plane.
     """
@@ -59,19 +64,19 @@ def fitted_windows(grid: VoxelGrid, towards: NDArray[np.float64]) -> Windows:
 
 
 def roughness(grid: VoxelGrid) -> float:
-    """How far voxels and those that touch them lie off a plane where the surface is smooth, voxel edges.
+    """Roughness of the smooth surfaces of a grid, voxel edges: how noisy they are.
 
-    It is the lower quartile, over voxels of some evenly spread stretches, of the root mean square distance of one ring
-    to its plane. Windows of two rings would read the edges of things of some voxels' size as noise.
+    The rms distance of a voxel and those that touch it to their plane is read at evenly spread voxels. Roughness is the
+    lower quartile of that. Two rings of voxels would read the edges of small things as noise.
     """
     n = grid.n_voxels
-    stretches = max(1, min(n // _LOOKED_AT, _STRETCHES))
+    stretches = max(1, min(n // _ROUGHNESS_SAMPLE, _STRETCHES))
     rings = Windows(np.empty((n, 10)), np.empty((n, 3)), np.full(n, np.nan))
     towards = np.zeros((n, 3))
     towards[:, 2] = 1.0
     for stretch in range(stretches):
         start = n * stretch // stretches
-        stop = min(start + _LOOKED_AT // stretches, n)
+        stop = min(start + _ROUGHNESS_SAMPLE // stretches, n)
         _first_ring(start, stop, grid.neighbourhood, grid.centroids, rings.moments)
         _fit(start, stop, towards, rings)
     return float(np.nanquantile(np.sqrt(rings.residuals) / grid.edge_lengths, 0.25))
@@ -108,7 +113,7 @@ def _second_ring(
     ring: NDArray[np.float64],
     moments: NDArray[np.float64],
 ) -> None:
-    """Moments of two rings, as sums of first rings: a voxel counts as often as there are ways to it."""
+    """Moments of each voxel with two rings of neighbours, as sums of first rings."""
     indptr, neighbours = neighbourhood
     for i in range(start, stop):
         ox, oy, oz = ring[i, 1], ring[i, 2], ring[i, 3]
@@ -158,7 +163,10 @@ def _degenerate_normal(
     towards: NDArray[np.float64],
     normal: NDArray[np.float64],
 ) -> None:
-    """Set the direction of least spread; across a line, the one nearest to the viewpoint; of a point, to the viewpoint.
+    """Set the normal of voxels that may be on no plane: the direction of least spread if they are on one.
+
+    On a line it is the direction across that is nearest to the viewpoint; of a single place, the direction to the
+    viewpoint.
 
     Parameters
     ----------
@@ -211,8 +219,8 @@ class LocalPlanes:
     Attributes
     ----------
     normals : (v, 3) float64
-        Unit normals on the viewpoint's side. Voxels that lie on a line get the normal nearest to the viewpoint,
-        lone ones the direction to the viewpoint.
+        Unit normals on the viewpoint's side. A voxel on a line has the normal nearest to the direction to the
+        viewpoint; a lone voxel has that direction.
     origins : (v, 3) float64, metres, the points' frame
         A point of each plane: the mean of its window.
     """
@@ -259,17 +267,17 @@ def local_planes(grid: VoxelGrid, viewpoints: NDArray[np.float64], reach: int) -
     ----------
     grid : VoxelGrid of v voxels
     viewpoints : (3,) or (v, 3) float64, metres, the points' frame
-        From where each voxel was seen.
+        Place from which each voxel was seen.
     reach : int, >= 0
         Voxels by which the window may lie off its voxel.
 
     Notes
     -----
-    A window is a voxel with two rings of its neighbours. Beside an edge the window around a voxel straddles both
-    faces and its normal is a compromise; but some window further in lies on one face alone. So each voxel takes,
-    of the windows within `reach`, the one with the least mean squared distance of its own voxels plus the squared
-    distance of this voxel to its plane. Its own window counts 0.7 times its mean alone: so on plain and evenly
-    curved ground, where all windows are as good, it is preferred, and noise averages out. Source of the idea:
+    A window is a voxel with two rings of its neighbours. Beside an edge the window around a voxel straddles both faces,
+    and its normal is a compromise. But some window further in lies on one face alone. So each voxel takes one of the
+    windows within `reach`: that of the least mean squared distance of its own voxels to its plane plus the squared
+    distance of this voxel to the plane. For its own window only 0.7 times the former counts. So it is preferred on
+    plain and evenly curved ground, where all windows are equally good, and noise averages out. Source of the idea:
     Kuwahara et al. 1976, for images.
     """
     n, neighbourhood = grid.n_voxels, grid.neighbourhood
@@ -295,7 +303,7 @@ def _set_planes(
     normals: NDArray[np.float64],
     origins: NDArray[np.float64],
 ) -> None:
-    """Set the plane of each voxel to that of its window, its normal on the side of the viewpoint."""
+    """Set the plane of each voxel to that of its window, with its normal on the side of the viewpoint."""
     for i in range(start, stop):
         w, facing = best[i], 0.0
         for axis in range(3):
@@ -317,9 +325,9 @@ def _take_best(
     costs: NDArray[np.float64],
     better: NDArray[np.int32],
 ) -> None:
-    """The best of the windows that a voxel and its neighbours hold so far, each as this voxel sees it.
+    """Set the best of the windows that a voxel and its neighbours hold so far, by what each costs this voxel.
 
-    A window's cost is never below its residual (`held`), so on plain ground no plane need be looked at.
+    The cost of a window is never below its residual (`held`), so on plain ground no plane has to be looked at.
     """
     indptr, neighbours = neighbourhood
     moments, normals, _ = windows

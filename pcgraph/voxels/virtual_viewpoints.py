@@ -1,13 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Virtual viewpoints around and within a cloud, and which of them agree on the outer side of its surfaces.
 
-A scanner stood where nothing was, and what it measured it saw from there. So places around and within the cloud are
-tried: those from which much of it is visible, always from the same side, tell which side that is.
+A scanner stood in free space, and it saw all that it measured. So candidate viewpoints (here: places) around and within
+the cloud are tried. Places from which much of the cloud is visible, always from the same side, tell the outer side.
+
+Words of this module:
+
+cell
+    A voxel of a coarse grid. Places are compared by the cells that they see.
+side
+    Signed cosine between the normal of a cell and the direction to a place; 0 where the place does not see the cell.
+agreement
+    A weight for each place, and an outer side for each cell, that fit each other: the weighted places vote for these
+    outer sides, and each weight follows from how well its place agrees with the vote.
+enclosure
+    Fraction of all directions in which a place sees something; nearly 1 in a closed room.
+partition
+    A thin wall between two rooms, of which both sides were scanned.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -16,6 +31,7 @@ from numpy.typing import NDArray
 
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.parallel import in_blocks, kernel, routine, summing_routine
+from pcgraph.rounding import NEARLY_ZERO
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.depth_buffer import facing_cosines, hit_fractions, visibility_from
 from pcgraph.voxels.directions import sphere_directions
@@ -25,59 +41,119 @@ from pcgraph.voxels.sampling import farthest_points
 from pcgraph.voxels.surface import Windows, fitted_windows
 from pcgraph.voxels.warp import Shift
 
-# Lengths are edges of coarse cells, and places those of viewpoints, where nothing else is said.
-_CELLS = 5000  # of the coarse grid on which viewpoints are compared, about
-_MIN_ON_SURFACES = 0.5  # fraction of the voxels that are joined; else those that are not count as well
-_FINER = (
-    1,
-    2,
-    4,
-)  # times as many cells and viewpoints, where there are rooms, until one agreement shows
-_SHOWS_MOST, _SHOWS_NEARLY_ALL = 0.85, 0.95  # of the surface; the latter where rooms are low,
-_MIN_LAYERS, _MAX_HEIGHT = 1.7, 8.0  # of so many cells over each other on average, and no higher than so many in all
-# Candidates
-_N_OUTSIDE = 42  # places around the cloud
-_OUTSIDE_DISTANCE = 1.3  # from its middle, in half diagonals of its bounding box
-_N_INSIDE = 64  # free places within it, of a lattice of
-_LATTICE_SIDE = 12  # places along each side
-_MIN_CLEARANCE = 2.0  # of a free place from the next surface
-_SPREAD_FRACTION = 0.75  # of the free places are far from each other, the others far from surfaces
-_MIN_SURROUNDED = 0.8  # of the directions that hit something, over the most of any place
-_SAMPLED_CELLS = 1500  # which these are tested against, about
-_MAX_TURNED_BOX = 0.2  # volume of a box along the principal axes, over the bounding box's, for it to be used
-_CLOSED = 0.96  # fraction of the directions that hit something, of a place in a room
-_MIN_IN_ROOMS = 16  # such places, for there to be rooms
-# Parts far from each other
-_BLOCKS_ALONG = 16  # blocks along the bounding box: parts have an empty one between them
-_MIN_PART = 0.05  # fraction of the cells
-_MAX_PARTS, _MAX_ROOMS = 3, 8  # of any kind; and if all beyond these are rooms
-_PART_QUANTILES = 0.05, 0.95  # of a part's cells, between which candidates are placed
-_MAX_PART_LENGTH = 0.5  # of the bounding box's length, for a part to have candidates of its own
-# Agreements
-_ROUNDS = 12  # of voting and weighting, at most
-_N_HALVES = 14  # half spaces, whose outer candidates are first opinions
-_BOTH_SIDES = 0.2  # cosine under which candidates in rooms see both sides of a partition
-_WELL_SEEN = 0.3  # weighted sum of cosines from which on a cell is seen well
-_MAX_OFF_PLANE = 0.1  # RMS distance of a flat cell and those around it from their plane
-_CELLS_PER_BLOCK = 512  # for speed: of many rooms a candidate sees few blocks
-# Score of an agreement: the fraction of the surface that it shows, differences up to _SHOWN_TOLERANCE ignored, plus
-_SHOWN_TOLERANCE = 0.004
-_W_UNANIMOUS = 0.02  # times how unanimous its viewpoints are
-_W_OUTSIDE = 0.003  # times how much those around the cloud see from its outer side
-_W_ORIGIN, _W_ABOVE_GROUND, _W_FREE_SIDE = 0.02, 0.05, 0.002  # times the same of the likely ones: the origin; those
-# above the ground; or those on the free side of another supporting plane
-_W_ROOM = 0.2  # times the fraction of the cells in a room (in a passage 1), if its viewpoints are closed in:
-_ENCLOSED_FOR_ROOM = 0.8  # weighted mean of the fraction of directions that hit something
-_MIN_SHOWN_FROM_INSIDE = 0.001  # fraction of the surface that such viewpoints show more, to count so in a passage
-_MAX_FROM_BEHIND = 0.02  # fraction of what it sees that may be planes from behind; what is more is taken off
-# The origin as a camera's place
-_MAX_SLOPE = 1.2  # tangent off the optical axis, along x and y, within which all lies,
-_MIN_SLOPE = 0.2  # and beyond which a tenth lies
-_MIN_SEEN_OF_OPPOSITE = 0.93  # what it sees over what its mirror image sees, on the other side of the supporting plane
-# Viewpoints that are chosen
-_MIN_CHOSEN, _MAX_CHOSEN = 12, 128  # the latter while each
-_MIN_GAIN = 0.005  # of all cells is first to see, or second to see four times as much
-_TINY = 1e-12
+# Thresholds without a reason were chosen by eye and not varied. A gain is the mean of all scores, less the mean without
+# the term (docs/pcgraph_experiments.md).
+
+
+@dataclass(frozen=True)
+class ResolutionThresholds:
+    """Resolution of the coarse grid on which places are compared.
+
+    Cells are thicker than partitions, and as high as low rooms. So where there are rooms, a finer grid with more places
+    is tried until one agreement shows most of the surface. Without this a law fails: floors and ceilings of rooms side
+    by side face inwards.
+    """
+
+    cells: int = 5000  # count, about: time grows with it
+    finer: tuple[int, ...] = (1, 2, 4)  # times as many cells and inner places, one after the other
+    shows_most: float = 0.85  # fraction of the surface: no finer grid is tried from here on
+    shows_nearly_all: float = 0.95  # the same for layered clouds, whose outside alone shows much
+    min_layers: float = 1.7  # mean number of cells over each other from which on a cloud may be layered
+    max_height: float = 8.0  # cell edges: a higher cloud is not layered
+    min_joined: float = 0.5  # fraction of the voxels: if fewer are joined, voxels that are not joined count as well
+
+
+@dataclass(frozen=True)
+class CandidateThresholds:
+    """Numbers and positions of candidate viewpoints."""
+
+    n_outside: int = 42  # places around the cloud; three times as many mend trucks, but turn reliefs and trenches
+    outside_distance: float = 1.3  # from the middle of the bounding box, in half diagonals of it
+    n_inside: int = 64  # free places within the bounding box
+    lattice_side: int = 12  # places along each side of the lattice of which these are chosen
+    min_clearance: float = 2.0  # cell edges from a free place to the next surface, at least
+    spread_fraction: float = 0.75  # fraction of them that lie far from each other; the others lie far from surfaces
+    min_surrounded: float = 0.8  # least enclosure over the largest of any place: others lie in corners; gain 0.0091
+    sampled_cells: int = 1500  # cells by which enclosure is measured then, about
+    max_turned_box: float = 0.2  # a box along the principal axes is used below this fraction of the volume; gain 0.0049
+    min_enclosure: float = 0.96  # of a place that is closed in: at most 2 of the 64 bins of directions are empty
+    min_in_rooms: int = 16  # closed-in places from which on the cloud has rooms
+
+
+@dataclass(frozen=True)
+class PartThresholds:
+    """Conditions for parts of a cloud to lie far from each other, so that each has places of its own."""
+
+    blocks_along: int = 16  # blocks along the bounding box: parts have an empty one between them
+    min_fraction: float = 0.05  # fraction of the cells
+    max_parts: int = 3  # parts of any kind, at most
+    max_rooms: int = 8  # pieces that are asked: beyond `max_parts` they are parts only if they are rooms
+    quantiles: tuple[float, float] = (0.05, 0.95)  # of a part's cells along each axis: its candidates lie between
+    max_length: float = 0.5  # a longer part, in lengths of the bounding box, has no candidates of its own
+
+
+@dataclass(frozen=True)
+class AgreementThresholds:
+    """Starts of agreements, and conditions for the cells that their places judge."""
+
+    n_halves: int = 14  # half spaces; the places around the cloud in one of them start together
+    both_sides: float = 0.2  # cosine from which on closed-in places see either side of a cell: it is a partition
+    max_off_plane: float = 0.1  # cell edges, rms distance of a cell and those around it from their plane: it is flat
+
+
+@dataclass(frozen=True)
+class ScoreThresholds:
+    """Weights and thresholds of an agreement's score, which starts with the fraction of the surface that it shows.
+
+    All weights are fractions of the surface, too.
+    """
+
+    shown_tolerance: float = 0.004  # a difference below that does not count; gain 0.0060, all of it on one street
+    unanimous: float = 0.02  # weight of how far each place sees one side only; gain 0.0076
+    outside: float = 0.003  # weight of how much the places around the cloud see from its outer side
+    origin: float = 0.02  # weight of how much likely places see so, if the frame's origin is likely
+    above_ground: float = 0.05  # the same for places above the ground; more than what a pit and a mound differ in shown
+    free_side: float = 0.002  # the same for places on the free side of another supporting plane; gain 0.0042
+    room: float = 0.2  # weight of the fraction of the cells in a room (1 in a passage), for an enclosed agreement
+    enclosed_for_room: float = 0.8  # weighted mean enclosure of the places of an enclosed agreement, at least
+    min_shown_from_inside: float = 0.001  # fraction of the surface that enclosed agreements show more, in a passage
+    max_from_behind: float = 0.02  # fraction of flat cells seen from behind: right ones have 0.014, wrong ones 0.045
+
+
+@dataclass(frozen=True)
+class CameraThresholds:
+    """Conditions for the frame's origin to be the place of a camera that looks along z."""
+
+    max_slope: float = 1.2  # tangent of the angle off the axis, along x and y: all lies within
+    min_slope: float = 0.2  # the same tangent: some of the cells lie beyond, else the origin is merely far off
+    min_beyond: float = 0.1  # fraction of the cells: so many lie beyond
+    min_seen_of_opposite: float = 0.93  # visible there over visible from its mirror image: pits 0.70-0.92, walls 0.94
+
+
+@dataclass(frozen=True)
+class ChoiceThresholds:
+    """Choice of the places of the best agreement from which the voxels are looked at."""
+
+    min_chosen: int = 12  # places
+    max_chosen: int = 128  # places: time grows with it
+    min_gain: float = 0.005  # fraction of the cells that the next place has to see anew
+    seen_again: float = 0.25  # factor by which a cell counts less each time it is seen: so each room has a place
+
+
+_RESOLUTION = ResolutionThresholds()
+_CANDIDATES = CandidateThresholds()
+_PART = PartThresholds()
+_AGREEMENT = AgreementThresholds()
+_SCORE = ScoreThresholds()
+_CAMERA = CameraThresholds()
+_CHOICE = ChoiceThresholds()
+
+_ROUNDS = 12
+"""Count of rounds of voting and weighting, at most; chosen by eye, not varied."""
+_WELL_SEEN = 0.3
+"""Weighted sum of cosines from which on a cell counts as shown in full; chosen by eye, not varied."""
+_CELLS_PER_BLOCK = 512
+"""Count of cells passed over at once if a place sees none, as in one of many rooms; chosen by eye, for speed."""
 
 
 class VirtualViewpoints(NamedTuple):
@@ -87,12 +163,14 @@ class VirtualViewpoints(NamedTuple):
     ----------
     places : (k, 3) float64, in half extents of the voxels' centroids from the middle of their bounding box
     weights : (k,) float64, 0..1
-        How much each counts.
+        Weight of each viewpoint in the vote on the outer side.
     parts : (k,) int64
-        The part of the cloud whose outside each is asked about; one place may be there for several.
+        Part of the cloud that each viewpoint is used for. A place that is used for several parts is listed once for
+        each.
     cells : (c, 3) float64
-        Places of coarse cells, in the same frame.
+        Centres of the coarse cells, in the frame of `places`.
     part_of_cell : (c,) int64
+        Part of the cloud that each cell belongs to.
     """
 
     places: NDArray[np.float64]
@@ -102,54 +180,59 @@ class VirtualViewpoints(NamedTuple):
     part_of_cell: NDArray[np.int64]
 
     def part_of(self, centres: NDArray[np.float64]) -> NDArray[np.int64]:
-        """The part of each of n places in the same frame, (n,)."""
+        """Part of the cloud that each of n places, (n, 3) in the same frame, belongs to, (n,): its nearest cell's."""
         from scipy.spatial import cKDTree
 
         return self.part_of_cell[cKDTree(self.cells).query(centres)[1]]
 
 
 def unit_frame(grid: VoxelGrid, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Middle, (3,), and half extent of places, a voxel edge at least: lengths there are of the order of 1."""
+    """Origin, (3,), and unit of length of a frame in which the coordinates of places lie within -1..1.
+
+    The origin is the middle of their bounding box; the unit is half of its longest side, or a voxel edge if that is
+    more.
+    """
     low, high = bounding_box(places)
     return (low + high) / 2.0, max(float((high - low).max()) / 2.0, float(grid.edge_lengths.min()))
 
 
 def either_normals(grid: VoxelGrid) -> NDArray[np.float64]:
-    """Unit normals of the surface at each voxel, (v, 3), towards either side."""
+    """Unit normal of the surface at each voxel, (v, 3); which of its two sides it points to is arbitrary."""
     return _windows(grid).normals
 
 
 def _windows(grid: VoxelGrid) -> Windows:
-    """Planes through each voxel and those around it, their normals towards either side."""
+    """The plane through each voxel and those around it; which side its normal points to is arbitrary."""
     upwards = np.zeros((grid.n_voxels, 3))
     upwards[:, 2] = 1.0
     return fitted_windows(grid, upwards)
 
 
 def lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lengths of rows, (n,), of the order of 1; of zeros nearly nothing."""
-    return np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), _TINY)
+    """Lengths of n rows, (n,), which are of the order of 1; at least `NEARLY_ZERO`, so that they can be divided by."""
+    return np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), NEARLY_ZERO)
 
 
 def virtual_viewpoints(grid: VoxelGrid) -> VirtualViewpoints:
     """Viewpoints that tell which side of the voxels' surface is its outside.
 
-    Of many rooms, whose partitions are thin and which hold few places each, more are looked at, through smaller cells;
-    and where floors and ceilings lie near to each other for cells of that size, so that hardly a place is in a room.
+    In a cloud of many rooms, partitions are thinner than a cell and few places lie in each room; in a low storey, few
+    places lie between floor and ceiling. Such clouds are looked at again with smaller cells and more places, until one
+    agreement shows most of the surface.
     """
     middle, reach = unit_frame(grid, grid.centroids)
     surfaces = _surfaces(grid, middle, reach)
-    for finer in _FINER:
-        coarse, points = _in_cells(surfaces, finer * _CELLS)
-        may_be_finer = finer < _FINER[-1] and coarse.n_voxels <= grid.n_voxels // 2
+    for finer in _RESOLUTION.finer:
+        coarse, points = _in_cells(surfaces, finer * _RESOLUTION.cells)
+        may_be_finer = finer < _RESOLUTION.finer[-1] and coarse.n_voxels <= grid.n_voxels // 2
         windows = _windows(coarse)
         candidates, part_of_cell = _candidates(coarse, points, windows.normals, -middle / reach, finer)
-        is_layered, n_in_rooms = _is_layered(coarse), np.count_nonzero(candidates.enclosure >= _CLOSED)
-        if may_be_finer and is_layered and n_in_rooms < _MIN_IN_ROOMS:
-            continue  # low rooms have few places at first, and the outside of all of them shows much
+        is_layered, n_in_rooms = _is_layered(coarse), np.count_nonzero(candidates.is_closed_in)
+        if may_be_finer and is_layered and n_in_rooms < _CANDIDATES.min_in_rooms:
+            continue  # low rooms hold few places in large cells, and places around all of them see much
         viewpoints, shown = _vote(coarse, points, windows, candidates, part_of_cell)
-        shows_most = shown >= (_SHOWS_NEARLY_ALL if is_layered else _SHOWS_MOST) or not (is_layered or n_in_rooms)
-        if shows_most or not may_be_finer:
+        enough = _RESOLUTION.shows_nearly_all if is_layered else _RESOLUTION.shows_most
+        if shown >= enough or not (is_layered or n_in_rooms) or not may_be_finer:
             break
     return viewpoints
 
@@ -161,24 +244,32 @@ def _vote(
     candidates: _Candidates,
     part_of_cell: NDArray[np.int64],
 ) -> tuple[VirtualViewpoints, float]:
-    """The candidates that agree best, and how much of the surface any agreement of them shows."""
-    normals, is_flat = windows.normals, windows.residuals <= (_MAX_OFF_PLANE * coarse.size) ** 2
+    """The viewpoints of the best agreement, and the largest fraction of the surface that any agreement shows."""
+    normals, is_flat = windows.normals, windows.residuals <= (_AGREEMENT.max_off_plane * coarse.size) ** 2
     seen = visibility_from(candidates.places, coarse.centroids, coarse.edge_lengths, normals)
     sides = facing_cosines(candidates.places, coarse.centroids, normals, seen)
-    in_rooms = candidates.enclosure >= _CLOSED
+    in_rooms = candidates.is_closed_in
     voting = _without_partitions(sides, sides[in_rooms])
-    starts = _starts(candidates.places[:_N_OUTSIDE], candidates.likely, in_rooms)
+    starts = _starts(candidates.places[: _CANDIDATES.n_outside], candidates.likely, in_rooms)
     of_place, of_part = _looks_at_parts(seen, part_of_cell)
     if of_part.any():
         asked = of_part[:, None] == part_of_cell
         seen, sides, voting = (np.where(asked, every[of_place], every.dtype.type(0)) for every in (seen, sides, voting))
     found = _agreements(voting, np.ascontiguousarray(starts[:, of_place]))
-    from_outside, likely, enclosure = of_place < _N_OUTSIDE, candidates.likely[of_place], candidates.enclosure[of_place]
-    looks = _Looks(sides, from_outside, likely, enclosure, of_part, part_of_cell, is_flat)
-    room_scores, has_rooms = np.zeros(int(part_of_cell.max()) + 1), np.count_nonzero(in_rooms) >= _MIN_IN_ROOMS
+    looks = _Looks(
+        sides=sides,
+        from_outside=of_place < _CANDIDATES.n_outside,
+        likely=candidates.likely[of_place],
+        enclosure=candidates.enclosure[of_place],
+        of_part=of_part,
+        part_of_cell=part_of_cell,
+        is_flat=is_flat,
+    )
+    room_scores = np.zeros(int(part_of_cell.max()) + 1)
+    has_rooms = np.count_nonzero(in_rooms) >= _CANDIDATES.min_in_rooms
     for part in range(len(room_scores) if has_rooms else 0):
         cells = part_of_cell == part
-        room_scores[part] = _W_ROOM * np.mean(cells) * _is_room(cells, coarse, normals, points)
+        room_scores[part] = _SCORE.room * np.mean(cells) * _is_room(cells, coarse, normals, points)
     may_be_passage = bool(has_rooms) and len(room_scores) == 1 and not room_scores.any()
     around, likely_weight = coarse.neighbourhood, candidates.likely_weight
     weights, shown = _best_agreement(found, looks, around, likely_weight, room_scores, may_be_passage)
@@ -188,23 +279,29 @@ def _vote(
 
 
 class _Candidates(NamedTuple):
-    """Places from which a cloud may have been seen: k of them, the first around it.
+    """The k places from which a cloud may have been seen, those around it first.
 
     Attributes
     ----------
     places : (k, 3) float64, in the frame of `unit_frame`
-    enclosure : (k,) float64
-        Fraction of the directions in which a place within has something; 0 of others.
+    enclosure : (k,) float64, 0..1
+        Fraction of the directions in which a place within the cloud sees something; 0 for the places around it.
     likely : (k,) bool
-        The origin, if all was seen from about there; else those around that are before what bears things.
+        Whether the sensor is likely to have stood there. That is the origin, if a camera at the origin would see the
+        whole cloud; else the places around the cloud on the free side of its supporting plane.
     likely_weight : float
-        What it counts where as much is seen.
+        Weight in the score of what the likely places see.
     """
 
     places: NDArray[np.float64]
     enclosure: NDArray[np.float64]
     likely: NDArray[np.bool_]
     likely_weight: float
+
+    @property
+    def is_closed_in(self) -> NDArray[np.bool_]:
+        """Whether each place sees something in nearly all directions, as in a closed room, (k,) bool."""
+        return self.enclosure >= _CANDIDATES.min_enclosure
 
 
 def _candidates(
@@ -214,51 +311,55 @@ def _candidates(
     origin: NDArray[np.float64],
     finer: int,
 ) -> tuple[_Candidates, NDArray[np.int64]]:
-    """Places around the coarse grid, and within, there so many times as many as usual; and the part of each cell."""
+    """Candidate places around the cells and among them, and the part of the cloud that each cell belongs to, (c,).
+
+    Among the cells there are `finer` times as many places as usual. `origin` is that of the points' frame.
+    """
     low, high = bounding_box(coarse.centroids)
     part_of_cell, boxes = _parts(coarse, normals, points)
-    share, upright = max(finer // (len(boxes) + 1), 1), np.eye(3)
-    in_boxes = np.concatenate([low[None][:0], *(_free_viewpoints(coarse, *box, upright, share) for box in boxes)])
-    in_boxes = in_boxes[hit_fractions(in_boxes, coarse.centroids) >= _CLOSED]
-    if len(in_boxes) < _MIN_IN_ROOMS:  # none of the parts is a room
+    n_times, upright = max(finer // (len(boxes) + 1), 1), np.eye(3)
+    in_boxes = np.concatenate([low[None][:0], *(_free_viewpoints(coarse, *box, upright, n_times) for box in boxes)])
+    in_boxes = in_boxes[hit_fractions(in_boxes, coarse.centroids) >= _CANDIDATES.min_enclosure]
+    if len(in_boxes) < _CANDIDATES.min_in_rooms:  # none of the parts is a room
         part_of_cell[:], in_boxes = 0, in_boxes[:0]
-    inside = np.concatenate((_free_viewpoints(coarse, *_smallest_box(coarse.centroids), share), in_boxes))
-    directions = sphere_directions(_N_OUTSIDE)
-    outside = (low + high) / 2.0 + _OUTSIDE_DISTANCE * lengths((high - low)[None]) / 2.0 * directions
+    inside = np.concatenate((_free_viewpoints(coarse, *_smallest_box(coarse.centroids), n_times), in_boxes))
+    directions = sphere_directions(_CANDIDATES.n_outside)
+    outside = (low + high) / 2.0 + _CANDIDATES.outside_distance * lengths((high - low)[None]) / 2.0 * directions
     if not (high > low).any():
         outside = low + directions
     upwards, offset, is_ground = supporting_plane(coarse, normals)
     sees = origin @ upwards >= offset and _has_in_view(origin, coarse.centroids)
     is_camera = sees and (abs(upwards[2]) < LEVEL or _sees_as_much(origin, upwards, coarse, normals))
-    if not is_camera and upwards[2] < -LEVEL:  # no accident: the frame stands upright, and things lie in a pit
+    if not is_camera and upwards[2] < -LEVEL:  # a level plane is no accident: z is up, and things lie in a pit
         upwards = -upwards
     places = np.concatenate((outside, inside))
-    enclosure = np.concatenate((np.zeros(_N_OUTSIDE), hit_fractions(inside, coarse.centroids)))
+    enclosure = np.concatenate((np.zeros(_CANDIDATES.n_outside), hit_fractions(inside, coarse.centroids)))
     if is_camera:
         places, enclosure = np.concatenate((places, origin[None])), np.append(enclosure, 0.0)
         likely = np.arange(len(places)) == len(places) - 1
-        return _Candidates(places, enclosure, likely, _W_ORIGIN), part_of_cell
+        return _Candidates(places, enclosure, likely, _SCORE.origin), part_of_cell
     likely = np.zeros(len(places), np.bool_)
-    likely[:_N_OUTSIDE] = directions @ upwards > 0.0
-    return _Candidates(places, enclosure, likely, _W_ABOVE_GROUND if is_ground else _W_FREE_SIDE), part_of_cell
+    likely[: _CANDIDATES.n_outside] = directions @ upwards > 0.0
+    return _Candidates(places, enclosure, likely, _SCORE.above_ground if is_ground else _SCORE.free_side), part_of_cell
 
 
 class _Looks(NamedTuple):
-    """Looks of k places at n cells, or at those of one part.
+    """The sides of n cells that k looks see. A look is one place with one part of the cloud, whose cells alone it sees.
 
     Attributes
     ----------
     sides : (k, n) float32
-        Signed cosines, 0 hidden.
+        Signed cosine between each cell's normal and the direction to the place; 0 where the cell is hidden.
     from_outside, likely : (k,) bool
-        Whether they are those of places around the cloud, and of places before what bears things or of the origin.
-    enclosure : (k,) float64
-        Fraction of the directions in which a place has something.
+        Whether the place lies around the cloud; whether it is a likely one (`_Candidates.likely`).
+    enclosure : (k,) float64, 0..1
+        Enclosure of the place.
     of_part : (k,) int64
-        The part at which each is.
+        Part of the cloud at which each looks.
     part_of_cell : (n,) int64
+        Part of the cloud that each cell belongs to.
     is_flat : (n,) bool
-        Whether cells lie on planes with those around. Places beyond an edge see what is on it from its back.
+        Whether a cell lies on one plane with those around it. On edges, places just beyond see the cell from its back.
     """
 
     sides: NDArray[np.float32]
@@ -273,10 +374,12 @@ class _Looks(NamedTuple):
 def _looks_at_parts(
     seen: NDArray[np.bool_], part_of_cell: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Number of the place, of k that see cells, (k, n), and of the part, for each look at a part of which it sees some.
+    """Place and part of each look, (m,) int64 both: every place with every part of which it sees a cell.
 
-    Parts are asked about one by one where one of them is a room, as a place before a house sees its front from the
-    right side and the room opposite, into which its sensor looked through a window, from the wrong one.
+    `seen`, (k, n), tells which of n cells each of k places sees.
+
+    Each part has votes of its own, because one place may see two parts from different sides: a sensor in a room saw a
+    house through the window; a place before the house sees the house from its outer side, but the room from its back.
     """
     n_parts = int(part_of_cell.max()) + 1
     if n_parts == 1:
@@ -287,60 +390,75 @@ def _looks_at_parts(
 
 
 def _is_layered(coarse: VoxelGrid) -> bool:
-    """Whether floors and ceilings may lie one over another across the thinnest side, too near for a place between."""
+    """Whether the cloud may be a low storey, whose floor and ceiling are too near each other for a place between them.
+
+    That is so if its thinnest side is only some cells high, and several cells lie over each other in most columns.
+    """
     low, high = bounding_box(coarse.centroids)
     thin = int(np.argmin(high - low))
     across, along = (np.unique(cells, return_inverse=True)[1] for cells in np.delete(coarse.cells, thin, axis=1).T)
     columns = np.unique(across * coarse.n_voxels + along)
-    return bool(coarse.n_voxels >= _MIN_LAYERS * len(columns) and (high - low)[thin] < _MAX_HEIGHT * coarse.size)
+    is_low = (high - low)[thin] < _RESOLUTION.max_height * coarse.size
+    return bool(is_low and coarse.n_voxels >= _RESOLUTION.min_layers * len(columns))
 
 
 def _without_partitions(sides: NDArray[np.float32], of_rooms: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The sides that places see, (k, n), but of partitions: cells of which those in rooms see both.
+    """The sides that k places see of n cells, (k, n), with 0 for partitions.
 
-    A cell is thicker than a partition, so that the rooms on either side of it would contradict each other.
+    `of_rooms` are the sides that closed-in places see. A cell is a partition if they see both of its sides. It is
+    thicker than the wall, so the places of the two rooms would contradict each other about its outer side.
     """
     if not len(of_rooms):
         return sides
     front, back = np.maximum(of_rooms, 0.0).max(axis=0), np.maximum(-of_rooms, 0.0).max(axis=0)
-    return np.where(np.minimum(front, back) > _BOTH_SIDES, np.float32(0.0), sides)
+    return np.where(np.minimum(front, back) > _AGREEMENT.both_sides, np.float32(0.0), sides)
 
 
 def _starts(
     outside: NDArray[np.float64], likely: NDArray[np.bool_], in_rooms: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """Weights of the places, (s, k), from which agreement may start: first opinions as different as there are."""
-    starts = np.zeros((_N_HALVES + 4, len(likely)), np.float32)
-    starts[:_N_HALVES, :_N_OUTSIDE] = sphere_directions(_N_HALVES) @ (outside - outside.mean(axis=0)).T > 0.0
-    starts[_N_HALVES, :_N_OUTSIDE] = 1.0
-    starts[_N_HALVES + 1, _N_OUTSIDE:] = 1.0
-    starts[_N_HALVES + 2] = likely
-    starts[_N_HALVES + 3] = in_rooms if np.count_nonzero(in_rooms) >= _MIN_IN_ROOMS else 0.0
+    """Weights of k places, (s, k), from which s agreements start.
+
+    They are as different as possible: the places around the cloud in each of some half spaces; all places around it;
+    all others; the likely ones; and those closed in, if there are rooms.
+    """
+    n, n_outside = _AGREEMENT.n_halves, len(outside)
+    starts = np.zeros((n + 4, len(likely)), np.float32)
+    starts[:n, :n_outside] = sphere_directions(n) @ (outside - outside.mean(axis=0)).T > 0.0
+    starts[n, :n_outside] = 1.0
+    starts[n + 1, n_outside:] = 1.0
+    starts[n + 2] = likely
+    starts[n + 3] = in_rooms if np.count_nonzero(in_rooms) >= _CANDIDATES.min_in_rooms else 0.0
     return starts[starts.any(axis=1)]
 
 
 def _has_in_view(place: NDArray[np.float64], centres: NDArray[np.float64]) -> bool:
-    """Whether all lies before a camera at a place, (3,), that looks along z, around its axis, and not all near that."""
+    """Whether a camera at a place, (3,), that looks along z would have all the centres, (n, 3), in its view.
+
+    They have to lie before it, on all sides of its axis, and some of them well off the axis.
+    """
     rays = centres - place
     if not (rays[:, 2] > 0.0).all():
         return False
     slopes = rays[:, :2] / rays[:, 2:]
     is_around = (slopes.min(axis=0) < 0.0).all() and (slopes.max(axis=0) > 0.0).all()
     aside = np.abs(slopes).max(axis=1)
-    return bool(is_around and aside.max() < _MAX_SLOPE and np.mean(aside > _MIN_SLOPE) > 0.1)
+    return bool(
+        is_around and aside.max() < _CAMERA.max_slope and np.mean(aside > _CAMERA.min_slope) > _CAMERA.min_beyond
+    )
 
 
 def _sees_as_much(
     place: NDArray[np.float64], upwards: NDArray[np.float64], coarse: VoxelGrid, normals: NDArray[np.float64]
 ) -> bool:
-    """Whether nearly as much is visible from a place as from its mirror image on the other side of all.
+    """Whether nearly as many cells are visible from a place as from its mirror image on the other side of the cloud.
 
-    Below a pit, that is seen from above, its floor hides its walls.
+    They are not if the place lies below a pit that was scanned from above: there the pit's floor hides its walls.
     """
     low, high = bounding_box(coarse.centroids)
     opposite = place - 2.0 * ((place - (low + high) / 2.0) @ upwards) * upwards
     seen = visibility_from(np.stack((place, opposite)), coarse.centroids, coarse.edge_lengths, normals).mean(axis=1)
-    return bool(seen[0] >= _MIN_SEEN_OF_OPPOSITE * seen[1])
+    return bool(seen[0] >= _CAMERA.min_seen_of_opposite * seen[1])
 
 
 @kernel
@@ -356,23 +474,24 @@ def _see_blocks(start: int, stop: int, sides: NDArray[np.float32], sees: NDArray
 
 
 def _seen_blocks(sides: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Whether k places, whose sides of n cells are 0 where hidden, (k, n), see any cell of each block, (k, b)."""
+    """Whether each of k places sees any cell of each of b blocks, (k, b) bool, given the sides of n cells, (k, n)."""
     sees = np.empty((len(sides), -(-sides.shape[1] // _CELLS_PER_BLOCK)), np.bool_)
     in_blocks(_see_blocks, len(sides), sides, sees, smallest=1)
     return sees
 
 
 class _Agreements(NamedTuple):
-    """What s first opinions come to, of k places about the sides of n cells.
+    """The agreements of k places about the outer sides of n cells, one for each of s starting weights.
 
     Attributes
     ----------
     weights : (s, k) float32, 0..1
-        How much each place counts.
+        Weight of each place.
     outward : (s, n) float32
-        The side on which the outside lies, as seen along the normals: -1, 1, or 0 where no place says.
+        Outer side of each cell: 1 if its normal points outwards, -1 if inwards, 0 if no place tells.
     agreed, known : (s, k) float32
-        Sums of the cosines that each place sees on the right side, and on either side of cells whose outside is known.
+        Sums of the cosines, without signs, under which each place sees cells from their outer side (`agreed`), and of
+        those under which it sees any cell whose outer side is told (`known`).
     """
 
     weights: NDArray[np.float32]
@@ -382,10 +501,10 @@ class _Agreements(NamedTuple):
 
 
 def _agreements(sides: NDArray[np.float32], starts: NDArray[np.float32]) -> _Agreements:
-    """What first opinions, weights of the places (s, k), come to, given the sides that each sees, (k, n).
+    """The agreements to which s starting weights of k places lead, (s, k), given the sides of n cells they see, (k, n).
 
-    Sides are signed cosines, 0 hidden. What is found, by turns, is nearly a pair of singular vectors, but no place
-    counts against what it sees.
+    Voting and weighting by turns is nearly the power iteration for a pair of singular vectors of `sides`, but no weight
+    is negative.
     """
     outward = np.empty((len(starts), sides.shape[1]), np.float32)
     found = _Agreements(starts.copy(), outward, np.zeros_like(starts), np.zeros_like(starts))
@@ -395,14 +514,17 @@ def _agreements(sides: NDArray[np.float32], starts: NDArray[np.float32]) -> _Agr
 
 @routine
 def _add(weight: np.float32, sides: NDArray[np.float32], total: NDArray[np.float32]) -> None:
-    """Add the sides that a place sees, so many times, to a sum of them."""
+    """Add the sides that a place sees, times its weight, to the vote on each cell."""
     for i in range(len(sides)):
         total[i] += weight * sides[i]
 
 
 @summing_routine
 def _balance(sides: NDArray[np.float32], outward: NDArray[np.float32]) -> tuple[np.float32, np.float32]:
-    """Sums of the cosines that a place sees, less those on the wrong side, and of all whose outside is known."""
+    """Agreement of a place with a vote: the sum of its cosines on the outer sides, less that on the inner sides.
+
+    Also the sum of all its cosines, without signs, on cells whose outer side is told.
+    """
     net = known = np.float32(0.0)
     for i in range(len(sides)):
         value = sides[i] * outward[i]
@@ -412,13 +534,14 @@ def _balance(sides: NDArray[np.float32], outward: NDArray[np.float32]) -> tuple[
 
 
 class _Paths(NamedTuple):
-    """What s first opinions came to about n cells, round by round, until each stood or met the path of one before it.
+    """The outer sides of n cells after each round of s agreements, up to the round from which each is known.
 
     Attributes
     ----------
     outward : (s, _ROUNDS, n) int8
+        Outer sides after each round: 1, -1 or 0, as in `_Agreements`.
     told : (s,) int64
-        How many of the rounds are here.
+        Number of rounds that are stored.
     rounds : (s,) int64
         The round in which nothing changed any more; 0 if there was none.
     """
@@ -430,9 +553,11 @@ class _Paths(NamedTuple):
 
 @routine
 def _path_met(paths: _Paths, s: int, this_round: int) -> int:
-    """Which opinion before one came by what this one comes to in a round, so that both end alike; -1 if none did.
+    """The number of an earlier agreement that had the same outer sides in some round as agreement s has in this one.
 
-    Rounds that are left have to be enough: else it depended on the others what is found.
+    From there on both go the same way, so the end of the earlier one is the end of this one. -1 if there is none, or if
+    this one would need more than `_ROUNDS` rounds to get there, as then the result would depend on which are computed
+    together.
     """
     outward, told, rounds = paths
     n = outward.shape[2]
@@ -457,7 +582,7 @@ def _vote_on_sides(
     total: NDArray[np.float32],
     outward: NDArray[np.float32],
 ) -> bool:
-    """Let viewpoints vote, by their weights, on the side on which the outside of each cell lies; whether any changed.
+    """Set the outer side of each cell by a weighted vote of the places; whether the side of any cell changed.
 
     `total` is scratch.
     """
@@ -482,9 +607,12 @@ def _vote_on_sides(
 def _weigh_by_agreement(
     sides: NDArray[np.float32], sees: NDArray[np.bool_], outward: NDArray[np.float32], found: _Agreements, s: int
 ) -> None:
-    """Weigh each viewpoint by how much it sees and how far that agrees with the vote, the largest weight being 1."""
+    """Set the weight of each place: the more it sees, and the better that agrees with the vote, the larger it is.
+
+    The largest weight is 1.
+    """
     n_places, n_blocks = sees.shape
-    weights, largest = found.weights[s], np.float32(_TINY)
+    weights, largest = found.weights[s], np.float32(NEARLY_ZERO)
     for k in range(n_places):
         net = known = np.float32(0.0)
         for block in range(n_blocks):
@@ -494,7 +622,7 @@ def _weigh_by_agreement(
                 net, known = net + more, known + more_known
         found.agreed[s, k], found.known[s, k] = (net + known) / 2.0, known
         net = max(net, np.float32(0.0))
-        weights[k] = math.sqrt(net) * (net / max(known, np.float32(_TINY))) ** 4
+        weights[k] = math.sqrt(net) * (net / max(known, np.float32(NEARLY_ZERO))) ** 4
         largest = max(largest, weights[k])
     for k in range(n_places):
         weights[k] /= largest
@@ -502,8 +630,8 @@ def _weigh_by_agreement(
 
 @kernel
 def _agree(start: int, stop: int, sides: NDArray[np.float32], sees: NDArray[np.bool_], found: _Agreements) -> None:
-    """Alternate until nothing changes: viewpoints vote on the outer side of each cell, then each is weighed by how far
-    it agrees with the vote."""
+    """Set each agreement: by turns the places vote on the outer sides, and are weighted by how well they agree with the
+    vote, until nothing changes."""
     n = sides.shape[1]
     total = np.empty(n, np.float32)
     paths = _Paths(
@@ -539,38 +667,44 @@ def _best_agreement(
     room_scores: NDArray[np.float64],
     may_be_passage: bool,
 ) -> tuple[NDArray[np.float64], float]:
-    """Weights of the viewpoints, (k,) float64, in the agreement of the highest score; how much any agreement shows.
+    """Weights of the looks, (k,) float64, in the agreement of the highest score; the largest fraction shown by any.
 
-    Crevices between things are crests from behind, which are seen the better: what little that is decides nothing.
-    A crease is hidden by what is beside it, so cells count as shown beside shown ones; but not where an agreement is
-    one of viewpoints in a room: of that part all but narrow gaps is seen from within. A room's floor and ceiling tell
-    that it is one. A passage, such as a tunnel or a gallery, has none that tell, and is one if viewpoints within show,
-    creases and all, what others do not: what was scanned had been seen, and what stands in a pipe is hidden from all
-    who are outside.
+    The score is the fraction of the surface that the agreement shows, and the terms of `ScoreThresholds`.
+
+    - Small differences in what is shown do not count: from behind, a crevice between things is a crest, so the wrong
+      side may show a little more than the right one.
+    - A crease is hidden by what is beside it. So a cell counts as shown if one beside it is shown. This does not hold
+      for a part about which closed-in places agree: a room is seen from within but for narrow gaps.
+    - An agreement of enclosed places is preferred in a room, which its floor and ceiling tell (`is_scanned_room`).
+    - It is preferred in a passage, too, such as a tunnel or a gallery. A cloud without such a floor and ceiling is a
+      passage if enclosed places show some of the surface that all other agreements miss: all that was scanned had been
+      seen, and what stands in a pipe is hidden from outside.
     """
     different = np.array(list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values()))
     weights = found.weights[different].astype(np.float64)
     of_parts = (looks.of_part == np.arange(looks.part_of_cell.max() + 1)[:, None]).T.astype(np.float64)
     total, enclosure = weights @ of_parts, weights @ (of_parts * looks.enclosure[:, None])
-    is_closed = ((enclosure >= _CLOSED * total) & (total > 0.0)).any(axis=0)[looks.part_of_cell]
-    is_within = (enclosure >= _ENCLOSED_FOR_ROOM * total) & (total > 0.0)
+    is_closed = ((enclosure >= _CANDIDATES.min_enclosure * total) & (total > 0.0)).any(axis=0)[looks.part_of_cell]
+    is_within = (enclosure >= _SCORE.enclosed_for_room * total) & (total > 0.0)
     show = partial(_shown, different, looks, _seen_blocks(looks.sides), found, around)
     shown, from_behind = show(is_closed)
     within = is_within @ room_scores
     if may_be_passage:
         with_creases, inside = show(np.zeros_like(is_closed))[0], is_within[:, 0]
-        alone = with_creases[inside].max(initial=0.0) > with_creases[~inside].max(initial=0.0) + _MIN_SHOWN_FROM_INSIDE
-        within = _W_ROOM * inside * alone
+        by_others = with_creases[~inside].max(initial=0.0)
+        is_passage = with_creases[inside].max(initial=0.0) > by_others + _SCORE.min_shown_from_inside
+        within = _SCORE.room * inside * is_passage
     most_shown = float(shown.max())
-    scores = np.minimum(shown, most_shown - _SHOWN_TOLERANCE) + within - np.maximum(from_behind - _MAX_FROM_BEHIND, 0.0)
+    scores = np.minimum(shown, most_shown - _SCORE.shown_tolerance) + within
+    scores -= np.maximum(from_behind - _SCORE.max_from_behind, 0.0)
     visible = np.abs(looks.sides).sum(axis=1)
     if not visible.any():
         return weights[0], most_shown
     agreed, known = found.agreed[different], found.known[different]
-    unanimous = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
-    scores += _W_UNANIMOUS * unanimous[:, visible > 0.0].mean(axis=1)
-    for some, weight in ((looks.from_outside, _W_OUTSIDE), (looks.likely, likely_weight)):
-        scores += weight * agreed[:, some].sum(axis=1) / max(float(visible[some].sum()), _TINY)
+    unanimous = np.abs(2.0 * agreed / np.maximum(known, NEARLY_ZERO) - 1.0)
+    scores += _SCORE.unanimous * unanimous[:, visible > 0.0].mean(axis=1)
+    for some, weight in ((looks.from_outside, _SCORE.outside), (looks.likely, likely_weight)):
+        scores += weight * agreed[:, some].sum(axis=1) / max(float(visible[some].sum()), NEARLY_ZERO)
     return weights[int(np.argmax(scores))], most_shown
 
 
@@ -582,7 +716,7 @@ def _shown(
     around: Neighbourhood,
     is_closed: NDArray[np.bool_],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What `_show` sets for some of the agreements, (d,) each."""
+    """Fraction of the surface that each of d agreements shows, and the fraction that it sees from behind, (d,) each."""
     shown, from_behind = np.empty(len(different)), np.empty(len(different))
     in_blocks(_show, len(different), different, looks, sees, found, around, is_closed, shown, from_behind, smallest=1)
     return shown, from_behind
@@ -596,8 +730,10 @@ def _add_shown(
     is_flat: NDArray[np.bool_],
     shown: NDArray[np.float32],
 ) -> tuple[np.float32, np.float32]:
-    """Add what a place sees of cells from their outer side, so many times, to a sum of that; and sums of what it sees,
-    and of planes from behind."""
+    """Add the cosines under which a place sees cells from their outer side, times its weight, to `shown`.
+
+    Return the sum of all its cosines, without signs, and of those under which it sees flat cells from behind.
+    """
     seen = against = nothing = np.float32(0.0)
     for i in range(len(sides)):
         value = sides[i] * outward[i] if outward[i] != nothing else abs(sides[i])
@@ -620,10 +756,10 @@ def _show(
     shown: NDArray[np.float64],
     contradicted: NDArray[np.float64],
 ) -> None:
-    """Set the fraction of the cells that each of some agreements shows, or shows beside them unless closed in; and how
-    much of what its places see are planes from behind.
+    """Set the fraction of the surface that each agreement shows, and the fraction of what it sees that is from behind.
 
-    Of partitions, on which no place has a vote, either side counts.
+    A cell that is not closed in also counts as shown if one beside it is. Of a partition, whose outer side is not told,
+    either side counts. Only flat cells count as seen from behind.
     """
     sides, is_flat = looks.sides, looks.is_flat
     n_places, n = sides.shape
@@ -642,7 +778,7 @@ def _show(
                             weights[k], sides[k, of_block], outward[of_block], is_flat[of_block], of_cells[of_block]
                         )
                         seen, against = seen + weights[k] * of_place, against + weights[k] * against_it
-        contradicted[d] = against / max(seen, np.float32(_TINY))
+        contradicted[d] = against / max(seen, np.float32(NEARLY_ZERO))
         total = 0.0
         for i in range(n):
             most = of_cells[i]
@@ -654,33 +790,34 @@ def _show(
 
 
 def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Some of the places, by weight and by how much each sees, (k, n) bool, that those before see seldom or never.
+    """Numbers of the places to look from, chosen one by one: always that of the largest weight times what it sees anew.
 
-    So each of many rooms has one, also where its neighbours have places that see much of it through doors.
+    `seen`, (k, n) bool, tells which of n cells each of k places sees. What an earlier choice saw counts less. So each
+    of many rooms has a place, also if its neighbours have places that see much of it through doors.
     """
     places = np.flatnonzero(weights > 0.0)
     left, sees = weights[places], seen[places].astype(np.float32)
     interest = np.ones(seen.shape[1], np.float32)
     chosen: list[int] = []
-    while len(chosen) < _MAX_CHOSEN and left.any():
+    while len(chosen) < _CHOICE.max_chosen and left.any():
         best = int(np.argmax(left * np.einsum("kn,n->k", sees, interest)))
-        if len(chosen) >= _MIN_CHOSEN and sees[best] @ interest < _MIN_GAIN * len(interest):
+        if len(chosen) >= _CHOICE.min_chosen and sees[best] @ interest < _CHOICE.min_gain * len(interest):
             break
         chosen.append(best)
-        interest[sees[best] > 0.0] *= np.float32(0.25)
+        interest[sees[best] > 0.0] *= np.float32(_CHOICE.seen_again)
         left[best] = 0.0
     return places[chosen]
 
 
 class CoarseGrid(NamedTuple):
-    """Voxels in larger ones, c of them.
+    """The coarse grid, of c cells.
 
     Attributes
     ----------
     cells : VoxelGrid
         In the frame of `unit_frame`.
     points : (c,) float64
-        How many points each holds.
+        Number of points in each cell.
     """
 
     cells: VoxelGrid
@@ -688,15 +825,15 @@ class CoarseGrid(NamedTuple):
 
 
 class _Surfaces(NamedTuple):
-    """Places on surfaces, about as far from each other as voxels of level 0 are.
+    """A sample of the surfaces: n places, about as far from each other as voxels of level 0 are.
 
     Attributes
     ----------
     places : (n, 3) float64, in the frame of `unit_frame`
     points : (n,) float64
-        For how many each stands.
+        Number of points of the cloud that each place stands for; a fraction where a large voxel gives several places.
     width : float
-        Edge of a voxel of level 0.
+        Edge length of a voxel of level 0 in that frame.
     """
 
     places: NDArray[np.float64]
@@ -705,9 +842,12 @@ class _Surfaces(NamedTuple):
 
 
 def _in_cells(surfaces: _Surfaces, cells: int) -> CoarseGrid:
-    """Places on surfaces in about so many cells, twice as many at most, the outermost surfaces amid a layer of them."""
+    """The coarse grid of about as many cells as asked for, at most twice as many.
+
+    It starts half a cell before the lowest corner, so that the outermost surfaces lie in the middle of a cell.
+    """
     places, points, width = surfaces
-    size = width * max(1.0, math.sqrt(np.minimum(points, 1.0).sum() / (1.5 * cells)))  # as many as a surface would have
+    size = width * max(1.0, math.sqrt(np.minimum(points, 1.0).sum() / (1.5 * cells)))  # of a surface, n ~ 1 / size^2
     low = bounding_box(places)[0]
     while True:
         coarse = voxel_grid(places, size, Shift(low - 0.5 * size))
@@ -717,14 +857,14 @@ def _in_cells(surfaces: _Surfaces, cells: int) -> CoarseGrid:
 
 
 def _surfaces(grid: VoxelGrid, middle: NDArray[np.float64], reach: float) -> _Surfaces:
-    """Means of voxels, and of larger ones as many places as these cover on their planes.
+    """The means of the voxels, as a sample of the surfaces. A larger voxel gives several places, evenly on its plane.
 
-    Voxels that are not joined as on a surface have no sides to be seen, and ghosts far off would stretch the box in
-    which places are tried: they do not count, unless most are such.
+    Voxels that are not joined do not count, unless most are such: they are on no surface, and ghosts far off would
+    stretch the box in which places are tried.
     """
     points, edges = np.diff(grid.starts).astype(np.float64), grid.edge_lengths
     counts = grid.joined
-    if np.mean(counts) < _MIN_ON_SURFACES:
+    if np.mean(counts) < _RESOLUTION.min_joined:
         counts[:] = True
     if grid.levels is None:
         size, some = float(edges[0] if edges.min() == edges.max() else np.median(edges)), np.flatnonzero(counts)
@@ -753,11 +893,11 @@ def _along_planes(normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], ND
 def _parts(
     coarse: VoxelGrid, normals: NDArray[np.float64], points: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], list[tuple[NDArray[np.float64], NDArray[np.float64]]]]:
-    """Parts of a cloud that are far from each other, the number of each cell's, (n,), the largest first, which has what
-    belongs to none; and boxes in which nearly all of them lies, where the box of all is twice as long.
+    """The part of the cloud that each of n cells belongs to, (n,), and the boxes in which small parts lie.
 
-    A room of whose surroundings little was seen through its windows, or scans of places far apart: the three largest
-    parts, and others that are rooms.
+    Parts lie far from each other: a room and the houses that were seen through its windows, or scans of places far
+    apart. They are the three largest pieces, and other pieces that are rooms. Cells of no part count to the first. A
+    part has a box, lowest and highest corner, if it is less than half as long as the cloud.
     """
     centres = coarse.centroids
     low, high = bounding_box(centres)
@@ -765,19 +905,19 @@ def _parts(
     boxes: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
     if not length > 0.0:
         return part_of_cell, boxes
-    blocks = voxel_grid(centres, length / _BLOCKS_ALONG, Shift(low))
+    blocks = voxel_grid(centres, length / _PART.blocks_along, Shift(low))
     piece = connected_components(blocks.touching_pairs(), blocks.n_voxels)[blocks.voxel_of_point]
     counts, part = np.bincount(piece), 0
-    for number in np.argsort(-counts, kind="stable")[:_MAX_ROOMS]:
+    for number in np.argsort(-counts, kind="stable")[: _PART.max_rooms]:
         cells = piece == number
-        if counts[number] < _MIN_PART * len(centres):
+        if counts[number] < _PART.min_fraction * len(centres):
             break
-        if part >= _MAX_PARTS and not _is_room(cells, coarse, normals, points):
+        if part >= _PART.max_parts and not _is_room(cells, coarse, normals, points):
             continue
         part_of_cell[cells] = part
         part += 1
-        lowest, highest = np.quantile(centres[cells], _PART_QUANTILES, axis=0)
-        if (highest - lowest).max() < _MAX_PART_LENGTH * length:
+        lowest, highest = np.quantile(centres[cells], _PART.quantiles, axis=0)
+        if (highest - lowest).max() < _PART.max_length * length:
             boxes.append((lowest, highest))
     return part_of_cell, boxes
 
@@ -785,22 +925,23 @@ def _parts(
 def _is_room(
     cells: NDArray[np.bool_], coarse: VoxelGrid, normals: NDArray[np.float64], points: NDArray[np.float64]
 ) -> bool:
-    """Whether some cells of the coarse grid are a room that tripods stood in."""
+    """Whether some of n cells, (n,) bool, are a room in which scanners on tripods stood."""
     return is_scanned_room(coarse.centroids[cells], normals[cells], points[cells], coarse.size)
 
 
 def _smallest_box(
     centres: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest and highest corner of a box around places, in its own frame, and its axes, rows of (3, 3).
+    """A box around centres, (n, 3): its lowest and highest corner along its own axes, and these axes, rows of (3, 3).
 
-    The bounding box; or one along the principal axes, where that is much smaller, as around a corridor askew.
+    It is the bounding box, or the box along the principal axes if that is much smaller, as around a corridor that lies
+    askew to the frame.
     """
     low, high = bounding_box(centres)
     offsets = centres - centres.mean(axis=0)
     axes = np.linalg.eigh(np.einsum("ij,ik->jk", offsets, offsets))[1].T
     lowest, highest = bounding_box(np.einsum("ij,kj->ik", centres, axes))
-    if np.prod(highest - lowest) < _MAX_TURNED_BOX * np.prod(high - low):
+    if np.prod(highest - lowest) < _CANDIDATES.max_turned_box * np.prod(high - low):
         return lowest, highest, axes
     return low, high, np.eye(3)
 
@@ -808,22 +949,27 @@ def _smallest_box(
 def _free_viewpoints(
     coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.float64], axes: NDArray[np.float64], finer: int
 ) -> NDArray[np.float64]:
-    """Places within a box along axes, the farthest off all surfaces first, (k, 3); so many times as many as usual."""
+    """Free places within a box, (k, 3): those of a lattice that lie off all surfaces and not in corners of the box.
+
+    There are `finer` times as many as usual. Most are spread out by farthest point sampling; the rest are those
+    farthest from all surfaces.
+    """
     from scipy.spatial import cKDTree
 
-    n, lattice_side = finer * _N_INSIDE, round(_LATTICE_SIDE * finer ** (1.0 / 3.0))
+    n, lattice_side = finer * _CANDIDATES.n_inside, round(_CANDIDATES.lattice_side * finer ** (1.0 / 3.0))
     steps = (np.arange(lattice_side) + 0.5) / lattice_side
     lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     places = np.einsum("ij,jk->ik", low + lattice * (high - low), axes)
     tree = cKDTree(coarse.centroids, 64, balanced_tree=False, compact_nodes=False)  # for few places
     clearance = tree.query(places)[0] / coarse.size
-    free = np.flatnonzero(clearance > _MIN_CLEARANCE)
+    free = np.flatnonzero(clearance > _CANDIDATES.min_clearance)
     if not len(free):
         return places[:0]
     places, clearance = places[free], clearance[free]
-    hits = hit_fractions(places, coarse.centroids[:: max(1, coarse.n_voxels // _SAMPLED_CELLS)])
-    among = np.flatnonzero(hits >= _MIN_SURROUNDED * hits.max())  # not the corners of the box around a room askew to it
-    chosen = among[farthest_points(places[among], int(np.argmax(clearance[among])), int(_SPREAD_FRACTION * n))]
+    hits = hit_fractions(places, coarse.centroids[:: max(1, coarse.n_voxels // _CANDIDATES.sampled_cells)])
+    among = np.flatnonzero(hits >= _CANDIDATES.min_surrounded * hits.max())
+    n_spread = int(_CANDIDATES.spread_fraction * n)
+    chosen = among[farthest_points(places[among], int(np.argmax(clearance[among])), n_spread)]
     order = np.argsort(-clearance, kind="stable")
     rest = order[~np.isin(order, chosen)][: n - len(chosen)]
     return places[np.concatenate((chosen, rest))]

@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which side of a surface is its outside, where nobody said from where it was seen: the side that is visible from
-virtual viewpoints (`pcgraph.voxels.virtual_viewpoints`)."""
+"""The outer side of a surface, found from what is visible.
+
+If nobody says from where the surface was seen, its outer side is the one that is visible from virtual viewpoints
+(`pcgraph.voxels.virtual_viewpoints`). A vote is a number for each voxel: above 0 if its normal points outwards, below 0
+if it points inwards, and near 0 if hardly anything tells.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,7 @@ from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.plumbing.short_repr import ShortRepr
+from pcgraph.rounding import TINY
 from pcgraph.voxels.depth_buffer import SAME_SURFACE_COSINE, cosines_towards, visibility_from
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 from pcgraph.voxels.virtual_viewpoints import (
@@ -22,14 +27,34 @@ from pcgraph.voxels.virtual_viewpoints import (
     virtual_viewpoints,
 )
 
-_NEARLY_EDGE_ON, _SEEN_WELL = 0.1, 0.2  # cosines between normals and rays, less and more
-_NEARLY_LEVEL, _LEVEL_INDEED, _FEW_LEVEL = 0.9, 0.97, 20  # cosines to the axis, and to what is level; voxels
-_MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at
-_SMOOTHING = 4  # rounds of votes by the voxels around
-_CLEAR = 0.3  # votes for a side that need no others, where all voxels are looked at
-_PATCH, _CREASE = 10, 0.5  # voxels of a patch, at least, and the cosine between normals at its edges, at most
-_OFF_PATCH = 0.7  # edge lengths between planes of touching voxels: so many, and they are two surfaces
-_HARDLY, _MOSTLY = 0.05, 0.3  # what votes that are not clear count beside edges; and how much more must agree than not
+
+@dataclass(frozen=True)
+class SideThresholds:
+    """Conditions for a voxel to tell its outer side itself, or by those around it. Chosen by eye; none was varied."""
+
+    edge_on: float = 0.1  # cosine between normal and ray: a level surface is seen edge-on below it
+    seen_well: float = 0.2  # cosine between normal and ray: above it a normal that is some degrees off tells its side
+    nearly_level: float = 0.9  # cosine between a normal and the scanner's axis: 26 degrees, as scanners may be tilted
+    level: float = 0.97  # cosine to the mean normal of what is nearly level: 14 degrees
+    min_level: int = 20  # voxels whose mean normal tells the vertical, at least
+    thinned: tuple[tuple[int, float], ...] = ((100_000, 7.0), (30_000, 3.0))  # of more voxels one in so many is seen
+    smoothing_rounds: int = 4  # rounds of votes by the voxels around, each of which reaches one voxel farther
+    clear: float = 0.3  # cosine, mean over the voxels around: such a vote needs no others, if all voxels are looked at
+
+
+_SIDES = SideThresholds()
+
+# Kernels read these.
+_MIN_PATCH = 10
+"""Voxels of a patch: a smaller one keeps its votes. Chosen by eye; without this and `_MIN_MAJORITY` woods turn over."""
+_MAX_CREASE_COSINE = 0.5
+"""Cosine between normals where two surfaces meet in an edge, 60 degrees or more; chosen by eye, not varied."""
+_MAX_OFF_PATCH = 0.7
+"""Voxel edges between the planes of touching voxels of one patch, at most; chosen by eye, not varied."""
+_WEIGHT_OF_UNCLEAR = 0.05
+"""Weight of votes that are not clear, as a fraction of what edges tell; chosen by eye, not varied."""
+_MIN_MAJORITY = 0.3
+"""Fraction of all evidence by which one side has to exceed the other. Chosen by eye; see `_MIN_PATCH`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +64,9 @@ class VisibleSides(ShortRepr):
     Attributes
     ----------
     places : (k, 3) float64, metres
-        From which the outside is seen, by decreasing weight.
+        The viewpoints, by decreasing weight.
     normals : (v, 3) float64
-        Unit normals, outwards.
+        Unit normals that point outwards.
     """
 
     places: NDArray[np.float64]
@@ -53,34 +78,35 @@ def visible_sides(
     normals: NDArray[np.float64],
     virtual: VirtualViewpoints | None = None,
 ) -> VisibleSides:
-    """The outer side of the surface at each voxel, found from what is visible.
+    """Outward normals of the voxels, found from what is visible.
 
     Parameters
     ----------
     grid : VoxelGrid of v voxels
     normals : (v, 3) float64
-        Unit normals of the surface, towards either side.
+        Unit normals of the surface; which of its two sides they point to is arbitrary.
     virtual : VirtualViewpoints, optional
-        `virtual_viewpoints(grid)`, where that is known.
+        `virtual_viewpoints(grid)`, if it is at hand.
 
     Notes
     -----
-    Places all around the cloud, and free places within its bounding box, see the cells of a coarse copy of the grid,
-    by a depth buffer over directions. A place counts as far as it agrees with others which side of what it sees is the
-    outside; so if those above the floor are right, one under it, which sees it from below, counts nothing. There are
-    several such agreements: within a room, around it, above it, below. All that was measured was seen from somewhere,
-    so the right one is that whose places see all of the surface, where others have furniture hidden by walls, and no
-    plane from behind, as those within a hall see the walls that others take for the sides of a box. Where two show as
-    much, as of a hollow shell, or of things on a table from below, what counts is that no place sees both
-    sides, then how much of what is seen from outside has its outside there, and how much of what is seen from those of
-    these places before the plane that bears most, as the ground or a table does, on which things stand (above it, if it
-    is level); or from the origin, if that lies there and all before it, as before a camera that looks along z. Where a
-    level plane reaches beyond all that stands on it, that it is seen from above counts more than what is shown. The
-    voxels then take the mean direction to the places that see them, those that none sees, and of many voxels most, from
-    the voxels around. A surface that no place sees well, as an underside or the back of a cabinet near a wall, takes
-    its side from what it meets at its edges: what lies behind one of two faces has the other behind itself.
+    1. Places around the cloud, and free places within its bounding box, see the cells of a coarse copy of the grid. A
+       depth buffer over all directions tells which. Each place counts as far as it agrees with the others on the outer
+       sides. So if the places above a floor are right, one under the floor counts nothing.
+    2. There are several such agreements: of the places within a room, around it, above it, below it. All that was
+       measured was seen from somewhere. So the right agreement shows the whole surface: from others, walls hide the
+       furniture. And it sees no plane from behind.
+    3. Two agreements may show as much, as of a hollow shell. Then these count, by decreasing weight: that no place sees
+       both sides of what it sees; that the places around the cloud see it from its outer side; that the likely places
+       do. Likely are the places on the free side of the plane that bears most, such as the ground or a table, or the
+       origin, if the cloud lies before it as before a camera. Over a level plane that reaches beyond all that stands on
+       it, the view from above counts more than what is shown.
+    4. The normal of a voxel faces the mean direction to the places that see it. The vote of a voxel that no place sees
+       comes from those around it; so does that of most voxels of a large grid, of which some are looked at.
+    5. A patch of the surface that no place sees well, such as an underside, takes its side from the faces it meets at
+       its edges (`_alike_sides`).
 
-    Visibility of points without a surface: Katz et al. 2007, here by a depth buffer, as voxels have a size.
+    Source: Katz et al. 2007 ask for the visibility of points without a size. Voxels have a size, hence a depth buffer.
     """
     middle, reach = unit_frame(grid, grid.centroids)
     virtual = virtual_viewpoints(grid) if virtual is None else virtual
@@ -94,13 +120,13 @@ def visible_sides(
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
     votes[looked_at] = np.einsum("ij,ij->i", towards, sides) / lengths(towards)
     votes = _smoothed_votes(grid, normals, votes)
-    _carry_over(grid.neighbourhood, grid.centroids, grid.edge_lengths, normals, votes, _CLEAR / stretch**2)
+    _carry_over(grid.neighbourhood, grid.centroids, grid.edge_lengths, normals, votes, _SIDES.clear / stretch**2)
     return VisibleSides(middle + reach * places, _turned(normals, votes))
 
 
 def occluder_subset(grid: VoxelGrid) -> tuple[NDArray[np.int64], float]:
-    """Indices of an evenly spread subset of the voxels, (s,), and the factor to widen them so that it hides as much."""
-    step = next((step for many, step in _MANY if grid.n_voxels > many), 1.0)
+    """Numbers of evenly spread voxels, (s,), and the factor by which to widen them so that they hide as much as all."""
+    step = next((step for many, step in _SIDES.thinned if grid.n_voxels > many), 1.0)
     if step == 1.0:
         return np.arange(grid.n_voxels), 1.0
     return np.concatenate(in_blocks(_in_step, grid.n_voxels, grid.cells, step)), math.sqrt(step)
@@ -108,7 +134,10 @@ def occluder_subset(grid: VoxelGrid) -> tuple[NDArray[np.int64], float]:
 
 @kernel
 def _in_step(start: int, stop: int, cells: NDArray[np.float64], step: float) -> NDArray[np.int64]:
-    """Which of some cells lie a whole number of steps out along (1, 2, 4): for 3 and 7, spread evenly on any plane."""
+    """Numbers of the cells (x, y, z) of which x + 2 y + 4 z is a multiple of `step`.
+
+    With steps of 3 and 7 these are spread evenly on every plane along two axes.
+    """
     found, n = np.empty(stop - start + 1, np.int64), 0
     for i in range(start, stop):
         steps = (cells[i, 0] + 2.0 * cells[i, 1] + 4.0 * cells[i, 2]) / step
@@ -122,16 +151,16 @@ def sides_towards(
 ) -> NDArray[np.float64]:
     """Unit normals, (v, 3) float64, towards the place, (3,), of a scanner that turned about an axis, (3,) of length 1.
 
-    What is nearly level and seen edge-on, as the ground far from a sweep's scanner, and that between rings of which one
-    alone runs through a voxel, faces as what is level and seen well does, if that is the side of the scanner: normals
-    that are two degrees off turned a tenth of it upside down. Level is what lies across the mean normal of that, as
-    scanners may be tilted. The other way, as ground that rises above the scanner, its own normals decide.
+    Far from the scanner, level ground is seen edge-on, and a normal that is two degrees off would turn it upside down:
+    a tenth of the ground was. So a voxel that is nearly level and seen edge-on faces as the level voxels that are seen
+    well, provided that the scanner lies on that side. Else, as on ground that rises above the scanner, its own normal
+    decides. Vertical is the mean normal of the level voxels that are seen well, as the axis may be tilted.
     """
     reach = unit_frame(grid, grid.centroids)[1]
     cosines = cosines_towards(place, reach, grid.centroids, normals)
     upwards = _upwards(normals, cosines, axis)
     along = np.einsum("ij,j->i", normals, upwards)
-    level = np.flatnonzero((np.abs(cosines) < _NEARLY_EDGE_ON) & (np.abs(along) > _NEARLY_LEVEL))
+    level = np.flatnonzero((np.abs(cosines) < _SIDES.edge_on) & (np.abs(along) > _SIDES.nearly_level))
     ways = (place - grid.centroids[level]) / reach
     heights = np.einsum("ij,j->i", ways, upwards) / lengths(ways)
     below = heights > 0.0
@@ -144,27 +173,32 @@ def sides_towards_each(
 ) -> NDArray[np.float64]:
     """Unit normals, (v, 3) float64, towards the place from which each voxel was seen, (v, 3).
 
-    What was seen edge-on, as ground far from a tripod, faces as the voxels around on one surface do: normals that are
-    a degree off turned a thirtieth of it upside down. What was seen well keeps its side, as those of a thin wall do.
+    A voxel that was seen edge-on, such as ground far from a tripod, faces as the voxels around it on one surface do:
+    normals that are a degree off turned a thirtieth of such ground upside down. A voxel that was seen well keeps its
+    side, as on a thin wall the voxels around may belong to the other face.
     """
     ways = places - grid.centroids
-    ways /= max(float(np.abs(ways).max()), np.finfo(np.float64).tiny)
+    ways /= max(float(np.abs(ways).max()), TINY)
     cosines = np.einsum("ij,ij->i", normals, ways) / lengths(ways)
-    edge_on = np.abs(cosines) < _SEEN_WELL
+    edge_on = np.abs(cosines) < _SIDES.seen_well
     return _turned(normals, np.where(edge_on, _smoothed_votes(grid, normals, cosines.copy()), cosines))
 
 
 def _upwards(
     normals: NDArray[np.float64], cosines: NDArray[np.float64], axis: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Where most of what is nearly level and seen well faces, (3,) of length 1: near an axis, which may be tilted."""
-    clear = np.abs(cosines) > _SEEN_WELL
+    """The vertical near an axis that may be tilted, (3,) of length 1.
+
+    It is the mean normal of what is nearly level and seen well, towards the side to which most of that faces. `cosines`
+    are those between normals and rays.
+    """
+    clear = np.abs(cosines) > _SIDES.seen_well
     facing = normals[clear] * np.sign(cosines[clear])[:, None]
     upwards = axis
-    for least in (_NEARLY_LEVEL, _LEVEL_INDEED):
+    for least in (_SIDES.nearly_level, _SIDES.level):
         along = np.einsum("ij,j->i", facing, upwards)
         near = np.abs(along) > least
-        if np.count_nonzero(near) < _FEW_LEVEL:
+        if np.count_nonzero(near) < _SIDES.min_level:
             break
         mean = np.sign(along[near]) @ facing[near]
         upwards = mean / np.linalg.norm(mean) * (1.0 if np.sign(along[near]).sum() >= 0.0 else -1.0)
@@ -172,14 +206,17 @@ def _upwards(
 
 
 def _turned(normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Normals, (v, 3), turned round where votes for their side, (v,), are below zero."""
+    """The normals, (v, 3), reversed where the vote for their side, (v,), is below zero."""
     turned = np.empty_like(normals)
     in_blocks(_turn, len(normals), normals, votes, turned)
     return turned
 
 
 def _smoothed_votes(grid: VoxelGrid, normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Votes for the side of each voxel's normal, (v,), overwritten, with those of the voxels around on one surface."""
+    """Votes for the side of each voxel's normal, (v,), averaged with those around it on one surface.
+
+    `votes` is overwritten.
+    """
     return _spread_votes(grid, _neighbours_on_one_surface(grid, normals), votes)
 
 
@@ -191,9 +228,12 @@ def _neighbours_on_one_surface(grid: VoxelGrid, normals: NDArray[np.float64]) ->
 
 
 def _spread_votes(grid: VoxelGrid, alike: NDArray[np.int8], votes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Votes of the voxels, (v,), overwritten, with those of the voxels around that are alike."""
+    """Votes, (v,), averaged with those of the voxels around that are on one surface, as `alike` says, in some rounds.
+
+    `votes` is overwritten.
+    """
     smoothed = np.empty_like(votes)
-    for _ in range(_SMOOTHING):
+    for _ in range(_SIDES.smoothing_rounds):
         in_blocks(_vote_along, grid.n_voxels, grid.neighbourhood, alike, votes, smoothed)
         votes, smoothed = smoothed, votes
     return votes
@@ -205,11 +245,11 @@ def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
 
 
 def shown_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
-    """Fraction of the surface that a place, (3,) float64, metres, shows: of the voxels that are joined as on a surface,
-    those that are visible from there, or on one surface with such a one a few voxels away.
+    """Fraction of the surface that a place, (3,) float64, metres, shows, 0..1.
 
-    All that one scan holds is shown by its place, but for what coarse voxels hide of what lies beside them; the far
-    side of what a moving scanner passed is not.
+    The surface is the joined voxels. A place shows those that are visible from it, and those on one surface with a
+    visible one a few voxels away, as coarse voxels hide some of what lies beside them. The place of a single scan shows
+    nearly all of it. The middle of a moving scanner's way does not show the far sides of what the scanner passed.
     """
     normals, joined = either_normals(grid), grid.joined
     visible = _visible(grid, place, normals).astype(np.float64)
@@ -218,6 +258,7 @@ def shown_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
 
 
 def _visible_fraction(grid: VoxelGrid, place: NDArray[np.float64], normals: NDArray[np.float64]) -> float:
+    """`visible_fraction`, given the normals of the voxels, of either sign."""
     return float(_visible(grid, place, normals).mean())
 
 
@@ -229,7 +270,7 @@ def _visible(grid: VoxelGrid, place: NDArray[np.float64], normals: NDArray[np.fl
 
 
 def likelier_viewpoint(grid: VoxelGrid, place: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The likelier of two scanner positions, (3,) float64, metres: that from which more is visible."""
+    """The one of two places, (3,) float64, metres, from which more is visible; the first if it is as much."""
     normals = either_normals(grid)
     return place if _visible_fraction(grid, place, normals) >= _visible_fraction(grid, other, normals) else other
 
@@ -255,7 +296,7 @@ def _look_around(
     centres: NDArray[np.float64],
     towards: NDArray[np.float64],
 ) -> None:
-    """Set the weighted sum of the unit vectors from each square to the places that see it."""
+    """Set the weighted sum of the unit vectors from each centre to the places that see it."""
     for i in range(start, stop):
         towards[i, 0] = towards[i, 1] = towards[i, 2] = 0.0
         for k in range(len(places)):
@@ -276,12 +317,13 @@ def _carry_over(
     votes: NDArray[np.float64],
     clear: float,
 ) -> None:
-    """Set votes of patches that have no clear ones by what they meet at their edges, if most of that agrees.
+    """Set the votes of patches without clear votes by what they meet at their edges, if most of that agrees.
 
-    A patch is voxels on one surface. What it meets has clear votes, or got them in an earlier round.
+    A patch is connected voxels on one surface whose votes are all below `clear`. The surfaces that it meets have clear
+    votes, or got them in an earlier round.
     """
     known, visited = np.abs(votes) >= clear, np.empty(len(votes), np.bool_)
-    patch, way = np.empty(len(votes), np.int64), np.empty(len(votes))  # 1 or -1 along the first one's normal
+    patch, way = np.empty(len(votes), np.int64), np.empty(len(votes))  # way: 1, or -1 if opposite to the first normal
     changed = True
     while changed:
         changed, visited[:] = False, known
@@ -293,8 +335,8 @@ def _carry_over(
             own = 0.0
             for i in patch[:size]:
                 own += way[i] * votes[i]
-            own *= _HARDLY / clear
-            if size >= _PATCH and said > 0.0 and abs(total + own) >= _MOSTLY * (said + abs(own)):
+            own *= _WEIGHT_OF_UNCLEAR / clear
+            if size >= _MIN_PATCH and said > 0.0 and abs(total + own) >= _MIN_MAJORITY * (said + abs(own)):
                 changed, side = True, clear if total + own > 0.0 else -clear
                 for i in patch[:size]:
                     known[i], votes[i] = True, side * way[i]
@@ -302,8 +344,10 @@ def _carry_over(
 
 @routine
 def _walk_patch(around, centroids, edge_lengths, normals, votes, known, visited, patch, way):  # type: ignore[no-untyped-def]
-    """Set `patch`, which holds its first voxel, and `way` of all of it; its size, what it meets, summed for the side of
-    the first one's normal, and how sure that is in sum."""
+    """Complete a patch, given its first voxel: set `patch`, its voxels, and `way`, their directions along the first.
+
+    Return its size; the evidence at its edges for the side of the first normal, summed with signs; and without signs.
+    """
     indptr, neighbours = around
     done, size, total, said = 0, 1, 0.0, 0.0
     while done < size:
@@ -327,8 +371,12 @@ def _walk_patch(around, centroids, edge_lengths, normals, votes, known, visited,
 def _alike_sides(
     i: int, j: int, centroids: NDArray[np.float64], normals: NDArray[np.float64], edge: float
 ) -> tuple[float, bool]:
-    """Whether the outer side of two touching voxels is that of both normals (or of neither), 1, or of one of them, -1,
-    the nearer to 0 the less it is sure; and whether they are on one surface."""
+    """Whether two touching voxels' normals point to the same side: 1 if both point outwards or both inwards, -1 if not.
+
+    Nearer to 0 the answer is less sure. Also whether they are on one surface. There the sign of the cosine tells. At an
+    edge between two faces, both normals point outwards or both inwards if each voxel lies behind the other's plane, or
+    each before it.
+    """
     cosine = ahead_of_i = ahead_of_j = 0.0
     for axis in range(3):
         way = centroids[j, axis] - centroids[i, axis]
@@ -336,9 +384,9 @@ def _alike_sides(
         ahead_of_i += way * normals[i, axis]
         ahead_of_j -= way * normals[j, axis]
     least, most = min(abs(ahead_of_i), abs(ahead_of_j)) / edge, max(abs(ahead_of_i), abs(ahead_of_j)) / edge
-    if abs(cosine) > SAME_SURFACE_COSINE and most <= _OFF_PATCH:
+    if abs(cosine) > SAME_SURFACE_COSINE and most <= _MAX_OFF_PATCH:
         return 1.0 if cosine > 0.0 else -1.0, True
-    if abs(cosine) < _CREASE:
+    if abs(cosine) < _MAX_CREASE_COSINE:
         return min(least, 1.0) * (1.0 if (ahead_of_i > 0.0) == (ahead_of_j > 0.0) else -1.0), False
     return 0.0, False
 
@@ -364,7 +412,7 @@ def _vote_along(
     votes: NDArray[np.float64],
     smoothed: NDArray[np.float64],
 ) -> None:
-    """Set the votes for the side of each voxel's normal, with those of the voxels around on the same surface."""
+    """Set the mean vote of each voxel and those around it on one surface, for the side of its own normal."""
     indptr, neighbours = around
     for i in range(start, stop):
         total = votes[i]

@@ -13,23 +13,27 @@ from numpy.typing import NDArray
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.voxels.cells import Lattice
 
-_SOME = 2048  # values
-_MIN_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are still finite
+_MEDIAN_SAMPLE = 2048
+"""Count of values off which bounds of the median are read, about; chosen by eye, for speed."""
+_MIN_LENGTH = 1e-150
+"""Metres, least range: squares of lesser ones are zero, and powers of it are still finite."""
 FORWARDS = (0.0, 0.0, 1.0)
-"""Where a camera looks in its own frame."""
+"""Direction in which a camera looks in its own frame, of length 1: +z, as in OpenCV."""
 
 
 class NormalTransform(NamedTuple):
-    """Transform of normals to the warped space: a plane's n becomes m = n + ray (n . r) r + depth (n . w) a.
+    """Transform of normals to the warped space: a normal n becomes m = n + ray (n . r) r + depth (n . w) a.
 
-    r is the direction of the warped place, w what of it lies across the axis a. Then a step dX in the warped space
-    leaves the plane by m . dX, in metres of the warped space: scale(p) m = J^-T n, J being the derivative of
-    `Warp.forward` at p.
+    Here a is an axis, r the direction of the warped place, and w the part of that place across the axis. A step dX in
+    the warped space leaves the plane by m . dX, in metres of the warped space: scale(p) m = J^-T n, where J is the
+    derivative of `Warp.forward` at p.
 
     Attributes
     ----------
     ray : float
+        0 unless voxels grow with range.
     depth : float, 1 / metres
+        0 unless voxels grow with depth.
     axis : three floats
         Of unit length.
     """
@@ -46,7 +50,7 @@ class Warp:
     Attributes
     ----------
     max_gap : float, voxel edges
-        Distance between the means of two voxels, at most, that a gap lies between.
+        Distance between the means of two voxels on either side of a gap, at most.
     """
 
     max_gap: ClassVar[float] = 3.0
@@ -59,7 +63,7 @@ class Warp:
         return points
 
     def on_lattice(self, points: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], Lattice]:
-        """Places, (n, 3) float64, metres, and the lattice on which they are in voxels of a size, metres."""
+        """Places, (n, 3) float64, metres, and the lattice of voxels of a size, metres, in which they lie."""
         return self.forward(points), Lattice(np.zeros(3), size)
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -72,18 +76,12 @@ class Warp:
 
     @property
     def slant(self) -> NormalTransform:
-        """How normals lie in the warped space."""
+        """Transform of normals to the warped space."""
         return NormalTransform()
 
-    @property
-    def seen_from(self) -> NDArray[np.float64] | None:
-        """The place, (3,) float64, metres, that all points were seen from, if voxels grow with the distance from it."""
-        return None
-
-    @property
-    def of_one_scan(self) -> bool:
-        """Whether there is such a place."""
-        return self.seen_from is not None
+    def from_corner(self, corner: NDArray[np.float64]) -> Warp:
+        """Voxels of one size counted from a corner, (3,) metres; where voxels grow about a place, the warp itself."""
+        return Shift(corner)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +100,7 @@ class Shift(Warp):
         return points - self.corner
 
     def on_lattice(self, points: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], Lattice]:
-        """The points as they are: the lattice starts at the corner."""
+        """The points themselves, and a lattice that starts at the corner."""
         return points, Lattice(self.corner, size)
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -135,6 +133,22 @@ class CameraWarp(Warp):
     reference_depth: float
     axis: NDArray[np.float64] = field(default_factory=lambda: np.array(FORWARDS))
 
+    @classmethod
+    def about(
+        cls, points: NDArray[np.float64], viewpoint: NDArray[np.float64], axis: NDArray[np.float64] | None = None
+    ) -> CameraWarp:
+        """The warp that keeps lengths at the median depth of points, (n, 3); the axis is +z unless it is given.
+
+        Raises
+        ------
+        ValueError
+            A point does not lie in front of the camera.
+        """
+        axis = np.array(FORWARDS) if axis is None else axis
+        warp = cls(viewpoint, _median(along_axis(points, axis)) - float(viewpoint @ axis), axis)
+        warp.check(points)
+        return warp
+
     def check(self, points: NDArray[np.float64]) -> None:
         """ValueError if a point does not lie in front of the camera."""
         least, place = float(along_axis(points, self.axis).min()), float(self.viewpoint @ self.axis)
@@ -161,14 +175,12 @@ class CameraWarp(Warp):
         """Depth over reference depth, (n,) float64."""
         return (along_axis(points, self.axis) - self.viewpoint @ self.axis) / self.reference_depth
 
-    @property
-    def seen_from(self) -> NDArray[np.float64]:
-        """The camera's place."""
-        return self.viewpoint
+    def from_corner(self, corner: NDArray[np.float64]) -> Warp:
+        return self
 
     @property
     def slant(self) -> NormalTransform:
-        """A step along the axis moves along the ray of the pixel."""
+        """The transform of a camera: a step along the axis of the warped space moves along the ray of a pixel."""
         x, y, z = self.axis.tolist()
         return NormalTransform(depth=1.0 / self.reference_depth, axis=(x, y, z))
 
@@ -196,6 +208,15 @@ class RangeWarp(Warp):
     reference_range: float
     growth: float
 
+    @classmethod
+    def about(cls, points: NDArray[np.float64], viewpoint: NDArray[np.float64], growth: float) -> Warp:
+        """The warp that keeps lengths at the median range of points, (n, 3).
+
+        It is the identity for a growth of 0, or if the median range is 0.
+        """
+        median_range = _median(_ranges(points, viewpoint)) if growth else 0.0
+        return cls(viewpoint, median_range, growth) if median_range > _MIN_LENGTH else Warp()
+
     def forward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Warped positions, (n, 3) float64, about the viewpoint."""
         warped = np.empty((len(points), 3))
@@ -211,24 +232,22 @@ class RangeWarp(Warp):
         """(r / r0)^growth, (n,) float64."""
         return (_ranges(points, self.viewpoint) / self.reference_range) ** self.growth
 
-    @property
-    def seen_from(self) -> NDArray[np.float64]:
-        """The scanner's place."""
-        return self.viewpoint
+    def from_corner(self, corner: NDArray[np.float64]) -> Warp:
+        return self
 
     @property
     def slant(self) -> NormalTransform:
-        """A step along the ray is shorter than one across it."""
+        """The transform of a scanner: a step along the ray is shorter than one across it."""
         return NormalTransform(ray=self.growth / (1.0 - self.growth))
 
 
 def _median(values: NDArray[np.float64]) -> float:
-    """Median of values, (n,), of many in a third of the time: only those near it, as some tell, are put in order."""
+    """Median of values, (n,). Of many values only those near it are put in order, which takes a third of the time."""
     n = len(values)
-    some = np.sort(values[:: n // _SOME + 1])
+    some = np.sort(values[:: n // _MEDIAN_SAMPLE + 1])
     low, high = some[[int(0.45 * len(some)), int(0.55 * len(some))]]
     near, at = values[(values >= low) & (values <= high)], n // 2 - np.count_nonzero(values < low)
-    if n < 4 * _SOME or not 1 <= at < len(near):
+    if n < 4 * _MEDIAN_SAMPLE or not 1 <= at < len(near):
         return float(np.median(values))
     near.partition((at - 1, at))
     return float(near[at] if n % 2 else near[at - 1 : at + 1].mean())
@@ -250,7 +269,7 @@ def _ranges(points: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> NDAr
 
 @routine
 def _ray(points: NDArray[np.float64], p: int, viewpoint: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """From a viewpoint to point p: x, y, z, and the range, at least `_MIN_LENGTH`."""
+    """Vector from a viewpoint to point p, x, y, z, and its length, at least `_MIN_LENGTH`, metres."""
     x, y, z = points[p, 0] - viewpoint[0], points[p, 1] - viewpoint[1], points[p, 2] - viewpoint[2]
     return x, y, z, max(math.sqrt(x * x + y * y + z * z), _MIN_LENGTH)
 
@@ -259,7 +278,7 @@ def _ray(points: NDArray[np.float64], p: int, viewpoint: NDArray[np.float64]) ->
 def warped_normal(
     slant: NormalTransform, x: float, y: float, z: float, a: float, b: float, c: float
 ) -> tuple[float, float, float]:
-    """The normal (a, b, c) in the warped space at the warped place (x, y, z); see `NormalTransform`."""
+    """Transform of the normal (a, b, c) of a plane at the warped place (x, y, z); see `NormalTransform`."""
     if slant.ray > 0.0:
         square = max(x * x + y * y + z * z, _MIN_LENGTH)
         along = slant.ray * (a * x + b * y + c * z) / square
@@ -274,7 +293,7 @@ def warped_normal(
 def _multiply(
     start: int, stop: int, points: NDArray[np.float64], axis: NDArray[np.float64], along: NDArray[np.float64]
 ) -> None:
-    """Set coordinates of points along an axis."""
+    """Set the coordinates of points along an axis."""
     for p in range(start, stop):
         along[p] = points[p, 0] * axis[0] + points[p, 2] * axis[2] + points[p, 1] * axis[1]  # as NumPy adds them
 
@@ -283,7 +302,7 @@ def _multiply(
 def _measure(
     start: int, stop: int, points: NDArray[np.float64], viewpoint: NDArray[np.float64], ranges: NDArray[np.float64]
 ) -> None:
-    """Set ranges of points."""
+    """Set the ranges of points from a viewpoint."""
     for p in range(start, stop):
         _, _, _, ranges[p] = _ray(points, p, viewpoint)
 
@@ -298,7 +317,7 @@ def _draw_near(
     growth: float,
     warped: NDArray[np.float64],
 ) -> None:
-    """Set places of points, about the viewpoint, as far away as `RangeWarp` says."""
+    """Set the warped positions of points about the viewpoint, as `RangeWarp` says."""
     for p in range(start, stop):
         x, y, z, distance = _ray(points, p, viewpoint)
         scale = (distance / reference_range) ** -growth
@@ -315,7 +334,7 @@ def _project(
     reference_depth: float,
     warped: NDArray[np.float64],
 ) -> None:
-    """Set places of points as a camera sees them, in metres at the reference depth."""
+    """Set the warped positions of points as `CameraWarp` says."""
     for p in range(start, stop):
         x, y, z = points[p, 0] - viewpoint[0], points[p, 1] - viewpoint[1], points[p, 2] - viewpoint[2]
         depth = x * axis[0] + y * axis[1] + z * axis[2]
@@ -324,46 +343,3 @@ def _project(
         warped[p, 0] = (x - depth * axis[0]) * scale + along * axis[0]
         warped[p, 1] = (y - depth * axis[1]) * scale + along * axis[1]
         warped[p, 2] = (z - depth * axis[2]) * scale + along * axis[2]
-
-
-def choose_warp(
-    points: NDArray[np.float64],
-    viewpoint: NDArray[np.float64],
-    camera: bool,
-    range_growth: float = 0.0,
-    axis: NDArray[np.float64] | None = None,
-) -> Warp:
-    """Camera warp about the median depth, range warp about the median range, or the identity.
-
-    Parameters
-    ----------
-    points : (n, 3) float64, metres
-        Finite, n >= 1.
-    viewpoint : (3,) float64, metres
-    camera : bool
-        Whether a camera at the viewpoint took the points.
-    range_growth : float, 0..1, without 1
-        Power of the range with which voxels grow; 0 for voxels of one size.
-    axis : (3,) float64, optional
-        Along which the camera looks, of unit length. Default: +z.
-
-    Raises
-    ------
-    ValueError
-        `camera` is true and a point does not lie in front of it, or voxels grow with range as well.
-    """
-    if not isinstance(camera, (bool, np.bool_)):
-        raise ValueError(f"expected camera as True, False or None, got {camera!r}")
-    if (camera or range_growth) and viewpoint.ndim != 1:
-        raise ValueError("expected one viewpoint where voxels grow with depth or range, got one per point")
-    if camera and range_growth:
-        raise ValueError("expected camera=True or a range_growth above 0, got both; voxels grow in one way")
-    if range_growth:
-        distance = _median(_ranges(points, viewpoint))
-        return RangeWarp(viewpoint, distance, range_growth) if distance > _MIN_LENGTH else Warp()
-    if not camera:
-        return Warp()
-    axis = np.array(FORWARDS) if axis is None else axis
-    warp = CameraWarp(viewpoint, _median(along_axis(points, axis)) - float(viewpoint @ axis), axis)
-    warp.check(points)
-    return warp

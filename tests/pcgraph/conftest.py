@@ -3,15 +3,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from clouds import two_boxes_on_a_plane
-from simulated_rooms import room
+from scenes.rooms import view_of_a_room
+from scenes.tables import two_boxes_on_a_plane
 
 import pcgraph
 from pcgraph.detection import find_planes
@@ -22,11 +19,11 @@ from pcgraph.detection import find_planes
 FIRST = (
     *("test_kernels", "test_real", "test_surface", "test_learning_classifier", "test_learning_transfer"),
     *("test_linkage_learned", "test_plain_files", "test_metrics_peers", "test_docs", "test_short_repr"),
-    *("test_detection_objects", "test_detection_planes", "test_plausibility", "test_benchmarks", "test_files"),
+    *("test_detection_objects", "test_detection_planes", "test_plausibility", "test_files"),
     *("test_properties",),
 )
 HERE = Path(__file__).parent
-REAL_CLOUDS = Path(__file__).resolve().parents[3] / "shared" / "data" / "mosd"
+REAL_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -45,7 +42,7 @@ def boxes():
 @pytest.fixture(scope="session")
 def rooms():
     """Four simulated rooms with their segmentations and planes."""
-    views = [room(seed) for seed in range(4)]
+    views = [view_of_a_room(seed) for seed in range(4)]
     results = [pcgraph.segment(r.points, r.colors) for r in views]
     return [(r, s, find_planes(s, up=r.up)) for r, s in zip(views, results, strict=True)]
 
@@ -53,7 +50,16 @@ def rooms():
 @pytest.fixture(scope="session")
 def real_clouds() -> list[Path]:
     """Paths of the labelled real clouds."""
-    paths = sorted(REAL_CLOUDS.glob("*.pcd"))
+    paths = sorted((REAL_DATA / "mosd").glob("*.pcd"))
     if not paths:
-        pytest.skip(f"the real clouds are not here: {REAL_CLOUDS}")
+        pytest.skip(f"the real clouds are not here: {REAL_DATA / 'mosd'}")
     return paths
+
+
+@pytest.fixture(scope="session")
+def real_sweep() -> np.ndarray:
+    """Points (n, 3) that a 64-beam LiDAR on a car sees ahead of it, the scanner at 0."""
+    path = REAL_DATA / "lidar" / "kitti_000008.bin"
+    if not path.exists():
+        pytest.skip(f"the real sweep is not here: {path}")
+    return np.fromfile(path, np.float32).reshape(-1, 4)[:, :3]

@@ -8,53 +8,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from checks import main_object
+from scenes.rooms import THREE_WALLS as WALLS
+from scenes.rooms import desk, floor, sheet
+from scenes.surfaces import labelled
 
 import pcgraph
 from pcgraph.graph.bounding_planes import bounding_planes
 from pcgraph.graph.continuations import faces_of
 from pcgraph.tree.tree import segmentation_tree
 
-STEP = 0.02  # metres between points
-
-
-def sheet(corner, first, second):
-    """Points (n, 3) on a parallelogram, metres, 2 cm apart, jittered by 2 mm."""
-    first, second = np.array(first), np.array(second)
-    n, m = (max(int(np.linalg.norm(side) / STEP), 1) for side in (first, second))
-    s, t = np.meshgrid((np.arange(n) + 0.5) / n, (np.arange(m) + 0.5) / m, indexing="ij")
-    points = corner + s.reshape(-1, 1) * first + t.reshape(-1, 1) * second
-    return points + np.random.default_rng(0).uniform(-0.002, 0.002, points.shape)
-
-
-def floor(start, stop, height=0.0):
-    return sheet([start, 0.0, height], [stop - start, 0.0, 0.0], [0.0, 2.0, 0.0])
-
-
-WALLS = (
-    sheet([-0.02, 0.0, 0.05], [0.0, 2.0, 0.0], [0.0, 0.0, 1.5]),
-    sheet([4.02, 0.0, 0.05], [0.0, 2.0, 0.0], [0.0, 0.0, 1.5]),
-    sheet([0.0, 2.02, 0.05], [4.0, 0.0, 0.0], [0.0, 0.0, 1.5]),
-)
-
-
-def desk(start, stop, height=0.5):
-    return sheet([start, 0.1, height], [stop - start, 0.0, 0.0], [0.0, 1.8, 0.0])
-
 
 def segmented(*sheets, **settings):
     """Segmentation of some sheets, and the number of the sheet of each point."""
-    which = np.repeat(np.arange(len(sheets)), [len(sheet) for sheet in sheets])
-    return pcgraph.segment(np.concatenate(sheets), **settings), which
-
-
-def main_object(labels, which, sheet):
-    names, counts = np.unique(labels[which == sheet], return_counts=True)
-    assert counts.max() > 0.95 * counts.sum()
-    return names[counts.argmax()]
+    points, which = labelled(sheets)
+    return pcgraph.segment(points, **settings), which
 
 
 def are_one(result, which, first=0, second=1):
-    return main_object(result.labels, which, first) == main_object(result.labels, which, second)
+    return len({main_object(result.labels, which, number, least=0.95) for number in (first, second)}) == 1
 
 
 def pairs_of(result):
@@ -162,8 +134,7 @@ def test_a_gap_too_wide_for_each_piece_is_bridged_by_what_two_of_them_are_togeth
 
 def test_order_frame_and_unit_do_not_count():
     sheets = (floor(0.0, 1.7), floor(2.3, 4.0), *WALLS, desk(1.7, 2.3))
-    points = np.concatenate(sheets)
-    which = np.repeat(np.arange(len(sheets)), [len(sheet) for sheet in sheets])
+    points, which = labelled(sheets)
     order = np.random.default_rng(1).permutation(len(points))
     plain = pcgraph.segment(points)
     shuffled = pcgraph.segment(points[order])

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import two_boxes_on_a_plane
+from scenes.surfaces import directions, tile
+from scenes.tables import two_boxes_on_a_plane
 from scipy.spatial.distance import cdist
 
 import pcgraph
@@ -16,8 +17,7 @@ SETTINGS = {"voxel_size": 0.05, "viewpoint": (0.0, 0.0, 30.0), "range_growth": 0
 
 def sheet(width: float, depth: float, corner: tuple[float, float, float]) -> np.ndarray:
     """A level sheet, four points per voxel."""
-    x, y = np.meshgrid(np.arange(0.0125, width, 0.025), np.arange(0.0125, depth, 0.025))
-    return np.stack((x.ravel(), y.ravel(), np.zeros(x.size)), axis=1) + corner
+    return tile(corner, (width, 0.0, 0.0), (0.0, depth, 0.0), 0.025)
 
 
 def balls(n: int, seed: int) -> np.ndarray:
@@ -25,9 +25,8 @@ def balls(n: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     clouds = []
     for _ in range(n):
-        directions = rng.normal(size=(int(rng.integers(5, 800)), 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        clouds.append(rng.uniform(0.0, 8.0, 3) + rng.uniform(0.01, 0.4) * directions)
+        ball = directions(int(rng.integers(5, 800)), rng)
+        clouds.append(rng.uniform(0.0, 8.0, 3) + rng.uniform(0.01, 0.4) * ball)
     return np.concatenate(clouds)
 
 

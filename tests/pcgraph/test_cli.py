@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clouds import two_boxes_on_a_plane
+from scenes.tables import two_boxes_on_a_plane
 from typer.testing import CliRunner
 
 import pcgraph

@@ -7,44 +7,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from checks import objects_of
+from scenes.images import before_a_wall
+from scenes.rooms import cabinet_from_wall_to_wall
 
 import pcgraph
 from pcgraph.graph.continuations import continuations, faces_of
 from pcgraph.tree.tree import segmentation_tree
 
-FOCAL = 150.0
-
-
-def seen(fronts, back, shape=(160, 220)):
-    """What a camera at the origin, z forward, sees of rectangles (x0, x1, y0, y1, z) before a wall at depth `back`.
-
-    Points (h, w, 3), metres, NaN where there is none, and which is seen, (h, w), the wall -1.
-    """
-    v, u = np.mgrid[: shape[0], : shape[1]].astype(float)
-    rays = np.stack(((u - shape[1] / 2 + 0.5) / FOCAL, (v - shape[0] / 2 + 0.5) / FOCAL, np.ones(shape)), axis=-1)
-    depth, thing = np.full(shape, back), np.full(shape, -1)
-    for number, (x0, x1, y0, y1, z) in enumerate(fronts):
-        x, y = z * rays[..., 0], z * rays[..., 1]
-        hit = (x0 < x) & (x < x1) & (y0 < y) & (y < y1) & (z < depth)
-        depth[hit], thing[hit] = z, number
-    points = rays * depth[..., None]
-    points[~np.isfinite(depth)] = np.nan
-    return points, thing
-
-
 PILLAR = (-0.1, 0.1, -2.0, 2.0, 1.0)
 BOARDS = [(-0.9, -0.2, -2.0, 2.0, 2.0), (0.2, 0.9, -2.0, 2.0, 2.0)]
 
 
-def objects_of(labels, thing, number):
-    """Objects that hold much of a thing."""
-    names, counts = np.unique(labels[(thing == number) & (labels >= 0)], return_counts=True)
-    return set(names[counts > 0.1 * counts.sum()].tolist())
-
-
 @pytest.mark.parametrize("organised", [True, False])
 def test_a_wall_behind_a_pillar_is_one_object(organised):
-    points, thing = seen([PILLAR], 2.0)
+    points, thing = before_a_wall([PILLAR], 2.0)
     if not organised:
         points, thing = points.reshape(-1, 3), thing.ravel()
     result = pcgraph.segment(points, viewpoint=(0, 0, 0))
@@ -59,7 +36,7 @@ def test_a_wall_behind_a_pillar_is_one_object(organised):
 
 
 def test_pairs_are_coplanar_and_neither_touch_nor_nearly_do():
-    points, _ = seen([PILLAR], 2.0)
+    points, _ = before_a_wall([PILLAR], 2.0)
     result = pcgraph.segment(points)
     graph, found = result.graph, result.graph.continuations
     x, _, depth = graph.node_features.centroid.T
@@ -77,7 +54,7 @@ def test_pairs_are_coplanar_and_neither_touch_nor_nearly_do():
 
 
 def test_a_surface_that_jumps_behind_the_pillar_does_not_go_on():
-    points, thing = seen([PILLAR, (-2.0, 0.0, -2.0, 2.0, 1.8)], 2.0)
+    points, thing = before_a_wall([PILLAR, (-2.0, 0.0, -2.0, 2.0, 1.8)], 2.0)
     result = pcgraph.segment(points)
     assert not len(result.graph.continuations.pairs)
     assert not objects_of(result.labels, thing, -1) & objects_of(result.labels, thing, 1)
@@ -85,7 +62,7 @@ def test_a_surface_that_jumps_behind_the_pillar_does_not_go_on():
 
 @pytest.mark.parametrize(("noise", "one"), [(0.0, False), (0.001, False), (0.02, True)])
 def test_a_surface_goes_on_if_it_lies_no_farther_off_behind_the_pillar_than_its_noise_leaves_open(noise, one):
-    points, thing = seen([PILLAR], 2.0)
+    points, thing = before_a_wall([PILLAR], 2.0)
     depth = points[..., 2] + np.where((thing < 0) & (points[..., 0] > 0), 0.04, 0.0)  # metres, less than a voxel
     depth += noise * np.random.default_rng(0).standard_normal(depth.shape)
     result = pcgraph.segment(points * (depth / points[..., 2])[..., None])
@@ -99,7 +76,7 @@ def test_a_surface_goes_on_if_it_lies_no_farther_off_behind_the_pillar_than_its_
 def test_boards_in_one_plane_end_in_the_open_though_something_stands_before_a_part_of_the_gap(back):
     """A pole a third as high as the boards hides their borders along a few lines; the other lines see past them."""
     fronts = [*BOARDS, (-0.16, 0.16, -0.15, 0.15, 1.0)]
-    points, thing = seen(fronts, back)
+    points, thing = before_a_wall(fronts, back)
     result = pcgraph.segment(points)
     assert not objects_of(result.labels, thing, 0) & objects_of(result.labels, thing, 1)
     x, _, depth = np.moveaxis(result.graph.node_features.centroid[result.graph.continuations.pairs], -1, 0)
@@ -111,35 +88,14 @@ def test_boards_in_one_plane_end_in_the_open_though_something_stands_before_a_pa
 def test_of_boards_whose_gap_is_hidden_all_along_only_wide_ones_are_one(width, one):
     """Nothing tells them from a wall behind a pillar; narrow ones are more likely things in a row."""
     boards = [(-0.2 - width, -0.2, -2.0, 2.0, 2.0), (0.2, 0.2 + width, -2.0, 2.0, 2.0)]
-    points, thing = seen([*boards, (-0.16, 0.16, -2.0, 2.0, 1.0)], np.inf)
+    points, thing = before_a_wall([*boards, (-0.16, 0.16, -2.0, 2.0, 1.0)], np.inf)
     result = pcgraph.segment(points)
     assert (objects_of(result.labels, thing, 0) == objects_of(result.labels, thing, 1)) is one
 
 
-def rectangle(origin, first, second, spacing, rng):
-    """Points at random on a parallelogram, `spacing` apart on average."""
-    first, second = np.array(first, float), np.array(second, float)
-    n = int(np.linalg.norm(np.cross(first, second)) / spacing**2)
-    return origin + rng.random((n, 1)) * first + rng.random((n, 1)) * second
-
-
-def room_with_a_cabinet(seed, spacing=0.02):
-    """A floor that was not seen below a cabinet from wall to wall, and walls around, from nowhere in particular."""
-    rng = np.random.default_rng(seed)
-    parts = [
-        rectangle((0, 0, 0), (4, 0, 0), (0, 1.6, 0), spacing, rng),
-        rectangle((0, 2.3, 0), (4, 0, 0), (0, 1.7, 0), spacing, rng),
-        *(rectangle((0, y, 0.15), (4, 0, 0), (0, 0, 0.85), spacing, rng) for y in (1.7, 2.2)),
-        rectangle((0, 1.7, 1.0), (4, 0, 0), (0, 0.5, 0), spacing, rng),
-    ]
-    truth = np.repeat([0, 0, 1, 1, 1], [len(part) for part in parts])
-    points = np.concatenate(parts)
-    return points + rng.normal(0.0, 0.001, points.shape), truth
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_a_floor_under_a_cabinet_is_one_object_though_nobody_says_from_where_it_was_seen(seed):
-    points, truth = room_with_a_cabinet(seed)
+    points, truth = cabinet_from_wall_to_wall(seed)
     result = pcgraph.segment(points)
     assert len(result.graph.continuations.pairs) > 1
     assert len(objects_of(result.labels, truth, 0)) == 1
@@ -148,7 +104,7 @@ def test_a_floor_under_a_cabinet_is_one_object_though_nobody_says_from_where_it_
 
 
 def test_order_of_points_changes_nothing():
-    points, _ = room_with_a_cabinet(0)
+    points, _ = cabinet_from_wall_to_wall(0)
     order = np.random.default_rng(1).permutation(len(points))
     one, other = pcgraph.segment(points), pcgraph.segment(points[order])
     assert np.array_equal(one.graph.continuations.pairs, other.graph.continuations.pairs)
@@ -157,7 +113,7 @@ def test_order_of_points_changes_nothing():
 
 def test_of_many_voxels_some_tell_the_same():
     """Of more than 30 000 every third is looked at, of more than 100 000 every seventh."""
-    points, truth = room_with_a_cabinet(0, spacing=0.007)
+    points, truth = cabinet_from_wall_to_wall(0, spacing=0.007)
     for voxel in (0.05, 0.025, 0.012):
         result = pcgraph.segment(points, voxel_size=voxel, seed_size=0.25)
         assert len(objects_of(result.labels, truth, 0)) == 1
@@ -166,7 +122,7 @@ def test_of_many_voxels_some_tell_the_same():
 
 
 def test_no_place_and_a_place_on_a_point_find_what_there_is():
-    points, _ = seen([PILLAR], 2.0)
+    points, _ = before_a_wall([PILLAR], 2.0)
     result = pcgraph.segment(points)
     surface, nodes = result.surface, result.graph.node_features
     faces = faces_of(result.graph.edges, result.graph.edge_features, result.graph.n_nodes)
@@ -177,7 +133,7 @@ def test_no_place_and_a_place_on_a_point_find_what_there_is():
 
 
 def test_several_viewpoints_and_an_update_look_from_some_of_them():
-    points, thing = seen([PILLAR], 2.0)
+    points, thing = before_a_wall([PILLAR], 2.0)
     places = np.zeros_like(points)
     result = pcgraph.segment(points, viewpoint=places)
     assert len(objects_of(result.labels, thing, -1)) == 1
@@ -207,7 +163,7 @@ def test_viewpoints_of_points_are_those_given_and_no_means_of_them():
     rng = np.random.default_rng(0)
     clouds, viewpoints = [], []
     for side in (-1.0, 1.0):
-        points = seen([PILLAR], 2.0)[0].reshape(-1, 3)[:, [0, 2, 1]] * [1.0, side, 1.0]  # y is along the view
+        points = before_a_wall([PILLAR], 2.0)[0].reshape(-1, 3)[:, [0, 2, 1]] * [1.0, side, 1.0]  # y is along the view
         clouds.append(points + np.array([0.0, -2.02 * side, 0.0]) + rng.normal(0.0, 5e-4, points.shape))
         viewpoints.append(np.tile([0.0, -2.02 * side, 0.0], (len(points), 1)))
     points, places = np.concatenate(clouds), np.concatenate(viewpoints)

@@ -8,8 +8,9 @@ import time
 
 import numpy as np
 import pytest
-from clouds import refines, two_boxes_on_a_plane
-from graphs import hand_graph, hand_tree, leaf_sets, random_graph, tree_of
+from checks import refines
+from scenes.graphs import hand_graph, hand_tree, leaf_sets, random_graph, tree_of
+from scenes.tables import two_boxes_on_a_plane
 
 from pcgraph import segment
 from pcgraph.features.moments import Moments
@@ -68,60 +69,6 @@ def test_no_segment_has_fewer_points_than_min_size(tree):
     for wrong in (0, 2.0, True):
         with pytest.raises(ValueError, match="min_size"):
             tree.cut(n=1, min_size=wrong)
-
-
-def test_the_most_stable_cut_of_five_leaves():
-    """Lives are differences of roots: so altitudes are squares, and roots those of the fixture."""
-    tree = hand_tree(PAIRS, np.square(ALTITUDES), COUNTS)
-    # Points x life: node 5: 70 x 3 = 210 against 40 + 30; node 7: 72 x 5 = 360 against 210 + 2 x 4 = 218;
-    # node 6: 28 x 7 = 196 against 40 + 16. The root has none.
-    assert tree.cut_stable().tolist() == [0, 0, 0, 1, 1]
-    assert tree.cut_stable_nodes().tolist() == [7, 7, 7, 6, 6]
-    # With a root of 8 instead of 4, node 7 lasts from 8 to 9 (72) and node 5 from 1 to 8 (490), leaf 2 from 0 to 8.
-    late = hand_tree(PAIRS, np.square([1.0, 2.0, 8.0, 9.0]), COUNTS)
-    assert late.cut_stable().tolist() == [0, 0, 1, 2, 2]
-    # With at least 10 points leaf 2 does not end node 5's life: 490 + 72 in one branch, and it goes along.
-    assert late.cut_stable(min_size=10).tolist() == [0, 0, 0, 1, 1]
-    assert late.cut_stable(min_size=1000).tolist() == [0, 0, 0, 0, 0]
-
-
-def test_a_merge_with_something_small_does_not_end_a_life():
-    # Leaves of 50, 50, 1 and 100 points; [0, 1] lasts from 1 to 1.6 (60), with leaf 2 from 1.6 to 2.2 (60.6): either
-    # alone is less than what leaves 0 and 1 have (50 each), both together are more.
-    tree = hand_tree([[0, 1], [2, 4], [3, 5]], np.square([1.0, 1.6, 2.2]), [50, 50, 1, 100])
-    assert tree.cut_stable().tolist() == [0, 1, 2, 3]
-    assert tree.cut_stable(min_size=10).tolist() == [0, 0, 0, 1]
-
-
-def test_the_most_stable_cut_is_the_same_in_any_unit():
-    rng = np.random.default_rng(2)
-    for _ in range(30):
-        tree = random_tree(int(rng.integers(2, 12)), rng)
-        scaled = SegmentationTree(tree.parents, 4.0**7 * tree.altitudes, tree.moments)
-        assert np.array_equal(tree.cut_stable_nodes(3), scaled.cut_stable_nodes(3))
-
-
-def test_trifles_that_come_late_do_not_make_a_scene_last():
-    #  halves of 100 points, of 50 each, become one at 1; three single points join at 2 and 3
-    counts = np.array([50, 50, 50, 50, 1, 1, 1])
-    parents = np.array([7, 7, 8, 8, 10, 11, 12, 9, 9, 10, 11, 12, 12], np.int32)
-    altitudes = np.array([0, 0, 0, 0, 0, 0, 0, 0.1, 0.1, 1.0, 2.0, 3.0, 3.0])
-    sizes = np.concatenate((counts, [100, 100, 200, 201, 202, 203]))
-    moments = Moments(sizes, np.zeros((13, 3)), np.zeros((13, 3, 3)), None)
-    late = SegmentationTree(parents, altitudes, moments)
-    assert late.cut_stable(min_size=10)[:4].tolist() == [0, 0, 1, 1]
-    assert late.cut_stable(min_size=1000).tolist() == [0] * 7
-
-
-def test_the_most_stable_cut_is_the_best_antichain():
-    rng = np.random.default_rng(1)
-    for _ in range(30):
-        n = int(rng.integers(1, 8))
-        tree = random_tree(n, rng)
-        roots = np.sqrt(tree.altitudes)
-        gain = tree.moments.counts * (roots[tree.parents] - roots)
-        best = max(gain[nodes].sum() for nodes in all_cuts(tree))
-        assert gain[np.unique(tree.cut_stable_nodes())].sum() == pytest.approx(best)
 
 
 def random_tree(n, rng, integers=True):
@@ -330,7 +277,6 @@ def test_a_hundred_thousand_leaves_take_a_second(shape):
     calls = (
         lambda: tree.cut(n=100),
         lambda: tree.cut(altitude=0.5, min_size=20),
-        lambda: tree.cut_stable(5),
         lambda: tree.cut_optimal(energy, 1.0),
         lambda: tree.edge_saliency(pairs),
     )
@@ -346,7 +292,7 @@ def test_one_leaf_is_a_tree():
     tree = hand_tree([], [])
     graph = hand_graph([], n=1)
     energy = plane_energy(tree, graph)
-    for cut in (tree.cut(n=1), tree.cut(altitude=0.0, min_size=7), tree.cut_stable(), tree.cut_optimal(energy, 1.0)):
+    for cut in (tree.cut(n=1), tree.cut(altitude=0.0, min_size=7), tree.cut_optimal(energy, 1.0)):
         assert cut.tolist() == [0]
     assert tree.persistence.tolist() == [np.inf]
     assert tree.edge_saliency(graph.edges).tolist() == []

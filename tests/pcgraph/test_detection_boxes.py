@@ -7,9 +7,9 @@ import json
 
 import numpy as np
 import pytest
+from scenes.surfaces import AWAY, TURN, UP, surface_of_a_box
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
-from solids import AWAY, TURN, UP, surface_of_a_box
 
 from pcgraph.detection.boxes import (
     OrientedBox,

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import SPACING, VIEWPOINT, box, patch
-from solids import sphere
+from scenes.surfaces import SPACING, patch, sphere
+from scenes.tables import VIEWPOINT, box
 
 import pcgraph
 from pcgraph.detection import find_planes, object_labels, objects_on

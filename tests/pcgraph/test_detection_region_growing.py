@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pcgraph.detection.region_growing import (
+    JOINING,
     PlanarPatches,
     assign_unassigned,
     join_coplanar,
@@ -20,7 +21,7 @@ from pcgraph.detection.region_growing import (
 from pcgraph.features.moments import Moments, grouped_moments, moments_of_groups
 
 ANGLE = np.radians(15.0)
-TOLERANCE = 0.01
+TOLERANCE = 0.01 / JOINING  # so that regions join within 0.01
 
 
 def scattered_patches(n, planes, seed, reach=0.1):
@@ -43,7 +44,7 @@ def scattered_patches(n, planes, seed, reach=0.1):
 
 
 def misfit(patches, first, second):
-    """Of two sets of supervoxels to their common plane, in tolerances."""
+    """Distance of two sets of supervoxels to their common plane, in tolerances, which hold their own noise."""
     first, second = np.array(first), np.array(second)
     both = np.concatenate((first, second))
     joint = grouped_moments(patches.moments[both], np.zeros(len(both), int), 1)
@@ -53,8 +54,9 @@ def misfit(patches, first, second):
         if abs(plane_normals(own)[0] @ normal) < patches.cos_angle:
             return np.inf
         square = ((own.centroids[0] - joint.centroids[0]) @ normal) ** 2 + normal @ own.covariances[0] @ normal
-        weights = patches.moments.counts[part]
-        worst = max(worst, np.sqrt(square / np.average(patches.tolerances[part] ** 2, weights=weights)))
+        noise = np.linalg.eigvalsh(patches.moments.covariances[part])[:, 0]
+        allowed = np.square(JOINING * patches.tolerances[part]) + noise
+        worst = max(worst, np.sqrt(square / np.average(allowed, weights=patches.moments.counts[part])))
     return worst
 
 

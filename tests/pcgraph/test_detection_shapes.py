@@ -7,7 +7,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from solids import AWAY, TURN, UP, sphere, surface_of_a_box
+from scenes.surfaces import AWAY, TURN, UP, sphere, surface_of_a_box
 
 from pcgraph.detection.shapes import Kind, fit_shape
 from pcgraph.features.primitives import Primitive

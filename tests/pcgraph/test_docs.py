@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes.rays import camera, to_plane
 
 import pcgraph
 from pcgraph.metrics import level_curves
@@ -28,10 +29,8 @@ DATA ascii
 
 def table_with_a_box() -> str:
     """PCD of 80 x 60 pixels: table 1 m below and before a level camera, a box on it, nothing above the horizon."""
-    rows, columns = np.mgrid[0:60, 0:80]
-    directions = np.stack(((columns - 39.5) / 60, (rows - 9.5) / 60, np.ones((60, 80))), axis=-1)
-    with np.errstate(divide="ignore"):
-        to_table = np.where(directions[..., 1] > 0.2, 1.0 / directions[..., 1], np.inf)
+    directions = camera((np.arange(80) - 39.5) / 60, (np.arange(60) - 9.5) / 60)
+    to_table = np.where(directions[..., 1] > 0.2, to_plane(directions, (0, 1, 0), 1.0), np.inf)
     to_front = np.full((60, 80), 2.0)
     front = directions * to_front[..., None]
     hit = (abs(front[..., 0]) < 0.4) & (front[..., 1] < 1.0) & (front[..., 1] > 0.6) & (to_front < to_table)

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import SPACING, patch, same_partition
+from checks import same_partition
+from scenes.surfaces import SPACING, patch
 
 import pcgraph
 from pcgraph.metrics import tree_oracle, undersegmentation_error

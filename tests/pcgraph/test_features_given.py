@@ -8,9 +8,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from clouds import SPACING, patch, same_partition, two_boxes_on_a_plane
+from checks import same_partition
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes.rays import camera
+from scenes.surfaces import SPACING, patch
+from scenes.tables import two_boxes_on_a_plane
 
 import pcgraph
 from pcgraph.columns import CLIP, RobustScaling
@@ -112,10 +115,9 @@ def test_order_does_not_matter():
 
 
 def test_shape_type_and_holes_of_the_input():
-    x, y = np.meshgrid(np.arange(60) * 0.01 - 0.3, np.arange(50) * 0.01 - 0.25)
-    image = np.stack((x, y, np.ones_like(x)), axis=-1)
+    image = camera(np.arange(60) * 0.01 - 0.3, np.arange(50) * 0.01 - 0.25)
     image[3:6, 7] = np.nan
-    levels = np.where(x > 0.013, 200, 40).astype(np.uint16)
+    levels = np.where(image[..., 0] > 0.013, 200, 40).astype(np.uint16)
     listed = pcgraph.segment(image.reshape(-1, 3), viewpoint=(0, 0, 0), features=levels.reshape(-1), camera=True)
     for features in (levels, levels[..., None], levels.astype(np.float16), levels.tolist()):
         found = pcgraph.segment(image, features=features)

@@ -7,9 +7,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scenes.streets import cartons
+from scenes.surfaces import tile
 from tiers import draws
 
 import pcgraph
+from pcgraph.acquisition.kinds import Scanner, Told, UnknownAcquisition
 from pcgraph.graph.gaps import gaps
 from pcgraph.graph.spherical_image import Surfels, seen_through, view_from
 from pcgraph.voxels.grid import Neighbourhood
@@ -19,8 +22,7 @@ VOXEL = 0.05
 
 def sheet(start: float, stop: float, z: float = 0.0) -> np.ndarray:
     """Points of a level sheet over x in start..stop and y in 0..1, one per voxel of VOXEL at its centre."""
-    x, y = np.meshgrid(np.arange(start + VOXEL / 2, stop, VOXEL), np.arange(VOXEL / 2, 1.0, VOXEL))
-    return np.stack((x.ravel(), y.ravel(), np.full(x.size, z)), axis=1)
+    return tile((start, 0.0, z), (stop - start, 0.0, 0.0), (0.0, 1.0, 0.0), VOXEL)
 
 
 def two_sheets(empty: int, **settings) -> pcgraph.Segmentation:
@@ -64,14 +66,14 @@ def test_a_gap_costs_more_in_one_scan():
     points = np.concatenate((sheet(0.0, 1.0), sheet(1.0 + VOXEL, 2.0, VOXEL)))
     settings = {"voxel_size": VOXEL, "seed_size": 6 * VOXEL, "viewpoint": (1.0, 0.5, 5.0)}
     several = pcgraph.segment(points, range_growth=0.0, **settings)
-    one = dataclasses.replace(several.graph, gaps=dataclasses.replace(several.graph.gaps, of_one_scan=True))
-    assert not several.graph.gaps.of_one_scan
+    one = dataclasses.replace(several.graph, acquisition=Scanner(Told(), np.zeros(3), 0.5))
+    assert not several.acquisition.is_one_scan
     altitudes = [
         pcgraph.RegionLinkage(gap=gap).merges(graph, several.leaves).altitudes.max()
         for graph, gap in ((several.graph, 0.15), (one, 0.15), (several.graph, 0.45))
     ]
     assert altitudes[0] < altitudes[1] == pytest.approx(altitudes[2], abs=1e-5)
-    assert pcgraph.segment(points, range_growth=0.5, **settings).graph.gaps.of_one_scan
+    assert pcgraph.segment(points, range_growth=0.5, **settings).acquisition.is_one_scan
 
 
 def test_a_linkage_of_contacts_alone_merges_across_no_gap():
@@ -83,7 +85,7 @@ def test_gaps_are_those_of_a_search_of_all_pairs():
     points = np.concatenate((sheet(0.0, 1.0), sheet(1.1, 1.6), sheet(0.3, 0.9, 0.12), rng.uniform(0, 1.5, (40, 3))))
     result = pcgraph.segment(points, voxel_size=VOXEL, viewpoint=(1.0, 0.5, 5.0), range_growth=0.0)
     grid, labels = result.surface.grid, result.surface.supervoxels
-    found = gaps(result.surface, result.graph.node_features, result.graph.edges)
+    found = gaps(result.surface, result.graph.node_features, result.graph.edges, UnknownAcquisition(Told()))
     touching = {tuple(pair) for pair in result.graph.edges.tolist()}
     degree = np.diff(grid.indptr)
     a, b = np.tril_indices(grid.n_voxels, -1)
@@ -146,26 +148,9 @@ def test_between_two_voxels_is_seen_what_lies_farther_off_near_the_middle():
     assert not seen_through(view(places[0], places[:1], facing[:1]), one, one).any()
 
 
-def scan_of_cartons(seed, apart):
-    """Six equal cartons in a row before a wall, seen from a tripod at the origin: points, and the carton of each."""
-    rng = np.random.default_rng(seed)
-    up, around = np.meshgrid(np.radians(np.arange(-60, 20, 0.3)), np.radians(np.arange(20, 160, 0.3)))
-    rays = np.stack((np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)), axis=-1).reshape(-1, 3)
-    ranges = np.minimum(np.where(rays[:, 2] < 0.0, -1.7 / rays[:, 2], np.inf), 4.5 / rays[:, 1])
-    truth = np.full(len(rays), -1)
-    for k in range(6):
-        low = np.array([(k - 2.5) * (0.5 + apart) - 0.25, 3.25 + rng.normal(0.0, 0.004), -1.7])
-        ends = low / rays, (low + np.array([0.5, 0.5, 0.6])) / rays
-        entry, leave = np.minimum(*ends).max(axis=1), np.maximum(*ends).min(axis=1)
-        hit = (entry < leave) & (entry < ranges)
-        ranges[hit], truth[hit] = entry[hit], k
-    near = ranges < 8.0
-    return (rays * (ranges + rng.normal(0.0, 0.003, len(ranges)))[:, None])[near], truth[near]
-
-
 @pytest.mark.parametrize("seed", draws(14, 4))
 def test_equal_cartons_in_a_row_are_objects(seed):
     """Their tops lie in one plane, and merged across 15 cm at any price: all six were one object."""
-    points, truth = scan_of_cartons(seed, 0.15)
+    points, truth = cartons(seed, 0.15)
     labels = pcgraph.segment(points).labels
     assert len(np.unique([np.bincount(labels[truth == k]).argmax() for k in range(6)])) >= 5

@@ -8,20 +8,20 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from checks import SEEDS, assert_covered_and_connected
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from test_guarantees import assert_covered_and_connected
+from scenes.rooms import flat_ground, two_densities
 
 import pcgraph
+from pcgraph.acquisition.kinds import Scanner, Told, UnknownAcquisition
 from pcgraph.metrics import segmentation_covering
-from pcgraph.voxels.adapted_size import adapted_grading
+from pcgraph.voxelisation.adapted_size import adapted_grading
 from pcgraph.voxels.grading import BLOCK, Grading
 from pcgraph.voxels.grid import VoxelGrid, at_ends, grid_union, grid_without, voxel_grid, voxels_within
-from pcgraph.voxels.outliers import is_near
-from pcgraph.voxels.warp import Warp, choose_warp
-
-seeds = st.integers(0, 2**32 - 1)
+from pcgraph.voxels.outliers import far_from
+from pcgraph.voxels.warp import RangeWarp, Warp
 
 
 def graded(rng: np.random.Generator, n: int, far: float = 0.0) -> tuple[NDArray[np.float64], Grading]:
@@ -38,7 +38,7 @@ def corners(grid: VoxelGrid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=seeds, n=st.integers(1, 400), far=st.sampled_from([0.0, 7e6, -3e6]))
+@given(seed=SEEDS, n=st.integers(1, 400), far=st.sampled_from([0.0, 7e6, -3e6]))
 def test_voxels_that_touch_are_cubes_that_share_a_point(seed: int, n: int, far: float) -> None:
     points, grading = graded(np.random.default_rng(seed), n, far)
     grid = voxel_grid(points, 1.0, Warp(), grading)
@@ -65,7 +65,7 @@ def _first(grid: VoxelGrid, of_point: list[int]) -> NDArray[np.int64]:
 
 
 @settings(max_examples=40, deadline=None)
-@given(seed=seeds, n=st.integers(1, 300), later=st.booleans(), reach=st.sampled_from([1.0, 3.0, 6.0]))
+@given(seed=SEEDS, n=st.integers(1, 300), later=st.booleans(), reach=st.sampled_from([1.0, 3.0, 6.0]))
 def test_voxels_near_others_are_those_within_edges_of_the_larger_one(seed, n, later, reach):
     rng = np.random.default_rng(seed)
     points, grading = graded(rng, n)
@@ -83,7 +83,7 @@ def test_voxels_near_others_are_those_within_edges_of_the_larger_one(seed, n, la
 
 
 @settings(max_examples=20, deadline=None)
-@given(seed=seeds, n=st.integers(2, 300))
+@given(seed=SEEDS, n=st.integers(2, 300))
 def test_a_union_is_the_grid_of_all_points_and_levels_are_grids_of_their_own(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     points, grading = graded(rng, n)
@@ -111,28 +111,6 @@ def test_a_union_is_the_grid_of_all_points_and_levels_are_grids_of_their_own(see
 
 
 # --- where voxels are larger ---
-
-
-def plain(rng: np.random.Generator, n: int, low: tuple[float, float], high: tuple[float, float]) -> NDArray[np.float64]:
-    return np.column_stack((rng.uniform(low, high, (n, 2)), rng.normal(0.0, 0.002, n)))
-
-
-def two_densities(thinner: float, seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """A floor of 8 m x 4 m with a crate on either half, one half of it thinned."""
-    rng = np.random.default_rng(seed)
-    parts, truth = [plain(rng, 100_000, (0.0, 0.0), (8.0, 4.0))], [0]
-    for number, x in enumerate((1.6, 5.6)):
-        for axis in range(3):
-            for side in (0.0, 0.8):
-                face = rng.uniform(0.0, 0.8, (2500, 3))
-                face[:, axis] = side
-                if axis < 2 or side:
-                    parts.append(face + rng.normal((x, 1.6, 0.0), 0.002, face.shape))
-                    truth.append(number + 1)
-    points, labels = np.concatenate(parts), np.repeat(truth, [len(part) for part in parts])
-    under = (labels == 0) & (np.abs(points[:, 1] - 2.0) < 0.4) & (np.abs(points[:, 0] % 4.0 - 2.0) < 0.4)
-    kept = ~under & ((points[:, 0] < 4.0) | (rng.random(len(points)) < 1.0 / thinner))
-    return points[kept], labels[kept]
 
 
 @pytest.mark.parametrize("thinner", [8.0, 20.0, 40.0])
@@ -163,7 +141,8 @@ def test_what_is_near_counts_in_edges_of_the_larger_voxel() -> None:
     large = voxel_grid(np.array([[1.0, 1.0, 1.0]]), 1.0, Warp(), everywhere)
     for away, near in ((15.0, True), (23.9, True), (24.1, False)):
         small = voxel_grid(np.array([[1.0 + away, 1.0, 1.0]]), 1.0, Warp(), everywhere)
-        assert is_near(small, large)[0] == is_near(large, small)[0] == near
+        every = np.ones(1, np.bool_)
+        assert far_from(small, large, every)[0] == far_from(large, small, every)[0] == (not near)
 
 
 def test_where_points_lie_evenly_voxels_have_one_size() -> None:
@@ -179,27 +158,31 @@ def test_few_voxels_stay_small_where_some_of_them_are_joined() -> None:
     rng = np.random.default_rng(0)
     for n, is_graded in ((4_000, False), (40_000, True)):
         side = 0.05 * math.sqrt(n)
-        dense, thin = plain(rng, 8 * n, (0.0, 0.0), (side, side)), plain(rng, n // 2, (side, 0.0), (2.0 * side, side))
+        dense, thin = (
+            flat_ground(8 * n, (0.0, 0.0), (side, side), rng),
+            flat_ground(n // 2, (side, 0.0), (2.0 * side, side), rng),
+        )
         grid = voxel_grid(np.concatenate((dense, thin)), 0.05, Warp())
         assert 0.2 < np.mean(grid.joined[grid.centroids[:, 0] > side]) < 0.4
-        assert (adapted_grading(grid) is not None) == is_graded
+        assert (adapted_grading(grid, UnknownAcquisition(Told())) is not None) == is_graded
 
 
 def test_voxels_of_one_scan_grow_already() -> None:
     """With the distance, and what of it lies in rows far apart is no surface at any size."""
-    points = two_densities(20.0)[0]
-    scanned = choose_warp(points, np.array([2.0, 2.0, 1.0]), False, 0.5)
-    assert adapted_grading(voxel_grid(points, 0.05, scanned)) is None
-    assert adapted_grading(voxel_grid(points, 0.05, Warp())) is not None
+    points, place = two_densities(20.0)[0], np.array([2.0, 2.0, 1.0])
+    scanned = RangeWarp.about(points, place, 0.5)
+    scanner = Scanner(Told(), place, 0.5)
+    assert adapted_grading(voxel_grid(points, 0.05, scanned), scanner) is None
+    assert adapted_grading(voxel_grid(points, 0.05, Warp()), UnknownAcquisition(Told())) is not None
 
 
 def test_wires_and_strays_are_no_surfaces_at_any_size() -> None:
     rng = np.random.default_rng(0)
     wire = np.column_stack((rng.uniform(0.0, 40.0, 3000), np.zeros(3000), np.full(3000, 6.0)))
     strays = rng.uniform(-20.0, 20.0, (1000, 3))
-    floor = plain(rng, 60_000, (0.0, -3.0), (8.0, 3.0))
+    floor = flat_ground(60_000, (0.0, -3.0), (8.0, 3.0), rng)
     grid = voxel_grid(np.concatenate((floor, wire, strays)), 0.1, Warp())
-    assert adapted_grading(grid) is None
+    assert adapted_grading(grid, UnknownAcquisition(Told())) is None
 
 
 @pytest.mark.parametrize("apart", [0.5, 0.9, 1.4])
@@ -208,9 +191,9 @@ def test_wires_that_larger_voxels_would_join_are_no_surface(apart: float) -> Non
     wires = [
         np.column_stack((rng.uniform(0.0, 40.0, 3000), np.full(3000, apart * i), np.full(3000, 6.0))) for i in range(5)
     ]
-    floor = plain(rng, 120_000, (0.0, -3.0), (16.0, 3.0))
+    floor = flat_ground(120_000, (0.0, -3.0), (16.0, 3.0), rng)
     points, wire = np.concatenate((floor, *wires)), np.repeat(np.arange(-1, 5), [len(floor), *map(len, wires)])
-    assert adapted_grading(voxel_grid(points, 0.1, Warp())) is None
+    assert adapted_grading(voxel_grid(points, 0.1, Warp()), UnknownAcquisition(Told())) is None
     supervoxels = pcgraph.segment(points).supervoxels
     pairs = np.unique(np.column_stack((supervoxels, wire))[wire >= 0], axis=0)
     assert len(pairs) == len(np.unique(pairs[:, 0]))
@@ -233,7 +216,7 @@ def test_a_scan_joins_one_whose_voxels_have_several_sizes() -> None:
     rng = np.random.default_rng(2)
     chosen = rng.random(len(points)) < 0.5
     results = [pcgraph.segment(points[chosen])]
-    beside = plain(rng, 40_000, (8.0, 0.0), (12.0, 4.0))
+    beside = flat_ground(40_000, (8.0, 0.0), (12.0, 4.0), rng)
     for scan in (points[~chosen], beside):
         results.append(pcgraph.update(results[-1], scan))
         assert not results[-1].outliers.mean() > 0.002

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import SPACING, patch
+from scenes.surfaces import SPACING, patch
 
 import pcgraph
 from pcgraph.features.moments import moments_of_groups

@@ -10,8 +10,9 @@ from pathlib import Path
 import networkx as nx
 import numpy as np
 import pytest
-from clouds import two_boxes_on_a_plane
-from graphs import hand_graph
+from scenes.graphs import hand_graph
+from scenes.images import plate_before_a_wall
+from scenes.tables import two_boxes_on_a_plane
 from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
 
 import pcgraph
@@ -185,9 +186,7 @@ def test_graphs_without_edges(name, request, tmp_path):
 @pytest.fixture(scope="module")
 def plate():
     """A plate before a wall, as a camera sees it: segmentation and occlusions."""
-    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 64), np.linspace(-0.4, 0.4, 48))
-    depth = np.where((abs(x) < 0.15) & (abs(y) < 0.15), 0.8, 1.2)
-    result = pcgraph.segment(np.stack((x * depth, y * depth, depth), axis=-1))
+    result = pcgraph.segment(plate_before_a_wall())
     return result.graph, result.occlusions()
 
 

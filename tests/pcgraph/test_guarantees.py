@@ -7,47 +7,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from clouds import SPACING, patch, refines, same_partition, two_boxes_on_a_plane
+from checks import SEEDS, assert_covered_and_connected, refines, same_partition
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
+from scenes.surfaces import DEGENERATE, SPACING, patch
+from scenes.tables import two_boxes_on_a_plane
 
 import pcgraph
-from pcgraph.voxels.grid import voxel_grid
-
-
-def assert_covered_and_connected(points, result, outliers=0.01):
-    """Every finite point but outliers has a label; the voxels that hold points of a supervoxel are one piece."""
-    flat = np.asarray(points, float).reshape(-1, 3)
-    outlier = result.outliers.reshape(-1)
-    finite = np.isfinite(flat).all(axis=1)
-    assert np.array_equal(result.labels.reshape(-1) == -1, ~finite)
-    assert outlier.sum() < outliers * max(len(flat), 300)
-    finite &= ~outlier
-    for labels in (result.labels, result.supervoxels):
-        assert labels.dtype == np.int32
-        assert labels.shape == np.shape(points)[:-1]
-        assert np.array_equal(labels.reshape(-1) >= 0, finite)
-        assert np.bincount(labels[labels >= 0]).all()  # 0, 1, 2, ... with none left out
-    of_result = result.surface.grid
-    grid = voxel_grid(flat[finite], of_result.size, of_result.warp, of_result.grading)
-    leaf = result.supervoxels.reshape(-1)[finite]
-    # Of a voxel on a boundary the points may belong to several supervoxels: each of its shares is a piece.
-    owners = int(leaf.max()) + 1
-    shares = np.unique(grid.voxel_of_point.astype(np.int64) * owners + leaf)
-    voxel, owner = np.divmod(shares, owners)
-    assert np.array_equal(np.unique(voxel), np.arange(grid.n_voxels))
-    degrees = np.diff(grid.indptr)[voxel]
-    piece = np.repeat(np.arange(len(shares)), degrees)
-    within = np.arange(len(piece)) - np.repeat(np.cumsum(degrees) - degrees, degrees)
-    beside = grid.neighbours[grid.indptr[voxel[piece]] + within].astype(np.int64) * owners + owner[piece]
-    other = np.searchsorted(shares, beside).clip(max=len(shares) - 1)
-    linked = shares[other] == beside
-    links = (piece[linked], other[linked])
-    matrix = csr_array((np.ones(len(links[0])), links), shape=(len(shares),) * 2)
-    pieces, _ = connected_components(matrix, directed=False)
-    assert pieces == result.graph.n_nodes == leaf.max() + 1
 
 
 def test_every_point_is_covered_and_every_supervoxel_connected(boxes):
@@ -112,24 +78,6 @@ def test_organised_clouds_keep_their_shape_and_nan():
     assert np.array_equal(result.cut(n=2) < 0, result.labels < 0)
 
 
-DEGENERATE = {
-    "one point": np.array([[1.0, 2, 3]]),
-    "one point at the origin": np.zeros((1, 3)),
-    "two points": np.array([[0.0, 0, 1], [0, 0, 2]]),
-    "duplicates of one point": np.ones((50, 3)),
-    "duplicates of many": np.repeat(np.random.default_rng(0).random((40, 3)), 5, axis=0),
-    "a line": np.linspace((0, 0, 1), (1, 0, 1), 200),
-    "a line through the viewpoint": np.linspace((0, 0, 1), (0, 0, 2), 200),
-    "a flat square": patch((0, 0, 1), (0.5, 0, 0), (0, 0.5, 0)),
-    "a flat square seen edge on": patch((0.1, 0, 0), (0.5, 0, 0), (0, 0.5, 0)),
-    "whole numbers": np.arange(60).reshape(20, 3),
-    "scattered": np.random.default_rng(1).random((300, 3)),
-    "tiny": np.random.default_rng(1).random((30, 3)) * 1e-200,
-    "huge": np.random.default_rng(1).random((30, 3)) * 1e99,
-    "subnormal": np.full((5, 3), 5e-324),
-}
-
-
 @pytest.mark.parametrize("name", DEGENERATE)
 def test_degenerate_clouds_work(name):
     points = DEGENERATE[name]
@@ -148,7 +96,7 @@ def test_flat_square_is_one_object():
 
 @settings(max_examples=25, deadline=None)
 @given(
-    seed=st.integers(0, 2**32 - 1),
+    seed=SEEDS,
     n=st.integers(1, 120),
     levels=st.integers(1, 12),
     holes=st.booleans(),

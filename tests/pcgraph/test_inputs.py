@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clouds import two_boxes_on_a_plane
+from scenes.tables import two_boxes_on_a_plane
 
 import pcgraph
 from pcgraph.io.ply import encode_ply

@@ -11,18 +11,20 @@ import json
 
 import numpy as np
 import pytest
-from simulated_rooms import room
+from scenes.rooms import view_of_a_room
 
 import pcgraph
 from pcgraph import learning
 from pcgraph.learning import leaf_descriptors
 from pcgraph.learning.descriptors import _climb, _contact_means, _uniform_tops
 
+SHAPE = (120, 160)
+
 
 @pytest.fixture(scope="module")
 def rooms():
     """Segmentations, classes and up vectors of four simulated rooms."""
-    views = [room(seed, shape=(120, 160)) for seed in range(4)]
+    views = [view_of_a_room(seed, SHAPE) for seed in range(4)]
     results = [pcgraph.segment(view.points, view.colors) for view in views]
     return results, [view.classes for view in views], [view.up for view in views]
 
@@ -47,7 +49,7 @@ def test_probabilities_and_labels_lie_on_the_points(rooms):
     from sklearn.tree import DecisionTreeClassifier
 
     _, classes, ups = rooms
-    points = room(0, shape=(120, 160)).points
+    points = view_of_a_room(0, SHAPE).points
     points[10:14, 20:30] = np.nan
     holes = pcgraph.segment(points)
     taught = learning.NodeClassifier(DecisionTreeClassifier(random_state=0)).fit(holes, classes[0], ups[0])
@@ -131,7 +133,7 @@ def test_cross_validation_of_clouds_of_different_sizes(rooms):
     from sklearn.tree import DecisionTreeClassifier
 
     results, classes, _ = rooms
-    small = room(7, shape=(60, 80))
+    small = view_of_a_room(7, (60, 80))
     clouds, truths = [*results[:2], pcgraph.segment(small.points)], [*classes[:2], small.classes]
     scores = cross_val_score(
         learning.NodeClassifier(DecisionTreeClassifier()), clouds, truths, cv=3, error_score="raise"

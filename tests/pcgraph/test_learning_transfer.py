@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import patch
+from scenes.surfaces import patch
 
 import pcgraph
 from pcgraph.learning import propagation, supervoxels_at

@@ -11,17 +11,15 @@ from dataclasses import fields, replace
 import msgspec
 import numpy as np
 import pytest
-from clouds import box, patch
-from graphs import random_graph
+from scenes.graphs import random_graph
+from scenes.surfaces import patch
+from scenes.tables import VIEWPOINT, box
 
 import pcgraph
 from pcgraph.graph.adjacency import EdgeFeatures
 from pcgraph.tree.learned import EdgeModel, LearnedLinkage, edge_evidence, leaf_truth
 
 MODEL = EdgeModel(("concavity", "step_voxels"), (0.2, 1.0), (0.5, 2.0), (1.5, 0.25), -0.5, 0.4)
-
-
-VIEWPOINT = np.array([0.8, -1.0, 3.0])
 
 
 def _box_on_a_plane(shift=0.0):
@@ -31,7 +29,7 @@ def _box_on_a_plane(shift=0.0):
     hidden = (abs(plane[:, 0] - 0.7) < 0.2) & (plane[:, 1] > 0.4) & (plane[:, 1] < 1.0)
     points = np.vstack((plane[~hidden], on_top)) + shift
     truth = np.repeat([0, 1], [int((~hidden).sum()), len(on_top)])
-    return pcgraph.segment(points, viewpoint=VIEWPOINT + shift), truth
+    return pcgraph.segment(points, viewpoint=np.add(VIEWPOINT, shift)), truth
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +44,7 @@ def test_fitted_on_one_scene_it_finds_the_objects_of_another(boxes):
     for shift in (0.0, 0.011, 0.023, 0.037, 0.041, 0.053, 0.067):
         result, truth = _box_on_a_plane(shift)
         linkage = LearnedLinkage.fit([result], [truth])
-        found = pcgraph.segment(points + shift, viewpoint=VIEWPOINT + shift, linkage=linkage)
+        found = pcgraph.segment(points + shift, viewpoint=np.add(VIEWPOINT, shift), linkage=linkage)
         overlaps.append(pcgraph.metrics.weighted_overlap(found.labels, objects))
         assert 0.0 < linkage.default_part_altitude < linkage.default_object_altitude < 1.0
         assert found.tree.altitudes[np.isfinite(found.tree.altitudes)].max() <= 1.0

@@ -9,7 +9,7 @@ import networkx
 import numpy as np
 import pytest
 import scipy.cluster.hierarchy as scipy_hierarchy
-from graphs import edges_of, hand_graph, leaf_sets, random_graph, tree_of, unit_leaves
+from scenes.graphs import CHAIN, edges_of, hand_graph, leaf_sets, random_graph, tree_of, unit_leaves
 from scipy.spatial.distance import squareform
 
 from pcgraph.features.moments import moments_of_groups
@@ -18,8 +18,6 @@ from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage, normal_contrast, scal
 from pcgraph.tree.lccp import LccpLinkage
 from pcgraph.tree.least_increase import MumfordShahLinkage, Regions, WardLinkage, least_increase_linkage
 from pcgraph.tree.single_linkage import QuasiFlatLinkage, minimum_spanning_forest, single_linkage
-
-CHAIN = [[0, 1], [1, 2], [2, 3], [3, 4]]
 
 
 def value_regions(values, masses=None):

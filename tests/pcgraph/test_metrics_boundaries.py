@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from checks import SEEDS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -81,7 +82,7 @@ def test_duplicates_are_neighbours_of_each_other():
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(0, 2))
+@given(SEEDS, st.integers(0, 2))
 def test_laws(seed: int, hops: int):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(60, 3))

@@ -5,15 +5,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from checks import SEEDS
 from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from pcgraph import metrics
 
 Labels = NDArray[np.int64]
-seeds = st.integers(0, 2**32 - 1)
 random_cases = settings(max_examples=40, deadline=None)
 
 
@@ -23,7 +22,7 @@ def labelling(seed: int) -> tuple[Labels, Labels]:
     return rng.integers(0, found, n), rng.integers(0, true, n)
 
 
-@given(seeds)
+@given(SEEDS)
 @random_cases
 def test_scikit_learn_agrees(seed: int):
     cluster = pytest.importorskip("sklearn.metrics", reason="scikit-learn is in the test extra")
@@ -41,7 +40,7 @@ def test_scikit_learn_agrees(seed: int):
     assert halves.split == pytest.approx((1 - completeness) * entropy["found"], abs=1e-9)
 
 
-@given(seeds)
+@given(SEEDS)
 @random_cases
 def test_scikit_image_agrees(seed: int):
     image = pytest.importorskip("skimage.metrics", reason="scikit-image is in the test extra")
@@ -59,7 +58,7 @@ def test_scikit_image_agrees(seed: int):
         assert error == pytest.approx(1 - 2 * precision * recall / (precision + recall))
 
 
-@given(seeds)
+@given(SEEDS)
 @random_cases
 def test_dense_definitions_agree(seed: int):
     found, true = labelling(seed)
@@ -84,7 +83,7 @@ def test_dense_definitions_agree(seed: int):
     assert quality.matches.tolist() == [matches.sum()]
 
 
-@given(seeds)
+@given(SEEDS)
 @random_cases
 def test_refining_never_loses_what_segments_can_achieve(seed: int):
     coarse, true = labelling(seed)
@@ -102,7 +101,7 @@ def test_refining_never_loses_what_segments_can_achieve(seed: int):
     assert metrics.explained_variation(values, fine) >= metrics.explained_variation(values, coarse) - 1e-12
 
 
-@given(seeds)
+@given(SEEDS)
 @random_cases
 def test_names_of_labels_and_order_of_points_change_nothing(seed: int):
     found, true = labelling(seed)
@@ -112,7 +111,7 @@ def test_names_of_labels_and_order_of_points_change_nothing(seed: int):
     assert scores(found, names[true]) == pytest.approx(scores(found, true), abs=1e-12)
 
 
-@given(seeds)
+@given(SEEDS)
 @random_cases
 def test_the_truth_itself_scores_best(seed: int):
     _, true = labelling(seed)

@@ -7,6 +7,7 @@ import itertools
 
 import numpy as np
 import pytest
+from checks import SEEDS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ LEAVES = np.array([0, 0, 1, 1, 2, 2, 2, 2])
 TRUTH = np.array([7, 7, 7, 9, 9, 9, 9, 9])  # cells: 0-7 2, 1-7 1, 1-9 1, 2-9 4
 
 SCORES = {score.name: score for score in LEVEL_SCORES.values()}
-seeds = st.integers(0, 2**32 - 1)
 
 
 def test_level_curve_by_hand():
@@ -106,7 +106,7 @@ def cut_at(parents: NDArray[np.int64], altitudes: NDArray[np.float64], height: f
 
 
 @pytest.mark.parametrize("score", SCORES)
-@given(seeds)
+@given(SEEDS)
 @settings(max_examples=30, deadline=None)
 def test_every_level_scores_as_its_labelling_does(score: str, seed: int):
     tree = parents, altitudes = random_tree(seed)
@@ -128,7 +128,7 @@ def all_cuts(parents: NDArray[np.int64], node: int) -> list[tuple[int, ...]]:
     return [(node,), *parts]
 
 
-@given(seeds)
+@given(SEEDS)
 @settings(max_examples=30, deadline=None)
 def test_no_cut_is_better_than_the_curve_and_the_oracle(seed: int):
     tree = parents, _ = random_tree(seed % 1000)
@@ -150,7 +150,7 @@ def test_no_cut_is_better_than_the_curve_and_the_oracle(seed: int):
         assert found == pytest.approx(least)
 
 
-@given(seeds)
+@given(SEEDS)
 @settings(max_examples=30, deadline=None)
 def test_purity_is_the_mean_over_all_pairs(seed: int):
     tree = parents, _ = random_tree(seed)
@@ -166,7 +166,7 @@ def test_purity_is_the_mean_over_all_pairs(seed: int):
     assert metrics.dendrogram_purity(tree, leaves, truth) == pytest.approx(np.mean(fractions) if fractions else 1.0)
 
 
-@given(seeds, st.integers(0, 2))
+@given(SEEDS, st.integers(0, 2))
 @settings(max_examples=30, deadline=None)
 def test_boundaries_of_every_level_are_those_of_its_labelling(seed: int, hops: int):
     tree = parents, altitudes = random_tree(seed)

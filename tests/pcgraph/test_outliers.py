@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import patch, two_boxes_on_a_plane
-from numpy.typing import NDArray
+from scenes.rooms import twenty_boxes
+from scenes.tables import two_boxes_on_a_plane
 from tiers import to_validate
 
 import pcgraph
@@ -55,31 +55,12 @@ def test_noise_through_the_volume_is_no_object(clean, fraction):
     assert f"{outliers.sum()} outliers" in repr(result)
 
 
-def room_with_boxes(step: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points, nearly a lattice, on the floor and four walls of a room of 6 m and on twenty boxes; which each is on."""
-    rng = np.random.default_rng(0)
-    parts = [patch((0, 0, 0), (6, 0, 0), (0, 5, 0), step)]
-    for corner in ((0, 0, 0), (0, 5, 0)):
-        parts.append(patch(corner, (6, 0, 0), (0, 0, 2.5), step))
-    for corner in ((0, 0, 0), (6, 0, 0)):
-        parts.append(patch(corner, (0, 5, 0), (0, 0, 2.5), step))
-    for x in 0.5 + 1.1 * np.arange(5):
-        for y in 0.5 + np.arange(4):
-            s = rng.uniform(0.25, 0.4)
-            sides = [patch((x, y, s), (s, 0, 0), (0, s, 0), step)]
-            sides += [patch((x, other, 0), (s, 0, 0), (0, 0, s), step) for other in (y, y + s)]
-            sides += [patch((other, y, 0), (0, s, 0), (0, 0, s), step) for other in (x, x + s)]
-            parts.append(np.concatenate(sides))
-    points, on = np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    return points + rng.normal(0.0, 0.1 * step, points.shape), on
-
-
 @pytest.mark.parametrize(("step", "fraction"), [(0.05, 0.2), *to_validate((0.03, 0.8), (0.05, 0.5), (0.05, 0.7))])
 def test_noise_makes_voxels_no_larger_than_surfaces_need(step, fraction):
     """What large voxels kept of it beside surfaces forbade smaller ones, and so dense that it was no sparser than the
     surfaces it stayed as a whole: coverings of 0.81, 0.93, 0.17 and 0.17, with up to 111 objects for 25.
     """
-    points, truth = room_with_boxes(step)
+    points, truth = twenty_boxes(step)
     noise = np.random.default_rng(9).uniform((0, 0, 0), (6.0, 5.0, 3.0), (int(fraction * len(points)), 3))
     before, result = pcgraph.segment(points), pcgraph.segment(np.concatenate((points, noise)))
     assert result.voxel_size == pytest.approx(before.voxel_size, rel=0.1)

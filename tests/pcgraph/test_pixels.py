@@ -5,34 +5,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scenes.images import VGA, floor_wall_and_boxes
+from scenes.rays import turning
 from scipy.spatial.transform import Rotation
 
 import pcgraph
+from pcgraph.acquisition.pixels import with_pixels
+from pcgraph.acquisition.resection import NO_PLANE, resection
 from pcgraph.inputs import clean_cloud
 from pcgraph.metrics import weighted_overlap
-from pcgraph.pixels import with_pixels
-from pcgraph.resection import NO_PLANE, resection
-
-FOCAL = 250.0  # pixels
-
-
-def depth_image(seed, shape=(240, 320), noise=0.002, step=0.0):
-    """Points of a camera, (h, w, 3), that sees a floor, a wall and three boxes, and which of these, (h, w).
-
-    Depths have noise, of inverse depth, and steps of it, 1/metres.
-    """
-    rng, (h, w) = np.random.default_rng(seed), shape
-    y, x = (np.mgrid[:h, :w] + 0.5 - np.array([h, w]).reshape(2, 1, 1) / 2.0) / FOCAL
-    inverse = np.stack((np.full(shape, 1.0 / 3.0), np.maximum(y, 0.0) / 0.8))
-    truth = inverse.argmax(axis=0)
-    inverse = inverse.max(axis=0)
-    for number in range(3):
-        left, top, depth = rng.uniform(-0.5, 0.3), rng.uniform(-0.3, 0.1), rng.uniform(1.2, 2.2)
-        box = (x > left) & (x < left + 0.25) & (y > top) & (y < top + 0.3) & (inverse < 1.0 / depth)
-        inverse[box], truth[box] = (1.0 + 0.2 * (x - left)[box]) / depth, 2 + number
-    inverse = inverse + noise * rng.normal(size=shape)
-    inverse = np.round(inverse / step) * step if step else inverse
-    return np.stack((x, y, np.ones(shape)), axis=-1) / inverse[..., None], truth
 
 
 def in_world(points, seed):
@@ -49,7 +30,7 @@ def image_of(points):
 @pytest.mark.parametrize("noise", [1e-5, 0.0005, 0.003])
 @pytest.mark.parametrize("seed", range(6))
 def test_a_list_tells_the_camera_that_took_it(seed, noise):
-    image, _ = depth_image(seed, noise=noise)
+    image, _ = floor_wall_and_boxes(seed, noise=noise)
     points, place, axis = in_world(image.reshape(-1, 3), seed)
     kept = np.random.default_rng(seed).permutation(len(points))[: int(0.9 * len(points))]
     found = image_of(points[kept])
@@ -66,7 +47,7 @@ def test_a_list_tells_the_camera_that_took_it(seed, noise):
 @pytest.mark.parametrize("seed", range(4))
 def test_steps_of_depth_do_not_deceive(seed):
     """Where inverse depth comes in steps, a pixel more for each of them is a whole number of pixels, too."""
-    image, _ = depth_image(seed, noise=1.4e-3, step=2.85e-3)
+    image, _ = floor_wall_and_boxes(seed, noise=1.4e-3, step=2.85e-3)
     points, place, axis = in_world(image.reshape(-1, 3), seed)
     found = image_of(points)
     assert np.allclose(found.view.place, place, atol=1e-3)
@@ -76,7 +57,7 @@ def test_steps_of_depth_do_not_deceive(seed):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_list_in_a_world_frame_has_the_objects_of_its_image_in_any_order(seed):
-    image, truth = depth_image(seed, noise=0.002)
+    image, truth = floor_wall_and_boxes(seed, noise=0.002)
     points, place, _ = in_world(image.reshape(-1, 3), seed)
     as_image = pcgraph.segment(points.reshape(image.shape))
     as_list = pcgraph.segment(points)
@@ -97,7 +78,7 @@ def test_a_list_in_a_world_frame_has_the_objects_of_its_image_in_any_order(seed)
 @pytest.mark.parametrize(("rows", "columns"), [(4, 1), (1, 4), (6, 1), (1, 6)])
 @pytest.mark.parametrize("seed", range(6))
 def test_surfaces_are_whole_whatever_the_shape_of_pixels(seed, rows, columns):
-    points, truth = depth_image(seed, (480, 640))
+    points, truth = floor_wall_and_boxes(seed, VGA)
     result = pcgraph.segment(points[::rows, ::columns])
     assert len(np.unique(result.labels)) <= 6  # wall, floor, boxes, and what flies
     assert weighted_overlap(result.labels, truth[::rows, ::columns]) > 0.9
@@ -105,13 +86,13 @@ def test_surfaces_are_whole_whatever_the_shape_of_pixels(seed, rows, columns):
 
 @pytest.mark.parametrize("unit", [2.0**-20, 1e-3, 1000.0, 2.0**40])
 def test_no_unit_hides_a_camera(unit):
-    image, _ = depth_image(0)
+    image, _ = floor_wall_and_boxes(0)
     points, place, _ = in_world(image.reshape(-1, 3), 1)
     assert np.allclose(image_of(points.astype(np.float64) * unit).view.place / unit, place, atol=1e-4)
 
 
 def test_a_camera_in_coordinates_of_a_map_is_found():
-    image, _ = depth_image(1)
+    image, _ = floor_wall_and_boxes(1)
     turn = Rotation.from_euler("xyz", (1.9, 0.1, 0.7)).as_matrix()
     place = np.array([5e5, 5e6, 100.0])
     assert np.allclose(image_of(image.reshape(-1, 3) @ turn.T + place).view.place, place, atol=1e-4)
@@ -119,13 +100,13 @@ def test_a_camera_in_coordinates_of_a_map_is_found():
 
 def no_images():
     rng = np.random.default_rng(0)
-    image, _ = depth_image(0)
+    image, _ = floor_wall_and_boxes(0)
     rays, turn = image.reshape(-1, 3), Rotation.from_rotvec((0.5, 1.0, -0.3)).as_matrix()
     x, y = np.meshgrid(np.arange(120) * 0.02, np.arange(100) * 0.02)
     height = 0.3 * np.sin(3.0 * x) * np.cos(2.0 * y)
-    azimuth, elevation = np.meshgrid(np.linspace(0.0, 6.28, 500, endpoint=False), np.linspace(-0.4, 0.3, 64))
-    sweep = np.stack((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)), -1)
-    ranges = np.minimum(1.5 / np.maximum(-sweep[..., 2], 1e-9), 8.0 + np.cos(3.0 * azimuth))
+    azimuths = np.linspace(0.0, 6.28, 500, endpoint=False)
+    sweep = turning(np.linspace(-0.4, 0.3, 64), azimuths)
+    ranges = np.minimum(1.5 / np.maximum(-sweep[:, 2], 1e-9), np.tile(8.0 + np.cos(3.0 * azimuths), 64))
     return {
         "two cameras": np.concatenate((rays, rays @ turn.T + (0.5, 0.1, 0.0))),
         "one point more": np.concatenate((rays, rays[:1] + 0.003)),
@@ -137,7 +118,7 @@ def no_images():
         * 0.001,
         "cells of a voxel grid": np.unique(np.rint(rays / 0.02), axis=0) * 0.02,
         "a block of cells": np.stack(np.meshgrid(*[np.arange(16.0)] * 3), axis=-1).reshape(-1, 3),
-        "a sweep": (sweep * ranges[..., None]).reshape(-1, 3),
+        "a sweep": sweep * ranges[:, None],
         "a plane without noise": (rays / (1.0 + 0.3 * rays[:, :1] / rays[:, 2:]) / rays[:, 2:]),
         "points at random": rng.uniform(size=(20000, 3)),
         "a line": np.outer(np.arange(3000.0), (1.0, 2.0, 3.0)),

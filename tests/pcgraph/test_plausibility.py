@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import two_boxes_on_a_plane
+from scenes.tables import two_boxes_on_a_plane
 
 import pcgraph
 from pcgraph import CloudWarning

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
-from test_guarantees import assert_covered_and_connected
+from checks import assert_covered_and_connected
 
 import pcgraph
 

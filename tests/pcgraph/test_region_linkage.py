@@ -4,17 +4,23 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
-from clouds import two_boxes_on_a_plane
-from graphs import random_graph
+from scenes.graphs import random_graph
+from scenes.tables import two_boxes_on_a_plane
 from scipy.spatial.transform import Rotation
 from tiers import draws
 
 import pcgraph
-from pcgraph.tree.region_linkage import MergeEdges, RegionLinkage, region_linkage
+from pcgraph.acquisition.kinds import Told, UnknownAcquisition
+from pcgraph.tree.region_linkage import AltitudeConstants, MergeEdges, RegionLinkage, region_linkage
+
+K = AltitudeConstants()
 
 
 @pytest.mark.parametrize(("known", "side"), [(True, 1.0), (True, -1.0), (False, 1.0), (False, -1.0)])
@@ -39,7 +45,7 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     unit = float(np.median(graph.edge_features.voxel_edge))
     leaves.scatters[grown.argmax()] += uneven * unit**2 * grown.max() * np.eye(3)
     nodes = replace(graph.node_features, normal=_normals_towards_the_smaller(leaves, side))
-    graph = replace(graph, node_features=nodes, sides_known=known)
+    graph = replace(graph, node_features=nodes, acquisition=UnknownAcquisition(Told(normals=known)))
     leaves = replace(
         leaves, normals=nodes.normal * [[1.0], [0.95]], colors=np.array([[0.9, 0.2, 0.1], [0.5, 0.3, 0.3]])
     )
@@ -57,25 +63,35 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     increase, length = residual(union) - residual(a) - residual(b), weight / 2
     square = color**2 * (0.4**2 + 0.1**2 + 0.2**2)
     increase += n[0] * n[1] / n.sum() / mean * square
-    least = 0.3 * n.min() / mean * (residual(leaves.scatters[n.argmax()]) / (n.max() / mean) - 2.0)
+    least = K.e1 * n.min() / mean * (residual(leaves.scatters[n.argmax()]) / (n.max() / mean) - K.q0)
     assert (least > increase) == (uneven > 0.0)
     increase = max(increase, least)
-    scale, width = increase / length, 7.7 * math.sqrt(n.min() / mean)
+    scale, width = increase / length, K.width * math.sqrt(n.min() / mean)
     stands_out = relief * _relief(leaves, unit, length, width) if side > 0.0 or not known else 0.0
-    smooth = 1.0 / (1.0 + (0.05 / 0.03) ** 2)
-    if side > 0.0 and times_as_large > 2:
-        stands_out += 9.0 * max(cost - 0.3, 0.0) * smooth * n.min() / (n.min() + 10.0 * mean)
-    evidence = cost + stands_out + 0.08 + 0.04 * math.log(1 + scale / 0.1)
+    smooth = 1.0 / (1.0 + (0.05 / K.v1) ** 2)
+    if side > 0.0 and times_as_large > K.r1:
+        stands_out += K.h1 * max(cost - K.h0, 0.0) * smooth * n.min() / (n.min() + K.m2 * mean)
+    evidence = cost + stands_out + K.c0 + K.c1 * math.log(1 + scale / K.l0)
     shortness = (width / (length + width)) ** 0.75
-    steep = max(cost - 0.45, 0.0) * max(0.5 - shortness, 0.0) * smooth
+    steep = max(cost - K.c2, 0.0) * max(K.s0 - shortness, 0.0) * smooth
     assert cost < 1.0 or steep > 0.05
-    of_colors = 8.0 * cost * (1.0 - shortness) * square / (1.0 + square) * n.min() / (n.min() + 10.0 * mean)
+    of_colors = K.k1 * cost * (1.0 - shortness) * square / (1.0 + square) * n.min() / (n.min() + K.m2 * mean)
     evidence = evidence * shortness + steep + of_colors
-    weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1))
-    weighed *= (1.0 + n.max() / (100.0 * n.min())) ** 0.25 * n.min() / (n.min() + 0.1 * mean)
+    weighed = increase / (increase + K.e0) * math.sqrt(scale / (scale + K.l0))
+    weighed *= (1.0 + n.max() / (K.r * n.min())) ** 0.25 * n.min() / (n.min() + K.m0 * mean)
     assert found == pytest.approx(evidence * weighed, rel=1e-5, abs=2e-6)
     assert found > 1e-3
     assert relief < 1000.0 or (known and side < 0.0) or stands_out > 0.1 * evidence
+
+
+def test_the_documentation_has_the_constants():
+    text = (Path(__file__).parents[2] / "docs" / "pcgraph_method.md").read_text(encoding="utf-8")
+    table = text[text.index("| constant | | constant |") : text.index("- *Concavity*")]
+    found = {
+        name: float(Fraction(value)) for name, value in re.findall(r"\| (\w\d?) \| ([\d./]+)(?: rad)? (?=\|)", table)
+    }
+    assert found == {name: getattr(K, name) for name in found}
+    assert set(found) == {"c0", "c1", "c2", "k1", "s0", "v1", "e0", "e1", "q0", "l0", "r", "m0", "m2"}
 
 
 def _normals_towards_the_smaller(leaves, side):
@@ -92,9 +108,9 @@ def _relief(leaves, unit, length, width):
     normal = np.linalg.eigh(leaves.scatters[large])[1][:, 0] / unit
     square = float(normal @ (leaves.centroids[small] - leaves.centroids[large])) ** 2
     across = [float(normal @ leaves.covariances[region] @ normal) for region in (small, large)]
-    noise = 4.0 * across[0] + across[1] + 0.075
-    around = min(length / (3.5 * width), 1.0) ** 2 * max(1.0 - 2.0 * m / larger, 0.0) * m / (m + 10.0)
-    return around / (1.0 + (noise / square) ** 8) / (1.0 + square / 9.0)
+    noise = 4.0 * across[0] + across[1] + K.v0
+    around = min(length / (K.b1 * width), 1.0) ** 2 * max(1.0 - K.r1 * m / larger, 0.0) * m / (m + K.m2)
+    return around / (1.0 + (noise / square) ** 8) / (1.0 + square / K.d1**2)
 
 
 def _wall(height, slope=None):
@@ -130,7 +146,7 @@ def test_turning_a_sheet_seen_from_who_knows_where_changes_no_object(turn):
     """Which of its sides is the outer one, nothing tells."""
     points, truth = _wall(0.02)
     found = pcgraph.segment(points @ Rotation.from_euler("x", turn, degrees=True).as_matrix().T)
-    assert not found.graph.sides_known
+    assert not found.acquisition.sides_known
     assert pcgraph.metrics.segmentation_covering(found.labels, truth) > 0.97
 
 

@@ -5,27 +5,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scenes.rooms import furniture, furniture_in_rings
+from scenes.streets import ground_and_wall, ground_before_a_ramp, height_before_a_ramp
+from scenes.surfaces import random_turn
+from scenes.tables import image_of_a_table
 from scipy.optimize import approx_fprime
-from scipy.spatial.transform import Rotation
-from test_visibility import (
-    image_of_a_table,
-    ranges_with_box,
-    rays_at,
-    scanned_furniture,
-    scanned_scene,
-)
 from tiers import draws
 
 import pcgraph
-from pcgraph.voxels.rings import Rows, _slopes, scanner_of_rings
-from pcgraph.voxels.spacing import spacing_and_rows
-from pcgraph.voxels.spacing_law import law_on_rings, spacing_law
+from pcgraph.acquisition.rings import _slopes, scanner_of_rings
+from pcgraph.acquisition.spacing_law import law_on_rings, spacing_law
+from pcgraph.voxels.spacing import Rows, spacing_and_rows
 
 NOWHERE = np.zeros((1, 3))
-
-
-def turned(seed):
-    return Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
 
 
 def tangents_of_rings(seed, noise=0.0):
@@ -48,7 +40,7 @@ def test_rings_do_not_slope_against_the_cones_of_their_scanner():
 
 def test_derivatives_of_slopes():
     rng = np.random.default_rng(0)
-    rows, frame = tangents_of_rings(0, 0.3), turned(0)
+    rows, frame = tangents_of_rings(0, 0.3), random_turn(0)
     for unknown in rng.normal(0.0, 0.3, (5, 5)):
         numbers = approx_fprime(unknown, lambda other: _slopes(rows, frame, other)[0], 1e-7)
         assert _slopes(rows, frame, unknown)[1] == pytest.approx(numbers, abs=3e-5)
@@ -57,7 +49,7 @@ def test_derivatives_of_slopes():
 @pytest.mark.parametrize("seed", draws(8))
 def test_rings_tell_place_and_axis(seed):
     """However the scanner is tilted, in any unit, and with an eighth of the rows across its rings."""
-    rows, turn, unit = tangents_of_rings(seed, 0.003), turned(seed), 10.0 ** (20 * seed - 80)
+    rows, turn, unit = tangents_of_rings(seed, 0.003), random_turn(seed), 10.0 ** (20 * seed - 80)
     across = np.random.default_rng(seed).normal(0.0, 1.0, (37, 3))
     directions = rows.directions.copy()
     directions[:37] = across / np.linalg.norm(across, axis=1)[:, None]
@@ -84,24 +76,10 @@ def test_what_is_on_no_scanners_rings_tells_nothing():
     assert scanner_of_rings(Rows(*np.empty((2, 0, 3))), NOWHERE) is None
 
 
-def furniture_in_rings(seed, n_beams):
-    """Furniture in a room as so many beams within 30 degrees see it, 0.2 degrees apart along each; 1 cm of noise."""
-    rng = np.random.default_rng(seed)
-    rays = rays_at(np.radians(np.linspace(-15.0, 15.0, n_beams)), np.radians(np.arange(0.1, 360.0, 0.2)))
-    place, size = np.array([2.2, 1.7, 1.2]), np.array([6.0, 5.0, 2.6])
-    ranges = (np.where(rays > 0, size - place, -place) / rays).min(axis=1)
-    for _ in range(6):
-        low = np.append(rng.uniform(0.0, size[:2] - 1.0), 0.0)
-        high = low + rng.uniform(0.4, 1.5, 3)
-        ranges = ranges_with_box(ranges, rays, low - place, high - place, nearest=0.5)
-    ranges += rng.normal(0.0, 0.01, ranges.shape)
-    return rays * ranges[:, None] + place, place
-
-
 @pytest.mark.parametrize("seed", draws(8))
 def test_a_scanner_of_few_beams_is_found(seed):
     """Spacing alone puts it off by half the median range."""
-    turn = turned(seed)
+    turn = random_turn(seed)
     points, place = furniture_in_rings(seed, 16 if seed % 2 else 32)
     moved = points @ turn.T + 100.0
     result = pcgraph.segment(moved)
@@ -122,7 +100,7 @@ def test_the_law_says_that_it_was_told_by_rings():
 
 def test_other_scans_are_left_to_their_spacing():
     """Images have rows, too, and a scanner with as many rows as columns has none."""
-    for points in (image_of_a_table(0), scanned_furniture(0)[0], scanned_scene()):
+    for points in (image_of_a_table(0), furniture(0).points, ground_and_wall()):
         law = spacing_law(points)
         assert law_on_rings(points, law, spacing_and_rows(points)[1]) is law
 
@@ -133,24 +111,6 @@ def test_rows_are_free_of_order():
     assert one[0] == other[0]
     assert one[1].points.tobytes() == other[1].points.tobytes()
     assert len(one[1].points) > 400
-
-
-def ground_before_a_ramp(seed, beams, tilt, slope):
-    """Street of 30 m width whose ground rises by a slope from 10 m on, and a scanner 1.8 m above it, 2 cm of noise.
-
-    Points, the place, and the height of the ground below each x.
-    """
-    rng, place = np.random.default_rng(seed), np.array([0.0, 0.0, 1.8])
-    rays = rays_at(np.radians(beams), np.radians(np.arange(0.1, 360.0, 0.2)))
-    rays = rays @ Rotation.from_euler("y", tilt, degrees=True).as_matrix().T
-    with np.errstate(divide="ignore"):
-        level, walls = -1.8 / rays[:, 2], 15.0 / np.abs(rays[:, 1])
-        ramp = (-1.8 - 10.0 * slope) / (rays[:, 2] - slope * rays[:, 0])
-    level = np.where((level > 0.0) & (level * rays[:, 0] < 10.0), level, np.inf)
-    ramp = np.where((ramp > 0.0) & (ramp * rays[:, 0] >= 10.0), ramp, np.inf)
-    ranges = np.minimum(np.minimum(level, ramp), walls) + rng.normal(0.0, 0.02, len(rays))
-    points = (rays * ranges[:, None])[ranges < 80.0] + place
-    return points, place, lambda x: slope * np.maximum(x - 10.0, 0.0)
 
 
 @pytest.mark.parametrize("given", [False, True])
@@ -166,13 +126,13 @@ def ground_before_a_ramp(seed, beams, tilt, slope):
 def test_the_ground_is_seen_from_above(beams, tilt, slope, given):
     """Far off, rays meet it at two degrees, of which noise of the normals takes a good part; it may rise above the
     scanner, and that may be tilted."""
-    points, place, height = ground_before_a_ramp(0, beams, tilt, slope)
-    turn, shift = turned(1), np.array([7.0, -4.0, 30.0])
+    points, place = ground_before_a_ramp(0, beams, tilt, slope)
+    turn, shift = random_turn(1), np.array([7.0, -4.0, 30.0])
     result = pcgraph.segment(points @ turn.T + shift, viewpoint=turn @ place + shift if given else None)
     assert np.linalg.norm(result.viewpoint - shift - turn @ place) < 0.05  # m
     where = (result.surface.grid.centroids - shift) @ turn
     upwards = (result.surface.normals @ turn)[:, 2]
-    on_ground = (np.abs(where[:, 2] - height(where[:, 0])) < 0.25) & (np.abs(where[:, 1]) < 14.5)
+    on_ground = (np.abs(where[:, 2] - height_before_a_ramp(where[:, 0], slope)) < 0.25) & (np.abs(where[:, 1]) < 14.5)
     assert (upwards[on_ground & (np.abs(upwards) > 0.9)] > 0.0).mean() > 0.98
 
 
@@ -182,5 +142,5 @@ def test_circles_about_an_axis_are_no_rings():
     circle = np.stack((np.cos(angles), np.sin(angles), np.zeros(500)), axis=1)
     for heights in (2.0 - 2.0 * radii, -np.sqrt(1.0 - radii**2), 0.3 * radii, 0.0 * radii):
         rings = radii[:, None, None] * circle + heights[:, None, None] * (0.0, 0.0, 1.0)
-        points = rings.reshape(-1, 3) @ turned(0).T + 2.0
+        points = rings.reshape(-1, 3) @ random_turn(0).T + 2.0
         assert law_on_rings(points, spacing_law(points), spacing_and_rows(points)[1]).axis is None

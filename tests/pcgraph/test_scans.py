@@ -5,22 +5,23 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import patch, same_partition, two_boxes_on_a_plane
-from scanned_scenes import scan, sphere_of_rays
-from scanned_streets import CAR, street
+from checks import assert_covered_and_connected, overlaps, same_partition
+from scenes.images import FRAMES, QVGA, VGA, at_depths, boards_with_mixed_edges, hall, stairs
+from scenes.rays import camera, pinhole, to_plane, turning
+from scenes.streets import lot, rings_of_ground
+from scenes.surfaces import patch
+from scenes.tables import two_boxes_on_a_plane
 from scipy.spatial.transform import Rotation
-from scores import mean_overlap
-from test_guarantees import assert_covered_and_connected
 from tiers import draws
 
 import pcgraph
-from pcgraph.depth_image import DepthImage, image_view
+from pcgraph.acquisition.depth_image import DepthImage, image_view
+from pcgraph.acquisition.pixels import with_pixels
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.inputs import clean_cloud
 from pcgraph.metrics import weighted_overlap
-from pcgraph.pixels import with_pixels
 from pcgraph.voxels.spacing import median_spacing
-from pcgraph.voxels.warp import CameraWarp, RangeWarp, choose_warp, warped_normal
+from pcgraph.voxels.warp import CameraWarp, RangeWarp, warped_normal
 
 
 def plate():
@@ -96,12 +97,13 @@ def test_sides_are_known_where_all_scans_tell_them():
     told, by_normals, bare = (
         pcgraph.segment(points, **given) for given in ({"viewpoint": seen_from}, {"normals": normals}, {})
     )
-    assert [result.graph.sides_known for result in (told, by_normals, bare)] == [True, True, False]
+    assert [result.acquisition.sides_known for result in (told, by_normals, bare)] == [True, True, False]
     after = [
-        pcgraph.update(first, points + 1.0, normals=normals).graph.sides_known for first in (told, by_normals, bare)
+        pcgraph.update(first, points + 1.0, normals=normals).acquisition.sides_known
+        for first in (told, by_normals, bare)
     ]
     assert after == [True, True, False]
-    assert not pcgraph.update(told, points + 1.0).graph.sides_known
+    assert not pcgraph.update(told, points + 1.0).acquisition.sides_known
 
 
 def test_an_image_takes_a_viewpoint_per_pixel():
@@ -117,26 +119,17 @@ def test_an_image_takes_a_viewpoint_per_pixel():
 
 
 def test_an_image_may_grow_with_range():
-    rows, columns = np.mgrid[0:40, 0:50]
-    points = np.stack(((columns - 25) / 50, (rows - 20) / 50, np.ones((40, 50))), axis=-1) * (
-        1.0 + columns[..., None] / 25
-    )
+    points = at_depths((40, 50), 50.0, np.tile(1.0 + np.arange(50) / 25, (40, 1)))
     result = pcgraph.segment(points, range_growth=0.5)
     assert not result.camera
     assert np.ptp(result.surface.grid.edge_lengths) > 0.1 * result.voxel_size
-
-
-def image_of_steps(height=60, width=80):
-    """A floor before a camera, with steps in depth, (height, width, 3)."""
-    u, v = np.meshgrid((np.arange(width) - width / 2) / width, (np.arange(height) + 1) / height)
-    return np.stack((u, v, np.ones_like(u)), axis=-1) * (1.0 / (v + 0.2) + (u > 0.1))[..., None]
 
 
 @pytest.mark.parametrize(
     "moved", ["as it is", "mirrored", "on its side", "upside down", "half missing", "a row", "a column"]
 )
 def test_what_is_in_the_order_of_its_rays_is_an_image(moved):
-    image = image_of_steps()
+    image = stairs()
     half = np.where(np.random.default_rng(0).random((*image.shape[:2], 1)) < 0.5, np.nan, image)
     clouds = {
         "as it is": image,
@@ -163,7 +156,7 @@ def test_an_image_in_another_frame_was_seen_from_its_camera(rooms):
 
 def test_an_image_in_another_frame_that_is_said_to_be_a_cameras_is_the_one_that_is_found():
     """It was refused, as no point of another frame need lie before the origin."""
-    image = image_of_steps()
+    image = stairs()
     turn = Rotation.random(random_state=1).as_matrix()
     moved, place = image @ turn.T + (1.0, 2.0, 3.0), np.array([1.0, 2.0, 3.0])
     found = pcgraph.segment(moved)
@@ -174,7 +167,7 @@ def test_an_image_in_another_frame_that_is_said_to_be_a_cameras_is_the_one_that_
 
 
 def test_an_image_whose_viewpoint_is_given_is_the_one_that_is_found():
-    points, walls = image_of_a_hall(5.0, 1.4e-3, 2.85e-3)
+    points, walls = hall(5.0, 1.4e-3, 2.85e-3)
     world = points[..., [0, 2, 1]] * [1.0, 1.0, -1.0] + [3.0, 2.0, 1.2]
     found, given = pcgraph.segment(world), pcgraph.segment(world, viewpoint=[3.0, 2.0, 1.2])
     assert given.voxel_size == pytest.approx(found.voxel_size, rel=1e-6)
@@ -182,14 +175,14 @@ def test_an_image_whose_viewpoint_is_given_is_the_one_that_is_found():
 
 
 def test_an_image_in_coordinates_of_a_map_was_not_seen_from_their_origin():
-    points, _ = image_of_a_hall(4.0)
+    points, _ = hall(4.0)
     on_map = points[..., [0, 2, 1]] * [1.0, 1.0, -1.0] + [5e5, 5e6, 100.0]  # the camera looks north
     assert np.allclose(image_view(clean_cloud(on_map, None, None)).place, [5e5, 5e6, 100.0], atol=1e-3)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_edges_along_one_axis_of_an_image_tell_that_it_was_moved(axis):
-    rays = np.stack((*np.meshgrid(np.arange(-40, 40) / 70.0, np.arange(-30, 30) / 70.0), np.ones((60, 80))), axis=-1)
+    rays = camera(np.arange(-40, 40) / 70.0, np.arange(-30, 30) / 70.0)
     points = rays * (2.0 + 0.3 * (rays[..., axis] > 0.0) + 0.01 * np.sin(9.0 * rays[..., 1 - axis]))[..., None]
     assert (image_view(clean_cloud(points, None, None)).place == 0.0).all()
     moved = image_view(clean_cloud(points + np.array([1.0, 2.0, 3.0]), None, None))
@@ -203,67 +196,38 @@ def test_a_height_map_in_another_frame_was_seen_by_no_camera():
 
 
 def test_a_turning_scanner_in_its_own_frame_sees_from_the_origin():
-    azimuth, elevation = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False), np.linspace(-0.4, 0.1, 32))
-    rays = np.stack((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)), -1)
+    azimuth = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
+    rays = turning(np.linspace(-0.4, 0.1, 32), azimuth).reshape(32, 400, 3)
     ranges = np.where(np.abs(azimuth - 2.0) < 0.3, 3.0, np.minimum(8.0 + np.cos(3.0 * azimuth), 40.0))
     assert (pcgraph.segment(rays * ranges[..., None]).viewpoint == 0.0).all()
 
 
-def image_of_a_hall(end, noise=0.0, step=0.0, shape=(240, 320)):
-    """A depth image, (h, w, 3), of a floor, two walls and a wall at the end, and which of these; depths by noise and
-    steps of inverse depth, 1/metres."""
-    rng, (h, w) = np.random.default_rng(0), shape
-    y, x = (np.mgrid[:h, :w] + 0.5 - np.array([h, w]).reshape(2, 1, 1) / 2.0) / (0.9 * w)
-    walls = np.stack([np.full(shape, end), *(1.2 / np.maximum(way, 1e-9) for way in (y, x, -x))])
-    inverse = 1.0 / walls.min(axis=0) + noise * rng.normal(size=shape)
-    inverse = np.round(inverse / step) * step if step else inverse
-    return np.stack((x, y, np.ones(shape)), axis=-1) / inverse[..., None], walls.argmin(axis=0)
-
-
 @pytest.mark.parametrize("noise", [0.5e-3, 1.4e-3])
 def test_steps_of_depth_are_read_off_an_image(noise):
-    points, _ = image_of_a_hall(4.0, noise, 2.85e-3)
+    points, _ = hall(4.0, noise, 2.85e-3)
     cloud = clean_cloud(points, None, None)
-    warp = choose_warp(cloud.points, np.zeros(3), True, 0.0)
+    warp = CameraWarp.about(cloud.points, np.zeros(3))
     far = np.quantile(cloud.points[:, 2], 0.8)
     needed = 2.85e-3 * far * warp.reference_depth / 0.75 / 3.5
-    assert DepthImage.of(cloud.points, cloud.image, np.zeros(3), None).spacing(
-        median_spacing(cloud.points, warp), warp
-    ) == pytest.approx(min(needed, 4.0 * median_spacing(cloud.points, warp)), rel=0.02)
-    fine, _ = image_of_a_hall(4.0, 0.05 * noise)
+    found = DepthImage.of(cloud.points, cloud.image, np.zeros(3), None).spacing(cloud.points, warp)
+    assert found == pytest.approx(min(needed, 4.0 * median_spacing(cloud.points, warp)), rel=0.02)
+    fine, _ = hall(4.0, 0.05 * noise)
     cloud = clean_cloud(fine, None, None)
-    assert DepthImage.of(cloud.points, cloud.image, np.zeros(3), None).spacing(
-        median_spacing(cloud.points, warp), warp
-    ) == median_spacing(cloud.points, warp)
+    found = DepthImage.of(cloud.points, cloud.image, np.zeros(3), None).spacing(cloud.points, warp)
+    assert found == pytest.approx(median_spacing(cloud.points, warp), rel=0.02)
 
 
 @pytest.mark.parametrize("end", [3.0, 4.0, 5.0, 6.0])
 def test_walls_far_from_a_camera_whose_depth_is_coarse_are_whole(end):
-    points, walls = image_of_a_hall(end, 1.4e-3, 2.85e-3, (480, 640))
+    points, walls = hall(end, 1.4e-3, 2.85e-3, VGA)
     result = pcgraph.segment(points)
     assert weighted_overlap(result.labels, walls) > 0.9
     assert result.objects.max() < 8
 
 
-def mixed_at_edges(seed, fraction=0.3):
-    """A depth image, (h, w, 3), of three boards before a wall, which of these, and which pixels are mixed of two."""
-    rng, (h, w) = np.random.default_rng(seed), (240, 320)
-    y, x = np.mgrid[:h, :w]
-    depths, truth = np.full((h, w), 2.0), np.zeros((h, w), int)
-    for number, (top, left) in enumerate(((30, 30), (90, 130), (60, 240)), start=1):
-        inside = (abs(y - top - 50) < 50) & (abs(x - left - 25) < 25)
-        depths[inside], truth[inside] = 1.0 + 0.2 * number, number
-    beside = np.zeros((h, w), bool)
-    beside[:, 1:] = depths[:, 1:] > depths[:, :-1] + 0.1
-    mixed = beside & (rng.random((h, w)) < fraction)
-    depths[mixed] -= rng.uniform(0.2, 0.8, mixed.sum()) * (depths - np.roll(depths, 1, axis=1))[mixed]
-    rays = np.stack(((x - w / 2) / 300.0, (y - h / 2) / 300.0, np.ones((h, w))), axis=-1)
-    return rays * (depths + 0.001 * rng.normal(size=(h, w)))[..., None], truth, mixed
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_pixels_that_mix_two_depths_are_outliers(seed):
-    points, truth, mixed = mixed_at_edges(seed)
+    points, truth, mixed = boards_with_mixed_edges(seed)
     result = pcgraph.segment(points)
     assert np.mean(result.outliers[mixed]) > 0.9
     assert np.mean(result.outliers[~mixed]) < 0.002
@@ -273,22 +237,15 @@ def test_pixels_that_mix_two_depths_are_outliers(seed):
     assert np.mean(again.outliers[mixed]) > 0.9
 
 
-_FRAMES = {  # of cameras: z forwards, as OpenGL's, and x forwards
-    "z": np.eye(3),
-    "-z": np.diag([1.0, -1.0, -1.0]),
-    "x": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
-}
-
-
 def measured(points):
     return np.isfinite(points).all(axis=-1)
 
 
 @pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("forwards", _FRAMES)
+@pytest.mark.parametrize("forwards", FRAMES)
 def test_a_list_in_its_cameras_frame_is_its_image(forwards, seed):
-    points, truth, mixed = mixed_at_edges(seed)
-    points = (points @ _FRAMES[forwards].T).astype(np.float32)
+    points, truth, mixed = boards_with_mixed_edges(seed)
+    points = (points @ FRAMES[forwards].T).astype(np.float32)
     order = np.random.default_rng(seed).permutation(points[..., 0].size)
     image, as_list = pcgraph.segment(points), pcgraph.segment(points.reshape(-1, 3)[order])
     assert image.camera
@@ -304,7 +261,7 @@ def test_a_list_in_its_cameras_frame_is_its_image(forwards, seed):
 
 
 def test_what_a_list_that_is_an_image_tells_of_its_points_is_in_their_order():
-    points, truth, _ = mixed_at_edges(0)
+    points, truth, _ = boards_with_mixed_edges(0)
     points, truth = points.reshape(-1, 3), truth.reshape(-1)
     order = np.random.default_rng(0).permutation(len(points))
     first, second = pcgraph.segment(points), pcgraph.segment(points[order])
@@ -322,10 +279,10 @@ def test_what_a_list_that_is_an_image_tells_of_its_points_is_in_their_order():
 
 
 def test_a_slanted_plane_in_any_cameras_frame_is_its_image():
-    rays = image_of_steps()
+    rays = stairs()
     points = rays / rays[..., 2:] / (1.0 + 0.3 * (rays[..., :1] / rays[..., 2:]))
     sizes = []
-    for turn in _FRAMES.values():
+    for turn in FRAMES.values():
         result = pcgraph.segment(points.reshape(-1, 3) @ turn.T)
         assert result.camera
         sizes.append(result.voxel_size)
@@ -334,7 +291,7 @@ def test_a_slanted_plane_in_any_cameras_frame_is_its_image():
 
 @pytest.mark.parametrize("left", [0.3, 0.6])
 def test_no_pixel_of_a_thinned_list_flies(left):
-    points, truth, _ = mixed_at_edges(0, fraction=0.0)
+    points, truth, _ = boards_with_mixed_edges(0, fraction=0.0)
     kept = np.random.default_rng(0).random(truth.shape) < left
     result = pcgraph.segment(points[kept])
     assert result.camera
@@ -356,7 +313,7 @@ def test_a_list_of_what_a_camera_saw_of_a_room_has_the_objects_of_its_image(room
 
 
 def test_a_part_of_an_image_with_features_and_viewpoints_keeps_what_each_point_has():
-    points, truth, _ = mixed_at_edges(0, fraction=0.0)
+    points, truth, _ = boards_with_mixed_edges(0, fraction=0.0)
     part = (truth > 0) | (np.random.default_rng(0).random(truth.shape) < 0.7)
     as_list, of_list = points[part], truth[part]
     as_list[5] = np.nan
@@ -371,7 +328,7 @@ def test_a_part_of_an_image_with_features_and_viewpoints_keeps_what_each_point_h
 
 @pytest.mark.parametrize("made", ["in millimetres", "twice", "with noise", "few"])
 def test_lists_that_are_not_the_pixels_of_one_image_are_mere_lists(made):
-    rng, (points, _, _) = np.random.default_rng(0), mixed_at_edges(0)
+    rng, (points, _, _) = np.random.default_rng(0), boards_with_mixed_edges(0)
     points = points.reshape(-1, 3)
     clouds = {
         "in millimetres": np.rint(1000.0 * points),
@@ -391,7 +348,7 @@ def test_grids_of_points_at_one_height_or_two_are_no_images(height):
 
 
 def test_no_pixel_of_a_tiny_image_flies():
-    points, _, mixed = mixed_at_edges(0)
+    points, _, mixed = boards_with_mixed_edges(0)
     rows, columns = np.nonzero(mixed)
     near = points[rows[0] : rows[0] + 20, columns[0] - 20 : columns[0] + 20]
     assert not pcgraph.segment(near).outliers.any()
@@ -399,10 +356,9 @@ def test_no_pixel_of_a_tiny_image_flies():
 
 @pytest.mark.parametrize("height", [0.1, 0.3, 1.5])
 def test_no_pixel_flies_on_a_floor_before_a_low_camera(height):
-    y, x = (np.mgrid[:240, :320] - np.array([119.5, 159.5]).reshape(2, 1, 1)) / 300.0
-    depths = np.where(y > 0.0, height / np.maximum(y, 1e-9), np.nan)
-    depths[depths > 200.0 * height] = np.nan
-    image = np.stack((x, y, np.ones_like(x)), axis=-1) * depths[..., None]
+    rays = pinhole(QVGA, 300.0)
+    depths = to_plane(rays, (0, 1, 0), height)
+    image = rays * np.where(depths > 200.0 * height, np.nan, depths)[..., None]
     for noise in (0.0, 1e-3):
         noisy = image * (1.0 + noise * np.random.default_rng(0).normal(size=(240, 320, 1)))
         cloud = clean_cloud(noisy, None, None)
@@ -444,9 +400,8 @@ def test_height_maps_and_turning_scanners_are_no_images():
     """They may lie at z > 0 all the same, where x/z means nothing."""
     x, y = np.meshgrid(np.arange(80) * 0.5, np.arange(60) * 0.5)
     heights = np.stack((x, y, 1.0 + 4.0 * (2.0 + np.sin(x / 5) + np.cos(y / 4))), axis=-1)
-    up, around = np.meshgrid(np.linspace(0.3, -0.4, 32), np.linspace(0, 6.28, 400), indexing="ij")
-    rays = np.stack((np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)), axis=-1)
-    ranges = np.minimum(np.where(rays[..., 2] < 0, -1.7 / np.minimum(rays[..., 2], -1e-9), np.inf), 30.0)
+    rays = turning(np.linspace(0.3, -0.4, 32), np.linspace(0, 6.28, 400)).reshape(32, 400, 3)
+    ranges = np.minimum(to_plane(rays, (0, 0, 1), -1.7), 30.0)
     sweep = rays * ranges[..., None] + (0.0, 0.0, 2.0)
     assert sweep[..., 2].min() > 0.0
     assert not pcgraph.segment(heights).camera
@@ -455,7 +410,7 @@ def test_height_maps_and_turning_scanners_are_no_images():
 
 
 def test_a_list_told_to_be_a_cameras_has_the_voxels_of_its_image():
-    image = image_of_steps(120, 160)
+    image = stairs(120, 160)
     as_list = pcgraph.segment(image.reshape(-1, 3), camera=True)
     assert as_list.voxel_size == pcgraph.segment(image).voxel_size
     assert as_list.camera
@@ -504,15 +459,8 @@ def test_a_cameras_warp_along_any_axis_is_that_along_z_turned(seed):
         turned.check(2.0 * place - there)
 
 
-def scanned_ground(rings=20, n=1000):
-    """Rings of ground around a scanner 2 m above it, as thin with range as a scanner sees it."""
-    angle, down = np.meshgrid(np.linspace(0, 2 * np.pi, n, endpoint=False), np.linspace(0.04, 0.9, rings))  # radians
-    reach = 2.0 / np.tan(down)
-    return np.stack((reach * np.cos(angle), reach * np.sin(angle), np.zeros(angle.shape)), axis=-1).reshape(-1, 3)
-
-
 def test_voxels_that_grow_with_range_keep_far_ground_in_one_piece():
-    points = scanned_ground()
+    points = rings_of_ground()
     plain = pcgraph.segment(points, viewpoint=(0, 0, 2), range_growth=0.0)
     grown = pcgraph.segment(points, viewpoint=(0, 0, 2), range_growth=0.5)
     assert_covered_and_connected(points, grown, outliers=0.01)
@@ -526,9 +474,9 @@ def test_voxels_that_grow_with_range_keep_far_ground_in_one_piece():
 
 def test_range_growth_is_checked():
     with pytest.raises(ValueError, match="range_growth of at least 0 and below 1"):
-        pcgraph.segment(scanned_ground(5, 10), range_growth=1.0)
+        pcgraph.segment(rings_of_ground(5, 10), range_growth=1.0)
     with pytest.raises(ValueError, match="voxels grow in one way"):
-        pcgraph.segment(scanned_ground(5, 10) + 5.0, range_growth=0.5, camera=True)
+        pcgraph.segment(rings_of_ground(5, 10) + 5.0, range_growth=0.5, camera=True)
 
 
 @pytest.fixture(scope="module")
@@ -603,40 +551,6 @@ def test_an_update_leaves_the_planes_as_they_are_fitted(halves):
     assert np.array_equal(again.supervoxels, second.supervoxels)
 
 
-def sweep_of_a_lot(beams, lowest, highest, cars, rng):
-    """Points of a turning scanner 1.8 m above a lot with two buildings, a wall and cars, given the middle and the yaw
-    of each, and on which car each point lies."""
-    things = [(14.0, 20.0, 0.3, 12.0, 8.0, 5.0), (-30.0, 5.0, 1.0, 10.0, 10.0, 6.0), (0.0, -28.0, 0.0, 30.0, 1.0, 2.0)]
-    things += [(*car, 4.4, 1.8, 1.5) for car in cars]
-    angles = np.meshgrid(np.radians(np.arange(0.0, 360.0, 0.2)), np.radians(np.linspace(lowest, highest, beams)))
-    azimuth, elevation = (angle.ravel() for angle in angles)
-    level = np.cos(elevation)
-    rays = np.stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=1)
-    with np.errstate(divide="ignore"):
-        ranges = np.where(rays[:, 2] < 0.0, -1.8 / rays[:, 2], np.inf)
-        car = np.full(len(rays), -1)
-        for number, (x, y, yaw, *size) in enumerate(things):
-            turn = np.array([[np.cos(yaw), np.sin(yaw), 0.0], [-np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-            place, ways, half = turn @ np.array((-x, -y, 1.8 - size[2] / 2.0)), rays @ turn.T, np.array(size) / 2.0
-            ends = np.stack(((-half - place) / ways, (half - place) / ways))
-            near, far = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)
-            hit = (near < far) & (near > 0.0) & (near < ranges)
-            ranges[hit], car[hit] = near[hit], number - 3 if number >= 3 else -1
-    seen = ranges < 80.0
-    return rays[seen] * (ranges[seen] + rng.normal(0.0, 0.02, seen.sum()))[:, None], car[seen]
-
-
-def overlaps(labels, car):
-    """Intersection over union of each car and the label that has most of it."""
-    found = []
-    for number in range(car.max() + 1):
-        own = car == number
-        of_own, counts = np.unique(labels[own], return_counts=True)
-        best = labels == of_own[counts.argmax()]
-        found.append((own & best).sum() / (own | best).sum())
-    return found
-
-
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("beams", "lowest", "highest"), [(16, -15.0, 15.0), (32, -30.67, 10.67)])
 def test_cars_in_a_sweep_of_few_beams_are_objects(beams, lowest, highest, seed):
@@ -645,23 +559,8 @@ def test_cars_in_a_sweep_of_few_beams_are_objects(beams, lowest, highest, seed):
     for i in range(10):
         angle, away = 2.4 * i + rng.uniform(-0.3, 0.3), 6.0 + 2.0 * i
         cars.append((away * np.cos(angle), away * np.sin(angle), rng.uniform(0.0, 3.0)))
-    points, car = sweep_of_a_lot(beams, lowest, highest, cars, rng)
+    points, car = lot(beams, lowest, highest, cars, rng)
     assert np.mean(overlaps(pcgraph.segment(points).labels, car)) > 0.65
-
-
-@pytest.mark.parametrize("seed", [3, 5])
-def test_cars_in_a_few_sweeps_of_few_beams_are_objects(seed):
-    """Voxels grew until three quarters of them touched five others, to a metre, though each step joined few more."""
-    rng, made = np.random.default_rng(seed), street(seed, half_length=60.0)
-    places = np.array([made.on_ground(x, -1.75) + np.array((0.0, 0.0, 2.0)) for x in (-15.0, 0.0, 15.0)])
-    rays = [
-        sphere_of_rays(np.arange(0.0, 360.0, 0.2) + turn, np.linspace(-15.0, 15.0, 16)) for turn in rng.uniform(size=3)
-    ]
-    seen = scan(made.scene, places, rays, 0.02, rng, reach=80.0)
-    found = pcgraph.segment(seen.points)
-    cars = [car for car in made.scene.numbers(CAR) if np.count_nonzero(seen.things == car) >= 50]
-    assert found.surface.grid.size < 0.4
-    assert mean_overlap(found.labels, seen.things, np.array(cars)) > 0.65
 
 
 @pytest.mark.parametrize("seed", draws(4, 1))
@@ -669,7 +568,7 @@ def test_cars_parked_side_by_side_are_objects(seed):
     """Over gaps of eight voxel edges two or three were one."""
     rng = np.random.default_rng(seed)
     cars = [(3.0 * i - 7.5, 8.0 + rng.normal(0.0, 0.15), np.pi / 2.0 + rng.normal(0.0, 0.03)) for i in range(6)]
-    points, car = sweep_of_a_lot(128, -25.0, 15.0, cars, rng)
+    points, car = lot(128, -25.0, 15.0, cars, rng)
     assert min(overlaps(pcgraph.segment(points).labels, car)) > 0.85
 
 
@@ -677,11 +576,11 @@ def test_viewpoints_that_hardly_differ_are_one():
     """A micrometre of drift took the growth with range away, and there were three times as many objects."""
     rng = np.random.default_rng(0)
     cars = [(8.0 * np.cos(i), 8.0 * np.sin(i), i) for i in range(6)]
-    points, _ = sweep_of_a_lot(64, -25.0, 15.0, cars, rng)
+    points, _ = lot(64, -25.0, 15.0, cars, rng)
     drifting = rng.normal(0.0, 1e-6, points.shape)
     one, each = pcgraph.segment(points, viewpoint=np.zeros(3)), pcgraph.segment(points, viewpoint=drifting)
     assert each.viewpoint == pytest.approx(np.zeros(3), abs=1e-5)
-    assert each.surface.grid.warp.of_one_scan
+    assert each.acquisition.is_one_scan
     assert each.labels.max() == pytest.approx(one.labels.max(), rel=0.1)
     apart = np.where(np.arange(len(points))[:, None] % 2 == 0, (3.0, 0.0, 0.0), (-3.0, 0.0, 0.0))
     assert pcgraph.segment(points, viewpoint=apart).viewpoint.ndim == 2
@@ -690,7 +589,7 @@ def test_viewpoints_that_hardly_differ_are_one():
 @pytest.mark.parametrize("seed", range(3))
 def test_outliers_do_not_depend_on_whether_the_size_of_voxels_was_found_or_told(seed):
     """They were those of the voxels that were tried first, half as large: 2 % of a sweep of 16 beams."""
-    points, _ = sweep_of_a_lot(16, -15.0, 15.0, [(8.0, 0.0, 0.0)], np.random.default_rng(seed))
+    points, _ = lot(16, -15.0, 15.0, [(8.0, 0.0, 0.0)], np.random.default_rng(seed))
     stray = np.random.default_rng(seed).uniform((-40.0, -40.0, 0.0), (40.0, 40.0, 12.0), (60, 3))
     found = pcgraph.segment(np.concatenate((points, stray)))
     told = pcgraph.segment(np.concatenate((points, stray)), voxel_size=found.voxel_size)

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import patch, two_boxes_on_a_plane
+from scenes.images import at_depths
+from scenes.surfaces import directions, patch
+from scenes.tables import two_boxes_on_a_plane
 
 import pcgraph
 from pcgraph.features.primitives import Primitive
@@ -25,9 +27,7 @@ def test_saliency_above_a_level_is_the_boundary_of_that_cut(boxes):
 
 
 def test_saliency_of_missing_points_is_nan():
-    rows, columns = np.mgrid[0:40, 0:50]
-    depth = np.where(columns > 25, 0.8, 1.0)
-    points = np.stack(((columns - 25) / 50 * depth, (rows - 20) / 50 * depth, depth), axis=-1)
+    points = at_depths((40, 50), 50.0, np.where(np.arange(50) > 25, 0.8, np.ones((40, 50))))
     points[3, 4] = np.nan
     result = pcgraph.segment(points)
     saliency = result.saliency()
@@ -38,9 +38,7 @@ def test_saliency_of_missing_points_is_nan():
 def test_the_front_plate_hides_the_wall_behind_it():
     rows, columns = np.mgrid[0:60, 0:80]
     plate = (abs(rows - 30) < 12) & (abs(columns - 40) < 15)
-    depth = np.where(plate, 0.6, 1.2)
-    points = np.stack(((columns - 40) / 80 * depth, (rows - 30) / 80 * depth, depth), axis=-1)
-    result = pcgraph.segment(points)
+    result = pcgraph.segment(at_depths((60, 80), 80.0, np.where(plate, 0.6, 1.2)))
     found = result.occlusions()
     of_plate = set(result.supervoxels[plate].tolist())
     assert len(found.pairs) > 0
@@ -61,8 +59,7 @@ def test_occlusions_need_one_viewpoint():
 
 def test_primitives_of_a_ball_on_a_floor():
     rng = np.random.default_rng(0)
-    directions = rng.normal(size=(6000, 3))
-    ball = 0.2 * directions / np.linalg.norm(directions, axis=1, keepdims=True) + (0.5, 0.5, 0.2)
+    ball = 0.2 * directions(6000, rng) + (0.5, 0.5, 0.2)
     seen = ball[ball[:, 2] > 0.1]
     floor = patch((0, 0, 0), (1, 0, 0), (0, 1, 0))
     points = np.vstack([floor[np.hypot(*(floor[:, :2] - 0.5).T) > 0.18], seen])

@@ -6,8 +6,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 import pytest
-from clouds import SPACING, patch, two_boxes_on_a_plane
-from test_guarantees import DEGENERATE, assert_covered_and_connected
+from checks import assert_covered_and_connected
+from scenes.surfaces import DEGENERATE, SPACING, patch
+from scenes.tables import two_boxes_on_a_plane
 
 import pcgraph
 from pcgraph.metrics import undersegmentation_error

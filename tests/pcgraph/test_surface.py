@@ -19,6 +19,7 @@ PACKAGE = Path(pcgraph.__file__).parent
 
 def test_public_names():
     assert pcgraph.__all__ == [
+        "Acquisition",
         "AdjacencyGraph",
         "BoundaryCost",
         "BoundaryStrength",
@@ -135,6 +136,15 @@ def test_pcgraph_never_imports_rangesim():
     assert len(files) > 20
     for path in files:
         assert not imported_modules(path) & {"rangesim", "mitsuba", "drjit"}, path
+
+
+def test_tests_of_pcgraph_and_their_scenes_import_no_benchmark():
+    """A benchmark may change as its figures need; what tests stand on may not. `tests/benchmarks` tests benchmarks."""
+    tests = Path(__file__).parents[1]
+    benchmarks = {path.stem for path in (tests.parent / "benchmarks").glob("*.py")}
+    files = [*tests.glob("pcgraph/*.py"), *tests.glob("scenes/*.py")]
+    assert len(benchmarks) > 30
+    assert [(file.name, found) for file in files if (found := imported_modules(file) & benchmarks)] == []
 
 
 LOADED = """

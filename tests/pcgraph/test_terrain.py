@@ -7,46 +7,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from checks import main_object
+from scenes.land import COURT, ROOF, SHED, SIDE, STREET, banked, block
 
 import pcgraph
 from pcgraph.graph.continuations import faces_of
 from pcgraph.graph.terrain import terrain
 from pcgraph.tree.tree import segmentation_tree
 
-SIDE = 120.0  # metres, along x and y
-STREET, COURT, ROOF, SHED, WALL = range(5)
-
-
-def block(court=0.0, roof=15.0, shed=None, walls=False, seed=0):
-    """A street around a block of four wings, 20 m wide, about a court of 40 m, from an aircraft: points (n, 3), metres,
-    and what each is on, (n,).
-
-    A shed of 14 m stands in the court, so many metres above it.
-    """
-    rng = np.random.default_rng(seed)
-    x, y = rng.uniform(0.0, SIDE, (2, 12_000))
-    off = np.maximum(np.abs(x - SIDE / 2), np.abs(y - SIDE / 2))  # of squares around the middle
-    on = np.where(off > 40.0, STREET, np.where(off > 20.0, ROOF, COURT))
-    z = np.choose(on, [0.0, court, roof])
-    if shed is not None:
-        on[off < 7.0], z[off < 7.0] = SHED, court + shed
-    points = np.stack((x, y, z + rng.normal(0.0, 0.05, len(x))), axis=1)
-    if walls:
-        along, height = rng.uniform(20.0, 100.0, 3000), rng.uniform(0.0, roof, 3000)
-        front = np.stack((along, np.full(3000, 20.0), height), axis=1)
-        points, on = np.concatenate((points, front, front[:, [1, 0, 2]])), np.concatenate((on, np.full(6000, WALL)))
-    return points, on
-
-
-def main_object(labels, on, what):
-    names, counts = np.unique(labels[(on == what) & (labels >= 0)], return_counts=True)
-    assert counts.max() > 0.9 * counts.sum()
-    return names[counts.argmax()]
-
 
 def found_in(result):
     graph = result.graph
-    return terrain(result.surface, graph.node_features, faces_of(graph.edges, graph.edge_features, graph.n_nodes))
+    return terrain(
+        result.surface,
+        graph.node_features,
+        faces_of(graph.edges, graph.edge_features, graph.n_nodes),
+        result.acquisition,
+    )
 
 
 @pytest.mark.parametrize("court", [0.0, 3.0, -3.0])
@@ -103,19 +80,6 @@ def test_a_scanner_over_the_court_knows_what_it_did_not_see():
     points, _ = block()
     result = pcgraph.segment(points, viewpoint=(60.0, 60.0, 100.0), range_growth=0.5)
     assert not len(found_in(result).pairs)
-
-
-def banked(houses, seed=0):
-    """Two levels of ground, parted by a bank of 3 m at 45 degrees; houses on both, 9 m high, or none."""
-    rng = np.random.default_rng(seed)
-    x, y = rng.uniform(0.0, SIDE, (2, 16_000))
-    z = np.clip(x - SIDE / 2, 0.0, 3.0)
-    on = np.where(x > SIDE / 2, COURT, STREET)
-    for east in (20.0, 90.0) if houses else ():
-        for north in (20.0, 60.0, 100.0):
-            house = (np.abs(x - east) < 6.0) & (np.abs(y - north) < 6.0)
-            on[house], z[house] = ROOF, 9.0 + 3.0 * (east > SIDE / 2)
-    return np.stack((x, y, z + rng.normal(0.0, 0.05, len(x))), axis=1), on
 
 
 def test_ground_that_touches_ground_at_a_bank_is_one_with_it():

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scenes.bodies import bolt, bottle, box, dumbbell, lamp, on_a_table
 from tiers import to_validate
-from turned_bodies import bolt, bottle, box, dumbbell, lamp, on_a_table
 
 import pcgraph
-from pcgraph.detection.objects import MAX_MISS
+from pcgraph.detection.objects import TURNED_BODY
 from pcgraph.detection.revolution import revolution_axis
 from pcgraph.metrics.node_table import NodeTable
 
@@ -74,4 +74,4 @@ def test_how_far_normals_of_prisms_miss_their_axis(corners: int, miss: float) ->
     found = np.median(axis.misses) / np.sqrt(np.mean(off**2))
     assert found == pytest.approx(half / 2 / np.sqrt(1 + half**2 / 3), rel=0.02)
     assert found == pytest.approx(miss, abs=0.01)
-    assert (found < MAX_MISS) == (corners == 6)
+    assert (found < TURNED_BODY.max_miss) == (corners == 6)

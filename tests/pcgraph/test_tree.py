@@ -8,7 +8,7 @@ from itertools import pairwise
 import networkx
 import numpy as np
 import pytest
-from clouds import refines
+from checks import refines
 
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features

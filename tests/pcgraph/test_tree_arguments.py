@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from graphs import hand_graph, hand_tree, random_graph, tree_of
+from scenes.graphs import CHAIN, hand_graph, hand_tree, random_graph, tree_of
 
 import pcgraph
 from pcgraph.graph.boundary import BoundaryCost, BoundaryStrength
@@ -18,8 +18,6 @@ from pcgraph.tree.least_increase import MumfordShahLinkage, WardLinkage
 from pcgraph.tree.optimal_cut import Energy
 from pcgraph.tree.saliency import point_saliency, voxel_saliency
 from pcgraph.tree.single_linkage import QuasiFlatLinkage
-
-CHAIN = [[0, 1], [1, 2], [2, 3], [3, 4]]
 
 
 @pytest.fixture

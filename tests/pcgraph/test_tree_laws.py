@@ -10,10 +10,10 @@ from typing import NamedTuple
 import networkx
 import numpy as np
 import pytest
-from clouds import refines
-from graphs import SHAPES, leaf_sets, random_graph, tree_of
+from checks import refines
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes.graphs import SHAPES, leaf_sets, made, random_graph, tree_of
 
 from pcgraph.features.moments import Moments
 from pcgraph.features.nodes import node_features
@@ -113,10 +113,9 @@ def assert_cuts_of_a_least_size_have_it_and_never_cross(case):
     finest = int(tree.cut(altitude=-1.0, min_size=least).max()) + 1
     by_number = [tree.cut(n=count, min_size=least) for count in range(finest, 0, -1)]
     assert [int(cut.max()) + 1 for cut in by_number] == list(range(finest, 0, -1))
-    stable = tree.cut_stable(least)
     for family in (cuts, by_number):
         assert all(refines(fine, coarse) for fine, coarse in pairwise(family))
-    for cut in (*cuts, *by_number, stable):
+    for cut in (*cuts, *by_number):
         assert np.bincount(cut, leaves.counts).min() >= min(least, leaves.counts.sum())
 
 
@@ -193,13 +192,10 @@ def test_a_long_chain_neither_recurses_nor_hangs(linkage):
     tree = tree_of(linkage, graph, leaves)
     assert tree.altitudes[-1] < np.inf
     assert tree.cut(n=7).max() == 6
-    assert tree.cut_stable().max() >= 0
     assert tree.cut_optimal(plane_energy(tree, graph), 1.0).max() >= 0
 
 
 def long_chain(n, rng):
-    from graphs import made
-
     ends = np.arange(n - 1)
     rows = {"convexity": -np.arange(1.0, n) / n, "contact_convexity": -np.arange(1.0, n) / n}
     rows |= {"contact_voxels": np.full(n - 1, 2), "contact_length": np.ones(n - 1)}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lists of points that are a camera's image: which pixel each of them is, told by their rays alone."""
+"""Pixels of lists of points that are a camera's image, found from the rays of the points alone."""
 
 from __future__ import annotations
 
@@ -9,24 +9,32 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.acquisition.pixel_lattice import (
+    MAX_OFF_PIXEL,
+    MAX_PIXELS,
+    MIN_LINES,
+    are_whole,
+    likely_cameras,
+    step_between,
+)
+from pcgraph.acquisition.resection import PinholeCamera, is_far_off
 from pcgraph.inputs import CleanCloud, ImageView, Pixels
 from pcgraph.parallel import in_blocks, inlined, kernel
-from pcgraph.pixel_lattice import MAX_OFF_PIXEL, MAX_PIXELS, MIN_LINES, are_whole, likely_cameras, step_between
-from pcgraph.resection import PinholeCamera, is_far_off
 from pcgraph.voxels.outliers import MIN_POINTS
 
-_SOME = 4096  # values that are looked at first
-_NOTHING = -1  # to divide by
-_FILLED = 0.2  # of an image at least, by points
+_SAMPLE = 4096
+"""Values of which it is asked first whether they are even; chosen by eye, for the time's sake."""
+_NOTHING = -1  # stands for an axis to divide by, if there is none
+_MIN_FILLED = 0.2
+"""Fraction of an image's pixels that are points, at least: with less, accidents are likelier; chosen by eye."""
 
 
 def with_pixels(cloud: CleanCloud) -> CleanCloud:
     """The cloud, with the pixels of its points if it is a list that a pinhole camera took.
 
-    That a list is such an image is exact: seen from the camera, its points lie in rows and columns, as pixels do, and
-    single precision leaves a thousandth of a pixel of it. No two points are one pixel, and at least a fifth of the
-    pixels in rows and columns between the first and the last are points. A grid of points at one height is not said to
-    be one, as it is as even without a division.
+    The test is sharp: seen from the camera, all points lie in rows and columns to a thousandth of a pixel, the rounding
+    of single precision. No two points share a pixel, and at least a fifth of the pixels between the first and last rows
+    and columns are points. A grid of points at one height is no image, as its coordinates are even without a division.
     """
     if cloud.image is not None or len(cloud.points) < MIN_POINTS:
         return cloud
@@ -35,15 +43,17 @@ def with_pixels(cloud: CleanCloud) -> CleanCloud:
 
 
 def _image_in_own_frame(cloud: CleanCloud) -> Pixels | None:
-    """The pixels, if the camera is the origin and looks along an axis: x/z and y/z are whole multiples of one over the
-    focal length, up to a shift."""
+    """The pixels, if the camera is at the origin and looks along an axis; else None.
+
+    Then x/z and y/z (or the same of other axes) are whole multiples of one over the focal length, up to a shift.
+    """
     low, high = cloud.bounds
     forwards = [axis for axis in (2, 0, 1) if low[axis] > 0.0 or high[axis] < 0.0]
     if not forwards or is_far_off(low, high):
         return None
-    points, some = cloud.points, cloud.sample[:_SOME]
+    points, some = cloud.points, cloud.sample[:_SAMPLE]
     for axis in forwards:
-        across = [i for i in (2, 1, 0) if i != axis]  # y, in rows, and x of one that looks along z
+        across = [i for i in (2, 1, 0) if i != axis]  # y tells rows and x columns, if it looks along z
         rows, columns = (even_steps(points, some, i, axis) for i in across)
         if rows is None or columns is None:
             continue
@@ -53,13 +63,13 @@ def _image_in_own_frame(cloud: CleanCloud) -> Pixels | None:
 
 
 def _image_in_any_frame(cloud: CleanCloud) -> Pixels | None:
-    """The pixels, if some patch of the points tells the camera."""
+    """The pixels, if a patch of the points tells the camera; else None."""
     images = (_image_by(camera, cloud) for camera in likely_cameras(cloud.points, cloud.sample))
     return next((image for image in images if image is not None), None)
 
 
 def _image_by(camera: PinholeCamera, cloud: CleanCloud) -> Pixels | None:
-    """The pixels at which a camera sees the points of a cloud; None if some are off theirs, or it has no place."""
+    """The pixels at which a camera sees the points of a cloud; None if some are off a pixel, or it has no place."""
     (low, high), n = cloud.bounds, len(cloud.points)
     place = camera.place(low, high)
     if place is None:
@@ -79,8 +89,10 @@ def _image_by(camera: PinholeCamera, cloud: CleanCloud) -> Pixels | None:
 def _find_pixels(
     start: int, stop: int, points: NDArray[np.float64], camera: NDArray[np.float64], at: NDArray[np.int64]
 ) -> int:
-    """Set row and column, (2, n), at which a camera, (3, 4), sees points; how many lie on its positive side, -1 if any
-    is off its pixel."""
+    """Set row and column, (2, n), at which a camera, (3, 4), sees points.
+
+    Return the number of points on its positive side, or -1 if any is off its pixel.
+    """
     ahead = 0
     for i in range(start, stop):
         x, y, z = points[i]
@@ -95,19 +107,27 @@ def _find_pixels(
 
 
 class Steps(NamedTuple):
-    """Which row, or column, each of n points is in, (n,) int64, and how many there are."""
+    """Rows, or columns, of n points.
+
+    Attributes
+    ----------
+    at : (n,) int64
+        Row, or column, of each point.
+    number : int
+        Number of rows, or columns.
+    """
 
     at: NDArray[np.int64]
     number: int
 
 
 def even_steps(points: NDArray[np.float64], some: NDArray[np.float64], axis: int, over: int) -> Steps | None:
-    """Coordinates of points, (n, 3), over those along another axis (-1: over 1) as whole numbers of one step.
+    """Coordinates of points, (n, 3), over those along another axis (-1: over 1), as whole numbers of one step.
 
-    None if they are not even, which is asked of some of them first, (m, 3).
+    None if they are no whole multiples of a step. That is asked of some of the points first, (m, 3).
     """
     n = len(points)
-    with np.errstate(over="ignore", invalid="ignore"):  # of points in the camera
+    with np.errstate(over="ignore", invalid="ignore"):  # points in the camera
         values = np.sort(some[:, axis] if over == _NOTHING else some[:, axis] / some[:, over])
         step = step_between(values)
         if step <= 0.0 or not are_whole((values - values[0]) / step):
@@ -122,7 +142,7 @@ def even_steps(points: NDArray[np.float64], some: NDArray[np.float64], axis: int
 
 @kernel
 def _ends(start: int, stop: int, points: NDArray[np.float64], axis: int, over: int) -> tuple[float, float]:
-    """Least and largest of the coordinates of some points."""
+    """Least and largest value of some points, as `_coordinate` gives it."""
     low, high = np.inf, -np.inf
     for i in range(start, stop):
         value = _coordinate(points, i, axis, over)
@@ -141,7 +161,7 @@ def _count_steps(
     step: float,
     at: NDArray[np.int64],
 ) -> bool:
-    """Set how many steps from the least the coordinates of some points are; whether all are even."""
+    """Set the number of steps from the least value to that of each point; return whether all are whole."""
     for i in range(start, stop):
         steps = (_coordinate(points, i, axis, over) - low) / step
         if not (abs(steps - np.rint(steps)) <= MAX_OFF_PIXEL and steps <= MAX_PIXELS):
@@ -152,13 +172,14 @@ def _count_steps(
 
 @inlined
 def _coordinate(points: NDArray[np.float64], i: int, axis: int, over: int) -> float:
+    """Coordinate of a point, over that along another axis unless this is `_NOTHING`."""
     return points[i, axis] if over == _NOTHING else points[i, axis] / points[i, over]
 
 
 def _pixels(rows: Steps, columns: Steps, view: ImageView) -> Pixels | None:
-    """The pixels of points in rows and columns; None if two points are in one, or few in any."""
+    """The pixels of points, given their rows and columns; None if two points share one, or if few pixels are points."""
     shape, n = (rows.number, columns.number), len(rows.at)
-    if min(shape) < MIN_LINES or n < _FILLED * shape[0] * shape[1]:
+    if min(shape) < MIN_LINES or n < _MIN_FILLED * shape[0] * shape[1]:
         return None
     pixels = Pixels(shape, rows.at * columns.number + columns.at, view)
     return None if len(pixels.order) < n else pixels

@@ -8,11 +8,14 @@ import pytest
 from ablation import Reference, markdown, measure, table
 from ablation_cost import Code, Source
 from ablation_parts import PARTS, Part, Target, jointly, switched_off
-from clouds import two_boxes_on_a_plane
 from domain_clouds import Domain, Sample
+from scenes.tables import two_boxes_on_a_plane
 
 import pcgraph
 import pcgraph.scan as scan_module
+
+CONSTANTS = "tree.region_linkage._CONSTANTS"
+"""The constants of `RegionLinkage`, of which several parts set one each."""
 
 
 @pytest.fixture(scope="module")
@@ -58,11 +61,11 @@ def test_a_part_is_back_after_it_was_switched_off():
 
 
 def test_parts_that_patch_one_name_are_off_together():
-    shape = Target.of("tree.region_linkage._SHAPE").value
+    constants = Target.of(CONSTANTS).value
     both = jointly(part for part in PARTS if part.name.endswith(("(c1)", "(k1)", "(m0)")))
     with switched_off(both):
-        found = Target.of("tree.region_linkage._SHAPE").value
-    assert found == shape._replace(c1=0.0, k1=0.0, m0=0.0)
+        found = Target.of(CONSTANTS).value
+    assert found == constants._replace(c1=0.0, k1=0.0, m0=0.0)
 
 
 def test_what_starts_from_the_default_s_voxels_is_what_all_of_it_gives(sample):

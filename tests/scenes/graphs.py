@@ -15,6 +15,8 @@ from pcgraph.tree.linkage import Linkage, Merges
 from pcgraph.tree.tree import SegmentationTree, segmentation_tree
 
 SHAPES = ("random", "chain", "star", "complete", "parts", "no edges")
+CHAIN = [[0, 1], [1, 2], [2, 3], [3, 4]]
+"""Edges of five nodes in a row."""
 
 
 def signed_convexity(normal_i: np.ndarray, normal_j: np.ndarray, offset: np.ndarray) -> np.ndarray:

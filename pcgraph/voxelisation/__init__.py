@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Voxels of a cloud: their size, and the points that are noise."""
