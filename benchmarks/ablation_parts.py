@@ -214,10 +214,12 @@ def _one_part(coarse: VoxelGrid, *others: object) -> tuple[NDArray[np.int64], li
     return np.zeros(coarse.n_voxels, np.int64), []
 
 
-def _all_level(
-    surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32], found: Continuations
-) -> NDArray[np.bool_]:
-    return np.ones(len(found.pairs), np.bool_)
+def _none_hidden(surface: Surface, places: object, ways: Any) -> list[NDArray[np.bool_]]:
+    return [np.zeros(len(some.ends), np.bool_) for some in ways]
+
+
+def _all_level(grid: VoxelGrid, pieces: object, ways: Any) -> NDArray[np.bool_]:
+    return np.ones(len(ways.ends), np.bool_)
 
 
 def _all_smooth(leaves: object, edges: NDArray[np.int32]) -> NDArray[np.float64]:
@@ -237,9 +239,8 @@ _NO_CLOSER_LOOK: dict[str, Replacement] = {
     "voxelisation.voxelised.is_full_of_noise": _gives(False),
     "voxelisation.voxelised._NOISY": _is(-1.0),
 }
-_NO_CONTINUATIONS: dict[str, Replacement] = {"scan.continuations": _is(_no_continuations)}
-_NO_PLANES: dict[str, Replacement] = {"scan.bounding_planes": _is(_no_continuations)}
-_NO_TERRAIN: dict[str, Replacement] = {"scan.terrain": _is(_no_continuations)}
+_NO_CONTINUATIONS: dict[str, Replacement] = {"graph.continuations._of_planes": _is(_no_continuations)}
+_NO_TERRAIN: dict[str, Replacement] = {"graph.continuations._of_terrain": _is(_no_continuations)}
 _NO_PIXELS: dict[str, Replacement] = {"scan.with_pixels": _keeps(0)}
 _NO_LAW: dict[str, Replacement] = {
     "acquisition.kinds.spacing_law": _is(_no_law),
@@ -319,8 +320,8 @@ GROUPS = (
     ),
     Part(
         "all: joins behind what hides",
-        (f"{_BEHIND}:continuations", "graph/bounding_planes.py", "graph/terrain.py"),
-        _NO_CONTINUATIONS | _NO_PLANES | _NO_TERRAIN,
+        (f"{_BEHIND}:continuations",),
+        _NO_CONTINUATIONS | _NO_TERRAIN,
     ),
     Part(
         "all: adapted voxel size",
@@ -550,15 +551,13 @@ GRAPH = (
     Part("gaps: wider in one scan", ("voxels/warp.py:RangeWarp.max_gap",), {"voxels.warp.RangeWarp.max_gap": _is(3.0)}),
     Part("gaps: price", (f"{_LINK}:RegionLinkage.gap", f"{_LINK}:_GAP_OF_SEVERAL_SCANS"), _linkage(gap=0.0)),
     _constant("gaps: cheaper in several scans", _LINK, "_GAP_OF_SEVERAL_SCANS", 1.0),
-    Part("continuations", (f"{_BEHIND}:continuations",), _NO_CONTINUATIONS),
-    _constant("continuations: open borders", _BEHIND, "_OPEN", math.inf, "_count_open", "_both_ways"),
-    _constant("continuations: wide enough", _BEHIND, "_SUPPORT", 0.0),
-    _function("continuations: level", _BEHIND, "_are_level", _is(_all_level)),
+    Part("pieces of one plane", (f"{_BEHIND}:_of_planes",), _NO_CONTINUATIONS),
+    _function("continuations", _BEHIND, "_unseen", _is(_none_hidden), "_ALONG_WAY", "_MIN_DEPTH"),
+    _function("continuations: level", _BEHIND, "_are_level", _is(_all_level), "_SIGMAS", "_MIN_NOISE"),
     _constant("continuations: three places", _ACQUISITION, "_MAX_PLACES", 1),
-    Part("bounding planes", ("graph/bounding_planes.py:bounding_planes",), _NO_PLANES),
-    _function("bounding planes: open gaps", "graph/bounding_planes.py", "_is_open", _none_of(3)),
-    Part("terrain", ("graph/terrain.py",), _NO_TERRAIN),
-    _function("terrain: pieces that touch", "graph/terrain.py", "_touching", _gives(np.empty((0, 2), np.int64))),
+    _function("bounding planes", _BEHIND, "_behind_something", lambda f: lambda *a: np.zeros(len(a[3].ends), np.bool_)),
+    Part("terrain", (f"{_BEHIND}:_of_terrain",), _NO_TERRAIN),
+    _function("terrain: pieces that touch", _BEHIND, "_touching", _gives(np.empty((0, 2), np.int64))),
     Part("bridges", ("graph/bridges.py", f"{_LINK}:RegionLinkage.bridge"), {"scan.bridges": _gives(_NO_BRIDGES)}),
     _threshold(
         "bridges between specks",

@@ -21,7 +21,6 @@ from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph import contacts
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.graph.bounding_planes import bounding_planes
 from pcgraph.graph.bridges import bridges
 from pcgraph.graph.continuations import continuations
 from pcgraph.graph.gaps import gaps
@@ -103,10 +102,9 @@ def _compile_graph_and_tree() -> None:
     leaves = replace(moments_of_groups(places, places, labels, n), normals=normals)
     surface = Surface(grid, normals, labels)
     nodes, touching = node_features(leaves), contacts.contacts(surface)
-    near = gaps(surface, nodes, touching.edges, Scanner(Told(), np.zeros(3), 0.5))
-    hidden = continuations(surface, nodes, labels, np.zeros((1, 3))).with_others(
-        bounding_planes(surface, nodes, labels)
-    )
+    scanner = Scanner(Told(), np.zeros(3), 0.5)
+    near = gaps(surface, nodes, touching.edges, scanner)
+    hidden = continuations(surface, nodes, labels, scanner, np.zeros((1, 3)))
     graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes, near, hidden)
     graph = replace(graph, bridges=bridges(surface, leaves.counts, graph.joined))
     segmentation_tree(RegionLinkage().merges(graph, leaves), leaves).cut(altitude=0.5)

@@ -17,12 +17,10 @@ from pcgraph.acquisition.pixels import with_pixels
 from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.graph.bounding_planes import bounding_planes
 from pcgraph.graph.bridges import bridges
 from pcgraph.graph.contacts import contacts, edge_features
 from pcgraph.graph.continuations import continuations, faces_of
 from pcgraph.graph.gaps import gaps
-from pcgraph.graph.terrain import terrain
 from pcgraph.inputs import CleanCloud, Features, Points, as_arrays, clean_cloud, whole_number
 from pcgraph.parallel import side_by_side
 from pcgraph.plausibility import (
@@ -208,12 +206,9 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     faces = faces_of(touching.edges, features, len(leaves))
     near, hidden = side_by_side(
         lambda: gaps(surface, nodes, touching.edges, scan.acquisition),
-        lambda: continuations(surface, nodes, faces, scan.oriented.places),
+        lambda: continuations(surface, nodes, faces, scan.acquisition, scan.oriented.places),
     )
-    of_planes, of_ground = side_by_side(
-        lambda: bounding_planes(surface, nodes, faces), lambda: terrain(surface, nodes, faces, scan.acquisition)
-    )
-    hidden = hidden.with_others(of_planes).without(touching.edges).without(near.edges).with_others(of_ground)
+    hidden = hidden.without_coplanar(touching.edges).without_coplanar(near.edges)
     graph = AdjacencyGraph(
         touching.edges, features, nodes, near, hidden, color_evidence=evidence, acquisition=scan.acquisition
     )

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import COST_STEPS, BoundaryCost, in_whole_steps
+from pcgraph.graph.continuations import MAX_RESIDUAL
 from pcgraph.hierarchy import NONE
 from pcgraph.inputs import check_non_negative
 from pcgraph.pairs import not_among
@@ -211,7 +212,7 @@ class AltitudeConstants(NamedTuple):
     """Most times, count, that a merge waits: two that wait for each other come to an end."""
     whole: float = 3.0
     """Least mass, mean supervoxels, of regions that wait or are waited for: smaller ones are parts of surfaces."""
-    flat: float = 0.25
+    flat: float = MAX_RESIDUAL**2
     """Most mean square distance of a support from its plane, squared voxel edges: half an edge is what voxels make of a
     plane. Terrain is less flat; its pieces lie off each other's planes without standing on each other."""
     clear: float = 1.0

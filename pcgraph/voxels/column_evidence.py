@@ -7,12 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.parallel import kernel
+from pcgraph.voxels.directions import CREASE_COSINE, SAME_SURFACE_COSINE
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 
-_SMOOTH_COSINE = 0.9
-"""Cosine between the normals of two touching voxels, 26 degrees, above which the surface is smooth; chosen by eye."""
-_CREASE_COSINE = 0.5
-"""Cosine between the normals of two touching voxels, 60 degrees, below which there is a crease; chosen by eye."""
 _SAMPLE = 1 << 13
 """Voxels at which the contrast is read, about; chosen by eye, for the time's sake."""
 _ROUNDING = 1e-24
@@ -78,12 +75,12 @@ def _add_squared_distances(
             j, cosine, square = neighbours[a], 0.0, 0.0
             for axis in range(3):
                 cosine += normals[i, axis] * normals[j, axis]
-            if _CREASE_COSINE <= cosine <= _SMOOTH_COSINE:
+            if CREASE_COSINE <= cosine <= SAME_SURFACE_COSINE:
                 continue
             for column in range(values.shape[1]):
                 gap = values[i, column] - values[j, column]
                 square += gap * gap
-            kind = 0 if cosine > _SMOOTH_COSINE else 1
+            kind = 0 if cosine > SAME_SURFACE_COSINE else 1
             sums[kind] += square * counts[i] * counts[j] / (counts[i] + counts[j])
             pairs[kind] += 1
 

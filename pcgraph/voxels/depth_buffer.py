@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is visible from places: depth buffers over all directions, on octahedral maps."""
+"""Visibility from places: depth buffers over all directions, on octahedral maps."""
 
 from __future__ import annotations
 
@@ -10,17 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.voxels.directions import SAME_SURFACE_COSINE
 
-SAME_SURFACE_COSINE = np.float32(0.8)
-"""Cosine between normals on one surface, at least."""
-_BINS_PER_RADIAN = 0.35  # of the octahedral map, over its width, on average
-_MAX_BINS = 512  # along each side: a map that stays in the cache
-_SLANTED = np.float32(8.0)  # widths between surfels of one surface of which one may seem to hide the other
-_STEEPEST = np.float32(4.0)  # of a surfel that is seen at a slant: tangent of its angle
+_COARSENESS = 0.35
+"""One over the bins along the map, for surfels of a radian: a bin is 1.24 surfels wide on average. Chosen by eye."""
+_MIN_BINS = 64
+"""Fewest bins along the map, a count. Chosen by eye."""
+_MAX_BINS = 512
+"""Most bins along the map, a count, so that it stays in the cache."""
+_SLANTED = np.float32(8.0)
+"""Most widths between surfels of one surface of which one may seem to hide the other. Chosen by eye."""
+_STEEPEST = np.float32(4.0)
+"""Largest slope of a surfel that is seen at a slant, the tangent of its angle. Chosen by eye."""
 _TINY = 1e-12
-_NOTHING = np.iinfo(np.int64).max
-_NUMBER = (1 << 32) - 1
+"""Least length in a frame of the order of 1 m, so that nothing is divided by zero."""
 _FAR = np.float32(np.inf)
+"""Range of a bin with no surfel."""
+_NOTHING = (0x7F800000 << 32) + (1 << 32) - 1
+"""Word of a bin with no surfel, because the bits of an infinite float32 stand above those of a number."""
+_NUMBER = (1 << 32) - 1
+"""Bits of a word from which the number of a surfel is read."""
 
 
 def visibility_from(
@@ -43,14 +52,51 @@ def visibility_from(
     stretch : float, >= 1
         Widths over depths: surfels that stand for others beside them are wider, but no deeper.
     """
-    seen = np.empty((len(places), len(centres)), np.bool_)
-    some = slice(None, None, max(1, len(centres) // 200))  # to know how fine a map it takes
+    return _depth_order(places, centres, widths, normals, stretch, len(centres), 0, 1.0) >= 0
+
+
+def depth_order(
+    places: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    widths: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    n_points: int,
+    finer: float = 1.0,
+) -> NDArray[np.int8]:
+    """Whether what is seen in the direction of each of m points is nearer, -1, farther, 1, or neither, 0; (k, m) int8.
+
+    Parameters
+    ----------
+    places, centres, widths, normals
+        As for `visibility_from`. Widths of points are the difference of depth that counts.
+    n_points : int
+        How many of the surfels, the last ones, are points where nothing need be, which hide nothing.
+    finer : float, >= 1
+        Times as many bins along the map as usual, at most, for surfels that are drawn smaller.
+    """
+    n_drawn = len(centres) - n_points
+    return _depth_order(places, centres, widths, normals, 1.0, n_drawn, n_drawn, finer)
+
+
+def _depth_order(
+    places: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    widths: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    stretch: float,
+    n_drawn: int,
+    first: int,
+    finer: float,
+) -> NDArray[np.int8]:
+    """The same for the surfels from the first on, given how many are drawn."""
+    order = np.empty((len(places), len(centres) - first), np.int8)
+    some = slice(None, n_drawn, max(1, n_drawn // 200))  # to know how fine a map it takes
     ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)
-    typical = np.median(widths[some] / np.maximum(ranges, 1e-12), axis=1)
-    bins = np.clip(1.0 / (_BINS_PER_RADIAN * typical), 64, _MAX_BINS).astype(np.int64)
+    typical = np.median(widths[some] / np.maximum(ranges, _TINY), axis=1)
+    bins = np.clip(1.0 / (_COARSENESS * typical), _MIN_BINS, finer * _MAX_BINS).astype(np.int64)
     surfels = _Surfels(_columns(centres), _columns(normals), widths.astype(np.float32), np.float32(1.0 / stretch))
-    in_blocks(_look, len(places), places.astype(np.float32), bins, surfels, seen, smallest=1)
-    return seen
+    in_blocks(_look, len(places), places.astype(np.float32), bins, surfels, n_drawn, order, smallest=1)
+    return order
 
 
 def hit_fractions(places: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -140,7 +186,7 @@ def _find_bins(place: NDArray[np.float32], centres: NDArray[np.float32], bins: N
 
 
 class _Views(NamedTuple):
-    """How surfels look from a place, (n,) float32 each.
+    """Surfels as they look from a place, (n,) float32 each.
 
     Attributes
     ----------
@@ -166,15 +212,16 @@ def _look(
     places: NDArray[np.float32],
     bins_of: NDArray[np.int64],
     surfels: _Surfels,
-    seen: NDArray[np.bool_],
+    n_drawn: int,
+    order: NDArray[np.int8],
 ) -> None:
-    """Set what is seen from each place, by the least range in each bin of directions that a surfel may cover.
+    """Set what `depth_order` returns, by the least range in each bin of directions that a surfel may cover.
 
     A bin holds the range, whose bits as a float32 sort as it does, above the number of the surfel that has it.
     """
-    n, nothing, half_bin = surfels.centres.shape[1], np.float32(0.0), np.float32(0.5)
+    n, m, nothing = surfels.centres.shape[1], order.shape[1], np.float32(0.0)
     depth = surfels.depth  # read here: a field read where surfels are compared costs that loop half its time again
-    at, doubtful = np.empty(n, np.int64), np.empty(n + 1, np.int64)
+    at, doubtful, nearest = np.empty(m, np.int64), np.empty(m + 1, np.int64), np.empty(0, np.int64)
     views = _Views(
         np.empty(n, np.float32),
         np.empty(n, np.float32),
@@ -183,35 +230,70 @@ def _look(
         np.empty(n, np.float32),
         np.empty(n, np.float32),
     )
-    most_bins = 0
     for k in range(start, stop):
-        most_bins = max(most_bins, bins_of[k])
-    nearest = np.empty(most_bins * most_bins, np.int64)
-    for k in range(start, stop):
-        bins, last = bins_of[k], bins_of[k] - 1
-        nearest[: bins * bins] = _NOTHING
-        _view(places[k], bins, surfels, views)
-        for i in range(n):
-            at[i] = 0
-            if views.ranges[i] <= nothing:
-                continue
-            u, v, half = views.u[i], views.v[i], views.halves[i]
-            at[i] = min(int(u), last) * bins + min(int(v), last)
-            first, final = min(int(max(v - half, nothing)), last), min(int(v + half), last)
-            for p in range(min(int(max(u - half, nothing)), last), min(int(u + half), last) + 1):
-                off = max(abs(np.float32(p) + half_bin - u) - half_bin, nothing)
-                for q in range(first, final + 1):
-                    beside = max(off, abs(np.float32(q) + half_bin - v) - half_bin)
-                    bits = np.float32(views.ranges[i] + views.slopes[i] * beside).view(np.int32)
-                    nearest[p * bins + q] = min(nearest[p * bins + q], np.int64(bits) << 32 | i)
+        _view(places[k], bins_of[k], surfels, views)
+        box = _box_of(views, n - m, bins_of[k])
+        if box.height * box.width > len(nearest):
+            nearest = np.empty(box.height * box.width, np.int64)
+        _draw(views, box, n_drawn, nearest, at)
         n_doubtful = 0
-        for i in range(n):  # branch-free: it would often be mispredicted
-            too_far = views.limits[i] - np.int32(nearest[at[i]] >> 32).view(np.float32)
-            seen[k, i] = too_far <= nothing
-            doubtful[n_doubtful] = i
-            n_doubtful += (too_far > nothing) & (too_far < _SLANTED * surfels.widths[i])
-        for i in doubtful[:n_doubtful]:
-            seen[k, i] = _on_one_surface(i, nearest[at[i]] & _NUMBER, surfels, depth)
+        for j in range(m):  # branch-free: it would often be mispredicted
+            i, found = n - m + j, np.int32(nearest[at[j]] >> 32).view(np.float32)
+            too_far, is_here = views.limits[i] - found, views.ranges[i] <= nothing  # what is at the place is not seen
+            farther = (found > views.ranges[i] + surfels.widths[i]) & (found < _FAR) & (not is_here)
+            order[k, j] = np.int8(farther) - np.int8((too_far > nothing) | is_here)
+            doubtful[n_doubtful] = j
+            n_doubtful += farther | ((too_far > nothing) & (too_far < _SLANTED * surfels.widths[i]))
+        for j in doubtful[:n_doubtful]:
+            if _on_one_surface(n - m + j, nearest[at[j]] & _NUMBER, surfels, depth):
+                order[k, j] = 0
+
+
+class _Box(NamedTuple):
+    """The bins of an octahedral map that are looked at: from where on, along u and v, and how many."""
+
+    u: int
+    v: int
+    height: int
+    width: int
+
+
+@routine
+def _box_of(views: _Views, first: int, bins: int) -> _Box:
+    """The bins in which the centres of surfels lie, from the first on."""
+    low_u = low_v = np.float32(bins)
+    high_u = high_v = nothing = np.float32(0.0)
+    for i in range(first, len(views.u)):
+        if views.ranges[i] > nothing:
+            low_u, high_u = min(low_u, views.u[i]), max(high_u, views.u[i])
+            low_v, high_v = min(low_v, views.v[i]), max(high_v, views.v[i])
+    u, v = min(int(min(low_u, high_u)), bins - 1), min(int(min(low_v, high_v)), bins - 1)
+    return _Box(u, v, min(int(high_u), bins - 1) - u + 1, min(int(high_v), bins - 1) - v + 1)
+
+
+@routine
+def _draw(views: _Views, box: _Box, n_drawn: int, nearest: NDArray[np.int64], at: NDArray[np.int64]) -> None:
+    """Set the nearest of the surfels that are there in each bin of a box, and the bin in which each of the last is."""
+    nothing, half_bin = np.float32(0.0), np.float32(0.5)
+    last_u, last_v = box.u + box.height - 1, box.v + box.width - 1
+    nearest[: box.height * box.width] = _NOTHING
+    at[:] = 0
+    first_asked = len(views.u) - len(at)
+    for i in range(len(views.u)):
+        if views.ranges[i] <= nothing:
+            continue
+        u, v, half = views.u[i], views.v[i], views.halves[i]
+        if i >= first_asked:
+            at[i - first_asked] = (min(int(u), last_u) - box.u) * box.width + min(int(v), last_v) - box.v
+        if i >= n_drawn:
+            continue
+        first, final = max(int(max(v - half, nothing)), box.v), min(int(v + half), last_v)
+        for p in range(max(int(max(u - half, nothing)), box.u), min(int(u + half), last_u) + 1):
+            off, row = max(abs(np.float32(p) + half_bin - u) - half_bin, nothing), (p - box.u) * box.width - box.v
+            for q in range(first, final + 1):
+                beside = max(off, abs(np.float32(q) + half_bin - v) - half_bin)
+                bits = np.float32(views.ranges[i] + views.slopes[i] * beside).view(np.int32)
+                nearest[row + q] = min(nearest[row + q], np.int64(bits) << 32 | i)
 
 
 @routine

@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unit vectors spread evenly over the sphere, and unit vectors along a plane."""
+"""Unit vectors spread evenly over the sphere, and along a plane; which normals are those of one surface."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
+SAME_SURFACE_COSINE = np.float32(0.8)
+"""Least cosine between the normals of two voxels on one surface, 37 degrees. Measured: with 0.9 for colours no score
+differs by 0.004."""
+CREASE_COSINE = 0.5
+"""Largest cosine between the normals of two voxels at a crease, 60 degrees. Chosen by eye, not varied."""
 
 
 def sphere_directions(n: int) -> NDArray[np.float64]:

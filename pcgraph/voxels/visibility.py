@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.rounding import TINY
-from pcgraph.voxels.depth_buffer import SAME_SURFACE_COSINE, cosines_towards, visibility_from
+from pcgraph.voxels.depth_buffer import cosines_towards, depth_order, visibility_from
+from pcgraph.voxels.directions import CREASE_COSINE, SAME_SURFACE_COSINE
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 from pcgraph.voxels.virtual_viewpoints import (
     VirtualViewpoints,
@@ -47,8 +48,6 @@ _SIDES = SideThresholds()
 # Kernels read these.
 _MIN_PATCH = 10
 """Voxels of a patch: a smaller one keeps its votes. Chosen by eye; without this and `_MIN_MAJORITY` woods turn over."""
-_MAX_CREASE_COSINE = 0.5
-"""Cosine between normals where two surfaces meet in an edge, 60 degrees or more; chosen by eye, not varied."""
 _MAX_OFF_PATCH = 0.7
 """Voxel edges between the planes of touching voxels of one patch, at most; chosen by eye, not varied."""
 _WEIGHT_OF_UNCLEAR = 0.05
@@ -239,6 +238,45 @@ def _spread_votes(grid: VoxelGrid, alike: NDArray[np.int8], votes: NDArray[np.fl
     return votes
 
 
+def depth_order_along(
+    grid: VoxelGrid,
+    normals: NDArray[np.float64],
+    places: NDArray[np.float64],
+    ends: NDArray[np.integer],
+    fractions: tuple[float, ...],
+    depth: float,
+    finer: float = 1.0,
+) -> NDArray[np.int8]:
+    """Whether what is seen past ways between voxels is nearer, -1, farther, 1, or neither, 0; (k, n, c) int8.
+
+    Parameters
+    ----------
+    grid : VoxelGrid of v voxels
+    normals : (v, 3) float64
+    places : (k, 3) float64, metres
+        From where it is seen.
+    ends : (c, 2) int
+        Voxels at both ends of each way. A surface from one to the other would not hide itself.
+    fractions : n floats, 0..1
+        Where along the ways it is asked.
+    depth : float, voxel edges
+        Difference of depth from which on something is nearer or farther.
+    finer : float, >= 1
+        Times by which voxels are drawn smaller than they are, in as many more bins, to see what lies between them.
+    """
+    start, stop = np.moveaxis(grid.centroids[ends], 1, 0)
+    points = start + np.array(fractions)[:, None, None] * (stop - start)
+    k, n, c = len(places), len(fractions), len(ends)
+    centres = np.concatenate((grid.centroids, points.reshape(-1, 3), places))
+    middle, reach = unit_frame(grid, centres)
+    centres -= middle  # in place: there may be many
+    centres /= reach
+    depths = np.tile(depth * grid.edge_lengths[ends].max(axis=1), n)
+    widths = np.concatenate((grid.edge_lengths / finer, depths)) / reach
+    facing = np.concatenate((normals, np.tile(normals[ends[:, 0]], (n, 1))))
+    return depth_order(centres[-k:], centres[:-k], widths, facing, n * c, finer).reshape(k, n, c)
+
+
 def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
     """Fraction of the voxels that are visible from a place, (3,) float64, metres."""
     return _visible_fraction(grid, place, either_normals(grid))
@@ -386,7 +424,7 @@ def _alike_sides(
     least, most = min(abs(ahead_of_i), abs(ahead_of_j)) / edge, max(abs(ahead_of_i), abs(ahead_of_j)) / edge
     if abs(cosine) > SAME_SURFACE_COSINE and most <= _MAX_OFF_PATCH:
         return 1.0 if cosine > 0.0 else -1.0, True
-    if abs(cosine) < _MAX_CREASE_COSINE:
+    if abs(cosine) < CREASE_COSINE:
         return min(least, 1.0) * (1.0 if (ahead_of_i > 0.0) == (ahead_of_j > 0.0) else -1.0), False
     return 0.0, False
 

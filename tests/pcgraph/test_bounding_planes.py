@@ -14,9 +14,11 @@ from scenes.rooms import desk, floor, sheet
 from scenes.surfaces import labelled
 
 import pcgraph
-from pcgraph.graph.bounding_planes import bounding_planes
-from pcgraph.graph.continuations import faces_of
+from pcgraph.acquisition.kinds import Told, UnknownAcquisition
+from pcgraph.graph.continuations import continuations, faces_of
 from pcgraph.tree.tree import segmentation_tree
+
+UNKNOWN, NOWHERE = UnknownAcquisition(Told()), np.empty((0, 3))  # nobody says from where the clouds were seen
 
 
 def segmented(*sheets, **settings):
@@ -33,7 +35,7 @@ def pairs_of(result):
     """Means of the supervoxels of each pair on bounding planes, (r, 2, 3), that the segmentation took."""
     graph = result.graph
     faces = faces_of(graph.edges, graph.edge_features, graph.n_nodes)
-    found = bounding_planes(result.surface, graph.node_features, faces)
+    found = continuations(result.surface, graph.node_features, faces, UNKNOWN, NOWHERE)
     assert found.coplanar.all()
     taken = {tuple(pair) for pair in graph.joined.tolist()}
     assert {tuple(pair) for pair in found.pairs.tolist()} <= taken
@@ -169,5 +171,5 @@ def test_many_pieces_take_little_time():
     faces = faces_of(graph.edges, graph.edge_features, graph.n_nodes)
     assert np.count_nonzero(np.bincount(faces[result.surface.supervoxels]) >= 40) > 1500
     begun = time.process_time()
-    bounding_planes(result.surface, graph.node_features, faces)
+    continuations(result.surface, graph.node_features, faces, UNKNOWN, NOWHERE)
     assert time.process_time() - begun < 10.0

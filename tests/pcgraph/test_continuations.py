@@ -93,6 +93,17 @@ def test_of_boards_whose_gap_is_hidden_all_along_only_wide_ones_are_one(width, o
     assert (objects_of(result.labels, thing, 0) == objects_of(result.labels, thing, 1)) is one
 
 
+@pytest.mark.parametrize(("beside", "one"), [(0.0, True), (1.5, False)])
+def test_what_one_of_the_places_sees_past_is_no_gap_in_the_data(beside, one):
+    """Half of the points were seen from another place: the same, or one that sees between the boards."""
+    boards = [(-1.4, -0.2, -2.0, 2.0, 2.0), (0.2, 1.4, -2.0, 2.0, 2.0)]
+    points, thing = before_a_wall([*boards, (-0.16, 0.16, -2.0, 2.0, 1.0)], np.inf)
+    places = np.zeros_like(points)
+    places[1::2, :, 0] = beside
+    result = pcgraph.segment(points, viewpoint=places)
+    assert (objects_of(result.labels, thing, 0) == objects_of(result.labels, thing, 1)) is one
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_floor_under_a_cabinet_is_one_object_though_nobody_says_from_where_it_was_seen(seed):
     points, truth = cabinet_from_wall_to_wall(seed)
@@ -126,7 +137,7 @@ def test_no_place_and_a_place_on_a_point_find_what_there_is():
     result = pcgraph.segment(points)
     surface, nodes = result.surface, result.graph.node_features
     faces = faces_of(result.graph.edges, result.graph.edge_features, result.graph.n_nodes)
-    on_a_point = continuations(surface, nodes, faces, surface.grid.centroids[:1])
+    on_a_point = continuations(surface, nodes, faces, result.acquisition, surface.grid.centroids[:1])
     assert on_a_point.pairs.shape[1] == 2
     single = pcgraph.segment(np.zeros((1, 3)), viewpoint=(0, 0, 0), voxel_size=0.1)
     assert single.graph.continuations.pairs.shape == (0, 2)

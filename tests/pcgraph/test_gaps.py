@@ -13,9 +13,10 @@ from tiers import draws
 
 import pcgraph
 from pcgraph.acquisition.kinds import Scanner, Told, UnknownAcquisition
-from pcgraph.graph.gaps import gaps
-from pcgraph.graph.spherical_image import Surfels, seen_through, view_from
-from pcgraph.voxels.grid import Neighbourhood
+from pcgraph.graph.gaps import gaps, seen_between
+from pcgraph.voxels.grid import voxel_grid
+from pcgraph.voxels.surface import Surface
+from pcgraph.voxels.warp import Warp
 
 VOXEL = 0.05
 
@@ -124,28 +125,30 @@ def halves_of(tables):
     return tables[:, 0] < 1.0 + VOXEL, tables[:, 0] > 1.0 + VOXEL
 
 
-def view(place, places, normals):
-    """Voxels of 5 cm as they are seen from a place."""
-    edges, n = np.full(len(places), 0.05), len(places)
-    touching = Neighbourhood(np.zeros(n + 1, np.uint64), np.empty(0, np.uint32))
-    return view_from(
-        place, Surfels(np.arange(n), places, normals, edges, edges, np.arange(n, dtype=np.int32), touching)
-    )
-
-
 def test_between_two_voxels_is_seen_what_lies_farther_off_near_the_middle():
+    """Voxels of 5 cm that face the origin."""
+
+    def seen(places, source, target, normals=None, place=(0.0, 0.0, 0.0)):
+        facing = np.tile([0.0, 0.0, -1.0], (len(places), 1)) if normals is None else normals
+        grid = voxel_grid(places, 0.05, Warp())
+        assert grid.n_voxels == len(places)
+        rows = grid.voxel_of_point
+        surface = Surface(grid, facing[grid.order], rows)
+        return seen_between(surface, np.array(place), np.stack((rows[source], rows[target]), axis=1)).tolist()
+
     places = np.array(
         [[-0.1, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 1.0, 1.0], [0.2, 1.0, 1.0], [0.2, 1.0, 3.0]]
     )
-    source, target, facing = np.array([0, 0, 3]), np.array([1, 4, 4]), np.tile([0.0, 0.0, -1.0], (6, 1))
-    through = seen_through(view(np.zeros(3), places, facing), source, target)
-    assert through.tolist() == [True, False, False]  # the last is farther off, but not in the middle
+    source, target = np.array([0, 0, 3]), np.array([1, 4, 4])
+    assert seen(places, source, target) == [True, False, False]  # the last is farther off, but not in the middle
     no_farther = places[:3] * [[1.0], [1.0], [0.53]]  # than by an edge and a half
-    assert not seen_through(view(np.zeros(3), no_farther, facing[:3]), source[:1], target[:1]).any()
-    slanted = np.where(np.arange(6)[:, None] == 0, [1.0, 0.0, -0.1], facing)  # its plane goes on there
-    assert not seen_through(view(np.zeros(3), places, slanted), source[:1], target[:1]).any()
+    assert seen(no_farther, source[:1], target[:1]) == [False]
+    farther = places[:3] * [[1.0], [1.0], [0.6]]
+    assert seen(farther, source[:1], target[:1]) == [True]
+    edge_on = np.tile([0.0, 1.0, 0.0], (3, 1))  # a plane that goes on there
+    assert seen(farther, source[:1], target[:1], edge_on) == [False]
     one = np.zeros(1, np.int64)
-    assert not seen_through(view(places[0], places[:1], facing[:1]), one, one).any()
+    assert seen(places[:1], one, one, place=places[0]) == [False]
 
 
 @pytest.mark.parametrize("seed", draws(14, 4))

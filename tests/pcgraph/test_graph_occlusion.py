@@ -16,8 +16,7 @@ from scenes.rays import pinhole
 import pcgraph
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
-from pcgraph.graph.occlusion import occlusions
-from pcgraph.graph.spherical_image import spherical_image, surfels_of, view_from
+from pcgraph.graph.occlusion import occlusions, spherical_image, view_from
 from pcgraph.voxels.surface import Surface
 
 RAYS = pinhole(PLATE_SHAPE, 150.0)
@@ -148,7 +147,7 @@ def test_a_panorama_has_no_seam(turn):
     angle = azimuth + turn
     points = np.column_stack((np.cos(angle), np.sin(angle), rise)) * distance[:, None]
     result = pcgraph.segment(points, viewpoint=(0, 0, 0), voxel_size=0.06, seed_size=0.5)
-    image = spherical_image(view_from(result.viewpoint, surfels_of(result.surface)))
+    image = spherical_image(view_from(result.viewpoint, result.surface))
     assert image.wraps
     assert np.mean(image.voxels >= 0) > 0.9
     near = np.hypot(*result.graph.node_features.centroid[:, :2].T) < 2.0
@@ -206,7 +205,7 @@ def test_any_cloud_from_anywhere(seed, n, exponent, voxel, inside):
 def test_the_nearest_voxel_is_seen():
     points = np.vstack([plate_before_a_wall().reshape(-1, 3), 2.5 * RAYS.reshape(-1, 3)])  # a second, hidden wall
     result = pcgraph.segment(points, viewpoint=(0, 0, 0), voxel_size=0.02, seed_size=0.1)
-    image = spherical_image(view_from(result.viewpoint, surfels_of(result.surface)))
+    image = spherical_image(view_from(result.viewpoint, result.surface))
     depth = result.surface.grid.centroids[image.voxels[image.voxels >= 0], 2]
     assert np.mean(depth > 2.25) < 0.02
 

@@ -31,7 +31,7 @@ import pcgraph
 from pcgraph.acquisition.spacing_law import spacing_law
 from pcgraph.metrics import segmentation_covering
 from pcgraph.voxels import virtual_viewpoints
-from pcgraph.voxels.depth_buffer import visibility_from
+from pcgraph.voxels.depth_buffer import depth_order, visibility_from
 from pcgraph.voxels.grid import voxel_grid
 from pcgraph.voxels.ground_and_rooms import dominant_plane
 from pcgraph.voxels.spacing import median_spacing
@@ -584,3 +584,21 @@ def test_a_closed_bottle_of_few_points_is_seen_from_outside(seed):
     points[base] = 0.04 * np.sqrt(rng.random((base.sum(), 1))) * outwards[base]
     outwards[base] = [0.0, 0.0, -1.0]
     assert fraction_outward(points, outwards) > 0.9
+
+
+def test_what_lies_at_the_place_is_not_seen_from_there():
+    places = np.array([[0.0, 0.0, 0.0], [0.3, 0.2, 0.9]])
+    seen = visibility_from(places, places, np.full(2, 0.02), np.tile([0.0, 0.0, 1.0], (2, 1)))
+    assert seen.tolist() == [[False, True], [True, False]]
+
+
+def test_past_a_point_is_seen_what_is_nearer_or_farther():
+    """A wall of surfels of 0.02 at z = 0.5; points before it, on it, behind it, a little behind it, and aside."""
+    x, y = (0.02 * np.mgrid[-10:11, -10:11]).reshape(2, -1)
+    wall = np.stack((x, y, np.full_like(x, 0.5)), axis=1)
+    points = np.array([[0.0, 0, 0.3], [0.05, 0, 0.5], [0.0, 0, 0.8], [0.0, 0.05, 0.52], [0.8, 0, 0.5]])
+    normals = np.tile([0.0, 0.0, -1.0], (len(wall) + len(points), 1))
+    widths = np.concatenate((np.full(len(wall), 0.02), np.full(len(points), 0.04)))
+    for finer in (1.0, 2.0):
+        order = depth_order(np.zeros((1, 3)), np.concatenate((wall, points)), widths, normals, len(points), finer)
+        assert order.tolist() == [[1, 0, -1, 0, 0]]
