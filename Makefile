@@ -37,7 +37,7 @@ validate: $(VENV)/.installed-test kernels ## long comparisons and statistics, be
 	$(BIN)/python -m pytest $(PARALLEL) -m validation
 
 kernels: $(VENV)/.installed-test # compiled once beside mypy, which leaves a core; else by each worker of the tests
-	@$(BIN)/python -c "from pcgraph.all_kernels import compile_kernels; compile_kernels()"
+	@$(BIN)/pcgraph compile > /dev/null
 
 coverage: $(VENV)/.installed-test ## every test of both, and which lines none reaches; takes a third longer
 	$(BIN)/python -m pytest $(PARALLEL) --cov --cov-report=term
@@ -76,6 +76,8 @@ system:
 $(VENV)/.installed: pyproject.toml constraints.txt scripts/setup | system
 	@scripts/setup venv $(VENV)
 	@scripts/setup install $(VENV)
+	@echo "Compiling the kernels of pcgraph (half a minute the first time) ..."
+	@$(BIN)/pcgraph compile > /dev/null
 	@touch $@
 
 $(VENV)/.installed-test: pyproject.toml constraints.txt scripts/setup | system

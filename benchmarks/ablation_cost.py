@@ -16,7 +16,7 @@ import pcgraph
 PACKAGE = Path(pcgraph.__file__).parent
 KERNELS = {"kernel", "routine", "summing_routine", "inlined"}
 """Decorators of compiled functions (`pcgraph.parallel`)."""
-_UNCOUNTED = ("__init__.py", "warmup.py", "all_kernels.py")  # they name what others use, and keep nothing alive
+_UNCOUNTED = ("__init__.py", "all_kernels.py")  # they name what others use, and keep nothing alive
 _CONSTANT = re.compile(r"_?[A-Z][A-Z0-9_]*|\w+Constants\.\w+|\w*Thresholds\.\w+")  # fields of these are constants, too
 
 

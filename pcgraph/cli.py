@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 import warnings
@@ -151,6 +152,20 @@ def segment(
     _print_summary(result, labels, targets, time.perf_counter() - start)
 
 
+@app.command(name="compile")
+def compile_ahead() -> None:
+    """Compile what the first segmentation of an installation would compile, so that it need not wait.
+
+    What is compiled already is left as it is.
+    """
+    from pcgraph.all_kernels import compile_kernels
+
+    logging.getLogger("pcgraph").setLevel(logging.ERROR)  # whoever asks for it knows what is waited for
+    start = time.perf_counter()
+    compile_kernels()
+    typer.echo(f"{'seconds':<12} {time.perf_counter() - start:.2f}")
+
+
 def main() -> None:
     """Run the command line."""
     try:
@@ -207,10 +222,7 @@ def _linkage(name: str) -> Linkage:
 def _segmented(path: Path, cloud: Cloud, **settings: Any) -> Segmentation:
     from pcgraph import scan
     from pcgraph.plausibility import CloudWarning
-    from pcgraph.warmup import must_compile
 
-    if must_compile():
-        typer.echo("pcgraph: compiling its kernels, which takes ten seconds or so; done once.", err=True)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:

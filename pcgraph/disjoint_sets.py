@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csgraph
 
-from pcgraph.parallel import kernel
+from pcgraph.parallel import kernel, routine
 
 
-@kernel
+@routine
 def root_of(links: NDArray[np.integer], element: int) -> int:
     """Representative of an element's set; paths are halved on the way (Tarjan and van Leeuwen 1984)."""
     while links[element] != element:
@@ -19,22 +18,37 @@ def root_of(links: NDArray[np.integer], element: int) -> int:
     return element
 
 
-@kernel
-def renumbered(labels: NDArray[np.int32], names: NDArray[np.int32], used: int) -> NDArray[np.int32]:
-    """Labels renamed by `names`, one per label; those named -1 get new names from `used` on, in the order of elements.
+@routine
+def renumber(labels: NDArray[np.int32], names: NDArray[np.int32], used: int) -> None:
+    """Rename labels by `names`, one per label; those named -1 get new names from `used` on, in the order of elements.
 
     `names` is overwritten.
     """
-    numbered = np.empty(len(labels), np.int32)
     for i in range(len(labels)):
         if names[labels[i]] < 0:
             names[labels[i]] = used
             used += 1
-        numbered[i] = names[labels[i]]
-    return numbered
+        labels[i] = names[labels[i]]
 
 
 def connected_components(edges: NDArray[np.integer], n: int) -> NDArray[np.int32]:
     """Connected component of each of n nodes, (n,) int32, by edges, (m, 2) int; numbered in order of first nodes."""
-    matrix = coo_array((np.ones(len(edges), np.bool_), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    return np.asarray(csgraph.connected_components(matrix, directed=False)[1], np.int32)
+    links, component = np.arange(n, dtype=np.int32), np.empty(n, np.int32)
+    _connect(np.ascontiguousarray(edges, np.int64), links, component)
+    return component
+
+
+@kernel
+def _connect(edges: NDArray[np.int64], links: NDArray[np.int32], component: NDArray[np.int32]) -> None:
+    """Set the component of each node; the representative of a set is its first node."""
+    for e in range(len(edges)):
+        a, b = root_of(links, edges[e, 0]), root_of(links, edges[e, 1])
+        links[max(a, b)] = min(a, b)
+    n = 0
+    for node in range(len(links)):
+        root = root_of(links, node)
+        if root == node:
+            component[node] = n
+            n += 1
+        else:
+            component[node] = component[root]

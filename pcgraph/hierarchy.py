@@ -147,14 +147,19 @@ def roots(parents: NDArray[np.int32]) -> NDArray[np.int32]:
     return propagation_sources(parents, np.ones(len(parents), np.bool_))
 
 
-@kernel
 def propagation_sources(parents: NDArray[np.int32], condition: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Node whose value each node has after `propagate_sequential`, (k,) int32: it or one above it."""
     sources = np.empty(len(parents), np.int32)
+    _set_sources(parents, condition, sources)
+    return sources
+
+
+@kernel
+def _set_sources(parents: NDArray[np.int32], condition: NDArray[np.bool_], sources: NDArray[np.int32]) -> None:
+    """Set what `propagation_sources` returns."""
     for node in range(len(parents) - 1, -1, -1):
         parent = parents[node]
         sources[node] = sources[parent] if condition[node] and parent != node else node
-    return sources
 
 
 class AncestorIndex(NamedTuple):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of nodes as sorted keys: distinct pairs, and pairs that are not among others."""
+"""Pairs of nodes as sorted keys, distinct ones and those that are not among others; and pairs of near places."""
 
 from __future__ import annotations
 
@@ -22,3 +22,29 @@ def not_among(pairs: NDArray[np.int32], others: NDArray[np.int32]) -> NDArray[np
     """Whether each of r pairs, (r, 2), is not among others, (m, 2), which are in ascending order; (r,) bool."""
     keys, known = pair_keys(*pairs.T), pair_keys(*others.T)
     return np.searchsorted(known, keys, "left") == np.searchsorted(known, keys, "right")
+
+
+_FEW_DISTANCES = 1 << 18
+"""Distances that are computed one by one, which takes 4 ms; to import SciPy's trees takes a quarter of a second."""
+
+
+def nearest(
+    places: NDArray[np.float64], sought: NDArray[np.float64], n: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Distances to the n nearest of k places and their numbers, (q, n) each, from q other places, the nearest first.
+
+    Parameters
+    ----------
+    places, sought : (k, 3), (q, 3) float64
+    n : int, 1..k
+    """
+    if len(places) * len(sought) > _FEW_DISTANCES:
+        from scipy.spatial import cKDTree
+
+        distances, numbers = cKDTree(places).query(sought, np.arange(1, n + 1))
+        return distances, np.asarray(numbers, np.int64)
+    squares = sum(np.square(sought[:, axis, None] - places[:, axis]) for axis in range(3))
+    numbers = np.argpartition(squares, n - 1, axis=1)[:, :n]
+    squares = np.take_along_axis(squares, numbers, axis=1)
+    order = np.argsort(squares, axis=1)
+    return np.sqrt(np.take_along_axis(squares, order, axis=1)), np.take_along_axis(numbers, order, axis=1)

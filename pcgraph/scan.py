@@ -41,7 +41,6 @@ from pcgraph.voxels.column_evidence import color_evidence
 from pcgraph.voxels.grid import VoxelGrid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER
 from pcgraph.voxels.surface import Surface
-from pcgraph.warmup import compile_in_two_processes
 
 _FLIP_COSINE = 0.5
 """Cosine between normals of small and of larger voxels below minus which the small one is flipped: chosen by eye. With
@@ -136,7 +135,6 @@ def segment(
     n_supervoxels = None if n_supervoxels is None else min(n_supervoxels, len(cloud.points))
     sizes = Sizes.of(voxel_size, seed_size, n_supervoxels)
     assumed = acquisition_of(cloud, viewpoint, camera, range_growth)
-    compile_in_two_processes()
     found = voxelise(without_flying_pixels(cloud, assumed.told.image), assumed, sizes)
     cloud, grid, acquisition = found.voxelised.cloud, found.voxelised.grid, found.acquisition
     warn_of_rounding(points, cloud, found.spacing)  # type: ignore[arg-type]

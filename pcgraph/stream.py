@@ -16,7 +16,6 @@ from pcgraph.supervoxels.method import SupervoxelMethod
 from pcgraph.tree.linkage import Linkage
 from pcgraph.voxelisation.voxelised import Voxelised, voxelise_beside, without_flying_pixels
 from pcgraph.voxels.grid import grid_union
-from pcgraph.warmup import compile_in_two_processes
 
 
 def update(
@@ -77,7 +76,6 @@ def update(
     )
     cloud = with_pixels(clean_cloud(points, colors, normals, features, earlier.feature_scaling))
     last = acquisition_of(cloud, viewpoint)
-    compile_in_two_processes()
     warn_of_rounding(points, cloud, None)  # type: ignore[arg-type]
     before = earlier.surface
     before.grid.warp.check(cloud.points)

@@ -189,7 +189,6 @@ STOREYS = [
     "families",
     "segmentation",
     "plausibility",
-    "warmup",
     "scan",
     "stream",
     "all_kernels",

@@ -268,7 +268,8 @@ class DepthImage(NamedTuple):
             return np.zeros(len(self.pixels.at), np.bool_)
         flying = np.empty(self.depths.shape, np.bool_)
         slope, step = _FLYING.min_slope * float(self.pitch[0]), _FLYING.min_steps * self.step
-        in_blocks(_find_flying, len(flying), self.depths, slope, step, flying, smallest=MIN_ROWS)
+        depths = np.ascontiguousarray(self.depths)
+        in_blocks(_find_flying, len(flying), depths, depths.reshape(-1), slope, step, flying, smallest=MIN_ROWS)
         found = flying.reshape(-1)[self.pixels.at]
         some_fly = len(found) >= MIN_POINTS and _FLYING.min_flying <= np.mean(found) <= _FLYING.max_flying
         return found if some_fly else np.zeros_like(found)
@@ -329,11 +330,12 @@ def _find_flying(
     start: int,
     stop: int,
     depths: NDArray[np.float64],
+    pixels: NDArray[np.float64],
     least_slope: float,
     least_step: float,
     flying: NDArray[np.bool_],
 ) -> None:
-    """Set whether each pixel of some rows flies."""
+    """Set whether each pixel of some rows flies, given depths as (h, w), and the same as (h w,)."""
     h, w = depths.shape
     for i in range(start, stop):
         for j in range(w):
@@ -341,34 +343,43 @@ def _find_flying(
             limit = max(least_slope * own, least_step * own * own)
             beside = abs(depths[i, max(j - 1, 0)] - own) > limit or abs(depths[i, min(j + 1, w - 1)] - own) > limit
             above = abs(depths[max(i - 1, 0), j] - own) > limit or abs(depths[min(i + 1, h - 1), j] - own) > limit
-            flying[i, j] = (beside and _is_mixed(depths[i], j, limit)) or (above and _is_mixed(depths[:, j], i, limit))
+            flying[i, j] = (beside and _is_mixed(pixels, i * w, np.int64(1), w, j, limit)) or (
+                above and _is_mixed(pixels, j, w, h, i, limit)
+            )
 
 
 @routine
-def _is_mixed(line: NDArray[np.float64], at: int, limit: float) -> bool:
-    """Whether a pixel of a line is a mix of two depths.
+def _is_mixed(pixels: NDArray[np.float64], first: int, step: int, length: int, at: int, limit: float) -> bool:
+    """Whether a pixel of a line, ``pixels[first : first + step * length : step]``, is a mix of two depths.
 
     It lies between the depths of its neighbours, by more than a limit off each (off one, if the other is NaN), and this
     slope ends on both sides.
     """
-    before = line[at - 1] - line[at] if at > 0 else 0.0
-    after = line[at + 1] - line[at] if at + 1 < len(line) else 0.0
+    own = pixels[first + step * at]
+    before = pixels[first + step * (at - 1)] - own if at > 0 else 0.0
+    after = pixels[first + step * (at + 1)] - own if at + 1 < length else 0.0
     between = min(before, after) < -limit and max(before, after) > limit
     at_hole = (abs(before) > limit and math.isnan(after)) or (abs(after) > limit and math.isnan(before))
-    return bool((between or at_hole) and _ends(line, at, -1) and _ends(line, at, 1))
+    if not (between or at_hole):
+        return False
+    ends = True
+    for way in (-1, 1):
+        ends = ends and _ends(pixels, first, step, length, at, way)
+    return ends
 
 
 @routine
-def _ends(line: NDArray[np.float64], at: int, way: int) -> bool:
+def _ends(pixels: NDArray[np.float64], first: int, step: int, length: int, at: int, way: int) -> bool:
     """Whether a slope ends within some pixels along a line, in a hole or on a surface.
 
     On a plane it does not end, even if it is seen edge-on: there inverse depth changes evenly.
     """
     for _ in range(_MAX_SLOPE_PIXELS):
         following = at + 2 * way
-        if following < 0 or following >= len(line):
+        if following < 0 or following >= length:
             return False
-        here, there, beyond = line[at], line[at + way], line[following]
+        here, there = pixels[first + step * at], pixels[first + step * (at + way)]
+        beyond = pixels[first + step * following]
         if math.isnan(there) or math.isnan(beyond):
             return True
         if abs(1.0 / beyond - 1.0 / there) < _END_OF_SLOPE * abs(1.0 / there - 1.0 / here):

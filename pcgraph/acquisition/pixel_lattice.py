@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from pcgraph.acquisition.resection import NO_PLANE, PinholeCamera, resection
 from pcgraph.parallel import in_blocks, kernel, routine
@@ -152,6 +151,8 @@ def likely_cameras(points: NDArray[np.float64], sample: NDArray[np.float64]) -> 
 def _seeds(places: NDArray[np.float64], nearest: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Centres of patches, (k, 3), far from each other where places are dense, and the distance to the neighbour of a
     given rank of each, (k,)."""
+    from scipy.spatial.distance import cdist
+
     reach = np.partition(cdist(places[: _PATCH.asked], places), nearest, axis=1)[:, nearest]
     dense = np.argsort(reach, kind="stable")[: len(reach) // 4]
     chosen = dense[farthest_points(places[dense], 0, _PATCH.tried)]

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from pcgraph.rounding import TINY
 from pcgraph.voxels.spacing import Rows
@@ -121,6 +120,8 @@ def _is_certain(rows: Rows, frame: NDArray[np.float64], unknown: NDArray[np.floa
 def _flattest(rows: Rows, frame: NDArray[np.float64], start: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
     """Place and tilts of the axis, (5,), of least slopes near a start, by a Cauchy loss of a scale."""
     slopes, derivatives = (partial(_either, rows, frame, which) for which in (0, 1))
+    from scipy.optimize import least_squares
+
     return least_squares(slopes, start, derivatives, loss="cauchy", f_scale=scale, max_nfev=_RINGS.max_evaluations).x
 
 

@@ -6,11 +6,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pcgraph.acquisition.rings import scanner_of_rings
 from pcgraph.parallel import in_blocks, kernel, summing_routine
@@ -22,6 +21,9 @@ from pcgraph.voxels.eigen import SYMMETRIC_INDICES, plane_normal
 from pcgraph.voxels.ground_and_rooms import dominant_plane
 from pcgraph.voxels.sampling import order_of_draw, sample
 from pcgraph.voxels.spacing import Rows
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 _MOVES = np.concatenate((np.zeros((1, 3)), np.eye(3), -np.eye(3), sphere_directions(8)))
 _NEIGHBOUR = 8
@@ -269,6 +271,8 @@ def _readings(chosen: NDArray[np.float64], number: int) -> _Readings:
     """Readings at the first places of a sample, as many as asked for."""
     if len(chosen) <= _NEIGHBOUR:
         return _Readings(chosen[:0], chosen[:0], np.empty(0))
+    from scipy.spatial import cKDTree
+
     some, tree = chosen[:number], cKDTree(chosen, 24, balanced_tree=False, compact_nodes=False)
     of_blocks = in_blocks(partial(_spacing_and_normals, tree, some), len(some), smallest=_SEARCH.min_block)
     usable, spacing, normals = (np.concatenate(column) for column in zip(*of_blocks, strict=True))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.columns import group_means
-from pcgraph.parallel import in_blocks, kernel, routine, side_by_side
+from pcgraph.parallel import kernel, routine, side_by_side
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.eigen import SYMMETRIC_INDICES
 
@@ -106,10 +106,12 @@ def _mean_and_scatter(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Counts (k,), means (k, 3) and scatters (k, 3, 3), from sums about each group's first value."""
     counts, sums, first = np.zeros(n_groups, np.int64), np.zeros((n_groups, 9)), np.empty((n_groups, 3))
-    means, scatters = np.empty((n_groups, 3)), np.empty((n_groups, 3, 3))
     _sum_up(values, groups, counts, first, sums)
-    in_blocks(_centre, n_groups, counts, first, sums, means, scatters)
-    return counts, means, scatters
+    scatters = np.empty((n_groups, 3, 3))
+    for column, (one, other) in enumerate(SYMMETRIC_INDICES):
+        about = sums[:, 3 + column] - sums[:, one] * sums[:, other] / counts
+        scatters[:, one, other] = scatters[:, other, one] = np.maximum(about, 0.0) if one == other else about
+    return counts, first + sums[:, :3] / counts[:, None], scatters
 
 
 @kernel
@@ -136,26 +138,6 @@ def _sum_up(
         sums[s, 6] += x * y
         sums[s, 7] += x * z
         sums[s, 8] += y * z
-
-
-@kernel
-def _centre(
-    start: int,
-    stop: int,
-    counts: NDArray[np.int64],
-    first: NDArray[np.float64],
-    sums: NDArray[np.float64],
-    means: NDArray[np.float64],
-    scatters: NDArray[np.float64],
-) -> None:
-    """Set means, and scatters about them, from sums about the first values."""
-    for s in range(start, stop):
-        for axis in range(3):
-            means[s, axis] = first[s, axis] + sums[s, axis] / counts[s]
-        for column in range(6):
-            one, other = SYMMETRIC_INDICES[column]
-            about = sums[s, 3 + column] - sums[s, one] * sums[s, other] / counts[s]
-            scatters[s, one, other] = scatters[s, other, one] = max(about, 0.0) if one == other else about
 
 
 def moments_up_tree(leaves: Moments, parents: NDArray[np.int32]) -> Moments:

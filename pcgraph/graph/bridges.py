@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.graph.adjacency import Bridges
+from pcgraph.pairs import nearest
 from pcgraph.parallel import kernel, routine
 from pcgraph.voxels.surface import Surface
 
@@ -75,7 +75,7 @@ def bridges(surface: Surface, counts: NDArray[np.int64], joined: NDArray[np.int3
     means = np.stack([np.bincount(supervoxels, x, k) / n_voxels for x in places.T], axis=1)
     means -= means[0]
     means /= max(float(np.abs(means).max()), 1.0)  # squares stay finite, and only the order of distances counts
-    distance, found = cKDTree(means).query(means[specks], k=min(_THRESHOLDS.n_nearest + 1, k))
+    distance, found = nearest(means, means[specks], min(_THRESHOLDS.n_nearest + 1, k))
     row, column = np.nonzero(component[found] != component[specks][:, None])
     edges = _closest_pairs(component, specks[row], found[row, column].astype(np.int64), distance[row, column])
     involved = np.zeros(k, np.bool_)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -194,66 +193,37 @@ def edge_features(nodes: NodeFeatures, contacts: Contacts) -> EdgeFeatures:
     contacts : Contacts, m of them, between these supervoxels
     """
     i, j = contacts.edges.T
-    convexity, contact_convexity, normal_angle, step = np.empty((4, len(i)))
-    relations = convexity, contact_convexity, normal_angle, step
-    _relate(contacts.edges, nodes.centroid, nodes.normal, contacts.positions, contacts.normals, relations)
+    at_i, at_j = contacts.positions[:, 0], contacts.positions[:, 1]
+    of_i, of_j = contacts.normals[:, 0], contacts.normals[:, 1]
+    angle = angle_between(nodes.normal[i], nodes.normal[j])
+    off_i = np.abs(_dot(at_j - nodes.centroid[i], nodes.normal[i]))
+    off_j = np.abs(_dot(at_i - nodes.centroid[j], nodes.normal[j]))
     return EdgeFeatures(
-        convexity=convexity,
-        contact_convexity=contact_convexity,
-        normal_angle=normal_angle,
+        convexity=angle * _turn(nodes.normal[i], nodes.normal[j], nodes.centroid[i], nodes.centroid[j]),
+        contact_convexity=angle_between(of_i, of_j) * _turn(of_i, of_j, at_i, at_j),
+        normal_angle=angle,
         color_contrast=np.nan_to_num(np.linalg.norm(nodes.color[j] - nodes.color[i], axis=1)),
         contact_voxels=contacts.voxels.sum(axis=1),
         contact_length=contacts.lengths,
-        step=step,
+        step=np.minimum(off_i, off_j),
     )
 
 
-@kernel
 def angle_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angle between rows, radians, 0..pi, (m,); by the arc tangent, which is exact for small angles, too."""
-    angles = np.empty(len(a))
-    for row in range(len(a)):
-        angles[row] = _angle(a[row], b[row])
-    return angles
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    return np.arctan2(np.sqrt(x * x + y * y + z * z), _dot(a, b))
 
 
-@kernel
-def _relate(edges, centroids, normals, places, contact_normals, relations):  # type: ignore[no-untyped-def]
-    """Set `relations`: convexity of nodes, convexity at contacts, angle between nodes' normals, and step, (m,) each."""
-    convexity, contact_convexity, angle, step = relations
-    for e in range(len(edges)):
-        i, j = edges[e, 0], edges[e, 1]
-        angle[e] = _angle(normals[i], normals[j])
-        convexity[e] = angle[e] * _turn(normals[i], normals[j], centroids[i], centroids[j])
-        contact_convexity[e] = _angle(contact_normals[e, 0], contact_normals[e, 1])
-        contact_convexity[e] *= _turn(contact_normals[e, 0], contact_normals[e, 1], places[e, 0], places[e, 1])
-        step[e] = min(_height(places[e, 1], centroids[i], normals[i]), _height(places[e, 0], centroids[j], normals[j]))
-
-
-@routine
-def _angle(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Angle between two vectors, radians, 0..pi."""
-    x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-    return math.atan2(math.sqrt(x * x + y * y + z * z), a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
-
-
-@routine
 def _turn(
     normal_i: NDArray[np.float64], normal_j: NDArray[np.float64], at_i: NDArray[np.float64], at_j: NDArray[np.float64]
-) -> float:
-    """1 if the surface bends away from its outside on the way from i to j, -1 if it bends towards it, else 0."""
-    opening = 0.0
-    for axis in range(3):
-        opening += (normal_j[axis] - normal_i[axis]) * (at_j[axis] - at_i[axis])
-    if opening > 0.0:
-        return 1.0
-    return -1.0 if opening < 0.0 else 0.0
+) -> NDArray[np.float64]:
+    """1 if the surface bends away from its outside on the way from i to j, -1 if it bends towards it, else 0; (m,)."""
+    return np.sign(_dot(normal_j - normal_i, at_j - at_i))
 
 
-@routine
-def _height(point: NDArray[np.float64], origin: NDArray[np.float64], normal: NDArray[np.float64]) -> float:
-    """Distance of a point from a plane."""
-    height = 0.0
-    for axis in range(3):
-        height += (point[axis] - origin[axis]) * normal[axis]
-    return abs(height)
+def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Products of rows, (m,)."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return ax * bx + ay * by + az * bz

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay, cKDTree
 
 from pcgraph.acquisition.kinds import Acquisition
 from pcgraph.disjoint_sets import connected_components
@@ -347,6 +346,8 @@ def _facing_ways(grid: VoxelGrid, plane: _Plane, border: NDArray[np.int64], piec
     """
     triangles, places = np.empty((0, 3), np.int32), grid.centroids[border]
     if len(places) >= _MIN_TRIANGULATED:  # in voxel edges: no unit is too small
+        from scipy.spatial import Delaunay
+
         triangles = Delaunay(plane.project(places) / grid.size, qhull_options="QJ").simplices
     sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     ends, _ = distinct_pairs(*np.sort(sides[piece[sides[:, 0]] != piece[sides[:, 1]]], axis=1).T)
@@ -455,7 +456,8 @@ def _bounding(scene: _Scene, pieces: _Pieces, groups: list[NDArray[np.int64]]) -
     """The groups of pieces whose planes bound the scene."""
     first, bounding = np.array([group[0] for group in groups], np.int64), np.empty(len(groups), np.bool_)
     some = np.random.default_rng(0).permutation(len(scene.places))[:_SAMPLED_SUPERVOXELS]
-    others = scene.places[some], _OFF_PLANE * scene.edges[some], scene.voxels[some]
+    voxels = scene.voxels[some]
+    others = scene.places[some], _OFF_PLANE * scene.edges[some], voxels, int(voxels.sum())
     in_blocks(_bound, len(groups), pieces.planes.centroid[first], pieces.planes.normal[first], *others, bounding)
     return [group for group, bounds in zip(groups, bounding.tolist(), strict=True) if bounds]
 
@@ -469,10 +471,11 @@ def _bound(
     places: NDArray[np.float64],
     beyond: NDArray[np.float64],
     voxels: NDArray[np.int64],
+    total: int,
     found: NDArray[np.bool_],
 ) -> None:
-    """Set which planes have nearly nothing behind them and much before them, given the supervoxels."""
-    total = voxels.sum()
+    """Set which planes have nearly nothing behind them and much before them, given the supervoxels and the total of
+    their voxels."""
     for plane in range(start, stop):
         behind = before = 0
         for s in range(len(places)):
@@ -550,6 +553,8 @@ def _beside_middles(
     """The nearest of some supervoxels to the middle of each way, as projected on a plane, (c, q) rows of `some`, and
     whether they are within half its length."""
     numbers = np.arange(1, min(_NEAREST, len(some)) + 1)
+    from scipy.spatial import cKDTree
+
     distance, nearest = cKDTree(plane.project(scene.places[some])).query(middles, k=numbers)
     return nearest, distance <= np.maximum(0.5 * lengths[:, None], _OFF_PLANE * scene.edges[some[nearest]])
 
@@ -579,6 +584,8 @@ def _behind_something(
     hidden = hides.any(axis=1) & ~(over & (sets_in[number] > larger)).any(axis=1)
     behind = scene.places[heights < -_OFF_PLANE * scene.edges]
     if len(behind):
+        from scipy.spatial import cKDTree
+
         shows = cKDTree(plane.project(behind)).query(middles)[0] <= 0.5 * ways.lengths
         hidden &= (ways.means(shows) == 0.0)[ways.pair]
     return hidden

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.disjoint_sets import renumbered, root_of
+from pcgraph.disjoint_sets import renumber, root_of
 from pcgraph.parallel import in_blocks, inlined, kernel, routine
 from pcgraph.rounding import NEARLY_ZERO
 from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
@@ -150,20 +150,36 @@ def _contrast(features: NDArray[np.float64], i: int, means: NDArray[np.float64],
     return weight * np.sqrt(squares)
 
 
-@routine
-def sum_features(features: NDArray[np.float64], labels: NDArray[np.int32], n_labels: int) -> NDArray[np.float64]:
-    """Sums of the features over each supervoxel's voxels, (n_labels, 10 + d) float64, in the order of voxels.
+class Sums(NamedTuple):
+    """Sums and means over the voxels of k supervoxels.
 
-    Column 9 is the number of voxels.
+    Attributes
+    ----------
+    sums : (k, 10 + d) float64
+        Of their features; column 9 is their number.
+    means : (k, 9 + d + 3) float64
+        See `set_means`.
     """
-    sums = np.zeros((n_labels, features.shape[1] + 1))
+
+    sums: NDArray[np.float64]
+    means: NDArray[np.float64]
+
+    @classmethod
+    def zeros(cls, voxels: VoxelGraph, n_supervoxels: int) -> Sums:
+        """Those of supervoxels without voxels."""
+        columns = voxels.features.shape[1]
+        return cls(np.zeros((n_supervoxels, columns + 1)), np.zeros((n_supervoxels, columns + 3)))
+
+
+@routine
+def sum_features(features: NDArray[np.float64], labels: NDArray[np.int32], sums: NDArray[np.float64]) -> None:
+    """Add the features of each supervoxel's voxels to its sums, in voxel order."""
     for i in range(len(labels)):
         if labels[i] >= 0:
             add_features(features, i, sums, labels[i], 1.0)
-    return sums
 
 
-@inlined
+@routine
 def add_features(features: NDArray[np.float64], i: int, sums: NDArray[np.float64], s: int, sign: float) -> None:
     """Update the sums as voxel i joins supervoxel s (sign 1), or leaves it (sign -1)."""
     for column in range(9):
@@ -326,7 +342,8 @@ def expand(
     seeds = seeds[initial[seeds] < 0]
     labels, n_initial = initial.copy(), int(initial.max()) + 1
     labels[seeds] = np.arange(n_initial, n_initial + len(seeds), dtype=np.int32)
-    _expand(voxels, initial >= 0, labels, n_initial + len(seeds), early_sweeps)
+    sums = Sums.zeros(voxels, n_initial + len(seeds))
+    _expand(voxels, initial >= 0, labels, sums, early_sweeps)
     return labels
 
 
@@ -335,7 +352,7 @@ def _expand(
     voxels: VoxelGraph,
     fixed: NDArray[np.bool_],
     labels: NDArray[np.int32],
-    n_labels: int,
+    of_labels: Sums,
     early_sweeps: int,
 ) -> None:
     """Spread labels over all voxels that they reach; each connected part that none reaches gets a label of its own.
@@ -343,12 +360,12 @@ def _expand(
     Early sweeps may also take a voxel from a supervoxel that is farther from it.
     """
     features, indptr, neighbours, metric, slant = voxels
-    n = len(features)
-    claim, best = np.full(n, -1, np.int32), np.full(n, np.inf)
-    sums, means = sum_features(features, labels, n_labels), np.zeros((n_labels, features.shape[1] + 3))
-    frontier, touched = np.empty(n, np.int32), np.empty(n, np.int32)
+    n, (sums, means) = len(features), of_labels
+    claim, best, frontier, touched = np.empty(n, np.int32), np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32)
+    sum_features(features, labels, sums)
     n_frontier, sweep = 0, 0
     for i in range(n):
+        claim[i], best[i] = -1, np.inf
         if labels[i] >= 0:
             best[i] = -1.0 if fixed[i] else 0.0  # no distance is below -1, so fixed voxels stay
             frontier[n_frontier] = i
@@ -363,7 +380,7 @@ def _expand(
                 j = neighbours[a]
                 if labels[j] == s or claim[j] == s or (labels[j] >= 0 and sweep >= early_sweeps):
                     continue
-                d = distance(features, j, means, s, metric)
+                d = distance(features, np.int64(j), means, s, metric)
                 if d < best[j] or (d == best[j] and claim[j] > s):
                     if claim[j] < 0:
                         touched[n_touched] = j
@@ -375,14 +392,14 @@ def _expand(
                 touched[n_touched] = j
                 n_touched += claim[j] >= 0
         for t in range(n_touched):
-            j = touched[t]
+            j = np.int64(touched[t])
             if labels[j] >= 0:
                 add_features(features, j, sums, labels[j], -1.0)
             add_features(features, j, sums, claim[j], 1.0)
             labels[j], claim[j] = claim[j], -1
         frontier, touched = touched, frontier
         n_frontier, sweep = n_touched, sweep + 1
-    _label_the_rest(indptr, neighbours, labels, n_labels, frontier)
+    _label_the_rest(indptr, neighbours, labels, len(sums), frontier)
 
 
 @routine
@@ -421,7 +438,8 @@ def refine(voxels: VoxelGraph, labels: NDArray[np.int32], fixed: NDArray[np.bool
         Whether each voxel keeps its supervoxel.
     """
     queued = fixed.copy()
-    active, sums, means = _boundary(voxels, labels, fixed, int(labels.max()) + 1)
+    sums, means = of_labels = Sums.zeros(voxels, int(labels.max()) + 1)
+    active = _boundary(voxels, labels, fixed, of_labels)
     for _ in range(_REFINEMENTS):
         chosen = np.empty_like(active)
         in_blocks(_choose, len(active), active, voxels, labels, means, chosen)
@@ -431,10 +449,10 @@ def refine(voxels: VoxelGraph, labels: NDArray[np.int32], fixed: NDArray[np.bool
 
 
 @kernel
-def _boundary(  # type: ignore[no-untyped-def]
-    voxels: VoxelGraph, labels: NDArray[np.int32], fixed: NDArray[np.bool_], n_labels: int
-):
-    """Voxels that touch another supervoxel and are not fixed, ascending; and sums and means of all supervoxels."""
+def _boundary(
+    voxels: VoxelGraph, labels: NDArray[np.int32], fixed: NDArray[np.bool_], of_labels: Sums
+) -> NDArray[np.int32]:
+    """Voxels that are not fixed and touch another supervoxel, ascending; sets sums and means of all supervoxels."""
     features, indptr, neighbours, _, slant = voxels
     found = np.empty(len(labels), np.int32)
     used = 0
@@ -446,9 +464,10 @@ def _boundary(  # type: ignore[no-untyped-def]
                 found[used] = i
                 used += 1
                 break
-    sums, means = sum_features(features, labels, n_labels), np.empty((n_labels, features.shape[1] + 3))
+    sums, means = of_labels
+    sum_features(features, labels, sums)
     set_means(sums, means, slant)
-    return found[:used], sums, means
+    return found[:used]
 
 
 @kernel
@@ -465,7 +484,7 @@ def _choose(
     features, indptr, neighbours, metric, _ = voxels
     around = np.empty(MAX_NEIGHBOURS + 1, np.int32)
     for q in range(start, stop):
-        i = active[q]
+        i = np.int64(active[q])
         own = nearest = last = labels[i]
         n = 0
         for a in range(indptr[i], indptr[i + 1]):  # without a branch, which would often be mispredicted
@@ -503,7 +522,7 @@ def _move(
     following = np.empty(len(labels), np.int32)
     used = 0
     for q in range(len(active)):
-        i = active[q]
+        i = np.int64(active[q])
         if labels[i] != chosen[q]:
             add_features(features, i, sums, labels[i], -1.0)
             add_features(features, i, sums, chosen[q], 1.0)
@@ -527,7 +546,7 @@ def _move(
 def enforce_connectivity(
     voxels: VoxelGraph, labels: NDArray[np.int32], initial: NDArray[np.int32]
 ) -> NDArray[np.int32]:
-    """Connected supervoxels, (v,) int32, renumbered in the order of their first voxel.
+    """Connected supervoxels, (v,) int32, renumber in the order of their first voxel.
 
     Each supervoxel keeps its initial piece, or else its largest. Voxels of other pieces go, ring by ring, to the
     nearest supervoxel that touches them.
@@ -540,23 +559,64 @@ def enforce_connectivity(
     initial : (v,) int32
         Supervoxels that exist already, each in one piece. They keep their numbers and voxels; -1 elsewhere.
     """
-    n_supervoxels = int(labels.max()) + 1
-    kept = _largest_pieces(voxels, labels, n_supervoxels, initial >= 0)
-    _adopt(voxels, kept, n_supervoxels)
-    names = np.full(n_supervoxels, -1, np.int32)
+    names = np.full(int(labels.max()) + 1, -1, np.int32)
     n_initial = int(initial.max()) + 1
     names[:n_initial] = np.arange(n_initial)
-    return renumbered(kept, names, n_initial)
+    n, n_supervoxels = len(labels), len(names)
+    pieces = _Pieces(
+        np.arange(n, dtype=np.int32), np.empty(n, np.int32), np.zeros(n, np.int64), np.full(n_supervoxels, -1)
+    )
+    _connect(voxels, labels, initial >= 0, pieces, Sums.zeros(voxels, n_supervoxels), names, n_initial)
+    return pieces.of_voxel
+
+
+class _Pieces(NamedTuple):
+    """Connected pieces of supervoxels; each is known by its first voxel.
+
+    Attributes
+    ----------
+    links : (v,) int32
+        Voxels, each its own piece at first; see `pcgraph.disjoint_sets`.
+    of_voxel : (v,) int32
+        The piece, and later the label, of each voxel.
+    sizes : (v,) int64
+        Of pieces, zero at first.
+    largest : (k,) int64
+        Piece of each supervoxel, -1 at first.
+    """
+
+    links: NDArray[np.int32]
+    of_voxel: NDArray[np.int32]
+    sizes: NDArray[np.int64]
+    largest: NDArray[np.int64]
 
 
 @kernel
-def _largest_pieces(
-    voxels: VoxelGraph, labels: NDArray[np.int32], n_supervoxels: int, fixed: NDArray[np.bool_]
-) -> NDArray[np.int32]:
-    """Labels of voxels in the fixed piece of their supervoxel, or its largest (of equals the first); -1 elsewhere."""
+def _connect(
+    voxels: VoxelGraph,
+    labels: NDArray[np.int32],
+    fixed: NDArray[np.bool_],
+    pieces: _Pieces,
+    of_labels: Sums,
+    names: NDArray[np.int32],
+    used: int,
+) -> None:
+    """Set connected labels by their names, (n_supervoxels,) int32; the `used` first have one, the others, -1, get the
+    next in the order of voxels."""
+    connected = pieces.of_voxel
+    _set_largest_pieces(voxels, labels, fixed, pieces)
+    _adopt(voxels, connected, of_labels)
+    renumber(connected, names, used)
+
+
+@routine
+def _set_largest_pieces(
+    voxels: VoxelGraph, labels: NDArray[np.int32], fixed: NDArray[np.bool_], pieces: _Pieces
+) -> None:
+    """Set the label of each voxel in its supervoxel's fixed piece, or largest one (the first of equals); else -1."""
     indptr, neighbours = voxels.indptr, voxels.neighbours
+    links, piece, sizes, largest = pieces
     n = len(labels)
-    links, piece = np.arange(n, dtype=np.int32), np.empty(n, np.int32)  # a piece has the number of its first voxel
     for i in range(n):
         root = i
         for a in range(indptr[i], indptr[i + 1]):
@@ -566,7 +626,6 @@ def _largest_pieces(
                 other = root_of(links, np.int64(neighbours[a]))
                 links[max(root, other)] = min(root, other)
                 root = min(root, other)
-    sizes, largest = np.zeros(n, np.int64), np.full(n_supervoxels, -1, np.int64)
     for i in range(n):
         piece[i] = root_of(links, i)
         sizes[piece[i]] += n if fixed[i] else 1  # a fixed voxel outweighs all others
@@ -576,19 +635,15 @@ def _largest_pieces(
             largest[s] = i
     for i in range(n):
         piece[i] = labels[i] if piece[i] == largest[labels[i]] else -1
-    return piece
 
 
-@kernel
-def _adopt(
-    voxels: VoxelGraph,
-    labels: NDArray[np.int32],
-    n_supervoxels: int,
-) -> None:
+@routine
+def _adopt(voxels: VoxelGraph, labels: NDArray[np.int32], of_labels: Sums) -> None:
     """Give every voxel without a label, ring by ring, the nearest label around it."""
     features, indptr, neighbours, metric, slant = voxels
-    means = np.zeros((n_supervoxels, features.shape[1] + 3))
-    set_means(sum_features(features, labels, n_supervoxels), means, slant)
+    sums, means = of_labels
+    sum_features(features, labels, sums)
+    set_means(sums, means, slant)
     waiting, adopted = np.empty(len(labels), np.int32), np.empty(len(labels), np.int32)
     n_waiting = 0
     for i in range(len(labels)):
@@ -597,7 +652,7 @@ def _adopt(
             n_waiting += 1
     while n_waiting > 0:
         for w in range(n_waiting):
-            adopted[w] = _nearest_label(waiting[w], features, metric, indptr, neighbours, labels, means)
+            adopted[w] = _nearest_label(np.int64(waiting[w]), features, metric, indptr, neighbours, labels, means)
         left = 0
         for w in range(n_waiting):
             if adopted[w] >= 0:

@@ -127,28 +127,14 @@ def assign_points(
     supervoxels : (v,) int32
     """
     chosen = np.empty(len(points), np.int32)
-    surface = np.empty((grid.n_voxels, 8))  # the row of a voxel is one line of the cache
-    in_blocks(_set_surface, grid.n_voxels, grid.centroids, planes.normals, planes.origins, surface)
+    # Rows of centroid, normal, and how far along the normal the plane lies off the centroid; one fills a cache line.
+    surface = np.zeros((grid.n_voxels, 8))
+    surface[:, :3], surface[:, 3:6] = grid.centroids, planes.normals
+    for axis in range(3):
+        surface[:, 6] += planes.normals[:, axis] * (planes.origins[:, axis] - grid.centroids[:, axis])
     members = PointsOfVoxels(points, grid.order, grid.starts)
     in_blocks(_assign, grid.n_voxels, members, grid.neighbourhood, surface, supervoxels, chosen)
     return chosen
-
-
-@kernel
-def _set_surface(
-    start: int,
-    stop: int,
-    centroids: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    origins: NDArray[np.float64],
-    surface: NDArray[np.float64],
-) -> None:
-    """Set rows of the voxels: centroid, normal, and distance of the plane from the centroid along the normal."""
-    for v in range(start, stop):
-        surface[v, 6] = 0.0
-        for axis in range(3):
-            surface[v, axis], surface[v, 3 + axis] = centroids[v, axis], normals[v, axis]
-            surface[v, 6] += normals[v, axis] * (origins[v, axis] - centroids[v, axis])
 
 
 @kernel

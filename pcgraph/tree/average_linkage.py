@@ -12,7 +12,7 @@ from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
 from pcgraph.parallel import kernel
-from pcgraph.tree.contraction import ContractedGraph, contract_cheapest, heap_update
+from pcgraph.tree.contraction import ContractedGraph, contract_cheapest, heap_update, insert_edges
 from pcgraph.tree.linkage import Linkage, Merges, check_cost
 
 
@@ -73,15 +73,16 @@ def average_linkage(
     A mean of two costs is never below the smaller one, so merging in ascending order yields ascending altitudes.
     """
     sums = np.stack((costs * weights, weights))
-    graph = ContractedGraph.of(n_nodes, edges, sums[0] / sums[1], sums)
-    _merge(graph)
+    graph = ContractedGraph.of(n_nodes, len(edges), sums)
+    _merge(graph, edges, sums[0] / sums[1])
     merges = graph.merges()
     return Merges(merges.pairs, np.maximum.accumulate(merges.altitudes))  # a mean may round down by one last place
 
 
 @kernel
-def _merge(graph: ContractedGraph) -> None:
+def _merge(graph: ContractedGraph, edges: NDArray[np.int32], costs: NDArray[np.float64]) -> None:
     sums = graph.sums
+    insert_edges(graph, edges, costs)
     while graph.heap.size[0] > 0:
         _, _, n_parallel = contract_cheapest(graph)
         for edge in graph.parallel[:n_parallel]:

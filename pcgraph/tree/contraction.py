@@ -14,7 +14,7 @@ from numba import config
 from numpy.typing import NDArray
 
 from pcgraph.hierarchy import NONE
-from pcgraph.parallel import kernel
+from pcgraph.parallel import routine
 from pcgraph.tree.linkage import Merges
 
 # Tables of records: fields that are used together lie side by side, and a kernel takes one array for each table.
@@ -78,12 +78,10 @@ class ContractedGraph(NamedTuple):
     done: NDArray[np.int64]
 
     @classmethod
-    def of(
-        cls, n_nodes: int, edges: NDArray[np.int32], costs: NDArray[np.float64], sums: NDArray[np.float64]
-    ) -> ContractedGraph:
-        """A graph before its first merge; the merges will change `sums` in place."""
-        m, most = len(edges), max(n_nodes - 1, 0)
-        graph = cls(
+    def of(cls, n_nodes: int, n_edges: int, sums: NDArray[np.float64]) -> ContractedGraph:
+        """A graph without its edges, which `insert_edges` puts in; `sums` change with its merges."""
+        m, most = n_edges, max(n_nodes - 1, 0)
+        return cls(
             EdgeHeap(_records(m, EDGE), np.empty(m, np.int64), np.zeros(1, np.int64)),
             _records(2 * m, HALF_EDGE),
             _records(n_nodes, CLUSTER),
@@ -93,27 +91,26 @@ class ContractedGraph(NamedTuple):
             np.empty(most),
             np.zeros(1, np.int64),
         )
-        _insert_edges(graph, edges, costs)
-        return graph
 
     def merges(self) -> Merges:
         """Merges so far, at their costs."""
         return Merges(self.pairs[: self.done[0]], self.altitudes[: self.done[0]])
 
 
-@kernel
-def _insert_edges(graph: ContractedGraph, edges: NDArray[np.int32], costs: NDArray[np.float64]) -> None:
+@routine
+def insert_edges(graph: ContractedGraph, edges: NDArray[np.int32], costs: NDArray[np.float64]) -> None:
+    """Put the edges between nodes in, (m, 2), at their costs, (m,)."""
     heap, halves, clusters = graph.heap, graph.halves, graph.clusters
     for node in range(len(clusters)):
         clusters[node].first, clusters[node].degree, clusters[node].tree_node = NONE, 0, node
     for edge in range(len(edges)):
-        _insert(halves, clusters, 2 * edge, edges[edge, 0])
-        _insert(halves, clusters, 2 * edge + 1, edges[edge, 1])
+        _insert(halves, clusters, 2 * edge, np.int64(edges[edge, 0]))
+        _insert(halves, clusters, 2 * edge + 1, np.int64(edges[edge, 1]))
         heap.order[edge], heap.edges[edge].place, heap.size[0] = edge, edge, edge + 1
         heap_update(heap, edge, costs[edge])
 
 
-@kernel
+@routine
 def contract_cheapest(graph: ContractedGraph) -> tuple[int, int, int]:
     """Merge the two clusters at the ends of the cheapest edge, at its cost.
 
@@ -161,7 +158,7 @@ def contract_cheapest(graph: ContractedGraph) -> tuple[int, int, int]:
 # --- the edges of a cluster -------------------------------------------------------------------------------------------
 
 
-@kernel
+@routine
 def _insert(halves: NDArray[Any], clusters: NDArray[Any], half: int, cluster: int) -> None:
     """Put a half-edge at the head of a cluster's list."""
     first = clusters[cluster].first
@@ -172,7 +169,7 @@ def _insert(halves: NDArray[Any], clusters: NDArray[Any], half: int, cluster: in
     clusters[cluster].degree += 1
 
 
-@kernel
+@routine
 def _remove(halves: NDArray[Any], clusters: NDArray[Any], half: int) -> None:
     """Take a half-edge out of its list."""
     cluster, after, before = halves[half].end, halves[half].after, halves[half].before
@@ -185,7 +182,7 @@ def _remove(halves: NDArray[Any], clusters: NDArray[Any], half: int) -> None:
     clusters[cluster].degree -= 1
 
 
-@kernel
+@routine
 def _edge_between(halves: NDArray[Any], clusters: NDArray[Any], a: int, b: int) -> int:
     """Edge between two clusters or -1, by a walk along the shorter list."""
     if clusters[b].degree < clusters[a].degree:
@@ -201,14 +198,14 @@ def _edge_between(halves: NDArray[Any], clusters: NDArray[Any], a: int, b: int) 
 # --- the heap ---------------------------------------------------------------------------------------------------------
 
 
-@kernel
+@routine
 def heap_update(heap: EdgeHeap, edge: int, cost: float) -> None:
     """Change the cost of an edge, and put it in its place."""
     heap.edges[edge].cost = cost
     _sift(heap, edge)
 
 
-@kernel
+@routine
 def heap_remove(heap: EdgeHeap, edge: int) -> None:
     """Take an edge out."""
     at, last = heap.edges[edge].place, heap.size[0] - 1
@@ -219,7 +216,7 @@ def heap_remove(heap: EdgeHeap, edge: int) -> None:
         _sift(heap, moved)
 
 
-@kernel
+@routine
 def _sift(heap: EdgeHeap, edge: int) -> None:
     """Move an edge up, and then down, to where it belongs."""
     edges, order, size = heap.edges, heap.order, heap.size[0]
@@ -245,6 +242,6 @@ def _sift(heap: EdgeHeap, edge: int) -> None:
     order[at], edges[edge].place = edge, at
 
 
-@kernel
+@routine
 def _is_cheaper(edges: NDArray[Any], a: int, b: int) -> bool:
     return edges[a].cost < edges[b].cost or (edges[a].cost == edges[b].cost and a < b)

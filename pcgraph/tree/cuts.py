@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.disjoint_sets import renumbered
 from pcgraph.hierarchy import binary_children, num_leaves, propagate_sequential, propagation_sources
 from pcgraph.inputs import whole_number
 from pcgraph.parallel import kernel
@@ -75,7 +74,11 @@ def numbered_segments(nodes: NDArray[np.int32], n_nodes: int) -> NDArray[np.int3
         Leaves with the same node are one segment.
     n_nodes : int
     """
-    return renumbered(nodes, np.full(n_nodes, -1, np.int32), 0)
+    leaves, first, number = np.arange(len(nodes)), np.empty(n_nodes, np.int64), np.empty(n_nodes, np.int32)
+    first[nodes[::-1]] = leaves[::-1]  # of equal nodes the last one written stays
+    firsts = nodes[first[nodes] == leaves]
+    number[firsts] = np.arange(len(firsts))
+    return number[nodes]
 
 
 # --- cores: segments of a least size ----------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph, EdgeFeatures
 from pcgraph.hierarchy import NONE
-from pcgraph.parallel import kernel
+from pcgraph.parallel import kernel, routine
 from pcgraph.tree.linkage import Linkage, Merges
 from pcgraph.tree.single_linkage import minimum_spanning_forest, single_linkage
 
@@ -118,7 +118,7 @@ def _scales(n_nodes: int, edges: NDArray[np.int32], weights: NDArray[np.float64]
     return levels[n_nodes:].copy()
 
 
-@kernel
+@routine
 def _join(regions: _Regions, node: int, a: int, b: int, weight: float) -> None:
     """Close a new region over two, and merge the paths above both into one, whose regions then hold both."""
     up, levels, sizes, inner = regions

@@ -16,8 +16,8 @@ from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.hierarchy import NONE
 from pcgraph.inputs import check_non_negative
-from pcgraph.parallel import inlined, kernel
-from pcgraph.tree.contraction import ContractedGraph, contract_cheapest, heap_update
+from pcgraph.parallel import kernel, routine
+from pcgraph.tree.contraction import ContractedGraph, contract_cheapest, heap_update, insert_edges
 from pcgraph.tree.linkage import Linkage, Merges
 from pcgraph.voxels.eigen import SYMMETRIC_INDICES, least_eigenvalue
 
@@ -163,8 +163,8 @@ def least_increase_linkage(regions: Regions, edges: NDArray[np.int32], lengths: 
     sums = np.empty((0, len(edges))) if lengths is None else lengths[None].astype(np.float64)
     n = len(regions.masses)
     state = RegionState.of(regions)
-    graph = ContractedGraph.of(n, edges, _first_costs(state, edges, sums), sums)
-    _merge(state, graph)
+    graph = ContractedGraph.of(n, len(edges), sums)
+    _merge(state, graph, edges, np.empty(len(edges)))
     merges = graph.merges()
     return Merges(merges.pairs, np.maximum.accumulate(np.maximum(merges.altitudes, 0.0)))
 
@@ -191,7 +191,7 @@ class RegionState(NamedTuple):
         return cls(masses, values, centroids, upper, np.zeros(len(masses)), float(regions.plane))
 
 
-@kernel
+@routine
 def set_residuals(state: RegionState) -> None:
     """Set the sums of squared distances of regions to their planes, if planes count."""
     if state.plane > 0.0:
@@ -201,18 +201,15 @@ def set_residuals(state: RegionState) -> None:
 
 
 @kernel
-def _first_costs(state: RegionState, edges: NDArray[np.int32], lengths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cost of each edge, (m,); this sets the residuals, too."""
-    set_residuals(state)
-    costs = np.empty(len(edges))
-    for edge in range(len(edges)):
-        costs[edge] = _cost(state, lengths, edge, edges[edge, 0], edges[edge, 1])
-    return costs
-
-
-@kernel
-def _merge(state: RegionState, graph: ContractedGraph) -> None:
+def _merge(
+    state: RegionState, graph: ContractedGraph, edges: NDArray[np.int32], first_costs: NDArray[np.float64]
+) -> None:
+    """Merge along the cheapest edge until there is none. The costs before the first merge, (m,), are set here."""
     heap, halves, lengths = graph.heap, graph.halves, graph.sums
+    set_residuals(state)
+    for edge in range(len(edges)):
+        first_costs[edge] = _cost(state, lengths, edge, np.int64(edges[edge, 0]), np.int64(edges[edge, 1]))
+    insert_edges(graph, edges, first_costs)
     while heap.size[0] > 0:
         kept, gone, _ = contract_cheapest(graph)
         unite(state, kept, gone)
@@ -223,14 +220,14 @@ def _merge(state: RegionState, graph: ContractedGraph) -> None:
             half = halves[half].after
 
 
-@kernel
+@routine
 def _cost(state: RegionState, lengths: NDArray[np.float64], edge: int, a: int, b: int) -> float:
     """Increase of energy by merging the two regions at an edge, per length if there are lengths."""
     increase = energy_increase(state, a, b, squared_distance(state.values, a, b))
     return increase / lengths[0, edge] if len(lengths) > 0 else increase
 
 
-@inlined
+@routine
 def energy_increase(state: RegionState, a: int, b: int, square: float) -> float:
     """Energy of the union of two regions less the sum of theirs; `square` is the squared distance of their values."""
     reduced = state.masses[a] * state.masses[b] / (state.masses[a] + state.masses[b])
@@ -240,7 +237,7 @@ def energy_increase(state: RegionState, a: int, b: int, square: float) -> float:
     return increase
 
 
-@inlined
+@routine
 def squared_distance(values: NDArray[np.float64], a: int, b: int) -> float:
     """Square of the distance of two rows."""
     square = 0.0
@@ -250,7 +247,7 @@ def squared_distance(values: NDArray[np.float64], a: int, b: int) -> float:
     return square
 
 
-@kernel
+@routine
 def unite(state: RegionState, kept: int, gone: int) -> None:
     """Give the first of two regions the moments of both."""
     masses, values, centroids, scatters, residuals, plane = state
@@ -270,7 +267,7 @@ def unite(state: RegionState, kept: int, gone: int) -> None:
     masses[kept] = total
 
 
-@inlined
+@routine
 def _least_of_union(state: RegionState, a: int, b: int, reduced: float) -> float:
     """Sum of squared distances of the union of two regions to its plane."""
     p, q = state.scatters[a], state.scatters[b]

@@ -17,8 +17,8 @@ from pcgraph.graph.continuations import MAX_RESIDUAL
 from pcgraph.hierarchy import NONE
 from pcgraph.inputs import check_non_negative
 from pcgraph.pairs import not_among
-from pcgraph.parallel import in_blocks, inlined, kernel, routine
-from pcgraph.tree.contraction import ContractedGraph, contract_cheapest, heap_update
+from pcgraph.parallel import kernel, routine
+from pcgraph.tree.contraction import ContractedGraph, contract_cheapest, heap_update, insert_edges
 from pcgraph.tree.least_increase import RegionState, energy_increase, regions_of, set_residuals, squared_distance, unite
 from pcgraph.tree.linkage import Linkage, Merges, check_cost
 from pcgraph.voxels.eigen import plane_normal
@@ -268,14 +268,11 @@ def region_linkage(
         (costs * weights, weights, _smoothness(leaves, edges) * weights, bridges * weights, terrain)
     )
     sums = sums[: (_TERRAIN if terrain.any() else _BRIDGE if bridges.any() else _SMOOTHNESS) + 1]
-    set_residuals(state)
-    altitudes = np.empty(len(edges))
-    in_blocks(_set_first_altitudes, len(edges), state, edges, sums, _CONSTANTS, altitudes)
     perimeters = np.bincount(edges.ravel(), np.repeat(weights, 2), graph.n_nodes)
     outward = state.masses[:, None] * graph.node_features.normal
     outlines = _Outlines(perimeters.astype(np.float64), outward, graph.acquisition.sides_known)
-    contracted = ContractedGraph.of(graph.n_nodes, edges, altitudes, sums)
-    _merge(state, outlines, relief, contracted, _CONSTANTS)
+    contracted, scratch = ContractedGraph.of(graph.n_nodes, len(edges), sums), np.empty((2, 3))
+    _merge(state, outlines, relief, contracted, _CONSTANTS, edges, np.empty(len(edges)), scratch)
     merges = contracted.merges()
     return Merges(merges.pairs, np.maximum.accumulate(merges.altitudes))
 
@@ -290,25 +287,17 @@ def _smoothness(leaves: Moments, edges: NDArray[np.int32]) -> NDArray[np.float64
 
 
 @kernel
-def _set_first_altitudes(
-    start: int,
-    stop: int,
-    state: RegionState,
-    edges: NDArray[np.int32],
-    sums: NDArray[np.float64],
-    constants: AltitudeConstants,
-    altitudes: NDArray[np.float64],
-) -> None:
-    """Set the altitude of each edge before the first merge, without relief."""
-    for edge in range(start, stop):
-        altitudes[edge] = _altitude(state, sums, edge, edges[edge, 0], edges[edge, 1], 0.0, constants)
-
-
-@kernel
 def _merge(
-    state: RegionState, outlines: _Outlines, relief: float, graph: ContractedGraph, constants: AltitudeConstants
+    state: RegionState,
+    outlines: _Outlines,
+    relief: float,
+    graph: ContractedGraph,
+    constants: AltitudeConstants,
+    edges: NDArray[np.int32],
+    altitudes: NDArray[np.float64],
+    scratch: NDArray[np.float64],
 ) -> None:
-    """Merge along the lowest edge until no edge is left.
+    """Merge along the lowest edge until no edge is left. The altitudes before the first merge, (m,), are set here.
 
     After a merge the edges of the merged region get new altitudes. Of a region with many edges, each gets its new
     altitude when it comes up. Whether one region stands out of the other is also asked when their edge comes up; if so,
@@ -316,10 +305,15 @@ def _merge(
     """
     heap, halves, clusters, sums = graph.heap, graph.halves, graph.clusters, graph.sums
     perimeters, outward, _ = outlines
-    # Numbers of merges done when a region changed, when an altitude was computed, and when relief was asked for.
+    # Numbers of merges done as a region changed, an altitude was computed, and (plus 1) relief was asked for.
     changed, computed = np.zeros(len(clusters), np.int64), np.zeros(len(heap.edges), np.int64)
-    asked, normal = np.full(len(heap.edges), -1), np.empty(3)
-    waits = np.zeros(len(heap.edges), np.int64)  # how often the merge at each edge has waited for another
+    asked, waits = np.zeros(len(heap.edges), np.int64), np.zeros(len(heap.edges), np.int64)  # and how often it waited
+    normal, normal_of_other = scratch[0], scratch[1]
+    set_residuals(state)
+    for edge in range(len(edges)):
+        a, b = np.int64(edges[edge, 0]), np.int64(edges[edge, 1])
+        altitudes[edge] = _altitude(state, sums, edge, a, b, 0.0, constants)
+    insert_edges(graph, edges, altitudes)
     while heap.size[0] > 0:
         edge = heap.order[0]
         a, b = halves[2 * edge].end, halves[2 * edge + 1].end
@@ -327,14 +321,14 @@ def _merge(
             computed[edge] = graph.done[0]
             heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0, constants))
             continue
-        if asked[edge] < computed[edge]:
-            asked[edge] = computed[edge]
+        if asked[edge] <= computed[edge]:
+            asked[edge] = computed[edge] + 1
             stands_out = _standing_out(state, outlines, sums, edge, a, b, relief, constants, normal)
             if stands_out > 0.0:
                 heap_update(heap, edge, _altitude(state, sums, edge, a, b, stands_out, constants))
                 continue
         if heap.edges[edge].cost > constants.wait_above and waits[edge] < constants.max_waits:
-            later = _awaited(state, graph, a, b, constants, normal)
+            later = _awaited(state, graph, a, b, constants, normal, normal_of_other)
             if later >= heap.edges[edge].cost:
                 waits[edge] += 1
                 heap_update(heap, edge, later + 1.0 / COST_STEPS)
@@ -359,7 +353,7 @@ def _merge(
                 heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0, constants))
 
 
-@kernel
+@routine
 def _awaited(
     state: RegionState,
     graph: ContractedGraph,
@@ -367,19 +361,20 @@ def _awaited(
     b: int,
     constants: AltitudeConstants,
     normal: NDArray[np.float64],
+    normal_of_other: NDArray[np.float64],
 ) -> float:
     """Altitude at which the smaller of two regions, on its support, merges first with a third beside it; -1 if never.
 
     The larger region is the support. A third region counts if it lies on the same side of the support and is no support
     of the smaller one itself. So a dumbbell is whole before it joins its table, though its bar is a deeper valley than
-    its feet. `normal` is scratch.
+    its feet. The normals are scratch.
     """
     if state.masses[b] < state.masses[a]:
         a, b = b, a
     side = _side_on(state, a, b, constants, normal)
     if state.masses[a] < constants.whole or side == 0.0:
         return -1.0
-    heap, halves, clusters, normal_of_other = graph.heap, graph.halves, graph.clusters, np.empty(3)
+    heap, halves, clusters = graph.heap, graph.halves, graph.clusters
     least, half = np.inf, clusters[a].first
     while half != NONE:
         c, cost = halves[half ^ 1].end, heap.edges[half >> 1].cost
@@ -413,7 +408,7 @@ def _height(state: RegionState, a: int, b: int, normal: NDArray[np.float64]) -> 
     return height
 
 
-@inlined
+@routine
 def _altitude(
     state: RegionState,
     sums: NDArray[np.float64],

@@ -79,7 +79,7 @@ def _kruskal(n_nodes: int, edges: NDArray[np.int32]) -> tuple[NDArray[np.int32],
     pairs, taken = np.empty((max(n_nodes - 1, 0), 2), np.int32), np.empty(max(n_nodes - 1, 0), np.int64)
     t = 0
     for e in range(len(edges)):
-        a, b = root_of(roots, edges[e, 0]), root_of(roots, edges[e, 1])
+        a, b = root_of(roots, np.int64(edges[e, 0])), root_of(roots, np.int64(edges[e, 1]))
         if a == b:
             continue
         if size[b] > size[a]:

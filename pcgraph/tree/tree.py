@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from pcgraph.features.moments import Moments, moments_up_tree
 from pcgraph.features.nodes import NodeFeatures, node_features, rows, scalar_columns
 from pcgraph.hierarchy import lowest_common_ancestors, roots
 from pcgraph.inputs import non_negative
+from pcgraph.pairs import nearest
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.tree.cuts import horizontal_cut, numbered_segments, persistences
 from pcgraph.tree.linkage import Merges
@@ -296,7 +296,7 @@ def _nearest_larger(
     """Larger part that has the leaf nearest to each part's own leaves, (p,) int64; the largest part if none is near."""
     n_near = min(_N_NEAREST + 1, len(centroids))
     seeking = np.flatnonzero(rank[part] < len(rank) - 1)  # the largest part looks for none
-    distance, leaf = cKDTree(centroids).query(centroids[seeking], k=n_near)
+    distance, leaf = nearest(centroids, centroids[seeking], n_near)
     row, column = np.nonzero(rank[part[leaf]] > rank[part[seeking]][:, None])
     source, candidate = part[seeking[row]], part[leaf[row, column]]
     best = np.lexsort((candidate, distance[row, column], source))

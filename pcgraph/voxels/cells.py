@@ -30,20 +30,21 @@ def bounding_box(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDAr
     """Lowest and highest coordinates, (3,) each, of points (n, 3), n >= 1; NaN if one is."""
     of_blocks = in_blocks(_bounds, len(points), np.ascontiguousarray(points, np.float64), smallest=_MIN_BLOCK)
     bounds = np.array(of_blocks)
-    return bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+    return bounds[:, :3].min(axis=0), bounds[:, 3:].max(axis=0)
 
 
 @kernel
-def _bounds(start: int, stop: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lowest and highest coordinates, (2, 3), of some of the points."""
-    low_x, low_y, low_z = high_x, high_y, high_z = points[start]
+def _bounds(start: int, stop: int, points: NDArray[np.float64]) -> tuple[float, float, float, float, float, float]:
+    """Lowest and highest coordinates of some of the points."""
+    low_x, low_y, low_z = points[start, 0], points[start, 1], points[start, 2]
+    high_x, high_y, high_z = low_x, low_y, low_z
     for p in range(start, stop):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
         low_x, low_y, low_z = x if x < low_x else low_x, y if y < low_y else low_y, z if z < low_z else low_z
         high_x, high_y, high_z = x if x > high_x else high_x, y if y > high_y else high_y, z if z > high_z else high_z
         if math.isnan(x + y + z) and (math.isnan(x) or math.isnan(y) or math.isnan(z)):
-            return np.full((2, 3), np.nan)
-    return np.array(((low_x, low_y, low_z), (high_x, high_y, high_z)))
+            return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
+    return low_x, low_y, low_z, high_x, high_y, high_z
 
 
 class Lattice(NamedTuple):
@@ -123,8 +124,9 @@ def sorted_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
     low_bits = _KEY_BITS - place_bits
     if key_bits <= low_bits:
         n_digits = max(-(-key_bits // (_DIGIT_BITS if len(keys) > _SHORT else _DIGIT_BITS_OF_SHORT)), 1)
+        digit_bits = max(-(-key_bits // n_digits), 1)
         room = np.empty(len(keys), np.int64)  # not in the kernel: NumPy asks for huge pages
-        return _sort_by_digits(keys, room, place_bits, n_digits, max(-(-key_bits // n_digits), 1))
+        return _sort_by_digits(keys, room, np.zeros((n_digits, 1 << digit_bits), np.int64), place_bits, digit_bits)
     order = sorted_keys(keys & ((1 << low_bits) - 1))[1]
     order = order[sorted_keys(keys[order] >> low_bits)[1]]
     return keys[order], order
@@ -178,14 +180,14 @@ def fetch_batch(
 
 @kernel
 def _sort_by_digits(
-    keys: NDArray[np.int64], room: NDArray[np.int64], place_bits: int, n_digits: int, digit_bits: int
+    keys: NDArray[np.int64], room: NDArray[np.int64], starts: NDArray[np.int64], place_bits: int, digit_bits: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Keys in ascending order, and where each was (radix sort; Knuth, The Art of Computer Programming 3, 5.2.5).
 
-    A key and its index, of `place_bits` bits, are moved as one number, to and fro between `keys` and `room`.
+    A key and its index, of `place_bits` bits, are moved as one number, to and fro between `keys` and `room`. `starts`,
+    zero at first, has a row for each digit and a column for each of its values.
     """
-    n, mask = len(keys), (1 << digit_bits) - 1
-    starts = np.zeros((n_digits, 1 << digit_bits), np.int64)
+    n, n_digits, mask = len(keys), len(starts), (1 << digit_bits) - 1
     for i in range(n):
         for digit in range(n_digits):
             starts[digit, (keys[i] >> (digit * digit_bits)) & mask] += 1
@@ -193,7 +195,7 @@ def _sort_by_digits(
     ordered = keys
     for digit in range(n_digits):
         start, shift = starts[digit], place_bits + digit * digit_bits
-        if start.max() == n:
+        if start[(ordered[0] >> shift) & mask] == n:
             continue  # all have the same
         total = 0
         for value in range(len(start)):

@@ -41,7 +41,8 @@ def crease_contrast(values: NDArray[np.float64], grid: VoxelGrid, normals: NDArr
     autocorrelation of Geary 1954. Some 8000 evenly spaced voxels are read.
     """
     step = -(-grid.n_voxels // _SAMPLE)
-    sums, pairs = _squared_distances(values, grid.counts, normals, grid.neighbourhood, step)
+    sums, pairs = np.zeros(2), np.zeros(2, np.int64)
+    _add_squared_distances(values, grid.counts, normals, grid.neighbourhood, step, sums, pairs)
     some, counts = values[::step], grid.counts[::step]
     mean = np.average(some, axis=0, weights=counts)
     any_two = float((counts @ np.square(some - mean)).sum()) / len(some)
@@ -58,16 +59,17 @@ def color_evidence(grid: VoxelGrid, normals: NDArray[np.float64]) -> float:
 
 
 @kernel
-def _squared_distances(
+def _add_squared_distances(
     values: NDArray[np.float64],
     counts: NDArray[np.int64],
     normals: NDArray[np.float64],
     around: Neighbourhood,
     step: int,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Weighted sums of squared differences of touching voxels, and numbers of pairs, (2,) each: smooth, at creases."""
+    sums: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+) -> None:
+    """Add weighted squared differences of touching voxels, and numbers of pairs, to (2,) each: smooth, at creases."""
     indptr, neighbours = around
-    sums, pairs = np.zeros(2), np.zeros(2, np.int64)
     for i in range(0, len(values), step):
         for a in range(indptr[i], indptr[i + 1]):
             j, cosine, square = neighbours[a], 0.0, 0.0
@@ -76,11 +78,11 @@ def _squared_distances(
             if CREASE_COSINE <= cosine <= SAME_SURFACE_COSINE:
                 continue
             for column in range(values.shape[1]):
-                square += (values[i, column] - values[j, column]) ** 2
+                gap = values[i, column] - values[j, column]
+                square += gap * gap
             kind = 0 if cosine > SAME_SURFACE_COSINE else 1
             sums[kind] += square * counts[i] * counts[j] / (counts[i] + counts[j])
             pairs[kind] += 1
-    return sums, pairs
 
 
 def autocorrelation(values: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:

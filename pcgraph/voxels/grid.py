@@ -316,7 +316,7 @@ def _gather(
 
     Sums are of whole numbers, exact as long as a voxel has less than 2**32 points, so that their order does not count.
     """
-    low_x, low_y, low_z = corner
+    low_x, low_y, low_z = corner[0], corner[1], corner[2]
     for v in range(start, stop):
         x = y = z = 0.0
         p = order[starts[v]]
@@ -586,22 +586,23 @@ def _find_ends(
     ends: NDArray[np.bool_],
 ) -> None:
     """Set whether each of some voxels lies at the end of a surface."""
-    taken = np.empty((3, 3, 3), np.bool_)  # places beside the voxel, as seen along each axis
+    taken, side = np.empty((3, 9), np.int64), np.empty(3, np.int64)  # places beside the voxel, as seen along each axis
     for m in range(start, stop):
-        i = voxels[m]
-        taken[:] = False
-        for a in range(around.indptr[i], around.indptr[i + 1]):
-            j = around.neighbours[a]
-            right, ahead, above = (
-                _beside(cells, levels, i, j, 0),
-                _beside(cells, levels, i, j, 1),
-                _beside(cells, levels, i, j, 2),
-            )
-            taken[0, ahead, above] = taken[1, right, above] = taken[2, right, ahead] = True
-        ends[m] = True
+        i, is_end = voxels[m], True
         for axis in range(3):
-            taken[axis, 1, 1] = False
-            ends[m] = ends[m] and taken[axis].sum() < _MIN_IN_PROJECTION
+            for place in range(9):
+                taken[axis, place] = 0
+        for a in range(around.indptr[i], around.indptr[i + 1]):
+            for axis in range(3):
+                side[axis] = _beside(cells, levels, i, around.neighbours[a], axis)
+            right, ahead, above = side[0], side[1], side[2]
+            taken[0, 3 * ahead + above] = taken[1, 3 * right + above] = taken[2, 3 * right + ahead] = 1
+        for axis in range(3):
+            n_taken = -taken[axis, 4]  # without its own place
+            for place in range(9):
+                n_taken += taken[axis, place]
+            is_end = is_end and n_taken < _MIN_IN_PROJECTION
+        ends[m] = is_end
 
 
 @routine

@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from scipy.special import pdtrc
 
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.parallel import in_blocks, kernel
@@ -145,6 +144,8 @@ def _surfaces_among(voxels: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.bo
     alone = np.flatnonzero(voxels)
     if len(alone) < 2 * _NEAREST:
         return found
+    from scipy.spatial import cKDTree
+
     places = grid.warped[alone] / grid.size
     near = cKDTree(places, balanced_tree=False).query(places, _NEAREST)[1]
     flat = np.empty(len(alone), np.bool_)
@@ -219,6 +220,8 @@ def far_from(other: VoxelGrid, grid: VoxelGrid, voxels: NDArray[np.bool_]) -> ND
 
     Both grids have the same size and warp.
     """
+    from scipy.spatial import cKDTree
+
     asked, far = np.flatnonzero(voxels), np.zeros(grid.n_voxels, np.bool_)
     far[asked] = True
     for of_level, level in other.of_levels():
@@ -231,8 +234,9 @@ def far_from(other: VoxelGrid, grid: VoxelGrid, voxels: NDArray[np.bool_]) -> ND
 
 def _least_significant(expected: float) -> int:
     """Least number of points that noise reaches with a probability below 1 in 10 000, if so many are expected."""
-    number = 1
-    while pdtrc(number - 1, expected) >= _NOISE.chance:
+    number, chance = 1, -math.expm1(-expected)  # of so many or more, by the law of Poisson
+    while chance >= _NOISE.chance:
+        chance -= math.exp(number * math.log(expected) - expected - math.lgamma(number + 1))
         number += 1
     return number
 

@@ -130,7 +130,7 @@ def some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
     order = order_of_draw(occupied.astype(np.uint64), counts)
     taken = np.zeros(BLOCKS**3, bool)
     taken[occupied[order]] = np.concatenate(([0], np.cumsum(counts[order])[:-1])) < _CROWD
-    return points.take(np.concatenate(in_blocks(_in_taken, len(points), block, taken)), axis=0)
+    return points.take(np.flatnonzero(taken[block]), axis=0)
 
 
 def blocks_of(
@@ -157,16 +157,6 @@ def _find_block(
         block[p] = (x * BLOCKS + y) * BLOCKS + z
         counts[block[p]] += 1
     return counts
-
-
-@kernel
-def _in_taken(start: int, stop: int, block: NDArray[np.int16], taken: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Numbers of the points that lie in blocks that are taken."""
-    found, n = np.empty(stop - start + 1, np.int64), 0
-    for p in range(start, stop):
-        found[n] = p
-        n += taken[block[p]]
-    return found[:n]
 
 
 def order_of_draw(numbers: NDArray[np.uint64], weights: NDArray[np.number]) -> NDArray[np.int64]:

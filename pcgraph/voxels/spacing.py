@@ -227,7 +227,8 @@ def _find_near(
     n, pointers, squares = len(keys), np.zeros(9, np.int64), np.empty(_NEIGHBOUR)
     for i in range(start, stop):
         own, beside, s = sample[i], 0, order[sample[i]]
-        squares[:] = np.inf
+        for rank in range(_NEIGHBOUR):
+            squares[rank] = np.inf
         for row in range(9):
             across, along = _ROWS_OF_CELLS[row]
             x = reach * (in_cell[s, 0] if across < 0 else across * (1.0 - in_cell[s, 0]))

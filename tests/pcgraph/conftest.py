@@ -17,7 +17,7 @@ from pcgraph.detection import find_planes
 # other has nothing left to do, then those with scikit-learn, which takes a second to import and which one worker
 # imports for all if they are neighbours.
 FIRST = (
-    *("test_warmup", "test_real", "test_surface", "test_learning_classifier", "test_learning_transfer"),
+    *("test_kernels", "test_real", "test_surface", "test_learning_classifier", "test_learning_transfer"),
     *("test_linkage_learned", "test_plain_files", "test_metrics_peers", "test_docs", "test_short_repr"),
     *("test_detection_objects", "test_detection_planes", "test_plausibility", "test_files"),
     *("test_properties",),

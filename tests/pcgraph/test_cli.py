@@ -72,6 +72,13 @@ def test_colours_that_are_not_used_are_kept(tmp_path):
     assert np.array_equal(read.labels, pcgraph.segment(points, viewpoint=(0.8, -1, 3)).labels)
 
 
+def test_compile_says_how_long_it_took():
+    done = CliRunner().invoke(app, ["compile"])
+    assert done.exit_code == 0, done.output
+    assert done.stdout.split()[0] == "seconds"
+    assert done.stderr == ""
+
+
 @pytest.mark.parametrize("points", [[[1, 2, 3]], [[1, 2, 3], [4, 5, 6]], np.ones((9, 3))])
 def test_few_points_work(points, tmp_path):
     path = tmp_path / "few.ply"

@@ -1,32 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels are compiled once, ahead of their use."""
+"""Kernels are compiled once, and kept on the disk."""
 
 from __future__ import annotations
 
 import os
-import pickle
 import shutil
 import subprocess
 import sys
-from ast import literal_eval
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from tiers import to_validate
 
 import pcgraph
-from pcgraph import warmup
 from pcgraph.all_kernels import compile_kernels
-from pcgraph.graph import contacts
 from pcgraph.kernel_cache import is_sound
 from pcgraph.supervoxels import clustering
 
 KERNELS = """
 import sys
 import numpy as np
-from pcgraph import warmup
 from pcgraph.scan import segment
+
+def started(event, _):
+    assert event not in ("subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.exec"), event
+
+sys.addaudithook(started)
 
 def kernels():
     modules = [m for name, m in sys.modules.items() if name.startswith("pcgraph")]
@@ -39,25 +38,13 @@ y, x = np.meshgrid(np.linspace(-0.3, 0.3, 60), np.linspace(-0.4, 0.4, 80), index
 image = np.stack((x, y, 1.0 + 0.1 * (x > 0.1)), axis=-1)
 """
 FIRST = """
-from pcgraph.graph import contacts
-from pcgraph.supervoxels import clustering
-from pcgraph.tree import region_linkage
-
-missing = clustering._expand, contacts._relate
-print(warmup.must_compile(), [warmup._is_cached(kernel) for kernel in missing])
-warmup.compile_in_two_processes()
-print([warmup._is_cached(kernel) for kernel in missing], len(region_linkage._merge.nopython_signatures))
-print({k.py_func.__name__ for k in kernels() if k.stats.cache_misses})
-warmup.compile_the_rest()
-before = compiled()
 segment(image, np.full(image.shape, 0.5))
-print(compiled() - before)
-print(before)
+segment(image, np.full(image.shape, 0.5))
+print(sorted({k.py_func.__name__ for k in kernels() if k.stats.cache_misses}))
 """
 LATER = """
 from pcgraph.all_kernels import compile_kernels
 
-print(warmup.must_compile())
 compile_kernels()
 before = compiled()
 image[::7, ::5] = np.nan
@@ -66,27 +53,22 @@ normals[..., 2] = -1.0
 segment(image, np.full(image.shape, 0.5, np.float32), normals, (0.0, 0.0, 0.0))
 segment(image.reshape(-1, 3))
 print(compiled() - before)
-print([(k.py_func.__qualname__, str(s)) for k in kernels() for s in k.stats.cache_misses])
+several = [k for k in kernels() if len(k.nopython_signatures) > 1]
+print({k.py_func.__name__ for k in several if "no_cpython_wrapper" not in k.targetoptions})
 """
 
 
-def run(code: str, folder: Path, **environment: str) -> str:
-    """What a process prints that is no worker of the tests: workers start no second process.
-
-    It imports the pcgraph in `folder`.
-    """
-    variables = {name: value for name, value in os.environ.items() if name != "PYTEST_XDIST_WORKER"} | environment
+def run(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """A process that imports the pcgraph in `folder`, with the cache beside it."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": "", "PYTHONDONTWRITEBYTECODE": "", "PYTHONPATH": str(folder)}
     line = [sys.executable, "-P", "-c", code]
-    variables["PYTHONPATH"] = str(folder)
-    return subprocess.run(line, capture_output=True, text=True, check=True, timeout=300, env=variables).stdout
+    return subprocess.run(line, capture_output=True, text=True, check=True, timeout=300, env=environment)
 
 
-def test_where_kernels_are_missing_a_second_process_compiles_those_of_the_tree(tmp_path):
-    """This one compiles those of voxels meanwhile. A process that starts later finds all in the cache, and after
-    `compile_kernels` nothing is left to compile whatever the form of the cloud.
+def test_segment_compiles_what_is_missing_and_says_so_once(tmp_path):
+    """It starts no process for that, and a later process finds all in the cache.
 
-    The package is a copy with the cache of the tests, less the two kernels that tell whether a cache is filled. That
-    the halves forget no other shows in the first process, which then compares what both compile with what a call needs.
+    The package is a copy with the cache of the tests, less one kernel.
     """
     compile_kernels()  # where no test has run yet
     source, package = Path(pcgraph.__file__).parent, tmp_path / "pcgraph"
@@ -96,57 +78,20 @@ def test_where_kernels_are_missing_a_second_process_compiles_those_of_the_tree(t
         file = Path(kernel.py_func.__code__.co_filename)
         cache = package / file.parent.relative_to(source) / "__pycache__"
         cache.mkdir(exist_ok=True)
-        left_out = kernel in (clustering._expand, contacts._relate)
         kept = f"{file.stem}.{kernel.py_func.__name__}-*.nb?"
-        for kernel_file in () if left_out else Path(kernel.stats.cache_path).glob(kept):
+        for kernel_file in () if kernel is clustering._expand else Path(kernel.stats.cache_path).glob(kept):
             shutil.copy2(kernel_file, cache)
-    environment = {"NUMBA_NUM_THREADS": "2", "NUMBA_CACHE_DIR": "", "PYTHONDONTWRITEBYTECODE": ""}
-    *said, needed = run(KERNELS + FIRST, tmp_path, **environment).splitlines()
-    assert said == ["True [False, False]", "[True, True] 0", "{'_expand'}", "set()"]
-    *said, compiled_later = run(KERNELS + LATER, tmp_path, **environment).splitlines()
-    assert said == ["False", "set()"]
-    assert len(literal_eval(needed)) > 5
-    assert literal_eval(needed).isdisjoint(literal_eval(compiled_later))
+    first, later = run(KERNELS + FIRST, tmp_path), run(KERNELS + FIRST, tmp_path)
+    assert first.stdout == "['_expand']\n"
+    assert first.stderr.startswith("pcgraph: compiling kernels")
+    assert first.stderr.count("\n") == 1
+    assert (later.stdout, later.stderr) == ("[]\n", "")
 
 
-@pytest.fixture
-def alone(monkeypatch):
-    """As in a process that is no worker of the tests, with an empty cache and two threads."""
-    monkeypatch.delenv("PYTEST_XDIST_WORKER", raising=False)
-    monkeypatch.setattr(warmup.config, "NUMBA_NUM_THREADS", 2)
-    monkeypatch.setattr(warmup, "must_compile", lambda: True)
-    monkeypatch.setattr(warmup, "_done", False)
-    calls = []
-    monkeypatch.setattr(warmup, "compile_voxels", lambda: calls.append("voxels"))
-    return calls
-
-
-@pytest.mark.parametrize("executable", ["", "/usr/bin/blender", "/nowhere/python3"])
-def test_without_an_interpreter_to_start_kernels_are_compiled_as_they_are_used(monkeypatch, alone, executable):
-    monkeypatch.setattr(warmup.sys, "executable", executable)
-    warmup.compile_in_two_processes()
-    assert alone == []
-
-
-def test_a_second_process_that_takes_too_long_is_given_up(monkeypatch, alone):
-    monkeypatch.setattr(warmup, "_PATIENCE_S", 0.01)
-    processes = []
-    start = warmup._second_process
-    monkeypatch.setattr(warmup, "_second_process", lambda: processes.append(start()) or processes[-1])
-    warmup.compile_in_two_processes()
-    assert alone == ["voxels"]
-    assert processes[0].returncode is not None
-
-
-def test_workers_of_a_pool_start_no_processes_of_their_own(monkeypatch, alone):
-    monkeypatch.setenv("PYTEST_XDIST_WORKER", "gw0")
-    assert warmup._second_process() is None
-
-
-def test_an_index_of_another_version_of_numba_is_none(tmp_path):
-    index = tmp_path / "a.nbi"
-    index.write_bytes(pickle.dumps("0.1") + b"more")
-    assert warmup._version_of(index) == "0.1"
+def test_after_compiling_ahead_nothing_is_left_to_compile_whatever_the_form_of_the_cloud():
+    """Each kernel has one signature, but for one that takes voxels of one size or of several."""
+    done = run(KERNELS + LATER, Path(pcgraph.__file__).parents[1])
+    assert done.stdout == "set()\n{'_find_ends'}\n"
 
 
 def test_what_was_compiled_for_a_class_that_is_no_more_is_compiled_anew(tmp_path):
@@ -254,18 +199,3 @@ def test_a_damaged_cache_heals(cached, kind):
         assert hits_of(cached) == "0 0"
     assert hits_of(cached) == "2 1"
     assert sorted((cached / "__pycache__").iterdir()) == before
-
-
-def test_an_index_that_is_damaged_counts_as_missing(tmp_path):
-    """So `pcgraph segment` says beforehand that it compiles."""
-    compile_kernels()
-    kernel = clustering._expand
-    code = kernel.py_func.__code__
-    (index,) = Path(kernel.stats.cache_path).glob(f"*.{code.co_name}-{code.co_firstlineno}.*.nbi")
-    copy = Path(shutil.copy2(index, tmp_path))
-    here = SimpleNamespace(py_func=kernel.py_func, stats=SimpleNamespace(cache_path=tmp_path))
-    assert warmup._is_cached(here)
-    content = index.read_bytes()
-    for damaged in (content[:-1] + bytes([content[-1] ^ 1]), content[:9], bytes(len(content)), b""):
-        copy.write_bytes(damaged)
-        assert not warmup._is_cached(here)
