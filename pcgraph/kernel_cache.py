@@ -26,7 +26,7 @@ from numba.core.runtime import rtsys
 
 _PACKAGE = __name__.partition(".")[0]
 _MARK = b"pcgraph kernel "
-_DIGEST_BYTES = 32
+_DIGEST_BYTES = 32  # bytes, as SHA-256 has
 
 
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -107,7 +107,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         self._cache_file = _CacheFile(self.cache_path, of.filename_base, of.locator.get_source_stamp())
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """What was compiled for a signature; None if it must be compiled.
+        """The function that was compiled for a signature; None if it must be compiled.
 
         Numba would prepare here for compiling, which takes longer than loading fifty kernels does, and its compiler
         does so itself. What is loaded needs the runtime only.

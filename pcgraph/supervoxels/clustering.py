@@ -166,7 +166,7 @@ class Sums(NamedTuple):
 
     @classmethod
     def zeros(cls, voxels: VoxelGraph, n_supervoxels: int) -> Sums:
-        """Those of supervoxels without voxels."""
+        """Sums and means of supervoxels that have no voxels yet."""
         columns = voxels.features.shape[1]
         return cls(np.zeros((n_supervoxels, columns + 1)), np.zeros((n_supervoxels, columns + 3)))
 
