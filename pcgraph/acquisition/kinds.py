@@ -171,6 +171,10 @@ class Acquisition(ABC):
         """The acquisition after a check of its viewpoint against what is visible from there."""
         return self
 
+    def without_rows(self) -> Acquisition:
+        """The acquisition without what it holds for each point or pixel, which no later scan asks for."""
+        return replace(self, told=self.told._replace(image=None))
+
     def warp(self, points: NDArray[np.float64]) -> Warp:
         """The warp by which voxels of points, (n, 3), grow; the identity if they do not."""
         return Warp()
@@ -380,6 +384,9 @@ class SeveralPlaces(Acquisition):
     def viewpoint_of(self, cloud: CleanCloud) -> NDArray[np.float64]:
         return self.places[cloud.kept]
 
+    def without_rows(self) -> Acquisition:
+        return SeveralPlaces(self.told._replace(image=None), np.empty((0, 3)))
+
     def oriented(self, cloud: CleanCloud, grid: VoxelGrid, planes_from: PlanesFrom) -> OrientedPlanes:
         """Planes with normals towards the mean of the places from which the points of a voxel were seen."""
         places = self.viewpoint_of(cloud)
@@ -401,7 +408,7 @@ class SeveralScans(Acquisition):
     Attributes
     ----------
     scans : tuple of Acquisition
-        In the order of `pcgraph.update`.
+        In the order of `pcgraph.update`. All but the last are without rows for their points.
     """
 
     scans: tuple[Acquisition, ...]
@@ -409,8 +416,8 @@ class SeveralScans(Acquisition):
     @classmethod
     def of(cls, earlier: Acquisition, last: Acquisition) -> SeveralScans:
         """The scans so far and one more."""
-        scans = (*(earlier.scans if isinstance(earlier, SeveralScans) else (earlier,)), last)
-        return cls(last.told, scans)
+        scans = earlier.scans if isinstance(earlier, SeveralScans) else (earlier,)
+        return cls(last.told, (*scans[:-1], scans[-1].without_rows(), last))
 
     @property
     def viewpoint(self) -> NDArray[np.float64] | None:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from scenes.images import floor_wall_and_boxes
@@ -128,3 +130,54 @@ def test_objects_keep_their_numbers_from_scan_to_scan() -> None:
         assert result.objects[: len(before.objects)].tolist() == before.objects.tolist()
         numbers.append(result.labels[-1])
     assert len(set(numbers)) == len(numbers) == 5
+
+
+def test_the_number_of_an_object_that_has_joined_another_is_not_given_again() -> None:
+    x, y = np.meshgrid(np.arange(0.0, 1.0, 0.02), np.arange(0.0, 1.0, 0.02))
+    plate, place = np.stack((x, y, np.zeros_like(x)), axis=-1).reshape(-1, 3), (1.0, 0.5, 5.0)
+    smaller = plate[plate[:, 0] < 0.7]
+    apart = pcgraph.segment(np.vstack((plate, smaller + np.array([1.3, 0.0, 0.0]))), viewpoint=place)
+    assert np.unique(apart.objects).tolist() == [0, 1]
+    joined = pcgraph.update(apart, plate[plate[:, 0] < 0.3] + np.array([1.0, 0.0, 0.0]), viewpoint=place)
+    kept = apart.labels[0]
+    assert np.unique(joined.objects).tolist() == [kept]
+    third = pcgraph.update(joined, plate + np.array([0.0, 3.0, 0.0]), viewpoint=place)
+    assert np.unique(third.objects).tolist() == [kept, 2]
+    again = pcgraph.update(third, plate + np.array([0.0, 6.0, 0.0]), viewpoint=place)
+    assert np.unique(again.objects).tolist() == [kept, 2, 3]
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_later_scans_keep_no_rows_of_earlier_ones(each: bool) -> None:
+    image = floor_wall_and_boxes(0, shape=(60, 80), noise=0.0).points
+    place = np.zeros(3) if not each else np.where(image[..., :1] < 0.0, (0.0, 0.0, 0.0), (0.3, 0.0, 0.0))
+    result, sizes = pcgraph.segment(image, camera=False), []
+    for _ in range(3):
+        result = pcgraph.update(result, image, viewpoint=place)
+        sizes.append(len(pickle.dumps(result.acquisition)))
+    assert sizes[2] < 1.05 * sizes[1]
+
+
+@pytest.mark.parametrize("height", [20.0, 1000.0])
+def test_a_height_map_was_seen_by_no_camera_at_the_origin(height: float) -> None:
+    """Its columns are in the order of x/z, and neighbours lie side by side, wherever it lies."""
+    x, y = np.meshgrid(np.arange(-25.0, 25.0, 0.5), np.arange(-20.0, 20.0, 0.5))
+    heights = np.stack((x, y, height + 2.0 * np.sin(x / 6.0) * np.cos(y / 5.0)), axis=-1)
+    assert not pcgraph.segment(heights).acquisition.told.evidence.is_sure
+    assert not isinstance(pcgraph.segment(heights, viewpoint=(0.0, 0.0, 0.0)).acquisition, CameraImage)
+    assert isinstance(pcgraph.segment(heights, camera=True).acquisition, CameraImage)  # if told so
+
+
+def test_a_single_pixel_does_not_tell_where_from() -> None:
+    image = np.full((60, 80, 3), np.nan)
+    image[20, 30] = (1.0, 2.0, 3.0)
+    assert isinstance(pcgraph.segment(image).acquisition, UnknownAcquisition)
+    assert isinstance(pcgraph.segment(image[20:21, 30:31]).acquisition, UnknownAcquisition)
+
+
+def test_a_column_of_pixels_has_neighbours_as_a_row_has() -> None:
+    """A path that leaps tells no place, whichever way it runs."""
+    rng = np.random.default_rng(0)
+    line = np.cumsum(rng.normal(size=(300, 3)) ** 3, axis=0)  # a path with leaps, not in view of the origin
+    for image in (line[None], line[:, None]):
+        assert not pcgraph.segment(image).acquisition.told.evidence.is_sure
