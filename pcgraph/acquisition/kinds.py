@@ -97,7 +97,7 @@ class Told(NamedTuple):
     image : DepthImage, or None
         What a camera measured, pixel by pixel, if the points are pixels of one.
     normals : bool
-        Whether normals came with the points.
+        Whether normals came with most of the points.
     growth : float, or None
         Power of the range with which voxels grow, if the caller gave one.
     """
@@ -473,7 +473,7 @@ def acquisition_of(
     if camera and growth:
         raise ValueError("expected camera=True or a range_growth above 0, got both; voxels grow in one way")
     place, axis, evidence = _place_and_axis(cloud, viewpoint, bool(camera))
-    told = Told(evidence, None, cloud.normals is not None, growth)
+    told = Told(evidence, None, _tell_sides(cloud.normals), growth)
     if place is None:
         return UnknownAcquisition(told)
     if place.ndim == 2:
@@ -482,13 +482,19 @@ def acquisition_of(
         places = np.full((math.prod(cloud.shape), 3), np.nan)
         places[cloud.kept] = place
         return SeveralPlaces(told, places)
+    grows_with_depth = camera or (camera is None and growth is None)
     if camera is None:
         camera = axis is not None or is_camera_image(cloud, place)
     if camera and cloud.image is not None:
         told = told._replace(image=DepthImage.of(cloud.points, cloud.image, place, axis))
-    if camera and not growth:
+    if camera and grows_with_depth:
         return CameraImage(told, place, np.array(FORWARDS) if axis is None else axis)
     return Scanner(told, place, growth) if growth else OnePlace(told, place)
+
+
+def _tell_sides(normals: NDArray[np.float64] | None) -> bool:
+    """Whether most normals, (n, 3), are given, and not zero."""
+    return normals is not None and bool(2 * np.count_nonzero(normals.any(axis=1)) > len(normals))
 
 
 def _place_and_axis(

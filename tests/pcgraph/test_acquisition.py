@@ -75,6 +75,11 @@ def test_what_is_given_is_not_guessed() -> None:
     assert isinstance(growing, Scanner)
     assert growing.growth == 0.3
     assert growing.law is None
+    for turned in (image, image @ random_turn(1).T + SHIFT):
+        even = pcgraph.segment(turned, range_growth=0.0)
+        assert np.ptp(even.surface.grid.edge_lengths) == 0.0
+        assert not even.acquisition.is_one_scan
+        assert even.acquisition.told.evidence is Evidence.PIXELS
     camera = pcgraph.segment(image.reshape(-1, 3)[::7], camera=True).acquisition
     assert isinstance(camera, CameraImage)
     assert not camera.place.any()
@@ -90,6 +95,8 @@ def test_a_body_seen_from_all_around_was_seen_from_unknown_places() -> None:
     assert "seen from unknown places" in repr(result)
     normals = faces((0.0, 0.0, 0.0), (0.4, 0.3, 0.5), 0.01).normals
     assert pcgraph.segment(box(), normals=normals).acquisition.sides_known
+    normals[1:] = np.nan
+    assert not pcgraph.segment(box(), normals=normals).acquisition.sides_known
 
 
 def test_a_viewpoint_for_each_point_follows_the_points_that_are_left() -> None:
