@@ -44,8 +44,8 @@ from pcgraph.voxels.surface import Surface
 from pcgraph.warmup import compile_in_two_processes
 
 _FLIP_COSINE = 0.5
-"""Cosine between normals of small and of larger voxels below minus which the small one is flipped: chosen by eye. With
-no flip, 23 of 24 closed bottles of few points are inside out."""
+"""A small voxel is flipped if the cosine between its normal and that of larger voxels is below minus this: chosen by
+eye. With no flip, 23 of 24 closed bottles of few points are inside out."""
 
 
 def segment(

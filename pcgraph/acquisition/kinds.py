@@ -433,7 +433,7 @@ class SeveralScans(Acquisition):
 
     @property
     def is_one_scan(self) -> bool:
-        """True if the first scan is one, as voxels grow by that."""
+        """True if the voxels, which are those of the first scan, follow the spacing of the points of one scan."""
         return self.scans[0].is_one_scan
 
     @property
