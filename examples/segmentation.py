@@ -76,7 +76,7 @@ def paint(labels: np.ndarray) -> np.ndarray:
     palette = hsv_to_rgb(
         np.stack((number * GOLDEN % 1.0, 0.45 + 0.2 * (number % 3), 0.95 - 0.1 * (number % 4)), axis=1)
     )
-    return np.vstack([palette, np.ones(3)])[labels]
+    return np.vstack([palette, np.ones(3)])[np.maximum(labels, -1)]
 
 
 if __name__ == "__main__":

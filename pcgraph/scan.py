@@ -43,8 +43,8 @@ from pcgraph.voxels.outliers import OUTLIER
 from pcgraph.voxels.surface import Surface
 
 _FLIP_COSINE = 0.5
-"""Cosine between normals of small and of larger voxels below minus which the small one is flipped: chosen by eye. With
-no flip, 23 of 24 closed bottles of few points are inside out."""
+"""A small voxel is flipped if the cosine between its normal and that of larger voxels is below minus this: chosen by
+eye. With no flip, 23 of 24 closed bottles of few points are inside out."""
 
 
 def segment(
@@ -216,7 +216,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
     if earlier is not None:
-        objects = _renumbered(objects, earlier.objects, leaves.counts)
+        objects = _renumbered(objects, earlier, leaves.counts)
     viewpoint = scan.acquisition.viewpoint_of(cloud)
     return Segmentation(
         labels=cloud.in_input_shape(objects[leaf_of_point], OUTLIER),
@@ -228,6 +228,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         seed_size=scan.seed_size,
         viewpoint=scan.oriented.places[0] if viewpoint is None else viewpoint,
         feature_scaling=cloud.scaling,
+        next_object=max(int(objects.max()) + 1, 0 if earlier is None else earlier.next_object),
         **vars(settings),
     )
 
@@ -265,13 +266,14 @@ def _leaves(
     return replace(leaves, normals=surface.mean_normals(n_leaves))
 
 
-def _renumbered(objects: NDArray[np.int32], before: NDArray[np.int32], weights: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Objects of k supervoxels, (k,), with the numbers that they had before, (b,) of the first b <= k supervoxels.
+def _renumbered(objects: NDArray[np.int32], earlier: Segmentation, weights: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Objects of k supervoxels, (k,), with their numbers in an earlier segmentation of the first of these supervoxels.
 
     An object keeps the number of that with which it shares most points, if no other object shares more with that. The
     other objects get numbers that were not used before.
     """
-    n_before, overlap = int(before.max()) + 1, weights[: len(before)]
+    before, n_before = earlier.objects, earlier.next_object
+    overlap = weights[: len(before)]
     shared, pair = np.unique(objects[: len(before)].astype(np.int64) * n_before + before, return_inverse=True)
     new, old = np.divmod(shared[np.argsort(-np.bincount(pair, overlap), kind="stable")], n_before)
     numbers = np.full(int(objects.max()) + 1, -1, np.int32)

@@ -86,6 +86,8 @@ class Segmentation:
         given per point.
     feature_scaling : RobustScaling, or None
         Center and spread of each column of the features; None if none were given.
+    next_object : int
+        Least number that no object has had, in this scan or an earlier one.
     """
 
     labels: NDArray[np.int32]
@@ -100,6 +102,7 @@ class Segmentation:
     object_altitude: float
     viewpoint: NDArray[np.float64]
     feature_scaling: RobustScaling | None = None
+    next_object: int = 0
 
     def __repr__(self) -> str:
         """Counts, sizes and the acquisition, in one line."""

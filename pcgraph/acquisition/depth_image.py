@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.acquisition.resection import NO_PLANE, is_far_off, resection
 from pcgraph.inputs import CleanCloud, ImageView, Pixels, unit_rows
 from pcgraph.parallel import MIN_ROWS, in_blocks, kernel, routine
+from pcgraph.rounding import TINY
 from pcgraph.voxels.outliers import MIN_POINTS
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING, median_spacing
 from pcgraph.voxels.warp import FORWARDS, Warp, along_axis
@@ -30,6 +31,8 @@ class CameraThresholds:
     max_residual: float = 1.0  # pixels, reprojection error of an inlier, at most
     min_inliers: float = 0.95  # fraction of the points that are inliers
     same_place: float = 0.02  # extents of the cloud between two places that are one
+    min_miss: float = 0.01  # pixels by which rays from one place miss a parallel view, at least; images of mOSD: 3e-5
+    parallel_miss: float = 0.1  # of that, by which parallel rays miss it, at most; images of mOSD: above 1e6
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,8 @@ def image_view(cloud: CleanCloud) -> ImageView | None:
 
     If the cloud came as a list whose pixels were found, its camera was found with them. Of organised points, the
     viewpoint is the origin if neighbours lie side by side as seen from there, as in the frame of their sensor. Else it
-    is the centre of the pinhole camera that sees each point at its pixel, in whatever frame the points are.
+    is the centre of the pinhole camera that sees each point at its pixel, in whatever frame the points are. A height
+    map tells none, nor do pixels of which hardly any has a neighbour.
     """
     if cloud.image is None:
         return None
@@ -81,7 +85,9 @@ def image_view(cloud: CleanCloud) -> ImageView | None:
         return cloud.image.view
     origin = ImageView(np.zeros(3), None)
     far_apart = _neighbours_far_apart(cloud, cloud.image)
-    told = max(far_apart, default=0.0) <= _CAMERA.max_far_apart
+    if not far_apart or _is_parallel_view(cloud, cloud.image, origin.place):
+        return None
+    told = max(far_apart) <= _CAMERA.max_far_apart
     if told and is_camera_image(cloud, origin.place):
         return ImageView(origin.place, np.array(FORWARDS))
     camera = _camera(cloud, cloud.image)
@@ -114,9 +120,9 @@ def _neighbours_far_apart(cloud: CleanCloud, image: Pixels) -> list[float]:
         return [1.0, 1.0]
     some, far_apart = _some_of(image, _CAMERA.sample), []
     for step in (1, image.shape[1]):
-        one, other = (unit_rows(cloud.points[at]) for at in _pairs_beside(image, some, step))
-        angles = np.linalg.norm(one - other, axis=1)
-        if len(angles) >= _CAMERA.min_pairs:
+        first, second = _pairs_beside(image, some, step)
+        angles = np.linalg.norm(unit_rows(cloud.points[first]) - unit_rows(cloud.points[second]), axis=1)
+        if len(angles) >= _CAMERA.min_pairs and np.median(angles) > 0.0:
             far_apart.append(float(np.mean(angles > _CAMERA.far_apart * np.median(angles))))
     return far_apart
 
@@ -126,7 +132,7 @@ def _pairs_beside(image: Pixels, some: NDArray[np.int32], step: int) -> tuple[ND
     neighbours, (m,) each."""
     sought, (h, w) = image.at[some] + step, image.shape
     beside = image.point_at[np.minimum(sought, h * w - 1)]
-    pairs = (beside >= 0) & (sought < h * w) & ((step != 1) | (sought % w > 0))
+    pairs = (beside >= 0) & (sought < h * w) & ((step == w) | (sought % w > 0))
     return some[pairs], beside[pairs]
 
 
@@ -162,6 +168,8 @@ def is_camera_image(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
         return False
     if not cloud.bounds[0][2] > viewpoint[2]:
         return False
+    if _is_parallel_view(cloud, cloud.image, viewpoint):
+        return False
     some = _some_of(cloud.image, _CAMERA.sample)
     rays = cloud.points[some] - viewpoint
     with np.errstate(over="ignore"):  # points in the camera
@@ -169,6 +177,32 @@ def is_camera_image(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
     row, column = np.divmod(cloud.image.at[some], cloud.image.shape[1])
     orders = ((x, column), (y, row)), ((x, row), (y, column))  # the second: an image on its side
     return any(all(_rank_correlation(a, b) >= _CAMERA.min_rank_correlation for a, b in order) for order in orders)
+
+
+def _is_parallel_view(cloud: CleanCloud, image: Pixels, place: NDArray[np.float64]) -> bool:
+    """Whether parallel rays fit the pixels well, as those of a height map, and rays from a place before it do not.
+
+    On a plane across the axis both fit; there the rays may come from the place.
+    """
+    if not cloud.bounds[0][2] > place[2]:
+        return False
+    some = _some_of(image, _CAMERA.sample)
+    rays = cloud.points[some] - place
+    rays /= max(float(np.abs(rays).max()), TINY)
+    with np.errstate(over="ignore"):  # points in the camera
+        central = rays[:, :2] / rays[:, 2:]
+    if not np.isfinite(central).all():
+        return False
+    pixels = np.stack(np.divmod(image.at[some], image.shape[1]), axis=1).astype(np.float64)
+    of_parallel, of_central = _miss(pixels, rays - rays.mean(axis=0)), _miss(pixels, central)
+    return of_central >= _CAMERA.min_miss and of_parallel <= _CAMERA.parallel_miss * of_central
+
+
+def _miss(pixels: NDArray[np.float64], at: NDArray[np.float64]) -> float:
+    """Rms distance, pixels, of m pixels, (m, 2), from the affine map of coordinates, (m, d), that fits best."""
+    of_image = np.column_stack((at / np.abs(at).max(axis=0).clip(TINY), np.ones(len(at))))
+    off = pixels - of_image @ np.linalg.lstsq(of_image, pixels, rcond=None)[0]
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
 class DepthImage(NamedTuple):

@@ -63,14 +63,14 @@ class Evidence(Enum):
 
     GIVEN = "sure: it was given"
     PIXELS = "sure: the order of its pixels tells"
-    RINGS = "sure: its rings tell"
+    RINGS = "likely: rings of its points lie about that place"
     SPACING = "likely: the spacing of the points grows with range from there"
     NOTHING = "nothing tells where from"
 
     @property
     def is_sure(self) -> bool:
         """True if the evidence leaves no doubt."""
-        return self in (Evidence.GIVEN, Evidence.PIXELS, Evidence.RINGS)
+        return self in (Evidence.GIVEN, Evidence.PIXELS)
 
 
 class OrientedPlanes(NamedTuple):
@@ -97,7 +97,7 @@ class Told(NamedTuple):
     image : DepthImage, or None
         What a camera measured, pixel by pixel, if the points are pixels of one.
     normals : bool
-        Whether normals came with the points.
+        Whether normals came with most of the points.
     growth : float, or None
         Power of the range with which voxels grow, if the caller gave one.
     """
@@ -437,7 +437,7 @@ class SeveralScans(Acquisition):
 
     @property
     def is_one_scan(self) -> bool:
-        """True if the first scan is one, as voxels grow by that."""
+        """True if the voxels, which are those of the first scan, follow the spacing of the points of one scan."""
         return self.first.is_one_scan
 
     @property
@@ -477,7 +477,7 @@ def acquisition_of(
     if camera and growth:
         raise ValueError("expected camera=True or a range_growth above 0, got both; voxels grow in one way")
     place, axis, evidence = _place_and_axis(cloud, viewpoint, bool(camera))
-    told = Told(evidence, None, cloud.normals is not None, growth)
+    told = Told(evidence, None, _tell_sides(cloud.normals), growth)
     if place is None:
         return UnknownAcquisition(told)
     if place.ndim == 2:
@@ -486,13 +486,19 @@ def acquisition_of(
         places = np.full((math.prod(cloud.shape), 3), np.nan)
         places[cloud.kept] = place
         return SeveralPlaces(told, places)
+    grows_with_depth = camera or (camera is None and growth is None)
     if camera is None:
         camera = axis is not None or is_camera_image(cloud, place)
     if camera and cloud.image is not None:
         told = told._replace(image=DepthImage.of(cloud.points, cloud.image, place, axis))
-    if camera and not growth:
+    if camera and grows_with_depth:
         return CameraImage(told, place, np.array(FORWARDS) if axis is None else axis)
     return Scanner(told, place, growth) if growth else OnePlace(told, place)
+
+
+def _tell_sides(normals: NDArray[np.float64] | None) -> bool:
+    """Whether most normals, (n, 3), are given, and not zero."""
+    return normals is not None and bool(2 * np.count_nonzero(normals.any(axis=1)) > len(normals))
 
 
 def _place_and_axis(

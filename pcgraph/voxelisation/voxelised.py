@@ -137,7 +137,7 @@ def voxelise(cloud: CleanCloud, assumed: Acquisition, sizes: Sizes) -> Voxelisat
 
 
 def voxelise_beside(cloud: CleanCloud, earlier: VoxelGrid) -> Voxelised:
-    """A later scan in voxels of the grid of earlier ones, without noise; what lies near those is none."""
+    """A later scan in the voxels of earlier ones, without noise. What lies near earlier voxels is no noise."""
     found = Voxelised.of(cloud, earlier.size, earlier.warp)
     found = found.without(far_from(earlier, found.grid, outlier_voxels(found.grid)))
     if earlier.grading is not None:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from scenes.images import floor_wall_and_boxes
@@ -44,7 +46,7 @@ def test_an_image_tells_its_camera_in_any_frame(as_list: bool, moved: bool) -> N
     assert "sure" in repr(found)
 
 
-def test_spacing_tells_a_scanner_and_rings_tell_it_for_sure() -> None:
+def test_spacing_tells_a_scanner_and_rings_tell_it_nearer() -> None:
     points, place = furniture(0)
     found = pcgraph.segment(points + SHIFT).acquisition
     assert isinstance(found, Scanner)
@@ -56,7 +58,7 @@ def test_spacing_tells_a_scanner_and_rings_tell_it_for_sure() -> None:
     found = pcgraph.segment(points + SHIFT).acquisition
     assert isinstance(found, Scanner)
     assert found.told.evidence is Evidence.RINGS
-    assert found.told.evidence.is_sure
+    assert not found.told.evidence.is_sure  # two scans may lie over each other
     assert np.linalg.norm(found.place - SHIFT - place) < 0.05  # m
 
 
@@ -73,6 +75,11 @@ def test_what_is_given_is_not_guessed() -> None:
     assert isinstance(growing, Scanner)
     assert growing.growth == 0.3
     assert growing.law is None
+    for turned in (image, image @ random_turn(1).T + SHIFT):
+        even = pcgraph.segment(turned, range_growth=0.0)
+        assert np.ptp(even.surface.grid.edge_lengths) == 0.0
+        assert not even.acquisition.is_one_scan
+        assert even.acquisition.told.evidence is Evidence.PIXELS
     camera = pcgraph.segment(image.reshape(-1, 3)[::7], camera=True).acquisition
     assert isinstance(camera, CameraImage)
     assert not camera.place.any()
@@ -88,6 +95,8 @@ def test_a_body_seen_from_all_around_was_seen_from_unknown_places() -> None:
     assert "seen from unknown places" in repr(result)
     normals = faces((0.0, 0.0, 0.0), (0.4, 0.3, 0.5), 0.01).normals
     assert pcgraph.segment(box(), normals=normals).acquisition.sides_known
+    normals[1:] = np.nan
+    assert not pcgraph.segment(box(), normals=normals).acquisition.sides_known
 
 
 def test_a_viewpoint_for_each_point_follows_the_points_that_are_left() -> None:
@@ -128,3 +137,58 @@ def test_objects_keep_their_numbers_from_scan_to_scan() -> None:
         assert result.objects[: len(before.objects)].tolist() == before.objects.tolist()
         numbers.append(result.labels[-1])
     assert len(set(numbers)) == len(numbers) == 5
+
+
+def test_the_number_of_an_object_that_has_joined_another_is_not_given_again() -> None:
+    x, y = np.meshgrid(np.arange(0.0, 1.0, 0.02), np.arange(0.0, 1.0, 0.02))
+    plate, place = np.stack((x, y, np.zeros_like(x)), axis=-1).reshape(-1, 3), (1.0, 0.5, 5.0)
+    smaller = plate[plate[:, 0] < 0.7]
+    apart = pcgraph.segment(np.vstack((plate, smaller + np.array([1.3, 0.0, 0.0]))), viewpoint=place)
+    assert np.unique(apart.objects).tolist() == [0, 1]
+    joined = pcgraph.update(apart, plate[plate[:, 0] < 0.3] + np.array([1.0, 0.0, 0.0]), viewpoint=place)
+    kept = apart.labels[0]
+    assert np.unique(joined.objects).tolist() == [kept]
+    third = pcgraph.update(joined, plate + np.array([0.0, 3.0, 0.0]), viewpoint=place)
+    assert np.unique(third.objects).tolist() == [kept, 2]
+    again = pcgraph.update(third, plate + np.array([0.0, 6.0, 0.0]), viewpoint=place)
+    assert np.unique(again.objects).tolist() == [kept, 2, 3]
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_later_scans_keep_no_rows_of_earlier_ones(each: bool) -> None:
+    image = floor_wall_and_boxes(0, shape=(60, 80), noise=0.0).points
+    place = np.zeros(3) if not each else np.where(image[..., :1] < 0.0, (0.0, 0.0, 0.0), (0.3, 0.0, 0.0))
+    result, sizes = pcgraph.segment(image, camera=False), []
+    for _ in range(3):
+        result = pcgraph.update(result, image, viewpoint=place)
+        sizes.append(len(pickle.dumps(result.acquisition)))
+    assert sizes[2] < 1.05 * sizes[1]
+
+
+@pytest.mark.parametrize("height", [20.0, 1000.0])
+def test_a_height_map_was_seen_by_no_camera_at_the_origin(height: float) -> None:
+    """Its columns are in the order of x/z, and neighbours lie side by side, wherever it lies."""
+    x, y = np.meshgrid(np.arange(-25.0, 25.0, 0.5), np.arange(-20.0, 20.0, 0.5))
+    heights = np.stack((x, y, height + 2.0 * np.sin(x / 6.0) * np.cos(y / 5.0)), axis=-1)
+    assert not pcgraph.segment(heights).acquisition.told.evidence.is_sure
+    assert not isinstance(pcgraph.segment(heights, viewpoint=(0.0, 0.0, 0.0)).acquisition, CameraImage)
+    assert isinstance(pcgraph.segment(heights, camera=True).acquisition, CameraImage)  # if told so
+
+
+def test_a_single_pixel_does_not_tell_where_from() -> None:
+    image = np.full((60, 80, 3), np.nan)
+    image[20, 30] = (1.0, 2.0, 3.0)
+    assert isinstance(pcgraph.segment(image).acquisition, UnknownAcquisition)
+    assert isinstance(pcgraph.segment(image[20:21, 30:31]).acquisition, UnknownAcquisition)
+
+
+def test_a_column_of_pixels_has_neighbours_as_a_row_has() -> None:
+    """A path that leaps tells no place, whichever way it runs."""
+    rng = np.random.default_rng(0)
+    line = np.cumsum(rng.normal(size=(300, 3)) ** 3, axis=0)  # a path with leaps, not in view of the origin
+    for image in (line[None], line[:, None]):
+        assert not pcgraph.segment(image).acquisition.told.evidence.is_sure
+
+
+def test_equal_points_do_not_tell_where_from() -> None:
+    assert not pcgraph.segment(np.ones((40, 50, 3))).acquisition.told.evidence.is_sure
