@@ -135,21 +135,22 @@ def segment(
     n_supervoxels = None if n_supervoxels is None else min(n_supervoxels, len(cloud.points))
     sizes = Sizes.of(voxel_size, seed_size, n_supervoxels)
     assumed = acquisition_of(cloud, viewpoint, camera, range_growth)
-    found = voxelise(without_flying_pixels(cloud, assumed.told.image), assumed, sizes)
-    cloud, grid, acquisition = found.voxelised.cloud, found.voxelised.grid, found.acquisition
-    warn_of_rounding(points, cloud, found.spacing)  # type: ignore[arg-type]
-    if found.spacing is not None:
-        warn_of_duplicates(cloud, found.spacing)
+    voxelisation = voxelise(without_flying_pixels(cloud, assumed.told.image), assumed, sizes)
+    voxelised, acquisition, spacing = voxelisation.voxelised, voxelisation.acquisition, voxelisation.spacing
+    cloud, grid = voxelised.cloud, voxelised.grid
+    warn_of_rounding(points, cloud, spacing)  # type: ignore[arg-type]
+    if spacing is not None:
+        warn_of_duplicates(cloud, spacing)
     warn_of_size("voxel_size", voxel_size, cloud)
     warn_of_size("seed_size", seed_size, cloud)
     warn_of_volume(grid)
     if viewpoint is not None and acquisition.one_viewpoint is not None:
         warn_of_viewpoint(acquisition.one_viewpoint, grid)
-    oriented = _oriented(found, settings.method)
+    oriented = _oriented(voxelisation, settings.method)
     if n_supervoxels is not None:
         seed_size = seed_size_for(n_supervoxels, grid, _normals(cloud, oriented, grid), settings.method)
     scan = Scan(
-        found.voxelised,
+        voxelised,
         acquisition,
         oriented,
         initial_labels=np.full(grid.n_voxels, -1, np.int32),
@@ -233,17 +234,18 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     )
 
 
-def _oriented(found: Voxelisation, method: SupervoxelMethod) -> OrientedPlanes:
+def _oriented(voxelisation: Voxelisation, method: SupervoxelMethod) -> OrientedPlanes:
     """Planes of the voxels with outward normals.
 
     Where few small voxels are joined, viewpoints see through the gaps into closed bodies. So where nothing tells the
     viewpoint, small voxels are flipped whose normals clearly point the other way than those of larger voxels.
     """
-    cloud, grid, acquisition = found.voxelised.cloud, found.voxelised.grid, found.acquisition
+    voxelised, acquisition = voxelisation.voxelised, voxelisation.acquisition
+    cloud, grid = voxelised.cloud, voxelised.grid
     oriented = acquisition.oriented(cloud, grid, method.planes)
-    if grid.size >= found.orienting_size or acquisition.viewpoint is not None:
+    if grid.size >= voxelisation.orienting_size or acquisition.viewpoint is not None:
         return oriented
-    larger = found.voxelised.resized(found.orienting_size).grid
+    larger = voxelised.resized(voxelisation.orienting_size).grid
     of_larger = acquisition.oriented(cloud, larger, method.planes).planes.normals
     normals, planes = voxel_means(of_larger[larger.voxel_of_point], grid), oriented.planes
     is_other = np.einsum("ij,ij->i", normals, planes.normals) < -_FLIP_COSINE
