@@ -545,7 +545,7 @@ GRAPH = (
     _function("gaps: seen through", _GAPS, "_open_ways", _none_of(3)),
     Part(
         "gaps: strips",
-        (f"{_GAPS}:_ends_of_surfaces", "voxels/grid.py:at_ends"),
+        (f"{_GAPS}:_ends_of_surfaces",),
         {"graph.gaps._ends_of_surfaces": lambda f: lambda grid, *others: np.flatnonzero(boundary_voxels(grid))},
     ),
     Part("gaps: wider in one scan", ("voxels/warp.py:RangeWarp.max_gap",), {"voxels.warp.RangeWarp.max_gap": _is(3.0)}),

@@ -108,7 +108,7 @@ def compile_voxels() -> None:
     median_spacing(points)
     spacing_law(points)
     outlier_voxels(grid)
-    at_ends(grid, np.zeros(1, np.int64))
+    at_ends(grid, np.zeros(1, np.int64), np.zeros(grid.n_voxels, np.int64))
     visible_fraction(grid, np.zeros(3))
     method = SurfaceGrowth()
     planes = method.planes(grid, np.zeros(3))
@@ -167,7 +167,7 @@ def compile_levels() -> None:
     """Compile what voxels of several sizes take beside."""
     everywhere = Grading(np.array(list(np.ndindex(3, 3, 3))) - 1.0, np.ones(27, np.int8))
     grid = voxel_grid(image_of_a_step()[0].reshape(-1, 3), 3.5 * _SPACING, Warp(), everywhere)
-    at_ends(grid, np.zeros(1, np.int64))
+    at_ends(grid, np.zeros(1, np.int64), np.zeros(grid.n_voxels, np.int64))
 
 
 def _compile_pixels() -> None:
