@@ -290,8 +290,8 @@ class _Ways(NamedTuple):
     def joined(self, may_join: NDArray[np.bool_], areas: NDArray[np.float64]) -> NDArray[np.int64]:
         """Ends of the ways, (j, 2), of pairs that join pieces, of so many square metres, into what is one.
 
-        Of the pairs that may join, (q,), the nearest join first; as what is one grows, wider gaps are bridged. All count
-        that may join and are one in the end.
+        Of the pairs that may join, (q,), the nearest join first; as what is one grows, wider gaps are bridged. All
+        count that may join and are one in the end.
         """
         pairs, widths = self.pairs, self.widths
         whole, areas = np.arange(len(areas)), areas.copy()
