@@ -545,7 +545,7 @@ GRAPH = (
     _function("gaps: seen through", _GAPS, "_open_ways", _none_of(3)),
     Part(
         "gaps: strips",
-        (f"{_GAPS}:_ends_of_surfaces", "voxels/grid.py:at_ends"),
+        (f"{_GAPS}:_ends_of_surfaces",),
         {"graph.gaps._ends_of_surfaces": lambda f: lambda grid, *others: np.flatnonzero(boundary_voxels(grid))},
     ),
     Part("gaps: wider in one scan", ("voxels/warp.py:RangeWarp.max_gap",), {"voxels.warp.RangeWarp.max_gap": _is(3.0)}),
@@ -553,7 +553,7 @@ GRAPH = (
     _constant("gaps: cheaper in several scans", _LINK, "_GAP_OF_SEVERAL_SCANS", 1.0),
     Part("pieces of one plane", (f"{_BEHIND}:_of_planes",), _NO_CONTINUATIONS),
     _function("continuations", _BEHIND, "_unseen", _is(_none_hidden), "_ALONG_WAY", "_MIN_DEPTH"),
-    _function("continuations: level", _BEHIND, "_are_level", _is(_all_level), "_SIGMAS", "_MIN_NOISE"),
+    _function("continuations: level", _BEHIND, "_are_level", _is(_all_level), "_MIN_NOISE"),
     _constant("continuations: three places", _ACQUISITION, "_MAX_PLACES", 1),
     _function("bounding planes", _BEHIND, "_behind_something", lambda f: lambda *a: np.zeros(len(a[3].ends), np.bool_)),
     Part("terrain", (f"{_BEHIND}:_of_terrain",), _NO_TERRAIN),

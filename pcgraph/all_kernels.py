@@ -72,7 +72,7 @@ def _compile_voxels() -> None:
     some_blocks(points)
     spacing_law(points)
     outlier_voxels(grid)
-    at_ends(grid, np.zeros(1, np.int64))
+    at_ends(grid, np.zeros(1, np.int64), np.zeros(grid.n_voxels, np.int64))
     visible_fraction(grid, np.zeros(3))
     visible_sides(grid, np.zeros((grid.n_voxels, 3)))
     virtual_viewpoints._agreements(np.ones((1, 1), np.float32), np.ones((1, 1), np.float32))
@@ -126,4 +126,4 @@ def _compile_levels() -> None:
     """Compile what voxels of several sizes take beside."""
     everywhere = Grading(np.array(list(np.ndindex(3, 3, 3))) - 1.0, np.ones(27, np.int8))
     grid = voxel_grid(_image_of_a_step()[0].reshape(-1, 3), 3.5 * _SPACING, Warp(), everywhere)
-    at_ends(grid, np.zeros(1, np.int64))
+    at_ends(grid, np.zeros(1, np.int64), np.zeros(grid.n_voxels, np.int64))

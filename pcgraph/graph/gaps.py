@@ -136,12 +136,12 @@ def _ends_of_surfaces(
     around them alone, as there is no time to look at others."""
     ends, of_nodes = boundary_voxels(grid), connected_components(touching, k)
     if of_nodes.any():
-        components = of_nodes[supervoxels]
+        components = of_nodes[supervoxels].astype(np.int64)
         sizes, looked_at = np.bincount(components), ~ends
         if 2 * sizes.max() > len(components):
             looked_at &= components != sizes.argmax()
         others = np.flatnonzero(looked_at)
-        ends[others] = at_ends(grid, others)
+        ends[others] = at_ends(grid, others, components)
     return np.flatnonzero(ends)
 
 

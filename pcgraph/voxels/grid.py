@@ -564,14 +564,14 @@ def boundary_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     return np.diff(grid.indptr) < _INTERIOR_NEIGHBOURS
 
 
-def at_ends(grid: VoxelGrid, voxels: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether each of m voxels lies at the end of a surface, (m,) bool, even if the surface is two voxels thick.
+def at_ends(grid: VoxelGrid, voxels: NDArray[np.int64], surfaces: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether each of m voxels lies at the end of its surface, (m,) bool, even if that is two voxels thick.
 
     Amid a surface, six of the eight places beside a voxel are occupied, as seen along one of the axes. At an end there
-    is no such axis.
+    is no such axis. `surfaces` are the numbers of those on which the grid's voxels lie, (v,).
     """
     ends = np.empty(len(voxels), np.bool_)
-    in_blocks(_find_ends, len(voxels), voxels, grid.cells, grid.levels, grid.neighbourhood, ends)
+    in_blocks(_find_ends, len(voxels), voxels, surfaces, grid.cells, grid.levels, grid.neighbourhood, ends)
     return ends
 
 
@@ -580,12 +580,13 @@ def _find_ends(
     start: int,
     stop: int,
     voxels: NDArray[np.int64],
+    surfaces: NDArray[np.int64],
     cells: NDArray[np.float64],
     levels: NDArray[np.int8] | None,
     around: Neighbourhood,
     ends: NDArray[np.bool_],
 ) -> None:
-    """Set whether each of some voxels lies at the end of a surface."""
+    """Set whether each of some voxels lies at the end of its surface."""
     taken, side = np.empty((3, 9), np.int64), np.empty(3, np.int64)  # places beside the voxel, as seen along each axis
     for m in range(start, stop):
         i, is_end = voxels[m], True
@@ -593,8 +594,11 @@ def _find_ends(
             for place in range(9):
                 taken[axis, place] = 0
         for a in range(around.indptr[i], around.indptr[i + 1]):
+            j = around.neighbours[a]
+            if surfaces[j] != surfaces[i]:
+                continue
             for axis in range(3):
-                side[axis] = _beside(cells, levels, i, around.neighbours[a], axis)
+                side[axis] = _beside(cells, levels, i, j, axis)
             right, ahead, above = side[0], side[1], side[2]
             taken[0, 3 * ahead + above] = taken[1, 3 * right + above] = taken[2, 3 * right + ahead] = 1
         for axis in range(3):

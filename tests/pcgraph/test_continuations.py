@@ -72,6 +72,19 @@ def test_a_surface_goes_on_if_it_lies_no_farther_off_behind_the_pillar_than_its_
     assert bool(left & right) == one
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("tilt", "one"), [(0.0, True), (0.05, True), (0.15, False)])
+def test_a_noisy_piece_behind_the_pillar_may_lean_a_little_as_on_a_bent_wall(seed, tilt, one):
+    """If it leans by 0.05 rad, its plane misses the middle of the wall, 1.5 m away, by more than a voxel edge."""
+    points, thing = before_a_wall([(0.4, 0.5, -2.0, 2.0, 1.0)], 2.0)
+    behind = points[..., 0] > 0.9  # metres, right of the middle of the pillar's shadow
+    depth = points[..., 2] + np.where((thing < 0) & behind, tilt * (points[..., 0] - 0.9), 0.0)
+    depth += 0.01 * np.random.default_rng(seed).standard_normal(depth.shape)
+    result = pcgraph.segment(points * (depth / points[..., 2])[..., None])
+    left, right = (objects_of(np.where(side, result.labels, -1), thing, -1) for side in (~behind, behind))
+    assert bool(left & right) == one
+
+
 @pytest.mark.parametrize("back", [4.0, np.inf])
 def test_boards_in_one_plane_end_in_the_open_though_something_stands_before_a_part_of_the_gap(back):
     """A pole a third as high as the boards hides their borders along a few lines; the other lines see past them."""

@@ -107,7 +107,7 @@ def test_a_union_is_the_grid_of_all_points_and_levels_are_grids_of_their_own(see
     again = voxel_grid(points[~gone[whole.voxel_of_point]], 1.0, Warp(), grading)
     assert np.array_equal(left.neighbours, again.neighbours)
     assert np.array_equal(left.levels, again.levels)
-    assert at_ends(left, np.arange(left.n_voxels)).dtype == np.bool_
+    assert at_ends(left, np.arange(left.n_voxels), np.zeros(left.n_voxels, np.int64)).dtype == np.bool_
 
 
 # --- where voxels are larger ---
