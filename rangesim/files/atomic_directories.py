@@ -350,10 +350,11 @@ class _Staging:
         try:
             self.target.mkdir(parents=True, exist_ok=True)
             self.path.mkdir(exist_ok=True)
-            if not _is_staging(self.path):
-                if os.path.lexists(self.path):
-                    raise kind.error(f"{self.path} is no staging directory of rangesim; move it away.")
+            found = _is_staging(self.path)
+            if found is None:  # its owner has just removed it
                 return False
+            if not found:
+                raise kind.error(f"{self.path} is no staging directory of rangesim; move it away.")
             self.handle = _lock(self.path)
         except FileNotFoundError:  # its owner has just removed it
             return False
@@ -692,20 +693,20 @@ def _make_plain_parents(folder: Path, name: str) -> None:
             parent.mkdir()  # FileExistsError if something else is there
 
 
-def _is_staging(path: Path) -> bool:
-    """Whether a directory with the name of a staging directory is one: it holds a lock, or nothing.
+def _is_staging(path: Path) -> bool | None:
+    """Whether a directory with the name of a staging directory is one: it holds a lock, or nothing; None if it is gone.
 
     Its owner may make or remove it meanwhile, and another process may make the next one. So it counts as foreign only
     if several checks in a row say so.
     """
     lock = path / _LOCK
     for _ in range(5):
-        if path.is_symlink() or not path.is_dir():
-            return False
         try:
+            if path.is_symlink() or not stat.S_ISDIR(path.lstat().st_mode):
+                return False
             names = os.listdir(path)
         except FileNotFoundError:
-            return False
+            return None
         if not names or (_LOCK in names and (is_plain_file(lock) or not os.path.lexists(lock))):
             return True
         time.sleep(0.002)
