@@ -130,6 +130,7 @@ def test_the_command_line_names_them_too(tmp_path: Path) -> None:
 # ---- A code from outside is calibrated and decoded like those of the package ----------------------------------------
 
 
+@pytest.mark.validation
 def test_images_of_an_own_code_calibrate_a_rig_and_decode_with_it(tmp_path: Path) -> None:
     """Its two classes suffice: no command and no calibration knows it, and the images say nothing of it."""
     sensor = sensor_of(FRINGES).for_projector(400, 300, ("columns", "rows"))

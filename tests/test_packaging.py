@@ -68,6 +68,7 @@ def test_the_sdist_holds_what_its_tests_need(built: Path) -> None:
     assert wanted <= names
 
 
+@pytest.mark.validation
 def test_an_installed_wheel_measures_its_own_scenes(built: Path, tmp_path: Path) -> None:
     """Outside the checkout, with the package from the wheel and its dependencies from here. The kernels are left as
     Python: to compile all of them for a place of their own takes longer than to run them on a few pixels."""

@@ -57,6 +57,7 @@ def test_the_carpet_is_a_plane_and_things_stand_on_it(images: np.ndarray, method
         assert above > 1.0  # nearer than the carpet behind it
 
 
+@pytest.mark.validation
 def test_opencv_finds_the_same_disparities(images: np.ndarray) -> None:
     """Where both read, 99 % agree within a pixel; OpenCV's own are in steps of 1/16 pixel that lock to whole ones."""
     found = decoded(images, DenseMatching())

@@ -53,6 +53,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
         yield page
 
 
+@pytest.mark.validation
 def test_a_crafted_directory_runs_no_script(page: Page, tmp_path: Path) -> None:
     """Each name is either refused by the reader or shown; material classes of the truth ran a script on hover once."""
     folder = tmp_path / "result"
