@@ -250,7 +250,7 @@ def _print_summary(result: Segmentation, labels: NDArray[np.int32], targets: lis
     segmented, outliers = int((result.supervoxels >= 0).sum()), int(result.outliers.sum())
     for name, value in (
         ("points", f"{segmented} of {result.labels.size} segmented, {outliers} outliers"),
-        ("acquisition", f"{result.acquisition}; {result.acquisition.told.evidence.value}"),
+        ("acquisition", result.acquisition.in_words),
         ("voxel size", f"{result.voxel_size:.3g} m" + (" at the median depth" if result.camera else "")),
         ("seed size", f"{result.seed_size:.3g} m"),
         ("supervoxels", str(result.graph.n_nodes)),

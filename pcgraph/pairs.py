@@ -35,7 +35,7 @@ def nearest(
 
     Parameters
     ----------
-    places, sought : (k, 3), (q, 3) float64
+    places, sought : (k, d), (q, d) float64
     n : int, 1..k
     """
     if len(places) * len(sought) > _FEW_DISTANCES:
@@ -43,7 +43,7 @@ def nearest(
 
         distances, numbers = cKDTree(places).query(sought, np.arange(1, n + 1))
         return distances, np.asarray(numbers, np.int64)
-    squares = sum(np.square(sought[:, axis, None] - places[:, axis]) for axis in range(3))
+    squares = sum(np.square(sought[:, axis, None] - places[:, axis]) for axis in range(places.shape[1]))
     numbers = np.argpartition(squares, n - 1, axis=1)[:, :n]
     squares = np.take_along_axis(squares, numbers, axis=1)
     order = np.argsort(squares, axis=1)

@@ -88,7 +88,7 @@ def image_view(cloud: CleanCloud) -> ImageView | None:
     if not far_apart or _is_parallel_view(cloud, cloud.image, origin.place):
         return None
     told = max(far_apart) <= _CAMERA.max_far_apart
-    if told and is_camera_image(cloud, origin.place):
+    if told and _is_in_order(cloud, cloud.image, origin.place):
         return ImageView(origin.place, np.array(FORWARDS))
     camera = _camera(cloud, cloud.image)
     if told:
@@ -120,20 +120,25 @@ def _neighbours_far_apart(cloud: CleanCloud, image: Pixels) -> list[float]:
         return [1.0, 1.0]
     some, far_apart = _some_of(image, _CAMERA.sample), []
     for step in (1, image.shape[1]):
-        first, second = _pairs_beside(image, some, step)
-        angles = np.linalg.norm(unit_rows(cloud.points[first]) - unit_rows(cloud.points[second]), axis=1)
+        rows, beside = _pairs_beside(image, some, step)
+        angles = np.linalg.norm(unit_rows(cloud.points[some[rows]]) - unit_rows(cloud.points[beside]), axis=1)
         if len(angles) >= _CAMERA.min_pairs and np.median(angles) > 0.0:
             far_apart.append(float(np.mean(angles > _CAMERA.far_apart * np.median(angles))))
     return far_apart
 
 
-def _pairs_beside(image: Pixels, some: NDArray[np.int32], step: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Pairs of neighbours in rows, if the step is 1, or in columns, if it is a row's width: points of `some`, and their
-    neighbours, (m,) each."""
-    sought, (h, w) = image.at[some] + step, image.shape
-    beside = image.point_at[np.minimum(sought, h * w - 1)]
-    pairs = (beside >= 0) & (sought < h * w) & ((step == w) | (sought % w > 0))
-    return some[pairs], beside[pairs]
+def _pairs_beside(image: Pixels, some: NDArray[np.int32], step: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Pairs of neighbours: which of some points have one, as rows of `some`, and these neighbours, (m,) each.
+
+    A step of 1 or -1 leads to the next or last pixel of the row; one of a row's width, or minus that, along a column.
+    """
+    at, (h, w) = image.at[some], image.shape
+    sought = at + step
+    beside = image.point_at[np.clip(sought, 0, h * w - 1)]
+    rows = np.flatnonzero(
+        (beside >= 0) & (sought >= 0) & (sought < h * w) & ((abs(step) == w) | (sought // w == at // w))
+    )
+    return rows, beside[rows]
 
 
 def _some_of(image: Pixels, number: int) -> NDArray[np.int32]:
@@ -166,15 +171,18 @@ def is_camera_image(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
     """
     if cloud.image is None or viewpoint.ndim != 1:
         return False
-    if not cloud.bounds[0][2] > viewpoint[2]:
+    return not _is_parallel_view(cloud, cloud.image, viewpoint) and _is_in_order(cloud, cloud.image, viewpoint)
+
+
+def _is_in_order(cloud: CleanCloud, image: Pixels, place: NDArray[np.float64]) -> bool:
+    """Whether all points lie before a place, and x/z and y/z from there are in the order of columns and rows."""
+    if not cloud.bounds[0][2] > place[2]:
         return False
-    if _is_parallel_view(cloud, cloud.image, viewpoint):
-        return False
-    some = _some_of(cloud.image, _CAMERA.sample)
-    rays = cloud.points[some] - viewpoint
+    some = _some_of(image, _CAMERA.sample)
+    rays = cloud.points[some] - place
     with np.errstate(over="ignore"):  # points in the camera
         x, y = (rays[:, :2] / rays[:, 2:]).T
-    row, column = np.divmod(cloud.image.at[some], cloud.image.shape[1])
+    row, column = np.divmod(image.at[some], image.shape[1])
     orders = ((x, column), (y, row)), ((x, row), (y, column))  # the second: an image on its side
     return any(all(_rank_correlation(a, b) >= _CAMERA.min_rank_correlation for a, b in order) for order in orders)
 
@@ -316,9 +324,9 @@ def _pitch(
 
     `step` is 1 for rows, and the width of a row for columns.
     """
-    one, other = (
-        (points[at] - place) / depths[at, None] for at in _pairs_beside(image, _some_of(image, _CAMERA.sample), step)
-    )
+    some = _some_of(image, _CAMERA.sample)
+    rows, beside = _pairs_beside(image, some, step)
+    one, other = ((points[at] - place) / depths[at, None] for at in (some[rows], beside))
     return float(np.median(np.linalg.norm(other - one, axis=1))) if len(one) else 0.0
 
 
@@ -329,16 +337,14 @@ def _nearest(
 
     Distances are those of a camera's warp: along the axis, differences of the logarithm of depth count.
     """
-    some, (h, w) = _some_of(image, _CAMERA.sample), image.shape
-    row, column = np.divmod(image.at[some], w)
+    some, w = _some_of(image, _CAMERA.sample), image.shape[1]
     nearest = np.full(len(some), np.inf)
-    for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-        inside = (row + down >= 0) & (row + down < h) & (column + right >= 0) & (column + right < w)
-        beside = np.where(inside, image.point_at[np.where(inside, image.at[some] + down * w + right, 0)], -1)
-        one, other = some[beside >= 0], beside[beside >= 0]
+    for step in (1, -1, w, -w):
+        rows, other = _pairs_beside(image, some, step)
+        one = some[rows]
         ways = (points[other] - place) / depths[other, None] - (points[one] - place) / depths[one, None]
         squares = np.einsum("ij,ij->i", ways, ways) + np.log(depths[other] / depths[one]) ** 2
-        nearest[beside >= 0] = np.fmin(nearest[beside >= 0], np.sqrt(squares))
+        nearest[rows] = np.fmin(nearest[rows], np.sqrt(squares))
     found = np.isfinite(nearest)
     return float(np.median(nearest[found])) if np.mean(found) >= _FLYING.min_with_neighbour else 0.0
 

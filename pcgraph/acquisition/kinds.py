@@ -179,16 +179,28 @@ class Acquisition(ABC):
         """The warp by which voxels of points, (n, 3), grow; the identity if they do not."""
         return Warp()
 
-    @abstractmethod
     def oriented(self, cloud: CleanCloud, grid: VoxelGrid, planes_from: PlanesFrom) -> OrientedPlanes:
-        """The plane of each voxel, with its normal outwards."""
+        """The plane of each voxel, with its normal outwards: towards the one viewpoint, or else where it is visible."""
+        place = self.one_viewpoint
+        if place is not None:
+            return OrientedPlanes(planes_from(grid, place), place[None])
+        planes, virtual = side_by_side(
+            lambda: planes_from(grid, far_along(grid, _UPWARDS)), lambda: virtual_viewpoints(grid)
+        )
+        sides = visible_sides(grid, planes.normals, virtual)
+        return OrientedPlanes(replace(planes, normals=sides.normals), sides.places[:_MAX_PLACES])
+
+    @property
+    def in_words(self) -> str:
+        """The acquisition and its evidence in words, as in "seen from (0, 0, 0) m; sure: it was given"."""
+        return f"{self}; {self.told.evidence.value}"
 
     @abstractmethod
     def __str__(self) -> str:
         """The acquisition in words, as in "seen by one camera at (0, 0, 0) m"."""
 
     def __repr__(self) -> str:
-        return f"Acquisition({self}; {self.told.evidence.value})"
+        return f"Acquisition({self.in_words})"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -207,9 +219,6 @@ class UnknownAcquisition(Acquisition):
         if self.told.growth:
             return MovingScanner(self.told, np.zeros(3), growth), spacing
         return self, spacing
-
-    def oriented(self, cloud: CleanCloud, grid: VoxelGrid, planes_from: PlanesFrom) -> OrientedPlanes:
-        return _oriented_by_visibility(grid, planes_from)
 
     def __str__(self) -> str:
         return "seen from unknown places"
@@ -235,9 +244,6 @@ class OnePlace(Acquisition):
             return self, None
         law, spacing = _law_and_spacing(cloud, self.place)
         return (Scanner(self.told, self.place, RANGE_GROWTH, law) if law.holds else self), spacing
-
-    def oriented(self, cloud: CleanCloud, grid: VoxelGrid, planes_from: PlanesFrom) -> OrientedPlanes:
-        return OrientedPlanes(planes_from(grid, self.place), self.place[None])
 
     def __str__(self) -> str:
         return f"seen from {_in_words(self.place)}"
@@ -273,9 +279,6 @@ class CameraImage(Acquisition):
     def warp(self, points: NDArray[np.float64]) -> Warp:
         return CameraWarp.about(points, self.place, self.axis)
 
-    def oriented(self, cloud: CleanCloud, grid: VoxelGrid, planes_from: PlanesFrom) -> OrientedPlanes:
-        return OrientedPlanes(planes_from(grid, self.place), self.place[None])
-
     def __str__(self) -> str:
         return f"seen by one camera at {_in_words(self.place)}"
 
@@ -309,7 +312,7 @@ class Scanner(Acquisition):
         """A scanner at the likelier of two mirrored places; a moving scanner, if neither shows most of the surface.
 
         Spacing grows with range about the middle of a short way, too, along which a scanner moved. But what it passed
-        has sides that the middle does not see. Rings tell their place without doubt.
+        has sides that the middle does not see. The place that rings tell is near enough, and is not checked.
         """
         law = self.law
         if self.told.evidence is not Evidence.SPACING or law is None:
@@ -325,10 +328,11 @@ class Scanner(Acquisition):
         return RangeWarp.about(points, self.place, self.growth)
 
     def oriented(self, cloud: CleanCloud, grid: VoxelGrid, planes_from: PlanesFrom) -> OrientedPlanes:
-        planes = planes_from(grid, self.place)
-        if self.law is not None and self.law.axis is not None:
-            planes = replace(planes, normals=sides_towards(grid, planes.normals, self.place, self.law.axis))
-        return OrientedPlanes(planes, self.place[None])
+        oriented = super().oriented(cloud, grid, planes_from)
+        if self.law is None or self.law.axis is None:
+            return oriented
+        normals = sides_towards(grid, oriented.planes.normals, self.place, self.law.axis)
+        return oriented._replace(planes=replace(oriented.planes, normals=normals))
 
     def __str__(self) -> str:
         return f"seen by one scanner at {_in_words(self.place)}"
@@ -357,9 +361,6 @@ class MovingScanner(Acquisition):
 
     def warp(self, points: NDArray[np.float64]) -> Warp:
         return RangeWarp.about(points, self.middle, self.growth)
-
-    def oriented(self, cloud: CleanCloud, grid: VoxelGrid, planes_from: PlanesFrom) -> OrientedPlanes:
-        return _oriented_by_visibility(grid, planes_from)
 
     def __str__(self) -> str:
         return f"seen by a scanner that moved about {_in_words(self.middle)}"
@@ -444,9 +445,6 @@ class SeveralScans(Acquisition):
     def sides_known(self) -> bool:
         return self.all_sides_known
 
-    def oriented(self, cloud: CleanCloud, grid: VoxelGrid, planes_from: PlanesFrom) -> OrientedPlanes:
-        return self.last.oriented(cloud, grid, planes_from)
-
     def __str__(self) -> str:
         return f"{self.number} scans, the last {self.last}"
 
@@ -520,15 +518,6 @@ def _law_and_spacing(cloud: CleanCloud, place: NDArray[np.float64] | None) -> tu
         partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, place, cloud.sample)
     )
     return law_on_rings(cloud.points, of_all, rows, place, cloud.sample), spacing
-
-
-def _oriented_by_visibility(grid: VoxelGrid, planes_from: PlanesFrom) -> OrientedPlanes:
-    """Planes with normals to the side that is visible from virtual viewpoints."""
-    planes, virtual = side_by_side(
-        lambda: planes_from(grid, far_along(grid, _UPWARDS)), lambda: virtual_viewpoints(grid)
-    )
-    sides = visible_sides(grid, planes.normals, virtual)
-    return OrientedPlanes(replace(planes, normals=sides.normals), sides.places[:_MAX_PLACES])
 
 
 def _some_places(places: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:

@@ -20,7 +20,7 @@ from pcgraph.features.moments import Moments, grouped_moments
 from pcgraph.features.nodes import NodeFeatures, node_features
 from pcgraph.graph.adjacency import EdgeFeatures
 from pcgraph.graph.contacts import angle_between
-from pcgraph.pairs import distinct_pairs, not_among, pair_keys
+from pcgraph.pairs import distinct_pairs, nearest, not_among, pair_keys
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.directions import plane_basis
@@ -553,11 +553,8 @@ def _beside_middles(
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """The nearest of some supervoxels to the middle of each way, as projected on a plane, (c, q) rows of `some`, and
     whether they are within half its length."""
-    numbers = np.arange(1, min(_NEAREST, len(some)) + 1)
-    from scipy.spatial import cKDTree
-
-    distance, nearest = cKDTree(plane.project(scene.places[some])).query(middles, k=numbers)
-    return nearest, distance <= np.maximum(0.5 * lengths[:, None], _OFF_PLANE * scene.edges[some[nearest]])
+    distance, found = nearest(plane.project(scene.places[some]), middles, min(_NEAREST, len(some)))
+    return found, distance <= np.maximum(0.5 * lengths[:, None], _OFF_PLANE * scene.edges[some[found]])
 
 
 def _behind_something(
@@ -580,14 +577,12 @@ def _behind_something(
     low, high = sums[np.searchsorted(heights[parallel], bands)]
     sets_in = np.where(cosines[before] >= np.cos(_MAX_ANGLE), high - low, 0.0)
     number, over = _beside_middles(scene, before, plane, middles, ways.lengths)
-    nearest, larger = before[number], areas[ways.pieces].max(axis=1)[:, None]
-    hides = over & (heights[nearest] > _OFF_PLANE * scene.edges[nearest]) & (heights[nearest] <= _MAX_HEIGHT * lengths)
+    above, larger = before[number], areas[ways.pieces].max(axis=1)[:, None]
+    hides = over & (heights[above] > _OFF_PLANE * scene.edges[above]) & (heights[above] <= _MAX_HEIGHT * lengths)
     hidden = hides.any(axis=1) & ~(over & (sets_in[number] > larger)).any(axis=1)
     behind = scene.places[heights < -_OFF_PLANE * scene.edges]
     if len(behind):
-        from scipy.spatial import cKDTree
-
-        shows = cKDTree(plane.project(behind)).query(middles)[0] <= 0.5 * ways.lengths
+        shows = nearest(plane.project(behind), middles, 1)[0][:, 0] <= 0.5 * ways.lengths
         hidden &= (ways.means(shows) == 0.0)[ways.pair]
     return hidden
 
