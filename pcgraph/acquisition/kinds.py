@@ -164,7 +164,7 @@ class Acquisition(ABC):
         return self.told.normals or self.viewpoint is not None
 
     def with_spacing(self, cloud: CleanCloud) -> tuple[Acquisition, float | None]:
-        """The acquisition with what the spacing tells beside; and the median spacing, metres, if it was read."""
+        """The acquisition after a look at the spacing of the points, and the median spacing, metres, if it was read."""
         return self, None
 
     def confirmed(self, grid: VoxelGrid) -> Acquisition:
@@ -205,7 +205,7 @@ class Acquisition(ABC):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UnknownAcquisition(Acquisition):
-    """A cloud of which nothing tells where it was seen from, such as a mesh or merged scans.
+    """A cloud seen from unknown places, such as a mesh or merged scans.
 
     The outside of a surface is the side that is visible from virtual viewpoints. Voxels have one size.
     """
@@ -226,7 +226,7 @@ class UnknownAcquisition(Acquisition):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OnePlace(Acquisition):
-    """A cloud seen from one known place, by a sensor that the spacing of the points does not tell.
+    """A cloud seen from one known place, whose spacing does not tell what sensor it was.
 
     Attributes
     ----------
@@ -368,7 +368,7 @@ class MovingScanner(Acquisition):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SeveralPlaces(Acquisition):
-    """A cloud of which the place is known from which each point was seen. Voxels have one size.
+    """A cloud with a known viewpoint for each point. Voxels have one size.
 
     Attributes
     ----------

@@ -170,34 +170,35 @@ def continuations(
     acquisition: Acquisition,
     places: NDArray[np.float64],
 ) -> Continuations:
-    """Supervoxels on the borders that pieces of one surface turn to each other, where what parts them is hidden.
+    """Pairs of supervoxels between which one surface goes on, behind something that hides it.
 
     Parameters
     ----------
     surface : Surface of v voxels
     nodes : NodeFeatures of the k supervoxels
     faces : (k,) int32
-        Which of them lie on one face (`faces_of`).
+        Face of each supervoxel (`faces_of`).
     acquisition : Acquisition
     places : (p, 3) float64, metres
-        Places from which the cloud was seen, if the acquisition tells any: others are not asked.
+        Places from which the cloud was seen. They count only if the acquisition knows a viewpoint.
 
     Notes
     -----
-    Two pieces lie on one plane, or are ground. Ways lead from one border to the other: edges of the Delaunay
-    triangulation of both. The pieces are one if half of the ways are hidden, at least, and the gap is not wider than
-    three quarters of the width of the larger one, by the root of its area, which grows as they join.
+    Pieces that may be one lie on one plane, or are ground. Ways lead from the border of one to that of the other: edges
+    of the Delaunay triangulation of both borders. The two pieces are one if at least half of the ways are hidden, and
+    the gap is at most three quarters as wide as the larger piece. Its width is the root of its area, which grows as
+    pieces join.
 
     Completion behind what hides a surface: Kellman and Shipley 1991.
     """
     places = places[:0] if acquisition.viewpoint is None else places
     of_planes = _of_planes(surface, nodes, faces, places)
-    # What one scanner did not see is told by its place, and no terrain.
+    # The place of one scanner tells what it did not see, so that terrain is not looked for.
     return of_planes if acquisition.is_one_scan else _of_terrain(surface, nodes, faces).with_others(of_planes)
 
 
 def faces_of(edges: NDArray[np.int32], features: EdgeFeatures, k: int) -> NDArray[np.int32]:
-    """Face of each of k supervoxels, (k,) int32: those that touch, and go on smoothly as each other, are on one."""
+    """Face of each of k supervoxels, (k,) int32. Supervoxels that touch and go on smoothly lie on one face."""
     smooth = _on_one_surface(features.normal_angle, features.step, features.voxel_edge)
     return connected_components(edges[smooth], k)
 
@@ -205,7 +206,7 @@ def faces_of(edges: NDArray[np.int32], features: EdgeFeatures, k: int) -> NDArra
 def _on_one_surface(
     angle: NDArray[np.float64], offset: NDArray[np.float64], edge: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Whether pairs lie on one smooth surface, by their normals' angle, radians, and what one lies off the other."""
+    """Whether pairs lie on one smooth surface, by the angle of their normals, radians, and their offset, metres."""
     return (angle <= _MAX_ANGLE) & (offset <= _MAX_OFFSET * edge)
 
 
@@ -287,10 +288,10 @@ class _Ways(NamedTuple):
         return np.bincount(self.pair, values, n_pairs) / np.bincount(self.pair, minlength=n_pairs)
 
     def joined(self, may_join: NDArray[np.bool_], areas: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Ends of the ways, (j, 2), of pairs that join pieces, of so many square metres, into what is one.
+        """Voxels at the ends of the ways, (j, 2), between pieces that become one.
 
-        Of the pairs that may join, (q,), the nearest join first; as what is one grows, wider gaps are bridged. All
-        count that may join and are one in the end.
+        Pairs that may join, (q,), join in the order of their widths. `areas` are those of the pieces, square metres: as
+        joined pieces grow, wider gaps are bridged. In the end all pairs count that may join and whose pieces are one.
         """
         pairs, widths = self.pairs, self.widths
         whole, areas = np.arange(len(areas)), areas.copy()
@@ -551,8 +552,8 @@ def _beside_middles(
     middles: NDArray[np.float64],
     lengths: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """The nearest of some supervoxels to the middle of each way, as projected on a plane, (c, q) rows of `some`, and
-    whether they are within half its length."""
+    """Supervoxels near the middle of each way, as projected on a plane: the nearest of some, (c, q) rows of `some`, and
+    whether each is within half the length of the way."""
     distance, found = nearest(plane.project(scene.places[some]), middles, min(_NEAREST, len(some)))
     return found, distance <= np.maximum(0.5 * lengths[:, None], _OFF_PLANE * scene.edges[some[found]])
 
@@ -562,8 +563,8 @@ def _behind_something(
 ) -> NDArray[np.bool_]:
     """Whether something lies before the middle of each way, (c,), and nothing shows behind the plane in the gap.
 
-    What faces as the pieces do, and takes more of a plane parallel to theirs than the larger one of them theirs, is
-    what they are set in, as doors are in a wall, and hides nothing between them.
+    A surface that is parallel to the pieces, and larger than both, is the wall in which they are set, as doors are. It
+    hides nothing between them.
     """
     heights, middles = plane.heights(scene.places), plane.project(surface.grid.centroids[ways.ends].mean(axis=1))
     cosines, lengths = np.einsum("ij,j->i", scene.normals, plane.normal), ways.lengths[:, None]
@@ -593,15 +594,14 @@ def _behind_something(
 def _of_terrain(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> Continuations:
     """Continuations between pieces of the ground, none coplanar, which may touch.
 
-    From far above, as from an aircraft, roofs are seen, and streets, but no walls: the ground of a courtyard touches
-    nothing, and may lie lower than the street. A face is ground if it is about level, and from its border it goes up
-    and hardly ever down; and so does the largest face of all, else the cloud stands on its head, or is a plateau. Two
-    pieces are one if they touch, as at a bank; or if on at least half of the ways between their borders something
-    stands that rises above the higher of them by four times as much as that lies above the other.
+    From far above, as from an aircraft, roofs and streets are seen, but no walls. So the ground of a courtyard touches
+    nothing, and it may lie lower than the street. A face is ground if it is about level, and if steps at its border
+    lead up and hardly ever down. The largest face of all must be ground, too; else the cloud stands on its head, or is
+    a plateau. Two pieces are one if they touch, as at a bank. They are also one if something stands on at least half of
+    the ways between their borders, and rises above the higher piece by four times the difference of their heights.
 
-    What is walled in on all sides, and low beside what walls it in, as a roof in a court, looks as the ground there
-    does, and is taken for it. There are none unless nearly all normals lie along one axis, and no single scanner took
-    the cloud: then what is hidden is known from its place.
+    A low roof within higher walls, as in a court, looks like the ground there, and is taken for it. There are no
+    continuations unless nearly all normals lie along one axis.
     """
     spans, found = np.empty((0, 2), np.int64), _ground_from_far_above(surface, faces)
     if found is not None:
@@ -617,10 +617,10 @@ def _of_terrain(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32])
 def _ground_from_far_above(
     surface: Surface, faces: NDArray[np.int32]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
-    """The direction from which all was seen, (3,) of length 1, and which faces are ground from there, (f,); None if it
-    was not seen from far off on one side, or two pieces of ground are not there.
+    """Direction from which all was seen, (3,) of length 1, and whether each face is ground, (f,).
 
-    Nothing that touches nothing tells the others' sides, so normals may point either way.
+    None if the cloud was not seen from far off on one side, or has less than two pieces of ground. Normals may point
+    either way, because pieces that touch nothing do not tell each other's sides.
     """
     some = surface.normals[:: max(1, surface.grid.n_voxels // _SAMPLED_VOXELS)]
     axis = np.linalg.eigh(np.einsum("ij,ik->jk", some, some))[1][:, 2]

@@ -119,7 +119,7 @@ def voxelise(cloud: CleanCloud, assumed: Acquisition, sizes: Sizes) -> Voxelisat
     ----------
     cloud : CleanCloud of n points
     assumed : Acquisition
-        As caller and pixels tell.
+        Acquisition that caller and pixels tell, before the spacing is read.
     sizes : Sizes
     """
     found, acquisition, noise = _without_noise(cloud, assumed, sizes)
