@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pcgraph.cloud import MAX_HEADER_BYTES, Cloud, cloud_from_columns, columns_from_text, numbers_from_text
 from pcgraph.errors import CloudReadError
+from pcgraph.io.format import Format
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
@@ -282,3 +283,6 @@ def decompress_lzf(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
                 target[wrote + offset] = target[start + offset]
         wrote += length
     return wrote
+
+
+PCD = Format("pcd", (".pcd",), lambda file: read_pcd(file.content), organised=True)

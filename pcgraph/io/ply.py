@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pcgraph.cloud import MAX_HEADER_BYTES, Cloud, cloud_from_columns, columns_from_text, numbers_from_text
 from pcgraph.errors import CloudReadError
+from pcgraph.io.format import Format
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -154,3 +155,6 @@ def _binary_columns(element: PlyElement, code: str, body: bytes) -> dict[str, ND
         )
     rows = np.frombuffer(body, record, count=element.count)
     return {name: rows[name].astype(kind, copy=False) for name, kind in element.properties}
+
+
+PLY = Format("ply", (".ply",), lambda file: read_ply(file.content))

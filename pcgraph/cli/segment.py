@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``pcgraph``."""
+"""The command ``pcgraph segment``."""
 
 from __future__ import annotations
 
-import logging
 import os
 import time
 import warnings
@@ -13,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pcgraph import __version__
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, one_line, without_long_words
 from pcgraph.families import member
 from pcgraph.plumbing.plain_files import said
@@ -26,26 +24,8 @@ if TYPE_CHECKING:
     from pcgraph.segmentation import Segmentation
     from pcgraph.tree.linkage import Linkage
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
-
-def _version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"pcgraph {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _pcgraph(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
-    ] = False,
-) -> None:
-    """Point clouds as supervoxels, an adjacency graph and a segmentation tree."""
-
-
-@app.command()
-def segment(
+def segment_command(
     cloud: Annotated[Path, typer.Argument(help="Point cloud, .pcd or .ply, coordinates in metres.")],
     out: Annotated[
         Path | None,
@@ -150,29 +130,6 @@ def segment(
         typer.echo(f"pcgraph: {one_line(message).rstrip('.')}.", err=True)
         raise typer.Exit(1) from None
     _print_summary(result, labels, targets, time.perf_counter() - start)
-
-
-@app.command(name="compile")
-def compile_ahead() -> None:
-    """Compile what the first segmentation of an installation would compile, so that it need not wait.
-
-    What is compiled already is left as it is.
-    """
-    from pcgraph.all_kernels import compile_kernels
-
-    logging.getLogger("pcgraph").setLevel(logging.ERROR)  # whoever asks for it knows what is waited for
-    start = time.perf_counter()
-    compile_kernels()
-    typer.echo(f"{'seconds':<12} {time.perf_counter() - start:.2f}")
-
-
-def main() -> None:
-    """Run the command line."""
-    try:
-        app(prog_name="pcgraph")
-    except OSError as error:  # the commands catch errors of files themselves
-        typer.echo(f"pcgraph: cannot print: {one_line(said(error))}.", err=True)
-        raise SystemExit(1) from None
 
 
 def _targets(cloud: Path, out: Path | None) -> list[Path]:
