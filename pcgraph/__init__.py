@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from pcgraph.tree.region_linkage import RegionLinkage as RegionLinkage
     from pcgraph.tree.single_linkage import QuasiFlatLinkage as QuasiFlatLinkage
     from pcgraph.tree.tree import SegmentationTree as SegmentationTree
+    from pcgraph.tree.weighted_graph import tree_of_graph as tree_of_graph
     from pcgraph.voxels.grid import VoxelGrid as VoxelGrid
     from pcgraph.voxels.surface import LocalPlanes as LocalPlanes
     from pcgraph.voxels.surface import Surface as Surface
@@ -95,6 +96,7 @@ else:
             "tree.region_linkage": ["RegionLinkage"],
             "tree.single_linkage": ["QuasiFlatLinkage"],
             "tree.tree": ["SegmentationTree"],
+            "tree.weighted_graph": ["tree_of_graph"],
             "voxels.grid": ["VoxelGrid"],
             "voxels.surface": ["LocalPlanes", "Surface"],
         },

@@ -188,15 +188,22 @@ def ancestor_index(parents: NDArray[np.int32]) -> AncestorIndex:
 def lowest_common_ancestors(
     parents: NDArray[np.int32], first: NDArray[np.integer], second: NDArray[np.integer]
 ) -> NDArray[np.int32]:
-    """Lowest common ancestor of each pair of leaves, (m,) int32; the leaf itself where the two are one.
+    """Lowest common ancestor of each pair of nodes, (m,) int32; the upper node where one is above the other.
 
     Parameters
     ----------
     parents : (k,) int32
-    first, second : (m,) int, 0..n_leaves - 1
+    first, second : (m,) int, 0..k - 1
+
+    Notes
+    -----
+    The first leaf below a node represents it. If neither of two nodes is above the other, their representatives meet
+    where they meet, above both. Otherwise the representatives meet at the upper node or below it. So the answer is the
+    largest of the three numbers.
     """
-    ends = np.ascontiguousarray(first, np.int32), np.ascontiguousarray(second, np.int32)
-    return _ancestors_of_pairs(ancestor_index(parents), *ends)
+    leaf = accumulate_sequential(parents, np.arange(num_leaves(parents)), "min").astype(np.int32)
+    meeting = _ancestors_of_pairs(ancestor_index(parents), leaf[first], leaf[second])
+    return np.maximum(meeting, np.maximum(first, second)).astype(np.int32)
 
 
 @kernel

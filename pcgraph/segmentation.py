@@ -155,11 +155,25 @@ class Segmentation:
     @property
     def leaves(self) -> Moments:
         """Moments of the supervoxels."""
-        return self.tree.moments[: self.tree.n_leaves]
+        return self.tree.known_moments()[: self.tree.n_leaves]
 
     def cut(self, n: int | None = None, altitude: float | None = None, min_size: int = 1) -> NDArray[np.int32]:
         """Segment of each point in the input's shape, -1 as in `labels`; see `SegmentationTree.cut`."""
         return self.on_points(self.tree.cut(n, altitude, min_size))
+
+    def points_of(self, node: int) -> NDArray[np.int64]:
+        """Flat indices of the points below a node of the tree, ascending, (p,) int64; after an update of the last scan.
+
+        They index the input as a list: ``points.reshape(-1, 3)[result.points_of(node)]``.
+
+        Raises
+        ------
+        ValueError
+            The tree has no such node.
+        """
+        is_below = np.zeros(self.tree.n_leaves, np.bool_)
+        is_below[self.tree.leaves_of(node)] = True
+        return np.flatnonzero(self.on_points(is_below))
 
     def on_points(self, values: ArrayLike) -> NDArray[Any]:
         """Values of supervoxels on the points, in the input's shape + s.
@@ -236,7 +250,7 @@ class Segmentation:
             inside, given = self.supervoxels >= 0, np.asarray(points)
             if given.shape != (*inside.shape, 3):
                 raise ValueError(f"expected the points that were segmented, {(*inside.shape, 3)}, got {given.shape}")
-            if np.count_nonzero(inside) != self.tree.moments.counts[-1]:
+            if np.count_nonzero(inside) != self.tree.sizes[-1]:
                 raise ValueError("expected the points of every scan, got one scan's; leave them out to use the voxels")
             places, groups = given[inside].astype(np.float64), self.supervoxels[inside]
             normals = normals[surface.grid.voxel_of_point]

@@ -64,6 +64,7 @@ def test_public_names():
         "plane_energy",
         "read_cloud",
         "segment",
+        "tree_of_graph",
         "update",
         "variance_energy",
         "write_segmentation",
