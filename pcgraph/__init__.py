@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from pcgraph.io import write_segmentation as write_segmentation
     from pcgraph.plausibility import CloudWarning as CloudWarning
     from pcgraph.scan import segment as segment
+    from pcgraph.scan import supervoxel_clustering as supervoxel_clustering
     from pcgraph.segmentation import Segmentation as Segmentation
+    from pcgraph.segmentation import Supervoxels as Supervoxels
     from pcgraph.stream import update as update
     from pcgraph.supervoxels.method import SupervoxelMethod as SupervoxelMethod
     from pcgraph.supervoxels.surface_growth import SurfaceGrowth as SurfaceGrowth
@@ -79,8 +81,8 @@ else:
             "graph.occlusion": ["Occlusions"],
             "io": ["read_cloud", "write_segmentation"],
             "plausibility": ["CloudWarning"],
-            "scan": ["segment"],
-            "segmentation": ["Segmentation"],
+            "scan": ["segment", "supervoxel_clustering"],
+            "segmentation": ["Segmentation", "Supervoxels"],
             "stream": ["update"],
             "supervoxels.method": ["SupervoxelMethod"],
             "supervoxels.surface_growth": ["SurfaceGrowth"],

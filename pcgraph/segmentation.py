@@ -15,6 +15,7 @@ from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.inputs import non_negative
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.supervoxels.method import SupervoxelMethod
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.linkage import Linkage
@@ -53,6 +54,38 @@ class Settings:
             raise ValueError(_refusal("linkage", "Linkage", linkage))
         altitude = linkage.default_object_altitude if object_altitude is None else object_altitude
         return cls(method, linkage, non_negative("object_altitude", altitude))
+
+
+@dataclass(frozen=True, eq=False)
+class Supervoxels(ShortRepr):
+    """Supervoxels of a cloud and their graph, before a tree merges them.
+
+    Attributes
+    ----------
+    labels : (n,) or (h, w) int32
+        Supervoxel of each point, that is node of the graph; -1 where it has none, because nothing was measured or
+        because it is an outlier.
+    outliers : (n,) or (h, w) bool
+        Whether each point is an outlier: no denser around than noise would be.
+    moments : Moments of k supervoxels
+        Moments of their points.
+    graph : AdjacencyGraph of k nodes
+    surface, seed_size, method, viewpoint, feature_scaling
+        As in `Segmentation`.
+    """
+
+    labels: NDArray[np.int32]
+    outliers: NDArray[np.bool_]
+    moments: Moments
+    graph: AdjacencyGraph
+    surface: Surface
+    seed_size: float
+    method: SupervoxelMethod
+    viewpoint: NDArray[np.float64]
+    feature_scaling: RobustScaling | None = None
+
+    def _counts(self) -> str:
+        return f"{np.count_nonzero(self.labels >= 0)} points, {len(self.moments)} supervoxels"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
