@@ -59,9 +59,9 @@ class StructuredLight(Sensor):
 
     References
     ----------
-    OpenCV, structured_light module, GrayCodePattern.
-    .. [2] Sansoni, Carocci, Rodella: "Three-dimensional vision based on a combination of gray-code and
-       phase-shift light projection", Applied Optics 38 (1999).
+    - OpenCV, structured_light module, GrayCodePattern.
+    - Sansoni, Carocci, Rodella: "Three-dimensional vision based on a combination of gray-code and
+      phase-shift light projection", Applied Optics 38 (1999).
 
     Examples
     --------
