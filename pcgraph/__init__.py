@@ -56,7 +56,6 @@ if TYPE_CHECKING:
     from pcgraph.tree.single_linkage import QuasiFlatLinkage as QuasiFlatLinkage
     from pcgraph.tree.tree import SegmentationTree as SegmentationTree
     from pcgraph.voxels.grid import VoxelGrid as VoxelGrid
-    from pcgraph.voxels.outliers import OUTLIER as OUTLIER
     from pcgraph.voxels.surface import LocalPlanes as LocalPlanes
     from pcgraph.voxels.surface import Surface as Surface
 else:
@@ -97,7 +96,6 @@ else:
             "tree.single_linkage": ["QuasiFlatLinkage"],
             "tree.tree": ["SegmentationTree"],
             "voxels.grid": ["VoxelGrid"],
-            "voxels.outliers": ["OUTLIER"],
             "voxels.surface": ["LocalPlanes", "Surface"],
         },
     )

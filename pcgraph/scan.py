@@ -39,7 +39,6 @@ from pcgraph.voxelisation.adapted_size import seed_spacing
 from pcgraph.voxelisation.voxelised import Sizes, Voxelisation, Voxelised, voxelise, without_flying_pixels
 from pcgraph.voxels.column_evidence import color_evidence
 from pcgraph.voxels.grid import VoxelGrid, voxel_means
-from pcgraph.voxels.outliers import OUTLIER
 from pcgraph.voxels.surface import Surface
 
 _FLIP_COSINE = 0.5
@@ -71,7 +70,7 @@ def segment(
     ----------
     points : (n, 3) or (h, w, 3) float or integer, metres, any frame; or a Cloud, or the name of a file
         Colours, normals and viewpoint of a `Cloud` or file are used where none are given beside it. Points that are
-        NaN, infinite, masked, or (0, 0, 0) as drivers write holes, are labelled -1, outliers -2.
+        NaN, infinite, masked, or (0, 0, 0) as drivers write holes, are labelled -1, and so are outliers.
     colors : same shape, uint8 0..255 or float 0..1, optional
     normals : same shape, float, optional
         Outward normals. They are estimated where they are zero or NaN.
@@ -220,7 +219,8 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         objects = _renumbered(objects, earlier, leaves.counts)
     viewpoint = scan.acquisition.viewpoint_of(cloud)
     return Segmentation(
-        labels=cloud.in_input_shape(objects[leaf_of_point], OUTLIER),
+        labels=cloud.in_input_shape(objects[leaf_of_point]),
+        outliers=cloud.is_outlier,
         supervoxels=cloud.in_input_shape(leaf_of_point),
         objects=objects,
         graph=graph,

@@ -20,7 +20,6 @@ from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.linkage import Linkage
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import SegmentationTree
-from pcgraph.voxels.outliers import OUTLIER
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.warp import CameraWarp
 
@@ -63,11 +62,12 @@ class Segmentation:
     Attributes
     ----------
     labels : (n,) or (h, w) int32
-        Object of each point, the default cut of the tree; -1 where nothing was measured (not finite, or a
-        hole written as (0, 0, 0)), -2 (`OUTLIER`) where it is an outlier.
+        Object of each point, the default cut of the tree; -1 where it has none, because nothing was measured (not
+        finite, or a hole written as (0, 0, 0)) or because it is an outlier.
+    outliers : (n,) or (h, w) bool
+        Whether each point is an outlier: no denser around than noise would be.
     supervoxels : (n,) or (h, w) int32
-        Supervoxel of each point, that is leaf of the tree and node of the graph; -1 where nothing was measured,
-        and of outliers.
+        Supervoxel of each point, that is leaf of the tree and node of the graph; -1 where `labels` is -1.
     objects : (k,) int32
         Object of each supervoxel, also of those that hold no point of the last scan. After an update some numbers may
         be missing, as those of objects that have joined another.
@@ -91,6 +91,7 @@ class Segmentation:
     """
 
     labels: NDArray[np.int32]
+    outliers: NDArray[np.bool_]
     supervoxels: NDArray[np.int32]
     objects: NDArray[np.int32]
     graph: AdjacencyGraph
@@ -125,13 +126,8 @@ class Segmentation:
         return self.surface.grid.size
 
     @property
-    def outliers(self) -> NDArray[np.bool_]:
-        """Whether each point is an outlier, in the input's shape: no denser around than noise would be."""
-        return self.labels == OUTLIER
-
-    @property
     def parts(self) -> NDArray[np.int32]:
-        """Part of each point, in the input's shape, negative as in `labels`: faces and smooth pieces.
+        """Part of each point, in the input's shape, -1 as in `labels`: faces and smooth pieces.
 
         Each lies within one object: the cut at the linkage's altitude of parts, or at that of the objects if that is
         lower.
@@ -140,8 +136,8 @@ class Segmentation:
 
     @property
     def groups(self) -> NDArray[np.int32]:
-        """Group of each point, in the input's shape, negative as in `labels`: a connected component of objects, such as
-        a table with all that stands on it.
+        """Group of each point, in the input's shape, -1 as in `labels`: a connected component of objects, such as a
+        table with all that stands on it.
 
         Objects are connected by the graph's contacts, gaps and continuations.
         """
@@ -149,7 +145,7 @@ class Segmentation:
         _, first, object_of = np.unique(self.objects, return_index=True, return_inverse=True)
         first = first[object_of]
         whole = np.stack((np.arange(k), first), axis=1).astype(np.int32)
-        return self._segments_on_points(connected_components(np.concatenate((self.graph.joined, whole)), k))
+        return self.on_points(connected_components(np.concatenate((self.graph.joined, whole)), k))
 
     @property
     def camera(self) -> bool:
@@ -162,8 +158,8 @@ class Segmentation:
         return self.tree.moments[: self.tree.n_leaves]
 
     def cut(self, n: int | None = None, altitude: float | None = None, min_size: int = 1) -> NDArray[np.int32]:
-        """Segment of each point in the input's shape, negative as in `labels`; see `SegmentationTree.cut`."""
-        return self._segments_on_points(self.tree.cut(n, altitude, min_size))
+        """Segment of each point in the input's shape, -1 as in `labels`; see `SegmentationTree.cut`."""
+        return self.on_points(self.tree.cut(n, altitude, min_size))
 
     def on_points(self, values: ArrayLike) -> NDArray[Any]:
         """Values of supervoxels on the points, in the input's shape + s.
@@ -246,11 +242,6 @@ class Segmentation:
             normals = normals[surface.grid.voxel_of_point]
         leaves = primitive_moments(places, normals, groups, self.tree.n_leaves)
         return fit_primitives(primitive_moments_up_tree(leaves, self.tree.parents))
-
-    def _segments_on_points(self, of_leaf: NDArray[np.int32]) -> NDArray[np.int32]:
-        segments = self.on_points(of_leaf)
-        segments[self.outliers] = OUTLIER
-        return segments
 
     def _in_input_shape(self, values: NDArray[Any], missing: float) -> NDArray[Any]:
         """Values of the points that have a supervoxel, in the input's shape."""

@@ -43,7 +43,6 @@ def test_public_names():
         "Moments",
         "MumfordShahLinkage",
         "NodeFeatures",
-        "OUTLIER",
         "Occlusions",
         "PcgraphError",
         "Primitive",
