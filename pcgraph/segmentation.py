@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -207,6 +207,38 @@ class Segmentation:
         is_below = np.zeros(self.tree.n_leaves, np.bool_)
         is_below[self.tree.leaves_of(node)] = True
         return np.flatnonzero(self.on_points(is_below))
+
+    def with_objects(self, n: int | None = None, altitude: float | None = None, min_size: int = 1) -> Segmentation:
+        """The same segmentation with another cut of its tree as its objects; parameters as for `SegmentationTree.cut`.
+
+        `labels`, `objects` and `object_altitude` change; whatever asks for objects (`parts`, `groups`, `update`,
+        detection, `write_segmentation`) then works with these.
+
+        Raises
+        ------
+        ValueError
+            As for `SegmentationTree.cut`.
+
+        Examples
+        --------
+        >>> import numpy as np, pcgraph
+        >>> floor = np.random.default_rng(0).random((4000, 3)) * [1.0, 1.0, 0.0]
+        >>> result = pcgraph.segment(np.concatenate((floor, floor + [0.0, 0.0, 1.0])))
+        >>> finer = result.with_objects(n=5)
+        >>> len(np.unique(finer.labels)), (finer.labels == result.cut(n=5)).all()
+        (5, np.True_)
+        """
+        objects = self.tree.cut(n, altitude, min_size)
+        if altitude is None:  # that of the last merge, or a finite one above all if parts that do not touch are one
+            last = self.tree.altitudes[len(self.tree.parents) - len(np.unique(objects))]
+            altitude = min(float(last), float(np.finfo(np.float64).max))
+        return replace(
+            self,
+            labels=self.on_points(objects),
+            objects=objects,
+            object_altitude=altitude,
+            next_object=int(objects.max()) + 1,
+        )
 
     def on_points(self, values: ArrayLike) -> NDArray[Any]:
         """Values of supervoxels on the points, in the input's shape + s.

@@ -149,6 +149,47 @@ def tight_box(points: ArrayLike) -> OrientedBox:
     return OrientedBox(best.center + middle, axes, best.size[order])
 
 
+def boxes_of_labels(points: ArrayLike, labels: ArrayLike, up: ArrayLike | None = None) -> dict[int, OrientedBox]:
+    """Box around the points of each label, by label in ascending order; negative labels have none.
+
+    Parameters
+    ----------
+    points : (n, 3) or (h, w, 3) float, metres
+        Points that are not finite do not count.
+    labels : (n,) or (h, w) int
+        For example ``result.labels`` or ``result.cut(n=50)``.
+    up : (3,) float, any length but zero, optional
+        Boxes stand along this direction, as `standing_box`. Default: free boxes, as `tight_box`.
+
+    Raises
+    ------
+    ValueError
+        There is not one label per point, labels are not whole numbers, or `up` is no direction.
+
+    Examples
+    --------
+    >>> import numpy as np, pcgraph
+    >>> corners = np.array([[x, y, z] for x in (0, 4) for y in (0, 2) for z in (0, 1)], float)
+    >>> boxes = pcgraph.detection.boxes_of_labels(np.concatenate((corners, corners + 9)), np.repeat([0, 7], 8))
+    >>> {label: box.size.tolist() for label, box in boxes.items()}
+    {0: [4.0, 2.0, 1.0], 7: [4.0, 2.0, 1.0]}
+    """
+    places, numbers = np.asarray(points, np.float64), np.asarray(labels)
+    if places.shape != (*numbers.shape, 3) or numbers.dtype.kind not in "iu":
+        raise ValueError(
+            f"expected one whole number per point as labels, got {numbers.dtype} of shape {numbers.shape} for points "
+            f"of shape {places.shape}"
+        )
+    direction = None if up is None else unit_vector("up", up)
+    places, numbers = places.reshape(-1, 3), numbers.reshape(-1)
+    kept = np.flatnonzero((numbers >= 0) & np.isfinite(places).all(axis=1))
+    order = kept[np.argsort(numbers[kept], kind="stable")]
+    found, first = np.unique(numbers[order], return_index=True)
+    groups = [places[rows] for rows in np.split(order, first[1:])][: len(found)]
+    box = tight_box if direction is None else lambda group: _standing(group, direction)
+    return {label: box(group) for label, group in zip(found.tolist(), groups, strict=True)}
+
+
 def some_points(points: ArrayLike) -> NDArray[np.float64]:
     """The points as (n, 3) float64; ValueError if there is none, or if they are not three finite numbers each."""
     places = finite_vectors("points", points)

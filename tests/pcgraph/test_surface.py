@@ -82,6 +82,7 @@ def test_the_public_names_of_rooms_are_these():
         "OrientedBox",
         "Planes",
         "Shape",
+        "boxes_of_labels",
         "find_planes",
         "fit_shape",
         "object_labels",
