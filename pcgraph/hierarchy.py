@@ -170,12 +170,15 @@ class AncestorIndex(NamedTuple):
 
     Attributes
     ----------
+    representatives : (k,) int32
+        Leaf at or below each node that represents it.
     links : (n_leaves,) int32
         Representative to which each representative was linked; itself for the last one.
     merges : (n_leaves,) int32
         Node at which it was linked; k, larger than any node, for the last one.
     """
 
+    representatives: NDArray[np.int32]
     links: NDArray[np.int32]
     merges: NDArray[np.int32]
 
@@ -194,28 +197,28 @@ def lowest_common_ancestors(
     ----------
     parents : (k,) int32
     first, second : (m,) int, 0..k - 1
-
-    Notes
-    -----
-    The first leaf below a node represents it. If neither of two nodes is above the other, their representatives meet
-    where they meet, above both. Otherwise the representatives meet at the upper node or below it. So the answer is the
-    largest of the three numbers.
     """
-    leaf = accumulate_sequential(parents, np.arange(num_leaves(parents)), "min").astype(np.int32)
-    meeting = _ancestors_of_pairs(ancestor_index(parents), leaf[first], leaf[second])
-    return np.maximum(meeting, np.maximum(first, second)).astype(np.int32)
+    ends = np.ascontiguousarray(first, np.int32), np.ascontiguousarray(second, np.int32)
+    return _ancestors_of_pairs(ancestor_index(parents), *ends)
 
 
 @kernel
 def lowest_common_ancestor(index: AncestorIndex, a: int, b: int) -> int:
-    """Lowest common ancestor of two leaves: the one that was linked first climbs, until both meet."""
+    """Lowest common ancestor of two nodes; the upper one where it is above the other.
+
+    Of the two representatives, the one that was linked first climbs until both meet. If neither node is above the
+    other, the nodes meet at the same place, above both. Otherwise the representatives meet at the upper node or below
+    it. So the answer is the largest of the three numbers.
+    """
+    upper = max(a, b)
+    a, b = index.representatives[a], index.representatives[b]
     node = a
     while a != b:
         if index.merges[a] < index.merges[b]:
             node, a = index.merges[a], index.links[a]
         else:
             node, b = index.merges[b], index.links[b]
-    return node
+    return max(node, upper)
 
 
 @kernel
@@ -227,7 +230,9 @@ def _ancestors_of_pairs(index: AncestorIndex, first: NDArray[np.int32], second: 
 
 
 @kernel
-def _linked(parents: NDArray[np.int32], n_leaves: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _linked(
+    parents: NDArray[np.int32], n_leaves: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
     k = len(parents)
     links, merges = np.arange(n_leaves).astype(np.int32), np.full(n_leaves, k, np.int32)
     representative, leaves = np.arange(k).astype(np.int32), np.zeros(k, np.int64)
@@ -243,4 +248,4 @@ def _linked(parents: NDArray[np.int32], n_leaves: int) -> tuple[NDArray[np.int32
             links[small], merges[small] = large, up
             representative[up] = large
         leaves[up] += leaves[node]
-    return links, merges
+    return representative, links, merges

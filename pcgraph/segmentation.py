@@ -195,9 +195,10 @@ class Segmentation:
         return self.on_points(self.tree.cut(n, altitude, min_size))
 
     def points_of(self, node: int) -> NDArray[np.int64]:
-        """Flat indices of the points below a node of the tree, ascending, (p,) int64; after an update of the last scan.
+        """Flat indices of the points below a node of the tree, ascending, (p,) int64.
 
-        They index the input as a list: ``points.reshape(-1, 3)[result.points_of(node)]``.
+        They index the input as a list: ``points.reshape(-1, 3)[result.points_of(node)]``. After an update the points
+        are those of the last scan.
 
         Raises
         ------
