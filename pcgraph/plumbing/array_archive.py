@@ -72,7 +72,7 @@ class Archive:
     >>> flat = Archive()
     >>> flat.flatten(Plane(np.array([0.0, 0.0, 1.0]), None), "floor")
     >>> flat.arrays, flat.values
-    ({'floor/normal': array([0., 0., 1.])}, {'floor': 'own:Plane', 'floor/offset': None})
+    ({'floor/normal': array([0., 0., 1.])}, {'floor': 'Plane', 'floor/offset': None})
     """
 
     arrays: dict[str, NDArray[Any]] = field(default_factory=dict)
