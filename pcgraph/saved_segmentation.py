@@ -344,6 +344,7 @@ def _check_tree(found: Segmentation) -> None:
 
 def _check_graph(found: Segmentation) -> None:
     graph = found.graph
+    _expect(0.0 <= graph.color_evidence <= 1.0, "evidence of colours from 0 to 1")
     pairs, lengths = {"edges": graph.edges}, [graph.edge_features.contact_length]
     if graph.gaps is not None:
         pairs["gaps/edges"] = graph.gaps.edges

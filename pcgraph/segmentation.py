@@ -39,7 +39,7 @@ SAVED_FORMAT = "pcgraph segmentation"
 SAVED_VERSION = 1
 """Version of that format. It rises as soon as a file of the one before cannot be read as a file of this one."""
 SAVED_MARK = "pcgraph-segmentation"
-"""Mark of the seal of saved segmentations, the one of all segmentations in files (`io.segmentation_files.FORMAT`)."""
+"""Mark of the seal of saved segmentations, in the comment at the end of each."""
 NOT_STORED = " (settings not stored)"
 """What follows the name of a method or linkage in the header if an archive has no form for its settings."""
 

@@ -162,7 +162,7 @@ def rebuild(archive: Archive, kind: Any, path: str, names: Mapping[str, Any]) ->
         if len(options) > 1:
             raise TypeError(f"expected one type or None for {path}, got {kind}")
         return rebuild(archive, options[0], path, names)
-    if get_origin(kind) is np.ndarray:
+    if np.ndarray in (kind, get_origin(kind)):
         return _array(archive, kind, path)
     if isinstance(kind, type) and issubclass(kind, Enum):
         stored = _value(archive, path, str)
@@ -204,8 +204,8 @@ def _array(archive: Archive, kind: Any, path: str) -> NDArray[Any]:
     array = archive.arrays.get(path)
     if array is None:
         raise DamagedError(f"the array {path} is missing")
-    wanted = get_args(get_args(kind)[1])[0]
-    if not np.issubdtype(array.dtype, wanted):
+    wanted = get_args(get_args(kind)[1])[0] if get_args(kind) else Any
+    if wanted is not Any and not np.issubdtype(array.dtype, wanted):
         raise DamagedError(f"expected the array {path} as {wanted.__name__}, got {array.dtype}")
     return array
 
@@ -290,7 +290,7 @@ def decode_archive(content: bytes, skipped: str) -> tuple[dict[str, Any], Archiv
             arrays = {one.filename.removesuffix(".npy"): _member(file, one) for one in members}
         if len(arrays) != len(members):
             raise DamagedError("an array is there twice")
-        header = json.loads(bytes(_header(arrays)))
+        header = json.loads(bytes(_header(arrays)), parse_constant=_refuse)
         values = header.pop("values")
         if not isinstance(values, dict):
             raise DamagedError("its header is not as expected")
@@ -307,6 +307,10 @@ def _header(arrays: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
     if text.dtype != np.uint8 or text.size > _MAX_JSON:
         raise DamagedError("its header is not as expected")
     return text
+
+
+def _refuse(constant: str) -> None:
+    raise DamagedError(f"its header is no JSON: {constant}")
 
 
 def _member(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:

@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
+import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +16,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scenes.images import floor_wall_and_boxes
 from scenes.rooms import two_densities
@@ -21,7 +26,7 @@ import pcgraph
 from pcgraph import detection, metrics
 from pcgraph.acquisition.kinds import Evidence, MovingScanner, Told
 from pcgraph.families import members
-from pcgraph.plumbing.array_archive import Archive, decode_archive, encode_archive, field_names
+from pcgraph.plumbing.array_archive import Archive, DamagedError, decode_archive, encode_archive, field_names, rebuild
 from pcgraph.saved_segmentation import ARRAYS, row_of
 from pcgraph.segmentation import SAVED_FORMAT, SAVED_MARK, SAVED_VERSION, Segmentation
 
@@ -74,7 +79,7 @@ def from_several_places() -> pcgraph.Segmentation:
 
 
 def updated() -> pcgraph.Segmentation:
-    return pcgraph.update(pcgraph.update(scanner(), ridge(seed=1) + [0.4, 0.0, 0.0]), ridge(seed=2))
+    return pcgraph.update(pcgraph.update(scanner(), ridge(seed=1) + np.array([0.4, 0.0, 0.0])), ridge(seed=2))
 
 
 def graded() -> pcgraph.Segmentation:
@@ -99,7 +104,9 @@ def assert_same(one: Any, other: Any, at: str = "") -> None:
     one, other = (part.item() if isinstance(part, np.generic) else part for part in (one, other))
     assert type(one) is type(other), at
     if isinstance(one, np.ndarray):
-        assert (one.dtype, one.shape, one.flags.c_contiguous) == (other.dtype, other.shape, other.flags.c_contiguous), at
+        assert (one.dtype, one.shape, one.flags.c_contiguous) == (other.dtype, other.shape, other.flags.c_contiguous), (
+            at
+        )
         assert one.tobytes() == other.tobytes(), at
         return
     if isinstance(one, msgspec.Struct):
@@ -143,8 +150,8 @@ def test_the_docs_tell_every_array(saved: dict[str, Any]) -> None:
 def test_linkages_and_methods_come_back(saved: dict[str, Any], kind: type[Any], tmp_path: Path) -> None:
     argument = "linkage" if issubclass(kind, pcgraph.Linkage) else "method"
     numbers = [f.name for f in dataclasses.fields(kind) if isinstance(f.default, float)]
-    given = kind(**{name: 0.125 for name in numbers})
-    result = replace(saved["unknown"][0], **{argument: given})
+    chosen = kind(**dict.fromkeys(numbers, 0.125))
+    result = replace(saved["unknown"][0], **{argument: chosen})
     result.save(tmp_path / "x.npz")
     assert_same(pcgraph.load_segmentation(tmp_path / "x.npz"), result)
 
@@ -198,7 +205,9 @@ def test_the_cloud_is_in_the_file_too(saved: dict[str, Any], tmp_path: Path) -> 
     result, path = saved["unknown"][0], tmp_path / "x.NPZ"
     points, n = ridge().astype(np.float32), len(ridge())
     columns = {"intensity": np.arange(n, dtype=np.uint16), "a/b é": np.ones((n, 2)), "a.npy": np.zeros(n, bool)}
-    cloud = pcgraph.Cloud(points, np.zeros((n, 3), np.uint8), -points, np.arange(n, dtype=np.int32), np.ones(3), columns)
+    cloud = pcgraph.Cloud(
+        points, np.zeros((n, 3), np.uint8), -points, np.arange(n, dtype=np.int32), np.ones(3), columns
+    )
     result.save(path, cloud)
     assert_same(pcgraph.load_segmentation(path), result)
     with np.load(path) as file:
@@ -262,6 +271,39 @@ def test_a_linkage_of_ones_own_comes_back_where_it_is_loaded(saved: dict[str, An
         pcgraph.load_segmentation(tmp_path / "x.npz", linkage=pcgraph.RegionLinkage())
     with pytest.raises(ValueError, match="expected a method such as"):
         pcgraph.load_segmentation(tmp_path / "x.npz", method=1)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Everything(Own):
+    """With settings of each kind that a file can hold."""
+
+    table: NDArray[np.int8] | None = None
+    other: np.ndarray | None = None
+    base: pcgraph.Linkage | None = None
+    names: tuple[str, ...] = ()
+    corner: tuple[float, float] = (0.0, 0.0)
+    evidence: Evidence = Evidence.NOTHING
+    is_on: bool = False
+    number: int = 0
+    text: str = ""
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    weight=st.floats(allow_nan=False),
+    number=st.integers(),
+    text=st.text(),
+    names=st.lists(st.text()).map(tuple),
+    corner=st.tuples(st.floats(allow_nan=False, allow_infinity=False), st.just(1.0)),
+    table=st.lists(st.integers(-128, 127)).map(lambda values: np.array(values, np.int8)),
+    evidence=st.sampled_from(Evidence),
+)
+def test_settings_of_each_kind_come_back(**values: Any) -> None:
+    one, archive = Everything(base=Own(2.0), other=np.eye(2), **values), Archive()
+    archive.flatten(one, "linkage")
+    header, stored = decode_archive(encode_archive(archive, {"format": "x"}, SAVED_MARK), "cloud/")
+    assert header == {"format": "x"}
+    assert_same(rebuild(stored, pcgraph.Linkage, "linkage", {}), one)
 
 
 def test_a_linkage_of_ones_own_is_asked_for_where_it_is_not_loaded(saved: dict[str, Any], tmp_path: Path) -> None:
@@ -391,7 +433,7 @@ DAMAGE: list[tuple[Mutation, str]] = [
     (set_one("surface/grid/counts", 0), "counts"),
     (set_one("surface/grid/indptr", 10**9, 3), "lists of the neighbours"),
     (set_one("surface/grid/neighbours", 10**8), "neighbours"),
-    (set_one("surface/grid/neighbours", -10**8), "neighbours"),
+    (set_one("surface/grid/neighbours", -(10**8)), "neighbours"),
     (set_array("surface/grid/neighbours", lambda a: a[::-1]), "neighbours"),
     (set_one("surface/grid/cells", np.nan), "finite"),
     (set_array("surface/grid/cells", lambda a: a[::-1]), "order of their cells"),
@@ -428,12 +470,7 @@ def test_what_no_segmentation_has_is_refused_before_a_kernel_sees_it(
     assert word in refusal_of(tmp_path / "x.npz")
 
 
-def test_files_that_would_fill_the_memory_are_refused(saved: dict[str, Any], tmp_path: Path) -> None:
-    import io
-    import zipfile
-
-    from pcgraph.plumbing.array_archive import DamagedError
-
+def test_files_that_would_fill_the_memory_or_run_code_are_refused() -> None:
     stream = io.BytesIO()
     np.savez_compressed(stream, labels=np.zeros(10**6, np.int32))
     with pytest.raises(DamagedError, match="compressed"):
@@ -496,10 +533,8 @@ def go_on(found: pcgraph.Segmentation) -> None:
         lambda: detection.find_planes(found),
     ]
     for call in calls:
-        try:
+        with suppress(ValueError, ArithmeticError, Warning, np.linalg.LinAlgError):
             call()
-        except (ValueError, ArithmeticError, Warning, np.linalg.LinAlgError):
-            pass
 
 
 def check_mutation(result: pcgraph.Segmentation, path: Path, seed: int) -> bool:
@@ -508,8 +543,7 @@ def check_mutation(result: pcgraph.Segmentation, path: Path, seed: int) -> bool:
         write(path, archive_of(result), mutate, seed)
     try:
         found = pcgraph.load_segmentation(path)
-    except pcgraph.CloudReadError as error:
-        assert len(str(error)) < 500
+    except pcgraph.CloudReadError:
         return False
     go_on(found)
     return True
