@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from pcgraph.io import read_cloud as read_cloud
     from pcgraph.io import write_segmentation as write_segmentation
     from pcgraph.plausibility import CloudWarning as CloudWarning
+    from pcgraph.saved_segmentation import load_segmentation as load_segmentation
     from pcgraph.scan import segment as segment
     from pcgraph.scan import supervoxel_clustering as supervoxel_clustering
     from pcgraph.segmentation import Segmentation as Segmentation
@@ -81,6 +82,7 @@ else:
             "graph.occlusion": ["Occlusions"],
             "io": ["read_cloud", "write_segmentation"],
             "plausibility": ["CloudWarning"],
+            "saved_segmentation": ["load_segmentation"],
             "scan": ["segment", "supervoxel_clustering"],
             "segmentation": ["Segmentation", "Supervoxels"],
             "stream": ["update"],

@@ -61,6 +61,7 @@ def test_public_names():
         "WardLinkage",
         "detection",
         "learning",
+        "load_segmentation",
         "metrics",
         "plane_energy",
         "read_cloud",
