@@ -190,6 +190,7 @@ STOREYS = [
     "families",
     "segmentation",
     "labelling",
+    "saved_segmentation",
     "plausibility",
     "scan",
     "stream",
