@@ -358,8 +358,8 @@ def _whole_labels(labels: NDArray[np.generic]) -> NDArray[np.int32]:
 
 
 def _checked_column(name: str, column: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.generic]:
-    if not isinstance(name, str) or not name.split():
-        raise CloudWriteError(f"expected names of columns as words, got {ascii(name)[:80]}")
+    if not isinstance(name, str) or not name.split() or not "".join(name.split()).isprintable():
+        raise CloudWriteError(f"expected names of columns as printable words, got {ascii(name)[:80]}")
     if not isinstance(column, np.ndarray) or column.dtype.kind not in "fiub":
         kind = column.dtype if isinstance(column, np.ndarray) else type(column).__name__
         raise CloudWriteError(f"expected the column {name!r} as an array of numbers, got {kind}")
