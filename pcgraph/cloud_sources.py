@@ -122,12 +122,14 @@ def _of_open3d_tensor(cloud: Any) -> Cloud:
 
 def _of_trimesh(mesh: Any) -> Cloud:
     """Cloud of a trimesh.PointCloud, or of the vertices of a trimesh.Trimesh with their normals."""
-    points, visual = np.asarray(mesh.vertices), mesh.visual
-    colors = np.asarray(visual.vertex_colors)[:, :3] if getattr(visual, "kind", None) == "vertex" else None
-    normals = np.asarray(mesh.vertex_normals) if hasattr(mesh, "vertex_normals") else None
-    return _from_columns(
-        _columns_of(points, colors, normals) | dict(getattr(mesh, "vertex_attributes", {})), points.shape[:1]
+    points = np.asarray(mesh.vertices)
+    colors = np.asarray(mesh.visual.vertex_colors) if mesh.visual.kind == "vertex" else np.empty(0)
+    columns = _columns_of(
+        points,
+        colors[:, :3] if len(colors) else None,
+        np.asarray(mesh.vertex_normals) if hasattr(mesh, "vertex_normals") else None,  # clouds have none
     )
+    return _from_columns(columns | getattr(mesh, "vertex_attributes", {}), points.shape[:1])
 
 
 def _columns_of(
@@ -151,7 +153,7 @@ def _from_columns(columns: dict[str, NDArray[np.generic]], shape: tuple[int, ...
 _KINDS: dict[tuple[str, ...], Callable[[Any], Cloud]] = {
     ("fields", "data", "point_step", "row_step"): _of_message,
     ("points", "colors", "normals", "has_points"): _of_open3d,
-    ("point", "is_gpu", "is_cpu"): _of_open3d_tensor,
+    ("point", "is_cpu", "is_cuda"): _of_open3d_tensor,
     ("vertices", "visual"): _of_trimesh,
 }
 """Converters by the attributes that tell the kind of an object, so that no library need be imported to know it."""

@@ -552,6 +552,11 @@ READERS = {
             for suffix in ("ply", "pcd")
         ),
         Reader(
+            "npz", _cloud, partial(seeds.array_files, "npz"), by_hand=(hostile.npz_files,), refuses=_CLOUD,
+            check=_arrays_agree,
+        ),
+        Reader("npy", _cloud, partial(seeds.array_files, "npy"), refuses=_CLOUD, check=_arrays_agree),
+        Reader(
             "edge-model", _edge_model, seeds.edge_models, by_hand=(hostile.json_trees,),
             refuses=("ValueError", *_CLOUD),
         ),
