@@ -13,7 +13,9 @@ from pcgraph.errors import CloudReadError
 from pcgraph.io.format import CloudFile, Format
 from pcgraph.io.pcd import PCD
 from pcgraph.io.ply import PLY
+from pcgraph.io.ptx import PTX
 from pcgraph.io.segmentation_files import write_segmentation
+from pcgraph.io.text import PTS, TEXT, XYZN, XYZRGB
 from pcgraph.plumbing.plain_files import read_file
 
 __all__ = ["read_cloud", "write_segmentation"]
@@ -21,7 +23,7 @@ __all__ = ["read_cloud", "write_segmentation"]
 MAX_REASON = 300
 """Characters of a message about a damaged file, count: such files can make messages of any length. Chosen by eye; not
 varied."""
-FORMATS: tuple[Format, ...] = (PCD, PLY)
+FORMATS: tuple[Format, ...] = (PCD, PLY, TEXT, PTS, PTX, XYZN, XYZRGB)
 
 
 def read_cloud(
