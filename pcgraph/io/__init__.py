@@ -10,7 +10,9 @@ from pathlib import Path
 
 from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudReadError
+from pcgraph.io.driving_sweeps import KITTI, NUSCENES, SWEEP
 from pcgraph.io.format import CloudFile, Format
+from pcgraph.io.ouster import OUSTER
 from pcgraph.io.pcd import PCD
 from pcgraph.io.ply import PLY
 from pcgraph.io.ptx import PTX
@@ -23,7 +25,7 @@ __all__ = ["read_cloud", "write_segmentation"]
 MAX_REASON = 300
 """Characters of a message about a damaged file, count: such files can make messages of any length. Chosen by eye; not
 varied."""
-FORMATS: tuple[Format, ...] = (PCD, PLY, TEXT, PTS, PTX, XYZN, XYZRGB)
+FORMATS: tuple[Format, ...] = (PCD, PLY, TEXT, PTS, PTX, XYZN, XYZRGB, KITTI, NUSCENES, SWEEP, OUSTER)
 
 
 def read_cloud(

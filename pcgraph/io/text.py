@@ -75,7 +75,9 @@ ROWS_AT_ONCE = 100_000
 eye; not varied."""
 COMMENTS = ("#", "//", "%")
 
-_MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+"""First bytes of a text in UTF-16."""
+
 _WHOLE = re.compile(r"[-+]?[0-9]+")
 _COUNT = re.compile(r"[0-9]{1,15}")
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+(,[0-9]+([eE][-+]?[0-9]+)?)?")
@@ -110,10 +112,13 @@ class Dialect:
         A comma or a semicolon; a blank for rows of words between blanks and tabs.
     has_last : bool
         Whether rows end in a separator with nothing behind it.
+    has_empty : bool
+        Whether cells may be empty.
     """
 
     separator: str
     has_last: bool = False
+    has_empty: bool = True
 
     @staticmethod
     def of(line: str) -> Dialect | None:
@@ -132,8 +137,7 @@ class Dialect:
         separator = self.separator
         if self.has_last:
             line = line.rstrip().removesuffix(separator)
-        tight = line.replace(" ", "").strip()
-        if separator * 2 in tight or tight.startswith(separator) or tight.endswith(separator):
+        if self.has_empty:
             line = separator.join(cell if cell.strip() else "nan" for cell in line.split(separator))
         if separator == ";":
             line = line.replace(",", ".")
@@ -185,9 +189,10 @@ class TextLines:
 
 def encoding_of(content: bytes) -> str:
     """UTF-8, or UTF-16 by the mark at its beginning, or else Latin-1. Raises CloudReadError if it is no text."""
-    marked = next((encoding for mark, encoding in _MARKS.items() if content.startswith(mark)), None)
-    if marked is not None:
-        return marked
+    if content.startswith(UTF_16):
+        return "utf-16"
+    if content.startswith(codecs.BOM_UTF8):
+        return "utf-8-sig"
     start = content[:MAX_HEADER_BYTES]
     if b"\0" in start:
         raise CloudReadError("expected a text with a row of numbers for each point, got binary data")
@@ -341,12 +346,14 @@ def open_table(content: bytes, is_named: bool = False) -> TextTable:
     lines = TextLines(content)
     above: list[tuple[int, str]] = []
     promised: int | None = None
+    characters = 0
     stream = iter(lines)
     for line in stream:
         dialect = None if line.startswith(COMMENTS) else Dialect.of(line)
         if dialect is None:
             above.append((lines.number, line))
-            if sum(len(text) for _, text in above) > MAX_HEADER_BYTES:
+            characters += len(line)
+            if characters > MAX_HEADER_BYTES:
                 raise CloudReadError(f"expected rows of numbers, but the first {lines.number} lines have none")
         elif not promised and _COUNT.fullmatch(line.strip()):
             promised = _promise(line, lines.number, len(content))
@@ -355,6 +362,7 @@ def open_table(content: bytes, is_named: bool = False) -> TextTable:
             whole = replace(dialect, has_last=False)  # the last cell may be empty, if the names say that there is one
             if dialect.has_last and _names(above, len(whole.row(line).split())):
                 dialect = whole
+            dialect = replace(dialect, has_empty=_has_empty(content, dialect.separator))
             first = dialect.row(line).partition("#")[0].split()
             names = _names(above, len(first))
             _refuse_strangers(above, len(first), is_named)
@@ -364,6 +372,12 @@ def open_table(content: bytes, is_named: bool = False) -> TextTable:
         number, line = above[0] if above else (1, "")
         raise CloudReadError(f"expected rows of numbers, but line {number} and all others have none: {line[:80]!r}")
     return TextTable(lines, names, [], iter(()))
+
+
+def _has_empty(content: bytes, separator: str) -> bool:
+    """Whether there may be empty cells: between separators, or between one and the beginning or end of a line."""
+    signs = [f"{separator}{sign}" for sign in (separator, f" {separator}", "\n", "\r")]
+    return content.startswith(UTF_16) or any(sign.encode() in content for sign in (*signs, f"\n{separator}"))
 
 
 def _promise(line: str, number: int, size: int) -> int:
