@@ -59,7 +59,7 @@ from pcgraph.errors import CloudReadError, CloudWriteError
 from pcgraph.io.format import CloudFile, Format
 
 MAX_LINE = 1 << 16
-"""Characters of a line, count: far more than rows have, so that one endless line does not fill the memory. Chosen by
+"""Bytes of a line, count: far more than rows have, so that one endless line does not fill the memory. Chosen by
 eye; not varied."""
 MAX_COLUMNS = 1024
 """Columns of a table, count: a guard. Chosen by eye; not varied."""
@@ -84,6 +84,8 @@ _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+(,[0-9]+([eE][-+]?[0-9]+)?)?")
 _UNIT = re.compile(r"\s*[\[(][^\])]*[\])]$")
 _NONE = ("NA", "N/A", "n/a", "null", "NULL", "None", "1.#IND", "1.#QNAN", "1.#SNAN")
 """Spellings of NaN that C's strtod does not know: of R and pandas, databases, Python, and Windows' old C library."""
+_OF_NUMBERS = b"0123456789.+- \t,;\r\n"
+"""Bytes of which most rows consist: what is left of a text without them is searched soon."""
 _IS_NONE = re.compile(rf"(?<![^\s,;])[-+]?(?:{'|'.join(map(re.escape, _NONE))})0*(?![^\s,;])")
 _IS_INFINITE = re.compile(r"1\.#INF0*")
 _SHORT_COLORS = (("r", "g", "b"), ("rf", "gf", "bf"))
@@ -165,17 +167,16 @@ class TextLines:
     def __init__(self, content: bytes) -> None:
         self.number = 0
         encoding = encoding_of(content)
-        self._has_odd_numbers = encoding == "utf-16" or any(word.encode() in content for word in (*_NONE, "1.#INF"))
+        _refuse_long_lines(content)
+        rare = content.translate(None, _OF_NUMBERS)
+        odd = (word.encode().translate(None, _OF_NUMBERS) in rare for word in (*_NONE, "1.#INF"))
+        self._has_odd_numbers = encoding == "utf-16" or any(odd)
         self._stream = io.TextIOWrapper(io.BytesIO(content), encoding, errors="replace", newline=None)
 
     def __iter__(self) -> Iterator[str]:
         try:
-            for line in iter(partial(self._stream.readline, MAX_LINE), ""):
+            for line in self._stream:
                 self.number += 1
-                if len(line) == MAX_LINE and not line.endswith("\n"):
-                    raise CloudReadError(
-                        f"expected rows of numbers, but line {self.number} has {MAX_LINE} characters or more"
-                    )
                 if not line.isspace():
                     yield self._usual(line.lstrip()) if self._has_odd_numbers else line.lstrip()
         except UnicodeError:
@@ -185,6 +186,14 @@ class TextLines:
     def _usual(line: str) -> str:
         """The line with the usual spellings of NaN and infinity."""
         return _IS_INFINITE.sub("inf", _IS_NONE.sub("nan", line))
+
+
+def _refuse_long_lines(content: bytes) -> None:
+    """Raise CloudReadError if no line ends within some `MAX_LINE` bytes."""
+    for start in range(0, len(content) - MAX_LINE, MAX_LINE):
+        if all(content.find(end, start, start + MAX_LINE) < 0 for end in (b"\n", b"\r")):
+            number = max(content.count(end, 0, start) for end in (b"\n", b"\r")) + 1
+            raise CloudReadError(f"expected rows of numbers, but line {number} has {MAX_LINE} bytes or more")
 
 
 def encoding_of(content: bytes) -> str:
@@ -240,6 +249,7 @@ def numbers(rows: Iterable[str], lines: TextLines) -> NDArray[np.float64]:
 
 def known_names(names: Sequence[str]) -> tuple[str, ...]:
     """Names with those of coordinates and colours as `cloud_from_columns` knows them; the others as they are."""
+    names = [name or f"column_{i}" for i, name in enumerate(names)]
     bare = [_UNIT.sub("", name) for name in names]
     found = [short if short.lower() in ("x", "y", "z") else name for short, name in zip(bare, names, strict=True)]
     lower = [name.lower() for name in names]

@@ -84,6 +84,7 @@ def test_nan_has_many_spellings() -> None:
     assert np.isnan(read("1,2,3\n,5,6\n").points[1]).tolist() == [True, False, False]
     assert np.isnan(read("x,y,z,t\n1,2,3,\n4,5,6,7\n").columns["t"]).tolist() == [True, False]
     assert read("1 2 inf\n-INF 4 1.#INF\n").points.tolist() == [[1, 2, np.inf], [-np.inf, 4, np.inf]]
+    assert read(",x,y,z\n0,1,2,3\n").columns["column_0"].tolist() == [0]
     assert "Banana" in read("x,y,z,Banana NA\n1,2,3,NA\n".replace(" NA", "")).columns
 
 
@@ -193,7 +194,8 @@ def test_files_without_points() -> None:
         ("1000000000\n1 2 3\n", "line 1 promises 1000000000 points, but the whole file has only 17 bytes"),
         ("1\n1 2 3\n999999999\n1 2 3\n", "line 3 promises 999999999 points"),
         ("x y z x\n1 2 3 4\n", "distinct"),
-        ("1 2 3\n" + "4" * 70_000, "line 2 has 65536 characters or more"),
+        ("1 2 3\n" + "4" * 200_000, "line 2 has 65536 bytes or more"),
+        (b"x" * 10**6, "line 1 has 65536 bytes or more"),
         (" ".join(["1"] * 2000), "at most 1024 numbers"),
         (b"\x00\x01\x02\x03 1 2 3\n" * 10, "got binary data"),
         (bytes(range(128, 256)) * 9, "line 1 and all others have none"),
