@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.cloud import Cloud, cloud_from_columns
+from pcgraph.cloud import Cloud, cloud_from_columns, columns_of_cloud
 from pcgraph.errors import CloudReadError, CloudWriteError
 from pcgraph.io.format import CloudFile, Format
 from pcgraph.plumbing.plain_files import read_file
@@ -110,8 +110,7 @@ def encode_sweep(cloud: Cloud, columns: tuple[str, ...]) -> bytes:
     CloudWriteError
         The cloud has others, or numbers that are not those of float32.
     """
-    own = {"x": cloud.points[:, 0], "y": cloud.points[:, 1], "z": cloud.points[:, 2], **cloud.columns}
-    own |= {name: value for name in ("colors", "normals", "labels") if (value := getattr(cloud, name)) is not None}
+    own = columns_of_cloud(cloud)
     if set(own) != set(columns):
         raise CloudWriteError(
             f"expected the columns {', '.join(columns)} and no others, got {', '.join(own)[:200]}: "

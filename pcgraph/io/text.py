@@ -54,6 +54,7 @@ from pcgraph.cloud import (
     PACKED_NAMES,
     Cloud,
     cloud_from_columns,
+    columns_of_cloud,
 )
 from pcgraph.errors import CloudReadError, CloudWriteError
 from pcgraph.io.format import CloudFile, Format
@@ -544,7 +545,7 @@ def encode_text(cloud: Cloud, suffix: str) -> bytes:
     Parameters
     ----------
     cloud : Cloud
-        Organised points become a list. Vectors of c numbers become columns ``name_0`` and so on.
+        As `pcgraph.cloud.plain_cloud` returns it. Vectors of c numbers become columns ``name_0`` and so on.
     suffix : str
         ".csv": names and numbers between commas. Others: between blanks, the names behind ``//``, as CloudCompare has
         them.
@@ -554,7 +555,7 @@ def encode_text(cloud: Cloud, suffix: str) -> bytes:
     CloudWriteError
         A column has no numbers that a text can hold, or a name that would be read as another one.
     """
-    columns = _columns(cloud)
+    columns = _scalars(columns_of_cloud(cloud))
     separator = "," if suffix == ".csv" else " "
     line = separator.join(_quoted(name, separator) for name in columns)
     line = line if separator == "," else f"//{line}"
@@ -571,7 +572,7 @@ def encode_pts(cloud: Cloud, suffix: str) -> bytes:
     CloudWriteError
         The cloud has other columns.
     """
-    columns = _columns(cloud)
+    columns = _scalars(columns_of_cloud(cloud))
     names = tuple(name for name in _PTS[-1] if name in columns)
     if names not in _PTS or len(names) < len(columns):
         others = ", ".join(name for name in columns if name not in names)
@@ -582,23 +583,15 @@ def encode_pts(cloud: Cloud, suffix: str) -> bytes:
     return f"{len(columns['x'])}\n".encode() + _body({name: columns[name] for name in names}, " ")
 
 
-def _columns(cloud: Cloud) -> dict[str, NDArray[np.generic]]:
-    """Columns of numbers by name, (n,) each."""
-    n = cloud.points.shape[:-1]
-    parts: dict[str, NDArray[np.generic]] = dict(zip("xyz", np.moveaxis(cloud.points, -1, 0), strict=True))
-    if cloud.colors is not None:
-        parts |= dict(zip(COLOR_NAMES, np.moveaxis(cloud.colors, -1, 0), strict=True))
-    if cloud.normals is not None:
-        parts |= dict(zip(NORMAL_NAMES[1], np.moveaxis(cloud.normals, -1, 0), strict=True))
-    if cloud.labels is not None:
-        parts["label"] = cloud.labels
-    for name, column in cloud.columns.items():
-        vector = column.ndim > len(n)
-        own = {f"{name}_{i}": column[..., i] for i in range(column.shape[-1])} if vector else {name: column}
+def _scalars(columns: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
+    """The columns with one column for each number of a vector."""
+    parts: dict[str, NDArray[np.generic]] = {}
+    for name, column in columns.items():
+        own = {name: column} if column.ndim == 1 else {f"{name}_{i}": part for i, part in enumerate(column.T)}
         if not own.keys().isdisjoint(parts):
-            raise CloudWriteError(f"expected names of columns that a text keeps, got {name!r} twice: rename it")
+            raise CloudWriteError(f"expected distinct columns, but {name!r} comes twice as a text has it: rename it")
         parts |= own
-    return {name: part.reshape(-1) for name, part in parts.items()}
+    return parts
 
 
 def _quoted(name: str, separator: str) -> str:

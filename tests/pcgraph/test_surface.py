@@ -59,7 +59,9 @@ def test_public_names():
         "Vccs",
         "VoxelGrid",
         "WardLinkage",
+        "as_cloud",
         "detection",
+        "labelled_cloud",
         "learning",
         "metrics",
         "plane_energy",
@@ -67,6 +69,7 @@ def test_public_names():
         "segment",
         "update",
         "variance_energy",
+        "write_cloud",
         "write_segmentation",
     ]
     for name in pcgraph.__all__:

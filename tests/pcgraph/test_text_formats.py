@@ -302,6 +302,18 @@ def test_every_number_of_every_column_comes_back(cloud: Cloud, suffix: str) -> N
         assert column.size == 0 or (back.dtype.kind == "f") == (column.dtype.kind == "f")
 
 
+def test_scans_go_from_ptx_to_csv_and_back(tmp_path: Path) -> None:
+    """With the place of each point's scanner; holes are left out."""
+    scan = "1\n2\n" + POSE + "1 0 0 0.5 1 2 3\n0 0 0 0 0 0 0\n"
+    (tmp_path / "a.ptx").write_text(scan + scan.replace("10 20 30", "0 0 5"))
+    cloud = pcgraph.read_cloud(tmp_path / "a.ptx")
+    pcgraph.write_cloud(tmp_path / "a.csv", cloud)
+    found = pcgraph.read_cloud(tmp_path / "a.csv")
+    assert np.array_equal(found.points, cloud.points[::2])
+    assert np.array_equal(found.viewpoint, cloud.viewpoint[::2])
+    assert found.columns["scan"].tolist() == [0, 1]
+
+
 def full_cloud(n: int = 40) -> Cloud:
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(n, 3))
@@ -334,11 +346,15 @@ def test_pts_files_hold_intensity_and_colours(keep: str) -> None:
 
 def test_names_that_a_text_does_not_keep_are_refused() -> None:
     points = np.zeros((1, 3))
-    for name in ("x", "two\nlines", 'a "quoted" one', "x [m]"):
+    for name in ("two\nlines", 'a "quoted" one', "x [m]"):
         with pytest.raises(CloudWriteError, match="expected names of columns that a text keeps"):
             encode_text(Cloud(points, columns={name: np.zeros(1)}), ".txt")
     with pytest.raises(CloudWriteError, match="at most 64 bits"):
         encode_text(Cloud(points, columns={"c": np.zeros(1, complex)}), ".csv")
+    with pytest.raises(CloudWriteError, match="another name than 'x'"):
+        encode_text(Cloud(points, columns={"x": np.zeros(1)}), ".csv")
+    with pytest.raises(CloudWriteError, match="'v_0' comes twice"):
+        encode_text(Cloud(points, columns={"v": np.zeros((1, 2)), "v_0": np.zeros(1)}), ".csv")
     vectors = encode_text(Cloud(points, columns={"v": np.arange(2.0)[None]}), ".csv")
     assert vectors.splitlines()[0] == b"x,y,z,v_0,v_1"
 
