@@ -163,10 +163,12 @@ class TextLines:
     ----------
     number : int
         Number of the last line that was read, from 1; 0 before the first.
+    size : int
+        Bytes of the whole text.
     """
 
     def __init__(self, content: bytes) -> None:
-        self.number = 0
+        self.number, self.size = 0, len(content)
         encoding = encoding_of(content)
         _refuse_long_lines(content)
         rare = content.translate(None, _OF_NUMBERS)
@@ -367,7 +369,7 @@ def open_table(content: bytes, is_named: bool = False) -> TextTable:
             if characters > MAX_HEADER_BYTES:
                 raise CloudReadError(f"expected rows of numbers, but the first {lines.number} lines have none")
         elif not promised and _COUNT.fullmatch(line.strip()):
-            promised = _promise(line, lines.number, len(content))
+            promised = _promise(line, lines)
         else:
             _refuse_decimal_commas(line, lines.number)
             whole = replace(dialect, has_last=False)  # the last cell may be empty, if the names say that there is one
@@ -377,7 +379,7 @@ def open_table(content: bytes, is_named: bool = False) -> TextTable:
             first = dialect.row(line).partition("#")[0].split()
             names = _names(above, len(first))
             _refuse_strangers(above, len(first), is_named)
-            return TextTable(lines, names, first, _rows(line, stream, dialect, promised, lines, len(content)))
+            return TextTable(lines, names, first, _rows(chain((line,), stream), dialect, promised, lines))
     names = _names(above, None)
     if promised is None and names is None:
         number, line = above[0] if above else (1, "")
@@ -391,11 +393,13 @@ def _has_empty(content: bytes, separator: str) -> bool:
     return content.startswith(UTF_16) or any(sign.encode() in content for sign in (*signs, f"\n{separator}"))
 
 
-def _promise(line: str, number: int, size: int) -> int:
-    """The count of points in a line; raises CloudReadError if the file is too small for it."""
+def _promise(line: str, lines: TextLines) -> int:
+    """The count of points in the last line; raises CloudReadError if the file is too small for it."""
     count = int(line)
-    if count * MIN_ROW_BYTES > size + 1:  # the last row may have no end
-        raise CloudReadError(f"line {number} promises {count} points, but the whole file has only {size} bytes")
+    if count * MIN_ROW_BYTES > lines.size + 1:  # the last row may have no end
+        raise CloudReadError(
+            f"line {lines.number} promises {count} points, but the whole file has only {lines.size} bytes"
+        )
     return count
 
 
@@ -424,18 +428,16 @@ def _refuse_strangers(above: list[tuple[int, str]], count: int, is_named: bool) 
             )
 
 
-def _rows(
-    first: str, stream: Iterator[str], dialect: Dialect, promised: int | None, lines: TextLines, size: int
-) -> Iterator[str]:
-    """All rows; where counts of points stand above them, of each block."""
+def _rows(stream: Iterator[str], dialect: Dialect, promised: int | None, lines: TextLines) -> Iterator[str]:
+    """The rows in a stream of lines; where counts of points stand above them, of each block."""
     left = promised
-    for line in chain((first,), stream):
+    for line in stream:
         if line.startswith(COMMENTS):
             continue
         if left == 0:
             if not _COUNT.fullmatch(line.strip()):
                 raise CloudReadError(f"line {lines.number} has one point more than the count above the points says")
-            left = _promise(line, lines.number, size)
+            left = _promise(line, lines)
             continue
         if left is not None:
             left -= 1
@@ -460,6 +462,12 @@ def read_text(file: CloudFile, is_pts: bool = False, usual: tuple[str, ...] | No
     CloudReadError
         The content is no text, or not one of numbers; rows have different numbers of columns; there are fewer rows than
         a count says; the names do not fit the columns, or x, y or z is not among them.
+
+    Examples
+    --------
+    >>> cloud = read_text(CloudFile(b"//X Y Z R G B Scalar field\\n1.5 2 3 255 0 0 7\\n4 5 6 0 0 255 8\\n"))
+    >>> cloud.points.tolist(), cloud.colors.tolist(), cloud.columns
+    ([[1.5, 2.0, 3.0], [4.0, 5.0, 6.0]], [[255, 0, 0], [0, 0, 255]], {'Scalar field': array([7, 8], dtype=int32)})
     """
     table = open_table(file.content, file.columns is not None)
     if not table.first:
