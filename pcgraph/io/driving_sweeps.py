@@ -127,6 +127,16 @@ def encode_sweep(cloud: Cloud, columns: tuple[str, ...]) -> bytes:
     return table.tobytes()
 
 
+def _encode_bin(cloud: Cloud) -> bytes:
+    content = encode_sweep(cloud, KITTI_COLUMNS)
+    if _is_nuscenes(content):
+        raise CloudWriteError(
+            "these points would be read as those of nuScenes, because their numbers look like rings: "
+            "write and read them with file_format='kitti'"
+        )
+    return content
+
+
 def _cloud(table: NDArray[np.float32], columns: tuple[str, ...]) -> Cloud:
     table = table.astype(np.float32, copy=False)
     return cloud_from_columns(dict(zip(columns, table.T, strict=True)), (len(table),))
@@ -163,4 +173,4 @@ def _labels_beside(path: Path) -> Path | None:
 
 KITTI = Format("kitti", (), read_kitti, lambda cloud, _: encode_sweep(cloud, KITTI_COLUMNS))
 NUSCENES = Format("nuscenes", (".pcd.bin",), read_nuscenes, lambda cloud, _: encode_sweep(cloud, NUSCENES_COLUMNS))
-SWEEP = Format("bin", (".bin",), read_sweep, lambda cloud, _: encode_sweep(cloud, KITTI_COLUMNS))
+SWEEP = Format("bin", (".bin",), read_sweep, lambda cloud, _: _encode_bin(cloud))

@@ -99,6 +99,14 @@ def test_sweeps_are_written_as_they_were_read() -> None:
             one.encode(Cloud(cloud.points.astype(float) + 1e-12, columns=cloud.columns), ".bin")
 
 
+def test_sweeps_that_would_be_read_as_others_are_written_by_name_only(tmp_path: Path) -> None:
+    cloud = Cloud(np.zeros((5, 3), np.float32), columns={"intensity": np.zeros(5, np.float32)})
+    with pytest.raises(CloudWriteError, match="write and read them with file_format='kitti'"):
+        pcgraph.write_cloud(tmp_path / "a.bin", cloud)
+    pcgraph.write_cloud(tmp_path / "a.bin", cloud, "kitti")
+    assert pcgraph.read_cloud(tmp_path / "a.bin", "kitti").points.shape == (5, 3)
+
+
 # ---- Ouster --------------------------------------------------------------------------------------------------------
 
 REAL = ("OS-0-128-U1_v2.3.0_1024x10", "OS-1-32-G_v2.1.1_1024x10")

@@ -302,6 +302,23 @@ def test_every_number_of_every_column_comes_back(cloud: Cloud, suffix: str) -> N
         assert column.size == 0 or (back.dtype.kind == "f") == (column.dtype.kind == "f")
 
 
+@settings(max_examples=30, deadline=None)
+@given(st.data(), st.integers(1, 4), st.booleans(), st.booleans())
+def test_every_number_of_a_pts_file_comes_back(
+    data: st.DataObject, n: int, has_colors: bool, has_intensity: bool
+) -> None:
+    points = data.draw(hnp.arrays("f8", (n, 3)))
+    colors = data.draw(hnp.arrays("u1", (n, 3))) if has_colors else None
+    columns = {"intensity": data.draw(hnp.arrays(data.draw(NUMBERS), n))} if has_intensity else {}
+    found = read(encode_pts(Cloud(points, colors, columns=columns), ".pts"), is_pts=True)
+    assert np.array_equal(found.points, points, equal_nan=True)
+    assert (found.colors is None) == (colors is None)
+    assert colors is None or np.array_equal(found.colors, colors)
+    assert set(found.columns) == set(columns)
+    for name, column in columns.items():
+        assert np.array_equal(found.columns[name], column, equal_nan=column.dtype.kind == "f")
+
+
 def test_scans_go_from_ptx_to_csv_and_back(tmp_path: Path) -> None:
     """With the place of each point's scanner; holes are left out."""
     scan = "1\n2\n" + POSE + "1 0 0 0.5 1 2 3\n0 0 0 0 0 0 0\n"
@@ -414,3 +431,33 @@ def test_cloudcompare_reads_what_is_written_and_is_read(tmp_path: Path, suffix: 
         if suffix != ".pts":
             assert np.allclose(found.normals, cloud.normals, atol=3e-3), name  # it keeps 16 bits of a normal
             assert any(np.array_equal(column, cloud.columns["object"]) for column in found.columns.values()), name
+
+
+@pytest.mark.validation
+@pytest.mark.skipif(not (which("CloudCompare") and which("xvfb-run")), reason="needs CloudCompare and xvfb-run")
+def test_cloudcompare_reads_the_same_points_of_ptx_files(tmp_path: Path) -> None:
+    """The matrix, the common frame and the holes."""
+    rng = np.random.default_rng(1)
+    texts = []
+    for _ in range(2):
+        rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        rotation *= np.linalg.det(rotation)
+        place = rng.normal(size=3).round(3)
+        lines = ["5", "4", " ".join(map(repr, place.tolist()))]
+        lines += [" ".join(map(repr, row)) for row in rotation.tolist()]
+        lines += [" ".join(map(repr, [*row, 0.0])) for row in rotation.tolist()]
+        lines += [" ".join(map(repr, [*place.tolist(), 1.0]))]
+        rows = np.column_stack([rng.normal(size=(20, 3)) * 5, rng.random(20)]).round(4)
+        rows[3, :3] = 0
+        texts.append("\n".join([*lines, *(" ".join(map(repr, row)) for row in rows.tolist())]) + "\n")
+    (tmp_path / "a.ptx").write_text("".join(texts))
+    command = ["xvfb-run", "-a", "CloudCompare", "-SILENT", "-AUTO_SAVE", "OFF", "-O", "a.ptx"]
+    command += ["-C_EXPORT_FMT", "ASC", "-PREC", "7", "-NO_TIMESTAMP", "-SAVE_CLOUDS"]
+    subprocess.run(command, check=True, timeout=120, capture_output=True, cwd=tmp_path)
+    names = ["x", "y", "z", "intensity"]
+    theirs = np.concatenate(
+        [pcgraph.read_cloud(tmp_path / name, columns=names).points for name in ("a_0.asc", "a_1.asc")]
+    )
+    ours = pcgraph.read_cloud(tmp_path / "a.ptx").finite().points
+    assert len(ours) == len(theirs) == 38
+    assert np.allclose(ours[np.lexsort(ours.T)], theirs[np.lexsort(theirs.T)], atol=1e-4)
