@@ -504,6 +504,8 @@ def _check_whole(name: str, numbers: NDArray[np.float64], least: int, most: int)
 def numbers_from_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> NDArray[np.float64]:
     """The first `n_rows` rows of numbers in a text, one row per line; empty lines do not count.
 
+    If the first row is spread over several lines, all others must be so in the same way.
+
     Parameters
     ----------
     body : bytes
@@ -531,37 +533,54 @@ def numbers_from_text(body: bytes, n_rows: int, n_columns: int, first_line: int)
 
 
 def _rows_of_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> Iterator[list[float]]:
-    """Numbers of each row."""
-    left = n_rows
+    """Numbers of each line; the lines of a row are as long as those of the first row."""
+    lengths = _line_lengths(body, n_columns)
+    n_lines, read = n_rows * len(lengths), 0
     lines = enumerate(BytesIO(body), first_line)
-    while left:
+    while read < n_lines:
         number, line = next(lines, (0, b""))
         if not number:
-            raise CloudReadError(f"the header promises {n_rows} points, but {n_rows - left} rows of numbers follow")
+            rows = read // len(lengths)
+            raise CloudReadError(f"the header promises {n_rows} points, but {rows} rows of numbers follow")
         words = line.split(None, n_columns)
         if not words:
             continue
-        if b"_" in line:  # only Python reads 1_000 as a number
-            word = next((word for word in words if b"_" in word), line).decode("latin-1")
-            raise CloudReadError(f"expected numbers only in the ascii data, got in line {number}: {word[:80]!r}")
-        if len(words) != n_columns:
+        expected = lengths[read % len(lengths)]
+        if len(words) != expected:
             got = f"more than {n_columns}" if len(words) > n_columns else f"{len(words)}"
             raise CloudReadError(
-                f"expected {n_columns} numbers in each line, one for each field of the header, "
+                f"expected {expected} numbers in each line, one for each field of the header, "
                 f"but line {number} has {got}: correct the line or the header{_about_commas(line)}"
             )
-        yield numbers_of_words(words, number)
-        left -= 1
+        yield numbers_of_words(words, line, number)
+        read += 1
 
 
-def numbers_of_words(words: Sequence[bytes], line: int) -> list[float]:
+def _line_lengths(body: bytes, n_columns: int) -> tuple[int, ...]:
+    """Count of the words of each line of the first row.
+
+    It is one line, but the viewer of RealSense cameras puts coordinates and colours in two.
+    """
+    lengths: list[int] = []
+    for line in BytesIO(body):
+        if words := len(line.split(None, n_columns)):
+            lengths.append(words)
+        if sum(lengths) >= n_columns:
+            break
+    return tuple(lengths) if sum(lengths) == n_columns else (n_columns,)
+
+
+def numbers_of_words(words: Sequence[bytes], line: bytes, number: int) -> list[float]:
     """Numbers of the words of a line; the C library of Windows writes NaN as ``1.#QNAN`` or ``-nan(ind)``.
 
     Raises
     ------
     CloudReadError
-        A word is no number; the message names the line.
+        A word is no number; the message names the number of the line.
     """
+    if b"_" in line:  # only Python reads 1_000 as a number
+        word = next((word for word in words if b"_" in word), line).decode("latin-1")
+        raise CloudReadError(f"expected numbers only in the ascii data, got in line {number}: {word[:80]!r}")
     try:
         return [float(word) for word in words]
     except ValueError:
@@ -569,8 +588,8 @@ def numbers_of_words(words: Sequence[bytes], line: int) -> list[float]:
     try:
         return [float(_INFINITE.sub(rb"\1inf", _NO_NUMBER.sub(b"nan", word))) for word in words]
     except ValueError as error:
-        reason = f"{str(error)[:120]}{_about_commas(b' '.join(words))}"
-        raise CloudReadError(f"expected numbers only in the ascii data, got in line {line}: {reason}") from None
+        reason = f"{str(error)[:120]}{_about_commas(line)}"
+        raise CloudReadError(f"expected numbers only in the ascii data, got in line {number}: {reason}") from None
 
 
 _NO_NUMBER = re.compile(rb"[-+]?(1\.#(QNAN|SNAN|IND)0*|nan\(\w+\))", re.IGNORECASE)

@@ -96,9 +96,7 @@ def segment_command(
 
     Example: pcgraph segment scan.pcd --out results/ --voxel-size 0.005 --seed-size 0.03
     """
-    from pcgraph.io import encode_cloud, read_cloud
-    from pcgraph.labelling import labelled_cloud
-    from pcgraph.plumbing.plain_files import write_file
+    from pcgraph.io import read_cloud
 
     start = time.perf_counter()
     try:
@@ -124,9 +122,7 @@ def segment_command(
         )
         level = result.object_altitude if objects is None else None
         labels = result.labels if level is not None and min_size == 1 else result.cut(objects, level, min_size)
-        _check_target(target, overwrite)  # again, as a file may have appeared during the segmentation
-        content = encode_cloud(labelled_cloud(read, replace(result, labels=labels)), target.name)
-        write_file(target, content, CloudWriteError, make_parents=True)
+        _write(target, overwrite, read, replace(result, labels=labels))
     except (PcgraphError, ValueError, MemoryError, OSError) as error:
         message = said(error) if isinstance(error, OSError) else str(error)
         message = without_long_words(message) or "the cloud does not fit into memory: choose a larger voxel size"
@@ -190,6 +186,16 @@ def _segmented(path: Path, cloud: Cloud, **settings: Any) -> Segmentation:
         else:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
     return result
+
+
+def _write(target: Path, overwrite: bool, cloud: Cloud, result: Segmentation) -> None:
+    from pcgraph.io import encode_cloud
+    from pcgraph.labelling import labelled_cloud
+    from pcgraph.plumbing.plain_files import write_file
+
+    content = encode_cloud(labelled_cloud(cloud, result), target.name)
+    _check_target(target, overwrite)  # again, as a file may have appeared during the segmentation
+    write_file(target, content, CloudWriteError, make_parents=True)
 
 
 def _print_summary(result: Segmentation, labels: NDArray[np.int32], target: Path, seconds: float) -> None:

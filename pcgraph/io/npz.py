@@ -37,9 +37,9 @@ from pcgraph.cloud import (
 from pcgraph.errors import CloudReadError
 from pcgraph.io.format import Format
 
-MAX_BYTES = 1 << 34
-"""Bytes of all arrays that are read of one file, decompressed: 16 GiB, more than `pcgraph.segment` takes in 64 GB of
-memory. Chosen by eye; not varied. An archive of a few megabytes can hold as much."""
+MAX_BYTES = 1 << 32
+"""Bytes of all arrays that are read of one file, decompressed: 4 GiB are 100 million points of 40 bytes, for which
+`pcgraph.segment` would need some 18 GB, as it needs 3.7 GB for 20 million. An archive of 4 MB can hold as much."""
 _MAX_MEMBERS = 4096
 """Arrays of an archive, at most: far more than clouds have columns. Chosen by eye; not varied."""
 _MAX_RATIO = 1040

@@ -209,11 +209,11 @@ def _listed_rows(element: PlyElement, body: bytes, first_line: int) -> Columns:
     """Columns of rows with lists, whose lengths stand before their numbers."""
     if element.count * len(element.properties) > len(body):
         raise CloudReadError(f"the PLY header promises {element.count} vertices, but only {len(body)} bytes follow")
-    lines = ((number, words) for number, line in enumerate(BytesIO(body), first_line) if (words := line.split()))
+    lines = ((number, line) for number, line in enumerate(BytesIO(body), first_line) if line.strip())
     values: list[list[list[float]]] = [[] for _ in element.properties]
     n_rows = 0
-    for number, words in islice(lines, element.count):
-        numbers, at = numbers_of_words(words, number), 0
+    for number, line in islice(lines, element.count):
+        numbers, at = numbers_of_words(line.split(), line, number), 0
         for one, rows in zip(element.properties, values, strict=True):
             length = 1
             if one.count_kind:

@@ -567,6 +567,11 @@ READERS = {
             check=_arrays_agree, share=0.2, renames=False,
         ),
         Reader(
+            "npz", _cloud, partial(seeds.array_files, "npz"), by_hand=(hostile.npz_files,), refuses=_CLOUD,
+            check=_arrays_agree,
+        ),
+        Reader("npy", _cloud, partial(seeds.array_files, "npy"), refuses=_CLOUD, check=_arrays_agree),
+        Reader(
             "edge-model", _edge_model, seeds.edge_models, by_hand=(hostile.json_trees,),
             refuses=("ValueError", *_CLOUD),
         ),

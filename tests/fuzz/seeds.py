@@ -416,7 +416,7 @@ BARE_FRAMES = 14
 
 def cloud_files(suffix: str) -> Seeds:
     """Clouds of all codings, by hand and by the package's writers."""
-    from fuzz.cloud_files import CORPUS
+    from fuzz.cloud_files import CORPUS, ORDERS, ply_with_lists
     from pcgraph.io.ply import encode_ply
     from rangesim.point_cloud import PointCloud
     from rangesim.point_cloud.point_cloud_files import save_point_cloud
@@ -430,7 +430,21 @@ def cloud_files(suffix: str) -> Seeds:
     if suffix == "ply":
         columns = {axis: rng.random(20) for axis in "xyz"} | {"labels": np.arange(20, dtype=np.int32)}
         seeds["pcgraph"] = of_file(name, encode_ply(columns))
+        seeds |= {f"lists {code}": of_file(name, ply_with_lists(code)) for code in ORDERS}
     return seeds
+
+
+def array_files(suffix: str) -> Seeds:
+    """Clouds as NumPy's files, with columns and without."""
+    from pcgraph.cloud import Cloud
+    from pcgraph.io import encode_cloud
+
+    rng = np.random.default_rng(4)
+    points = rng.random((3, 4, 3)).astype(np.float32)
+    whole = Cloud(points, np.zeros((3, 4, 3), np.uint8), points, columns={"ring": np.zeros((3, 4), np.uint16)})
+    name = f"cloud.{suffix}"
+    clouds = {"plain": Cloud(rng.random((20, 3))), "whole": whole}
+    return {key: of_file(name, encode_cloud(cloud, name)) for key, cloud in clouds.items()}
 
 
 def mesh_files(suffix: str) -> Seeds:
