@@ -48,8 +48,10 @@ from numpy.typing import NDArray
 
 from pcgraph.cloud import (
     COLOR_NAMES,
+    INFINITY_OF_WINDOWS,
     LABEL_NAMES,
     MAX_HEADER_BYTES,
+    NAN_OF_WINDOWS,
     NORMAL_NAMES,
     PACKED_NAMES,
     Cloud,
@@ -83,12 +85,12 @@ _WHOLE = re.compile(r"[-+]?[0-9]+")
 _COUNT = re.compile(r"[0-9]{1,15}")
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+(,[0-9]+([eE][-+]?[0-9]+)?)?")
 _UNIT = re.compile(r"\s*[\[(][^\])]*[\])]$")
-_NONE = ("NA", "N/A", "n/a", "null", "NULL", "None", "1.#IND", "1.#QNAN", "1.#SNAN")
-"""Spellings of NaN that C's strtod does not know: of R and pandas, databases, Python, and Windows' old C library."""
+_MISSING = ("NA", "N/A", "n/a", "null", "NULL", "None")
+"""Words that stand for NaN in tables of R and pandas, of databases and of Python."""
 _OF_NUMBERS = b"0123456789.+- \t,;\r\n"
 """Bytes of which most rows consist: what is left of a text without them is searched soon."""
-_IS_NONE = re.compile(rf"(?<![^\s,;])[-+]?(?:{'|'.join(map(re.escape, _NONE))})0*(?![^\s,;])")
-_IS_INFINITE = re.compile(r"1\.#INF0*")
+_IS_NAN = re.compile(rf"(?<![^\s,;])[-+]?(?:{'|'.join(_MISSING)}|{NAN_OF_WINDOWS})(?![^\s,;])")
+_IS_INFINITE = re.compile(INFINITY_OF_WINDOWS)
 _SHORT_COLORS = (("r", "g", "b"), ("rf", "gf", "bf"))
 """Names of red, green and blue that CloudCompare writes, as bytes and as floats within 0..1."""
 _NAMES_BEFORE_A_FIELD = {"x", "y", "z", *COLOR_NAMES, *NORMAL_NAMES[1], "intensity"}
@@ -172,8 +174,8 @@ class TextLines:
         encoding = encoding_of(content)
         _refuse_long_lines(content)
         rare = content.translate(None, _OF_NUMBERS)
-        odd = (word.encode().translate(None, _OF_NUMBERS) in rare for word in (*_NONE, "1.#INF"))
-        self._has_odd_numbers = encoding == "utf-16" or any(odd)
+        is_odd = b".#" in content or any(word.encode() in rare for word in (*_MISSING, "an(", "AN("))
+        self._has_odd_numbers = is_odd or encoding == "utf-16"
         self._stream = io.TextIOWrapper(io.BytesIO(content), encoding, errors="replace", newline=None)
 
     def __iter__(self) -> Iterator[str]:
@@ -188,7 +190,7 @@ class TextLines:
     @staticmethod
     def _usual(line: str) -> str:
         """The line with the usual spellings of NaN and infinity."""
-        return _IS_INFINITE.sub("inf", _IS_NONE.sub("nan", line))
+        return _IS_INFINITE.sub("inf", _IS_NAN.sub("nan", line))
 
 
 def _refuse_long_lines(content: bytes) -> None:

@@ -76,7 +76,7 @@ def test_the_same_points_in_many_dialects(dialect: str) -> None:
 
 
 def test_nan_has_many_spellings() -> None:
-    words = ("nan", "NaN", "-nan", "NA", "N/A", "null", "NULL", "None", "1.#IND", "-1.#IND00", "1.#QNAN")
+    words = ("nan", "NaN", "-nan", "NA", "N/A", "null", "NULL", "None", "1.#IND", "-1.#IND00", "1.#QNAN", "-nan(ind)")
     for word in words:
         for row in (f"{word} 1 2\n3 4 5\n", f"3,4,5\n{word},1,2\n", f"9;9;9\n{word};1;2\n"):
             points = read(row).points
