@@ -592,8 +592,12 @@ def numbers_of_words(words: Sequence[bytes], line: bytes, number: int) -> list[f
         raise CloudReadError(f"expected numbers only in the ascii data, got in line {number}: {reason}") from None
 
 
-_NO_NUMBER = re.compile(rb"[-+]?(1\.#(QNAN|SNAN|IND)0*|nan\(\w+\))", re.IGNORECASE)
-_INFINITE = re.compile(rb"([-+]?)1\.#INF0*", re.IGNORECASE)
+NAN_OF_WINDOWS = r"(?i:1\.#(?:QNAN|SNAN|IND)0*|nan\(\w+\))"
+"""Pattern of NaN as the C libraries of Windows write it, without a sign."""
+INFINITY_OF_WINDOWS = r"(?i:1\.#INF0*)"
+"""Pattern of infinity as the C libraries of Windows write it, without a sign."""
+_NO_NUMBER = re.compile(rf"[-+]?{NAN_OF_WINDOWS}".encode())
+_INFINITE = re.compile(rf"([-+]?){INFINITY_OF_WINDOWS}".encode())
 
 
 def _about_commas(line: bytes) -> str:

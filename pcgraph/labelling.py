@@ -61,7 +61,7 @@ def labelled_cloud(cloud: Any, segmentation: Segmentation, levels: Sequence[int]
     ['object', 'part', 'supervoxel', 'level_2']
     """
     check_segmentation(segmentation)
-    cloud = segmented_cloud(cloud, segmentation.supervoxels.shape)
+    cloud = segmented_cloud(cloud, segmentation)
     ours: dict[str, NDArray[np.generic]] = {
         "object": segmentation.labels,
         "part": segmentation.parts,

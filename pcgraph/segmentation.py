@@ -374,6 +374,10 @@ class Segmentation:
         path = Path(path)
         if path.suffix.lower() != ".npz":
             raise CloudWriteError(f"expected the name of a file ending in .npz, got {path.name!r}")
+        write_file(path, self.to_bytes(cloud), CloudWriteError)
+
+    def to_bytes(self, cloud: Any = None) -> bytes:
+        """Bytes of the file that `save` writes."""
         archive = Archive()
         for name in field_names(Segmentation):
             value = getattr(self, name)
@@ -384,9 +388,8 @@ class Segmentation:
                     raise
                 archive.values[name] = class_name(type(value)) + NOT_STORED
         if cloud is not None:
-            archive.flatten(plain_cloud(segmented_cloud(cloud, self.supervoxels.shape)), "cloud")
-        header = {"format": SAVED_FORMAT, "version": SAVED_VERSION}
-        write_file(path, encode_archive(archive, header, SAVED_MARK), CloudWriteError)
+            archive.flatten(plain_cloud(segmented_cloud(cloud, self)), "cloud")
+        return encode_archive(archive, {"format": SAVED_FORMAT, "version": SAVED_VERSION}, SAVED_MARK)
 
     def _in_input_shape(self, values: NDArray[Any], missing: float) -> NDArray[Any]:
         """Values of the points that have a supervoxel, in the input's shape."""
@@ -395,19 +398,13 @@ class Segmentation:
         return full
 
 
-def segmented_cloud(source: Any, shape: tuple[int, ...]) -> Cloud:
-    """The cloud of a segmentation of points of a shape, (n,) or (h, w), from whatever `as_cloud` takes.
-
-    Raises
-    ------
-    ValueError
-        It is no cloud, or has another shape.
-    """
-    cloud = as_cloud(source)
-    if np.shape(cloud.points) != (*shape, 3):
+def segmented_cloud(cloud: Any, segmentation: Segmentation) -> Cloud:
+    """The cloud that was segmented, of anything that `as_cloud` takes; ValueError if it has another shape."""
+    found, shape = as_cloud(cloud), segmentation.supervoxels.shape
+    if np.shape(found.points) != (*shape, 3):
         expected = f"the points that were segmented, of shape {(*shape, 3)}"
-        raise ValueError(f"expected {expected}, got {np.shape(cloud.points)}; give the cloud of this segmentation")
-    return cloud
+        raise ValueError(f"expected {expected}, got {np.shape(found.points)}; give the cloud of this segmentation")
+    return found
 
 
 def check_segmentation(given: object) -> None:

@@ -10,10 +10,14 @@ from pathlib import Path
 
 from pcgraph.cloud import Cloud, plain_cloud
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
+from pcgraph.io.driving_sweeps import KITTI, NUSCENES, SWEEP
 from pcgraph.io.format import CloudFile, Format
 from pcgraph.io.npz import NPY, NPZ
+from pcgraph.io.ouster import OUSTER
 from pcgraph.io.pcd import PCD
 from pcgraph.io.ply import PLY
+from pcgraph.io.ptx import PTX
+from pcgraph.io.text import PTS, TEXT, XYZN, XYZRGB
 from pcgraph.plumbing.plain_files import read_file, write_file
 
 __all__ = ["decode_cloud", "encode_cloud", "read_cloud", "write_cloud"]
@@ -21,7 +25,11 @@ __all__ = ["decode_cloud", "encode_cloud", "read_cloud", "write_cloud"]
 MAX_REASON = 300
 """Characters of a message about a damaged file, count: such files can make messages of any length. Chosen by eye; not
 varied."""
-FORMATS: tuple[Format, ...] = (PCD, PLY, NPZ, NPY)
+FORMATS: tuple[Format, ...] = (
+    *(PCD, PLY, NPZ, NPY),
+    *(TEXT, PTS, PTX, XYZN, XYZRGB),
+    *(KITTI, NUSCENES, SWEEP, OUSTER),
+)
 _WRITABLE = tuple(one for one in FORMATS if one.encode is not None)
 
 
@@ -33,8 +41,10 @@ def read_cloud(
     Parameters
     ----------
     path : str or path
-        ``.pcd`` (ascii, binary, binary_compressed), ``.ply`` (ascii, binary of either byte order; the vertices of a
-        mesh), ``.npz`` or ``.npy``.
+        ``.pcd`` (ascii, binary, binary_compressed); ``.ply`` (ascii, binary of either byte order; the vertices of a
+        mesh); ``.npz`` or ``.npy``; text: ``.xyz``, ``.txt``, ``.csv``, ``.asc``, ``.pts``, ``.ptx``, ``.xyzn``,
+        ``.xyzrgb`` (`pcgraph.io.text` says what is understood); sweeps of KITTI (``.bin``) and nuScenes
+        (``.pcd.bin``); ``.pcap`` of an Ouster LiDAR, with the sensor's metadata in a ``.json`` of that name beside it.
     file_format : str, optional
         Name of the format, such as "ply". Default: by the end of the file's name.
     columns : names, optional
@@ -90,6 +100,9 @@ def write_cloud(path: str | PathLike[str], cloud: Cloud, file_format: str | None
     | ``.pcd`` | half floats and truth values become float32 and uint8 |
     | ``.ply`` | rows and columns of an image, points that are not finite, the viewpoint of all points; integers of 64 bits become doubles, vectors the columns ``name_0``, ``name_1``; and as in PCD |
     | ``.npy`` | the viewpoint of all points |
+    | ``.xyz``, ``.txt``, ``.csv``, ``.asc`` | rows and columns of an image, points that are not finite, the viewpoint of all points; widths of types, see `pcgraph.io.text`; vectors become the columns ``name_0``, ``name_1`` |
+    | ``.pts`` | the same; other columns than colours and ``intensity`` are refused |
+    | ``.bin``, ``.pcd.bin`` | rows and columns of an image, points that are not finite, the viewpoint of all points; other columns than ``intensity`` (and ``ring``), and numbers that are not float32, are refused |
     | ``.npz`` | nothing |
 
     Colours are kept in 8 bits and labels in 32. Blanks in names of columns become underscores in PCD and PLY. A
@@ -132,6 +145,17 @@ def check_writable(name: str) -> None:
     _format(name, None, _WRITABLE, CloudWriteError)
 
 
+def holds_columns(suffix: str) -> bool:
+    """Whether `write_cloud` can write a file that ends so, with columns of any name."""
+    return any(suffix.lower() in one.suffixes and one.holds_columns for one in _WRITABLE)
+
+
+def without_suffix(name: str) -> str:
+    """The name of a file without the end that tells its format, or without its extension."""
+    end = max((suffix for suffix in _suffixes(FORMATS) if name.lower().endswith(suffix)), key=len, default="")
+    return name[: -len(end)] if end else Path(name).stem
+
+
 def _read(chosen: Format, file: CloudFile, name: str) -> Cloud:
     try:
         return chosen.read(file)
@@ -160,7 +184,7 @@ def _format(
             known = ", ".join(one.name for one in formats)
             raise error(f"expected file_format as one of {known}, got {ascii(file_format)[:80]}")
         own = [suffix for suffix, one in ends.items() if one is named[0]]
-        return named[0], max(own, key=len) if own else named[0].suffixes[0]
+        return named[0], max(own or named[0].suffixes[:1], key=len, default="")
     if not ends:
         hint = "convert it first" if error is CloudReadError else "choose another name"
         raise error(f"expected a file ending in {_either(_suffixes(formats))}, got {name!r}: {hint}")

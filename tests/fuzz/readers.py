@@ -551,6 +551,21 @@ READERS = {
             )
             for suffix in ("ply", "pcd")
         ),
+        *(
+            Reader(
+                f"cloud-{suffix}", _cloud, partial(seeds.text_clouds, suffix), refuses=_CLOUD, check=_arrays_agree,
+                share=0.5, renames=False,
+            )
+            for suffix in ("csv", "pts", "ptx")
+        ),
+        Reader(
+            "cloud-nuscenes", _cloud, seeds.nuscenes_sweeps, refuses=_CLOUD, check=_arrays_agree, share=0.2,
+            renames=False,
+        ),
+        Reader(
+            "cloud-ouster", _cloud, seeds.lidar_recordings, ("*.pcap", "*.json"), (_sidecar_trees,), refuses=_CLOUD,
+            check=_arrays_agree, share=0.2, renames=False,
+        ),
         Reader(
             "npz", _cloud, partial(seeds.array_files, "npz"), by_hand=(hostile.npz_files,), refuses=_CLOUD,
             check=_arrays_agree,

@@ -358,7 +358,8 @@ def test_results_go_with_points_of_any_dtype_that_is_segmented(tmp_path, dtype):
 
 def test_results_come_back(tmp_path, boxes):
     points, _, result = boxes
-    for name in ("a.ply", "a.pcd", "a.npz", "a.npy"):
+    names = ["a.csv", "a.npy", "a.npz", "a.pcd", "a.ply"]
+    for name in names:
         pcgraph.write_segmentation(tmp_path / name, points, result, levels=[2, 9])
         read = pcgraph.read_cloud(tmp_path / name)
         assert np.array_equal(read.points, points)
@@ -369,13 +370,13 @@ def test_results_come_back(tmp_path, boxes):
         assert np.array_equal(read.columns["supervoxel"], result.supervoxels)
         assert np.array_equal(read.columns["level_9"], result.cut(9))
         assert read.colors is read.labels is None
-    with pytest.raises(pcgraph.CloudWriteError, match=r"ending in .*\.ply.*, got 'a\.txt'"):
-        pcgraph.write_segmentation(tmp_path / "a.txt", points, result)
+    with pytest.raises(pcgraph.CloudWriteError, match=r"ending in .*\.ply.*, got 'a\.doc'"):
+        pcgraph.write_segmentation(tmp_path / "a.doc", points, result)
     with pytest.raises(pcgraph.CloudWriteError, match="cannot write"):
         pcgraph.write_segmentation(tmp_path / "no" / "a.ply", points, result)
     with pytest.raises(ValueError, match="expected a whole number n"):
         pcgraph.write_segmentation(tmp_path / "b.ply", points, result, levels=[0])
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npy", "a.npz", "a.pcd", "a.ply"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
 
 
 def test_colours_of_objects_stand_before_the_clouds_own_if_asked_for(boxes):
