@@ -392,23 +392,14 @@ def columns_of_cloud(
     clash = [name for name in further if name in (*axes, "_")]
     if clash:
         raise CloudWriteError(f"expected a column of another name than {clash[0]!r}, which files keep for themselves")
-    per_point = cloud.viewpoint is not None and cloud.viewpoint.ndim > 1
-    no_names: Sequence[tuple[str, ...]] = [()]
-    for names in product(
-        no_names if cloud.colors is None else colors,
-        no_names if cloud.normals is None else normals,
-        no_names if cloud.labels is None else [(name,) for name in LABEL_NAMES],
-        [VIEWPOINT_NAMES] if per_point else no_names,
-    ):
-        chosen = Roles(*names)
-        own = {
-            **_named(chosen.colors, cloud.colors),
-            **_named(chosen.normals, cloud.normals),
-            **_named(chosen.labels, cloud.labels),
-            **_named(chosen.viewpoint, cloud.viewpoint),
-        }
+    places = cloud.viewpoint if cloud.viewpoint is not None and cloud.viewpoint.ndim > 1 else None
+    given = (cloud.colors, cloud.normals, cloud.labels, places)
+    choices: list[Sequence[tuple[str, ...]]] = [colors, normals, [(name,) for name in LABEL_NAMES], [VIEWPOINT_NAMES]]
+    choices = [[()] if values is None else of for values, of in zip(given, choices, strict=True)]
+    for names in product(*choices):
+        own = dict(chain.from_iterable(_named(role, values) for role, values in zip(names, given, strict=True)))
         columns = {**axes, **own, **further}
-        if len(columns) == len(axes) + len(own) + len(further) and _is_found(chosen, columns):
+        if len(columns) == len(axes) + len(own) + len(further) and _is_found(names, columns):
             return columns
     raise CloudWriteError(
         f"expected columns of other names than the cloud's own colours, normals and labels have, "
@@ -416,17 +407,17 @@ def columns_of_cloud(
     )
 
 
-def _named(names: tuple[str, ...], values: NDArray[np.generic] | None) -> Columns:
-    """The values under their names; three bytes under one name are packed as PCL packs colours."""
+def _named(names: tuple[str, ...], values: NDArray[np.generic] | None) -> Iterable[tuple[str, NDArray[np.generic]]]:
+    """The values with their names; three bytes under one name are packed as PCL packs colours."""
     if not names or values is None:
-        return {}
+        return ()
     if names[0] in PACKED_NAMES:
         rows = values.reshape(-1, 3).astype(np.uint32)
-        return {names[0]: rows[:, 0] << 16 | rows[:, 1] << 8 | rows[:, 2]}
-    return dict(zip(names, values.reshape(-1, len(names)).T, strict=True))
+        return ((names[0], rows[:, 0] << 16 | rows[:, 1] << 8 | rows[:, 2]),)
+    return zip(names, values.reshape(-1, len(names)).T, strict=True)
 
 
-def _is_found(chosen: Roles, columns: Columns) -> bool:
+def _is_found(chosen: Iterable[tuple[str, ...]], columns: Columns) -> bool:
     """Whether `cloud_from_columns` finds these roles; what a cloud has not may be found, too, among its columns."""
     lower = _names_by_lower_case(columns)
     found = Roles.of({name: columns[stored] for name, stored in lower.items() if columns[stored].ndim == 1})

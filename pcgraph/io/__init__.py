@@ -105,7 +105,8 @@ def write_cloud(path: str | PathLike[str], cloud: Cloud, file_format: str | None
     | ``.bin``, ``.pcd.bin`` | rows and columns of an image, points that are not finite, the viewpoint of all points; other columns than ``intensity`` (and ``ring``), and numbers that are not float32, are refused |
     | ``.npz`` | nothing |
 
-    Colours are kept in 8 bits and labels in 32. Blanks in names of columns become underscores in PCD and PLY. A
+    Colours are kept in 8 bits and labels in 32, under the names that most programs know: ``red``, ``nx``, ``label``, in
+    PCD ``rgb`` and ``normal_x``. Blanks in names of columns become underscores in PCD and PLY. A
     viewpoint of (0, 0, 0) in a PCD file counts as none.
 
     Parameters

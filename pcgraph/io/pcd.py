@@ -73,7 +73,7 @@ def read_pcd(content: bytes) -> Cloud:
     """Cloud of a PCD file, given the file's bytes, with organisation, NaN, colours, normals and labels.
 
     What older versions leave out is taken as PCL takes it: ``COLUMNS`` are FIELDS, numbers without SIZE and TYPE are
-    float32, and a cloud without HEIGHT is a list.
+    float32, and a cloud without HEIGHT is a list. The orientation in VIEWPOINT and the alpha of ``rgba`` are not read.
 
     Raises
     ------
