@@ -107,7 +107,8 @@ def write_cloud(path: str | PathLike[str], cloud: Cloud, file_format: str | None
 
     Colours are kept in 8 bits and labels in 32, under the names that most programs know: ``red``, ``nx``, ``label``, in
     PCD ``rgb`` and ``normal_x``. Blanks in names of columns become underscores in PCD and PLY. A
-    viewpoint of (0, 0, 0) in a PCD file counts as none.
+    viewpoint of (0, 0, 0) in a PCD file counts as none. PCL and the older of Open3D's two readers take only float32
+    points from PCD files; they read doubles from PLY files.
 
     Parameters
     ----------
