@@ -332,7 +332,7 @@ def test_open3d_files_are_read_and_ours_read_back(tmp_path):
         assert np.unique(read.colors).tolist() == [51]
     colors, object_of = np.random.default_rng(1).integers(0, 256, (50, 3), np.uint8), np.arange(50, dtype=np.int32)
     for dtype, suffix in (("f4", "ply"), ("f8", "ply"), ("f4", "pcd"), ("f8", "pcd")):
-        ours = pcgraph.Cloud(points.astype(dtype), colors, points.astype("f4"), columns={"object": object_of})
+        ours = pcgraph.Cloud(points.astype(dtype), colors, points.astype(dtype), columns={"object": object_of})
         path = str(tmp_path / f"ours.{suffix}")
         pcgraph.write_cloud(path, ours)
         read = pcgraph.as_cloud(o3d.t.io.read_point_cloud(path))
