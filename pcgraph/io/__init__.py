@@ -10,7 +10,9 @@ from pathlib import Path
 
 from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudReadError
+from pcgraph.io.e57 import E57
 from pcgraph.io.format import CloudFile, Format
+from pcgraph.io.las import LAS
 from pcgraph.io.pcd import PCD
 from pcgraph.io.ply import PLY
 from pcgraph.io.segmentation_files import write_segmentation
@@ -21,7 +23,7 @@ __all__ = ["read_cloud", "write_segmentation"]
 MAX_REASON = 300
 """Characters of a message about a damaged file, count: such files can make messages of any length. Chosen by eye; not
 varied."""
-FORMATS: tuple[Format, ...] = (PCD, PLY)
+FORMATS: tuple[Format, ...] = (PCD, PLY, LAS, E57)
 
 
 def read_cloud(
