@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from pcgraph.graph.continuations import Continuations as Continuations
     from pcgraph.graph.occlusion import Occlusions as Occlusions
     from pcgraph.io import read_cloud as read_cloud
+    from pcgraph.io import sample_surface as sample_surface
     from pcgraph.io import write_segmentation as write_segmentation
     from pcgraph.plausibility import CloudWarning as CloudWarning
     from pcgraph.scan import segment as segment
@@ -77,7 +78,7 @@ else:
             "graph.boundary": ["BoundaryCost", "BoundaryStrength"],
             "graph.continuations": ["Continuations"],
             "graph.occlusion": ["Occlusions"],
-            "io": ["read_cloud", "write_segmentation"],
+            "io": ["read_cloud", "sample_surface", "write_segmentation"],
             "plausibility": ["CloudWarning"],
             "scan": ["segment"],
             "segmentation": ["Segmentation"],

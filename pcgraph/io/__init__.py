@@ -13,17 +13,18 @@ from pcgraph.errors import CloudReadError
 from pcgraph.io.e57 import E57
 from pcgraph.io.format import CloudFile, Format
 from pcgraph.io.las import LAS
+from pcgraph.io.mesh import GLTF, OBJ, OFF, STL, sample_surface
 from pcgraph.io.pcd import PCD
 from pcgraph.io.ply import PLY
 from pcgraph.io.segmentation_files import write_segmentation
 from pcgraph.plumbing.plain_files import read_file
 
-__all__ = ["read_cloud", "write_segmentation"]
+__all__ = ["read_cloud", "sample_surface", "write_segmentation"]
 
 MAX_REASON = 300
 """Characters of a message about a damaged file, count: such files can make messages of any length. Chosen by eye; not
 varied."""
-FORMATS: tuple[Format, ...] = (PCD, PLY, LAS, E57)
+FORMATS: tuple[Format, ...] = (PCD, PLY, LAS, E57, OBJ, STL, OFF, GLTF)
 
 
 def read_cloud(

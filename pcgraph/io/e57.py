@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""E57 files (ASTM E2807), of terrestrial laser scanners, through libE57Format, which pye57 brings: the extra ``e57``."""
+"""E57 files (ASTM E2807), of terrestrial laser scanners.
+
+Reading and writing are done by libE57Format, which pye57 brings: the extra ``e57``.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +47,8 @@ _NORMAL_FIELDS = ("nor:normalX", "nor:normalY", "nor:normalZ")
 _DESCRIPTION = f"{_OWN}:columns"
 _SCAN = "scan"
 _BUFFERS = {"i1": np.int8, "u1": np.uint8, "i2": np.int16, "u2": np.uint16, "f4": np.float32, "f8": np.float64}
-"""Types of the arrays that the library fills; all other whole numbers go through 64 bits."""
+"""Types of arrays that the library fills. All other whole numbers go through `numpy.longlong`: pye57 does not take
+int32, and it takes NumPy's own int64, which is a C long, for 32 bits."""
 _INTEGERS = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8")
 _MAX_INTEGER = (1 << 63) - 1
 _MAX_SCANS = 1 << 16
@@ -127,11 +131,11 @@ def _scan(library: ModuleType, image: Any, node: Any, max_bits: int) -> _Scan:
     invalid = fields.pop("cartesianInvalidState" if system is _CARTESIAN else "sphericalInvalidState", None)
     if invalid is not None and invalid.any():
         fields = {name: values[invalid == 0] for name, values in fields.items()}
-    points = np.stack([fields.pop(name) for name in system], axis=1)
+    points = _floats(fields, system)
     colors = _colors(library, node, elements, fields)
     rotation, place = _pose(node)
     if all(name in fields for name in _NORMAL_FIELDS):
-        normals = np.stack([fields.pop(name) for name in _NORMAL_FIELDS], axis=1)
+        normals = _floats(fields, _NORMAL_FIELDS)
         fields |= dict(zip(NORMALS, _moved(normals, rotation, None).T, strict=True))
     fields = {_column_name(name, fields): values for name, values in fields.items()}
     points = _moved(points if system is _CARTESIAN else _cartesian(points), rotation, place)
@@ -170,6 +174,12 @@ def _bits(library: ModuleType, element: Any) -> int:
     if isinstance(element, library.FloatNode):
         return 32 if element.precision() == library.E57_SINGLE else 64
     return ceil(log2(max(1, element.maximum() - element.minimum() + 1)))
+
+
+def _floats(fields: Arrays, names: tuple[str, ...]) -> NDArray[np.floating]:
+    """Fields side by side, (n, c), taken out."""
+    values = np.stack([fields.pop(name) for name in names], axis=1)
+    return values.astype(np.result_type(values, np.float32), copy=False)
 
 
 def _colors(library: ModuleType, node: Any, elements: dict[str, Any], fields: Arrays) -> NDArray[np.uint8] | None:
@@ -237,7 +247,7 @@ def _moved(
 
 
 def _cartesian(spherical: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Points (n, 3) of ranges, azimuths and elevations: in metres and radians, the azimuth from x, elevation from xy."""
+    """Points (n, 3) of ranges in metres, azimuths from x and elevations from the xy plane in radians."""
     ranges, azimuth, elevation = spherical.astype(np.float64).T
     flat = ranges * np.cos(elevation)
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)], axis=1)
@@ -367,10 +377,11 @@ def _write(
         limits = {"intensityMinimum": number(known.min()), "intensityMaximum": number(known.max())}
         scan.set("intensityLimits", structure(**limits))
     prototype, buffers = structure(), library.VectorSourceDestBuffer()
-    arrays = []  # which the buffers point into
+    arrays: list[NDArray[np.generic]] = []  # which the buffers point into
     for name, values in stored.items():
         prototype.set(name, _element(library, image, values.dtype))
-        arrays.append(np.array(values, _BUFFERS.get(values.dtype.str[1:], np.longlong)))
+        arrays.append(np.empty(len(values), _BUFFERS.get(values.dtype.str[1:], np.longlong)))
+        arrays[-1][:] = values
         buffers.append(library.SourceDestBuffer(image, name, arrays[-1], len(values), True, True))
     points = library.CompressedVectorNode(image, prototype, library.VectorNode(image, True))
     scan.set("points", points)
@@ -384,7 +395,7 @@ def _element(library: ModuleType, image: Any, kind: np.dtype[np.generic]) -> Any
     """Field of a type; limits of whole numbers are those of the type, so that it comes back."""
     if kind.kind == "f":
         return library.FloatNode(image, 0.0, library.E57_SINGLE if kind.itemsize == 4 else library.E57_DOUBLE)
-    limits = np.iinfo(kind)
+    limits = np.iinfo(kind.name)
     return library.IntegerNode(image, 0, int(limits.min), min(int(limits.max), _MAX_INTEGER))
 
 

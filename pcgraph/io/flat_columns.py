@@ -23,7 +23,8 @@ Arrays = dict[str, NDArray[np.generic]]
 NORMALS = ("NormalX", "NormalY", "NormalZ")
 """Fields of normals, under the names that CloudCompare gives them in LAS files."""
 LABEL = "label"
-_VIEWPOINTS = ("ViewpointX", "ViewpointY", "ViewpointZ")
+_VIEWPOINTS = ("vp_x", "vp_y", "vp_z")
+"""Fields of viewpoints, one for each point, as in PCL's PointWithViewpoint."""
 _STORED = {"b1": "u1", "f2": "f4", "f16": "f8"}
 """Types that no such format has, and those that are stored in their place. All but the last hold the same numbers."""
 

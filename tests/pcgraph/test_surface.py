@@ -64,6 +64,7 @@ def test_public_names():
         "metrics",
         "plane_energy",
         "read_cloud",
+        "sample_surface",
         "segment",
         "update",
         "variance_energy",
