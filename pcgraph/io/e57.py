@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.cloud import Cloud
-from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
+from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, library_reason
 from pcgraph.io.flat_columns import NORMALS, Arrays, described, flatten, listed_points, unflatten
 from pcgraph.io.format import CloudFile, Format
 
@@ -53,7 +53,9 @@ _INTEGERS = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8")
 _MAX_INTEGER = (1 << 63) - 1
 _MAX_SCANS = 1 << 16
 """Scans of a file, at most: the column ``scan`` has 16 bits."""
-_PAGE = struct.Struct("<8sIIQQQQ")
+_PAGE_BYTES = 1024
+"""Bytes of a page; the standard has no others. The last 4 are its checksum."""
+_HEADER = struct.Struct("<8sIIQQQQ")
 """Header: signature, version, length of the file, place and length of its XML, size of a page."""
 
 
@@ -88,7 +90,7 @@ def read_e57(file: CloudFile) -> Cloud:
             finally:
                 image.close()
         except library.E57Exception as error:
-            raise CloudReadError(f"the E57 file is damaged: {_reason(error)}") from None
+            raise CloudReadError(f"the E57 file is damaged: {library_reason(error)}") from None
         except MemoryError:
             raise CloudReadError("the points do not fit into memory") from None
     return _joined(scans)
@@ -105,11 +107,13 @@ class _Scan:
 
 def _check_xml(content: bytes) -> None:
     """Raise CloudReadError if there is no header, or if the XML has definitions of its own, which could fill memory."""
-    if len(content) < _PAGE.size or not content.startswith(b"ASTM-E57"):
+    if len(content) < _HEADER.size or not content.startswith(b"ASTM-E57"):
         raise CloudReadError("expected an E57 header that begins with 'ASTM-E57', but found none")
-    _, _, _, length, start, _, page = _PAGE.unpack_from(content)
-    if not (48 < page <= 1 << 20 and start < len(content)) or length != len(content):
+    _, _, _, length, start, _, page = _HEADER.unpack_from(content)
+    if length != len(content):
         raise CloudReadError(f"the E57 header promises {length} bytes, but the file has {len(content)}")
+    if page != _PAGE_BYTES or start >= length:
+        raise CloudReadError(f"expected pages of {_PAGE_BYTES} bytes and XML in the file, got {page}, XML at {start}")
     pages = range(start - start % page, len(content), page)
     text = b"".join(content[max(first, start) : first + page - 4] for first in pages)  # without checksums
     if b"<!DOCTYPE" in text:
@@ -315,7 +319,7 @@ def encode_e57(cloud: Cloud, suffix: str) -> bytes:
             finally:
                 image.close()
         except library.E57Exception as error:
-            raise CloudWriteError(f"the E57 library cannot write this cloud: {_reason(error)}") from None
+            raise CloudWriteError(f"the E57 library cannot write this cloud: {library_reason(error)}") from None
         return path.read_bytes()
 
 
@@ -421,11 +425,6 @@ def _named(file: CloudFile) -> Iterator[Path]:
         path = Path(folder) / "cloud.e57"
         path.write_bytes(file.content)
         yield path
-
-
-def _reason(error: BaseException) -> str:
-    """The first line of what the library said; places in its source follow."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 E57 = Format("e57", (".e57",), read_e57, encode_e57)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.cloud import COLOR_NAMES, Cloud
-from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
+from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, library_reason
 from pcgraph.io.flat_columns import Arrays, described, flatten, listed_points, unflatten
 from pcgraph.io.format import Format
 
@@ -31,11 +31,14 @@ _VLR_BYTES = 54
 """Bytes of a variable length record without its data."""
 _PIECE = 1 << 20
 """Points that are unpacked at a time: memory grows with what the file really holds. Chosen by eye; not varied."""
+_LAYERED = b"\x03\x00"
+"""Compressor of LAZ for the point formats from 6 on."""
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+"""Layers of each item of a compressed point: its base, colours, colours with infrared, wave packets. Extra bytes, item
+14, have one layer for each byte."""
 _MAX_OF_8_BITS = 255
 _WHITE_RATIO = 257
 """White in 16 bits over white in 8 bits: 65535 / 255."""
-_MAX_REASON = 200
-"""Characters of what a library says about a file, at most. Chosen by eye; not varied."""
 _DESCRIPTION = ("pcgraph", 1)
 """User and number of the variable length record with the description of the columns."""
 _MAX_VLR_BYTES = 65535
@@ -84,16 +87,23 @@ def read_las(content: bytes) -> Cloud:
     _check_length(content)
     laspy = _laspy(CloudReadError, "reading", compressed=bool(content[104] & 0xC0))
     try:
-        with laspy.open(BytesIO(content), read_evlrs=False) as reader:
+        with np.errstate(over="ignore", invalid="ignore"), laspy.open(BytesIO(content), read_evlrs=False) as reader:
+            if reader.header.are_points_compressed and reader.header.point_count:
+                is_coarse = _largest_chunk(content, reader.header) > _PIECE
+                reader.laz_backend = laspy.LazBackend.Lazrs if is_coarse else laspy.LazBackend.LazrsParallel
             records = reader.header.vlrs.get_by_id(_DESCRIPTION[0], (_DESCRIPTION[1],))
             description = records[0].record_data_bytes() if records else None
             empty = laspy.ScaleAwarePointRecord.zeros(0, header=reader.header)
             pieces = [_arrays(piece) for piece in (empty, *reader.chunk_iterator(_PIECE))]
             n_points, standard = reader.header.point_count, set(reader.header.point_format.standard_dimension_names)
+    except CloudReadError:
+        raise
     except MemoryError:
         raise CloudReadError("the points do not fit into memory") from None
-    except Exception as error:  # noqa: BLE001 - of damaged files, laspy and lazrs raise whatever their parts raise
-        raise CloudReadError(f"the LAS file is damaged: {reason(error)}") from None
+    except BaseException as error:  # of damaged files, laspy raises whatever its parts raise, lazrs a panic of Rust
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        raise CloudReadError(f"the LAS file is damaged: {library_reason(error)}") from None
     points = np.concatenate([piece.pop("xyz") for piece in pieces])
     if len(points) != n_points:
         raise CloudReadError(f"the LAS header promises {n_points} points, but {len(points)} follow")
@@ -122,6 +132,41 @@ def _check_length(content: bytes) -> None:
         raise CloudReadError(
             f"the LAS header promises {n_points} points ({needed} bytes), but only {available} bytes follow"
         )
+
+
+def _largest_chunk(content: bytes, header: laspy.LasHeader) -> int:
+    """Points in the largest chunk of a LAZ file, whose parallel reader has room for all of them.
+
+    Raises CloudReadError if the file promises chunks longer than itself, or layers longer than their chunk: lazrs takes
+    memory for what is promised, and ends the process if there is none. Source: the LASzip specification. Chunks of the
+    point formats from 6 on hold the first point, the count of points, the lengths of the layers and the layers.
+    """
+    import lazrs
+
+    packing, start = header.vlrs[header.vlrs.index("LasZipVlr")].record_data, header.offset_to_point_data
+    kinds = struct.unpack_from(f"<{3 * struct.unpack_from('<H', packing, 32)[0]}H", packing, 34)
+    items = list(zip(kinds[::3], kinds[1::3], strict=True))
+    size = sum(n_bytes for _, n_bytes in items)
+    if size != header.point_format.size:
+        raise CloudReadError(f"expected compressed points of {header.point_format.size} bytes, got {size}")
+    (table,) = struct.unpack_from("<q", content, start)
+    if table < 0:  # the writer could not go back: the place is at the end of the file
+        (table,) = struct.unpack_from("<q", content, len(content) - 8)
+    _, n_chunks = struct.unpack_from("<2I", content, table)
+    if n_chunks * size > len(content):
+        raise CloudReadError(f"the LAZ file promises {n_chunks} chunks, but it is only {len(content)} bytes long")
+    source = BytesIO(content)
+    source.seek(start)
+    n_layers = sum(_LAYERS.get(kind, n_bytes) for kind, n_bytes in items) if packing[:2] == _LAYERED else 0
+    at, largest = start + 8, 0  # after the place of the table
+    for n_points, n_bytes in lazrs.read_chunk_table(source, lazrs.LazVlr(packing)):
+        if at + n_bytes > len(content):
+            raise CloudReadError(f"the LAZ file promises a chunk of {n_bytes} bytes, but {len(content) - at} follow")
+        lengths = struct.unpack_from(f"<{n_layers}I", content, at + size + 4)
+        if sum(lengths) > n_bytes:
+            raise CloudReadError(f"the LAZ file promises layers of {sum(lengths)} bytes in a chunk of {n_bytes}")
+        at, largest = at + n_bytes, max(largest, n_points)
+    return largest
 
 
 def _arrays(points: laspy.ScaleAwarePointRecord) -> Arrays:
@@ -154,11 +199,6 @@ def _laspy(error: type[PcgraphError], what: str, compressed: bool) -> ModuleType
         raise error(f"{what} {name} needs {needed}: pip install rangesim[las]") from None
     logging.getLogger("laspy").addHandler(logging.NullHandler())  # else its errors are printed beside our sentence
     return laspy
-
-
-def reason(error: BaseException) -> str:
-    """What a library said about a file, in one line."""
-    return " ".join(str(error).split())[:_MAX_REASON] or type(error).__name__
 
 
 # ---- Writing -------------------------------------------------------------------------------------------------------
@@ -232,7 +272,7 @@ def _fits(column: NDArray[np.generic], dimension: Any) -> bool:
         return False
     if dimension.kind.name != "BitField":
         return bool(column.dtype == dimension.dtype)
-    return column.dtype == np.uint8 and int(column.max(initial=0)) <= dimension.max
+    return bool(column.dtype == np.uint8 and int(column.max(initial=0)) <= dimension.max)
 
 
 def _safe_name(name: str, room: int) -> str:

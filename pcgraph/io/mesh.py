@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.cloud import Cloud
-from pcgraph.errors import CloudReadError
+from pcgraph.errors import CloudReadError, library_reason
 from pcgraph.io.format import CloudFile, Format
 from pcgraph.plumbing.plain_files import read_file
 
@@ -32,8 +32,6 @@ _FEW_VERTICES = 1000
 _MAX_ZEROS_PER_BYTE = 10
 """Elements of glTF accessors without data, which are zeros, per byte of the file, at most: sparse shapes of animated
 faces have less than one. Chosen by eye; not varied."""
-_MAX_REASON = 200
-"""Characters of what trimesh says about a file, at most. Chosen by eye; not varied."""
 _PLASTIC = 1.32471795724474602596
 """The plastic number, the root of x**3 = x + 1: multiples of its inverse powers fill a square evenly."""
 
@@ -189,8 +187,7 @@ def _parts(file: CloudFile, kind: str) -> list[_Part]:
     except MemoryError:
         raise CloudReadError("the mesh does not fit into memory") from None
     except Exception as error:  # noqa: BLE001 - of damaged files, trimesh raises whatever its parts raise
-        reason = " ".join(str(error).split())[:_MAX_REASON]
-        raise CloudReadError(f"the mesh file is damaged: {type(error).__name__}: {reason}") from None
+        raise CloudReadError(f"the mesh file is damaged: {library_reason(error)}") from None
     parts = [part for part in parts if len(part.points)]
     if not parts:
         raise CloudReadError("expected a mesh with vertices, but the file has none")
