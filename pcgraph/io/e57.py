@@ -89,10 +89,12 @@ def read_e57(file: CloudFile) -> Cloud:
                 scans = [_scan(library, image, node, 8 * len(file.content)) for node in nodes]
             finally:
                 image.close()
-        except library.E57Exception as error:
-            raise CloudReadError(f"the E57 file is damaged: {library_reason(error)}") from None
+        except CloudReadError:
+            raise
         except MemoryError:
             raise CloudReadError("the points do not fit into memory") from None
+        except Exception as error:  # noqa: BLE001 - E57Exception, and what nodes of unexpected types cause
+            raise CloudReadError(f"the E57 file is damaged: {library_reason(error)}") from None
     return _joined(scans)
 
 
@@ -126,7 +128,7 @@ def _scan(library: ModuleType, image: Any, node: Any, max_bits: int) -> _Scan:
     names = [prototype.get(i).elementName() for i in range(prototype.childCount())]
     elements = {name: prototype[name] for name in names if not isinstance(prototype[name], library.StringNode)}
     count = int(stored.childCount())
-    if count * max(1, sum(_bits(library, element) for element in elements.values())) > max_bits:
+    if not 0 <= count * max(1, sum(_bits(library, element) for element in elements.values())) <= max_bits:
         raise CloudReadError(f"the E57 file promises {count} points, but it is only {max_bits // 8} bytes long")
     fields = _read_fields(library, image, stored, elements, count)
     system = next((s for s in (_CARTESIAN, _SPHERICAL) if all(name in fields for name in s)), None)

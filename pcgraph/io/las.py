@@ -126,8 +126,9 @@ def _check_length(content: bytes) -> None:
         n_points = struct.unpack_from("<Q", content, 247)[0]
     if n_records * _VLR_BYTES > len(content):
         raise CloudReadError(f"the LAS header promises {n_records} records, but the file has {len(content)} bytes")
-    available = max(0, len(content) - start)
-    needed = n_points * size
+    available, needed = len(content) - start, n_points * size
+    if available < 0:
+        raise CloudReadError(f"the LAS header promises points from byte {start} on, but the file has {len(content)}")
     if not point_format & 0xC0 and available < needed:
         raise CloudReadError(
             f"the LAS header promises {n_points} points ({needed} bytes), but only {available} bytes follow"
