@@ -145,7 +145,8 @@ def _scan(library: ModuleType, image: Any, node: Any, max_bits: int) -> _Scan:
         fields |= dict(zip(NORMALS, _moved(normals, rotation, None).T, strict=True))
     fields = {_column_name(name, fields): values for name, values in fields.items()}
     points = _moved(points if system is _CARTESIAN else _cartesian(points), rotation, place)
-    text = node[_DESCRIPTION].value().encode() if node.isDefined(_DESCRIPTION) else None
+    is_own = _OWN in (image.extensionsPrefix(i) for i in range(image.extensionsCount()))
+    text = node[_DESCRIPTION].value().encode() if is_own and node.isDefined(_DESCRIPTION) else None
     return _Scan(points, colors, fields, described(text), place)
 
 

@@ -232,7 +232,8 @@ def encode_las(cloud: Cloud, suffix: str) -> bytes:
     header.creation_date = None  # the same cloud gives the same bytes
     standard = {dimension.name: dimension for dimension in header.point_format.dimensions}
     taken = {*laspy.PointFormat(8).dimension_names, "x", "y", "z", "xyz"}
-    kept = [name for name, column in cloud.columns.items() if name in standard and _fits(column, standard[name])]
+    scalars = {name: column for name, column in cloud.columns.items() if column.ndim == cloud.points.ndim - 1}
+    kept = [name for name, column in scalars.items() if name in standard and _fits(column, standard[name])]
     fields, description = flatten(cloud, kept, taken, _safe_name)
     extra = [name for name in fields if name not in kept]
     if len(extra) > _MAX_EXTRA_FIELDS or len(description) > _MAX_VLR_BYTES:

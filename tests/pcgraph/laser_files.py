@@ -3,7 +3,12 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+from pathlib import Path
+
 import numpy as np
+import pytest
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -54,7 +59,7 @@ def mixed_cloud(n: int = 50, seed: int = 0) -> Cloud:
     rng = np.random.default_rng(seed)
     normals = rng.normal(size=(n, 3))
     return Cloud(
-        rng.uniform(-20.0, 20.0, (n, 3)) + (412345.0, 5654321.0, 123.0),
+        rng.uniform(-20.0, 20.0, (n, 3)) + np.array([412345.0, 5654321.0, 123.0]),
         rng.integers(0, 256, (n, 3), np.uint8),
         (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
         rng.integers(-1, 9, n, np.int32),
@@ -68,3 +73,20 @@ def mixed_cloud(n: int = 50, seed: int = 0) -> Cloud:
             "descriptor": rng.normal(size=(n, 4)).astype(np.float32),
         },
     )
+
+
+def as_cloudcompare_reads(path: Path) -> dict[str, np.ndarray]:
+    """Columns of a file by the names that CloudCompare gives them; skips the test if CloudCompare cannot read it."""
+    program, screen = shutil.which("CloudCompare"), shutil.which("xvfb-run")
+    if program is None or screen is None:
+        pytest.skip("CloudCompare or xvfb-run is not installed")
+    out = path.with_suffix(".asc")
+    command = [screen, "-a", program, "-SILENT", "-AUTO_SAVE", "OFF", "-O", "-GLOBAL_SHIFT", "AUTO", str(path)]
+    command += ["-C_EXPORT_FMT", "ASC", "-PREC", "9", "-ADD_HEADER", "-SAVE_CLOUDS", "FILE", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    said = done.stdout + done.stderr
+    if "unhandled file extension" in said:
+        pytest.skip(f"CloudCompare is built without a plugin for {path.suffix}")
+    assert out.exists(), said[-2000:]
+    lines = out.read_text().splitlines()
+    return dict(zip(lines[0].lstrip("/").split(), np.loadtxt(lines[1:], ndmin=2).T, strict=True))
