@@ -65,11 +65,6 @@ def flatten(
 
     parts: dict[str, str | list[str]] = {}
     for name, column in cloud.columns.items():
-        if column.shape[: cloud.points.ndim - 1] != cloud.points.shape[:-1] or column.dtype.kind not in "fiub":
-            raise CloudWriteError(
-                f"expected the column {name!r} as numbers in the points' shape {cloud.points.shape[:-1]}, "
-                f"got {column.dtype} {column.shape}"
-            )
         if name in kept:
             fields[name], parts[name] = column.reshape(-1), name
         elif column.ndim == cloud.points.ndim - 1:
@@ -143,17 +138,14 @@ def _taken(fields: Arrays, stored: object) -> NDArray[np.generic] | None:
         return fields.pop(stored, None)
     if not (isinstance(stored, list) and stored and all(isinstance(name, str) and name in fields for name in stored)):
         return None
-    many = [fields[name] for name in stored]
-    if any(values.ndim != 1 for values in many):
+    if len(set(stored)) < len(stored) or any(fields[name].ndim != 1 for name in stored):
         return None
-    for name in stored:
-        fields.pop(name, None)
-    return np.stack(many, axis=1)
+    return np.stack([fields.pop(name) for name in stored], axis=1)
 
 
 def _viewpoint(fields: Arrays, stored: object) -> NDArray[np.float64] | None:
     """Viewpoint of a description, (3,), or of the fields that it names, (n, 3)."""
-    if isinstance(stored, list) and len(stored) == 3 and all(isinstance(value, (int, float)) for value in stored):
-        return np.array(stored, np.float64)
+    if isinstance(stored, list) and len(stored) == 3 and all(isinstance(value, float) for value in stored):
+        return np.array(stored)
     values = _taken(fields, stored)
     return None if values is None or values.ndim != 2 or values.shape[1] != 3 else values.astype(np.float64)

@@ -11,6 +11,7 @@ import re
 import struct
 from collections.abc import Callable
 from io import BytesIO
+from itertools import chain
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -37,6 +38,8 @@ _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 """Layers of each item of a compressed point: its base, colours, colours with infrared, wave packets. Extra bytes, item
 14, have one layer for each byte."""
 _MAX_OF_8_BITS = 255
+"""Largest channel of colours that were stored in 8 bits. In 16 bits, only a cloud that is all but black has no larger
+one."""
 _WHITE_RATIO = 257
 """White in 16 bits over white in 8 bits: 65535 / 255."""
 _DESCRIPTION = ("pcgraph", 1)
@@ -53,8 +56,8 @@ _COARSEST_STEP = 1e-4
 """Metres: coordinates off any grid are rounded to steps of at most 0.1 mm, finer than laser scanners measure."""
 _STEPS_PER_EXTENT = 1e7
 """Steps in the extent of a small cloud off any grid, at least: as many as the 24 bits of float32 tell apart."""
-_MAX_STEPS = 2.0**32 - 4.0
-"""Steps in the extent of a cloud, at most: whole numbers of 32 bits, less the rounding of the offset."""
+_MAX_STEPS = 2.0**31 - 2.0
+"""Steps from the offset to a coordinate, at most: whole numbers of 32 bits, less a rounding."""
 _GRIDS = tuple(10.0**-digits for digits in range(10))
 """Steps of grids on which coordinates may lie already. Steps as 0.002 or 0.00025 are multiples of one of these."""
 _FINE_ENOUGH = 16
@@ -87,15 +90,7 @@ def read_las(content: bytes) -> Cloud:
     _check_length(content)
     laspy = _laspy(CloudReadError, "reading", compressed=bool(content[104] & 0xC0))
     try:
-        with np.errstate(over="ignore", invalid="ignore"), laspy.open(BytesIO(content), read_evlrs=False) as reader:
-            if reader.header.are_points_compressed and reader.header.point_count:
-                is_coarse = _largest_chunk(content, reader.header) > _PIECE
-                reader.laz_backend = laspy.LazBackend.Lazrs if is_coarse else laspy.LazBackend.LazrsParallel
-            records = reader.header.vlrs.get_by_id(_DESCRIPTION[0], (_DESCRIPTION[1],))
-            description = records[0].record_data_bytes() if records else None
-            empty = laspy.ScaleAwarePointRecord.zeros(0, header=reader.header)
-            pieces = [_arrays(piece) for piece in (empty, *reader.chunk_iterator(_PIECE))]
-            n_points, standard = reader.header.point_count, set(reader.header.point_format.standard_dimension_names)
+        points, fields, standard, text = _unpacked(laspy, content)
     except CloudReadError:
         raise
     except MemoryError:
@@ -104,16 +99,53 @@ def read_las(content: bytes) -> Cloud:
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         raise CloudReadError(f"the LAS file is damaged: {library_reason(error)}") from None
-    points = np.concatenate([piece.pop("xyz") for piece in pieces])
-    if len(points) != n_points:
-        raise CloudReadError(f"the LAS header promises {n_points} points, but {len(points)} follow")
-    fields = {name: np.concatenate([piece.pop(name) for piece in pieces]) for name in list(pieces[0])}
-    own = described(description)
+    own = described(text)
     if own is not None:  # dimensions of the point format that the written cloud did not have
         for name in standard.intersection(fields) - {*map(str, own["columns"].values()), *COLOR_NAMES}:
             if (fields[name] == _UNUSED.get(name, 0)).all():
                 del fields[name]
     return unflatten(points, _colors(fields, is_own=own is not None), fields, own)
+
+
+class _Unpacked(NamedTuple):
+    """What a file holds.
+
+    Attributes
+    ----------
+    points : (n, 3) float64
+    fields : dict of name to (n,) or (n, c) array
+        The other dimensions.
+    standard : names of dimensions
+        Those of the point format.
+    description : bytes, or None
+        Record of `flatten`.
+    """
+
+    points: NDArray[np.floating]
+    fields: Arrays
+    standard: set[str]
+    description: bytes | None
+
+
+def _unpacked(laspy: ModuleType, content: bytes) -> _Unpacked:
+    with np.errstate(over="ignore", invalid="ignore"), laspy.open(BytesIO(content), read_evlrs=False) as reader:
+        header = reader.header
+        if header.are_points_compressed and header.point_count:
+            is_coarse = _largest_chunk(content, header) > _PIECE
+            reader.laz_backend = laspy.LazBackend.Lazrs if is_coarse else laspy.LazBackend.LazrsParallel
+        dimensions = [name for name in header.point_format.dimension_names if name not in ("X", "Y", "Z")]
+        standard = set(header.point_format.standard_dimension_names)
+        records = header.vlrs.get_by_id(_DESCRIPTION[0], (_DESCRIPTION[1],))
+        empty = laspy.ScaleAwarePointRecord.zeros(0, header=header)
+        points, columns = [], []
+        for piece in chain([empty], reader.chunk_iterator(_PIECE)):
+            points.append(np.stack([piece.x, piece.y, piece.z], axis=1))
+            columns.append({name: np.array(piece[name]) for name in dimensions})
+    n_found = sum(map(len, points))
+    if n_found != header.point_count:
+        raise CloudReadError(f"the LAS header promises {header.point_count} points, but {n_found} follow")
+    fields: Arrays = {name: np.concatenate([piece.pop(name) for piece in columns]) for name in dimensions}
+    return _Unpacked(np.concatenate(points), fields, standard, records[0].record_data_bytes() if records else None)
 
 
 def _check_length(content: bytes) -> None:
@@ -170,12 +202,6 @@ def _largest_chunk(content: bytes, header: laspy.LasHeader) -> int:
     return largest
 
 
-def _arrays(points: laspy.ScaleAwarePointRecord) -> Arrays:
-    """The points ``xyz``, (n, 3), and one array for each dimension but their whole numbers."""
-    arrays: Arrays = {name: np.array(points[name]) for name in points.point_format.dimension_names if name not in "XYZ"}
-    return arrays | {"xyz": np.stack([points.x, points.y, points.z], axis=1)}
-
-
 def _colors(fields: Arrays, is_own: bool) -> NDArray[np.generic] | None:
     """Colours, (n, 3) uint8, or uint16 where white is 65535, taken out; None if all are black in a file of others."""
     if not all(name in fields for name in COLOR_NAMES):
@@ -229,6 +255,7 @@ def encode_las(cloud: Cloud, suffix: str) -> bytes:
     laspy = _laspy(CloudWriteError, "writing", compressed=suffix == ".laz")
     header = laspy.LasHeader(version="1.4", point_format=_point_format(cloud))
     header.global_encoding.wkt = True  # the standard demands it for formats from 6 on
+    header.generating_software = "pcgraph"
     header.creation_date = None  # the same cloud gives the same bytes
     standard = {dimension.name: dimension for dimension in header.point_format.dimensions}
     taken = {*laspy.PointFormat(8).dimension_names, "x", "y", "z", "xyz"}
@@ -296,21 +323,22 @@ def _grid(values: NDArray[np.floating]) -> Grid:
     low, high = float(values.min()), float(values.max())
     rounding = float(np.spacing(values.dtype.type(max(abs(low), abs(high)))))
     middle = float(np.rint(0.5 * low + 0.5 * high))
-    extent = high - low
     for offset in (middle, low):
         for step in _GRIDS:
-            fits = step > _FINE_ENOUGH * rounding and extent < _MAX_STEPS * step
+            fits = step > _FINE_ENOUGH * rounding and max(high - offset, offset - low) <= _MAX_STEPS * step
             if fits and all(_on_grid(part, Grid(step, offset), rounding) for part in (values[:_SAMPLE], values)):
                 return Grid(step, offset)
-    step = _power_of_ten(min(_COARSEST_STEP, extent / _STEPS_PER_EXTENT), np.floor) if extent else _COARSEST_STEP
-    if extent >= _MAX_STEPS * step:
-        step = _power_of_ten(extent / _MAX_STEPS, np.ceil)
+    finest = max((high - low) / _STEPS_PER_EXTENT, float(np.finfo(np.float64).tiny))
+    step = _power_of_ten(min(_COARSEST_STEP, finest), np.floor)
+    reach = max(high - middle, middle - low)
+    if reach > _MAX_STEPS * step:
+        step = _power_of_ten(reach / _MAX_STEPS, np.ceil)
         if step > max(rounding, _COARSEST_STEP):
             raise CloudWriteError(
-                f"expected coordinates within {_MAX_STEPS * _COARSEST_STEP / 1000:.0f} km of each other, as LAS has 32 "
-                f"bits for each, got {low:g} to {high:g}: leave out points far away, or write .ply or .npz"
+                f"expected coordinates within {2.0 * _MAX_STEPS * _COARSEST_STEP / 1000:.0f} km of each other, as LAS "
+                f"has 32 bits for each, got {low:g} to {high:g}: leave out points far away, or write .ply or .npz"
             )
-    return Grid(step, low if not extent else middle)
+    return Grid(step, middle)
 
 
 def _on_grid(values: NDArray[np.floating], grid: Grid, rounding: float) -> bool:

@@ -15,7 +15,20 @@ from hypothesis.extra import numpy as hnp
 from pcgraph.cloud import Cloud
 
 TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
-NAMES = ("intensity", "classification", "gps_time", "user_data", "timeStamp", "rowIndex", "ring", "nir", "x y", "größe")
+NAMES = (
+    "intensity",
+    "classification",
+    "gps_time",
+    "user_data",
+    "timeStamp",
+    "rowIndex",
+    "ring",
+    "nir",
+    "x y",
+    "xyz",
+    "array",
+    "größe",
+)
 LONG_NAMES = tuple(f"a name of more than thirty-two characters, number {i}" for i in range(2))
 
 

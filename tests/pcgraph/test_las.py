@@ -255,7 +255,7 @@ def test_coordinates_of_las_files_stay_on_their_grid(scale, offset):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("extent", [1e-3, 0.3, 40.0, 1e3, 1e5])
+@pytest.mark.parametrize("extent", [1e-12, 1e-3, 0.3, 40.0, 1e3, 1e5, 2.147e5])
 @pytest.mark.parametrize("middle", [0.0, 5654321.0])
 def test_other_coordinates_are_kept_to_a_tenth_of_a_millimetre_or_better(dtype, extent, middle):
     points = (middle + np.random.default_rng(0).uniform(-extent, extent, (500, 3))).astype(dtype)
