@@ -142,7 +142,7 @@ def test_the_cases_hold_every_array_that_a_file_may_hold(saved: dict[str, Any]) 
 
 
 def test_the_docs_tell_every_array(saved: dict[str, Any]) -> None:
-    text = (Path(pcgraph.__file__).parents[1] / "docs" / "pcgraph.md").read_text()
+    text = (Path(pcgraph.__file__).parents[1] / "docs" / "files.md").read_text()
     assert [pattern for pattern in ARRAYS if f"`{pattern}`" not in text] == []
 
 
@@ -245,9 +245,9 @@ def test_places_that_cannot_be_written_are_refused(saved: dict[str, Any], tmp_pa
 
 @dataclass(frozen=True)
 class Own(pcgraph.Linkage):
-    """Convexity by the user's own name."""
+    """Convexity by the user's own name; it needs an argument, so that it is no member of the family by name."""
 
-    weight: float = 1.0
+    weight: float
     default_object_altitude = 0.5
     default_part_altitude = 0.1
 
@@ -311,7 +311,7 @@ def test_a_linkage_of_ones_own_is_asked_for_where_it_is_not_loaded(saved: dict[s
     write(path, archive_of(saved["unknown"][0]), lambda archive, _: archive.values.update(linkage="own:Gone"))
     with pytest.raises(pcgraph.CloudReadError, match=r"with a linkage of your own, Gone: give it, .*linkage=Gone\(\)"):
         pcgraph.load_segmentation(path)
-    result = replace(saved["unknown"][0], linkage=Opaque(call=sum))
+    result = replace(saved["unknown"][0], linkage=Opaque(1.0, call=sum))
     result.save(path)
     with pytest.raises(pcgraph.CloudReadError, match="with a linkage of your own, Opaque: give it"):
         pcgraph.load_segmentation(path)
@@ -320,7 +320,7 @@ def test_a_linkage_of_ones_own_is_asked_for_where_it_is_not_loaded(saved: dict[s
 
 def test_a_class_of_a_users_does_not_pass_for_one_of_ours(saved: dict[str, Any], tmp_path: Path) -> None:
     own = dataclass(frozen=True)(type("RegionLinkage", (Own,), {"__module__": "elsewhere"}))
-    replace(saved["unknown"][0], linkage=own()).save(tmp_path / "x.npz")
+    replace(saved["unknown"][0], linkage=own(1.0)).save(tmp_path / "x.npz")
     assert type(pcgraph.load_segmentation(tmp_path / "x.npz").linkage) is own
     assert type(pcgraph.load_segmentation(saved["unknown"][1]).linkage) is pcgraph.RegionLinkage
     other = dataclass(frozen=True)(type("RegionLinkage", (Own,), {"__module__": "elsewhere_too"}))
