@@ -39,19 +39,19 @@ from pcgraph.voxels.warp import CameraWarp, RangeWarp, Warp
 
 _FOR_TYPE_CHECKERS = {"Continuations": Continuations}
 """Types of fields whose modules import them for type checkers alone."""
-_UNIT = 1.0 + 1e-6
-"""Largest absolute value of what is 1 at most, because it was rounded."""
 _MAX_LEVEL = 4
 """Number of times that the edge of a voxel is doubled, at most (`Grading`)."""
 _MAX_LENGTH = 1e102
 """Metres, largest length: coordinates of clouds are 1e100 at most (`pcgraph.inputs`), ranges a few times that. Squares
-of larger ones overflow, and kernels that look for the least distance do not end where all are NaN."""
+of far larger ones overflow, and a loop that waits for a least distance does not end where all are NaN."""
 _MAX_SCATTER = 1e225
 """Square metres, largest scatter: the square of such lengths, of 10^18 points."""
 _MAX_COUNT = 1 << 53
 """Points of a voxel or a node, less than: sums of such counts are exact as floats, too."""
 _ROUNDING = 1e-6
 """Relative difference that rounding may make, at most, also between two machines. Chosen by eye; not varied."""
+_UNIT = 1.0 + _ROUNDING
+"""Largest absolute value of what is 1 at most, because it was rounded."""
 
 
 class Row(NamedTuple):
