@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from os import PathLike
@@ -115,7 +116,7 @@ ARRAYS: dict[str, Row] = {
     "surface/normals": Row("v 3", largest=_UNIT),
     "surface/supervoxels": Row("v", 0, "k"),
     "surface/grid/warp/*": Row("3"),
-    "surface/grid/cells": Row("v 3"),
+    "surface/grid/cells": Row("v 3", largest=sys.float_info.max),
     "surface/grid/voxel_of_point": Row("n", 0, "v"),
     "surface/grid/order": Row("n", 0, "n"),
     "surface/grid/starts": Row("v+1", 0),

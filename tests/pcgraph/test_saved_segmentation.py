@@ -86,7 +86,11 @@ def graded() -> pcgraph.Segmentation:
     return pcgraph.segment(two_densities(4.0).points)
 
 
-CASES = (image, unknown, with_features, scanner, moving, from_several_places, updated, graded)
+def of_absurdly_small_voxels() -> pcgraph.Segmentation:
+    return pcgraph.segment(np.random.default_rng(0).random((50, 3)) - 0.5, voxel_size=1e-200)
+
+
+CASES = (of_absurdly_small_voxels, image, unknown, with_features, scanner, moving, from_several_places, updated, graded)
 
 
 @pytest.fixture(scope="module")
