@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.columns import CLIP
+from pcgraph.disjoint_sets import connected_components
 from pcgraph.errors import MAX_WORD, CloudReadError, one_line
 from pcgraph.graph.continuations import Continuations
 from pcgraph.hierarchy import checked_parents
@@ -303,6 +304,10 @@ def _check(found: Segmentation) -> None:
     surface, k = found.surface, found.tree.n_leaves
     _expect(np.count_nonzero(inside) == len(surface.grid.voxel_of_point), "as many points as have a supervoxel")
     _expect(bool(np.bincount(surface.supervoxels, minlength=k).all()), "a voxel of each supervoxel")
+    touching = surface.grid.touching_pairs()
+    within = touching[surface.supervoxels[touching[:, 0]] == surface.supervoxels[touching[:, 1]]]
+    n_pieces = int(connected_components(within, surface.grid.n_voxels).max()) + 1
+    _expect(n_pieces == k, "each supervoxel in one piece")
     _expect(bool((np.linalg.norm(surface.normals, axis=1) <= _UNIT).all()), "normals of unit length")
     _expect(0 <= int(found.objects.max()) < found.next_object, "numbers of objects below the next one")
     _expect(found.viewpoint.shape in ((3,), (np.count_nonzero(inside), 3)), "one viewpoint, or one for each point")

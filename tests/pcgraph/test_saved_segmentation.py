@@ -434,6 +434,7 @@ DAMAGE: list[tuple[Mutation, str]] = [
     (set_one("surface/normals", 7.0), "up to 1"),
     (set_one("surface/normals", 0.9), "unit length"),
     (set_array("surface/supervoxels", lambda a: a * 0), "each supervoxel"),
+    (set_array("surface/supervoxels", lambda a: np.roll(a, 1)), "in one piece"),
     (set_one("surface/grid/voxel_of_point", 10**6), "voxel_of_point"),
     (set_one("surface/grid/voxel_of_point", -5), "voxel_of_point"),
     (set_array("surface/grid/order", lambda a: a * 0), "each point in the list"),
