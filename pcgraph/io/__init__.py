@@ -11,7 +11,10 @@ from pathlib import Path
 from pcgraph.cloud import Cloud, plain_cloud
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
 from pcgraph.io.driving_sweeps import KITTI, NUSCENES, SWEEP
+from pcgraph.io.e57 import E57
 from pcgraph.io.format import CloudFile, Format
+from pcgraph.io.las import LAS
+from pcgraph.io.mesh import GLTF, OBJ, OFF, STL, sample_surface
 from pcgraph.io.npz import NPY, NPZ
 from pcgraph.io.ouster import OUSTER
 from pcgraph.io.pcd import PCD
@@ -20,15 +23,16 @@ from pcgraph.io.ptx import PTX
 from pcgraph.io.text import PTS, TEXT, XYZN, XYZRGB
 from pcgraph.plumbing.plain_files import read_file, write_file
 
-__all__ = ["decode_cloud", "encode_cloud", "read_cloud", "write_cloud"]
+__all__ = ["decode_cloud", "encode_cloud", "read_cloud", "sample_surface", "write_cloud"]
 
 MAX_REASON = 300
 """Characters of a message about a damaged file, count: such files can make messages of any length. Chosen by eye; not
 varied."""
 FORMATS: tuple[Format, ...] = (
-    *(PCD, PLY, NPZ, NPY),
+    *(PCD, PLY, LAS, E57, NPZ, NPY),
     *(TEXT, PTS, PTX, XYZN, XYZRGB),
     *(KITTI, NUSCENES, SWEEP, OUSTER),
+    *(OBJ, STL, OFF, GLTF),
 )
 _WRITABLE = tuple(one for one in FORMATS if one.encode is not None)
 
@@ -41,10 +45,9 @@ def read_cloud(
     Parameters
     ----------
     path : str or path
-        ``.pcd`` (ascii, binary, binary_compressed); ``.ply`` (ascii, binary of either byte order; the vertices of a
-        mesh); ``.npz`` or ``.npy``; text: ``.xyz``, ``.txt``, ``.csv``, ``.asc``, ``.pts``, ``.ptx``, ``.xyzn``,
-        ``.xyzrgb`` (`pcgraph.io.text` says what is understood); sweeps of KITTI (``.bin``) and nuScenes
-        (``.pcd.bin``); ``.pcap`` of an Ouster LiDAR, with the sensor's metadata in a ``.json`` of that name beside it.
+        Of any format of docs/files.md: LAS, LAZ, COPC, E57, PLY, PCD, text (``.xyz``, ``.csv``, ``.pts``, ``.ptx`` and
+        others), ``.npz``, ``.npy``, sweeps of KITTI, nuScenes and Ouster, the vertices of meshes (``.obj``, ``.stl``,
+        ``.off``, ``.glb``).
     file_format : str, optional
         Name of the format, such as "ply". Default: by the end of the file's name.
     columns : names, optional
@@ -60,7 +63,7 @@ def read_cloud(
     if os.path.isdir(path):  # unlike Path.is_dir it takes names that no file can have
         raise CloudReadError(f"{path} is a directory: expected a file ending in {_either(_suffixes(FORMATS))}")
     chosen, _ = _format(path.name, file_format, FORMATS, CloudReadError)
-    return _read(chosen, CloudFile(read_file(path, CloudReadError), path, _named(columns)), str(path))
+    return _read(chosen, CloudFile(read_file(path, CloudReadError), path, _named(columns, chosen)), str(path))
 
 
 def decode_cloud(content: bytes, name: str, columns: Sequence[str] | None = None) -> Cloud:
@@ -86,29 +89,15 @@ def decode_cloud(content: bytes, name: str, columns: Sequence[str] | None = None
     [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
     """
     chosen, _ = _format(Path(name).name, None, FORMATS, CloudReadError)
-    return _read(chosen, CloudFile(content, None, _named(columns)), name)
+    return _read(chosen, CloudFile(content, None, _named(columns, chosen)), name)
 
 
 def write_cloud(path: str | PathLike[str], cloud: Cloud, file_format: str | None = None) -> None:
     """Write a cloud as a whole file, or none; an older file of that name is replaced.
 
-    `read_cloud` of the file gives the same points, colours, normals, labels and columns, in their types and under their
-    names, but for what a format cannot hold:
-
-    | format | what is lost |
-    |---|---|
-    | ``.pcd`` | half floats and truth values become float32 and uint8 |
-    | ``.ply`` | rows and columns of an image, points that are not finite, the viewpoint of all points; integers of 64 bits become doubles, vectors the columns ``name_0``, ``name_1``; and as in PCD |
-    | ``.npy`` | the viewpoint of all points |
-    | ``.xyz``, ``.txt``, ``.csv``, ``.asc`` | rows and columns of an image, points that are not finite, the viewpoint of all points; widths of types, see `pcgraph.io.text`; vectors become the columns ``name_0``, ``name_1`` |
-    | ``.pts`` | the same; other columns than colours and ``intensity`` are refused |
-    | ``.bin``, ``.pcd.bin`` | rows and columns of an image, points that are not finite, the viewpoint of all points; other columns than ``intensity`` (and ``ring``), and numbers that are not float32, are refused |
-    | ``.npz`` | nothing |
-
-    Colours are kept in 8 bits and labels in 32, under the names that most programs know: ``red``, ``nx``, ``label``, in
-    PCD ``rgb`` and ``normal_x``. Blanks in names of columns become underscores in PCD and PLY. A
-    viewpoint of (0, 0, 0) in a PCD file counts as none. PCL and the older of Open3D's two readers take only float32
-    points from PCD files; they read doubles from PLY files.
+    `read_cloud` of the file gives the same points, colours, normals, labels and columns, in their types and under
+    their names, but for what a format cannot hold: docs/files.md lists it. Lists of points, which all formats but PCD,
+    NPZ and NPY are, hold the finite points only.
 
     Parameters
     ----------
@@ -132,7 +121,7 @@ def write_cloud(path: str | PathLike[str], cloud: Cloud, file_format: str | None
     >>> write_cloud(path, Cloud(np.ones((2, 3)), columns={"ring": np.array([0, 1], np.uint16)}))
     >>> read_cloud(path).columns
     {'ring': array([0, 1], dtype=uint16)}
-    """  # noqa: E501
+    """
     path = Path(path)
     write_file(path, _encode(cloud, path.name, file_format), CloudWriteError)
 
@@ -194,7 +183,9 @@ def _format(
     return ends[suffix], suffix
 
 
-def _named(columns: Sequence[str] | None) -> tuple[str, ...] | None:
+def _named(columns: Sequence[str] | None, chosen: Format) -> tuple[str, ...] | None:
+    if columns is not None and not chosen.takes_names:
+        raise CloudReadError(f"expected columns for text files only, as a .{chosen.name} names its own: leave it out")
     return None if columns is None else tuple(columns)
 
 

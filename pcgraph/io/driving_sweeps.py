@@ -171,6 +171,12 @@ def _labels_beside(path: Path) -> Path | None:
     return labels if labels.is_file() else None
 
 
-KITTI = Format("kitti", (), read_kitti, lambda cloud, _: encode_sweep(cloud, KITTI_COLUMNS))
-NUSCENES = Format("nuscenes", (".pcd.bin",), read_nuscenes, lambda cloud, _: encode_sweep(cloud, NUSCENES_COLUMNS))
-SWEEP = Format("bin", (".bin",), read_sweep, lambda cloud, _: _encode_bin(cloud))
+KITTI = Format("kitti", (), read_kitti, lambda cloud, _: encode_sweep(cloud, KITTI_COLUMNS), holds_columns=False)
+NUSCENES = Format(
+    "nuscenes",
+    (".pcd.bin",),
+    read_nuscenes,
+    lambda cloud, _: encode_sweep(cloud, NUSCENES_COLUMNS),
+    holds_columns=False,
+)
+SWEEP = Format("bin", (".bin",), read_sweep, lambda cloud, _: _encode_bin(cloud), holds_columns=False)

@@ -58,6 +58,8 @@ class Format:
         the finite points.
     holds_columns : bool
         Whether a file takes columns of any name and number.
+    takes_names : bool
+        Whether `CloudFile.columns` may name the columns.
     """
 
     name: str
@@ -66,6 +68,7 @@ class Format:
     encode: Callable[[Cloud, str], bytes] | None = None
     organised: bool = False
     holds_columns: bool = True
+    takes_names: bool = False
 
 
 # ---- Names of fields in headers of words ---------------------------------------------------------------------------

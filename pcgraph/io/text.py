@@ -626,7 +626,7 @@ def _number_words(name: str, column: NDArray[np.generic]) -> list[str]:
     return list(map(repr, column.astype(np.float64).tolist() if kind == "f" else column.tolist()))
 
 
-TEXT = Format("text", (".xyz", ".txt", ".csv", ".asc"), read_text, encode_text)
-PTS = Format("pts", (".pts",), partial(read_text, is_pts=True), encode_pts)
-XYZN = Format("xyzn", (".xyzn",), partial(read_text, usual=("x", "y", "z", *NORMAL_NAMES[1])))
-XYZRGB = Format("xyzrgb", (".xyzrgb",), partial(read_text, usual=("x", "y", "z", *COLOR_NAMES)))
+TEXT = Format("text", (".xyz", ".txt", ".csv", ".asc"), read_text, encode_text, takes_names=True)
+PTS = Format("pts", (".pts",), partial(read_text, is_pts=True), encode_pts, holds_columns=False, takes_names=True)
+XYZN = Format("xyzn", (".xyzn",), partial(read_text, usual=("x", "y", "z", *NORMAL_NAMES[1])), takes_names=True)
+XYZRGB = Format("xyzrgb", (".xyzrgb",), partial(read_text, usual=("x", "y", "z", *COLOR_NAMES)), takes_names=True)
