@@ -21,6 +21,7 @@ from pcgraph.graph.bridges import bridges
 from pcgraph.graph.contacts import contacts, edge_features
 from pcgraph.graph.continuations import continuations, faces_of
 from pcgraph.graph.gaps import gaps
+from pcgraph.history import History
 from pcgraph.inputs import CleanCloud, Features, Points, as_arrays, clean_cloud, whole_number
 from pcgraph.parallel import side_by_side
 from pcgraph.plausibility import (
@@ -184,8 +185,8 @@ class Scan:
     seed_size: float
 
 
-def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -> Segmentation:
-    """Segmentation of a scan: the algorithm from voxels on."""
+def segment_scan(scan: Scan, earlier: History | None, settings: Settings) -> Segmentation:
+    """Segmentation of a scan, and of what is kept of earlier ones: the algorithm from voxels on."""
     cloud, grid, planes = scan.voxelised.cloud, scan.voxelised.grid, scan.oriented.planes
     method, linkage = settings.method, settings.linkage
     normals = _normals(cloud, scan.oriented, grid)
@@ -228,6 +229,8 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         surface=surface,
         seed_size=scan.seed_size,
         viewpoint=scan.oriented.places[0] if viewpoint is None else viewpoint,
+        ages=_ages(leaf_of_point, len(leaves), earlier),
+        supervoxel_of_earlier=np.empty(0, np.int32) if earlier is None else earlier.numbers,
         feature_scaling=cloud.scaling,
         next_object=max(int(objects.max()) + 1, 0 if earlier is None else earlier.next_object),
         **vars(settings),
@@ -253,9 +256,7 @@ def _oriented(voxelisation: Voxelisation, method: SupervoxelMethod) -> OrientedP
     return oriented._replace(planes=replace(planes, normals=flipped))
 
 
-def _leaves(
-    cloud: CleanCloud, surface: Surface, leaf_of_point: NDArray[np.int32], earlier: Segmentation | None
-) -> Moments:
+def _leaves(cloud: CleanCloud, surface: Surface, leaf_of_point: NDArray[np.int32], earlier: History | None) -> Moments:
     """Moments of the supervoxels' points, with those of earlier scans."""
     n_leaves = int(surface.supervoxels.max()) + 1
     if earlier is None:
@@ -264,12 +265,21 @@ def _leaves(
         is_seen = np.bincount(leaf_of_point, minlength=n_leaves) > 0
         found, group = np.flatnonzero(is_seen), (np.cumsum(is_seen) - 1).astype(np.int32)[leaf_of_point]
         gained = moments_of_groups(cloud.points, cloud.colors, group, len(found), cloud.features)
-        leaves = joined_moments(replace(earlier.leaves, normals=None), gained, found, n_leaves)
+        leaves = joined_moments(earlier.leaves, gained, found, n_leaves)
     return replace(leaves, normals=surface.mean_normals(n_leaves))
 
 
-def _renumbered(objects: NDArray[np.int32], earlier: Segmentation, weights: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Objects of k supervoxels, (k,), with their numbers in an earlier segmentation of the first of these supervoxels.
+def _ages(leaf_of_point: NDArray[np.int32], n_leaves: int, earlier: History | None) -> NDArray[np.int32]:
+    """Number of scans since the last one that saw each supervoxel, (n_leaves,) int32."""
+    ages = np.zeros(n_leaves, np.int32)
+    if earlier is not None:
+        ages[: len(earlier.ages)] = earlier.ages + 1
+        ages[leaf_of_point] = 0
+    return ages
+
+
+def _renumbered(objects: NDArray[np.int32], earlier: History, weights: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Objects of k supervoxels, (k,), with the numbers that they had when the first of these supervoxels were all.
 
     An object keeps the number of that with which it shares most points, if no other object shares more with that. The
     other objects get numbers that were not used before.

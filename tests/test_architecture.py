@@ -188,6 +188,7 @@ STOREYS = [
     "tree",
     "families",
     "segmentation",
+    "history",
     "plausibility",
     "scan",
     "stream",
