@@ -115,25 +115,26 @@ def update(
     )
     cloud = with_pixels(clean_cloud(points, colors, normals, features, earlier.feature_scaling))
     last = acquisition_of(cloud, viewpoint)
+    place, n_gone = last.one_viewpoint, 0
+    if carve_free_space and place is None:
+        raise ValueError("expected one viewpoint of the new scan to carve free space, got none, or one per point")
     warn_of_rounding(points, cloud, None)  # type: ignore[arg-type]
     earlier.surface.grid.warp.check(cloud.points)
     history = History.of(earlier)
     if max_age is not None:
         history = history.without(history.ages >= whole_number("max_age", max_age, least=0))
     found = voxelise_beside(without_flying_pixels(cloud, last.told.image), history.surface.grid)
-    place, n_gone = last.one_viewpoint, 0
     if place is not None:
         order = history.depth_order(place, found.grid)
-        n_gone = np.count_nonzero(order > 0)
+        n_gone = int(np.count_nonzero(order > 0))
         if carve_free_space:
             history = history.without(history.seen_through(order))
-    elif carve_free_space:
-        raise ValueError("expected one viewpoint of the new scan to carve free space, got none, or one per point")
     if viewpoint is not None and place is not None:
         warn_of_viewpoint(place, found.grid)
     before = history.surface
     union = grid_union(before.grid, found.grid)
-    warn_of_frame(n_gone, before.grid.n_voxels + found.grid.n_voxels - union.grid.n_voxels)
+    n_there = before.grid.n_voxels + found.grid.n_voxels - union.grid.n_voxels
+    warn_of_frame(n_gone, n_there, found.grid.n_voxels)
     labels = np.full(union.grid.n_voxels, -1, np.int32)
     labels[union.first] = before.supervoxels
     viewpoint_of_voxel = np.empty((union.grid.n_voxels, 3))
