@@ -84,9 +84,10 @@ def update(
     A supervoxel is remembered or forgotten as a whole: the points of which it is made are not kept, so that no part of
     it could be taken out of its moments. It is seen through if something is measured more than two voxel edges behind
     more of its voxels than not, of those that nothing nearer hides; a measurement that met nothing tells nothing. So
-    what stood before the sky, or is hidden now, stays. In still scenes 0 to 0.01 of the voxels are lost per scan, of
-    leaves and thin rods up to 0.09 (docs/pcgraph_method.md). Source: free space as in OctoMap (Hornung et al. 2013),
-    but without counts of hits and misses. `max_age` is that of trackers such as SORT (Bewley et al. 2016).
+    what stood before the sky, or is hidden now, stays. A still scene loses up to 0.005 of its voxels per scan if poses
+    are right to two voxel edges, its leaves and glass up to 0.08 (docs/pcgraph_method.md). Source: free space as in
+    OctoMap (Hornung et al. 2013), but without counts of hits and misses. `max_age` is that of trackers such as SORT
+    (Bewley et al. 2016).
 
     Voxels stay as large as the first scan needed, also where that had points far apart and a later one has many. Where
     voxels grow with depth or range, they grow with that from the first place: give the first scan of a sensor that

@@ -194,7 +194,7 @@ def test_all_of_a_scene_may_be_seen_through():
 
 def test_what_cannot_be_forgotten_is_refused(window):
     ground = patch((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.6, 0.0), 0.02)
-    places = ground + (0.0, 0.0, 2.0)
+    places = ground + np.array([0.0, 0.0, 2.0])
     for viewpoint in (None, places):
         with pytest.raises(ValueError, match="expected one viewpoint of the new scan to carve free space"):
             pcgraph.update(window[0], ground, viewpoint=viewpoint, carve_free_space=True)
