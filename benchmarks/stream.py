@@ -131,7 +131,7 @@ def run_along(scans: list[tuple[Floats, Floats]], **forgetting) -> dict[str, obj
             )
     third = len(seconds) // 3
     for name, values in (("voxels", voxels), ("update_s", seconds), ("rss_mb", rss)):
-        row[name] = [round(float(np.median(values[end - 10 : end])), 3) for end in (third, len(values))]
+        row[name] = [round(float(np.median(values[max(0, end - 10) : end])), 3) for end in (third, len(values))]
     return row
 
 
