@@ -191,6 +191,7 @@ STOREYS = [
     "segmentation",
     "saved_segmentation",
     "labelling",
+    "history",
     "plausibility",
     "scan",
     "stream",
