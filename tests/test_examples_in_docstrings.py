@@ -16,6 +16,7 @@ from rangesim import AmcwToF, Detector, compare, decode, expose
 
 ROOMS = [
     "pcgraph.detection",
+    "pcgraph.io",
     "pcgraph.plumbing",
     "pcgraph.tree",
     "rangesim.calibration",
@@ -47,6 +48,9 @@ ROOMS = [
 ]
 """Packages whose docstrings are run, all of their modules."""
 MODULES = [
+    "pcgraph.cloud",
+    "pcgraph.cloud_sources",
+    "pcgraph.labelling",
     "pcgraph.scan",
     "rangesim",
     "rangesim.errors",

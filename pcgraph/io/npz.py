@@ -24,7 +24,6 @@ from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from pcgraph.cloud import (
-    MAX_HEADER_BYTES,
     Cloud,
     are_labels,
     cloud_from_array,
@@ -35,7 +34,7 @@ from pcgraph.cloud import (
     native,
 )
 from pcgraph.errors import CloudReadError
-from pcgraph.io.format import Format
+from pcgraph.io.format import MAX_HEADER_BYTES, Format
 
 MAX_BYTES = 1 << 32
 """Bytes of all arrays that are read of one file, decompressed: 4 GiB are 100 million points of 40 bytes, for which
@@ -220,7 +219,7 @@ def _numbers(stream: IO[bytes], header: _Header) -> NDArray[np.generic]:
 
 
 def encode_npz(cloud: Cloud) -> bytes:
-    """Bytes of an .npz archive of the cloud's arrays, compressed.
+    """Bytes of an .npz archive of the cloud's arrays, not compressed.
 
     A column has its own name as key, after ``columns/`` if that name is one of the cloud's own.
     """
@@ -229,7 +228,7 @@ def encode_npz(cloud: Cloud) -> bytes:
         is_free = name not in _OWN and not name.startswith((_COLUMNS, _CLOUD))
         arrays[name if is_free else f"{_COLUMNS}{name}"] = column
     stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
         for name, values in arrays.items():
             if values is not None:
                 with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:

@@ -15,17 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.cloud import (
-    MAX_HEADER_BYTES,
     Cloud,
     cloud_from_columns,
-    columns_from_text,
     columns_of_cloud,
     native,
-    numbers_from_text,
-    numbers_of_words,
 )
 from pcgraph.errors import CloudReadError
-from pcgraph.io.format import Format, check_words, field_name, field_word
+from pcgraph.io.format import MAX_HEADER_BYTES, Format, check_words, field_name, field_word
+from pcgraph.io.text_numbers import columns_from_text, numbers_from_text, numbers_of_words
 
 Columns = dict[str, NDArray[np.generic]]
 

@@ -48,10 +48,7 @@ from numpy.typing import NDArray
 
 from pcgraph.cloud import (
     COLOR_NAMES,
-    INFINITY_OF_WINDOWS,
     LABEL_NAMES,
-    MAX_HEADER_BYTES,
-    NAN_OF_WINDOWS,
     NORMAL_NAMES,
     PACKED_NAMES,
     Cloud,
@@ -59,7 +56,8 @@ from pcgraph.cloud import (
     columns_of_cloud,
 )
 from pcgraph.errors import CloudReadError, CloudWriteError
-from pcgraph.io.format import CloudFile, Format
+from pcgraph.io.format import MAX_HEADER_BYTES, CloudFile, Format
+from pcgraph.io.text_numbers import INFINITY_OF_WINDOWS, NAN_OF_WINDOWS
 
 MAX_LINE = 1 << 16
 """Bytes of a line, count: far more than rows have, so that one endless line does not fill the memory. Chosen by

@@ -330,9 +330,19 @@ def test_open3d_files_are_read_and_ours_read_back(tmp_path):
         read = pcgraph.read_cloud(tmp_path / name)
         assert read.points == pytest.approx(points, abs=1e-6)
         assert np.unique(read.colors).tolist() == [51]
-    result = pcgraph.segment(points)
-    pcgraph.write_segmentation(tmp_path / "out.ply", pcgraph.Cloud(points), result)
-    assert np.asarray(o3d.io.read_point_cloud(str(tmp_path / "out.ply")).points) == pytest.approx(points)
+    colors, object_of = np.random.default_rng(1).integers(0, 256, (50, 3), np.uint8), np.arange(50, dtype=np.int32)
+    for dtype, suffix in (("f4", "ply"), ("f8", "ply"), ("f4", "pcd"), ("f8", "pcd")):
+        ours = pcgraph.Cloud(points.astype(dtype), colors, points.astype(dtype), columns={"object": object_of})
+        path = str(tmp_path / f"ours.{suffix}")
+        pcgraph.write_cloud(path, ours)
+        read = pcgraph.as_cloud(o3d.t.io.read_point_cloud(path))
+        assert np.array_equal(read.points, ours.points)
+        assert np.array_equal(read.columns["object"], object_of)
+        if (dtype, suffix) != ("f8", "pcd"):  # of which the older reader makes zeros
+            read = pcgraph.as_cloud(o3d.io.read_point_cloud(path))
+            assert np.array_equal(read.points, ours.points)
+        assert np.array_equal(read.colors, colors)
+        assert np.array_equal(read.normals, ours.normals)
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.npz"])
