@@ -6,19 +6,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hmac
-import logging
 import shutil
+import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Annotated, Any
 
-from fastapi import Depends, FastAPI, Query, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
+from fastapi import Path as PathParameter
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, JSONResponse
+from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.background import BackgroundTask
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.routing import Match, Route
+from starlette.types import Scope
 
 from pcgraph import __version__
 from pcgraph.service.guards import Guards, problem_response
@@ -31,7 +34,7 @@ from pcgraph.service.models import (
     Points,
     ProblemModel,
     SegmentationModel,
-    SegmentParameters,
+    TreeModel,
     UploadQuery,
     Wait,
     did_you_mean,
@@ -39,12 +42,11 @@ from pcgraph.service.models import (
 from pcgraph.service.problems import Problem, busy
 from pcgraph.service.settings import ServiceSettings
 from pcgraph.service.store import Job, Store
-from pcgraph.service.tasks import SAVED
 from pcgraph.service.uploads import FILE_FIELD, Upload, receive_upload, said
 from pcgraph.service.worker_pool import RETRY_SECONDS, WorkerPool
 
-_log = logging.getLogger("pcgraph.service")
-
+SAVED = "segmentation.npz"
+"""Name of the file of a saved segmentation."""
 JANITOR_SECONDS = 30.0
 """Time between two looks for segmentations that are too old. Chosen by eye; not varied."""
 VIEW_POLICY = "sandbox allow-scripts"
@@ -116,7 +118,7 @@ class Service:
             "task": "segment_upload",
             "upload": str(path),
             "name": upload.name,
-            "folder": str(job.folder),
+            "saved": str(job.folder / SAVED),
             "max_points": self.settings.max_points,
             **upload.parameters.model_dump(exclude={"wait"}),
         }
@@ -145,7 +147,7 @@ class Service:
         folder = self.store.answer_folder(job, SAVED)
         try:
             order = self.answering.put(
-                {"task": task, "segmentation_id": job.id, "folder": str(folder), **arguments}
+                {"task": task, "segmentation_id": job.id, "saved": str(folder / SAVED), **arguments}
             )
             try:
                 written = await order.answer
@@ -163,7 +165,9 @@ class Service:
         if job.problem is not None:
             raise Problem(409, f"this segmentation failed: {job.problem.detail}")
         if job.summary is None:
-            raise Problem(409, f"this segmentation is {job.state}: ask again later", {"Retry-After": str(RETRY_SECONDS)})
+            raise Problem(
+                409, f"this segmentation is {job.state}: ask again later", {"Retry-After": str(RETRY_SECONDS)}
+            )
         return job
 
     def model(self, job: Job, root: str) -> SegmentationModel:
@@ -185,7 +189,7 @@ class Service:
 
 def _note(job: Job, words: str) -> None:
     if job.began is None:
-        job.began = asyncio.get_running_loop().time()
+        job.began = time.monotonic()
     job.stage = words
 
 
@@ -210,3 +214,328 @@ def _declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
         }
         for status in (400, 401, 403, 408, 413, 422, *statuses)
     }
+
+
+# ---- Operations ----------------------------------------------------------------------------------------------------
+
+_UPLOAD = {
+    "requestBody": {
+        "required": True,
+        "description": "A form with the file in the field `cloud`; or the file itself, with its name in the query; or a "
+        "small cloud as JSON. Every format that `pcgraph.read_cloud` reads is taken, .npz with arrays too.",
+        "content": {
+            "application/json": {
+                "schema": {"$ref": "#/components/schemas/Points"},
+                "example": {"points": [[0.1 * x, 0.1 * y, 2.0] for y in range(6) for x in range(6)]},
+            },
+            "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": [FILE_FIELD],
+                    "properties": {
+                        FILE_FIELD: {
+                            "type": "string",
+                            "format": "binary",
+                            "description": "The file; the end of its name tells the format.",
+                        }
+                    },
+                    "additionalProperties": False,
+                }
+            },
+        },
+    }
+}
+"""OpenAPI's description of an upload's body; fields of a form are the parameters of the query, too."""
+
+
+_LOCATION = {"Location": {"description": "Path of the segmentation.", "schema": {"type": "string"}}}
+_OF_ID = {"segmentation_id": "$response.body#/id"}
+_LINKS = {
+    name: {"operationId": name, "parameters": _OF_ID}
+    for name in ("state", "labels", "objects", "tree", "view", "file", "remove")
+}
+"""What can be asked about a segmentation, as OpenAPI's links."""
+
+
+def _service(request: Request) -> Service:
+    service: Service = request.app.state.service
+    return service
+
+
+Here = Annotated[Service, Depends(_service)]
+Id = Annotated[str, PathParameter(min_length=1, max_length=64, description="Its id, as the upload's answer says.")]
+open_router = APIRouter()
+"""Operations without a token."""
+router = APIRouter()
+"""Operations that need the token, if there is one."""
+
+
+@open_router.get("/health", operation_id="health", responses=_declared())
+async def health(service: Here) -> Health:
+    """How the service is. It answers without a token, and only after the kernels are compiled."""
+    pools = (service.segmenting, service.answering)
+    return Health(
+        ready=all(pool.n_ready for pool in pools),
+        version=__version__,
+        workers=sum(pool.n_ready for pool in pools),
+        queued=service.segmenting.n_waiting,
+        segmentations=len(service.store),
+    )
+
+
+@router.post(
+    "/segmentations",
+    operation_id="segment",
+    status_code=201,
+    response_model=SegmentationModel,
+    responses={
+        201: {"description": "The cloud is segmented.", "headers": _LOCATION, "links": _LINKS},
+        202: {
+            "model": SegmentationModel,
+            "description": "The cloud waits or is being segmented: ask at `Location`.",
+            "headers": _LOCATION,
+            "links": _LINKS,
+        },
+        **_declared(415, 500, 503, 504),
+    },
+    openapi_extra=_UPLOAD,
+)
+async def segment(request: Request, service: Here, query: Annotated[UploadQuery, Query()]) -> Response:
+    """Segment a cloud.
+
+    The answer comes when the segmentation is done, or after `wait` seconds, whatever is first. A client that hangs up
+    before has no id, so its segmentation is ended.
+    """
+    with service.upload_slot(), service.store.upload_file() as path:
+        upload = await receive_upload(request, query, path)
+        job = service.begin(upload, path)
+    try:
+        if not await _finished(job, upload.parameters.wait, request):
+            service.store.remove(job)
+    except asyncio.CancelledError:
+        service.store.remove(job)
+        raise
+    if job.problem is not None:
+        service.store.remove(job)
+        raise job.problem
+    model = service.model(job, request.scope.get("root_path", ""))
+    location = {"Location": model.links["self"]}
+    return JSONResponse(model.model_dump(mode="json"), 201 if model.state == "done" else 202, location)
+
+
+async def _finished(job: Job, seconds: float, request: Request) -> bool:
+    """Wait until a job has finished, for so many seconds at most; False if the client hangs up."""
+    finished = asyncio.create_task(job.finished.wait())
+    hung_up = asyncio.create_task(_hung_up(request))
+    try:
+        await asyncio.wait({finished, hung_up}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        return not hung_up.done()
+    finally:
+        finished.cancel()
+        hung_up.cancel()
+
+
+async def _hung_up(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+@router.get(
+    "/segmentations/{segmentation_id}", operation_id="state", responses=_declared(404), response_model=SegmentationModel
+)
+async def state(request: Request, service: Here, segmentation_id: Id, wait: Annotated[Wait, Query()] = 0.0) -> Any:
+    """How far a segmentation is, and what came of it. With `wait` the answer comes when it is done, or then."""
+    job = service.store.job(segmentation_id)
+    await _finished(job, wait, request)
+    return service.model(job, request.scope.get("root_path", ""))
+
+
+@router.delete("/segmentations/{segmentation_id}", operation_id="remove", status_code=204, responses=_declared(404))
+async def remove(service: Here, segmentation_id: Id) -> None:
+    """End a segmentation, if it is not done, and remove it."""
+    service.store.remove(service.store.job(segmentation_id))
+
+
+@router.get(
+    "/segmentations/{segmentation_id}/labels",
+    operation_id="labels",
+    response_class=FileResponse,
+    responses={
+        200: {
+            "description": "The labels, in the format that was asked for.",
+            "content": {
+                "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
+                "application/json": {"schema": {"$ref": "#/components/schemas/LabelsModel"}},
+            },
+        },
+        **_declared(404, 409, 500, 503, 504),
+    },
+)
+async def labels(service: Here, segmentation_id: Id, query: Annotated[LabelQuery, Query()]) -> FileResponse:
+    """Labels of the points: the objects, or a cut of the tree at any level. Nothing is segmented again.
+
+    Give `n` for a number of segments, or `altitude` for a level; neither for the objects.
+    """
+    if query.format not in LABEL_FORMATS:
+        known = list(LABEL_FORMATS)
+        raise Problem(
+            422,
+            f"expected format as one of {', '.join(known)}, got {query.format[:80]!r}{did_you_mean(query.format, known)}",
+        )
+    if query.n is not None and query.altitude is not None:
+        raise Problem(422, "expected n or altitude, got both: choose one")
+    media_type = "application/json" if query.format == "json" else "application/octet-stream"
+    arguments = query.model_dump(exclude={"format"})
+    return await service.answer(segmentation_id, "write_labels", media_type, file_format=query.format, **arguments)
+
+
+@router.get(
+    "/segmentations/{segmentation_id}/objects",
+    operation_id="objects",
+    response_model=ObjectsModel,
+    responses=_declared(404, 409, 500, 503, 504),
+)
+async def objects(service: Here, segmentation_id: Id) -> Response:
+    """What stands on the largest horizontal plane, with boxes and shapes: see `pcgraph.detection.objects_on`."""
+    return await service.answer(segmentation_id, "write_objects", "application/json")
+
+
+@router.get(
+    "/segmentations/{segmentation_id}/tree",
+    operation_id="tree",
+    response_model=TreeModel,
+    responses=_declared(404, 409, 500, 503, 504),
+)
+async def tree(service: Here, segmentation_id: Id) -> Response:
+    """The segmentation tree: parents, altitudes and sizes of its nodes."""
+    return await service.answer(segmentation_id, "write_tree", "application/json")
+
+
+@router.get(
+    "/segmentations/{segmentation_id}/view",
+    operation_id="view",
+    response_class=HTMLResponse,
+    responses=_declared(404, 409, 500, 503, 504),
+)
+async def view(service: Here, segmentation_id: Id) -> Response:
+    """The viewer: one HTML page that works offline."""
+    title = service.done(segmentation_id).title
+    page = await service.answer(segmentation_id, "write_view", "text/html", title=title)
+    page.headers["Content-Disposition"] = "inline"
+    page.headers["Content-Security-Policy"] = VIEW_POLICY
+    return page
+
+
+@router.get(
+    f"/segmentations/{{segmentation_id}}/{SAVED}",
+    operation_id="file",
+    response_class=FileResponse,
+    responses={
+        200: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}},
+        **_declared(404, 409),
+    },
+)
+async def file(service: Here, segmentation_id: Id) -> Response:
+    """The saved segmentation, with the cloud: `pcgraph.load_segmentation` opens it."""
+    job = service.done(segmentation_id)
+    path = service.store.answer_folder(job, SAVED) / SAVED
+    return _file(path, "application/octet-stream", f"{Path(job.title).stem}.{SAVED}")
+
+
+# ---- The application -----------------------------------------------------------------------------------------------
+
+
+def application(settings: ServiceSettings) -> FastAPI:
+    """The service as an ASGI application; see `pcgraph.service.create_app`."""
+    service = Service(settings)
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        async with service.running():
+            yield
+
+    app = FastAPI(
+        title="pcgraph",
+        version=__version__,
+        description="Segments point clouds: objects, parts, supervoxels, the graph and the tree between them.",
+        lifespan=lifespan,
+        redirect_slashes=False,
+        docs_url=None,  # FastAPI's pages load their scripts from another web site
+        redoc_url=None,
+    )
+    app.state.service = service
+    app.add_middleware(Guards, settings=settings)
+    for kind, respond in _RESPONDERS.items():
+        app.add_exception_handler(kind, respond)
+    app.include_router(open_router)
+    app.include_router(router, dependencies=[] if settings.token is None else [Depends(_check_token)])
+    _describe(app)
+    return app
+
+
+def _check_token(
+    service: Here, given: Annotated[HTTPAuthorizationCredentials | None, Depends(HTTPBearer(auto_error=False))]
+) -> None:
+    """Raise a 401 unless the request has the token; how long this takes tells nothing about the token."""
+    token = service.settings.token or ""
+    if given is None or not hmac.compare_digest(given.credentials.encode(), token.encode()):
+        raise Problem(
+            401,
+            "expected the token of the service in the header: Authorization: Bearer TOKEN",
+            {"WWW-Authenticate": "Bearer"},
+        )
+
+
+async def _of_problem(request: Request, error: Exception) -> Response:
+    assert isinstance(error, Problem)
+    return problem_response(error)
+
+
+async def _of_validation(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    known = UploadQuery if request.method == "POST" else LabelQuery  # the operations that refuse unknown names
+    return problem_response(Problem(422, said(error.errors(), list(known.model_fields))))
+
+
+async def _of_http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    detail, headers = f"{error.detail}: {request.method} {request.url.path[:200]}", dict(error.headers or {})
+    if error.status_code == 405:
+        headers["Allow"] = ", ".join(sorted(_methods(request.scope)))
+    return problem_response(Problem(error.status_code, detail, headers))
+
+
+def _methods(scope: Scope) -> set[str]:
+    """Methods of a path. FastAPI has one route for each, so that its own header `Allow` names the first only."""
+    routes = [route for one in (open_router, router) for route in one.routes if isinstance(route, Route)]
+    return {m for route in routes if route.matches(scope)[0] != Match.NONE for m in route.methods or ()}
+
+
+async def _of_disconnect(request: Request, error: Exception) -> Response:
+    return problem_response(Problem(400, "the upload was cut off"))  # nobody hears it
+
+
+async def _of_bug(request: Request, error: Exception) -> Response:
+    return problem_response(Problem(500, "the service failed at this request; its log says where"))  # uvicorn logs it
+
+
+_RESPONDERS = {
+    Problem: _of_problem,
+    RequestValidationError: _of_validation,
+    HTTPException: _of_http,
+    ClientDisconnect: _of_disconnect,
+    Exception: _of_bug,
+}
+"""Answers to exceptions, all of them problems."""
+
+
+def _describe(app: FastAPI) -> None:
+    """Add the schemas to the OpenAPI document that no type of an operation names."""
+    document = app.openapi()
+    schemas = document["components"]["schemas"]
+    for model in (ProblemModel, Points, LabelsModel):
+        schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+        schemas[model.__name__] = schema
+    for name in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(name, None)

@@ -62,7 +62,9 @@ class Guards:
         host, origin = headers.get("host", ""), headers.get("origin")
         name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
         if self._settings.token is None and name.lower() not in (*LOCAL_NAMES, self._settings.host.lower()):
-            return Problem(400, f"expected a request to {', '.join(LOCAL_NAMES)}: give the service a token to use others")
+            return Problem(
+                400, f"expected a request to {', '.join(LOCAL_NAMES)}: give the service a token to use others"
+            )
         if self._settings.token is None and origin is not None and origin.partition("://")[2] != host:
             return Problem(403, "expected no request from another web site's page: give the service a token for that")
         length = headers.get("content-length", "")

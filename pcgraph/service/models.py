@@ -16,7 +16,13 @@ MAX_WAIT_SECONDS = 60.0
 60 s)."""
 WAIT_SECONDS = 4.0
 """Time for which an upload waits for its segmentation, unless told: httpx gives up after 5 s."""
-LABEL_FORMATS = ("npz", "json", *(end[1:] for one in FORMATS if one.encode is not None for end in one.suffixes if end != ".npz"))
+MAX_NAME = 255
+"""Characters of a file's name, the limit of common file systems."""
+LABEL_FORMATS = (
+    "npz",
+    "json",
+    *(end[1:] for one in FORMATS if one.encode is not None for end in one.suffixes if end != ".npz"),
+)
 """Formats of labels: arrays alone, and every format of clouds that is written."""
 
 Wait = Annotated[
@@ -37,7 +43,7 @@ def _one_of(family: str, default: str, text: str) -> Any:
 
     def check(name: str) -> str:
         if name not in known:
-            raise ValueError(f"expected one of {', '.join(known)}{did_you_mean(name, known)}")
+            raise ValueError(f"expected one of {', '.join(known)}, got {name[:80]!r}{did_you_mean(name, known)}")
         return name
 
     return Annotated[
@@ -66,9 +72,7 @@ class SegmentParameters(BaseModel):
     n_supervoxels: int | None = Field(
         None, ge=1, le=10_000_000, description="About how many supervoxels there are, in place of seed_size."
     )
-    camera: bool | None = Field(
-        None, description="Whether a camera took the points. Default: found from the points."
-    )
+    camera: bool | None = Field(None, description="Whether a camera took the points. Default: found from the points.")
     range_growth: float | None = Field(
         None,
         ge=0.0,
@@ -103,7 +107,7 @@ class UploadQuery(SegmentParameters):
     name: str | None = Field(
         None,
         min_length=1,
-        max_length=255,
+        max_length=MAX_NAME,
         description="Name of the file, if the body is the file itself: its end tells the format.",
         examples=["scan.laz"],
     )
@@ -211,3 +215,14 @@ class ObjectsModel(BaseModel):
     objects: list[dict[str, Any]] = Field(
         description="Each with its count of points, standing box, free box and shape, the largest first."
     )
+
+
+class TreeModel(BaseModel):
+    """A segmentation tree, one entry for each node; the supervoxels come first, the root is the last."""
+
+    n_leaves: int = Field(description="Number of supervoxels.")
+    parents: list[int] = Field(description="Parent of each node; the root is its own.")
+    altitudes: list[float | None] = Field(
+        description="Altitude of each node, the linkage's unit; null where parts that do not touch were joined."
+    )
+    sizes: list[int] = Field(description="Points of each node.")

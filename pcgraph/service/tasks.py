@@ -13,29 +13,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pcgraph.cloud import Cloud
 from pcgraph.detection.objects import objects_on
 from pcgraph.detection.plane_detection import find_planes
+from pcgraph.errors import CloudReadError
 from pcgraph.families import members
 from pcgraph.io import decode_cloud, encode_cloud, labelled_cloud, read_cloud
-from pcgraph.io.saved_segmentations import load_segmentation
 from pcgraph.plausibility import CloudWarning
+from pcgraph.saved_segmentation import load_segmentation
 from pcgraph.scan import segment
 from pcgraph.segmentation import Segmentation
 from pcgraph.service.problems import Problem
 
 Stage = Callable[[str], None]
 """Told in words what a task has come to."""
-
-SAVED = "segmentation.npz"
-"""Name of the saved segmentation in the folder of each."""
-ARRAYS = {"points": 2, "colors": 2, "normals": 2}
-"""Keys of a cloud in JSON, and the dimensions of their arrays."""
 
 
 # ---- Segmenting ----------------------------------------------------------------------------------------------------
@@ -45,7 +41,7 @@ def segment_upload(
     stage: Stage,
     upload: str,
     name: str | None,
-    folder: str,
+    saved: str,
     max_points: int,
     color: bool,
     columns: Sequence[str] | None,
@@ -53,7 +49,7 @@ def segment_upload(
     linkage: str,
     **parameters: Any,
 ) -> dict[str, Any]:
-    """Segment an upload, save the segmentation in a folder, and say what came of it.
+    """Segment an upload, save the segmentation, and say what came of it.
 
     Parameters
     ----------
@@ -62,8 +58,8 @@ def segment_upload(
         Path of the upload; its name says nothing.
     name : str, or None
         Name that the user gave the file, whose end tells the format; None: the upload is JSON.
-    folder : str
-        Folder for the saved segmentation.
+    saved : str
+        Path for the saved segmentation.
     max_points : int
     color : bool
         Whether colours shape the supervoxels.
@@ -80,7 +76,9 @@ def segment_upload(
     del content
     n_points = cloud.points.size // 3
     if n_points > max_points:
-        raise Problem(413, f"expected a cloud of at most {max_points} points, got {n_points}: send a part or a thinned one")
+        raise Problem(
+            413, f"expected a cloud of at most {max_points} points, got {n_points}: send a part or a thinned one"
+        )
     stage("segmenting")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -91,7 +89,7 @@ def segment_upload(
             **parameters,
         )
     stage("saving")
-    result.save(Path(folder) / SAVED, cloud)
+    result.save(saved, cloud)
     return {
         "points": n_points,
         "segmented": int(np.count_nonzero(result.supervoxels >= 0)),
@@ -109,33 +107,14 @@ def segment_upload(
 
 
 def _cloud_of_json(content: bytes) -> Cloud:
-    """Cloud of ``{"points": [[x, y, z], ...], "colors": ..., "normals": ...}``."""
-    try:
-        given = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"expected JSON such as {{\"points\": [[0, 0, 1]]}}: {str(error)[:100]}") from None
-    if not isinstance(given, dict) or "points" not in given or not set(given) <= set(ARRAYS):
-        found = ", ".join(sorted(given))[:100] if isinstance(given, dict) else type(given).__name__
-        raise ValueError(f"expected a JSON object with points and, if there are any, colors and normals, got {found}")
-    arrays = {key: _rows_of_json(key, rows) for key, rows in given.items()}
-    colors = arrays.get("colors")
-    if colors is not None:
-        if not ((colors >= 0) & (colors <= 255) & (colors == np.rint(colors))).all():
-            raise ValueError("expected colors as whole numbers from 0 to 255")
-        arrays["colors"] = colors.astype(np.uint8)
-    if len({len(array) for array in arrays.values()}) > 1:
+    """Cloud of JSON that is a `pcgraph.service.models.Points`."""
+    given = json.loads(content)
+    arrays = {name: np.array(rows) for name, rows in given.items() if rows is not None}
+    colors = arrays.pop("colors", None)
+    arrays = {name: rows.astype(np.float64) for name, rows in arrays.items()}
+    if len({len(rows) for rows in (*arrays.values(), colors) if rows is not None}) > 1:
         raise ValueError(f"expected as many colors and normals as points, {len(arrays['points'])}")
-    return Cloud(**arrays)
-
-
-def _rows_of_json(key: str, rows: object) -> NDArray[Any]:
-    try:
-        array = np.array(rows)
-    except ValueError:  # rows of several lengths
-        array = np.empty(0, object)
-    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "iuf":
-        raise ValueError(f"expected {key} as a list of rows of three numbers each")
-    return array.astype(np.float64)
+    return Cloud(**arrays, colors=None if colors is None else colors.astype(np.uint8))
 
 
 # ---- Answers about a saved segmentation ----------------------------------------------------------------------------
@@ -144,34 +123,36 @@ _opened: dict[str, tuple[Cloud, Segmentation]] = {}
 """The segmentation that was asked about last: questions about one mostly follow each other."""
 
 
-def _open(segmentation_id: str, folder: str) -> tuple[Cloud, Segmentation]:
+def _open(segmentation_id: str, saved: str) -> tuple[Cloud, Segmentation]:
     if segmentation_id not in _opened:
         _opened.clear()
-        path = Path(folder) / SAVED
-        _opened[segmentation_id] = read_cloud(path), load_segmentation(path)
+        try:
+            _opened[segmentation_id] = read_cloud(saved), load_segmentation(saved)
+        except CloudReadError as error:
+            raise Problem(500, f"the service cannot read its own file: {error}") from None
     return _opened[segmentation_id]
 
 
 def write_labels(
     stage: Stage,
     segmentation_id: str,
-    folder: str,
+    saved: str,
     file_format: str,
     n: int | None,
     altitude: float | None,
     min_size: int,
     colorize: bool,
 ) -> dict[str, Any]:
-    """Write the labels of a cut, or the cloud with its labels, to a file of a folder.
+    """Write the labels of a cut, or the cloud with its labels, to a file beside the saved segmentation.
 
     Formats npz and json hold the labels alone, in the input's shape; all others hold the cloud with its own columns,
     and ours: object, part, supervoxel, and, if a cut was asked for, segment.
     """
-    cloud, result = _open(segmentation_id, folder)
+    cloud, result = _open(segmentation_id, saved)
     is_default = n is None and altitude is None and min_size == 1
     level = result.object_altitude if n is None and altitude is None else altitude
     labels = result.labels if is_default else result.cut(n, level, min_size)
-    path = Path(folder) / f"labels.{file_format}"
+    path = Path(saved).with_name(f"labels.{file_format}")
     if file_format == "json":
         path.write_text(json.dumps({"labels": labels.tolist(), "segments": int(labels.max(initial=-1)) + 1}))
     elif file_format == "npz":
@@ -186,9 +167,9 @@ def write_labels(
     return {"file": path.name}
 
 
-def write_objects(stage: Stage, segmentation_id: str, folder: str) -> dict[str, Any]:
+def write_objects(stage: Stage, segmentation_id: str, saved: str) -> dict[str, Any]:
     """Write the objects on the largest horizontal plane, with their boxes and shapes, as JSON."""
-    cloud, result = _open(segmentation_id, folder)
+    cloud, result = _open(segmentation_id, saved)
     planes = find_planes(result)
     level = np.flatnonzero(planes.roles == "horizontal")
     support = None
@@ -196,28 +177,46 @@ def write_objects(stage: Stage, segmentation_id: str, folder: str) -> dict[str, 
         plane = int(level[0])
         support = {"normal": planes.normals[plane].tolist(), "centroid": planes.centroids[plane].tolist()}
     found = objects_on(result, planes, points=cloud.points)
-    return _write_json(folder, "objects.json", {"support": support, "objects": [one.to_dict() for one in found]})
+    return _write_json(saved, "objects.json", {"support": support, "objects": [one.to_dict() for one in found]})
 
 
-def write_tree(stage: Stage, segmentation_id: str, folder: str) -> dict[str, Any]:
+def write_tree(stage: Stage, segmentation_id: str, saved: str) -> dict[str, Any]:
     """Write the segmentation tree as JSON."""
-    _, result = _open(segmentation_id, folder)
-    return _write_json(folder, "tree.json", result.tree.to_dict())
+    _, result = _open(segmentation_id, saved)
+    return _write_json(saved, "tree.json", result.tree.to_dict())
 
 
-def write_view(stage: Stage, segmentation_id: str, folder: str, title: str) -> dict[str, Any]:
+def write_view(stage: Stage, segmentation_id: str, saved: str, title: str) -> dict[str, Any]:
     """Write the viewer page of a segmentation, one HTML file that works offline."""
     from pcgraph.viewer import view_page
 
-    cloud, result = _open(segmentation_id, folder)
-    path = Path(folder) / "view.html"
+    cloud, result = _open(segmentation_id, saved)
+    path = Path(saved).with_name("view.html")
     path.write_text(view_page(cloud, result, title), encoding="utf-8")
     return {"file": path.name}
 
 
-def _write_json(folder: str, name: str, content: dict[str, Any]) -> dict[str, Any]:
-    (Path(folder) / name).write_text(json.dumps(content, allow_nan=False), encoding="utf-8")
+def _write_json(saved: str, name: str, content: dict[str, Any]) -> dict[str, Any]:
+    Path(saved).with_name(name).write_text(json.dumps(content, allow_nan=False), encoding="utf-8")
     return {"file": name}
+
+
+def warm_up() -> None:
+    """Do every task once, on a small cloud of a box on a table, so that all kernels are compiled and loaded."""
+    for family in ("Linkage", "SupervoxelMethod"):
+        members(family)  # whose classes saved segmentations name
+    x, y = np.meshgrid(*2 * [np.linspace(0.0, 1.0, 40)])
+    on_box = (abs(x - 0.5) < 0.2) & (abs(y - 0.5) < 0.2)
+    cloud = Cloud(np.stack((x, y, np.where(on_box, 0.2, 0.0)), axis=-1))
+    with TemporaryDirectory(prefix="pcgraph-") as folder:
+        saved = f"{folder}/box.npz"
+        segment(cloud, viewpoint=(0.5, 0.5, 3.0)).save(saved, cloud)
+        about = {"stage": str, "segmentation_id": folder, "saved": saved}
+        write_labels(**about, file_format="ply", n=2, altitude=None, min_size=1, colorize=True)
+        write_objects(**about)
+        write_tree(**about)
+        write_view(**about, title="box")
+    _opened.clear()
 
 
 TASKS: dict[str, Callable[..., dict[str, Any]]] = {

@@ -32,11 +32,12 @@ def main() -> None:
         answers.flush()
 
     from pcgraph.all_kernels import compile_kernels
-    from pcgraph.service.tasks import TASKS
+    from pcgraph.service.tasks import TASKS, warm_up
 
     tasks: queue.SimpleQueue[str] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(sys.stdin, tasks), daemon=True).start()
     compile_kernels()
+    warm_up()
     _limit_memory(int(sys.argv[1]))
     say({"ready": True})
     while True:
@@ -61,14 +62,15 @@ def _limit_memory(n_bytes: int) -> None:
 
 
 def _answer(do: Callable[..., Any], arguments: dict[str, Any], stage: Callable[[str], None]) -> dict[str, Any]:
+    own = os.path.join(os.path.dirname(arguments["saved"]), "")  # no path of the server comes into a message
     try:
         return {"result": do(stage=stage, **arguments)}
     except Problem as problem:
-        return _problem(problem.status, problem.detail)
+        return _problem(problem.status, problem.detail.replace(own, ""))
     except MemoryError:
         return _problem(413, "the cloud needs more memory than this service gives to one: send fewer points")
     except (CloudReadError, CloudWriteError, PcgraphError, ValueError) as error:
-        return _problem(422, str(error))
+        return _problem(422, str(error).replace(own, ""))
     except OSError as error:
         traceback.print_exc()
         return _problem(500, f"the service cannot keep its files: {error.strerror or 'the disk fails'}")
