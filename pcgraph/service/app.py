@@ -221,8 +221,8 @@ def _declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
 _UPLOAD = {
     "requestBody": {
         "required": True,
-        "description": "A form with the file in the field `cloud`; or the file itself, with its name in the query; or a "
-        "small cloud as JSON. Every format that `pcgraph.read_cloud` reads is taken, .npz with arrays too.",
+        "description": "A form with the file in the field `cloud`; or the file itself, with its name in the query; or "
+        "a small cloud as JSON. Every format that `pcgraph.read_cloud` reads is taken, .npz with arrays too.",
         "content": {
             "application/json": {
                 "schema": {"$ref": "#/components/schemas/Points"},
@@ -378,11 +378,8 @@ async def labels(service: Here, segmentation_id: Id, query: Annotated[LabelQuery
     Give `n` for a number of segments, or `altitude` for a level; neither for the objects.
     """
     if query.format not in LABEL_FORMATS:
-        known = list(LABEL_FORMATS)
-        raise Problem(
-            422,
-            f"expected format as one of {', '.join(known)}, got {query.format[:80]!r}{did_you_mean(query.format, known)}",
-        )
+        hint = did_you_mean(query.format, list(LABEL_FORMATS))
+        raise Problem(422, f"expected format as one of {', '.join(LABEL_FORMATS)}, got {query.format[:80]!r}{hint}")
     if query.n is not None and query.altitude is not None:
         raise Problem(422, "expected n or altitude, got both: choose one")
     media_type = "application/json" if query.format == "json" else "application/octet-stream"

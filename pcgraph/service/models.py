@@ -46,9 +46,8 @@ def _one_of(family: str, default: str, text: str) -> Any:
             raise ValueError(f"expected one of {', '.join(known)}, got {name[:80]!r}{did_you_mean(name, known)}")
         return name
 
-    return Annotated[
-        str, AfterValidator(check), Field(description=text, json_schema_extra={"enum": known}, examples=[default])
-    ]
+    enum: dict[str, Any] = {"enum": known}
+    return Annotated[str, AfterValidator(check), Field(description=text, json_schema_extra=enum, examples=[default])]
 
 
 def did_you_mean(given: str, known: list[str]) -> str:

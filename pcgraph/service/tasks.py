@@ -109,12 +109,12 @@ def segment_upload(
 def _cloud_of_json(content: bytes) -> Cloud:
     """Cloud of JSON that is a `pcgraph.service.models.Points`."""
     given = json.loads(content)
-    arrays = {name: np.array(rows) for name, rows in given.items() if rows is not None}
-    colors = arrays.pop("colors", None)
-    arrays = {name: rows.astype(np.float64) for name, rows in arrays.items()}
-    if len({len(rows) for rows in (*arrays.values(), colors) if rows is not None}) > 1:
-        raise ValueError(f"expected as many colors and normals as points, {len(arrays['points'])}")
-    return Cloud(**arrays, colors=None if colors is None else colors.astype(np.uint8))
+    arrays = {name: np.array(rows, np.float64) for name, rows in given.items() if rows is not None}
+    points, colors, normals = (arrays.get(name) for name in ("points", "colors", "normals"))
+    assert points is not None
+    if any(rows is not None and len(rows) != len(points) for rows in (colors, normals)):
+        raise ValueError(f"expected as many colors and normals as points, {len(points)}")
+    return Cloud(points, None if colors is None else colors.astype(np.uint8), normals)
 
 
 # ---- Answers about a saved segmentation ----------------------------------------------------------------------------
@@ -211,7 +211,7 @@ def warm_up() -> None:
     with TemporaryDirectory(prefix="pcgraph-") as folder:
         saved = f"{folder}/box.npz"
         segment(cloud, viewpoint=(0.5, 0.5, 3.0)).save(saved, cloud)
-        about = {"stage": str, "segmentation_id": folder, "saved": saved}
+        about: dict[str, Any] = {"stage": str, "segmentation_id": folder, "saved": saved}
         write_labels(**about, file_format="ply", n=2, altitude=None, min_size=1, colorize=True)
         write_objects(**about)
         write_tree(**about)

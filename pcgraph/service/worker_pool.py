@@ -99,7 +99,7 @@ class Worker:
         return worker
 
     async def do(self, order: Order, max_seconds: float) -> dict[str, Any]:
-        """Result of a task; Problem if there is none. The worker has ended then, or ends, unless it told the problem."""
+        """Result of a task; Problem if there is none: then the worker ends, too, unless it told the problem itself."""
         assert self._process.stdin is not None
         order.worker = self
         try:

@@ -10,20 +10,23 @@ for each task any number of {"stage": words}, and {"result": {...}} or {"problem
 from __future__ import annotations
 
 import json
+import logging
 import os
 import queue
 import sys
 import threading
-import traceback
 from collections.abc import Callable
 from typing import Any, TextIO
 
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, one_line, without_long_words
 from pcgraph.service.problems import Problem
 
+_log = logging.getLogger("pcgraph.service")
+
 
 def main() -> None:
     """Do tasks until the standard input is closed, as it is when the server ends."""
+    logging.basicConfig(level=logging.WARNING, format="pcgraph: %(message)s")
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what libraries print must not come between the answers
 
@@ -72,10 +75,10 @@ def _answer(do: Callable[..., Any], arguments: dict[str, Any], stage: Callable[[
     except (CloudReadError, CloudWriteError, PcgraphError, ValueError) as error:
         return _problem(422, str(error).replace(own, ""))
     except OSError as error:
-        traceback.print_exc()
+        _log.exception("the worker cannot use a file")
         return _problem(500, f"the service cannot keep its files: {error.strerror or 'the disk fails'}")
-    except Exception as error:  # the worker goes on: whatever it is, it belongs to this cloud
-        traceback.print_exc()
+    except Exception as error:  # noqa: BLE001  # it belongs to this task, and the worker goes on
+        _log.exception("the worker failed")
         return _problem(500, f"the service failed at this cloud ({type(error).__name__}); its log says where")
 
 
