@@ -203,13 +203,19 @@ class CleanCloud(ShortRepr):
         """About 16 000 of the points, without duplicates, in a pseudo-random order that does not depend on theirs."""
         return sample(self.points, self.bounds)
 
-    def in_input_shape(self, labels: NDArray[np.int32], of_outliers: int = -1) -> NDArray[np.int32]:
-        """Labels of the points in the input's shape: -1 where nothing was measured, `of_outliers` of outliers."""
+    def in_input_shape(self, labels: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Labels of the points in the input's shape, int32; -1 where nothing was measured, and of outliers."""
         if len(labels) == math.prod(self.shape):
             return labels.astype(np.int32).reshape(self.shape)
         full = np.full(self.shape, -1, np.int32)
         full.reshape(-1)[self.kept] = labels
-        full.reshape(-1)[self.outliers] = of_outliers
+        return full
+
+    @property
+    def is_outlier(self) -> NDArray[np.bool_]:
+        """Whether each point was left out as an outlier, in the input's shape."""
+        full = np.zeros(self.shape, np.bool_)
+        full.reshape(-1)[self.outliers] = True
         return full
 
     def without(self, outliers: NDArray[np.bool_]) -> CleanCloud:
