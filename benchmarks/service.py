@@ -35,6 +35,7 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -43,7 +44,7 @@ from numpy.typing import NDArray
 import pcgraph
 from pcgraph.io import encode_cloud
 
-LIMITS = {"max-seconds": 15, "max-upload-mb": 100, "max-upload-seconds": 5, "max-stored-gb": 0.05, "max-memory-gb": 3}
+LIMITS = {"max-seconds": 10, "max-upload-mb": 100, "max-upload-seconds": 5, "max-stored-gb": 0.05, "max-memory-gb": 3}
 """Of the server: short times, so that slow uploads and the stuck job end within the minute, and a small store, so that
 it has to make room."""
 CUT = 12
@@ -54,7 +55,11 @@ ACTIONS = {"good": 0.80, "cut off": 0.04, "garbage": 0.04, "too large": 0.03, "t
            "wrong parameter": 0.04, "slow": 0.03}  # fmt: skip
 """How often a client does what."""
 STUCK_POINTS = 3_000_000
-"""Points of the stuck cloud: noise in a cube, with small voxels; takes a minute and more on one core."""
+"""Points of the stuck cloud, noise in a cube."""
+STUCK_VOXEL = 0.01
+"""Edge of its voxels, metres: a million of them."""
+RECOVERY_SECONDS = 20
+"""Time in which a new worker must be ready; it takes some three seconds on a free core."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +81,6 @@ class Tally:
     lost: int = 0
     refused: int = 0
     seconds: list[float] = field(default_factory=list)
-
-    def wrongly(self, action: str, answer: httpx.Response | None, why: str = "") -> None:
-        status = "no answer" if answer is None else f"{answer.status_code} {answer.text[:150]}"
-        self.wrong[f"{action}: {why or status}"] += 1
 
 
 def box_on_a_table(n: int, rng: np.random.Generator) -> pcgraph.Cloud:
@@ -121,12 +122,12 @@ class Client:
             try:
                 await (self.good(cloud) if action == "good" else self.bad(action, cloud))
             except httpx.HTTPError as error:
-                self.tally.wrongly(action, None, f"{type(error).__name__} {error}")
+                self.tally.wrong[f"{action}: no answer, {type(error).__name__} {error}"] += 1
 
-    async def ask(self, method: str, path: str, **arguments: object) -> httpx.Response:
+    async def ask(self, method: str, path: str, **arguments: Any) -> httpx.Response:
         """An answer other than 503, after which it asks again."""
         while True:
-            answer = await self.http.request(method, path, **arguments)  # type: ignore[arg-type]
+            answer = await self.http.request(method, path, **arguments)
             self.tally.answers[str(answer.status_code)] += 1
             if answer.status_code != 503:
                 return answer
@@ -139,40 +140,41 @@ class Client:
             made = await self.ask("POST", "/segmentations", params={"name": cloud.name}, content=cloud.content)
         else:
             made = await self.ask("POST", "/segmentations", files={"cloud": (cloud.name, cloud.content)})
-        if made.status_code not in (201, 202):
-            return self.failed(made, made.json())
-        job = made.json()
-        while job["state"] in ("queued", "running"):
-            answer = await self.ask("GET", job["links"]["self"], params={"wait": 10})
-            if answer.status_code != 200:
-                return self.tally.wrongly("state", answer)
-            job = answer.json()
-        if job["state"] == "failed":
-            return self.failed(made, job["problem"])
+        job = await self.outcome(made)
+        if "state" not in job:
+            return self.failed("good", job)
         self.tally.seconds.append(time.monotonic() - start)
         for parameters, right in (({}, cloud.labels), ({"n": CUT}, cloud.cut)):
             answer = await self.ask("GET", job["links"]["labels"], params=parameters)
             if answer.status_code == 404:  # removed to make room for others
                 continue
             if answer.status_code != 200:
-                self.failed(answer, answer.json())
+                self.failed("labels", answer.json())
             elif not np.array_equal(np.load(BytesIO(answer.content))["labels"], right):
-                self.tally.wrongly("labels", None, f"of {cloud.name} differ")
+                self.tally.wrong[f"the labels of {cloud.name} differ"] += 1
         if self.rng.random() < 0.3:
             answer = await self.ask("DELETE", job["links"]["self"])
             if answer.status_code not in (204, 404):
-                self.tally.wrongly("remove", answer)
+                self.tally.wrong[f"remove: {answer.text}"] += 1
         return None
 
-    def failed(self, answer: httpx.Response, problem: dict[str, object]) -> None:
+    async def outcome(self, made: httpx.Response) -> dict[str, Any]:
+        """The finished job of an upload's answer, or its problem."""
+        job: dict[str, Any] = made.json()
+        while job.get("state") in ("queued", "running"):
+            job = (await self.ask("GET", job["links"]["self"], params={"wait": 10})).json()
+        problem: dict[str, Any] | None = job.get("problem")
+        return job if problem is None else problem
+
+    def failed(self, action: str, problem: dict[str, Any]) -> None:
         """Count a failure: lost with the killed worker, or wrong."""
-        if "SIGKILL" in str(problem["detail"]):
+        if "SIGKILL" in problem["detail"]:
             self.tally.lost += 1
         else:
-            self.tally.wrongly("good", answer, json.dumps(problem))
+            self.tally.wrong[f"{action}: {json.dumps(problem)}"] += 1
 
     async def bad(self, action: str, cloud: Known) -> None:
-        parameters: dict[str, object] = {"name": cloud.name}
+        parameters: dict[str, Any] = {"name": cloud.name}
         content: bytes | AsyncIterator[bytes]
         content, right = cloud.content, 422
         if action == "cut off":
@@ -187,12 +189,20 @@ class Client:
             parameters["voxel_sise"] = 0.1
         elif action == "slow":
             content, right = drip(), 408
-        answer = await self.http.post("/segmentations", params=parameters, content=content)
+        try:
+            answer = await self.http.post("/segmentations", params=parameters, content=content)
+        except (httpx.ReadError, httpx.WriteError):
+            if action in ("slow", "too large, unsaid"):  # ended while it sends, so that it may miss the answer
+                self.tally.answers["ended"] += 1
+                return
+            raise
         self.tally.answers[str(answer.status_code)] += 1
         if answer.status_code == 503:
             self.tally.refused += 1
-        elif answer.status_code != right:
-            self.tally.wrongly(action, answer)
+            return
+        outcome = await self.outcome(answer)
+        if outcome.get("status") != right:
+            self.failed(action, {"detail": "", **outcome})
 
 
 async def endless() -> AsyncIterator[bytes]:
@@ -249,42 +259,48 @@ async def kill_one(pid: int, at: float) -> int:
     return worker
 
 
-async def stuck_job(http: httpx.AsyncClient, rng: np.random.Generator) -> dict[str, object]:
-    """The state of a job that takes too long, after its end."""
+async def begin_stuck_job(http: httpx.AsyncClient, rng: np.random.Generator) -> str:
+    """Path of a job that takes too long, after its beginning."""
     points = rng.uniform(0.0, 1.0, (STUCK_POINTS, 3)).astype(np.float32)
     content = encode_cloud(pcgraph.Cloud(points), "stuck.ply")
-    made = await http.post(
-        "/segmentations", params={"name": "stuck.ply", "voxel_size": 0.01, "wait": 0}, content=content
-    )
-    job: dict[str, object] = made.json()
-    while job.get("state") in ("queued", "running"):
+    parameters: dict[str, Any] = {"name": "stuck.ply", "voxel_size": STUCK_VOXEL, "wait": 0}
+    path: str = (await http.post("/segmentations", params=parameters, content=content)).headers["Location"]
+    while (await http.get(path)).json()["state"] == "queued":
+        await asyncio.sleep(0.1)
+    return path
+
+
+async def recovered(http: httpx.AsyncClient, pid: int, killed: int) -> bool:
+    """Whether all workers are ready again, within some seconds, and none is the killed one."""
+    for _ in range(RECOVERY_SECONDS):
+        health = (await http.get("/health")).json()
+        if health["ready"] and health["workers"] == len(children(pid)) and killed not in children(pid):
+            return True
         await asyncio.sleep(1.0)
-        job = (await http.get(f"/segmentations/{job['id']}")).json()
-    return job
+    return False
 
 
 # ---- The run -------------------------------------------------------------------------------------------------------
 
 
-async def load(address: str, pid: int, known: list[Known], arguments: argparse.Namespace) -> dict[str, object]:
-    tally, samples = Tally(), []
-    begin = time.monotonic()
-    until = begin + arguments.seconds
+async def load(address: str, pid: int, known: list[Known], arguments: argparse.Namespace) -> dict[str, Any]:
+    tally, samples = Tally(), list[tuple[float, int]]()
     limits = httpx.Limits(max_connections=None)
     async with httpx.AsyncClient(base_url=address, timeout=120.0, limits=limits) as http:
+        stuck = await begin_stuck_job(http, np.random.default_rng(arguments.seed))
+        begin = time.monotonic()
+        until = begin + arguments.seconds
         watching = asyncio.create_task(watch_memory(pid, samples))
-        stuck = asyncio.create_task(stuck_job(http, np.random.default_rng(arguments.seed)))
         kill = asyncio.create_task(kill_one(pid, begin + arguments.seconds / 2))
         clients = [Client(http, known, tally, 1000 * arguments.seed + i) for i in range(arguments.clients)]
         await asyncio.gather(*(client.run(until) for client in clients))
         end = time.monotonic()
-        job, killed = await stuck, await kill
         watching.cancel()
-        health = (await http.get("/health")).json()
-    if (job.get("problem") or {}).get("status") != 504:  # type: ignore[attr-defined]
-        tally.wrong[f"stuck: {json.dumps(job)[:300]}"] += 1
-    if killed in children(pid) or not health["ready"] or health["workers"] != len(children(pid)):
-        tally.wrong[f"workers after the kill: {health}"] += 1
+        job = (await http.get(stuck, params={"wait": LIMITS["max-seconds"]})).json()
+        if (job.get("problem") or {}).get("status") != 504:
+            tally.wrong[f"stuck: {json.dumps(job)[:300]}"] += 1
+        if not await recovered(http, pid, await kill):
+            tally.wrong["workers did not come back"] += 1
     quarter = (end - begin) / 4
     second = [rss for at, rss in samples if begin + quarter <= at < begin + 2 * quarter]
     last = [rss for at, rss in samples if end - quarter <= at <= end]
@@ -321,7 +337,7 @@ def main() -> None:
         server.send_signal(signal.SIGTERM)
         status = server.wait(30)
     if status:
-        result["wrong"] = int(str(result["wrong"])) + 1
+        result["wrong"] += 1
         print(f"wrong: the server ended with status {status}")
     print(json.dumps(result))
 

@@ -59,6 +59,6 @@ def serve_command(
     except (PcgraphError, ValueError, OSError) as error:
         typer.echo(f"pcgraph: {one_line(error).rstrip('.')}.", err=True)
         raise typer.Exit(1) from None
-    logging.basicConfig(level=logging.WARNING, format="pcgraph: %(message)s")
+    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(message)s")
     signal.set_wakeup_fd(-1)  # the server ends by signals itself, and with it its workers
     raise typer.Exit(run(app, settings, lambda address: typer.echo(f"serving at {address}")))

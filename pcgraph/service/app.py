@@ -27,6 +27,8 @@ from pcgraph import __version__
 from pcgraph.service.guards import Guards, problem_response
 from pcgraph.service.models import (
     LABEL_FORMATS,
+    BoxesModel,
+    CutQuery,
     Health,
     LabelQuery,
     LabelsModel,
@@ -173,7 +175,7 @@ class Service:
     def model(self, job: Job, root: str) -> SegmentationModel:
         """A job as clients see it."""
         own = f"{root}/segmentations/{job.id}"
-        names = {"labels": "labels", "objects": "objects", "tree": "tree", "view": "view", "file": SAVED}
+        names = {name: name for name in ("labels", "boxes", "objects", "tree", "view")} | {"file": SAVED}
         problem = None if job.problem is None else ProblemModel(**job.problem.to_dict())
         return SegmentationModel(
             id=job.id,
@@ -253,7 +255,7 @@ _LOCATION = {"Location": {"description": "Path of the segmentation.", "schema": 
 _OF_ID = {"segmentation_id": "$response.body#/id"}
 _LINKS = {
     name: {"operationId": name, "parameters": _OF_ID}
-    for name in ("state", "labels", "objects", "tree", "view", "file", "remove")
+    for name in ("state", "labels", "boxes", "objects", "tree", "view", "file", "remove")
 }
 """What can be asked about a segmentation, as OpenAPI's links."""
 
@@ -380,11 +382,27 @@ async def labels(service: Here, segmentation_id: Id, query: Annotated[LabelQuery
     if query.format not in LABEL_FORMATS:
         hint = did_you_mean(query.format, list(LABEL_FORMATS))
         raise Problem(422, f"expected format as one of {', '.join(LABEL_FORMATS)}, got {query.format[:80]!r}{hint}")
-    if query.n is not None and query.altitude is not None:
-        raise Problem(422, "expected n or altitude, got both: choose one")
+    _check_cut(query)
     media_type = "application/json" if query.format == "json" else "application/octet-stream"
     arguments = query.model_dump(exclude={"format"})
     return await service.answer(segmentation_id, "write_labels", media_type, file_format=query.format, **arguments)
+
+
+def _check_cut(query: CutQuery) -> None:
+    if query.n is not None and query.altitude is not None:
+        raise Problem(422, "expected n or altitude, got both: choose one")
+
+
+@router.get(
+    "/segmentations/{segmentation_id}/boxes",
+    operation_id="boxes",
+    response_model=BoxesModel,
+    responses=_declared(404, 409, 500, 503, 504),
+)
+async def boxes(service: Here, segmentation_id: Id, query: Annotated[CutQuery, Query()]) -> Response:
+    """Oriented boxes around the objects, or around the segments of a cut at any level."""
+    _check_cut(query)
+    return await service.answer(segmentation_id, "write_boxes", "application/json", **query.model_dump())
 
 
 @router.get(

@@ -16,9 +16,11 @@ from pcgraph.service.settings import ServiceSettings
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+AT_ONCE_SECONDS = 0.05
+"""Time in which the rest of a short upload, which an answer did not need, is here. Chosen by eye; not varied."""
 LINGER_SECONDS = 2.0
-"""Time in which the rest of a refused upload is received and dropped, because many clients read no answer before they
-have sent all. Chosen by eye; not varied."""
+"""Time for which the rest of a long refused upload is received and dropped behind the answer. If the connection were
+closed at once, the client's system would drop the answer with it. Chosen by eye; not varied."""
 LOCAL_NAMES = ("localhost", "127.0.0.1", "[::1]")
 """Names by which this computer calls itself."""
 
@@ -43,20 +45,24 @@ class Guards:
             await self._app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        body = _Body(receive, self._settings, asks_first=headers.get("expect", "").lower() == "100-continue")
+        body = _Body(receive, self._settings, headers)
 
-        async def send_after_body(message: Message) -> None:
-            if message["type"] == "http.response.start" and not body.complete:
-                await body.drop()
+        async def send_all(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                await body.drop(AT_ONCE_SECONDS)
                 if not body.complete:
                     MutableHeaders(scope=message)["Connection"] = "close"
+            elif not message.get("more_body", False) and not body.complete:
+                await send({**message, "more_body": True})  # the client has the whole answer and may stop
+                await body.drop(LINGER_SECONDS)
+                message = {"type": "http.response.body"}
             await send(message)
 
         problem = self._refusal(headers)
         if problem is None:
-            await self._app(scope, body.receive, send_after_body)
+            await self._app(scope, body.receive, send_all)
         else:
-            await problem_response(problem)(scope, body.receive, send_after_body)
+            await problem_response(problem)(scope, body.receive, send_all)
 
     def _refusal(self, headers: Headers) -> Problem | None:
         host, origin = headers.get("host", ""), headers.get("origin")
@@ -76,12 +82,13 @@ class Guards:
 class _Body:
     """The body of a request, received within limits."""
 
-    def __init__(self, receive: Receive, settings: ServiceSettings, asks_first: bool) -> None:
+    def __init__(self, receive: Receive, settings: ServiceSettings, headers: Headers) -> None:
         self._receive, self._settings = receive, settings
-        self._unasked = asks_first  # the client sends nothing before the first call of `receive` tells it to
         self._deadline = time.monotonic() + settings.max_upload_seconds
         self._n_bytes = 0
-        self.complete = False
+        self.complete = "content-length" not in headers and "transfer-encoding" not in headers  # there is none
+        self._unasked = headers.get("expect", "").lower() == "100-continue"
+        """Whether the client waits to be asked for the body, which the first call of `receive` does."""
 
     async def receive(self) -> Message:
         if self.complete:
@@ -100,12 +107,12 @@ class _Body:
             raise _too_large(self._settings)
         return message
 
-    async def drop(self) -> None:
-        """Receive the rest and drop it, for a while."""
+    async def drop(self, seconds: float) -> None:
+        """Receive the rest and drop it, for so many seconds at most."""
         if self._unasked:
             return
         try:
-            async with asyncio.timeout(LINGER_SECONDS):
+            async with asyncio.timeout(seconds):
                 while not self.complete:
                     self.complete = not (await self._receive()).get("more_body", False)
         except TimeoutError:

@@ -112,10 +112,20 @@ class UploadQuery(SegmentParameters):
     )
 
 
-class LabelQuery(BaseModel):
-    """A cut of the tree, and the format of its labels."""
+class CutQuery(BaseModel):
+    """A cut of the tree: `n` segments, or at an altitude; neither: the objects."""
 
     model_config = ConfigDict(extra="forbid")
+
+    n: int | None = Field(None, ge=1, le=1 << 31, description="Exact number of segments.", examples=[10])
+    altitude: float | None = Field(
+        None, ge=0.0, description="All merges up to this cost are done, the linkage's unit.", allow_inf_nan=False
+    )
+    min_size: int = Field(1, ge=1, le=1 << 31, description="Points that every segment has at least.")
+
+
+class LabelQuery(CutQuery):
+    """A cut of the tree, and the format of its labels."""
 
     format: str = Field(
         "npz",
@@ -124,11 +134,6 @@ class LabelQuery(BaseModel):
         "and object, part, supervoxel, and segment if a cut is asked for.",
         examples=["npz"],
     )
-    n: int | None = Field(None, ge=1, le=1 << 31, description="Exact number of segments.", examples=[10])
-    altitude: float | None = Field(
-        None, ge=0.0, description="All merges up to this cost are done, the linkage's unit.", allow_inf_nan=False
-    )
-    min_size: int = Field(1, ge=1, le=1 << 31, description="Points that every segment has at least.")
     colorize: bool = Field(False, description="Whether red, green and blue are those of the objects.")
 
 
@@ -203,6 +208,21 @@ class LabelsModel(BaseModel):
         description="Segment of each point, in the shape of the input; -1 where a point has none."
     )
     segments: int = Field(description="Number of segments.")
+
+
+class BoxModel(BaseModel):
+    """The oriented box around a segment."""
+
+    segment: int
+    center: list[float] = Field(description="Metres, the points' frame.")
+    axes: list[list[float]] = Field(description="Unit vectors, one row each, the longest side first.")
+    size: list[float] = Field(description="Full lengths along the axes, metres.")
+
+
+class BoxesModel(BaseModel):
+    """Boxes of the segments of a cut."""
+
+    boxes: list[BoxModel]
 
 
 class ObjectsModel(BaseModel):

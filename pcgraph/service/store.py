@@ -136,16 +136,15 @@ class Store:
         self.make_room()
 
     def make_room(self) -> None:
-        """Remove finished jobs that have not been used for long, or that are the oldest of too many."""
+        """Remove finished jobs not used for long, and the oldest while there are too many or they are too large."""
         oldest_first = sorted((job for job in self._jobs.values() if job.finished.is_set()), key=lambda job: job.used)
         n_bytes = sum(job.n_bytes for job in oldest_first)
         earliest = time.monotonic() - 60.0 * self._settings.max_age_minutes
         for job in oldest_first:
-            too_many = len(self._jobs) > MAX_JOBS or n_bytes > self._settings.max_stored_gb * 1e9
-            if not too_many and job.used > earliest:
-                break
-            n_bytes -= job.n_bytes
-            self.remove(job)
+            too_large = n_bytes > self._settings.max_stored_gb * 1e9 and job.n_bytes > 0
+            if too_large or len(self._jobs) > MAX_JOBS or job.used < earliest:
+                n_bytes -= job.n_bytes
+                self.remove(job)
 
     @contextlib.contextmanager
     def upload_file(self) -> Iterator[Path]:

@@ -17,8 +17,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pcgraph.cloud import Cloud
+from pcgraph.detection.boxes import boxes_of_labels
 from pcgraph.detection.objects import objects_on
 from pcgraph.detection.plane_detection import find_planes
 from pcgraph.errors import CloudReadError
@@ -133,6 +135,15 @@ def _open(segmentation_id: str, saved: str) -> tuple[Cloud, Segmentation]:
     return _opened[segmentation_id]
 
 
+def _cut(result: Segmentation, n: int | None, altitude: float | None, min_size: int) -> tuple[bool, NDArray[np.int32]]:
+    """Labels of a cut, and whether it is the default one; without `n` and `altitude` it is at that of the objects."""
+    if n is None and altitude is None:
+        if min_size == 1:
+            return True, result.labels
+        altitude = result.object_altitude
+    return False, result.cut(n, altitude, min_size)
+
+
 def write_labels(
     stage: Stage,
     segmentation_id: str,
@@ -149,9 +160,7 @@ def write_labels(
     and ours: object, part, supervoxel, and, if a cut was asked for, segment.
     """
     cloud, result = _open(segmentation_id, saved)
-    is_default = n is None and altitude is None and min_size == 1
-    level = result.object_altitude if n is None and altitude is None else altitude
-    labels = result.labels if is_default else result.cut(n, level, min_size)
+    is_default, labels = _cut(result, n, altitude, min_size)
     path = Path(saved).with_name(f"labels.{file_format}")
     if file_format == "json":
         path.write_text(json.dumps({"labels": labels.tolist(), "segments": int(labels.max(initial=-1)) + 1}))
@@ -165,6 +174,17 @@ def write_labels(
             shown = replace(shown, columns={**shown.columns, "segment": labels})
         path.write_bytes(encode_cloud(shown, path.name))
     return {"file": path.name}
+
+
+def write_boxes(
+    stage: Stage, segmentation_id: str, saved: str, n: int | None, altitude: float | None, min_size: int
+) -> dict[str, Any]:
+    """Write the free box around each segment of a cut as JSON."""
+    cloud, result = _open(segmentation_id, saved)
+    _, labels = _cut(result, n, altitude, min_size)
+    found = boxes_of_labels(cloud.points, labels)
+    boxes = [{"segment": label, **box.to_dict()} for label, box in found.items()]
+    return _write_json(saved, "boxes.json", {"boxes": boxes})
 
 
 def write_objects(stage: Stage, segmentation_id: str, saved: str) -> dict[str, Any]:
@@ -203,16 +223,19 @@ def _write_json(saved: str, name: str, content: dict[str, Any]) -> dict[str, Any
 
 def warm_up() -> None:
     """Do every task once, on a small cloud of a box on a table, so that all kernels are compiled and loaded."""
-    for family in ("Linkage", "SupervoxelMethod"):
-        members(family)  # whose classes saved segmentations name
     x, y = np.meshgrid(*2 * [np.linspace(0.0, 1.0, 40)])
     on_box = (abs(x - 0.5) < 0.2) & (abs(y - 0.5) < 0.2)
-    cloud = Cloud(np.stack((x, y, np.where(on_box, 0.2, 0.0)), axis=-1))
+    cloud = Cloud(np.stack((x, y, np.where(on_box, 1.2, 1.0)), axis=-1))
+    for linkage in members("Linkage").values():
+        result = segment(cloud, viewpoint=(0.5, 0.5, 3.0), linkage=linkage())
+    for method in members("SupervoxelMethod").values():
+        segment(cloud, camera=True, method=method(), n_supervoxels=20)
     with TemporaryDirectory(prefix="pcgraph-") as folder:
         saved = f"{folder}/box.npz"
-        segment(cloud, viewpoint=(0.5, 0.5, 3.0)).save(saved, cloud)
+        result.save(saved, cloud)
         about: dict[str, Any] = {"stage": str, "segmentation_id": folder, "saved": saved}
-        write_labels(**about, file_format="ply", n=2, altitude=None, min_size=1, colorize=True)
+        write_labels(**about, file_format="ply", n=2, altitude=None, min_size=5, colorize=True)
+        write_boxes(**about, n=2, altitude=None, min_size=1)
         write_objects(**about)
         write_tree(**about)
         write_view(**about, title="box")
@@ -220,6 +243,7 @@ def warm_up() -> None:
 
 
 TASKS: dict[str, Callable[..., dict[str, Any]]] = {
-    function.__name__: function for function in (segment_upload, write_labels, write_objects, write_tree, write_view)
+    function.__name__: function
+    for function in (segment_upload, write_labels, write_boxes, write_objects, write_tree, write_view)
 }
 """Tasks by their names."""

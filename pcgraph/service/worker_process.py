@@ -26,7 +26,7 @@ _log = logging.getLogger("pcgraph.service")
 
 def main() -> None:
     """Do tasks until the standard input is closed, as it is when the server ends."""
-    logging.basicConfig(level=logging.WARNING, format="pcgraph: %(message)s")
+    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(message)s")
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what libraries print must not come between the answers
 
