@@ -26,11 +26,12 @@ if TYPE_CHECKING:
 
 
 def segment_command(
-    cloud: Annotated[Path, typer.Argument(help="Point cloud, .pcd or .ply, coordinates in metres.")],
+    cloud: Annotated[Path, typer.Argument(help="Point cloud in any format that is read, coordinates in metres.")],
     out: Annotated[
         Path | None,
-        typer.Option(help="A .ply or .npz file, or a folder for both. Default: the current folder."),
+        typer.Option(help="A file of any format that is written, or a folder. Default: the current folder."),
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an output that exists.")] = False,
     voxel_size: Annotated[
         float | None,
         typer.Option(help="Voxel edge in metres. Default: 3.5 x the median spacing of the points."),
@@ -89,19 +90,19 @@ def segment_command(
         typer.Option(help="Sensor position x y z in metres. Default: the file's, else found from the cloud."),
     ] = None,
 ) -> None:
-    """Segment a point cloud into objects, and write labels, supervoxels, graph and tree.
+    """Segment a point cloud into objects, and write it with its objects, parts and supervoxels.
 
-    Writes NAME.segments.ply (points coloured by object, with labels and supervoxels) and NAME.segments.npz
-    (labels in the input's shape, graph and tree). The columns of the input keep their names: if it has colours or
-    labels of its own, the result's are called segment_red and so on, and segment_labels.
+    Writes NAME.segments.ply: the cloud with all its columns, and the columns object, part and supervoxel.
 
     Example: pcgraph segment scan.pcd --out results/ --voxel-size 0.005 --seed-size 0.03
     """
-    from pcgraph.io import read_cloud
+    from pcgraph.io import encode_cloud, read_cloud
+    from pcgraph.labelling import labelled_cloud
+    from pcgraph.plumbing.plain_files import write_file
 
     start = time.perf_counter()
     try:
-        targets = _targets(cloud, out)
+        target = _target(cloud, out, overwrite)
         if objects is not None and altitude is not None:
             raise ValueError("expected --objects or --altitude, got both: choose one")
         if seed_size is not None and supervoxels is not None:
@@ -123,47 +124,44 @@ def segment_command(
         )
         level = result.object_altitude if objects is None else None
         labels = result.labels if level is not None and min_size == 1 else result.cut(objects, level, min_size)
-        _write(targets, read, result, labels)
+        _check_target(target, overwrite)  # again, as a file may have appeared during the segmentation
+        content = encode_cloud(labelled_cloud(read, replace(result, labels=labels)), target.name)
+        write_file(target, content, CloudWriteError, make_parents=True)
     except (PcgraphError, ValueError, MemoryError, OSError) as error:
         message = said(error) if isinstance(error, OSError) else str(error)
         message = without_long_words(message) or "the cloud does not fit into memory: choose a larger voxel size"
         typer.echo(f"pcgraph: {one_line(message).rstrip('.')}.", err=True)
         raise typer.Exit(1) from None
-    _print_summary(result, labels, targets, time.perf_counter() - start)
+    _print_summary(result, labels, target, time.perf_counter() - start)
 
 
-def _targets(cloud: Path, out: Path | None) -> list[Path]:
+def _target(cloud: Path, out: Path | None, overwrite: bool) -> Path:
+    from pcgraph.io import check_writable
+
     if out is not None and str(out) == "-":
-        raise CloudWriteError("nothing is written to a pipe, got --out -: give a .ply or .npz file or a folder")
+        raise CloudWriteError("nothing is written to a pipe, got --out -: give a file or a folder")
     if out is not None and out.suffix and not out.is_dir():
-        if out.suffix.lower() not in (".ply", ".npz"):
-            raise CloudWriteError(f"expected --out as a .ply or .npz file or a folder, got {out.name!r}")
+        check_writable(out.name)
         if not out.parent.is_dir():
             raise CloudWriteError(f"cannot write {out}: there is no folder {out.parent}; create it first")
-        if os.path.realpath(out) == os.path.realpath(cloud):
-            raise CloudWriteError(f"--out is the input itself, {out}: choose another name")
-        targets = [out]
+        target = out
     else:
-        folder = Path() if out is None else out
-        targets = [folder / f"{cloud.stem}.segments{suffix}" for suffix in (".ply", ".npz")]
-    _check_targets(targets)
-    return targets
+        target = (Path() if out is None else out) / f"{cloud.stem}.segments.ply"
+    if os.path.realpath(target) == os.path.realpath(cloud):
+        raise CloudWriteError(f"--out is the input itself, {target}: choose another name")
+    _check_target(target, overwrite)
+    return target
 
 
-def _check_targets(targets: list[Path]) -> None:
-    """Raise CloudWriteError if a target is a file of the user's, or cannot be written; this writes nothing."""
-    from pcgraph.io.segmentation_files import is_segmentation
-
-    for target in targets:
-        if target.is_symlink() and not target.exists():
-            raise CloudWriteError(f"{target} is a link to a file that does not exist; choose another --out")
-        if target.exists() and not (target.is_file() and is_segmentation(target)):
-            raise CloudWriteError(
-                f"{target} exists and was not written by pcgraph, or changed since; move it or choose another --out"
-            )
-    above = next(folder for folder in (targets[0].parent, *targets[0].absolute().parents) if folder.exists())
+def _check_target(target: Path, overwrite: bool) -> None:
+    """Raise CloudWriteError if a file is in the target's place, or if it cannot be written; this writes nothing."""
+    if target.is_symlink() and not target.exists():
+        raise CloudWriteError(f"{target} is a link to a file that does not exist; choose another --out")
+    if target.exists() and not (overwrite and target.is_file()):
+        raise CloudWriteError(f"{target} exists; choose another --out, or replace it with --overwrite")
+    above = next(folder for folder in (target.parent, *target.absolute().parents) if folder.exists())
     if not above.is_dir():
-        raise CloudWriteError(f"cannot create the folder {targets[0].parent}: {above} is a file; choose another --out")
+        raise CloudWriteError(f"cannot create the folder {target.parent}: {above} is a file; choose another --out")
     if not os.access(above, os.W_OK | os.X_OK):
         raise CloudWriteError(f"cannot write to {above}: permission denied; choose another --out")
 
@@ -194,16 +192,7 @@ def _segmented(path: Path, cloud: Cloud, **settings: Any) -> Segmentation:
     return result
 
 
-def _write(targets: list[Path], cloud: Cloud, result: Segmentation, labels: NDArray[np.int32]) -> None:
-    from pcgraph.io.segmentation_files import encode_segmentation
-    from pcgraph.plumbing.plain_files import write_files
-
-    contents = {target: encode_segmentation(target.name, cloud, result, labels) for target in targets}
-    _check_targets(targets)  # again, as files may have appeared during the segmentation
-    write_files(contents, CloudWriteError, make_parents=True)
-
-
-def _print_summary(result: Segmentation, labels: NDArray[np.int32], targets: list[Path], seconds: float) -> None:
+def _print_summary(result: Segmentation, labels: NDArray[np.int32], target: Path, seconds: float) -> None:
     segmented, outliers = int((result.supervoxels >= 0).sum()), int(result.outliers.sum())
     for name, value in (
         ("points", f"{segmented} of {result.labels.size} segmented, {outliers} outliers"),
@@ -214,6 +203,6 @@ def _print_summary(result: Segmentation, labels: NDArray[np.int32], targets: lis
         ("edges", str(len(result.graph.edges))),
         ("objects", str(int(labels.max()) + 1)),
         ("seconds", f"{seconds:.2f}"),
-        *(("written", one_line(target)) for target in targets),
+        ("written", one_line(target)),
     ):
         typer.echo(f"{name:<12} {value}")

@@ -59,7 +59,9 @@ def test_public_names():
         "Vccs",
         "VoxelGrid",
         "WardLinkage",
+        "as_cloud",
         "detection",
+        "labelled_cloud",
         "learning",
         "load_segmentation",
         "metrics",
@@ -70,6 +72,7 @@ def test_public_names():
         "tree_of_graph",
         "update",
         "variance_energy",
+        "write_cloud",
         "write_segmentation",
     ]
     for name in pcgraph.__all__:
