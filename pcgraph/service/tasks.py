@@ -25,7 +25,8 @@ from pcgraph.detection.objects import objects_on
 from pcgraph.detection.plane_detection import find_planes
 from pcgraph.errors import CloudReadError
 from pcgraph.families import members
-from pcgraph.io import decode_cloud, encode_cloud, labelled_cloud, read_cloud
+from pcgraph.io import decode_cloud, encode_cloud, read_cloud
+from pcgraph.labelling import labelled_cloud
 from pcgraph.plausibility import CloudWarning
 from pcgraph.saved_segmentation import load_segmentation
 from pcgraph.scan import segment
@@ -171,7 +172,9 @@ def write_labels(
     else:
         shown = labelled_cloud(cloud, result, colorize=colorize)
         if not is_default:
-            shown = replace(shown, columns={**shown.columns, "segment": labels})
+            taken = {column.lower() for column in shown.columns}
+            own = "segment" if "segment" not in taken else "pcgraph_segment"
+            shown = replace(shown, columns={**shown.columns, own: labels})
         path.write_bytes(encode_cloud(shown, path.name))
     return {"file": path.name}
 
