@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 AT_ONCE_SECONDS = 0.05
 """Time in which the rest of a short upload, which an answer did not need, is here. Chosen by eye; not varied."""
-LINGER_SECONDS = 2.0
+LINGER_SECONDS = 10.0
 """Time for which the rest of a long refused upload is received and dropped behind the answer. If the connection were
 closed at once, the client's system would drop the answer with it. Chosen by eye; not varied."""
 LOCAL_NAMES = ("localhost", "127.0.0.1", "[::1]")
