@@ -12,7 +12,7 @@ from fastapi import Request
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import UploadFile
-from starlette.formparsers import MultiPartException
+from starlette.exceptions import HTTPException
 
 from pcgraph.service.models import MAX_NAME, Points, SegmentParameters, UploadQuery, did_you_mean
 from pcgraph.service.problems import Problem
@@ -97,8 +97,8 @@ async def _receive_form(request: Request, parameters: SegmentParameters, target:
             with target.open("wb") as copy:
                 await run_in_threadpool(shutil.copyfileobj, file.file, copy)
             return Upload(file.filename[:MAX_NAME], parameters)
-    except MultiPartException as error:
-        raise Problem(400, f"expected a whole form of type multipart/form-data: {error.message}") from None
+    except HTTPException as error:  # as which Starlette raises what its parser says
+        raise Problem(400, f"expected a whole form of type multipart/form-data: {error.detail}") from None
 
 
 def with_fields(parameters: SegmentParameters, fields: list[tuple[str, Any]]) -> SegmentParameters:

@@ -26,6 +26,7 @@ from scenes.tables import two_boxes_on_a_plane
 
 import pcgraph
 from pcgraph.detection import boxes_of_labels
+from pcgraph.io import decode_cloud, encode_cloud
 from pcgraph.service import create_app, guards, store, worker_pool
 from pcgraph.service.problems import Problem
 from pcgraph.service.settings import ServiceSettings
@@ -141,7 +142,7 @@ PARAMETERS = {"viewpoint": list(VIEW), "voxel_size": 0.06}
 
 
 def upload(client: Client, cloud: pcgraph.Cloud, name: str = "scan.ply", **parameters: Any) -> httpx.Response:
-    content = pcgraph.io.encode_cloud(cloud, name)
+    content = encode_cloud(cloud, name)
     return client.post("/segmentations", params={"name": name, "wait": 30, **PARAMETERS, **parameters}, content=content)
 
 
@@ -175,7 +176,7 @@ def test_answers_are_those_of_pcgraph(service, scene, tmp_path):
     assert np.array_equal(larger, right.cut(altitude=right.object_altitude, min_size=500))
     answer = labels(format="ply", n=5, colorize=True)
     assert answer.headers["Content-Disposition"] == 'attachment; filename="scan.labels.ply"'
-    written = pcgraph.io.decode_cloud(answer.content, "labels.ply")
+    written = decode_cloud(answer.content, "labels.ply")
     assert list(written.columns) == ["ring", "object", "part", "supervoxel", "segment"]
     assert np.array_equal(written.columns["segment"], right.cut(5))
     assert written.colors is not None
@@ -199,7 +200,7 @@ def test_answers_are_those_of_pcgraph(service, scene, tmp_path):
 def test_forms_json_and_files_are_segmented_alike(service, scene):
     cloud, right = scene
     client = service()
-    content = pcgraph.io.encode_cloud(cloud, "scan.ply")
+    content = encode_cloud(cloud, "scan.ply")
     form = client.post("/segmentations", files={"cloud": ("scan.ply", content)}, data={"wait": 30, **PARAMETERS})
     array = BytesIO()
     np.savez(array, points=cloud.points)
@@ -519,7 +520,7 @@ def server(tmp_path) -> Iterator[Any]:
 
 
 def noise(n: int) -> bytes:
-    return pcgraph.io.encode_cloud(pcgraph.Cloud(np.random.default_rng(0).random((n, 3)).astype(np.float32)), "a.npy")
+    return encode_cloud(pcgraph.Cloud(np.random.default_rng(0).random((n, 3)).astype(np.float32)), "a.npy")
 
 
 @pytest.mark.validation
@@ -622,7 +623,7 @@ def test_clients_in_three_languages_find_the_boxes(server, scene, tmp_path):
         assert sizes[:, 1:] == pytest.approx(np.array([[1.6, 1.2, 0], [0.3, 0.3, 0.3], [0.25, 0.25, 0.25]]), abs=0.04)
     subprocess.run(build, check=True)
     done = subprocess.run([str(program), str(path), one.address], capture_output=True, check=True)
-    assert len(np.unique(pcgraph.io.decode_cloud(done.stdout, "labelled.pcd").columns["object"])) == 3
+    assert len(np.unique(decode_cloud(done.stdout, "labelled.pcd").columns["object"])) == 3
     path.unlink()
     program.unlink()
 
