@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.cloud import COLOR_NAMES, Cloud
-from pcgraph.cloud_sources import as_cloud
 from pcgraph.errors import CloudWriteError
 from pcgraph.io import encode_cloud
 from pcgraph.plumbing.plain_files import write_file
-from pcgraph.segmentation import Segmentation, check_segmentation
+from pcgraph.segmentation import Segmentation, check_segmentation, segmented_cloud
 
 
 def labelled_cloud(cloud: Any, segmentation: Segmentation, levels: Sequence[int] = (), colorize: bool = False) -> Cloud:
@@ -62,10 +61,7 @@ def labelled_cloud(cloud: Any, segmentation: Segmentation, levels: Sequence[int]
     ['object', 'part', 'supervoxel', 'level_2']
     """
     check_segmentation(segmentation)
-    cloud, shape = as_cloud(cloud), segmentation.supervoxels.shape
-    if np.shape(cloud.points) != (*shape, 3):
-        expected = f"the points that were segmented, of shape {(*shape, 3)}"
-        raise ValueError(f"expected {expected}, got {np.shape(cloud.points)}; give the cloud of this segmentation")
+    cloud = segmented_cloud(cloud, segmentation)
     ours: dict[str, NDArray[np.generic]] = {
         "object": segmentation.labels,
         "part": segmentation.parts,

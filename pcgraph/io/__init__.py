@@ -132,6 +132,17 @@ def check_writable(name: str) -> None:
     _format(name, None, _WRITABLE, CloudWriteError)
 
 
+def holds_columns(suffix: str) -> bool:
+    """Whether `write_cloud` can write a file that ends so, with columns of any name."""
+    return any(suffix.lower() in one.suffixes and one.holds_columns for one in _WRITABLE)
+
+
+def without_suffix(name: str) -> str:
+    """The name of a file without the end that tells its format, or without its extension."""
+    end = max((suffix for suffix in _suffixes(FORMATS) if name.lower().endswith(suffix)), key=len, default="")
+    return name[: -len(end)] if end else Path(name).stem
+
+
 def _read(chosen: Format, file: CloudFile, name: str) -> Cloud:
     try:
         return chosen.read(file)

@@ -52,6 +52,8 @@ class Format:
     organised : bool
         Whether a file keeps images of points, (h, w, 3), and NaN where nothing was measured. Other formats are lists of
         the finite points.
+    holds_columns : bool
+        Whether a file takes columns of any name and number.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Format:
     read: Callable[[CloudFile], Cloud]
     encode: Callable[[Cloud, str], bytes] | None = None
     organised: bool = False
+    holds_columns: bool = True
 
 
 # ---- Names of fields in headers of words ---------------------------------------------------------------------------
