@@ -36,6 +36,7 @@ from pcgraph.service.models import (
     Points,
     ProblemModel,
     SegmentationModel,
+    SegmentParameters,
     TreeModel,
     UploadQuery,
     Wait,
@@ -240,7 +241,8 @@ _UPLOAD = {
                             "type": "string",
                             "format": "binary",
                             "description": "The file; the end of its name tells the format.",
-                        }
+                        },
+                        **SegmentParameters.model_json_schema()["properties"],
                     },
                     "additionalProperties": False,
                 }
@@ -248,7 +250,7 @@ _UPLOAD = {
         },
     }
 }
-"""OpenAPI's description of an upload's body; fields of a form are the parameters of the query, too."""
+"""OpenAPI's description of an upload's body; the parameters of the query may be fields of a form, too."""
 
 
 _LOCATION = {"Location": {"description": "Path of the segmentation.", "schema": {"type": "string"}}}
@@ -463,11 +465,11 @@ async def file(service: Here, segmentation_id: Id) -> Response:
 
 def application(settings: ServiceSettings) -> FastAPI:
     """The service as an ASGI application; see `pcgraph.service.create_app`."""
-    service = Service(settings)
 
     @contextlib.asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        async with service.running():
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        app.state.service = Service(settings)
+        async with app.state.service.running():
             yield
 
     app = FastAPI(
@@ -479,7 +481,6 @@ def application(settings: ServiceSettings) -> FastAPI:
         docs_url=None,  # FastAPI's pages load their scripts from another web site
         redoc_url=None,
     )
-    app.state.service = service
     app.add_middleware(Guards, settings=settings)
     for kind, respond in _RESPONDERS.items():
         app.add_exception_handler(kind, respond)

@@ -72,6 +72,8 @@ class ServiceSettings:
                 raise ValueError(f"expected {one.name} as a finite number above 0, got {value}")
         if not 0 <= self.port < 1 << 16:
             raise ValueError(f"expected port as a whole number from 0 to 65535, got {self.port}")
+        if self.folder is not None and not self.folder.is_dir():
+            raise ValueError(f"expected folder as a directory that exists, got {self.folder}")
         if self.token is not None and not (self.token.isascii() and self.token.isprintable() and self.token.strip()):
             raise ValueError("expected token as one or more printable ASCII characters")
         if self.token is None and not self.is_loopback:

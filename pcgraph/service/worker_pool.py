@@ -249,6 +249,10 @@ class WorkerPool:
             except Problem as problem:
                 if not order.answer.done():
                     order.answer.set_exception(problem)
+            except (KeyError, TypeError):  # no message of ours: whatever it is now, it is a worker no more
+                worker.kill()
+                if not order.answer.done():
+                    order.answer.set_exception(Problem(500, "the worker process failed"))
             else:
                 if not order.answer.done():
                     order.answer.set_result(result)

@@ -353,6 +353,7 @@ def test_settings_are_checked():
         ({"max_seconds": float("nan")}, "max_seconds as a finite number above 0"),
         ({"port": 70000}, "port as a whole number from 0 to 65535"),
         ({"token": "a\nb"}, "printable ASCII"),
+        ({"folder": Path("/nowhere")}, "folder as a directory that exists, got /nowhere"),
     ):
         with pytest.raises(ValueError, match=re.escape(words)):
             ServiceSettings(**settings)
