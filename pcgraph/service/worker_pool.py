@@ -119,6 +119,7 @@ class Worker:
         if "problem" in message:
             raise Problem(**message["problem"])
         if "result" not in message:
+            self.kill()
             raise Problem(
                 500,
                 f"the worker process ended ({in_words(await self.ended)}): try again; if it ends again, the cloud is "
