@@ -96,7 +96,7 @@ async def _receive_form(request: Request, parameters: SegmentParameters, target:
             parameters = with_fields(parameters, fields)
             with target.open("wb") as copy:
                 await run_in_threadpool(shutil.copyfileobj, file.file, copy)
-            return Upload(file.filename[:MAX_NAME], parameters)
+            return Upload(file.filename[-MAX_NAME:], parameters)
     except HTTPException as error:  # as which Starlette raises what its parser says
         raise Problem(400, f"expected a whole form of type multipart/form-data: {error.detail}") from None
 
