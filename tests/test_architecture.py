@@ -194,7 +194,7 @@ STOREYS = [
     "all_kernels",
 ]
 """Of pcgraph, from the ground up: nobody imports from above."""
-ON_TOP = ("detection", "learning", "cli", "__main__")
+ON_TOP = ("detection", "learning", "viewer", "cli", "__main__")
 """What stands on these and may import all of them."""
 
 

@@ -22,13 +22,14 @@ from scroll_hints import check_scroll_hints
 from small_result import SCENES, SENSORS, result_of_two_cameras, small_result
 from tiers import to_validate
 
+from pcgraph.viewer.node_colors import node_colors
 from rangesim.causes import Cause
 from rangesim.decoding.status import Status
 from rangesim.environment.doctor import find_browser
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
 from rangesim.pipeline.experiment_run import carry_out
-from rangesim.report import palette, point_viewer, render_report, tables, write_report
+from rangesim.report import palette, render_report, tables, write_report
 from rangesim.report.experiment_page import by_camera
 from rangesim.report.verdict import verdict
 from rangesim.results.experiment_results import PhotonsRecord, load_result, write_result
@@ -143,7 +144,7 @@ def test_the_failures_of_a_surface_add_up() -> None:
 
 def test_a_node_has_the_colour_of_its_largest_child() -> None:
     """Leaves of 5, 3 and 4 points: the pair (1, 2) takes the colour of leaf 2, the root that of the pair."""
-    colors = point_viewer._colors(np.array([4, 3, 3, 4, 4]), np.array([5, 3, 4]))
+    colors = node_colors(np.array([4, 3, 3, 4, 4]), np.array([5, 3, 4]))
     assert (colors[3] == colors[2]).all()
     assert (colors[4] == colors[3]).all()
     assert len(np.unique(colors[:3], axis=0)) == 3

@@ -13,11 +13,13 @@ import typer
 from pcgraph import __version__
 from pcgraph.cli.compile import compile_command
 from pcgraph.cli.segment import segment_command
+from pcgraph.cli.view import view_command
 from pcgraph.errors import one_line
 from pcgraph.plumbing.plain_files import said
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 app.command("segment")(segment_command)
+app.command("view")(view_command)
 app.command("compile")(compile_command)
 
 

@@ -10,7 +10,8 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from rangesim.report.content_security import StyleRules, content_policy, visible_text
+from pcgraph.viewer.content_policy import content_policy
+from rangesim.report.content_security import StyleRules, visible_text
 
 
 def render_page(template: str, values: Mapping[str, Any], scripts: Sequence[str] = ("scroll.js",)) -> str:

@@ -66,6 +66,7 @@ def test_public_names():
         "segment",
         "update",
         "variance_energy",
+        "viewer",
         "write_segmentation",
     ]
     for name in pcgraph.__all__:

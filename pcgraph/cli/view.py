@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``pcgraph view``."""
+
+from __future__ import annotations
+
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, one_line, without_long_words
+from pcgraph.plumbing.plain_files import said, write_file
+
+if TYPE_CHECKING:
+    from pcgraph.cloud import Cloud
+    from pcgraph.segmentation import Segmentation
+    from pcgraph.viewer.page import Shown
+
+
+def view_command(
+    source: Annotated[Path, typer.Argument(help="A point cloud, or a folder of point clouds.")],
+    out: Annotated[Path | None, typer.Option(help="The page's file. Default: NAME.html in the current folder.")] = None,
+    segment: Annotated[bool, typer.Option("--segment", help="Segment clouds that have no segmentation first.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a page that exists.")] = False,
+    open_page: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
+) -> None:
+    """Write one HTML page that shows a cloud in a browser, offline.
+
+    A folder becomes one page with a chooser over its files.
+
+    Example: pcgraph view scan.pcd --segment --open
+    """
+    from pcgraph.viewer.page import views_page
+
+    target = Path(f"{source.absolute().stem}.html") if out is None else out
+    try:
+        if target.exists() and not (overwrite and target.is_file()):
+            raise CloudWriteError(f"{target} exists: add --overwrite, or choose another --out")
+        shown = [_shown(path, segment) for path in _files(source)]
+        write_file(target, views_page(shown, source.absolute().name).encode("utf-8"), CloudWriteError)
+    except (PcgraphError, ValueError, MemoryError, OSError) as error:
+        message = said(error) if isinstance(error, OSError) else str(error)
+        message = without_long_words(message) or "the clouds do not fit into memory: choose fewer files"
+        typer.echo(f"pcgraph: {one_line(message).rstrip('.')}.", err=True)
+        raise typer.Exit(1) from None
+    typer.echo(f"{'clouds':<12} {len(shown)}")
+    typer.echo(f"{'written':<12} {one_line(target)}, {target.stat().st_size / 1e6:.1f} MB")
+    if open_page:
+        webbrowser.open(target.resolve().as_uri())
+
+
+def _files(source: Path) -> list[Path]:
+    """The file itself, or the clouds of a folder in the order of their names."""
+    from pcgraph.io import FORMATS
+
+    if not source.is_dir():
+        return [source]
+    ends = tuple(suffix for one in FORMATS for suffix in one.suffixes)
+    found = sorted(path for path in source.iterdir() if path.is_file() and path.name.lower().endswith(ends))
+    if not found:
+        raise CloudReadError(f"the folder {source} has no point cloud: expected files ending in {', '.join(ends)}")
+    return found
+
+
+def _shown(path: Path, segment: bool) -> Shown:
+    from pcgraph.io import read_cloud
+    from pcgraph.viewer.page import Shown
+
+    cloud = read_cloud(path)
+    return Shown(path.name, cloud, _segmented(path, cloud) if segment else None)
+
+
+def _segmented(path: Path, cloud: Cloud) -> Segmentation:
+    from pcgraph import scan
+
+    try:
+        return scan.segment(cloud)
+    except ValueError as error:
+        raise CloudReadError(f"cannot segment {path}: {error}") from None
