@@ -15,7 +15,7 @@ from pcgraph.plumbing.plain_files import said, write_file
 if TYPE_CHECKING:
     from pcgraph.cloud import Cloud
     from pcgraph.segmentation import Segmentation
-    from pcgraph.viewer.page import Shown
+    from pcgraph.viewer.cloud_data import Shown
 
 
 def view_command(
@@ -65,10 +65,10 @@ def _files(source: Path) -> list[Path]:
 
 def _shown(path: Path, segment: bool) -> Shown:
     from pcgraph.io import read_cloud
-    from pcgraph.viewer.page import Shown
+    from pcgraph.viewer.cloud_data import Shown
 
     cloud = read_cloud(path)
-    return Shown(path.name, cloud, _segmented(path, cloud) if segment else None)
+    return Shown.of(path.name, cloud, _segmented(path, cloud) if segment else None)
 
 
 def _segmented(path: Path, cloud: Cloud) -> Segmentation:

@@ -3,16 +3,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.cloud import Cloud
-from pcgraph.segmentation import Segmentation
+from pcgraph.errors import visible
+from pcgraph.plumbing.short_repr import ShortRepr
+from pcgraph.segmentation import Segmentation, check_segmentation
 from pcgraph.viewer.node_colors import distinct_colors
 from pcgraph.viewer.packing import pack
-from pcgraph.viewer.tree_data import tree_data
+from pcgraph.viewer.tree_data import ShownTree, tree_data
 from pcgraph.voxels.spacing import median_spacing
 
 POSITION_STEPS = 65535
@@ -53,7 +57,72 @@ class Drawn(NamedTuple):
     far: int
 
 
-def cloud_data(name: str, cloud: Cloud, segmentation: Segmentation | None) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False)
+class Categories(ShortRepr):
+    """What the whole numbers of a column stand for.
+
+    Attributes
+    ----------
+    names : sequence of str
+        Of 0, 1 and so on.
+    colors : (c, 3) uint8, red green blue
+        One for each name.
+    """
+
+    names: Sequence[str]
+    colors: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Shown(ShortRepr):
+    """What one entry of a page's chooser shows.
+
+    Attributes
+    ----------
+    name : str
+    cloud : Cloud
+    tree : ShownTree, optional
+        Of this very cloud.
+    outliers : (n,) or (h, w) bool, optional
+        Which points were noise.
+    camera : bool, optional
+        Whether x points right, y down and z ahead. Default: whether an organised cloud lies ahead of z = 0.
+    categories : mapping of a column's name to Categories, optional
+    units : mapping of a column's name to its unit, optional
+    """
+
+    name: str
+    cloud: Cloud
+    tree: ShownTree | None = None
+    outliers: NDArray[np.bool_] | None = None
+    camera: bool | None = None
+    categories: Mapping[str, Categories] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, name: str, cloud: Cloud, segmentation: Segmentation | None) -> Shown:
+        """A cloud and its segmentation, if there is one.
+
+        Raises
+        ------
+        ValueError
+            The cloud or the segmentation is none, or the segmentation is that of another cloud.
+        """
+        if not isinstance(cloud, Cloud):
+            raise ValueError(f"expected a Cloud, as pcgraph.read_cloud returns it, got {type(cloud).__name__}")
+        if segmentation is None:
+            return cls(name, cloud)
+        check_segmentation(segmentation)
+        if segmentation.labels.shape != cloud.points.shape[:-1]:
+            raise ValueError(
+                f"expected the segmentation of this cloud, of {cloud.points.shape[:-1]} points, "
+                f"got one of {segmentation.labels.shape}"
+            )
+        outliers = segmentation.outliers if segmentation.outliers.any() else None
+        return cls(name, cloud, ShownTree.of(segmentation), outliers, segmentation.camera or None)
+
+
+def cloud_data(shown: Shown) -> dict[str, Any]:
     """A cloud, with its segmentation if there is one, as JSON takes it; arrays are text of `pack`.
 
     Returns
@@ -64,15 +133,16 @@ def cloud_data(name: str, cloud: Cloud, segmentation: Segmentation | None) -> di
     columns : list of `_column`
     tree : `tree_data`, or None
     """
+    cloud = shown.cloud
     drawn = _drawn(cloud)
     low = drawn.points.min(axis=0) if len(drawn.points) else np.zeros(3)
     span = np.ptp(drawn.points, axis=0) if len(drawn.points) else np.zeros(3)
     step = np.where(span > 0.0, span / POSITION_STEPS, 1.0)
     steps = np.rint((drawn.points - low) / step).astype(np.uint16)
     begin, end = _extent(drawn.points)
-    columns = _columns(cloud, segmentation)
+    columns = _columns(shown)
     return {
-        "name": name,
+        "name": visible(shown.name),
         "count": len(drawn.rows),
         "unmeasured": int(cloud.points.size // 3 - len(drawn.rows) - drawn.far),
         "far": drawn.far,
@@ -82,14 +152,14 @@ def cloud_data(name: str, cloud: Cloud, segmentation: Segmentation | None) -> di
         "middle": ((begin + end) / 2).tolist(),
         "radius": max(float(np.linalg.norm(end - begin)) / 2, 1e-6),
         "spacing": median_spacing(drawn.points) if len(drawn.points) > 1 else 0.01,
-        "camera": _is_of_a_camera(cloud, segmentation, drawn.points),
+        "camera": _is_ahead(cloud, drawn.points) if shown.camera is None else shown.camera,
         "index": None if len(drawn.rows) == cloud.points.size // 3 else pack(drawn.rows.astype(np.uint32)),
         "positions": pack(steps.T),
         "colors": None if cloud.colors is None else pack(cloud.colors.reshape(-1, 3)[drawn.rows]),
         "normals": None if cloud.normals is None else pack(_direction_bytes(cloud.normals.reshape(-1, 3)[drawn.rows])),
-        "columns": [_column(title, values[drawn.rows]) for title, values in columns[:MAX_COLUMNS]],
+        "columns": [_column(shown, name, values[drawn.rows]) for name, values in columns[:MAX_COLUMNS]],
         "columnsLeftOut": max(len(columns) - MAX_COLUMNS, 0),
-        "tree": None if segmentation is None else tree_data(segmentation, drawn.rows, drawn.points),
+        "tree": None if shown.tree is None else tree_data(shown.tree, drawn.rows, drawn.points),
     }
 
 
@@ -114,10 +184,8 @@ def _extent(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
     return ends[0], ends[1]
 
 
-def _is_of_a_camera(cloud: Cloud, segmentation: Segmentation | None, points: NDArray[np.float64]) -> bool:
-    """Whether the axes are those of a camera, x right, y down, z ahead: an image all of which lies ahead."""
-    if segmentation is not None and segmentation.camera:
-        return True
+def _is_ahead(cloud: Cloud, points: NDArray[np.float64]) -> bool:
+    """Whether this is an image of what lies ahead along z, as clouds in the axes of a camera are."""
     return cloud.organised and bool(len(points)) and bool((points[:, 2] >= 0.0).all())
 
 
@@ -126,11 +194,14 @@ def _direction_bytes(normals: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.rint(127.5 + 127.5 * clipped).astype(np.uint8)
 
 
-def _columns(cloud: Cloud, segmentation: Segmentation | None) -> list[tuple[str, NDArray[np.generic]]]:
+def _columns(shown: Shown) -> list[tuple[str, NDArray[np.generic]]]:
     """Names and values, one number per point, of all columns; those of several numbers are split."""
-    given: list[tuple[str, NDArray[np.generic]]] = [] if cloud.labels is None else [("label", cloud.labels.reshape(-1))]
-    if segmentation is not None and segmentation.outliers.any():
-        given.append(("outlier", segmentation.outliers.reshape(-1)))
+    cloud = shown.cloud
+    given: list[tuple[str, NDArray[np.generic]]] = []
+    if cloud.labels is not None:
+        given.append(("label", cloud.labels.reshape(-1)))
+    if shown.outliers is not None:
+        given.append(("outlier", shown.outliers.reshape(-1)))
     count = cloud.points.size // 3
     for name, column in cloud.columns.items():
         table = column.reshape(count, -1)
@@ -138,38 +209,50 @@ def _columns(cloud: Cloud, segmentation: Segmentation | None) -> list[tuple[str,
     return given
 
 
-def _column(name: str, values: NDArray[np.generic]) -> dict[str, Any]:
+def _column(shown: Shown, name: str, values: NDArray[np.generic]) -> dict[str, Any]:
     """One column: categories, or numbers in steps.
 
     Returns
     -------
-    name : str
-    values, colors, keys : of categories, their numbers as text, a colour each, and per point 1 + the place of its own
+    name, unit : str
+    values, colors, keys : of categories, their texts, a colour each, and per point 1 + the place of its own
     low, step, shown, keys : of numbers, value = low + step * (key - 1), 0 for none; ends of the colour bar
     whole : whether the numbers are whole
     """
-    kind = values.dtype.kind
-    if kind in "iub":
-        found, keys = np.unique(values, return_inverse=True)
-        is_named = name.lower() in CATEGORY_NAMES or name.lower().startswith("level_")
-        if kind == "b" or len(found) <= MAX_CATEGORIES or is_named:
-            said = ["no" if not v else "yes" for v in found] if kind == "b" else [str(v) for v in found]
-            wide = len(found) > VALUE_STEPS
-            packed = pack((keys.ravel() + 1).astype(np.uint32 if wide else np.uint16))
-            return {
-                "name": name,
-                "values": said,
-                "colors": pack(distinct_colors(len(found))),
-                "wide": wide,
-                "keys": packed,
-            }
+    about = {"name": visible(name), "unit": shown.units.get(name, "")}
+    if _are_categories(name, values) or name in shown.categories:
+        return {**about, **_categories(values, shown.categories.get(name))}
+    return {**about, **_numbers(values)}
+
+
+def _are_categories(name: str, values: NDArray[np.generic]) -> bool:
+    if values.dtype.kind not in "iub":
+        return False
+    is_named = name.lower() in CATEGORY_NAMES or name.lower().startswith("level_")
+    return is_named or len(np.unique(values)) <= MAX_CATEGORIES
+
+
+def _categories(values: NDArray[np.generic], known: Categories | None) -> dict[str, Any]:
+    found, keys = np.unique(values, return_inverse=True)
+    if known is not None:
+        texts, colors = [known.names[k] for k in found.tolist()], known.colors[found.astype(np.int64)]
+    elif values.dtype.kind == "b":
+        texts, colors = ["yes" if value else "no" for value in found], distinct_colors(len(found))
+    else:
+        texts, colors = [str(value) for value in found], distinct_colors(len(found))
+    wide = len(found) > VALUE_STEPS
+    packed = pack((keys.ravel() + 1).astype(np.uint32 if wide else np.uint16))
+    return {"values": texts, "colors": pack(colors), "wide": wide, "keys": packed}
+
+
+def _numbers(values: NDArray[np.generic]) -> dict[str, Any]:
     numbers = values.astype(np.float64)
     finite = np.isfinite(numbers)
     known = numbers[finite] if finite.any() else np.zeros(1)
     low, high = float(known.min()), float(known.max())
     step = (high - low) / VALUE_STEPS if high > low else 1.0
     keys = np.where(finite, 1 + np.rint((np.where(finite, numbers, low) - low) / step), 0).astype(np.uint16)
-    shown = np.quantile(known, [SHOWN_TAIL, 1.0 - SHOWN_TAIL]).tolist()
-    if shown[0] == shown[1]:
-        shown = [low, high]
-    return {"name": name, "low": low, "step": step, "shown": shown, "whole": kind in "iu", "keys": pack(keys)}
+    ends = np.quantile(known, [SHOWN_TAIL, 1.0 - SHOWN_TAIL]).tolist()
+    if ends[0] == ends[1]:
+        ends = [low, high]
+    return {"low": low, "step": step, "shown": ends, "whole": values.dtype.kind in "iu", "keys": pack(keys)}

@@ -6,7 +6,6 @@ from __future__ import annotations
 import html
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
@@ -17,31 +16,14 @@ import numpy as np
 from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudWriteError, visible
 from pcgraph.plumbing.plain_files import write_file
-from pcgraph.segmentation import Segmentation, check_segmentation
-from pcgraph.viewer.cloud_data import cloud_data
+from pcgraph.segmentation import Segmentation
+from pcgraph.viewer.cloud_data import Shown, cloud_data
 from pcgraph.viewer.content_policy import content_policy
 
 SCRIPTS = ("three.js", "points.js", "boxes.js", "tree.js", "viewer.js")
 """Files of this package whose JavaScript a page runs, in this order."""
 MAX_PAGE_BYTES = 1 << 29
 """Largest page, bytes: V8, which most browsers run, has no longer strings (2**29 - 24 characters)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """What one entry of a page's chooser shows.
-
-    Attributes
-    ----------
-    name : str
-    cloud : Cloud
-    segmentation : Segmentation, or None
-        Of this very cloud.
-    """
-
-    name: str
-    cloud: Cloud
-    segmentation: Segmentation | None = None
 
 
 def view_page(cloud: Cloud, segmentation: Segmentation | None = None, title: str | None = None) -> str:
@@ -73,7 +55,7 @@ def view_page(cloud: Cloud, segmentation: Segmentation | None = None, title: str
     True
     """
     name = "Point cloud" if title is None else title
-    return views_page([Shown(name, cloud, segmentation)], name)
+    return views_page([Shown.of(name, cloud, segmentation)], name)
 
 
 def write_view(
@@ -97,7 +79,7 @@ def views_page(shown: Sequence[Shown], title: str) -> str:
     Raises
     ------
     ValueError
-        There is no cloud, a segmentation is that of another cloud, or the page would be larger than browsers load.
+        There is no cloud, or the page would be larger than browsers load.
     """
     if not shown:
         raise ValueError("expected at least one cloud to show, got none")
@@ -125,23 +107,7 @@ def views_page(shown: Sequence[Shown], title: str) -> str:
 def _data_blocks(shown: Sequence[Shown]) -> Iterator[str]:
     """JSON of each cloud; no text in it can end the element that holds it."""
     for one in shown:
-        _check(one)
-        data = cloud_data(visible(one.name), one.cloud, one.segmentation)
-        yield json.dumps({**data, "colorTable": _color_table()}, allow_nan=False).replace("<", "\\u003c")
-
-
-def _check(one: Shown) -> None:
-    """Raise ValueError unless this is a cloud with a segmentation of its shape, if any."""
-    if not isinstance(one.cloud, Cloud):
-        raise ValueError(f"expected a Cloud, as pcgraph.read_cloud returns it, got {type(one.cloud).__name__}")
-    if one.segmentation is None:
-        return
-    check_segmentation(one.segmentation)
-    if one.segmentation.labels.shape != one.cloud.points.shape[:-1]:
-        raise ValueError(
-            f"expected the segmentation of this cloud, {one.cloud.points.shape[:-1]} points, "
-            f"got one of {one.segmentation.labels.shape}"
-        )
+        yield json.dumps({**cloud_data(one), "colorTable": _color_table()}, allow_nan=False).replace("<", "\\u003c")
 
 
 def _color_table() -> list[int]:

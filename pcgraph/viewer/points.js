@@ -61,7 +61,7 @@ void main() {
     float own = log2(away(at)) - log2(1.0 + slack / away(at)), sum = 0.0;  // less than a point's size is no step
     int r = int(reach);
     ivec2 near[8] = ivec2[8](ivec2(r, 0), ivec2(-r, 0), ivec2(0, r), ivec2(0, -r), ivec2(r, r), ivec2(-r, r), ivec2(r, -r), ivec2(-r, -r));
-    for (int i = 0; i < 8; i++) sum += clamp(own - log2(away(clamp(at + near[i], ivec2(0), last))), 0.0, 0.05);
+    for (int i = 0; i < 8; i++) sum += clamp(own - log2(away(clamp(at + near[i], ivec2(0), last))), 0.0, 0.04);
     shade = exp(-strength * sum);
   }
   pixel = vec4(texelFetch(color, at, 0).rgb * shade, 1.0);
@@ -258,7 +258,7 @@ class PointScene {
     uniforms.least.value = least * ratio;
     Object.assign(this.screen.uniforms, {
       range: { value: [camera.near, camera.far] }, parallel: { value: camera.isOrthographicCamera ? 1 : 0 },
-      strength: { value: this.shading ? 14 : 0 }, reach: { value: Math.max(1, Math.round(ratio)) }, slack: { value: pointSize },
+      strength: { value: this.shading ? 11 : 0 }, reach: { value: Math.max(1, Math.round(ratio)) }, slack: { value: pointSize },
     });
     for (const { material } of this.overlay.children) material.uniforms.screen.value = [width, height];
     renderer.setRenderTarget(target);

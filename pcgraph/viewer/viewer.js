@@ -29,7 +29,7 @@ function number(value, digits = 4) {
   if (!Number.isFinite(value)) return Number.isNaN(value) ? "none" : value > 0 ? "infinite" : "−infinite";
   if (Number.isInteger(value) && Math.abs(value) < 1e15) return value.toLocaleString("en").replace("-", "−");
   const size = Math.abs(value);
-  const text = size >= 1e6 || size < 1e-4 ? value.toPrecision(digits) : size >= 1e3 ? value.toFixed(1) : String(+value.toPrecision(digits));
+  const text = size >= 1e7 || size < 1e-4 ? value.toPrecision(digits) : size >= 1e3 ? value.toFixed(1) : String(+value.toPrecision(digits));
   return text.replace("-", "−");
 }
 
@@ -99,6 +99,7 @@ class Viewer {
     this.scene.show(cloud);
     for (const name of ["boxLines", "edgeLines", "chosenLines"]) { this.scene.removeLines(this[name]); this[name] = null; }
     for (const part of document.querySelectorAll(".of-tree")) part.hidden = !tree;
+    $("show-edges").parentElement.hidden = !tree?.edgeKinds.length;
     $("branches").hidden = !(tree && $("show-branches").checked);
     $("edge-legend").hidden = !(tree && $("show-edges").checked);
     $("picked").hidden = $("ring").hidden = true;
@@ -193,7 +194,7 @@ class Viewer {
     paint.table = numberTable(this.cloud.colorTable);
     paint.shown = column.shown.map((v) => 1 + (v - column.low) / column.step);
     if (paint.shown[0] === paint.shown[1]) paint.shown[1]++;
-    this.bar(column.shown[0], column.shown[1], "");
+    this.bar(column.shown[0], column.shown[1], column.unit && ` ${column.unit}`);
     if (column.keys.includes(0)) $("legend").append(make("ul", { className: "legend" }, make("li", {}, swatch(css(NO_VALUE)), "no value")));
   }
 
@@ -406,7 +407,7 @@ class Viewer {
     const ends = new Float32Array(3 * tree.edges.length), colors = new Float32Array(3 * tree.edgeKinds.length);
     tree.edges.forEach((leaf, i) => { for (let a = 0; a < 3; a++) ends[3 * i + a] = tree.centroids[3 * leaf + a] + shift[a]; });
     tree.edgeKinds.forEach((kind, i) => colors.set(EDGE_COLORS[kind], 3 * i));
-    return this.scene.addLines(ends, colors, { width: 1.4, opacity: 0.85, hidden: false });
+    return this.scene.addLines(ends, colors, { width: 1.1, opacity: 0.9, lift: 6 * this.cloud.spacing });
   }
 
   boxStrips() {
@@ -501,7 +502,7 @@ class Viewer {
     if (cloud.normals) rows.push(["normal", [...cloud.normals.subarray(3 * point, 3 * point + 3)].map((b) => number((b - 127.5) / 127.5, 2)).join(", ")]);
     for (const column of cloud.columns) {
       const key = column.keys[point], value = column.low + column.step * (key - 1);
-      rows.push([column.name, key === 0 ? "none" : column.values ? column.values[key - 1] : number(column.whole ? Math.round(value) : value, 5)]);
+      rows.push([column.name, key === 0 ? "none" : column.values ? column.values[key - 1] : number(column.whole ? Math.round(value) : value, 5) + (column.unit && ` ${column.unit}`)]);
     }
     if (tree && cloud.leaf[point]) {
       const leaf = cloud.leaf[point] - 1;

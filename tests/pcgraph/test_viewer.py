@@ -21,7 +21,7 @@ from PIL import Image
 
 import pcgraph
 from pcgraph.viewer import view_page, views_page, write_view
-from pcgraph.viewer.cloud_data import cloud_data
+from pcgraph.viewer.cloud_data import Shown, cloud_data
 from pcgraph.viewer.node_colors import distinct_colors, node_colors
 
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="there is no Chromium")
@@ -92,7 +92,7 @@ def test_the_page_holds_the_tree_and_the_graph(rich: tuple[pcgraph.Cloud, pcgrap
     edges, kinds = unpacked(tree["edges"], "<i4").reshape(-1, 2), unpacked(tree["edgeKinds"], np.uint8)
     touching = len(seen.graph.edges)
     assert (edges[:touching] == seen.graph.edges).all()
-    assert ((kinds[:touching] == 1) == (seen.graph.edge_features.convexity < 0)).all()
+    assert ((kinds[:touching] == 1) == (seen.graph.edge_features.convexity < -np.radians(10))).all()
     assert (kinds[touching:] == 2).all()
     assert tree["objectCount"] == len(np.unique(seen.labels[seen.labels >= 0]))
     names = tree["featureNames"]
@@ -112,7 +112,7 @@ def test_points_that_were_not_measured_or_lie_far_away_are_counted() -> None:
     points = np.random.default_rng(0).random((20_000, 3))
     points[7] = np.nan
     points[8] = (1e6, 0, 0)
-    data = cloud_data("x", pcgraph.Cloud(points), None)
+    data = cloud_data(Shown("x", pcgraph.Cloud(points)))
     assert (data["count"], data["unmeasured"], data["far"]) == (19_998, 1, 1)
     assert max(data["step"]) < 2e-5
     assert (unpacked(data["index"], "<u4") == np.delete(np.arange(20_000), [7, 8])).all()
