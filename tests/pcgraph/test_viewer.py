@@ -6,6 +6,9 @@ from __future__ import annotations
 import base64
 import json
 import re
+import shutil
+import subprocess
+import time
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import BROWSER, OPTIONS, Page, browser
+from browser import BROWSER, OPTIONS, WITHOUT_WEBGL, Page, browser
 from PIL import Image
 
 import pcgraph
@@ -226,3 +229,179 @@ def test_the_slider_recolours_and_a_click_shows_the_path(page_of_boxes: Path, tm
         said = page.evaluate("document.getElementById('picked').textContent")
         for word in ("intensity", "gps_time", "planarity", "normal", "tight box"):
             assert word in said, word
+
+
+@needs_browser
+@pytest.mark.validation
+def test_colours_toggles_keys_and_the_dendrogram_work(page_of_boxes: Path, tmp_path: Path) -> None:
+    """Every colouring draws another picture; so do boxes, edges, keys, projection, axis and a click on a branch."""
+    with opened(page_of_boxes, tmp_path) as page:
+        pictures = {}
+        for name in page.evaluate("[...document.querySelectorAll('#color option')].map((o) => o.value)"):
+            page.evaluate(f"viewer.color({json.dumps(name)})")
+            pictures[name] = picture(page)
+        names = list(pictures)
+        assert len(names) == 12
+        same = [
+            (a, b)
+            for i, a in enumerate(names)
+            for b in names[i + 1 :]
+            if (np.abs(pictures[a].astype(int) - pictures[b]) > 8).any(axis=-1).mean() < 0.01
+        ]
+        # The level is that of the objects, and the objects are the true ones.
+        assert same == [("level", "object"), ("level", "column 0"), ("object", "column 0")]
+        page.evaluate("viewer.color('level')")
+        last = picture(page)
+
+        def changes(act: str) -> bool:
+            nonlocal last
+            page.evaluate(act)
+            before, last = last, picture(page)
+            return bool(
+                before.shape != last.shape or (np.abs(before.astype(int) - last) > 8).any(axis=-1).mean() > 1e-3
+            )
+
+        key = "viewer.canvas.dispatchEvent(new KeyboardEvent('keydown', {{ key: '{}', shiftKey: {} }}))"
+        acts = [
+            "document.getElementById('show-boxes').click()",
+            "document.getElementById('show-edges').click()",
+            key.format("ArrowLeft", "false"),
+            key.format("ArrowUp", "true"),
+            key.format("+", "false"),
+            "(() => { const p = document.getElementById('projection'); p.value = 'parallel'; "
+            "p.dispatchEvent(new Event('change')); })()",
+            "(() => { const u = document.getElementById('up'); u.value = '0 1 0'; "
+            "u.dispatchEvent(new Event('change')); })()",
+            "document.getElementById('reset').click()",
+            key.format("Enter", "false"),
+            key.format("Escape", "false"),
+            "document.getElementById('show-branches').click()",
+        ]
+        for act in acts:
+            assert changes(act) or "reset" in act, act
+        branches = "document.querySelectorAll('#dendrogram path.branch').length"
+        assert page.evaluate(branches) == 401  # 200 merges and their children
+        line = "document.querySelector('#dendrogram line').getAttribute('x1')"
+        coarse = float(page.evaluate(line))
+        set_slider(page, 700)
+        assert float(page.evaluate(line)) > coarse
+        branch = "document.querySelectorAll('#dendrogram path.hit')[3]"
+        page.evaluate(f"{branch}.dispatchEvent(new MouseEvent('click', {{ bubbles: true }}))")
+        assert page.evaluate("viewer.chosen.node") == page.evaluate(f"+{branch}.dataset.node")
+        assert page.evaluate("viewer.chosen.inside.reduce((a, b) => a + b, 0)") > 0
+
+
+@needs_browser
+@pytest.mark.validation
+def test_a_drag_turns_and_the_wheel_zooms(page_of_boxes: Path, tmp_path: Path) -> None:
+    with opened(page_of_boxes, tmp_path) as page:
+        before = page.evaluate("viewer.eye.position.toArray()")
+        page.drag("#view", 120)
+        turned = page.evaluate("viewer.eye.position.toArray()")
+        assert np.linalg.norm(np.subtract(before, turned)) > 0.1 * np.linalg.norm(before)
+        assert page.evaluate("viewer.chosen") is None
+        page.mouse("mouseWheel", page.place("#view"), deltaX=0, deltaY=-300)
+        page.wait_for(f"viewer.eye.position.length() < {0.99 * float(np.linalg.norm(turned))}")
+
+
+@needs_browser
+@pytest.mark.validation
+def test_without_webgl_there_is_a_still_picture_and_a_sentence(page_of_boxes: Path, tmp_path: Path) -> None:
+    """The silhouette is that of WebGL's picture, and the slider and a click work as there."""
+    (tmp_path / "with").mkdir()
+    (tmp_path / "without").mkdir()
+    with opened(page_of_boxes, tmp_path / "with") as page:
+        page.evaluate("viewer.scene.shading = false")
+        drawn = picture(page)
+        assert page.evaluate("document.getElementById('still-note').hidden")
+    with opened(page_of_boxes, tmp_path / "without", options=WITHOUT_WEBGL) as page:
+        still = picture(page)
+        assert "no WebGL" in page.evaluate("document.getElementById('still-note').textContent")
+        assert not page.evaluate("document.getElementById('still-note').hidden")
+        ground = [(np.abs(image.astype(int) - (16, 21, 29)) <= 2).all(axis=-1) for image in (drawn, still)]
+        assert (ground[0] == ground[1]).mean() > 0.98
+        set_slider(page, 1000)
+        assert (picture(page) != still).any(axis=-1).mean() > 0.05
+        page.evaluate("viewer.pick(viewer.canvas.clientWidth / 2, viewer.canvas.clientHeight / 2, 200)")
+        assert page.evaluate("document.querySelectorAll('#path li').length") > 2
+
+
+@needs_browser
+@pytest.mark.validation
+def test_a_folder_becomes_one_page_with_a_chooser(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    shown = [Shown(f"cloud {i}", pcgraph.Cloud(rng.random((500 * (i + 1), 3)))) for i in range(3)]
+    path = tmp_path / "three.html"
+    path.write_text(views_page(shown, "Three"))
+    with opened(path, tmp_path, state="cloud=1") as page:
+        assert page.evaluate("document.getElementById('summary').textContent").startswith("1,000 points")
+        page.evaluate("document.getElementById('file').value = 2")
+        page.evaluate("document.getElementById('file').dispatchEvent(new Event('change'))")
+        page.wait_for("document.getElementById('summary').textContent.startsWith('1,500 points')")
+        assert page.evaluate("[...document.querySelectorAll('.of-tree')].every((part) => part.hidden)")
+
+
+@pytest.fixture(scope="session")
+def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The script of axe-core, from npm."""
+    folder = tmp_path_factory.mktemp("axe")
+    npm = shutil.which("npm")
+    if npm is None:
+        pytest.skip("there is no npm")
+    done = subprocess.run(
+        [npm, "install", "--no-audit", "--no-fund", "--prefix", folder, "axe-core@4.14.1"], timeout=120
+    )
+    if done.returncode:
+        pytest.skip("npm cannot fetch axe-core")
+    return (folder / "node_modules" / "axe-core" / "axe.min.js").read_text()
+
+
+@needs_browser
+@pytest.mark.validation
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [400, 1440])
+def test_axe_finds_nothing_serious(page_of_boxes: Path, tmp_path: Path, axe: str, width: int, scheme: str) -> None:
+    with opened(page_of_boxes, tmp_path, width=width) as page:
+        page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        for toggle in ("show-branches", "show-edges", "show-boxes"):
+            page.evaluate(f"document.getElementById('{toggle}').click()")
+        page.evaluate("viewer.pick(viewer.canvas.clientWidth / 2, viewer.canvas.clientHeight / 2, 300)")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        page.evaluate(axe + "; 0")
+        found = page.evaluate(
+            """axe.run().then((r) => r.violations.filter((v) => ["serious", "critical"].includes(v.impact))
+            .map((v) => `${v.id}: ${v.nodes.map((n) => n.html.slice(0, 80)).join(" | ")}`))"""
+        )
+        assert found == []
+
+
+@needs_browser
+@pytest.mark.validation
+def test_a_million_points_recolour_without_being_sent_again(tmp_path: Path) -> None:
+    """Software rendering: the figures are printed for docs/viewer.md. Moving the slider writes one small texture."""
+    rng = np.random.default_rng(0)
+    points = rng.random((1_000_000, 3)) * (12.0, 9.0, 0.002) + UTM
+    points[:, 2] += 0.4 * np.floor(points[:, 0] % 4)
+    cloud = pcgraph.Cloud(points)
+    seen = pcgraph.segment(cloud)
+    start = time.perf_counter()
+    write_view(tmp_path / "million.html", cloud, seen)
+    build = time.perf_counter() - start
+    with opened(tmp_path / "million.html", tmp_path) as page:
+        frame, slide, sent = page.evaluate(
+            """(() => { const gl = viewer.scene.renderer.getContext(), pixel = new Uint8Array(4);
+            const done = () => gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+            const turn = () => { viewer.turn(0.03, 0); viewer.draw(); done(); };
+            turn();
+            const start = performance.now();
+            for (let i = 0; i < 5; i++) turn();
+            const frame = (performance.now() - start) / 5;
+            let sent = 0; const old = gl.bufferData.bind(gl); gl.bufferData = (...a) => { sent++; return old(...a); };
+            let n = 1; const t = performance.now(); for (let i = 0; i < 20; i++) viewer.setCount(n += 37);
+            const slide = (performance.now() - t) / 20; viewer.draw(); done();
+            return [frame, slide, sent]; })()"""
+        )
+        assert sent == 0
+        assert slide < 100
+        size = (tmp_path / "million.html").stat().st_size / 1e6
+        print(f"page {size:.1f} MB in {build:.1f} s; frame {frame:.0f} ms (software), slider {slide:.1f} ms")  # noqa: T201
