@@ -35,8 +35,11 @@ if TYPE_CHECKING:
     from pcgraph.io import read_cloud as read_cloud
     from pcgraph.io import write_segmentation as write_segmentation
     from pcgraph.plausibility import CloudWarning as CloudWarning
+    from pcgraph.saved_segmentation import load_segmentation as load_segmentation
     from pcgraph.scan import segment as segment
+    from pcgraph.scan import supervoxel_clustering as supervoxel_clustering
     from pcgraph.segmentation import Segmentation as Segmentation
+    from pcgraph.segmentation import Supervoxels as Supervoxels
     from pcgraph.stream import update as update
     from pcgraph.supervoxels.method import SupervoxelMethod as SupervoxelMethod
     from pcgraph.supervoxels.surface_growth import SurfaceGrowth as SurfaceGrowth
@@ -56,6 +59,7 @@ if TYPE_CHECKING:
     from pcgraph.tree.region_linkage import RegionLinkage as RegionLinkage
     from pcgraph.tree.single_linkage import QuasiFlatLinkage as QuasiFlatLinkage
     from pcgraph.tree.tree import SegmentationTree as SegmentationTree
+    from pcgraph.tree.weighted_graph import tree_of_graph as tree_of_graph
     from pcgraph.voxels.grid import VoxelGrid as VoxelGrid
     from pcgraph.voxels.surface import LocalPlanes as LocalPlanes
     from pcgraph.voxels.surface import Surface as Surface
@@ -79,8 +83,9 @@ else:
             "graph.occlusion": ["Occlusions"],
             "io": ["read_cloud", "write_segmentation"],
             "plausibility": ["CloudWarning"],
-            "scan": ["segment"],
-            "segmentation": ["Segmentation"],
+            "saved_segmentation": ["load_segmentation"],
+            "scan": ["segment", "supervoxel_clustering"],
+            "segmentation": ["Segmentation", "Supervoxels"],
             "stream": ["update"],
             "supervoxels.method": ["SupervoxelMethod"],
             "supervoxels.surface_growth": ["SurfaceGrowth"],
@@ -96,6 +101,7 @@ else:
             "tree.region_linkage": ["RegionLinkage"],
             "tree.single_linkage": ["QuasiFlatLinkage"],
             "tree.tree": ["SegmentationTree"],
+            "tree.weighted_graph": ["tree_of_graph"],
             "voxels.grid": ["VoxelGrid"],
             "voxels.surface": ["LocalPlanes", "Surface"],
         },

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from dataclasses import dataclass
+from types import FrameType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -114,5 +116,9 @@ def warn_of_viewpoint(viewpoint: NDArray[np.float64], grid: VoxelGrid) -> None:
 
 
 def _warn(sentence: str) -> None:
-    """Warn with a sentence, as of the line that called `segment`."""
-    warnings.warn(sentence, CloudWarning, stacklevel=4)
+    """Warn with a sentence, as of the line outside this package from which the call came."""
+    frame: FrameType | None = sys._getframe()
+    level = 1
+    while frame is not None and frame.f_globals["__name__"].startswith("pcgraph."):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(sentence, CloudWarning, stacklevel=level)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Segmentation of a cloud: the whole algorithm on a page.
 
-`segment` decides who took the cloud, makes voxels and finds outward normals; `segment_scan` goes on to supervoxels,
-graph, tree and objects. `pcgraph.stream` adds later scans.
+`supervoxel_clustering` decides who took the cloud, makes voxels and finds outward normals; `cluster_scan` goes on to
+supervoxels and their graph, `merge_supervoxels` to tree and objects. `pcgraph.stream` adds later scans.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from pcgraph.plausibility import (
     warn_of_viewpoint,
     warn_of_volume,
 )
-from pcgraph.segmentation import Segmentation, Settings
+from pcgraph.segmentation import Segmentation, Settings, Supervoxels
 from pcgraph.supervoxels.method import SupervoxelMethod, seed_size_for, supervoxels_by
 from pcgraph.tree.linkage import Linkage, checked_merges
 from pcgraph.tree.tree import segmentation_tree
@@ -124,12 +124,74 @@ def segment(
     -----
     Supervoxels: Papon et al. 2013 (VCCS). Convexity: Stein et al. 2014 (LCCP).
     """
+    settings = Settings.of(method, linkage, object_altitude)
+    supervoxels = supervoxel_clustering(
+        points,
+        colors,
+        normals,
+        viewpoint,
+        features=features,
+        voxel_size=voxel_size,
+        seed_size=seed_size,
+        n_supervoxels=n_supervoxels,
+        camera=camera,
+        range_growth=range_growth,
+        method=settings.method,
+    )
+    result = merge_supervoxels(supervoxels, None, settings)
+    warn_of_oversegmentation(len(np.unique(result.objects)), result.tree.n_leaves, result.voxel_size)
+    return result
+
+
+def supervoxel_clustering(
+    points: Points,
+    colors: ArrayLike | None = None,
+    normals: ArrayLike | None = None,
+    viewpoint: ArrayLike | None = None,
+    *,
+    features: Features = None,
+    voxel_size: float | None = None,
+    seed_size: float | None = None,
+    n_supervoxels: int | None = None,
+    camera: bool | None = None,
+    range_growth: float | None = None,
+    method: SupervoxelMethod | None = None,
+) -> Supervoxels:
+    """Supervoxels of a point cloud and their adjacency graph: the first half of `segment`, for those who need no tree.
+
+    Parameters
+    ----------
+    points, colors, normals, viewpoint, features, voxel_size, seed_size, n_supervoxels, camera, range_growth, method
+        As for `pcgraph.segment`, which makes the same supervoxels.
+
+    Returns
+    -------
+    Supervoxels
+        `labels` are the supervoxels of the points, in the input's shape; -1 where a point has none.
+
+    Raises
+    ------
+    ValueError, CloudReadError
+        As for `pcgraph.segment`.
+
+    Notes
+    -----
+    Source: Papon et al. 2013 (VCCS, PCL's SupervoxelClustering).
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[0:1:0.02, 0:1:0.02]
+    >>> step = np.stack((x, y, np.where(x < 0.5, 0.0, 0.3)), axis=-1)
+    >>> found = supervoxel_clustering(step, viewpoint=(0.5, 0.5, 5.0), seed_size=0.2)
+    >>> found.labels.shape, found.graph.n_nodes == len(found.moments)
+    ((50, 50), True)
+    """
     points, colors, normals, viewpoint, features = as_arrays(points, colors, normals, viewpoint, features)
     if n_supervoxels is not None:
         n_supervoxels = whole_number("n_supervoxels", n_supervoxels)
         if seed_size is not None:
             raise ValueError("expected seed_size or n_supervoxels, got both")
-    settings = Settings.of(method, linkage, object_altitude)
+    method = Settings.of(method, None, None).method
     cloud = with_pixels(clean_cloud(points, colors, normals, features))
     n_supervoxels = None if n_supervoxels is None else min(n_supervoxels, len(cloud.points))
     sizes = Sizes.of(voxel_size, seed_size, n_supervoxels)
@@ -145,9 +207,9 @@ def segment(
     warn_of_volume(grid)
     if viewpoint is not None and acquisition.one_viewpoint is not None:
         warn_of_viewpoint(acquisition.one_viewpoint, grid)
-    oriented = _oriented(voxelisation, settings.method)
+    oriented = _oriented(voxelisation, method)
     if n_supervoxels is not None:
-        seed_size = seed_size_for(n_supervoxels, grid, _normals(cloud, oriented, grid), settings.method)
+        seed_size = seed_size_for(n_supervoxels, grid, _normals(cloud, oriented, grid), method)
     scan = Scan(
         voxelised,
         acquisition,
@@ -155,9 +217,7 @@ def segment(
         initial_labels=np.full(grid.n_voxels, -1, np.int32),
         seed_size=seed_spacing(grid, acquisition) if seed_size is None else float(seed_size),
     )
-    result = segment_scan(scan, None, settings)
-    warn_of_oversegmentation(len(np.unique(result.objects)), result.tree.n_leaves, grid.size)
-    return result
+    return cluster_scan(scan, None, method)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,8 +245,12 @@ class Scan:
 
 def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -> Segmentation:
     """Segmentation of a scan: the algorithm from voxels on."""
+    return merge_supervoxels(cluster_scan(scan, earlier, settings.method), earlier, settings)
+
+
+def cluster_scan(scan: Scan, earlier: Segmentation | None, method: SupervoxelMethod) -> Supervoxels:
+    """Supervoxels of a scan and their graph: the algorithm from voxels to the graph."""
     cloud, grid, planes = scan.voxelised.cloud, scan.voxelised.grid, scan.oriented.planes
-    method, linkage = settings.method, settings.linkage
     normals = _normals(cloud, scan.oriented, grid)
     if earlier is not None:
         normals = normals.copy()  # the planes keep their own
@@ -213,22 +277,38 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         touching.edges, features, nodes, near, hidden, color_evidence=evidence, acquisition=scan.acquisition
     )
     graph = replace(graph, bridges=bridges(surface, leaves.counts, graph.joined))
-    tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
+    viewpoint = scan.acquisition.viewpoint_of(cloud)
+    return Supervoxels(
+        labels=cloud.in_input_shape(leaf_of_point),
+        outliers=cloud.is_outlier,
+        moments=leaves,
+        graph=graph,
+        surface=surface,
+        seed_size=scan.seed_size,
+        method=method,
+        viewpoint=scan.oriented.places[0] if viewpoint is None else viewpoint,
+        feature_scaling=cloud.scaling,
+    )
+
+
+def merge_supervoxels(found: Supervoxels, earlier: Segmentation | None, settings: Settings) -> Segmentation:
+    """Segmentation of supervoxels: the algorithm from the graph to tree and objects."""
+    linkage, leaves = settings.linkage, found.moments
+    tree = segmentation_tree(checked_merges(linkage.merges(found.graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
     if earlier is not None:
         objects = _renumbered(objects, earlier, leaves.counts)
-    viewpoint = scan.acquisition.viewpoint_of(cloud)
     return Segmentation(
-        labels=cloud.in_input_shape(objects[leaf_of_point]),
-        outliers=cloud.is_outlier,
-        supervoxels=cloud.in_input_shape(leaf_of_point),
+        labels=np.append(objects, np.int32(-1))[found.labels],
+        outliers=found.outliers,
+        supervoxels=found.labels,
         objects=objects,
-        graph=graph,
+        graph=found.graph,
         tree=tree,
-        surface=surface,
-        seed_size=scan.seed_size,
-        viewpoint=scan.oriented.places[0] if viewpoint is None else viewpoint,
-        feature_scaling=cloud.scaling,
+        surface=found.surface,
+        seed_size=found.seed_size,
+        viewpoint=found.viewpoint,
+        feature_scaling=found.feature_scaling,
         next_object=max(int(objects.max()) + 1, 0 if earlier is None else earlier.next_object),
         **vars(settings),
     )

@@ -4,17 +4,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.acquisition.kinds import Acquisition
+from pcgraph.cloud import Cloud, without_mask
 from pcgraph.columns import RobustScaling
 from pcgraph.disjoint_sets import connected_components
+from pcgraph.errors import CloudWriteError
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.inputs import non_negative
+from pcgraph.plumbing.array_archive import Archive, class_name, encode_archive, field_names
+from pcgraph.plumbing.plain_files import write_file
+from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.supervoxels.method import SupervoxelMethod
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.linkage import Linkage
@@ -26,6 +33,15 @@ from pcgraph.voxels.warp import CameraWarp
 if TYPE_CHECKING:
     from pcgraph.features.primitives import Primitives
     from pcgraph.graph.occlusion import Occlusions
+
+SAVED_FORMAT = "pcgraph segmentation"
+"""Name of the format of saved segmentations, in the header of each."""
+SAVED_VERSION = 1
+"""Version of that format. It rises as soon as a file of the one before cannot be read as a file of this one."""
+SAVED_MARK = "pcgraph-segmentation"
+"""Mark of the seal of saved segmentations, in the comment at the end of each."""
+NOT_STORED = " (settings not stored)"
+"""What follows the name of a method or linkage in the header if an archive has no form for its settings."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +69,38 @@ class Settings:
             raise ValueError(_refusal("linkage", "Linkage", linkage))
         altitude = linkage.default_object_altitude if object_altitude is None else object_altitude
         return cls(method, linkage, non_negative("object_altitude", altitude))
+
+
+@dataclass(frozen=True, eq=False)
+class Supervoxels(ShortRepr):
+    """Supervoxels of a cloud and their graph, before a tree merges them.
+
+    Attributes
+    ----------
+    labels : (n,) or (h, w) int32
+        Supervoxel of each point, that is node of the graph; -1 where it has none, because nothing was measured or
+        because it is an outlier.
+    outliers : (n,) or (h, w) bool
+        Whether each point is an outlier: no denser around than noise would be.
+    moments : Moments of k supervoxels
+        Moments of their points.
+    graph : AdjacencyGraph of k nodes
+    surface, seed_size, method, viewpoint, feature_scaling
+        As in `Segmentation`.
+    """
+
+    labels: NDArray[np.int32]
+    outliers: NDArray[np.bool_]
+    moments: Moments
+    graph: AdjacencyGraph
+    surface: Surface
+    seed_size: float
+    method: SupervoxelMethod
+    viewpoint: NDArray[np.float64]
+    feature_scaling: RobustScaling | None = None
+
+    def _counts(self) -> str:
+        return f"{np.count_nonzero(self.labels >= 0)} points, {len(self.moments)} supervoxels"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -155,11 +203,26 @@ class Segmentation:
     @property
     def leaves(self) -> Moments:
         """Moments of the supervoxels."""
-        return self.tree.moments[: self.tree.n_leaves]
+        return self.tree.known_moments()[: self.tree.n_leaves]
 
     def cut(self, n: int | None = None, altitude: float | None = None, min_size: int = 1) -> NDArray[np.int32]:
         """Segment of each point in the input's shape, -1 as in `labels`; see `SegmentationTree.cut`."""
         return self.on_points(self.tree.cut(n, altitude, min_size))
+
+    def points_of(self, node: int) -> NDArray[np.int64]:
+        """Flat indices of the points below a node of the tree, ascending, (p,) int64.
+
+        They index the input as a list: ``points.reshape(-1, 3)[result.points_of(node)]``. After an update the points
+        are those of the last scan.
+
+        Raises
+        ------
+        ValueError
+            The tree has no such node.
+        """
+        is_below = np.zeros(self.tree.n_leaves, np.bool_)
+        is_below[self.tree.leaves_of(node)] = True
+        return np.flatnonzero(self.on_points(is_below))
 
     def with_objects(self, n: int | None = None, altitude: float | None = None, min_size: int = 1) -> Segmentation:
         """The same segmentation with another cut of its tree as its objects; parameters as for `SegmentationTree.cut`.
@@ -268,18 +331,86 @@ class Segmentation:
             inside, given = self.supervoxels >= 0, np.asarray(points)
             if given.shape != (*inside.shape, 3):
                 raise ValueError(f"expected the points that were segmented, {(*inside.shape, 3)}, got {given.shape}")
-            if np.count_nonzero(inside) != self.tree.moments.counts[-1]:
+            if np.count_nonzero(inside) != self.tree.sizes[-1]:
                 raise ValueError("expected the points of every scan, got one scan's; leave them out to use the voxels")
             places, groups = given[inside].astype(np.float64), self.supervoxels[inside]
             normals = normals[surface.grid.voxel_of_point]
         leaves = primitive_moments(places, normals, groups, self.tree.n_leaves)
         return fit_primitives(primitive_moments_up_tree(leaves, self.tree.parents))
 
+    def save(self, path: str | PathLike[str], cloud: Cloud | ArrayLike | None = None) -> None:
+        """Write the segmentation, whole or not at all; an older file of that name is replaced.
+
+        `pcgraph.load_segmentation` opens it again, and goes on from it as from this one.
+
+        Parameters
+        ----------
+        path : str or path, ``.npz``
+            One array for each field, under a name such as ``graph/edges`` (docs/pcgraph.md lists them), and all other
+            values as JSON in the array ``header``. Nothing is pickled or compressed.
+        cloud : Cloud, or points (n, 3) or (h, w, 3), optional
+            The cloud that was segmented, after an update the last scan. It is stored, too, under ``cloud/points``,
+            ``cloud/columns/intensity`` and the like, and `pcgraph.read_cloud` reads it from the same file.
+
+        Raises
+        ------
+        CloudWriteError
+            The name does not end in ``.npz``, the place cannot be written, or the cloud's columns are no arrays of
+            numbers, one row for each point.
+        ValueError
+            The points have another shape than those that were segmented.
+
+        Examples
+        --------
+        >>> import numpy as np, pcgraph, tempfile
+        >>> x, y = np.meshgrid(np.linspace(-1.0, 1.0, 64), np.linspace(-1.0, 1.0, 64))
+        >>> wall = np.stack((x, y, np.full_like(x, 2.0)), axis=-1)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     pcgraph.segment(wall).save(f"{folder}/wall.npz", wall)
+        ...     print(pcgraph.load_segmentation(f"{folder}/wall.npz").labels.shape)
+        (64, 64)
+        """
+        path = Path(path)
+        if path.suffix.lower() != ".npz":
+            raise CloudWriteError(f"expected the name of a file ending in .npz, got {path.name!r}")
+        archive = Archive()
+        for name in field_names(Segmentation):
+            value = getattr(self, name)
+            try:
+                archive.flatten(value, name)
+            except TypeError:
+                if name not in ("method", "linkage"):
+                    raise
+                archive.values[name] = class_name(type(value)) + NOT_STORED
+        if cloud is not None:
+            archive.flatten(_cloud_of(cloud, self.supervoxels.shape), "cloud")
+        header = {"format": SAVED_FORMAT, "version": SAVED_VERSION}
+        write_file(path, encode_archive(archive, header, SAVED_MARK), CloudWriteError)
+
     def _in_input_shape(self, values: NDArray[Any], missing: float) -> NDArray[Any]:
         """Values of the points that have a supervoxel, in the input's shape."""
         full = np.full(self.supervoxels.shape, missing, values.dtype)
         full[self.supervoxels >= 0] = values
         return full
+
+
+def _cloud_of(given: Cloud | ArrayLike, shape: tuple[int, ...]) -> Cloud:
+    """The cloud of a segmentation of points of a shape, (n,) or (h, w), checked."""
+    cloud = given if isinstance(given, Cloud) else Cloud(np.asarray(without_mask(given)))
+    points = np.asarray(without_mask(cloud.points))
+    if points.shape != (*shape, 3):
+        raise ValueError(f"expected the points that were segmented, of shape {(*shape, 3)}, got {points.shape}")
+    cloud = replace(cloud, points=points if points.dtype.kind == "f" else points.astype(np.float64))
+    beside = {name: getattr(cloud, name) for name in ("colors", "normals", "labels")}
+    for name, column in {**beside, **cloud.columns}.items():
+        if column is None:
+            continue
+        if not isinstance(column, np.ndarray) or column.dtype.kind not in "fiub" or column.shape[: len(shape)] != shape:
+            got = f"{column.dtype} of {column.shape}" if isinstance(column, np.ndarray) else type(column).__name__
+            raise CloudWriteError(f"expected {ascii(name)[:80]} as numbers of shape {shape} or that + (c,), got {got}")
+        if not isinstance(name, str) or any(letter < " " or "\ud800" <= letter <= "\udfff" for letter in name):
+            raise CloudWriteError(f"expected names of columns without control characters, got {ascii(name)[:80]}")
+    return cloud
 
 
 def check_segmentation(given: object) -> None:

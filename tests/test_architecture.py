@@ -188,6 +188,7 @@ STOREYS = [
     "tree",
     "families",
     "segmentation",
+    "saved_segmentation",
     "plausibility",
     "scan",
     "stream",

@@ -15,7 +15,9 @@ from synthetic import plane_signals, stereo_rig
 from rangesim import AmcwToF, Detector, compare, decode, expose
 
 ROOMS = [
+    "pcgraph.detection",
     "pcgraph.plumbing",
+    "pcgraph.tree",
     "rangesim.calibration",
     "rangesim.capture",
     "rangesim.causes",
@@ -45,6 +47,7 @@ ROOMS = [
 ]
 """Packages whose docstrings are run, all of their modules."""
 MODULES = [
+    "pcgraph.scan",
     "rangesim",
     "rangesim.errors",
     "rangesim.light_transport.transport_settings",

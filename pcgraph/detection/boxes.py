@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +11,7 @@ from scipy.spatial import ConvexHull
 
 from pcgraph.features.nodes import unit_vector
 from pcgraph.features.primitives import finite_vectors
+from pcgraph.plumbing.plain_dict import PlainDict
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.directions import plane_basis
 
@@ -26,7 +26,7 @@ _MAX_FACETS = 64
 
 
 @dataclass(frozen=True, eq=False)
-class OrientedBox(ShortRepr):
+class OrientedBox(ShortRepr, PlainDict):
     """A box in any pose.
 
     Attributes
@@ -36,6 +36,16 @@ class OrientedBox(ShortRepr):
         Rows are unit vectors and form a right-handed frame.
     size : (3,) float64, metres
         Full lengths along the axes; 0 where the points are flat.
+
+    Examples
+    --------
+    `to_dict` is what JSON holds; the class takes it back:
+
+    >>> box = OrientedBox(np.zeros(3), np.eye(3), np.array([0.3, 0.2, 0.1]))
+    >>> box.to_dict()["size"]
+    [0.3, 0.2, 0.1]
+    >>> OrientedBox(**{name: np.array(value) for name, value in box.to_dict().items()}).volume == box.volume
+    True
     """
 
     center: NDArray[np.float64]
@@ -51,13 +61,6 @@ class OrientedBox(ShortRepr):
         """Corners, (8, 3) float64, metres; corner 4 a + 2 b + c lies on side a, b, c (0 or 1) of the three axes."""
         signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
         return self.center + (signs * self.size) @ self.axes
-
-    def to_dict(self) -> dict[str, list[Any]]:
-        """Centre, axes and size as lists of plain numbers, which `json.dumps` takes; ``OrientedBox`` reads them back.
-
-        ``OrientedBox(**{name: numpy.array(value) for name, value in box.to_dict().items()})``
-        """
-        return {"center": self.center.tolist(), "axes": self.axes.tolist(), "size": self.size.tolist()}
 
     def local(self, points: ArrayLike) -> NDArray[np.float64]:
         """Points, (..., 3), in the box's own frame: from its centre along its axes, metres."""
