@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import webbrowser
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
 
 
 def view_command(
-    source: Annotated[Path, typer.Argument(help="A point cloud, or a folder of point clouds.")],
+    source: Annotated[
+        Path, typer.Argument(help="A point cloud, a segmentation saved with its cloud (.npz), or a folder of these.")
+    ],
     out: Annotated[Path | None, typer.Option(help="The page's file. Default: NAME.html in the current folder.")] = None,
     segment: Annotated[bool, typer.Option("--segment", help="Segment clouds that have no segmentation first.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a page that exists.")] = False,
@@ -56,7 +59,7 @@ def _files(source: Path) -> list[Path]:
 
     if not source.is_dir():
         return [source]
-    ends = tuple(suffix for one in FORMATS for suffix in one.suffixes)
+    ends = (".npz", *(suffix for one in FORMATS for suffix in one.suffixes))
     found = sorted(path for path in source.iterdir() if path.is_file() and path.name.lower().endswith(ends))
     if not found:
         raise CloudReadError(f"the folder {source} has no point cloud: expected files ending in {', '.join(ends)}")
@@ -67,8 +70,31 @@ def _shown(path: Path, segment: bool) -> Shown:
     from pcgraph.io import read_cloud
     from pcgraph.viewer.cloud_data import Shown
 
+    if _is_saved_segmentation(path):
+        return Shown.of(path.name, *_with_its_points(path))
     cloud = read_cloud(path)
     return Shown.of(path.name, cloud, _segmented(path, cloud) if segment else None)
+
+
+def _is_saved_segmentation(path: Path) -> bool:
+    """Whether a file is an archive that holds a tree."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return "tree/parents.npy" in archive.namelist()
+
+
+def _with_its_points(path: Path) -> tuple[Cloud, Segmentation]:
+    from pcgraph.io import read_cloud
+    from pcgraph.saved_segmentation import load_segmentation
+
+    segmentation = load_segmentation(path)
+    try:
+        return read_cloud(path), segmentation
+    except CloudReadError:
+        raise CloudReadError(
+            f"{path} holds no points, as it was saved without its cloud: save it with save(path, cloud)"
+        ) from None
 
 
 def _segmented(path: Path, cloud: Cloud) -> Segmentation:

@@ -87,13 +87,20 @@ def tree_data(shown: ShownTree, rows: NDArray[np.int64], points: NDArray[np.floa
     objectCount, partCount : how many there are
     edges, edgeKinds : pairs of leaves; convex 0, concave 1, gap 2
     boxes : of objects, with their numbers of points
+
+    Raises
+    ------
+    ValueError
+        The tree has no moments.
     """
-    tree = shown.tree
+    tree, moments = shown.tree, shown.tree.moments
+    if moments is None:
+        raise ValueError("expected a tree with moments of its points, got one without: give it moments")
     leaf = shown.supervoxels.reshape(-1)[rows]
     wide = tree.n_leaves >= 65535
-    sizes = tree.moments.counts
+    sizes = moments.counts
     features = _features(tree)
-    centroids = tree.moments.centroids[: tree.n_leaves]
+    centroids = moments.centroids[: tree.n_leaves]
     origin = centroids.mean(axis=0)
     edges, kinds = _edges(shown.graph)
     return {
