@@ -13,7 +13,7 @@ echo '{"private": true}' > package.json
 npm install --silent --no-audit --no-fund --no-save "three@$THREE" "esbuild@$ESBUILD"
 cat > entry.js <<'END'
 export {
-  AlwaysDepth, BufferAttribute, BufferGeometry, DataTexture, DepthTexture, DoubleSide, GLSL3, Matrix4, Mesh, NearestFilter,
+  AlwaysDepth, BufferAttribute, BufferGeometry, Camera, DataTexture, DepthTexture, DoubleSide, GLSL3, Matrix4, Mesh, NearestFilter,
   OrthographicCamera, PerspectiveCamera, Points, RawShaderMaterial, Scene, UnsignedIntType, Vector3, WebGLRenderer, WebGLRenderTarget,
 } from "three";
 export { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";

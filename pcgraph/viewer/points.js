@@ -10,17 +10,32 @@ const MAX_POINT_PIXELS = 32;
 // How points are coloured: by the segment of their supervoxel, by a key through a table, or by a key that is a colour.
 const BY_SEGMENT = 0, BY_NUMBER = 1, BY_CATEGORY = 2, BY_COLOR = 3;
 
+// Points that one sensor saw: they are as large as its pixels at their distance. Many of them share a pixel of the canvas.
+// If the nearest were drawn, readings that are too near would hide the others. Points within this fraction of their
+// distance are therefore drawn in random order.
+const SPREAD = 0.01;
+
 const POINT_VERTEX = `
 precision highp float; precision highp int;
-uniform mat4 modelViewMatrix, projectionMatrix;
+uniform mat4 modelMatrix, viewMatrix, projectionMatrix;
 uniform highp sampler2D segments, table;
+uniform vec4 seen;
 uniform int way; uniform vec2 shown; uniform float size, least;
 in vec3 position; in uint key, leaf;
 out vec3 tint; out float side;
 vec4 entry(highp sampler2D colors, uint i) { return texelFetch(colors, ivec2(i % ${TABLE_WIDTH}u, i / ${TABLE_WIDTH}u), 0); }
 void main() {
-  gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
-  side = clamp(size / gl_Position.w, least, ${MAX_POINT_PIXELS}.0);
+  vec4 place = modelMatrix * vec4(position, 1.0);
+  gl_Position = projectionMatrix * viewMatrix * place;
+  side = size / gl_Position.w;
+  if (seen.w > 0.0) {
+    vec3 ray = place.xyz - seen.xyz;
+    float random = fract(sin(dot(place.xyz, vec3(129.898, 782.33, 377.19))) * 43758.5453);
+    vec4 moved = projectionMatrix * viewMatrix * vec4(seen.xyz + ray * (1.0 - 0.5 * ${SPREAD} + ${SPREAD} * random), 1.0);
+    gl_Position.z = moved.z / moved.w * gl_Position.w;
+    side *= length(ray);
+  }
+  side = clamp(side, least, ${MAX_POINT_PIXELS}.0);
   gl_PointSize = side;
   vec4 segment = entry(segments, leaf);
   if (way == ${BY_SEGMENT}) tint = segment.rgb;
@@ -31,10 +46,10 @@ void main() {
 }`;
 const POINT_FRAGMENT = `
 precision highp float;
-in vec3 tint; in float side; out vec4 pixel;
+uniform vec4 seen; in vec3 tint; in float side; out vec4 pixel;
 void main() {
   vec2 from = gl_PointCoord - 0.5;
-  if (side > 4.0 && dot(from, from) > 0.25) discard;
+  if (seen.w == 0.0 && side > 4.0 && dot(from, from) > 0.25) discard;
   pixel = vec4(tint, 1.0);
 }`;
 
@@ -117,7 +132,14 @@ function painting(leaves) {
   return { way: BY_COLOR, segments, key: null, table: tableBytes(1), shown: [0, 1] };
 }
 
-// Packed colour of a point, as the vertex shader finds it.
+// Keys that are colours, of three bytes per point.
+function colorKeys(bytes) {
+  const keys = new Uint32Array(bytes.length / 3);
+  for (let i = 0; i < keys.length; i++) keys[i] = bytes[3 * i] << 16 | bytes[3 * i + 1] << 8 | bytes[3 * i + 2];
+  return keys;
+}
+
+// Colour of a point, as the vertex shader finds it.
 function colorOf(paint, leaf, i) {
   const { way, segments, key, table, shown } = paint, k = key ? key[i] : 0;
   let from = segments, at = 4 * leaf[i];
@@ -143,7 +165,9 @@ function setPlanes(camera, centre, radius) {
 // Size of a point of a size in metres: pixels times the fourth component of its place on the screen.
 function pixelsPerMetre(camera, height) { return camera.projectionMatrix.elements[5] * height / 2; }
 
-// A cloud as drawing needs it: steps (uint16, 3 per point), the size of a step and the place of step 0 in the view's frame.
+// A cloud as drawing needs it: `steps`, 3 numbers per point, the size of a `step` and the place of step 0, `corner`, in the
+// view's frame; `leaf`, 1 + the supervoxel of each point or 0; and `seenFrom`, the place of a sensor whose pixels the points
+// are, if they are.
 class PointScene {
   constructor(canvas, context) {
     Object.assign(this, { canvas, lines: [], shading: true });
@@ -177,13 +201,15 @@ class PointScene {
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.BufferAttribute(cloud.steps, 3));
     geometry.setAttribute("leaf", new THREE.BufferAttribute(cloud.leaf, 1));
+    geometry.setAttribute("key", new THREE.BufferAttribute(new Uint32Array(cloud.leaf.length), 1));
     const material = new THREE.RawShaderMaterial({
       glslVersion: THREE.GLSL3, vertexShader: POINT_VERTEX, fragmentShader: POINT_FRAGMENT,
       uniforms: {
         segments: { value: null }, table: { value: null }, way: { value: BY_COLOR }, shown: { value: [0, 1] },
-        size: { value: 1 }, least: { value: 1 },
+        size: { value: 1 }, least: { value: 1 }, seen: { value: cloud.seenFrom ? [...cloud.seenFrom, 1] : [0, 0, 0, 0] },
       },
     });
+    this.key = null;
     this.points = new THREE.Points(geometry, material);
     this.points.frustumCulled = false;
     this.points.scale.fromArray(cloud.step);
@@ -192,8 +218,12 @@ class PointScene {
 
   // Takes up a painting whose arrays have changed; the points stay on the graphics card.
   paint(paint) {
-    const { geometry, material } = this.points, { uniforms } = material, key = paint.key ?? geometry.attributes.leaf.array;
-    if (geometry.attributes.key?.array !== key) geometry.setAttribute("key", new THREE.BufferAttribute(key, 1));
+    const { geometry, material } = this.points, { uniforms } = material;
+    if (paint.key && this.key !== paint.key) {
+      geometry.attributes.key.array.set(paint.key);
+      geometry.attributes.key.needsUpdate = true;
+      this.key = paint.key;
+    }
     if (!this.points.parent) this.scene.add(this.points);
     for (const name of ["segments", "table"]) {
       const texture = uniforms[name].value;
@@ -247,18 +277,19 @@ class PointScene {
     mesh.material.dispose();
   }
 
-  // camera: one of three.js; pointSize: metres; least: pixels of the smallest point
-  draw(camera, pointSize, least) {
+  // camera: one of three.js; size: pixels of a point at w = 1 (of one that a sensor saw, at 1 m from it); least: pixels of the
+  // smallest point; slack: steps in depth, in metres, that the shading leaves out
+  draw(camera, size, least, slack = 0) {
     const { renderer, target } = this, ratio = Math.min(window.devicePixelRatio || 1, 2), [width, height] = fit(this.canvas);
     if (!(width && height && this.points)) return;
     renderer.setViewport(0, 0, width, height);
     if (target.width !== width || target.height !== height) target.setSize(width, height);
     const uniforms = this.points.material.uniforms;
-    uniforms.size.value = pointSize * pixelsPerMetre(camera, height);
+    uniforms.size.value = size;
     uniforms.least.value = least * ratio;
     Object.assign(this.screen.uniforms, {
       range: { value: [camera.near, camera.far] }, parallel: { value: camera.isOrthographicCamera ? 1 : 0 },
-      strength: { value: this.shading ? 11 : 0 }, reach: { value: Math.max(1, Math.round(ratio)) }, slack: { value: pointSize },
+      strength: { value: this.shading ? 11 : 0 }, reach: { value: Math.max(1, Math.round(ratio)) }, slack: { value: slack },
     });
     for (const { material } of this.overlay.children) material.uniforms.screen.value = [width, height];
     renderer.setRenderTarget(target);
@@ -286,10 +317,10 @@ class StillScene {
 
   removeLines() {}
 
-  draw(camera, pointSize, least) {
-    const [width, height] = fit(this.canvas), { steps, step, corner, leaf } = this.cloud;
+  draw(camera, size, least) {
+    const [width, height] = fit(this.canvas), { steps, step, corner, leaf, seenFrom } = this.cloud;
     if (!(width && height)) return;
-    const m = screenMatrix(camera, step, corner), size = pointSize * pixelsPerMetre(camera, height);
+    const m = screenMatrix(camera, step, corner), sensor = seenFrom?.map((c, a) => (c - corner[a]) / step[a]);
     const context = this.canvas.getContext("2d"), image = context.createImageData(width, height);
     const nearest = new Float32Array(width * height).fill(Infinity), pixels = new Uint32Array(image.data.buffer);
     const packed = ([r, g, b]) => (255 << 24) | (b << 16) | (g << 8) | r;  // of a little-endian machine
@@ -297,7 +328,14 @@ class StillScene {
     for (let i = 0, k = 0; i < leaf.length; i++, k += 3) {
       const x = steps[k], y = steps[k + 1], z = steps[k + 2], w = m[3] * x + m[7] * y + m[11] * z + m[15];
       if (w <= 0) continue;
-      const side = Math.max(least, Math.min(MAX_POINT_PIXELS, size / w)), depth = (m[2] * x + m[6] * y + m[10] * z + m[14]) / w;
+      let side = size / w, depth = (m[2] * x + m[6] * y + m[10] * z + m[14]) / w;
+      if (sensor) {
+        const by = 1 - 0.5 * SPREAD + SPREAD * (i * 0.618033988749895 % 1);
+        const [u, v, t] = [sensor[0] + by * (x - sensor[0]), sensor[1] + by * (y - sensor[1]), sensor[2] + by * (z - sensor[2])];
+        depth = (m[2] * u + m[6] * v + m[10] * t + m[14]) / (m[3] * u + m[7] * v + m[11] * t + m[15]);
+        side *= Math.hypot((x - sensor[0]) * step[0], (y - sensor[1]) * step[1], (z - sensor[2]) * step[2]);
+      }
+      side = Math.max(least, Math.min(MAX_POINT_PIXELS, side));
       const left = (0.5 + 0.5 * (m[0] * x + m[4] * y + m[8] * z + m[12]) / w) * width - side / 2;
       const top = (0.5 - 0.5 * (m[1] * x + m[5] * y + m[9] * z + m[13]) / w) * height - side / 2;
       const color = packed(colorOf(this.painting, leaf, i));

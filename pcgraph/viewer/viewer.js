@@ -57,13 +57,6 @@ async function unpackCloud(data) {
   return cloud;
 }
 
-// Keys that are colours, of three bytes per point.
-function colorKeys(bytes) {
-  const keys = new Uint32Array(bytes.length / 3);
-  for (let i = 0; i < keys.length; i++) keys[i] = bytes[3 * i] << 16 | bytes[3 * i + 1] << 8 | bytes[3 * i + 2];
-  return keys;
-}
-
 function numberTable(colors) {
   const table = tableBytes(257);
   table.set([...NO_VALUE, 255], 0);
@@ -337,8 +330,8 @@ class Viewer {
 
   draw() {
     if (!this.cloud || !this.paint) return;
-    const camera = this.camera(), { canvas } = this, bigger = 2 ** +$("size").value;
-    this.scene.draw(camera, 2.2 * bigger * this.cloud.spacing, Math.max(1, 1.5 * bigger));
+    const camera = this.camera(), { canvas } = this, bigger = 2 ** +$("size").value, size = 2.2 * bigger * this.cloud.spacing;
+    this.scene.draw(camera, size * pixelsPerMetre(camera, fit(canvas)[1]), Math.max(1, 1.5 * bigger), size);
     const ring = $("ring");
     ring.hidden = this.pickedPoint === undefined || this.pickedPoint < 0;
     if (ring.hidden) return;

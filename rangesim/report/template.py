@@ -23,7 +23,8 @@ def render_page(template: str, values: Mapping[str, Any], scripts: Sequence[str]
     Parameters
     ----------
     template : name of the template's file. values : the other variables of the template, by name.
-    scripts : names of the files whose JavaScript the page runs, in this order.
+    scripts : names of the files whose JavaScript the page runs, in this order, of this package or, such as
+        "pcgraph.viewer:points.js", of another one.
 
     Raises
     ------
@@ -43,5 +44,6 @@ def render_page(template: str, values: Mapping[str, Any], scripts: Sequence[str]
 
 
 def _file(name: str) -> str:
-    """Text of a file of this package."""
-    return (files("rangesim.report") / name).read_text(encoding="utf-8")
+    """Text of a file of this package or, as "package:name", of another one."""
+    package, _, file = name.rpartition(":")
+    return (files(package or "rangesim.report") / file).read_text(encoding="utf-8")

@@ -20,9 +20,13 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import BROWSER, OPTIONS, WITHOUT_WEBGL, Page, browser
+from click.testing import Result
 from PIL import Image
+from typer.testing import CliRunner
 
 import pcgraph
+from pcgraph.cli import app
+from pcgraph.io.ply import encode_ply
 from pcgraph.viewer import view_page, views_page, write_view
 from pcgraph.viewer.cloud_data import Shown, cloud_data
 from pcgraph.viewer.node_colors import distinct_colors, node_colors
@@ -160,6 +164,31 @@ def test_what_is_no_cloud_or_another_clouds_segmentation_is_refused(
     with pytest.raises(ValueError, match="at least one cloud"):
         views_page([], "x")
     assert not list(tmp_path.iterdir())
+
+
+def test_view_writes_one_page_for_a_file_or_a_folder_and_replaces_none(tmp_path: Path) -> None:
+    def view(source: Path, *more: str) -> Result:
+        return CliRunner().invoke(app, ["view", str(source), "--out", str(tmp_path / "page.html"), *more])
+
+    (tmp_path / "clouds").mkdir()
+    rng = np.random.default_rng(0)
+    for i in range(2):
+        places = rng.random((50 + i, 3))
+        ply = encode_ply({axis: places[:, k] for k, axis in enumerate("xyz")})
+        (tmp_path / "clouds" / f"{i}.ply").write_bytes(ply)
+    done = view(tmp_path / "clouds" / "0.ply")
+    assert done.exit_code == 0, done.output
+    assert data_of((tmp_path / "page.html").read_text())["count"] == 50
+    refused = view(tmp_path / "clouds")
+    assert refused.exit_code == 1
+    assert "add --overwrite" in refused.output
+    done = view(tmp_path / "clouds", "--overwrite")
+    assert done.exit_code == 0, done.output
+    page = (tmp_path / "page.html").read_text()
+    assert [data_of(page, i)["name"] for i in range(2)] == ["0.ply", "1.ply"]
+    (tmp_path / "empty").mkdir()
+    assert "has no point cloud" in view(tmp_path / "empty", "--overwrite").output
+    assert data_of((tmp_path / "page.html").read_text(), 1)["count"] == 51
 
 
 # ---- In the browser ------------------------------------------------------------------------------------------------
@@ -397,6 +426,7 @@ def test_a_million_points_recolour_without_being_sent_again(tmp_path: Path) -> N
             for (let i = 0; i < 5; i++) turn();
             const frame = (performance.now() - start) / 5;
             let sent = 0; const old = gl.bufferData.bind(gl); gl.bufferData = (...a) => { sent++; return old(...a); };
+            const part = gl.bufferSubData.bind(gl); gl.bufferSubData = (...a) => { sent++; return part(...a); };
             let n = 1; const t = performance.now(); for (let i = 0; i < 20; i++) viewer.setCount(n += 37);
             const slide = (performance.now() - t) / 20; viewer.draw(); done();
             return [frame, slide, sent]; })()"""
