@@ -59,7 +59,7 @@ def _files(source: Path) -> list[Path]:
 
     if not source.is_dir():
         return [source]
-    ends = (".npz", *(suffix for one in FORMATS for suffix in one.suffixes))
+    ends = tuple(dict.fromkeys((".npz", *(suffix for one in FORMATS for suffix in one.suffixes))))
     found = sorted(path for path in source.iterdir() if path.is_file() and path.name.lower().endswith(ends))
     if not found:
         raise CloudReadError(f"the folder {source} has no point cloud: expected files ending in {', '.join(ends)}")

@@ -26,6 +26,9 @@ VALUE_STEPS = 65534
 TAIL = 0.001
 """Fraction of the points that may lie outside at either end of each axis when the extent of the cloud is taken. Chosen
 by eye; not varied."""
+FIRST_VIEW_TAIL = 0.02
+"""The same fraction for the extent that the first view shows: sweeps of a LiDAR have a few points far ahead. Chosen by
+eye; not varied."""
 MAX_REACH = 2.0
 """Distance from the extent, in lengths of its longest side, beyond which points are not drawn.
 
@@ -139,7 +142,7 @@ def cloud_data(shown: Shown) -> dict[str, Any]:
     span = np.ptp(drawn.points, axis=0) if len(drawn.points) else np.zeros(3)
     step = np.where(span > 0.0, span / POSITION_STEPS, 1.0)
     steps = np.rint((drawn.points - low) / step).astype(np.uint16)
-    begin, end = _extent(drawn.points)
+    begin, end = _extent(drawn.points, FIRST_VIEW_TAIL)
     columns = _columns(shown)
     return {
         "name": visible(shown.name),
@@ -168,7 +171,7 @@ def _drawn(cloud: Cloud) -> Drawn:
     flat = cloud.points.reshape(-1, 3)
     measured = np.flatnonzero(np.isfinite(flat).all(axis=1))
     points = flat[measured].astype(np.float64)
-    begin, end = _extent(points)
+    begin, end = _extent(points, TAIL)
     reach = MAX_REACH * float((end - begin).max())
     near = (
         ((points >= begin - reach) & (points <= end + reach)).all(axis=1) if reach > 0.0 else np.ones(len(points), bool)
@@ -176,11 +179,11 @@ def _drawn(cloud: Cloud) -> Drawn:
     return Drawn(measured[near], points[near], int((~near).sum()))
 
 
-def _extent(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Ends of the box of nearly all points, metres."""
+def _extent(points: NDArray[np.float64], tail: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Ends of a box, metres, that a fraction of the points lies outside of at either end of each axis."""
     if not len(points):
         return np.zeros(3), np.zeros(3)
-    ends = np.quantile(points, [TAIL, 1.0 - TAIL], axis=0)
+    ends = np.quantile(points, [tail, 1.0 - tail], axis=0)
     return ends[0], ends[1]
 
 

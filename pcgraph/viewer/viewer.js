@@ -5,6 +5,7 @@ const $ = (id) => document.getElementById(id);
 const FIELD_OF_VIEW = 45;  // degrees, from top to bottom
 const START_FROM = [-0.55, -0.8, 0.5];  // where the viewer is, seen from the middle, for a cloud whose z is up
 const PICK_REACH = 5;  // pixels
+const SIZE_IN_SPACINGS = 2.6;  // so that three quarters of a surface of random points are covered; by eye, not varied
 const LARGEST_LEGEND = 12;
 const EDGE_COLORS = [[0.33, 0.64, 0.96], [0.95, 0.55, 0.22], [0.73, 0.76, 0.8]];  // convex, concave, gap; as in viewer.css
 const CHOSEN_COLOR = [1, 0.83, 0.25];
@@ -31,6 +32,12 @@ function number(value, digits = 4) {
   const size = Math.abs(value);
   const text = size >= 1e7 || size < 1e-4 ? value.toPrecision(digits) : size >= 1e3 ? value.toFixed(1) : String(+value.toPrecision(digits));
   return text.replace("-", "−");
+}
+
+// A value of a column, to the digits that its steps have.
+function valueText(column, value) {
+  if (column.whole) return number(Math.round(value));
+  return Math.abs(value) < 1e-4 || column.step > 1e6 ? number(value) : value.toFixed(Math.min(6, digitsOf(column.step))).replace("-", "−");
 }
 
 function counted(count, one, many = `${one}s`) { return `${count.toLocaleString("en")} ${count === 1 ? one : many}`; }
@@ -283,7 +290,7 @@ class Viewer {
   }
 
   resetView() {
-    const { cloud } = this, up = this.up(), away = 0.92 * cloud.radius / Math.tan(FIELD_OF_VIEW / 2 * Math.PI / 180) / Math.min(1, this.aspect());
+    const { cloud } = this, up = this.up(), away = (cloud.camera ? 0.75 : 0.92) * cloud.radius / Math.tan(FIELD_OF_VIEW / 2 * Math.PI / 180) / Math.min(1, this.aspect());
     let from = START_FROM;
     if (cloud.camera && up[1] === -1) from = [-0.22, -0.16, -1];
     else if (up[2] !== 1) from = [...[0, 1, 2].map((a) => (up[a] ? 0.5 * up[a] : a === 2 ? 0.8 : 0.55))];
@@ -330,7 +337,7 @@ class Viewer {
 
   draw() {
     if (!this.cloud || !this.paint) return;
-    const camera = this.camera(), { canvas } = this, bigger = 2 ** +$("size").value, size = 2.2 * bigger * this.cloud.spacing;
+    const camera = this.camera(), { canvas } = this, bigger = 2 ** +$("size").value, size = SIZE_IN_SPACINGS * bigger * this.cloud.spacing;
     this.scene.draw(camera, size * pixelsPerMetre(camera, fit(canvas)[1]), Math.max(1, 1.5 * bigger), size);
     const ring = $("ring");
     ring.hidden = this.pickedPoint === undefined || this.pickedPoint < 0;
@@ -495,7 +502,7 @@ class Viewer {
     if (cloud.normals) rows.push(["normal", [...cloud.normals.subarray(3 * point, 3 * point + 3)].map((b) => number((b - 127.5) / 127.5, 2)).join(", ")]);
     for (const column of cloud.columns) {
       const key = column.keys[point], value = column.low + column.step * (key - 1);
-      rows.push([column.name, key === 0 ? "none" : column.values ? column.values[key - 1] : number(column.whole ? Math.round(value) : value, 5) + (column.unit && ` ${column.unit}`)]);
+      rows.push([column.name, key === 0 ? "none" : column.values ? column.values[key - 1] : valueText(column, value) + (column.unit && ` ${column.unit}`)]);
     }
     if (tree && cloud.leaf[point]) {
       const leaf = cloud.leaf[point] - 1;
