@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pcgraph import viewer as viewer
     from pcgraph.acquisition.kinds import Acquisition as Acquisition
     from pcgraph.cloud import Cloud as Cloud
+    from pcgraph.cloud_sources import as_cloud as as_cloud
     from pcgraph.columns import RobustScaling as RobustScaling
     from pcgraph.errors import CloudReadError as CloudReadError
     from pcgraph.errors import CloudWriteError as CloudWriteError
@@ -33,7 +34,9 @@ if TYPE_CHECKING:
     from pcgraph.graph.continuations import Continuations as Continuations
     from pcgraph.graph.occlusion import Occlusions as Occlusions
     from pcgraph.io import read_cloud as read_cloud
-    from pcgraph.io import write_segmentation as write_segmentation
+    from pcgraph.io import write_cloud as write_cloud
+    from pcgraph.labelling import labelled_cloud as labelled_cloud
+    from pcgraph.labelling import write_segmentation as write_segmentation
     from pcgraph.plausibility import CloudWarning as CloudWarning
     from pcgraph.saved_segmentation import load_segmentation as load_segmentation
     from pcgraph.scan import segment as segment
@@ -72,6 +75,7 @@ else:
         submod_attrs={
             "acquisition.kinds": ["Acquisition"],
             "cloud": ["Cloud"],
+            "cloud_sources": ["as_cloud"],
             "columns": ["RobustScaling"],
             "errors": ["CloudReadError", "CloudWriteError", "PcgraphError"],
             "features.moments": ["Moments"],
@@ -81,7 +85,8 @@ else:
             "graph.boundary": ["BoundaryCost", "BoundaryStrength"],
             "graph.continuations": ["Continuations"],
             "graph.occlusion": ["Occlusions"],
-            "io": ["read_cloud", "write_segmentation"],
+            "io": ["read_cloud", "write_cloud"],
+            "labelling": ["labelled_cloud", "write_segmentation"],
             "plausibility": ["CloudWarning"],
             "saved_segmentation": ["load_segmentation"],
             "scan": ["segment", "supervoxel_clustering"],

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.acquisition.kinds import Acquisition
-from pcgraph.cloud import Cloud, without_mask
+from pcgraph.cloud import Cloud, plain_cloud
+from pcgraph.cloud_sources import as_cloud
 from pcgraph.columns import RobustScaling
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.errors import CloudWriteError
@@ -338,7 +339,7 @@ class Segmentation:
         leaves = primitive_moments(places, normals, groups, self.tree.n_leaves)
         return fit_primitives(primitive_moments_up_tree(leaves, self.tree.parents))
 
-    def save(self, path: str | PathLike[str], cloud: Cloud | ArrayLike | None = None) -> None:
+    def save(self, path: str | PathLike[str], cloud: Any = None) -> None:
         """Write the segmentation, whole or not at all; an older file of that name is replaced.
 
         `pcgraph.load_segmentation` opens it again, and goes on from it as from this one.
@@ -348,7 +349,7 @@ class Segmentation:
         path : str or path, ``.npz``
             One array for each field, under a name such as ``graph/edges`` (docs/pcgraph.md lists them), and all other
             values as JSON in the array ``header``. Nothing is pickled or compressed.
-        cloud : Cloud, or points (n, 3) or (h, w, 3), optional
+        cloud : Cloud, or anything else that `as_cloud` takes, optional
             The cloud that was segmented, after an update the last scan. It is stored, too, under ``cloud/points``,
             ``cloud/columns/intensity`` and the like, and `pcgraph.read_cloud` reads it from the same file.
 
@@ -373,6 +374,10 @@ class Segmentation:
         path = Path(path)
         if path.suffix.lower() != ".npz":
             raise CloudWriteError(f"expected the name of a file ending in .npz, got {path.name!r}")
+        write_file(path, self.to_bytes(cloud), CloudWriteError)
+
+    def to_bytes(self, cloud: Any = None) -> bytes:
+        """Bytes of the file that `save` writes."""
         archive = Archive()
         for name in field_names(Segmentation):
             value = getattr(self, name)
@@ -383,9 +388,8 @@ class Segmentation:
                     raise
                 archive.values[name] = class_name(type(value)) + NOT_STORED
         if cloud is not None:
-            archive.flatten(_cloud_of(cloud, self.supervoxels.shape), "cloud")
-        header = {"format": SAVED_FORMAT, "version": SAVED_VERSION}
-        write_file(path, encode_archive(archive, header, SAVED_MARK), CloudWriteError)
+            archive.flatten(plain_cloud(segmented_cloud(cloud, self)), "cloud")
+        return encode_archive(archive, {"format": SAVED_FORMAT, "version": SAVED_VERSION}, SAVED_MARK)
 
     def _in_input_shape(self, values: NDArray[Any], missing: float) -> NDArray[Any]:
         """Values of the points that have a supervoxel, in the input's shape."""
@@ -394,23 +398,13 @@ class Segmentation:
         return full
 
 
-def _cloud_of(given: Cloud | ArrayLike, shape: tuple[int, ...]) -> Cloud:
-    """The cloud of a segmentation of points of a shape, (n,) or (h, w), checked."""
-    cloud = given if isinstance(given, Cloud) else Cloud(np.asarray(without_mask(given)))
-    points = np.asarray(without_mask(cloud.points))
-    if points.shape != (*shape, 3):
-        raise ValueError(f"expected the points that were segmented, of shape {(*shape, 3)}, got {points.shape}")
-    cloud = replace(cloud, points=points if points.dtype.kind == "f" else points.astype(np.float64))
-    beside = {name: getattr(cloud, name) for name in ("colors", "normals", "labels")}
-    for name, column in {**beside, **cloud.columns}.items():
-        if column is None:
-            continue
-        if not isinstance(column, np.ndarray) or column.dtype.kind not in "fiub" or column.shape[: len(shape)] != shape:
-            got = f"{column.dtype} of {column.shape}" if isinstance(column, np.ndarray) else type(column).__name__
-            raise CloudWriteError(f"expected {ascii(name)[:80]} as numbers of shape {shape} or that + (c,), got {got}")
-        if not isinstance(name, str) or any(letter < " " or "\ud800" <= letter <= "\udfff" for letter in name):
-            raise CloudWriteError(f"expected names of columns without control characters, got {ascii(name)[:80]}")
-    return cloud
+def segmented_cloud(cloud: Any, segmentation: Segmentation) -> Cloud:
+    """The cloud that was segmented, of anything that `as_cloud` takes; ValueError if it has another shape."""
+    found, shape = as_cloud(cloud), segmentation.supervoxels.shape
+    if np.shape(found.points) != (*shape, 3):
+        expected = f"the points that were segmented, of shape {(*shape, 3)}"
+        raise ValueError(f"expected {expected}, got {np.shape(found.points)}; give the cloud of this segmentation")
+    return found
 
 
 def check_segmentation(given: object) -> None:

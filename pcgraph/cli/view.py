@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, one_line, without_long_words
-from pcgraph.plumbing.plain_files import said, write_file
+from pcgraph.cli.clouds import check_outputs, read_saved, refusals, segmented
+from pcgraph.errors import CloudReadError, CloudWriteError, one_line
 
 if TYPE_CHECKING:
-    from pcgraph.cloud import Cloud
-    from pcgraph.segmentation import Segmentation
     from pcgraph.viewer.cloud_data import Shown
 
 
@@ -32,21 +30,16 @@ def view_command(
 
     A folder becomes one page with a chooser over its files.
 
-    Example: pcgraph view scan.pcd --segment --open
+    Example: pcgraph view scan.segmentation.npz --open
     """
+    from pcgraph.plumbing.plain_files import write_file
     from pcgraph.viewer.page import views_page
 
-    target = Path(f"{source.absolute().stem}.html") if out is None else out
-    try:
-        if target.exists() and not (overwrite and target.is_file()):
-            raise CloudWriteError(f"{target} exists: add --overwrite, or choose another --out")
+    with refusals():
+        target = Path(f"{source.absolute().stem}.html") if out is None else out
+        check_outputs([target], [str(source)], overwrite)
         shown = [_shown(path, segment) for path in _files(source)]
         write_file(target, views_page(shown, source.absolute().name).encode("utf-8"), CloudWriteError)
-    except (PcgraphError, ValueError, MemoryError, OSError) as error:
-        message = said(error) if isinstance(error, OSError) else str(error)
-        message = without_long_words(message) or "the clouds do not fit into memory: choose fewer files"
-        typer.echo(f"pcgraph: {one_line(message).rstrip('.')}.", err=True)
-        raise typer.Exit(1) from None
     typer.echo(f"{'clouds':<12} {len(shown)}")
     typer.echo(f"{'written':<12} {one_line(target)}, {target.stat().st_size / 1e6:.1f} MB")
     if open_page:
@@ -59,7 +52,7 @@ def _files(source: Path) -> list[Path]:
 
     if not source.is_dir():
         return [source]
-    ends = tuple(dict.fromkeys((".npz", *(suffix for one in FORMATS for suffix in one.suffixes))))
+    ends = tuple(suffix for one in FORMATS for suffix in one.suffixes)
     found = sorted(path for path in source.iterdir() if path.is_file() and path.name.lower().endswith(ends))
     if not found:
         raise CloudReadError(f"the folder {source} has no point cloud: expected files ending in {', '.join(ends)}")
@@ -71,9 +64,9 @@ def _shown(path: Path, segment: bool) -> Shown:
     from pcgraph.viewer.cloud_data import Shown
 
     if _is_saved_segmentation(path):
-        return Shown.of(path.name, *_with_its_points(path))
+        return Shown.of(path.name, *read_saved(path))
     cloud = read_cloud(path)
-    return Shown.of(path.name, cloud, _segmented(path, cloud) if segment else None)
+    return Shown.of(path.name, cloud, segmented(str(path), cloud) if segment else None)
 
 
 def _is_saved_segmentation(path: Path) -> bool:
@@ -82,25 +75,3 @@ def _is_saved_segmentation(path: Path) -> bool:
         return False
     with zipfile.ZipFile(path) as archive:
         return "tree/parents.npy" in archive.namelist()
-
-
-def _with_its_points(path: Path) -> tuple[Cloud, Segmentation]:
-    from pcgraph.io import read_cloud
-    from pcgraph.saved_segmentation import load_segmentation
-
-    segmentation = load_segmentation(path)
-    try:
-        return read_cloud(path), segmentation
-    except CloudReadError:
-        raise CloudReadError(
-            f"{path} holds no points, as it was saved without its cloud: save it with save(path, cloud)"
-        ) from None
-
-
-def _segmented(path: Path, cloud: Cloud) -> Segmentation:
-    from pcgraph import scan
-
-    try:
-        return scan.segment(cloud)
-    except ValueError as error:
-        raise CloudReadError(f"cannot segment {path}: {error}") from None

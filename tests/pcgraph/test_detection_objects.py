@@ -115,7 +115,7 @@ def test_what_is_no_segmentation_is_refused_in_a_sentence(boxes, kind, tmp_path)
     calls = [lambda: find_planes(given), lambda: objects_on(given), lambda: object_labels(given, [])]
     calls += [lambda: objects_on(given, find_planes(result), points=points)]
     calls += [lambda: pcgraph.write_segmentation(tmp_path / "a.ply", points, given)]
-    calls += [lambda: pcgraph.write_segmentation(tmp_path / "a.npz", points, given)]
+    calls += [lambda: pcgraph.labelled_cloud(points, given)]
     for call in calls:
         with pytest.raises(ValueError, match=rf"expected a Segmentation, .* got {type(given).__name__}$"):
             call()

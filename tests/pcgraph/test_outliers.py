@@ -154,8 +154,7 @@ def test_files_keep_outliers(clean, tmp_path):
     pcgraph.write_segmentation(tmp_path / "a.ply", cloud, result)
     read = pcgraph.read_cloud(tmp_path / "a.ply")
     assert len(read.points) == len(points) + 1
-    assert read.labels is not None
-    assert read.labels[-1] == -1
+    assert read.columns["object"][-1] == -1
 
 
 def test_an_update_keeps_single_points_beside_what_was_seen(clean):

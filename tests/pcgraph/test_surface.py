@@ -59,7 +59,9 @@ def test_public_names():
         "Vccs",
         "VoxelGrid",
         "WardLinkage",
+        "as_cloud",
         "detection",
+        "labelled_cloud",
         "learning",
         "load_segmentation",
         "metrics",
@@ -71,6 +73,7 @@ def test_public_names():
         "update",
         "variance_energy",
         "viewer",
+        "write_cloud",
         "write_segmentation",
     ]
     for name in pcgraph.__all__:

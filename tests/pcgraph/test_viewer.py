@@ -191,6 +191,19 @@ def test_view_writes_one_page_for_a_file_or_a_folder_and_replaces_none(tmp_path:
     assert data_of((tmp_path / "page.html").read_text(), 1)["count"] == 51
 
 
+def test_view_opens_a_saved_segmentation(rich: tuple[pcgraph.Cloud, pcgraph.Segmentation], tmp_path: Path) -> None:
+    cloud, seen = rich
+    seen.save(tmp_path / "boxes.npz", cloud)
+    done = CliRunner().invoke(app, ["view", str(tmp_path / "boxes.npz"), "--out", str(tmp_path / "page.html")])
+    assert done.exit_code == 0, done.output
+    kept, wanted = data_of((tmp_path / "page.html").read_text()), data_of(view_page(cloud, seen))
+    assert kept["tree"] == wanted["tree"]
+    assert kept["columns"] == wanted["columns"]
+    seen.save(tmp_path / "bare.npz")
+    refused = CliRunner().invoke(app, ["view", str(tmp_path / "bare.npz"), "--out", str(tmp_path / "bare.html")])
+    assert "saved without its cloud" in refused.output
+
+
 # ---- In the browser ------------------------------------------------------------------------------------------------
 
 
