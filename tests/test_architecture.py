@@ -198,7 +198,7 @@ STOREYS = [
     "all_kernels",
 ]
 """Of pcgraph, from the ground up: nobody imports from above."""
-ON_TOP = ("detection", "learning", "service", "cli", "__main__")
+ON_TOP = ("detection", "learning", "viewer", "service", "cli", "__main__")
 """What stands on these and may import all of them."""
 
 
