@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from pcgraph import detection as detection
     from pcgraph import learning as learning
     from pcgraph import metrics as metrics
+    from pcgraph import viewer as viewer
     from pcgraph.acquisition.kinds import Acquisition as Acquisition
     from pcgraph.cloud import Cloud as Cloud
     from pcgraph.cloud_sources import as_cloud as as_cloud
@@ -71,7 +72,7 @@ else:
 
     __getattr__, __dir__, __all__ = lazy_loader.attach(
         __name__,
-        submodules={"detection", "learning", "metrics"},
+        submodules={"detection", "learning", "metrics", "viewer"},
         submod_attrs={
             "acquisition.kinds": ["Acquisition"],
             "cloud": ["Cloud"],

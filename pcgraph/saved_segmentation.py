@@ -64,8 +64,8 @@ class Row(NamedTuple):
     shape : str
         Numbers and names of dimensions, separated by spaces. A name stands for one number throughout the file: n
         points that have a supervoxel; v voxels; e entries of the lists of touching voxels; k supervoxels; t nodes of
-        the tree; m edges, g gaps, r continuations and b bridges; d columns of features; c blocks. "points" is the
-        leading shape of the input. "..." is any shape.
+        the tree; m edges, g gaps, r continuations and b bridges; d columns of features; c blocks;
+        p supervoxels before the last update. "points" is the leading shape of the input. "..." is any shape.
     least, below : int, or the name of a dimension
         Range of whole numbers. None: there is no such limit.
     largest : float, or None
@@ -83,6 +83,8 @@ ARRAYS: dict[str, Row] = {
     "outliers": Row("points"),
     "supervoxels": Row("points", -1, "k"),
     "objects": Row("k", 0),
+    "ages": Row("k", 0),
+    "supervoxel_of_earlier": Row("p", -1, "k"),
     "viewpoint": Row("..."),
     "feature_scaling/*": Row("d", largest=None),
     "graph/edges": Row("m 2", 0, "k"),

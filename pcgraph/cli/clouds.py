@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,6 +45,39 @@ def read_input(name: str, file_format: str | None = None, columns: str | None = 
     if file_format is None:
         raise CloudReadError("expected the format of the cloud on stdin, got none: give it, for example --from ply")
     return decode_cloud(sys.stdin.buffer.read(), f"stdin.{file_format}", named)
+
+
+def read_saved(path: Path) -> tuple[Cloud, Segmentation]:
+    """A saved segmentation and the cloud in its file."""
+    from pcgraph.io import read_cloud
+    from pcgraph.saved_segmentation import load_segmentation
+
+    result = load_segmentation(path)
+    try:
+        return read_cloud(path), result
+    except CloudReadError:
+        raise CloudReadError(
+            f"{path} holds no points, as it was saved without its cloud: save it with save(path, cloud)"
+        ) from None
+
+
+def segmented(name: str, cloud: Cloud, **settings: Any) -> Segmentation:
+    """Segmentation of a cloud; warnings go to stderr, one line each, and errors name the cloud."""
+    from pcgraph import scan
+    from pcgraph.plausibility import CloudWarning
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            result = scan.segment(cloud, **settings)
+        except ValueError as error:
+            raise CloudReadError(f"cannot segment {name}: {error}") from None
+    for warning in caught:
+        if issubclass(warning.category, CloudWarning):
+            typer.echo(f"pcgraph: warning: {one_line(warning.message)}.", err=True)
+        else:
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+    return result
 
 
 def output_paths(name: str, out: Path | None, suffix: str | None) -> list[Path]:

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from pcgraph.cli.clouds import SAVED, check_outputs, numbers, object_records, refusals, write_results
-from pcgraph.errors import CloudReadError, one_line
+from pcgraph.cli.clouds import SAVED, check_outputs, numbers, object_records, read_saved, refusals, write_results
+from pcgraph.errors import one_line
 
 
 def cut_command(
@@ -37,23 +37,14 @@ def cut_command(
     Example: pcgraph cut scan.segmentation.npz --objects 200 --out finer.laz
     """
     with refusals():
-        from pcgraph.io import read_cloud
-        from pcgraph.saved_segmentation import load_segmentation
-
         cuts = numbers(levels, "--levels")
         name = segmentation.name.removesuffix(SAVED).removesuffix(".npz")
         target = segmentation.with_name(f"{name}.cut.ply") if out is None else out
         check_outputs([target], [str(segmentation)], overwrite)
-        result = load_segmentation(segmentation)
+        cloud, result = read_saved(segmentation)
         if objects is not None or altitude is not None or min_size != 1:
             level = result.object_altitude if objects is None and altitude is None else altitude
             result = result.with_objects(objects, level, min_size)
-        try:
-            cloud = read_cloud(segmentation)
-        except CloudReadError:
-            raise CloudReadError(
-                f"{segmentation} holds no points, as it was saved without its cloud: save it with save(path, cloud)"
-            ) from None
         write_results([target], cloud, result, cuts, colorize)
         if boxes:
             for record in object_records(cloud, result):

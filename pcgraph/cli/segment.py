@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import sys
 import time
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,10 +20,11 @@ from pcgraph.cli.clouds import (
     output_paths,
     read_input,
     refusals,
+    segmented,
     sentence,
     write_results,
 )
-from pcgraph.errors import CloudReadError, PcgraphError, one_line
+from pcgraph.errors import PcgraphError, one_line
 from pcgraph.families import member
 
 if TYPE_CHECKING:
@@ -175,7 +175,7 @@ def segment_command(
         start = time.perf_counter()
         try:
             cloud = read_input(name, from_format, columns)
-            result = _segmented(name, cloud if color else replace(cloud, colors=None), **settings)
+            result = segmented(name, cloud if color else replace(cloud, colors=None), **settings)
             if objects is not None or min_size != 1:
                 level = None if objects is not None else result.object_altitude
                 result = result.with_objects(objects, level, min_size)
@@ -203,24 +203,6 @@ def _linkage(name: str) -> Linkage:
     from pcgraph.tree.learned import LearnedLinkage
 
     return LearnedLinkage.load(name)
-
-
-def _segmented(name: str, cloud: Cloud, **settings: Any) -> Segmentation:
-    from pcgraph import scan
-    from pcgraph.plausibility import CloudWarning
-
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        try:
-            result = scan.segment(cloud, **settings)
-        except ValueError as error:
-            raise CloudReadError(f"cannot segment {name}: {error}") from None
-    for warning in caught:
-        if issubclass(warning.category, CloudWarning):
-            typer.echo(f"pcgraph: warning: {one_line(warning.message)}.", err=True)
-        else:
-            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
-    return result
 
 
 def _summary(name: str, cloud: Cloud, result: Segmentation, written: list[Path], seconds: float) -> dict[str, Any]:

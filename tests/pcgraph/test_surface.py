@@ -73,6 +73,7 @@ def test_public_names():
         "tree_of_graph",
         "update",
         "variance_energy",
+        "viewer",
         "write_cloud",
         "write_segmentation",
     ]
