@@ -8,7 +8,7 @@ DEMO_OUT := out/demo
 export PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-pcgraph test-rangesim test-benchmarks validate coverage fuzz kernels lint format constraints audit clean system
+.PHONY: help demo test test-pcgraph test-rangesim test-benchmarks validate docs coverage fuzz kernels lint format constraints audit clean system
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /|/' | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
@@ -41,6 +41,11 @@ kernels: $(VENV)/.installed-test # compiled once beside mypy, which leaves a cor
 
 coverage: $(VENV)/.installed-test ## every test of both, and which lines none reaches; takes a third longer
 	$(BIN)/python -m pytest $(PARALLEL) --cov --cov-report=term
+
+docs: $(VENV)/.installed-test ## the documentation as a site, in out/docs; a warning is an error
+	@scripts/setup install $(VENV) test,docs
+	$(BIN)/python -m sphinx -q -W --keep-going -E -b html docs out/docs
+	@echo "Documentation: $(CURDIR)/out/docs/index.html"
 
 N := 20000
 SEED := $(shell date +%Y%m%d)

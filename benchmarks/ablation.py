@@ -128,9 +128,9 @@ class Reference:
     ----------
     result : pcgraph.Segmentation
     scan : pcgraph.scan.Scan
-        What `segment_scan` was given.
+        What `cluster_scan` was given.
     before, after : set of CodeType
-        Python functions that were called before `segment_scan`, and by it.
+        Python functions that were called before `cluster_scan`, and by it and `merge_supervoxels`.
     """
 
     result: pcgraph.Segmentation
@@ -143,21 +143,24 @@ class Reference:
         """That of a cloud."""
         before: set[CodeType] = set()
         after: set[CodeType] = set()
-        scans: list[scan_module.Scan] = []
-        segment_scan = scan_module.segment_scan
+        given: list[Any] = []
+        steps = {step.__name__: step for step in (scan_module.cluster_scan, scan_module.merge_supervoxels)}
 
-        def noting(scan: scan_module.Scan, *others: Any) -> pcgraph.Segmentation:
-            scans.append(scan)
-            with _noted(after):
-                return segment_scan(scan, *others)
+        def noting(step: Callable[..., Any]) -> Callable[..., Any]:
+            def noted(*arguments: Any) -> Any:
+                given.append(arguments[0])
+                with _noted(after):
+                    return step(*arguments)
 
-        vars(scan_module)["segment_scan"] = noting
+            return noted
+
+        vars(scan_module).update({name: noting(step) for name, step in steps.items()})
         try:
             with _noted(before):
                 result = pcgraph.segment(sample.points, sample.colors)
         finally:
-            vars(scan_module)["segment_scan"] = segment_scan
-        return cls(result, scans[0], before, after)
+            vars(scan_module).update(steps)
+        return cls(result, given[0], before, after)
 
     def without(self, part: Part, sample: Sample) -> pcgraph.Segmentation | None:
         """The result without a part; None if it is the same."""

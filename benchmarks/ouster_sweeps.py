@@ -125,7 +125,7 @@ def _picture(image: np.ndarray, reflectivity: np.ndarray, labels: np.ndarray, pa
     from PIL import Image
     from scores import largest
 
-    from pcgraph.io.segmentation_files import label_colors
+    from pcgraph.labelling import label_colors
 
     ranges = np.linalg.norm(image, axis=-1)
     bands = [np.log(ranges), np.log1p(reflectivity.astype(float))]

@@ -13,8 +13,10 @@ if TYPE_CHECKING:
     from pcgraph import detection as detection
     from pcgraph import learning as learning
     from pcgraph import metrics as metrics
+    from pcgraph import viewer as viewer
     from pcgraph.acquisition.kinds import Acquisition as Acquisition
     from pcgraph.cloud import Cloud as Cloud
+    from pcgraph.cloud_sources import as_cloud as as_cloud
     from pcgraph.columns import RobustScaling as RobustScaling
     from pcgraph.errors import CloudReadError as CloudReadError
     from pcgraph.errors import CloudWriteError as CloudWriteError
@@ -33,10 +35,15 @@ if TYPE_CHECKING:
     from pcgraph.graph.occlusion import Occlusions as Occlusions
     from pcgraph.io import read_cloud as read_cloud
     from pcgraph.io import sample_surface as sample_surface
-    from pcgraph.io import write_segmentation as write_segmentation
+    from pcgraph.io import write_cloud as write_cloud
+    from pcgraph.labelling import labelled_cloud as labelled_cloud
+    from pcgraph.labelling import write_segmentation as write_segmentation
     from pcgraph.plausibility import CloudWarning as CloudWarning
+    from pcgraph.saved_segmentation import load_segmentation as load_segmentation
     from pcgraph.scan import segment as segment
+    from pcgraph.scan import supervoxel_clustering as supervoxel_clustering
     from pcgraph.segmentation import Segmentation as Segmentation
+    from pcgraph.segmentation import Supervoxels as Supervoxels
     from pcgraph.stream import update as update
     from pcgraph.supervoxels.method import SupervoxelMethod as SupervoxelMethod
     from pcgraph.supervoxels.surface_growth import SurfaceGrowth as SurfaceGrowth
@@ -56,8 +63,8 @@ if TYPE_CHECKING:
     from pcgraph.tree.region_linkage import RegionLinkage as RegionLinkage
     from pcgraph.tree.single_linkage import QuasiFlatLinkage as QuasiFlatLinkage
     from pcgraph.tree.tree import SegmentationTree as SegmentationTree
+    from pcgraph.tree.weighted_graph import tree_of_graph as tree_of_graph
     from pcgraph.voxels.grid import VoxelGrid as VoxelGrid
-    from pcgraph.voxels.outliers import OUTLIER as OUTLIER
     from pcgraph.voxels.surface import LocalPlanes as LocalPlanes
     from pcgraph.voxels.surface import Surface as Surface
 else:
@@ -65,10 +72,11 @@ else:
 
     __getattr__, __dir__, __all__ = lazy_loader.attach(
         __name__,
-        submodules={"detection", "learning", "metrics"},
+        submodules={"detection", "learning", "metrics", "viewer"},
         submod_attrs={
             "acquisition.kinds": ["Acquisition"],
             "cloud": ["Cloud"],
+            "cloud_sources": ["as_cloud"],
             "columns": ["RobustScaling"],
             "errors": ["CloudReadError", "CloudWriteError", "PcgraphError"],
             "features.moments": ["Moments"],
@@ -78,10 +86,12 @@ else:
             "graph.boundary": ["BoundaryCost", "BoundaryStrength"],
             "graph.continuations": ["Continuations"],
             "graph.occlusion": ["Occlusions"],
-            "io": ["read_cloud", "sample_surface", "write_segmentation"],
+            "io": ["read_cloud", "sample_surface", "write_cloud"],
+            "labelling": ["labelled_cloud", "write_segmentation"],
             "plausibility": ["CloudWarning"],
-            "scan": ["segment"],
-            "segmentation": ["Segmentation"],
+            "saved_segmentation": ["load_segmentation"],
+            "scan": ["segment", "supervoxel_clustering"],
+            "segmentation": ["Segmentation", "Supervoxels"],
             "stream": ["update"],
             "supervoxels.method": ["SupervoxelMethod"],
             "supervoxels.surface_growth": ["SurfaceGrowth"],
@@ -97,8 +107,8 @@ else:
             "tree.region_linkage": ["RegionLinkage"],
             "tree.single_linkage": ["QuasiFlatLinkage"],
             "tree.tree": ["SegmentationTree"],
+            "tree.weighted_graph": ["tree_of_graph"],
             "voxels.grid": ["VoxelGrid"],
-            "voxels.outliers": ["OUTLIER"],
             "voxels.surface": ["LocalPlanes", "Surface"],
         },
     )

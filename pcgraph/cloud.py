@@ -1,33 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The point cloud as files hold it, and its making from the files' named columns."""
+"""The point cloud as files hold it, and its making from the files' named columns, and back."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from io import BytesIO
-from itertools import chain
+from itertools import chain, product
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.errors import CloudReadError
+from pcgraph.errors import CloudReadError, CloudWriteError
 from pcgraph.plumbing.short_repr import ShortRepr
 
 Columns = Mapping[str, NDArray[np.generic]]
 """One array per field of a file."""
 
-TextField = tuple[str, DTypeLike, int]
-"""A field of a text file: its name, its type, and the count of its numbers for each point."""
-
-MAX_HEADER_BYTES = 1 << 16
-"""Bytes in which the header of a file must end: far more than headers have, so that a file without one is refused
-before all of it is searched. Chosen by eye; not varied."""
-
 NORMAL_NAMES = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
 PACKED_NAMES = ("rgb", "rgba")
 COLOR_NAMES = ("red", "green", "blue")
+COLOR_TRIPLES = (COLOR_NAMES, ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 LABEL_NAMES = ("label", "labels")
+VIEWPOINT_NAMES = ("vp_x", "vp_y", "vp_z")
+"""As in PCL's PointWithViewpoint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +42,18 @@ class Cloud(ShortRepr):
     labels : same leading shape, int32, or None
         The file's own ``label`` or ``labels`` field, for example ground truth. Labels of unsigned 32 bits keep their
         bits: 4294967295, as PCL stores -1, is -1. A field of 64 bits that int32 does not hold stays in `columns`.
-    viewpoint : (3,) float64, metres, or None
-        Position of the sensor, from the PCD header; None if the format has none.
+    viewpoint : (3,) or points' shape float64, metres, the file's frame, or None
+        Position of the sensor, one for all points or one for each, as of several scans; None where none is known.
     columns : dict of name to array of the same leading shape, or that + (c,), of any dtype of numbers
         All other fields of the file, as stored: intensity, ring, time, classification and the like.
-        `pcgraph.segment` takes them as `features` by name; `write_segmentation` writes them back.
+        `pcgraph.segment` takes them as `features` by name; `write_cloud` and `write_segmentation` write them back.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> cloud = Cloud(np.zeros((2, 3)), columns={"intensity": np.array([7, 9], np.uint16)})
+    >>> cloud.points.shape, cloud.organised, cloud.columns["intensity"].tolist()
+    ((2, 3), False, [7, 9])
     """
 
     points: NDArray[np.floating]
@@ -65,6 +68,54 @@ class Cloud(ShortRepr):
         """Whether the points lie on an image lattice."""
         return self.points.ndim == 3
 
+    def finite(self) -> Cloud:
+        """The points whose coordinates are finite, as a list in the points' order, with all that is known of them."""
+        seen = np.isfinite(self.points).all(axis=-1)
+        return Cloud(
+            self.points[seen],
+            None if self.colors is None else self.colors[seen],
+            None if self.normals is None else self.normals[seen],
+            None if self.labels is None else self.labels[seen],
+            self.viewpoint if self.viewpoint is None or self.viewpoint.ndim == 1 else self.viewpoint[seen],
+            {name: column[seen] for name, column in self.columns.items()},
+        )
+
+
+# ---- From columns --------------------------------------------------------------------------------------------------
+
+
+class Roles(NamedTuple):
+    """Lower-case names of the columns that are colours, normals, labels and viewpoint of a cloud; () if there are none.
+
+    Attributes
+    ----------
+    colors : one name of packed colours, or those of red, green and blue
+    normals, viewpoint : names of x, y and z
+    labels : one name
+    """
+
+    colors: tuple[str, ...]
+    normals: tuple[str, ...]
+    labels: tuple[str, ...]
+    viewpoint: tuple[str, ...]
+
+    @classmethod
+    def of(cls, columns: Columns) -> Roles:
+        """Roles of columns by their lower-case names."""
+        packed = (name for name in PACKED_NAMES if name in columns and columns[name].dtype.itemsize == 4)
+        labels = (name for name in LABEL_NAMES if name in columns and are_labels(columns[name]))
+        return cls(
+            next(((name,) for name in packed), _all_of(COLOR_TRIPLES, columns)),
+            _all_of(NORMAL_NAMES, columns),
+            next(((name,) for name in labels), ()),
+            _all_of((VIEWPOINT_NAMES,), columns),
+        )
+
+
+def _all_of(choices: Iterable[tuple[str, ...]], columns: Columns) -> tuple[str, ...]:
+    """The first of the choices all names of which are columns; () if there is none."""
+    return next((names for names in choices if all(name in columns for name in names)), ())
+
 
 def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDArray[np.float64] | None = None) -> Cloud:
     """Cloud built from one array per field.
@@ -72,13 +123,15 @@ def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDAr
     Parameters
     ----------
     columns : mapping of field name to (n,) or (n, c) array
-        Must hold ``x``, ``y``, ``z``. Colours (``rgb``/``rgba`` packed, or ``red``/``green``/``blue``), normals and
-        labels are found under the names that PCL, Open3D and MeshLab write, in upper or lower case. White is 65535 in
-        unsigned 16 bits, 1 in floats of at most 1, else 255. All other fields, and those of several numbers for each
-        point, are kept as they are, but for ``_``, the name of padding in PCD files.
+        Must hold ``x``, ``y``, ``z``. Colours (``rgb``/``rgba`` packed, or ``red``/``green``/``blue``, or these after
+        ``diffuse_``, or ``r``/``g``/``b``), normals, labels and viewpoints (``vp_x`` and so on) are found under the
+        names that PCL, Open3D and MeshLab write, in upper or lower case. White is 65535 in unsigned 16 bits, 1 in
+        floats of at most 1, else 255. All other fields, and those of several numbers for each point, are kept as they
+        are, but for ``_``, the name of padding in PCD files.
     shape : (n,) or (h, w)
         Leading shape of the result.
     viewpoint : (3,) float64, metres, optional
+        Place of the sensor where no columns tell one for each point.
 
     Raises
     ------
@@ -96,13 +149,15 @@ def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDAr
         raise CloudReadError(
             f"expected the fields x, y and z, but {', '.join(missing)} is missing; found: {', '.join(columns)[:200]}"
         )
-    of_colors, of_normals, of_labels = _color_names(columns), _normal_names(columns), _label_name(columns)
-    used = {"_", *(names[lower] for lower in ("x", "y", "z", *of_colors, *of_normals, *of_labels))}
+    roles = Roles.of(columns)
+    used = {"_", *(names[lower] for lower in ("x", "y", "z", *chain.from_iterable(roles)))}
+    if roles.viewpoint:
+        viewpoint = _stack(columns, roles.viewpoint, shape).astype(np.float64)
     return Cloud(
         points=_stack(columns, ("x", "y", "z"), shape),
-        colors=_colors(columns, of_colors, shape),
-        normals=_stack(columns, of_normals, shape) if of_normals else None,
-        labels=columns[of_labels[0]].astype(np.int32).reshape(shape) if of_labels else None,
+        colors=_colors(columns, roles.colors, shape),
+        normals=_stack(columns, roles.normals, shape) if roles.normals else None,
+        labels=columns[roles.labels[0]].astype(np.int32).reshape(shape) if roles.labels else None,
         viewpoint=viewpoint,
         columns={name: _kept(column, shape) for name, column in stored.items() if name not in used},
     )
@@ -117,18 +172,17 @@ def _stack(columns: Columns, names: tuple[str, ...], shape: tuple[int, ...]) -> 
     return stacked
 
 
+def float_points(rows: NDArray[np.generic]) -> NDArray[np.floating]:
+    """Coordinates of any type of numbers as float32, or as float64 where that would round them."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return rows.astype(np.float64 if _is_wide(rows) else np.float32, copy=False)
+
+
 def _is_wide(column: NDArray[np.generic]) -> bool:
     """Whether float32 would round the column: because of its type, or of whole numbers beyond 2**24."""
     if column.dtype.itemsize > 4:
         return True
     return column.dtype.kind in "iu" and max(abs(int(column.min(initial=0))), int(column.max(initial=0))) > 1 << 24
-
-
-def _color_names(columns: Columns) -> tuple[str, ...]:
-    for name in PACKED_NAMES:
-        if name in columns and columns[name].dtype.itemsize == 4:
-            return (name,)
-    return COLOR_NAMES if all(name in columns for name in COLOR_NAMES) else ()
 
 
 def _colors(columns: Columns, names: tuple[str, ...], shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
@@ -147,6 +201,12 @@ def _colors(columns: Columns, names: tuple[str, ...], shape: tuple[int, ...]) ->
     return np.clip(np.nan_to_num(scaled), 0, 255).astype(np.uint8).reshape(*shape, 3)
 
 
+def color_bytes(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """Colours of any type of numbers, (..., 3), as uint8, with white as `cloud_from_columns` finds it."""
+    channels = dict(zip(COLOR_NAMES, colors.reshape(-1, 3).T, strict=True))
+    return _colors(channels, COLOR_NAMES, colors.shape[:-1])  # type: ignore[return-value]
+
+
 def _white(stored: list[NDArray[np.generic]], values: NDArray[np.float64]) -> float:
     """The number that means white: 65535 in unsigned 16 bits, 1 in floats of at most 1, else 255."""
     if all(channel.dtype.kind == "u" and channel.dtype.itemsize == 2 for channel in stored):
@@ -155,15 +215,7 @@ def _white(stored: list[NDArray[np.generic]], values: NDArray[np.float64]) -> fl
     return 1.0 if floats and values.max(initial=0.0, where=np.isfinite(values)) <= 1.0 else 255.0
 
 
-def _normal_names(columns: Columns) -> tuple[str, ...]:
-    return next((names for names in NORMAL_NAMES if all(name in columns for name in names)), ())
-
-
-def _label_name(columns: Columns) -> tuple[str, ...]:
-    return tuple(name for name in LABEL_NAMES if name in columns and _are_labels(columns[name]))[:1]
-
-
-def _are_labels(column: NDArray[np.generic]) -> bool:
+def are_labels(column: NDArray[np.generic]) -> bool:
     """Whether a column holds whole numbers that stay distinct as int32."""
     if column.dtype.kind not in "iu" or column.dtype.itemsize <= 4:
         return column.dtype.kind in "iu"
@@ -184,117 +236,195 @@ def _kept(column: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.gen
     return column.reshape(*shape, *column.shape[1:]).copy()
 
 
-def columns_from_text(table: NDArray[np.float64], fields: Iterable[TextField]) -> dict[str, NDArray[np.generic]]:
-    """One array per field of a text file, in the types that the header names.
-
-    A packed colour of nan means no colour, because a text does not keep the bits of a nan. It becomes 0, black; a field
-    with no other colours is left out. Packed colours in whole numbers of 32 bits may have a sign or not, whatever the
-    header says.
+def cloud_from_array(array: NDArray[np.generic]) -> Cloud:
+    """Cloud of an array whose last axis, or whose fields, are the columns.
 
     Parameters
     ----------
-    table : (n, m) float64
-        Numbers of the text, row by row.
-    fields : (name, dtype, count) of each field; the counts add up to m
-
-    Returns
-    -------
-    dict of field name to (n,) array, (n, c) where the count is above 1
+    array : (n, 3 + c) or (h, w, 3 + c) numbers; or (n,) or (h, w) with fields x, y, z and others
+        Further columns of an array without fields are called ``column_3``, ``column_4`` and so on, as NumPy counts
+        them, because nothing tells whether they are intensities, colours or labels. Numbers stay in their type. Fields
+        are found as `cloud_from_columns` finds columns.
 
     Raises
     ------
-    CloudReadError
-        A field of integers has a number that is not whole, or out of the range of its type.
+    ValueError
+        The shape is another, a coordinate is missing, or a field is not of numbers.
     """
-    columns: dict[str, NDArray[np.generic]] = {}
-    end = 0
-    for name, dtype, count in fields:
-        first, end = end, end + count
-        numbers = table[:, first] if count == 1 else table[:, first:end]
-        kind = np.dtype(dtype)
-        is_packed = name.lower() in PACKED_NAMES and kind.itemsize == 4
-        if is_packed and (none := np.isnan(numbers)).any():
-            if none.all():
-                continue
-            numbers = np.where(none, 0.0, numbers)
-        if kind.kind in "iu":
-            limits = np.iinfo(kind)
-            least, most = (-(1 << 31), (1 << 32) - 1) if is_packed else (int(limits.min), int(limits.max))
-            _check_whole(name, numbers, least, most)
-        if is_packed and kind.kind in "iu":
-            numbers = numbers.astype(np.int64)
-        with np.errstate(over="ignore", invalid="ignore"):
-            columns[name] = numbers.astype(kind)
-    return columns
-
-
-def _check_whole(name: str, numbers: NDArray[np.float64], least: int, most: int) -> None:
-    """Raise CloudReadError if a field of integers cannot hold one of the numbers, (n,) or (n, c)."""
-    wrong = ~((numbers >= float(least)) & (numbers <= float(most)) & (numbers == np.rint(numbers)))
-    if wrong.any():
-        row = int(np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))[0])
-        got = f"{numbers[wrong][0]:.12g}"
-        raise CloudReadError(
-            f"the header says that {name!r} holds whole numbers from {least} to {most}, "
-            f"but row {row + 1} of numbers has {got}: correct the type in the header, or the number"
-        )
-
-
-def numbers_from_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> NDArray[np.float64]:
-    """The first `n_rows` rows of numbers in a text, one row per line; empty lines do not count.
-
-    Parameters
-    ----------
-    body : bytes
-        Lines that end in a line feed. Text after the last row is not read.
-    n_rows, n_columns : int
-    first_line : int
-        Number of the body's first line in the file, from 1, for messages.
-
-    Returns
-    -------
-    (n_rows, n_columns) float64
-        ``nan`` and ``inf`` in any case are numbers too.
-
-    Raises
-    ------
-    CloudReadError
-        Too few rows, a row of more or fewer words than columns, or a word that is not a number.
-    """
-    needed = n_rows * n_columns
-    if needed > len(body):  # a number takes at least a byte: no memory for numbers that only the header has
-        raise CloudReadError(f"the header promises {needed} numbers, but only {len(body)} bytes follow")
-    rows = _rows_of_text(body, n_rows, n_columns, first_line)
-    # Not through an array of the words: each would take as many bytes as the longest.
-    return np.fromiter(chain.from_iterable(rows), np.float64, needed).reshape(n_rows, n_columns)
-
-
-def _rows_of_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> Iterator[list[float]]:
-    """Numbers of each row."""
-    left = n_rows
-    lines = enumerate(BytesIO(body), first_line)
-    while left:
-        number, line = next(lines, (0, b""))
-        if not number:
-            raise CloudReadError(f"the header promises {n_rows} points, but {n_rows - left} rows of numbers follow")
-        words = line.split(None, n_columns)
-        if not words:
-            continue
-        if b"_" in line:  # only Python reads 1_000 as a number
-            word = next((word for word in words if b"_" in word), line).decode("latin-1")
-            raise CloudReadError(f"expected numbers only in the ascii data, got in line {number}: {word[:80]!r}")
-        if len(words) != n_columns:
-            got = f"more than {n_columns}" if len(words) > n_columns else f"{len(words)}"
-            raise CloudReadError(
-                f"expected {n_columns} numbers in each line, one for each field of the header, "
-                f"but line {number} has {got}: correct the line or the header"
-            )
+    if array.dtype.names is not None:
+        table: NDArray[np.void] = array  # type: ignore[assignment]
+        fields: dict[str, NDArray[np.generic]] = {name: np.atleast_1d(table[name]) for name in array.dtype.names}
+        wrong = [name for name, values in fields.items() if values.dtype.kind not in "fiub"]
+        if wrong:
+            raise ValueError(f"expected fields of numbers, got {fields[wrong[0]].dtype} in the field {wrong[0]!r}")
+        n, shape = array.size, array.shape if array.ndim else (1,)
+        columns = {name: native(values).reshape(n, *_rest(values, shape)) for name, values in fields.items()}
         try:
-            yield [float(word) for word in words]
-        except ValueError as error:
-            reason = str(error)[:120]
-            raise CloudReadError(f"expected numbers only in the ascii data, got in line {number}: {reason}") from None
-        left -= 1
+            return cloud_from_columns(columns, shape)
+        except CloudReadError as error:
+            raise ValueError(str(error)) from None
+    if array.ndim not in (2, 3) or array.shape[-1] < 3:
+        expected = "points of shape (n, 3) or (h, w, 3), or with further columns, (n, 4) and so on"
+        raise ValueError(f"expected {expected}, got {array.shape}")
+    further = {f"column_{i}": array[..., i] for i in range(3, array.shape[-1])}
+    return Cloud(array[..., :3] if further else array, columns=further)  # type: ignore[arg-type]
+
+
+def _rest(values: NDArray[np.generic], shape: tuple[int, ...]) -> tuple[int, ...]:
+    """The axis behind the points' axes: () of scalars, (c,) of vectors and of all that have more axes."""
+    rest = values.shape[len(shape) :]
+    return (int(np.prod(rest)),) if rest else ()
+
+
+def native(values: NDArray[np.generic]) -> NDArray[np.generic]:
+    """The values in the byte order of this machine."""
+    return values.astype(values.dtype.newbyteorder("="), copy=False)
+
+
+# ---- Into columns --------------------------------------------------------------------------------------------------
+
+
+def plain_cloud(cloud: Cloud) -> Cloud:
+    """The cloud in the types that `Cloud` states.
+
+    Masked numbers are NaN, points of any numbers are float32 or float64, colours within 0..1 are uint8, and labels are
+    int32.
+
+    Raises
+    ------
+    CloudWriteError
+        An array has another shape than the points, is not of numbers, or holds what its type cannot.
+    """
+    points = np.asarray(without_mask(cloud.points))
+    if points.dtype.kind not in "fiu" or points.ndim not in (2, 3) or points.shape[-1] != 3:
+        raise CloudWriteError(
+            f"expected the cloud's points as numbers of shape (n, 3) or (h, w, 3), got {points.dtype} {points.shape}"
+        )
+    points = float_points(points)
+    shape = points.shape[:-1]
+    colors, normals = _own("colors", cloud.colors, points.shape), _own("normals", cloud.normals, points.shape)
+    labels, viewpoint = _own("labels", cloud.labels, shape), cloud.viewpoint
+    if normals is not None and normals.dtype.kind != "f":
+        raise CloudWriteError(f"expected the cloud's normals as floats, got {normals.dtype}")
+    if viewpoint is not None and np.shape(viewpoint) != (3,):
+        viewpoint = _own("viewpoint", viewpoint, points.shape)  # type: ignore[assignment]
+    return Cloud(
+        points,
+        None if colors is None else _bytes_of(colors),
+        None if normals is None else float_points(normals),
+        None if labels is None else _whole_labels(labels),
+        None if viewpoint is None else np.asarray(viewpoint, np.float64),
+        {name: _checked_column(name, column, shape) for name, column in cloud.columns.items()},
+    )
+
+
+def _own(name: str, given: ArrayLike | None, wanted: tuple[int, ...]) -> NDArray[np.generic] | None:
+    """The cloud's own colours, normals, labels or viewpoints in the points' shape."""
+    if given is None:
+        return None
+    values = np.asarray(without_mask(given))
+    if values.shape != wanted:
+        raise CloudWriteError(f"expected the cloud's {name} in the shape {wanted}, got {values.shape}")
+    return values
+
+
+def _bytes_of(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """Colours as uint8, from floats within 0..1, which `segment` takes, too; black where they are NaN."""
+    if colors.dtype == np.uint8:
+        return colors  # type: ignore[return-value]
+    shades = np.nan_to_num(colors.astype(np.float64)) if colors.dtype.kind == "f" else np.array([np.inf])
+    if not ((shades >= 0.0) & (shades <= 1.0)).all():
+        raise CloudWriteError(f"expected the cloud's colors as uint8 or as floats within 0..1, got {colors.dtype}")
+    return np.rint(255.0 * shades).astype(np.uint8)
+
+
+def _whole_labels(labels: NDArray[np.generic]) -> NDArray[np.int32]:
+    limits = np.iinfo(np.int32)
+    is_whole = labels.dtype.kind in "iub" or (labels.dtype.kind == "f" and bool((labels == np.rint(labels)).all()))
+    if not is_whole:
+        raise CloudWriteError(f"expected the cloud's labels as whole numbers, got {labels.dtype}")
+    if labels.size and not (limits.min <= labels.min() and labels.max() <= limits.max):
+        raise CloudWriteError(f"expected the cloud's labels in 32 bits, got {labels.min()} to {labels.max()}")
+    return labels.astype(np.int32, copy=False)
+
+
+def _checked_column(name: str, column: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.generic]:
+    if not isinstance(name, str) or not name.split() or not "".join(name.split()).isprintable():
+        raise CloudWriteError(f"expected names of columns as printable words, got {ascii(name)[:80]}")
+    if not isinstance(column, np.ndarray) or column.dtype.kind not in "fiub":
+        kind = column.dtype if isinstance(column, np.ndarray) else type(column).__name__
+        raise CloudWriteError(f"expected the column {name!r} as an array of numbers, got {kind}")
+    if column.shape[: len(shape)] != shape or column.ndim > len(shape) + 1:
+        raise CloudWriteError(f"expected the column {name!r} in the points' shape {shape}, got {column.shape}")
+    return np.asarray(without_mask(column))
+
+
+def columns_of_cloud(
+    cloud: Cloud,
+    colors: Sequence[tuple[str, ...]] = (COLOR_NAMES, PACKED_NAMES[:1]),
+    normals: Sequence[tuple[str, ...]] = NORMAL_NAMES[::-1],
+) -> dict[str, NDArray[np.generic]]:
+    """One array per field of a cloud: the inverse of `cloud_from_columns`.
+
+    Colours, normals, labels and viewpoints of each point get the first of their names under which they are found again.
+    Usually these are ``red``, ``nx``, ``label`` and ``vp_x``; if the cloud has a further column ``red``, its colours
+    are packed as ``rgb``. A viewpoint that all points share is not among the columns.
+
+    Parameters
+    ----------
+    cloud : Cloud, as `plain_cloud` returns it
+    colors, normals : names to choose from, the best first; a single name is that of packed colours
+
+    Returns
+    -------
+    dict of name to (n,) array, or (n, c) of vectors
+        Coordinates first, the cloud's further columns last.
+
+    Raises
+    ------
+    CloudWriteError
+        A further column has the name of a coordinate, or is in the way of the cloud's own under all their names.
+    """
+    n = cloud.points[..., 0].size
+    axes = dict(zip("xyz", cloud.points.reshape(-1, 3).T, strict=True))
+    shape = cloud.points.shape[:-1]
+    further = {name: column.reshape(n, *_rest(column, shape)) for name, column in cloud.columns.items()}
+    clash = [name for name in further if name in (*axes, "_")]
+    if clash:
+        raise CloudWriteError(f"expected a column of another name than {clash[0]!r}, which files keep for themselves")
+    places = cloud.viewpoint if cloud.viewpoint is not None and cloud.viewpoint.ndim > 1 else None
+    given = (cloud.colors, cloud.normals, cloud.labels, places)
+    choices: list[Sequence[tuple[str, ...]]] = [colors, normals, [(name,) for name in LABEL_NAMES], [VIEWPOINT_NAMES]]
+    choices = [[()] if values is None else of for values, of in zip(given, choices, strict=True)]
+    for names in product(*choices):
+        own = dict(chain.from_iterable(_named(role, values) for role, values in zip(names, given, strict=True)))
+        columns = {**axes, **own, **further}
+        if len(columns) == len(axes) + len(own) + len(further) and _is_found(names, columns):
+            return columns
+    raise CloudWriteError(
+        f"expected columns of other names than the cloud's own colours, normals and labels have, "
+        f"got {', '.join(further)[:200]}; rename those columns"
+    )
+
+
+def _named(names: tuple[str, ...], values: NDArray[np.generic] | None) -> Iterable[tuple[str, NDArray[np.generic]]]:
+    """The values with their names; three bytes under one name are packed as PCL packs colours."""
+    if not names or values is None:
+        return ()
+    if names[0] in PACKED_NAMES:
+        rows = values.reshape(-1, 3).astype(np.uint32)
+        return ((names[0], rows[:, 0] << 16 | rows[:, 1] << 8 | rows[:, 2]),)
+    return zip(names, values.reshape(-1, len(names)).T, strict=True)
+
+
+def _is_found(chosen: Iterable[tuple[str, ...]], columns: Columns) -> bool:
+    """Whether `cloud_from_columns` finds these roles; what a cloud has not may be found, too, among its columns."""
+    lower = _names_by_lower_case(columns)
+    found = Roles.of({name: columns[stored] for name, stored in lower.items() if columns[stored].ndim == 1})
+    return all(names in ((), role) for names, role in zip(chosen, found, strict=True))
+
+
+# ---- Arrays of callers ----------------------------------------------------------------------------------------------
 
 
 def without_mask(values: ArrayLike) -> ArrayLike:
@@ -304,3 +434,15 @@ def without_mask(values: ArrayLike) -> ArrayLike:
     if values.dtype.kind not in "fiu" or not np.ma.getmaskarray(values).any():
         return values.data
     return np.ma.filled(values.astype(np.result_type(values.dtype, np.float32)), np.nan)
+
+
+def as_numbers(name: str, values: ArrayLike) -> NDArray[np.generic]:
+    """The values as an array of numbers, masked ones as NaN; ValueError if they are none."""
+    values = without_mask(values)
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise ValueError(f"expected {name} as a regular array of numbers, got rows of different lengths") from None
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"expected {name} of a floating-point or integer dtype, got {array.dtype}")
+    return array

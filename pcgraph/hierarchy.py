@@ -170,12 +170,15 @@ class AncestorIndex(NamedTuple):
 
     Attributes
     ----------
+    representatives : (k,) int32
+        Leaf at or below each node that represents it.
     links : (n_leaves,) int32
         Representative to which each representative was linked; itself for the last one.
     merges : (n_leaves,) int32
         Node at which it was linked; k, larger than any node, for the last one.
     """
 
+    representatives: NDArray[np.int32]
     links: NDArray[np.int32]
     merges: NDArray[np.int32]
 
@@ -188,12 +191,12 @@ def ancestor_index(parents: NDArray[np.int32]) -> AncestorIndex:
 def lowest_common_ancestors(
     parents: NDArray[np.int32], first: NDArray[np.integer], second: NDArray[np.integer]
 ) -> NDArray[np.int32]:
-    """Lowest common ancestor of each pair of leaves, (m,) int32; the leaf itself where the two are one.
+    """Lowest common ancestor of each pair of nodes, (m,) int32; the upper node where one is above the other.
 
     Parameters
     ----------
     parents : (k,) int32
-    first, second : (m,) int, 0..n_leaves - 1
+    first, second : (m,) int, 0..k - 1
     """
     ends = np.ascontiguousarray(first, np.int32), np.ascontiguousarray(second, np.int32)
     return _ancestors_of_pairs(ancestor_index(parents), *ends)
@@ -201,14 +204,21 @@ def lowest_common_ancestors(
 
 @kernel
 def lowest_common_ancestor(index: AncestorIndex, a: int, b: int) -> int:
-    """Lowest common ancestor of two leaves: the one that was linked first climbs, until both meet."""
+    """Lowest common ancestor of two nodes; the upper one where it is above the other.
+
+    Of the two representatives, the one that was linked first climbs until both meet. If neither node is above the
+    other, the nodes meet at the same place, above both. Otherwise the representatives meet at the upper node or below
+    it. So the answer is the largest of the three numbers.
+    """
+    upper = max(a, b)
+    a, b = index.representatives[a], index.representatives[b]
     node = a
     while a != b:
         if index.merges[a] < index.merges[b]:
             node, a = index.merges[a], index.links[a]
         else:
             node, b = index.merges[b], index.links[b]
-    return node
+    return max(node, upper)
 
 
 @kernel
@@ -220,7 +230,9 @@ def _ancestors_of_pairs(index: AncestorIndex, first: NDArray[np.int32], second: 
 
 
 @kernel
-def _linked(parents: NDArray[np.int32], n_leaves: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _linked(
+    parents: NDArray[np.int32], n_leaves: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
     k = len(parents)
     links, merges = np.arange(n_leaves).astype(np.int32), np.full(n_leaves, k, np.int32)
     representative, leaves = np.arange(k).astype(np.int32), np.zeros(k, np.int64)
@@ -236,4 +248,4 @@ def _linked(parents: NDArray[np.int32], n_leaves: int) -> tuple[NDArray[np.int32
             links[small], merges[small] = large, up
             representative[up] = large
         leaves[up] += leaves[node]
-    return links, merges
+    return representative, links, merges

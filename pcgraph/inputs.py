@@ -8,12 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from os import PathLike
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.cloud import Cloud, without_mask
+from pcgraph.cloud import Cloud, as_numbers
+from pcgraph.cloud_sources import as_cloud
 from pcgraph.columns import RobustScaling
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.rounding import TINY
@@ -34,8 +35,8 @@ _RANGE_SAMPLE = 1 << 12
 """Points off which the median range is read, about; chosen by eye, for the time's sake."""
 
 
-Points = ArrayLike | Cloud | PathLike[str]
-"""What `pcgraph.segment` takes: an array of points, a cloud, or the name of a file."""
+Points = ArrayLike | Cloud | PathLike[str] | Any
+"""What `pcgraph.segment` takes: whatever `pcgraph.as_cloud` takes."""
 
 
 Features = ArrayLike | str | Sequence[str] | None
@@ -59,7 +60,7 @@ def as_arrays(
     viewpoint: ArrayLike | None,
     features: Features = None,
 ) -> Arrays:
-    """The arguments as arrays; those that are None are taken from the cloud or the file, if `points` is such.
+    """The arguments as arrays; those that are None are taken from the cloud that `points` is, or that has them.
 
     Features that are names are replaced by the columns of the cloud that have these names.
 
@@ -68,28 +69,16 @@ def as_arrays(
     CloudReadError
         `points` names a file that cannot be read as a cloud.
     ValueError
-        `features` names a column that is not there, or that has another shape.
+        `points` is nothing that `as_cloud` takes, or `features` names a column that is not there, or that has another
+        shape.
     """
-    if isinstance(points, (str, PathLike)):
-        from pcgraph.io import read_cloud
-
-        points = read_cloud(points)
-    names = _names(features)
-    if not isinstance(points, Cloud):
-        if names:
-            raise ValueError(
-                "expected features as numbers beside an array of points; names are those of a Cloud's columns"
-            )
-        return Arrays(points, colors, normals, viewpoint, features)
-    stored = points.viewpoint
-    if stored is not None and not stored.any():
-        stored = None  # PCD writers put zeros where they know nothing
+    cloud, names = as_cloud(points), _names(features)
     return Arrays(
-        points.points,
-        points.colors if colors is None else colors,
-        points.normals if normals is None else normals,
-        stored if viewpoint is None else viewpoint,
-        _columns(points, names) if names else features,
+        cloud.points,
+        cloud.colors if colors is None else colors,
+        cloud.normals if normals is None else normals,
+        cloud.viewpoint if viewpoint is None else viewpoint,
+        _columns(cloud, names) if names else features,  # type: ignore[arg-type]
     )
 
 
@@ -108,7 +97,7 @@ def _columns(cloud: Cloud, names: list[str]) -> NDArray[np.float64]:
         if name not in cloud.columns:
             known = ", ".join(cloud.columns)[:200] or "none"
             raise ValueError(f"expected features to name columns of the cloud, got {name!r}; there are: {known}")
-        column = _numbers(f"the column {name!r}", cloud.columns[name])
+        column = as_numbers(f"the column {name!r}", cloud.columns[name])
         if column.shape[: len(shape)] != shape or column.ndim > len(shape) + 1:
             raise ValueError(f"expected the column {name!r} in the points' shape {shape}, got {column.shape}")
         with np.errstate(over="ignore"):
@@ -203,13 +192,19 @@ class CleanCloud(ShortRepr):
         """About 16 000 of the points, without duplicates, in a pseudo-random order that does not depend on theirs."""
         return sample(self.points, self.bounds)
 
-    def in_input_shape(self, labels: NDArray[np.int32], of_outliers: int = -1) -> NDArray[np.int32]:
-        """Labels of the points in the input's shape: -1 where nothing was measured, `of_outliers` of outliers."""
+    def in_input_shape(self, labels: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Labels of the points in the input's shape, int32; -1 where nothing was measured, and of outliers."""
         if len(labels) == math.prod(self.shape):
             return labels.astype(np.int32).reshape(self.shape)
         full = np.full(self.shape, -1, np.int32)
         full.reshape(-1)[self.kept] = labels
-        full.reshape(-1)[self.outliers] = of_outliers
+        return full
+
+    @property
+    def is_outlier(self) -> NDArray[np.bool_]:
+        """Whether each point was left out as an outlier, in the input's shape."""
+        full = np.zeros(self.shape, np.bool_)
+        full.reshape(-1)[self.outliers] = True
         return full
 
     def without(self, outliers: NDArray[np.bool_]) -> CleanCloud:
@@ -243,13 +238,7 @@ def clean_cloud(
     ValueError
         A shape, dtype or range is not the documented one, or no point is finite.
     """
-    if not isinstance(points, (np.ndarray, Sequence)) and np.asarray(points).dtype == object:
-        kinds = "an array (n, 3) or (h, w, 3), a pcgraph.Cloud or the name of a .pcd or .ply file"
-        hint = "; pass its .points (and .colors)" if hasattr(points, "points") else ""
-        if hasattr(points, "to_point_cloud"):
-            hint = "; pass its to_point_cloud().points"
-        raise ValueError(f"expected points as {kinds}, got {type(points).__name__}{hint}")
-    array = _numbers("points", points)
+    array = as_numbers("points", points)
     if array.ndim not in (2, 3) or array.shape[-1] != 3:
         raise ValueError(f"expected points of shape (n, 3) or (h, w, 3), got {array.shape}")
     shape = array.shape[:-1]
@@ -298,7 +287,7 @@ def clean_viewpoint(viewpoint: ArrayLike, cloud: CleanCloud) -> NDArray[np.float
 
     Viewpoints of the points that are nearly one place become one, as of a sweep whose scanner moved a little.
     """
-    given = _numbers("viewpoint", viewpoint).astype(np.float64)
+    given = as_numbers("viewpoint", viewpoint).astype(np.float64)
     per_point = given.ndim > 1 and given.shape == (*cloud.shape, 3)
     position = given.reshape(-1, 3).take(cloud.kept, axis=0) if per_point else given
     if position.shape not in ((3,), cloud.points.shape) or not (np.abs(position) <= _MAX_LENGTH_M).all():
@@ -359,10 +348,10 @@ def fraction(name: str, value: float) -> float:
     return number
 
 
-def whole_number(name: str, value: int) -> int:
-    """The value as int, if it is a whole number of at least 1; ValueError otherwise."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"expected {name} as a whole number of at least 1, got {value!r}")
+def whole_number(name: str, value: int, least: int = 1) -> int:
+    """The value as int, if it is a whole number of at least the least; ValueError otherwise."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise ValueError(f"expected {name} as a whole number of at least {least}, got {value!r}")
     return int(value)
 
 
@@ -376,21 +365,9 @@ def _number(value: float) -> float:
         return float("nan")
 
 
-def _numbers(name: str, values: ArrayLike) -> NDArray[np.generic]:
-    """The values as an array of numbers, masked ones as NaN; ValueError if they are none."""
-    values = without_mask(values)
-    try:
-        array = np.asarray(values)
-    except ValueError:
-        raise ValueError(f"expected {name} as a regular array of numbers, got rows of different lengths") from None
-    if array.dtype.kind not in "fiu":
-        raise ValueError(f"expected {name} of a floating-point or integer dtype, got {array.dtype}")
-    return array
-
-
 def _same_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.generic]:
     """Rows of three values, (n, 3), for points of a shape; ValueError if they have another."""
-    array = _numbers(name, values)
+    array = as_numbers(name, values)
     if array.shape != (*shape, 3):
         raise ValueError(f"expected {name} of the points' shape {(*shape, 3)}, got {array.shape}")
     return array.reshape(-1, 3)
@@ -444,7 +421,7 @@ def unit_rows(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _features(features: ArrayLike, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64]:
     """The features of the points that are kept, (n, d)."""
-    array = _numbers("features", features)
+    array = as_numbers("features", features)
     if array.shape[: len(shape)] != shape or array.ndim > len(shape) + 1 or array.shape[len(shape) :] == (0,):
         wanted = f"{shape} or {shape} + (d,)"
         raise ValueError(f"expected features of the points' leading shape, {wanted}, got {array.shape}")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Segmentation of a cloud: the whole algorithm on a page.
 
-`segment` decides who took the cloud, makes voxels and finds outward normals; `segment_scan` goes on to supervoxels,
-graph, tree and objects. `pcgraph.stream` adds later scans.
+`supervoxel_clustering` decides who took the cloud, makes voxels and finds outward normals; `cluster_scan` goes on to
+supervoxels and their graph, `merge_supervoxels` to tree and objects. `pcgraph.stream` adds later scans.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pcgraph.graph.bridges import bridges
 from pcgraph.graph.contacts import contacts, edge_features
 from pcgraph.graph.continuations import continuations, faces_of
 from pcgraph.graph.gaps import gaps
+from pcgraph.history import History
 from pcgraph.inputs import CleanCloud, Features, Points, as_arrays, clean_cloud, whole_number
 from pcgraph.parallel import side_by_side
 from pcgraph.plausibility import (
@@ -31,7 +32,7 @@ from pcgraph.plausibility import (
     warn_of_viewpoint,
     warn_of_volume,
 )
-from pcgraph.segmentation import Segmentation, Settings
+from pcgraph.segmentation import Segmentation, Settings, Supervoxels
 from pcgraph.supervoxels.method import SupervoxelMethod, seed_size_for, supervoxels_by
 from pcgraph.tree.linkage import Linkage, checked_merges
 from pcgraph.tree.tree import segmentation_tree
@@ -39,7 +40,6 @@ from pcgraph.voxelisation.adapted_size import seed_spacing
 from pcgraph.voxelisation.voxelised import Sizes, Voxelisation, Voxelised, voxelise, without_flying_pixels
 from pcgraph.voxels.column_evidence import color_evidence
 from pcgraph.voxels.grid import VoxelGrid, voxel_means
-from pcgraph.voxels.outliers import OUTLIER
 from pcgraph.voxels.surface import Surface
 
 _FLIP_COSINE = 0.5
@@ -71,7 +71,7 @@ def segment(
     ----------
     points : (n, 3) or (h, w, 3) float or integer, metres, any frame; or a Cloud, or the name of a file
         Colours, normals and viewpoint of a `Cloud` or file are used where none are given beside it. Points that are
-        NaN, infinite, masked, or (0, 0, 0) as drivers write holes, are labelled -1, outliers -2.
+        NaN, infinite, masked, or (0, 0, 0) as drivers write holes, are labelled -1, and so are outliers.
     colors : same shape, uint8 0..255 or float 0..1, optional
     normals : same shape, float, optional
         Outward normals. They are estimated where they are zero or NaN.
@@ -125,12 +125,74 @@ def segment(
     -----
     Supervoxels: Papon et al. 2013 (VCCS). Convexity: Stein et al. 2014 (LCCP).
     """
+    settings = Settings.of(method, linkage, object_altitude)
+    supervoxels = supervoxel_clustering(
+        points,
+        colors,
+        normals,
+        viewpoint,
+        features=features,
+        voxel_size=voxel_size,
+        seed_size=seed_size,
+        n_supervoxels=n_supervoxels,
+        camera=camera,
+        range_growth=range_growth,
+        method=settings.method,
+    )
+    result = merge_supervoxels(supervoxels, None, settings)
+    warn_of_oversegmentation(len(np.unique(result.objects)), result.tree.n_leaves, result.voxel_size)
+    return result
+
+
+def supervoxel_clustering(
+    points: Points,
+    colors: ArrayLike | None = None,
+    normals: ArrayLike | None = None,
+    viewpoint: ArrayLike | None = None,
+    *,
+    features: Features = None,
+    voxel_size: float | None = None,
+    seed_size: float | None = None,
+    n_supervoxels: int | None = None,
+    camera: bool | None = None,
+    range_growth: float | None = None,
+    method: SupervoxelMethod | None = None,
+) -> Supervoxels:
+    """Supervoxels of a point cloud and their adjacency graph: the first half of `segment`, for those who need no tree.
+
+    Parameters
+    ----------
+    points, colors, normals, viewpoint, features, voxel_size, seed_size, n_supervoxels, camera, range_growth, method
+        As for `pcgraph.segment`, which makes the same supervoxels.
+
+    Returns
+    -------
+    Supervoxels
+        `labels` are the supervoxels of the points, in the input's shape; -1 where a point has none.
+
+    Raises
+    ------
+    ValueError, CloudReadError
+        As for `pcgraph.segment`.
+
+    Notes
+    -----
+    Source: Papon et al. 2013 (VCCS, PCL's SupervoxelClustering).
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[0:1:0.02, 0:1:0.02]
+    >>> step = np.stack((x, y, np.where(x < 0.5, 0.0, 0.3)), axis=-1)
+    >>> found = supervoxel_clustering(step, viewpoint=(0.5, 0.5, 5.0), seed_size=0.2)
+    >>> found.labels.shape, found.graph.n_nodes == len(found.moments)
+    ((50, 50), True)
+    """
     points, colors, normals, viewpoint, features = as_arrays(points, colors, normals, viewpoint, features)
     if n_supervoxels is not None:
         n_supervoxels = whole_number("n_supervoxels", n_supervoxels)
         if seed_size is not None:
             raise ValueError("expected seed_size or n_supervoxels, got both")
-    settings = Settings.of(method, linkage, object_altitude)
+    method = Settings.of(method, None, None).method
     cloud = with_pixels(clean_cloud(points, colors, normals, features))
     n_supervoxels = None if n_supervoxels is None else min(n_supervoxels, len(cloud.points))
     sizes = Sizes.of(voxel_size, seed_size, n_supervoxels)
@@ -146,9 +208,9 @@ def segment(
     warn_of_volume(grid)
     if viewpoint is not None and acquisition.one_viewpoint is not None:
         warn_of_viewpoint(acquisition.one_viewpoint, grid)
-    oriented = _oriented(voxelisation, settings.method)
+    oriented = _oriented(voxelisation, method)
     if n_supervoxels is not None:
-        seed_size = seed_size_for(n_supervoxels, grid, _normals(cloud, oriented, grid), settings.method)
+        seed_size = seed_size_for(n_supervoxels, grid, _normals(cloud, oriented, grid), method)
     scan = Scan(
         voxelised,
         acquisition,
@@ -156,9 +218,7 @@ def segment(
         initial_labels=np.full(grid.n_voxels, -1, np.int32),
         seed_size=seed_spacing(grid, acquisition) if seed_size is None else float(seed_size),
     )
-    result = segment_scan(scan, None, settings)
-    warn_of_oversegmentation(len(np.unique(result.objects)), result.tree.n_leaves, grid.size)
-    return result
+    return cluster_scan(scan, None, method)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,10 +244,14 @@ class Scan:
     seed_size: float
 
 
-def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -> Segmentation:
-    """Segmentation of a scan: the algorithm from voxels on."""
+def segment_scan(scan: Scan, earlier: History | None, settings: Settings) -> Segmentation:
+    """Segmentation of a scan, and of what is kept of earlier ones: the algorithm from voxels on."""
+    return merge_supervoxels(cluster_scan(scan, earlier, settings.method), earlier, settings)
+
+
+def cluster_scan(scan: Scan, earlier: History | None, method: SupervoxelMethod) -> Supervoxels:
+    """Supervoxels of a scan and their graph: the algorithm from voxels to the graph."""
     cloud, grid, planes = scan.voxelised.cloud, scan.voxelised.grid, scan.oriented.planes
-    method, linkage = settings.method, settings.linkage
     normals = _normals(cloud, scan.oriented, grid)
     if earlier is not None:
         normals = normals.copy()  # the planes keep their own
@@ -214,21 +278,40 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         touching.edges, features, nodes, near, hidden, color_evidence=evidence, acquisition=scan.acquisition
     )
     graph = replace(graph, bridges=bridges(surface, leaves.counts, graph.joined))
-    tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
+    viewpoint = scan.acquisition.viewpoint_of(cloud)
+    return Supervoxels(
+        labels=cloud.in_input_shape(leaf_of_point),
+        outliers=cloud.is_outlier,
+        moments=leaves,
+        graph=graph,
+        surface=surface,
+        seed_size=scan.seed_size,
+        method=method,
+        viewpoint=scan.oriented.places[0] if viewpoint is None else viewpoint,
+        feature_scaling=cloud.scaling,
+    )
+
+
+def merge_supervoxels(found: Supervoxels, earlier: History | None, settings: Settings) -> Segmentation:
+    """Segmentation of supervoxels: the algorithm from the graph to tree and objects."""
+    linkage, leaves = settings.linkage, found.moments
+    tree = segmentation_tree(checked_merges(linkage.merges(found.graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
     if earlier is not None:
         objects = _renumbered(objects, earlier, leaves.counts)
-    viewpoint = scan.acquisition.viewpoint_of(cloud)
     return Segmentation(
-        labels=cloud.in_input_shape(objects[leaf_of_point], OUTLIER),
-        supervoxels=cloud.in_input_shape(leaf_of_point),
+        labels=np.append(objects, np.int32(-1))[found.labels],
+        outliers=found.outliers,
+        supervoxels=found.labels,
         objects=objects,
-        graph=graph,
+        graph=found.graph,
         tree=tree,
-        surface=surface,
-        seed_size=scan.seed_size,
-        viewpoint=scan.oriented.places[0] if viewpoint is None else viewpoint,
-        feature_scaling=cloud.scaling,
+        surface=found.surface,
+        seed_size=found.seed_size,
+        viewpoint=found.viewpoint,
+        ages=_ages(found.labels[found.labels >= 0], len(leaves), earlier),
+        supervoxel_of_earlier=np.empty(0, np.int32) if earlier is None else earlier.numbers,
+        feature_scaling=found.feature_scaling,
         next_object=max(int(objects.max()) + 1, 0 if earlier is None else earlier.next_object),
         **vars(settings),
     )
@@ -253,9 +336,7 @@ def _oriented(voxelisation: Voxelisation, method: SupervoxelMethod) -> OrientedP
     return oriented._replace(planes=replace(planes, normals=flipped))
 
 
-def _leaves(
-    cloud: CleanCloud, surface: Surface, leaf_of_point: NDArray[np.int32], earlier: Segmentation | None
-) -> Moments:
+def _leaves(cloud: CleanCloud, surface: Surface, leaf_of_point: NDArray[np.int32], earlier: History | None) -> Moments:
     """Moments of the supervoxels' points, with those of earlier scans."""
     n_leaves = int(surface.supervoxels.max()) + 1
     if earlier is None:
@@ -264,12 +345,21 @@ def _leaves(
         is_seen = np.bincount(leaf_of_point, minlength=n_leaves) > 0
         found, group = np.flatnonzero(is_seen), (np.cumsum(is_seen) - 1).astype(np.int32)[leaf_of_point]
         gained = moments_of_groups(cloud.points, cloud.colors, group, len(found), cloud.features)
-        leaves = joined_moments(replace(earlier.leaves, normals=None), gained, found, n_leaves)
+        leaves = joined_moments(earlier.leaves, gained, found, n_leaves)
     return replace(leaves, normals=surface.mean_normals(n_leaves))
 
 
-def _renumbered(objects: NDArray[np.int32], earlier: Segmentation, weights: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Objects of k supervoxels, (k,), with their numbers in an earlier segmentation of the first of these supervoxels.
+def _ages(leaf_of_point: NDArray[np.int32], n_leaves: int, earlier: History | None) -> NDArray[np.int32]:
+    """Number of scans since the last one that saw each supervoxel, (n_leaves,) int32."""
+    ages = np.zeros(n_leaves, np.int32)
+    if earlier is not None:
+        ages[: len(earlier.ages)] = earlier.ages + 1
+        ages[leaf_of_point] = 0
+    return ages
+
+
+def _renumbered(objects: NDArray[np.int32], earlier: History, weights: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Objects of k supervoxels, (k,), with the numbers that they had when the first of these supervoxels were all.
 
     An object keeps the number of that with which it shares most points, if no other object shares more with that. The
     other objects get numbers that were not used before.

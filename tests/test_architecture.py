@@ -173,6 +173,7 @@ STOREYS = [
     "columns",
     "kernel_cache",
     "io",
+    "cloud_sources",
     "parallel",
     "rounding",
     "disjoint_sets",
@@ -188,13 +189,16 @@ STOREYS = [
     "tree",
     "families",
     "segmentation",
+    "saved_segmentation",
+    "labelling",
+    "history",
     "plausibility",
     "scan",
     "stream",
     "all_kernels",
 ]
 """Of pcgraph, from the ground up: nobody imports from above."""
-ON_TOP = ("detection", "learning", "cli", "__main__")
+ON_TOP = ("detection", "learning", "viewer", "service", "cli", "__main__")
 """What stands on these and may import all of them."""
 
 

@@ -15,7 +15,10 @@ from synthetic import plane_signals, stereo_rig
 from rangesim import AmcwToF, Detector, compare, decode, expose
 
 ROOMS = [
+    "pcgraph.detection",
+    "pcgraph.io",
     "pcgraph.plumbing",
+    "pcgraph.tree",
     "rangesim.calibration",
     "rangesim.capture",
     "rangesim.causes",
@@ -45,6 +48,10 @@ ROOMS = [
 ]
 """Packages whose docstrings are run, all of their modules."""
 MODULES = [
+    "pcgraph.cloud",
+    "pcgraph.cloud_sources",
+    "pcgraph.labelling",
+    "pcgraph.scan",
     "rangesim",
     "rangesim.errors",
     "rangesim.light_transport.transport_settings",

@@ -21,14 +21,18 @@ from PIL import Image
 from scroll_hints import check_scroll_hints
 from small_result import SCENES, SENSORS, result_of_two_cameras, small_result
 from tiers import to_validate
+from typer.testing import CliRunner
 
+from pcgraph.viewer.node_colors import node_colors
 from rangesim.causes import Cause
+from rangesim.cli import app
 from rangesim.decoding.status import Status
 from rangesim.environment.doctor import find_browser
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
 from rangesim.pipeline.experiment_run import carry_out
-from rangesim.report import palette, point_viewer, render_report, tables, write_report
+from rangesim.report import palette, render_report, tables, write_report
+from rangesim.report.clouds_page import render_clouds_page
 from rangesim.report.experiment_page import by_camera
 from rangesim.report.verdict import verdict
 from rangesim.results.experiment_results import PhotonsRecord, load_result, write_result
@@ -48,6 +52,7 @@ def html() -> str:
 
 def test_it_is_one_file_that_needs_no_network(html: str) -> None:
     without_data = re.sub(r'"data:image/png;base64,[^"]*"', '""', html)
+    without_data = without_data.replace("http://www.w3.org/1999/xhtml", "")  # a name of XML, which nothing asks for
     assert not re.search(r"https?:|//[a-z]+\.[a-z]|@import|url\(|<link (?!rel=\"icon\" href=\"data:)", without_data)
     assert not re.search(r"<script[^>]+src=|<iframe|<object|fetch\(|XMLHttpRequest", without_data)
 
@@ -143,7 +148,7 @@ def test_the_failures_of_a_surface_add_up() -> None:
 
 def test_a_node_has_the_colour_of_its_largest_child() -> None:
     """Leaves of 5, 3 and 4 points: the pair (1, 2) takes the colour of leaf 2, the root that of the pair."""
-    colors = point_viewer._colors(np.array([4, 3, 3, 4, 4]), np.array([5, 3, 4]))
+    colors = node_colors(np.array([4, 3, 3, 4, 4]), np.array([5, 3, 4]))
     assert (colors[3] == colors[2]).all()
     assert (colors[4] == colors[3]).all()
     assert len(np.unique(colors[:3], axis=0)) == 3
@@ -285,7 +290,8 @@ def test_slider_mouse_and_wheel_work(tmp_path: Path) -> None:
         assert page.evaluate("page.view.zoom") == pytest.approx(np.exp(0.45))
 
 
-CLOUD = """(() => { const one = document.querySelectorAll("canvas.cloud")[%d], copy = document.createElement("canvas");
+CLOUD = """(() => { const { canvas: one } = page.clouds[%d], copy = document.createElement("canvas");
+    page.clouds.forEach((cloud) => cloud.draw());  // in this very task, as a picture does not stay
     copy.width = one.width; copy.height = one.height;
     const context = copy.getContext("2d"); context.drawImage(one, 0, 0);
     return [one.height, one.width, ...context.getImageData(0, 0, one.width, one.height).data]; })()"""
@@ -435,3 +441,44 @@ def test_ideal_sensors_alone_have_a_verdict_without_empty_paragraphs() -> None:
     result = carry_out(Experiment(str(SCENES / "plane.xml"), width=16, height=12, spp=1, instruments=instruments))
     assert [f.text != "" for f in verdict(result.measurements)] == [True, True]
     assert "Ideal time of flight" in render_report(result)
+
+
+def test_the_clouds_page_holds_every_reading_with_its_cause_and_its_segment() -> None:
+    result = load_result(small_result())
+    page = render_clouds_page(result)
+    for number, m in enumerate(result.measurements):
+        block = re.search(rf'id="cloud-{number}">(.*?)</script>', page)
+        assert block
+        data = json.loads(block[1])
+        valid = m.image.valid.ravel()
+        assert data["count"] + data["far"] == valid.sum()
+        rows = _unpacked(data["index"], "<u4", (-1,))
+        columns = {column["name"]: column for column in data["columns"]}
+        causes = np.array(columns["cause"]["values"])[_unpacked(columns["cause"]["keys"], "<u2", (-1,)) - 1]
+        assert (causes == np.array(palette.OUTCOME_NAMES)[palette.outcomes(m).ravel()[rows]]).all()
+        error = columns["error"]
+        assert error["unit"] == "mm"
+        keys = _unpacked(error["keys"], "<u2", (-1,))
+        wanted = 1e3 * (m.image.reading_m - m.true_m).ravel()[rows]
+        known = keys > 0
+        assert (known == np.isfinite(wanted)).all()
+        np.testing.assert_allclose(
+            error["low"] + error["step"] * (keys[known] - 1.0), wanted[known], atol=error["step"]
+        )
+        assert m.segmentation is not None
+        leaf = _unpacked(data["tree"]["leaf"], "<u2", (-1,)).astype(int) - 1
+        assert (leaf == m.segmentation.supervoxels.ravel()[rows]).all()
+        objects = np.append(_unpacked(data["tree"]["objects"], "<i4", (-1,)), -1)[leaf]
+        assert (objects == m.segmentation.labels.ravel()[rows]).all()
+
+
+def test_view_writes_a_page_and_replaces_none(tmp_path: Path) -> None:
+    target = tmp_path / "clouds.html"
+    arguments = ["view", str(small_result()), "--out", str(target)]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    size = target.stat().st_size
+    assert size > 600_000
+    again = CliRunner().invoke(app, arguments)
+    assert again.exit_code == 1
+    assert "add --overwrite" in str(again.exception)
+    assert target.stat().st_size == size

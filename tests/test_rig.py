@@ -78,8 +78,8 @@ def test_a_distortion_too_small_to_bend_a_ray_is_none() -> None:
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js")
 def test_the_viewer_of_reports_has_the_rays_of_a_camera_without_distortion() -> None:
-    """`unproject` in viewer.js repeats the pinhole of `rangesim.rig.camera_model`, because it runs in a browser."""
-    viewer = (Path(__file__).parent.parent / "rangesim" / "report" / "viewer.js").read_text(encoding="utf-8")
+    """`unproject` in sensor_views.js repeats the pinhole of `rangesim.rig.camera_model`, as it runs in a browser."""
+    viewer = (Path(__file__).parent.parent / "rangesim" / "report" / "sensor_views.js").read_text(encoding="utf-8")
     start = viewer.index("function unproject(")
     function = viewer[start : viewer.index("\n}\n", start) + 3]
     camera = Intrinsics(6, 4, 5.0, 4.5, 2.8, 2.2)

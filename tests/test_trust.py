@@ -151,44 +151,15 @@ def test_results_without_a_manifest_are_not_taken_for_ours(run: Command, tmp_pat
 
 
 def test_a_foreign_file_named_like_segments_stays(command: Command, tmp_path: Path) -> None:
-    cloud = tmp_path / "scan.ply"
+    cloud, out = tmp_path / "scan.ply", tmp_path / "scan.segments.ply"
     shutil.copy(small_result() / "lines" / "cloud.ply", cloud)
-    for name, content in (
-        ("scan.segments.npz", b"a thesis"),
-        ("scan.segments.ply", b"ply\ncomment mine\nend_header\n"),
-    ):
-        (tmp_path / name).write_bytes(content)
-        done = command("segment", cloud, "--out", tmp_path, package="pcgraph")
-        assert_refused(done, f"{name} exists and was not written by pcgraph")
-        assert (tmp_path / name).read_bytes() == content
-        assert_refused(command("segment", cloud, "--out", tmp_path / name, package="pcgraph"), "not written by pcgraph")
-        (tmp_path / name).unlink()
-    np.savez(tmp_path / "scan.segments.npz", labels=np.arange(3))
-    assert_refused(command("segment", cloud, "--out", tmp_path, package="pcgraph"), "not written by pcgraph")
-    (tmp_path / "scan.segments.npz").unlink()
-    for _ in range(2):  # one's own are replaced
-        assert command("segment", cloud, "--out", tmp_path, package="pcgraph").returncode == 0
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["scan.ply", "scan.segments.npz", "scan.segments.ply"]
-
-
-def test_segments_corrected_by_hand_stay(command: Command, tmp_path: Path) -> None:
-    cloud = tmp_path / "scan.ply"
-    shutil.copy(small_result() / "lines" / "cloud.ply", cloud)
-    arrays, points = tmp_path / "scan.segments.npz", tmp_path / "scan.segments.ply"
-    assert command("segment", cloud, "--out", tmp_path, package="pcgraph").returncode == 0
-    with np.load(arrays) as file:
-        corrected = dict(file)
-    corrected["labels"] += 1
-    for path in (points, arrays):
-        if path == points:
-            path.write_bytes(path.read_bytes()[:-1] + b"\x01")
-        else:
-            np.savez(path, **corrected)
-        mine = path.read_bytes()
-        done = command("segment", cloud, "--out", tmp_path, package="pcgraph")
-        assert_refused(done, f"{path.name} exists and was not written by pcgraph, or changed since")
-        assert path.read_bytes() == mine
-        path.unlink()
+    out.write_bytes(b"ply\ncomment mine\nend_header\n")
+    for place in (tmp_path, out):
+        assert_refused(command("segment", cloud, "--out", place, package="pcgraph"), f"{out.name} exists; choose")
+    assert out.read_bytes() == b"ply\ncomment mine\nend_header\n"
+    for _ in range(2):
+        assert command("segment", cloud, "--out", tmp_path, "--overwrite", package="pcgraph").returncode == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["scan.ply", "scan.segments.ply"]
 
 
 # ---- Durable and clean ----------------------------------------------------------------------------------------------
@@ -221,7 +192,7 @@ def test_signals_end_a_command_in_one_line_at_any_moment(tmp_path: Path, package
             assert time.monotonic() - start < 5.0
         if process.returncode == 0 or (process.returncode == 128 + number and "nothing was written" not in err):
             written = {path.name for path in (tmp_path / "out" / "n").iterdir()}
-            assert written >= ({"report.html"} if package == "rangesim" else {"big.segments.ply", "big.segments.npz"})
+            assert written >= ({"report.html"} if package == "rangesim" else {"big.segments.ply"})
             shutil.rmtree(tmp_path / "out")
             continue
         assert process.returncode == 128 + number, err

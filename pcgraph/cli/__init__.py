@@ -12,13 +12,21 @@ import typer
 
 from pcgraph import __version__
 from pcgraph.cli.compile import compile_command
+from pcgraph.cli.cut import cut_command
+from pcgraph.cli.info import info_command
 from pcgraph.cli.segment import segment_command
+from pcgraph.cli.serve import serve_command
+from pcgraph.cli.view import view_command
 from pcgraph.errors import one_line
 from pcgraph.plumbing.plain_files import said
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 app.command("segment")(segment_command)
+app.command("cut")(cut_command)
+app.command("info")(info_command)
+app.command("view")(view_command)
 app.command("compile")(compile_command)
+app.command("serve")(serve_command)
 
 
 def _version(wanted: bool) -> None:

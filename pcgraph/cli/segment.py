@@ -3,34 +3,67 @@
 
 from __future__ import annotations
 
-import os
+import json
+import sys
 import time
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, one_line, without_long_words
+from pcgraph.cli.clouds import (
+    PIPE,
+    check_outputs,
+    numbers,
+    object_records,
+    output_paths,
+    read_input,
+    refusals,
+    segmented,
+    sentence,
+    write_results,
+)
+from pcgraph.errors import PcgraphError, one_line
 from pcgraph.families import member
-from pcgraph.plumbing.plain_files import said
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from pcgraph.cloud import Cloud
     from pcgraph.segmentation import Segmentation
     from pcgraph.tree.linkage import Linkage
 
 
 def segment_command(
-    cloud: Annotated[Path, typer.Argument(help="Point cloud, .pcd or .ply, coordinates in metres.")],
+    clouds: Annotated[
+        list[str], typer.Argument(metavar="CLOUD...", help="Point clouds, coordinates in metres; - is stdin.")
+    ],
     out: Annotated[
         Path | None,
-        typer.Option(help="A .ply or .npz file, or a folder for both. Default: the current folder."),
+        typer.Option(help="One file, a folder, or - for stdout. Default: two files in the current folder."),
     ] = None,
+    from_format: Annotated[
+        str | None, typer.Option("--from", help="Format of the input, such as ply. Default: by its name.")
+    ] = None,
+    to_format: Annotated[
+        str | None,
+        typer.Option("--to", help="End of the labelled cloud's name, such as laz. Default: as the input, or ply."),
+    ] = None,
+    columns: Annotated[
+        str | None, typer.Option(help="Names of the columns of a text without a header: x,y,z,intensity.")
+    ] = None,
+    levels: Annotated[
+        str | None, typer.Option(help="Numbers of segments, such as 10,50,200: a column level_10 and so on for each.")
+    ] = None,
+    colorize: Annotated[
+        bool, typer.Option("--colorize", help="Colour the points by object; their own colours go to original_red etc.")
+    ] = False,
+    boxes: Annotated[
+        bool, typer.Option("--boxes", help="Also print each object with its oriented box, as JSON.")
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one line of JSON for each cloud in place of the table.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace outputs that exist.")] = False,
     voxel_size: Annotated[
         float | None,
         typer.Option(help="Voxel edge in metres. Default: 3.5 x the median spacing of the points."),
@@ -89,83 +122,79 @@ def segment_command(
         typer.Option(help="Sensor position x y z in metres. Default: the file's, else found from the cloud."),
     ] = None,
 ) -> None:
-    """Segment a point cloud into objects, and write labels, supervoxels, graph and tree.
+    """Segment point clouds into objects, and write labels, supervoxels, graph and tree.
 
-    Writes NAME.segments.ply (points coloured by object, with labels and supervoxels) and NAME.segments.npz
-    (labels in the input's shape, graph and tree). The columns of the input keep their names: if it has colours or
-    labels of its own, the result's are called segment_red and so on, and segment_labels.
+    For scan.laz it writes scan.segments.laz, the cloud with all its columns and the columns object, part and
+    supervoxel, and scan.segmentation.npz, which `pcgraph view`, `pcgraph cut` and load_segmentation open again.
+    With --out FILE only that file is written: the segmentation if it ends in .npz, else the labelled cloud.
+    If one of several clouds cannot be read or segmented, the others are still done, and the exit status is 1.
 
-    Example: pcgraph segment scan.pcd --out results/ --voxel-size 0.005 --seed-size 0.03
+    Examples:
+
+      pcgraph segment scan.laz --levels 10,50,200
+
+      pcgraph segment *.ply --out results/ --json --boxes
+
+      cat scan.pcd | pcgraph segment - --from pcd --out - --to ply > segments.ply
     """
-    from pcgraph.io import read_cloud
+    with refusals():
+        from pcgraph.io import encode_cloud
+        from pcgraph.labelling import labelled_cloud
 
-    start = time.perf_counter()
-    try:
-        targets = _targets(cloud, out)
+        piped = out is not None and str(out) == PIPE
+        if piped and (len(clouds) > 1 or to_format is None or as_json or boxes):
+            raise ValueError(
+                "expected one cloud, --to and neither --json nor --boxes with --out -, as stdout takes one file"
+            )
+        if out is not None and not piped and out.suffix and not out.is_dir() and len(clouds) > 1:
+            raise ValueError(f"expected --out as a folder for {len(clouds)} clouds, got {str(out)!r}")
         if objects is not None and altitude is not None:
             raise ValueError("expected --objects or --altitude, got both: choose one")
         if seed_size is not None and supervoxels is not None:
             raise ValueError("expected --seed-size or --supervoxels, got both: choose one")
-        read = read_cloud(cloud)
-        result = _segmented(
-            cloud,
-            read if color else replace(read, colors=None),
-            viewpoint=viewpoint,
-            features=features or None,
-            voxel_size=voxel_size,
-            seed_size=seed_size,
-            n_supervoxels=supervoxels,
-            camera=camera,
-            range_growth=range_growth,
-            method=member("SupervoxelMethod", method),
-            linkage=_linkage(linkage),
-            object_altitude=altitude,
-        )
-        level = result.object_altitude if objects is None else None
-        labels = result.labels if level is not None and min_size == 1 else result.cut(objects, level, min_size)
-        _write(targets, read, result, labels)
-    except (PcgraphError, ValueError, MemoryError, OSError) as error:
-        message = said(error) if isinstance(error, OSError) else str(error)
-        message = without_long_words(message) or "the cloud does not fit into memory: choose a larger voxel size"
-        typer.echo(f"pcgraph: {one_line(message).rstrip('.')}.", err=True)
-        raise typer.Exit(1) from None
-    _print_summary(result, labels, targets, time.perf_counter() - start)
-
-
-def _targets(cloud: Path, out: Path | None) -> list[Path]:
-    if out is not None and str(out) == "-":
-        raise CloudWriteError("nothing is written to a pipe, got --out -: give a .ply or .npz file or a folder")
-    if out is not None and out.suffix and not out.is_dir():
-        if out.suffix.lower() not in (".ply", ".npz"):
-            raise CloudWriteError(f"expected --out as a .ply or .npz file or a folder, got {out.name!r}")
-        if not out.parent.is_dir():
-            raise CloudWriteError(f"cannot write {out}: there is no folder {out.parent}; create it first")
-        if os.path.realpath(out) == os.path.realpath(cloud):
-            raise CloudWriteError(f"--out is the input itself, {out}: choose another name")
-        targets = [out]
-    else:
-        folder = Path() if out is None else out
-        targets = [folder / f"{cloud.stem}.segments{suffix}" for suffix in (".ply", ".npz")]
-    _check_targets(targets)
-    return targets
-
-
-def _check_targets(targets: list[Path]) -> None:
-    """Raise CloudWriteError if a target is a file of the user's, or cannot be written; this writes nothing."""
-    from pcgraph.io.segmentation_files import is_segmentation
-
-    for target in targets:
-        if target.is_symlink() and not target.exists():
-            raise CloudWriteError(f"{target} is a link to a file that does not exist; choose another --out")
-        if target.exists() and not (target.is_file() and is_segmentation(target)):
-            raise CloudWriteError(
-                f"{target} exists and was not written by pcgraph, or changed since; move it or choose another --out"
-            )
-    above = next(folder for folder in (targets[0].parent, *targets[0].absolute().parents) if folder.exists())
-    if not above.is_dir():
-        raise CloudWriteError(f"cannot create the folder {targets[0].parent}: {above} is a file; choose another --out")
-    if not os.access(above, os.W_OK | os.X_OK):
-        raise CloudWriteError(f"cannot write to {above}: permission denied; choose another --out")
+        cuts = numbers(levels, "--levels")
+        suffix = None if to_format is None else f".{to_format.lstrip('.')}"
+        targets = {name: [] if piped else output_paths(name, out, suffix) for name in clouds}
+        check_outputs([path for paths in targets.values() for path in paths], clouds, overwrite)
+        settings = {
+            "viewpoint": viewpoint,
+            "features": features or None,
+            "voxel_size": voxel_size,
+            "seed_size": seed_size,
+            "n_supervoxels": supervoxels,
+            "camera": camera,
+            "range_growth": range_growth,
+            "method": member("SupervoxelMethod", method),
+            "linkage": _linkage(linkage),
+            "object_altitude": altitude,
+        }
+    failed = False
+    for number, name in enumerate(clouds, start=1):
+        if len(clouds) > 1:
+            typer.echo(f"pcgraph: {number} of {len(clouds)}: {one_line(name)}", err=True)
+        start = time.perf_counter()
+        try:
+            cloud = read_input(name, from_format, columns)
+            result = segmented(name, cloud if color else replace(cloud, colors=None), **settings)
+            if objects is not None or min_size != 1:
+                level = None if objects is not None else result.object_altitude
+                result = result.with_objects(objects, level, min_size)
+            check_outputs(targets[name], clouds, overwrite)  # again, as files may have appeared
+            write_results(targets[name], cloud, result, cuts, colorize)
+            content = encode_cloud(labelled_cloud(cloud, result, cuts, colorize), f"stdout{suffix}") if piped else None
+            record = _summary(name, cloud, result, targets[name], time.perf_counter() - start)
+            if boxes:
+                record["boxes"] = object_records(cloud, result)
+        except (PcgraphError, ValueError, MemoryError, OSError) as error:
+            typer.echo(f"pcgraph: {sentence(error)}", err=True)
+            failed = True
+            continue
+        if content is None:
+            _print(record, as_json)
+        else:
+            sys.stdout.buffer.write(content)
+    if failed:
+        raise typer.Exit(1)
 
 
 def _linkage(name: str) -> Linkage:
@@ -176,44 +205,41 @@ def _linkage(name: str) -> Linkage:
     return LearnedLinkage.load(name)
 
 
-def _segmented(path: Path, cloud: Cloud, **settings: Any) -> Segmentation:
-    from pcgraph import scan
-    from pcgraph.plausibility import CloudWarning
+def _summary(name: str, cloud: Cloud, result: Segmentation, written: list[Path], seconds: float) -> dict[str, Any]:
+    """Record of one cloud, as JSON takes it."""
+    import numpy as np
 
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        try:
-            result = scan.segment(cloud, **settings)
-        except ValueError as error:
-            raise CloudReadError(f"cannot segment {path}: {error}") from None
-    for warning in caught:
-        if issubclass(warning.category, CloudWarning):
-            typer.echo(f"pcgraph: warning: {one_line(warning.message)}.", err=True)
-        else:
-            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
-    return result
-
-
-def _write(targets: list[Path], cloud: Cloud, result: Segmentation, labels: NDArray[np.int32]) -> None:
-    from pcgraph.io.segmentation_files import encode_segmentation
-    from pcgraph.plumbing.plain_files import write_files
-
-    contents = {target: encode_segmentation(target.name, cloud, result, labels) for target in targets}
-    _check_targets(targets)  # again, as files may have appeared during the segmentation
-    write_files(contents, CloudWriteError, make_parents=True)
+    return {
+        "cloud": name,
+        "points": int(np.prod(cloud.points.shape[:-1])),
+        "segmented": int((result.supervoxels >= 0).sum()),
+        "outliers": int(result.outliers.sum()),
+        "acquisition": result.acquisition.in_words,
+        "voxel_size": result.voxel_size,
+        "seed_size": result.seed_size,
+        "supervoxels": result.graph.n_nodes,
+        "edges": len(result.graph.edges),
+        "objects": len(np.unique(result.labels[result.labels >= 0])),
+        "seconds": round(seconds, 3),
+        "written": [str(path) for path in written],
+    }
 
 
-def _print_summary(result: Segmentation, labels: NDArray[np.int32], targets: list[Path], seconds: float) -> None:
-    segmented, outliers = int((result.supervoxels >= 0).sum()), int(result.outliers.sum())
+def _print(record: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps(record, allow_nan=False))
+        return
+    points = f"{record['segmented']} of {record['points']} segmented, {record['outliers']} outliers"
     for name, value in (
-        ("points", f"{segmented} of {result.labels.size} segmented, {outliers} outliers"),
-        ("acquisition", result.acquisition.in_words),
-        ("voxel size", f"{result.voxel_size:.3g} m" + (" at the median depth" if result.camera else "")),
-        ("seed size", f"{result.seed_size:.3g} m"),
-        ("supervoxels", str(result.graph.n_nodes)),
-        ("edges", str(len(result.graph.edges))),
-        ("objects", str(int(labels.max()) + 1)),
-        ("seconds", f"{seconds:.2f}"),
-        *(("written", one_line(target)) for target in targets),
+        ("points", points),
+        ("acquisition", record["acquisition"]),
+        ("voxel size", f"{record['voxel_size']:.3g} m"),
+        ("seed size", f"{record['seed_size']:.3g} m"),
+        ("supervoxels", record["supervoxels"]),
+        ("edges", record["edges"]),
+        ("objects", record["objects"]),
+        ("seconds", f"{record['seconds']:.2f}"),
+        *(("written", one_line(path)) for path in record["written"]),
+        *(("box", json.dumps(one, allow_nan=False)) for one in record.get("boxes", [])),
     ):
         typer.echo(f"{name:<12} {value}")

@@ -6,6 +6,7 @@ from __future__ import annotations
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from pcgraph.detection.boxes import OrientedBox as OrientedBox
+    from pcgraph.detection.boxes import boxes_of_labels as boxes_of_labels
     from pcgraph.detection.boxes import standing_box as standing_box
     from pcgraph.detection.boxes import tight_box as tight_box
     from pcgraph.detection.objects import DetectedObject as DetectedObject
@@ -21,7 +22,7 @@ else:
     __getattr__, __dir__, __all__ = lazy_loader.attach(
         __name__,
         submod_attrs={
-            "boxes": ["OrientedBox", "standing_box", "tight_box"],
+            "boxes": ["OrientedBox", "boxes_of_labels", "standing_box", "tight_box"],
             "objects": ["DetectedObject", "object_labels", "objects_on"],
             "plane_detection": ["Planes", "find_planes"],
             "shapes": ["Shape", "fit_shape"],

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +11,7 @@ from scipy.spatial import ConvexHull
 
 from pcgraph.features.nodes import unit_vector
 from pcgraph.features.primitives import finite_vectors
+from pcgraph.plumbing.plain_dict import PlainDict
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.directions import plane_basis
 
@@ -26,7 +26,7 @@ _MAX_FACETS = 64
 
 
 @dataclass(frozen=True, eq=False)
-class OrientedBox(ShortRepr):
+class OrientedBox(ShortRepr, PlainDict):
     """A box in any pose.
 
     Attributes
@@ -36,6 +36,16 @@ class OrientedBox(ShortRepr):
         Rows are unit vectors and form a right-handed frame.
     size : (3,) float64, metres
         Full lengths along the axes; 0 where the points are flat.
+
+    Examples
+    --------
+    `to_dict` is what JSON holds; the class takes it back:
+
+    >>> box = OrientedBox(np.zeros(3), np.eye(3), np.array([0.3, 0.2, 0.1]))
+    >>> box.to_dict()["size"]
+    [0.3, 0.2, 0.1]
+    >>> OrientedBox(**{name: np.array(value) for name, value in box.to_dict().items()}).volume == box.volume
+    True
     """
 
     center: NDArray[np.float64]
@@ -51,13 +61,6 @@ class OrientedBox(ShortRepr):
         """Corners, (8, 3) float64, metres; corner 4 a + 2 b + c lies on side a, b, c (0 or 1) of the three axes."""
         signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
         return self.center + (signs * self.size) @ self.axes
-
-    def to_dict(self) -> dict[str, list[Any]]:
-        """Centre, axes and size as lists of plain numbers, which `json.dumps` takes; ``OrientedBox`` reads them back.
-
-        ``OrientedBox(**{name: numpy.array(value) for name, value in box.to_dict().items()})``
-        """
-        return {"center": self.center.tolist(), "axes": self.axes.tolist(), "size": self.size.tolist()}
 
     def local(self, points: ArrayLike) -> NDArray[np.float64]:
         """Points, (..., 3), in the box's own frame: from its centre along its axes, metres."""
@@ -144,6 +147,47 @@ def tight_box(points: ArrayLike) -> OrientedBox:
     axes = best.axes[order]
     axes[2] *= np.sign(np.linalg.det(axes))
     return OrientedBox(best.center + middle, axes, best.size[order])
+
+
+def boxes_of_labels(points: ArrayLike, labels: ArrayLike, up: ArrayLike | None = None) -> dict[int, OrientedBox]:
+    """Box around the points of each label, by label in ascending order; negative labels have none.
+
+    Parameters
+    ----------
+    points : (n, 3) or (h, w, 3) float, metres
+        Points that are not finite do not count.
+    labels : (n,) or (h, w) int
+        For example ``result.labels`` or ``result.cut(n=50)``.
+    up : (3,) float, any length but zero, optional
+        Boxes stand along this direction, as `standing_box`. Default: free boxes, as `tight_box`.
+
+    Raises
+    ------
+    ValueError
+        There is not one label per point, labels are not whole numbers, or `up` is no direction.
+
+    Examples
+    --------
+    >>> import numpy as np, pcgraph
+    >>> corners = np.array([[x, y, z] for x in (0, 4) for y in (0, 2) for z in (0, 1)], float)
+    >>> boxes = pcgraph.detection.boxes_of_labels(np.concatenate((corners, corners + 9)), np.repeat([0, 7], 8))
+    >>> {label: box.size.tolist() for label, box in boxes.items()}
+    {0: [4.0, 2.0, 1.0], 7: [4.0, 2.0, 1.0]}
+    """
+    places, numbers = np.asarray(points, np.float64), np.asarray(labels)
+    if places.shape != (*numbers.shape, 3) or numbers.dtype.kind not in "iu":
+        raise ValueError(
+            f"expected one whole number per point as labels, got {numbers.dtype} of shape {numbers.shape} for points "
+            f"of shape {places.shape}"
+        )
+    direction = None if up is None else unit_vector("up", up)
+    places, numbers = places.reshape(-1, 3), numbers.reshape(-1)
+    kept = np.flatnonzero((numbers >= 0) & np.isfinite(places).all(axis=1))
+    order = kept[np.argsort(numbers[kept], kind="stable")]
+    found, first = np.unique(numbers[order], return_index=True)
+    groups = [places[rows] for rows in np.split(order, first[1:])][: len(found)]
+    box = tight_box if direction is None else lambda group: _standing(group, direction)
+    return {label: box(group) for label, group in zip(found.tolist(), groups, strict=True)}
 
 
 def some_points(points: ArrayLike) -> NDArray[np.float64]:

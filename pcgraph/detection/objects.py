@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +21,7 @@ from pcgraph.detection.revolution import revolution_axis
 from pcgraph.detection.shapes import Shape, fit_shape
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.inputs import non_negative
+from pcgraph.plumbing.plain_dict import PlainDict
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.segmentation import Segmentation, check_segmentation
 from pcgraph.voxels.directions import plane_basis
@@ -36,7 +38,7 @@ support's own by half of one."""
 
 
 @dataclass(frozen=True, eq=False)
-class DetectedObject(ShortRepr):
+class DetectedObject(ShortRepr, PlainDict):
     """One thing on a support.
 
     Attributes
@@ -64,6 +66,10 @@ class DetectedObject(ShortRepr):
     def height(self) -> float:
         """Height of its highest point above the support, metres."""
         return float(self.box.size[2])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The attributes, and ``height``, by name as `OrientedBox.to_dict` gives them: metres, None if not finite."""
+        return {**super().to_dict(), "height": self.height}
 
 
 def objects_on(

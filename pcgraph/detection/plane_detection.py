@@ -19,6 +19,7 @@ from pcgraph.detection.region_growing import (
 )
 from pcgraph.features.nodes import node_features, unit_vector
 from pcgraph.inputs import positive
+from pcgraph.plumbing.plain_dict import PlainDict
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.segmentation import Segmentation, check_segmentation
 from pcgraph.voxels.directions import plane_basis
@@ -29,7 +30,7 @@ hand knows `up` to some degrees. Not varied."""
 
 
 @dataclass(frozen=True, eq=False)
-class Planes(ShortRepr):
+class Planes(ShortRepr, PlainDict):
     """p planes, the one of largest area first.
 
     Attributes

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.detection.boxes import OrientedBox, some_points, standing_box, tight_box
 from pcgraph.features.nodes import unit_vector
 from pcgraph.features.primitives import finite_vectors, fit_primitives, primitive_moments
+from pcgraph.plumbing.plain_dict import PlainDict
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.directions import plane_basis
 
@@ -54,7 +55,7 @@ LIMITS = ShapeLimits()
 
 
 @dataclass(frozen=True, eq=False)
-class Shape(ShortRepr):
+class Shape(ShortRepr, PlainDict):
     """Shape that fits points best.
 
     Attributes

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.parallel import kernel, routine
+from pcgraph.plumbing.plain_dict import plain
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.voxels.eigen import symmetric_eigen
 
@@ -188,11 +189,13 @@ def _plane_normal(
 # --- tables of features: one array per column ---
 
 
-def rows(columns: dict[str, NDArray[np.generic]] | dict[str, NDArray[np.float64]], n: int) -> list[dict[str, object]]:
-    """One dict per row, from one array per column; scalars become Python numbers, vectors stay arrays."""
-    names = list(columns)
-    lists = [column.tolist() if column.ndim == 1 else list(column) for column in columns.values()]
-    return [dict(zip(names, (values[i] for values in lists), strict=True)) for i in range(n)]
+def rows(columns: dict[str, NDArray[np.generic]], n: int) -> list[dict[str, object]]:
+    """One dict of Python's own values per row, from one array (n,) per column.
+
+    A number that is not finite is left out of its row, because JSON has neither NaN nor infinity.
+    """
+    lists = {name: plain(column) for name, column in columns.items()}
+    return [{name: values[i] for name, values in lists.items() if values[i] is not None} for i in range(n)]
 
 
 def scalar_columns(columns: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:

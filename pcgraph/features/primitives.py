@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.moments import accumulate_moments, moments_of_groups
 from pcgraph.parallel import kernel, routine
+from pcgraph.plumbing.plain_dict import PlainDict
 from pcgraph.plumbing.short_repr import ShortRepr
 
 _MAX_RADIUS = 1e7
@@ -33,7 +35,7 @@ class Primitive(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Primitives(ShortRepr):
+class Primitives(ShortRepr, PlainDict):
     """The best plane, sphere and cylinder of each of k groups of points.
 
     If a group is flat, so that no sphere or cylinder fits better than the plane, radii are infinite, and centre and
@@ -78,6 +80,10 @@ class Primitives(ShortRepr):
     def columns(self) -> dict[str, NDArray[np.generic]]:
         """All features by name, in the order of the attributes."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The attributes by name as lists of k, metres; None if not finite; `best` as "plane", "sphere", "cylinder"."""
+        return {**super().to_dict(), "best": [Primitive(kind).name.lower() for kind in self.best.tolist()]}
 
 
 def fit_primitives(moments: PrimitiveMoments, *, gain: float = 2.0, noise: float = 0.0) -> Primitives:

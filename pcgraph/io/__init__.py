@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds and segmentations in files: one function reads all formats, one writes them."""
+"""Point clouds in files: one function reads all formats, one writes them."""
 
 from __future__ import annotations
 
@@ -8,23 +8,33 @@ from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
-from pcgraph.cloud import Cloud
-from pcgraph.errors import CloudReadError
+from pcgraph.cloud import Cloud, plain_cloud
+from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
+from pcgraph.io.driving_sweeps import KITTI, NUSCENES, SWEEP
 from pcgraph.io.e57 import E57
 from pcgraph.io.format import CloudFile, Format
 from pcgraph.io.las import LAS
 from pcgraph.io.mesh import GLTF, OBJ, OFF, STL, sample_surface
+from pcgraph.io.npz import NPY, NPZ
+from pcgraph.io.ouster import OUSTER
 from pcgraph.io.pcd import PCD
 from pcgraph.io.ply import PLY
-from pcgraph.io.segmentation_files import write_segmentation
-from pcgraph.plumbing.plain_files import read_file
+from pcgraph.io.ptx import PTX
+from pcgraph.io.text import PTS, TEXT, XYZN, XYZRGB
+from pcgraph.plumbing.plain_files import read_file, write_file
 
-__all__ = ["read_cloud", "sample_surface", "write_segmentation"]
+__all__ = ["decode_cloud", "encode_cloud", "read_cloud", "sample_surface", "write_cloud"]
 
 MAX_REASON = 300
 """Characters of a message about a damaged file, count: such files can make messages of any length. Chosen by eye; not
 varied."""
-FORMATS: tuple[Format, ...] = (PCD, PLY, LAS, E57, OBJ, STL, OFF, GLTF)
+FORMATS: tuple[Format, ...] = (
+    *(PCD, PLY, LAS, E57, NPZ, NPY),
+    *(TEXT, PTS, PTX, XYZN, XYZRGB),
+    *(KITTI, NUSCENES, SWEEP, OUSTER),
+    *(OBJ, STL, OFF, GLTF),
+)
+_WRITABLE = tuple(one for one in FORMATS if one.encode is not None)
 
 
 def read_cloud(
@@ -35,7 +45,9 @@ def read_cloud(
     Parameters
     ----------
     path : str or path
-        ``.pcd`` (ascii, binary, binary_compressed) or ``.ply`` (ascii, binary of either byte order).
+        Of any format of docs/files.md: LAS, LAZ, COPC, E57, PLY, PCD, text (``.xyz``, ``.csv``, ``.pts``, ``.ptx`` and
+        others), ``.npz``, ``.npy``, sweeps of KITTI, nuScenes and Ouster, the vertices of meshes (``.obj``, ``.stl``,
+        ``.off``, ``.glb``).
     file_format : str, optional
         Name of the format, such as "ply". Default: by the end of the file's name.
     columns : names, optional
@@ -49,10 +61,90 @@ def read_cloud(
     """
     path = Path(path)
     if os.path.isdir(path):  # unlike Path.is_dir it takes names that no file can have
-        raise CloudReadError(f"{path} is a directory: expected a file ending in {_suffixes()}")
-    chosen = _format(path.name, file_format)
-    named = None if columns is None else tuple(columns)
-    return _read(chosen, CloudFile(read_file(path, CloudReadError), path, named), str(path))
+        raise CloudReadError(f"{path} is a directory: expected a file ending in {_either(_suffixes(FORMATS))}")
+    chosen, _ = _format(path.name, file_format, FORMATS, CloudReadError)
+    return _read(chosen, CloudFile(read_file(path, CloudReadError), path, _named(columns, chosen)), str(path))
+
+
+def decode_cloud(content: bytes, name: str, columns: Sequence[str] | None = None) -> Cloud:
+    """Cloud of the bytes of a file, as of an upload or from a pipe; its name tells the format.
+
+    Parameters
+    ----------
+    content : bytes
+    name : str
+        Name of the file, such as "scan.ply"; nothing of that name need exist.
+    columns : as for `read_cloud`
+
+    Raises
+    ------
+    CloudReadError
+        As for `read_cloud`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> content = encode_cloud(Cloud(np.ones((2, 3))), "two.pcd")
+    >>> decode_cloud(content, "two.pcd").points.tolist()
+    [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
+    """
+    chosen, _ = _format(Path(name).name, None, FORMATS, CloudReadError)
+    return _read(chosen, CloudFile(content, None, _named(columns, chosen)), name)
+
+
+def write_cloud(path: str | PathLike[str], cloud: Cloud, file_format: str | None = None) -> None:
+    """Write a cloud as a whole file, or none; an older file of that name is replaced.
+
+    `read_cloud` of the file gives the same points, colours, normals, labels and columns, in their types and under
+    their names, but for what a format cannot hold: docs/files.md lists it. Lists of points, which all formats but PCD,
+    NPZ and NPY are, hold the finite points only.
+
+    Parameters
+    ----------
+    path : str or path
+    cloud : Cloud
+        `pcgraph.as_cloud` makes one of arrays and of the clouds of other libraries.
+    file_format : str, optional
+        Name of the format, such as "ply". Default: by the end of the file's name.
+
+    Raises
+    ------
+    CloudWriteError
+        The extension is another, the place cannot be written, or the format cannot hold a column.
+    ValueError
+        `cloud` is no `Cloud`.
+
+    Examples
+    --------
+    >>> import numpy as np, tempfile, pathlib
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "two.ply"
+    >>> write_cloud(path, Cloud(np.ones((2, 3)), columns={"ring": np.array([0, 1], np.uint16)}))
+    >>> read_cloud(path).columns
+    {'ring': array([0, 1], dtype=uint16)}
+    """
+    path = Path(path)
+    write_file(path, _encode(cloud, path.name, file_format), CloudWriteError)
+
+
+def encode_cloud(cloud: Cloud, name: str) -> bytes:
+    """Bytes that `write_cloud` writes to a file of that name, which tells the format."""
+    return _encode(cloud, Path(name).name, None)
+
+
+def check_writable(name: str) -> None:
+    """Raise CloudWriteError unless `write_cloud` knows the format of a file of that name."""
+    _format(name, None, _WRITABLE, CloudWriteError)
+
+
+def holds_columns(suffix: str) -> bool:
+    """Whether `write_cloud` can write a file that ends so, with columns of any name."""
+    return any(suffix.lower() in one.suffixes and one.holds_columns for one in _WRITABLE)
+
+
+def without_suffix(name: str) -> str:
+    """The name of a file without the end that tells its format, or without its extension."""
+    end = max((suffix for suffix in _suffixes(FORMATS) if name.lower().endswith(suffix)), key=len, default="")
+    return name[: -len(end)] if end else Path(name).stem
 
 
 def _read(chosen: Format, file: CloudFile, name: str) -> Cloud:
@@ -64,20 +156,42 @@ def _read(chosen: Format, file: CloudFile, name: str) -> Cloud:
         raise CloudReadError(f"{name}: {said[:MAX_REASON]}") from None
 
 
-def _format(name: str, file_format: str | None) -> Format:
-    """The format of a name, or the one whose end the file's name has; of several ends the longest counts."""
+def _encode(cloud: Cloud, name: str, file_format: str | None) -> bytes:
+    if not isinstance(cloud, Cloud):
+        raise ValueError(f"expected a Cloud, as pcgraph.as_cloud makes it, got {type(cloud).__name__}")
+    chosen, suffix = _format(name, file_format, _WRITABLE, CloudWriteError)
+    cloud = plain_cloud(cloud)
+    return chosen.encode(cloud if chosen.organised else cloud.finite(), suffix)  # type: ignore[misc]
+
+
+def _format(
+    name: str, file_format: str | None, formats: tuple[Format, ...], error: type[PcgraphError]
+) -> tuple[Format, str]:
+    """The format of a name, or the one whose end the file's name has, and that end; of several ends the longest."""
+    ends = {suffix: one for one in formats for suffix in one.suffixes if name.lower().endswith(suffix)}
     if file_format is not None:
-        named = [one for one in FORMATS if one.name == file_format]
+        named = [one for one in formats if one.name == file_format]
         if not named:
-            known = ", ".join(one.name for one in FORMATS)
-            raise CloudReadError(f"expected file_format as one of {known}, got {ascii(file_format)[:80]}")
-        return named[0]
-    ends = {suffix: one for one in FORMATS for suffix in one.suffixes if name.lower().endswith(suffix)}
+            known = ", ".join(one.name for one in formats)
+            raise error(f"expected file_format as one of {known}, got {ascii(file_format)[:80]}")
+        own = [suffix for suffix, one in ends.items() if one is named[0]]
+        return named[0], max(own or named[0].suffixes[:1], key=len, default="")
     if not ends:
-        raise CloudReadError(f"expected a file ending in {_suffixes()}, got {name!r}: convert it first")
-    return ends[max(ends, key=len)]
+        hint = "convert it first" if error is CloudReadError else "choose another name"
+        raise error(f"expected a file ending in {_either(_suffixes(formats))}, got {name!r}: {hint}")
+    suffix = max(ends, key=len)
+    return ends[suffix], suffix
 
 
-def _suffixes() -> str:
-    ends = [suffix for one in FORMATS for suffix in one.suffixes]
+def _named(columns: Sequence[str] | None, chosen: Format) -> tuple[str, ...] | None:
+    if columns is not None and not chosen.takes_names:
+        raise CloudReadError(f"expected columns for text files only, as a .{chosen.name} names its own: leave it out")
+    return None if columns is None else tuple(columns)
+
+
+def _suffixes(formats: tuple[Format, ...]) -> list[str]:
+    return [suffix for one in formats for suffix in one.suffixes]
+
+
+def _either(ends: list[str]) -> str:
     return f"{', '.join(ends[:-1])} or {ends[-1]}"

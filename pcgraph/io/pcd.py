@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PCD files (Point Cloud Data, PCL's format, version 0.7): ascii, binary and binary_compressed."""
+"""PCD files (Point Cloud Data, PCL's format): versions 0.5 to 0.7 are read, in ascii, binary and binary_compressed."""
 
 from __future__ import annotations
 
@@ -10,13 +10,22 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.cloud import MAX_HEADER_BYTES, Cloud, cloud_from_columns, columns_from_text, numbers_from_text
-from pcgraph.errors import CloudReadError
-from pcgraph.io.format import Format
+from pcgraph.cloud import (
+    COLOR_NAMES,
+    NORMAL_NAMES,
+    PACKED_NAMES,
+    Cloud,
+    cloud_from_columns,
+    columns_of_cloud,
+)
+from pcgraph.errors import CloudReadError, CloudWriteError
+from pcgraph.io.format import MAX_HEADER_BYTES, Format, check_words, field_name, field_word
+from pcgraph.io.text_numbers import columns_from_text, numbers_from_text
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
-_REQUIRED = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA")
+_INSTEAD = {"f2": "f4", "b1": "u1"}
+"""Types that PCD does not have, and those that are written in their place."""
 _MAX_NUMBER = 10**15
 """Largest number of a header, count of points and the like: no file holds as many, and numpy still takes it as the
 length of an array of no bytes. Chosen by eye; not varied."""
@@ -32,8 +41,8 @@ class PcdHeader:
         Name, little-endian scalar type, and count of numbers per point.
     width, height : int
         Size of the lattice; an unorganised cloud has the height 1.
-    viewpoint : (3,) float64, metres
-        Position of the sensor.
+    viewpoint : (3,) float64, metres, or None
+        Position of the sensor. None if it is missing, damaged, or (0, 0, 0), which PCL writes where it knows nothing.
     data : str
         ``ascii``, ``binary`` or ``binary_compressed``.
     n_lines : int
@@ -45,7 +54,7 @@ class PcdHeader:
     counts: tuple[int, ...]
     width: int
     height: int
-    viewpoint: NDArray[np.float64]
+    viewpoint: NDArray[np.float64] | None
     data: str
     n_lines: int
 
@@ -62,6 +71,9 @@ class PcdHeader:
 
 def read_pcd(content: bytes) -> Cloud:
     """Cloud of a PCD file, given the file's bytes, with organisation, NaN, colours, normals and labels.
+
+    What older versions leave out is taken as PCL takes it: ``COLUMNS`` are FIELDS, numbers without SIZE and TYPE are
+    float32, and a cloud without HEIGHT is a list. The orientation in VIEWPOINT and the alpha of ``rgba`` are not read.
 
     Raises
     ------
@@ -83,26 +95,27 @@ def _parse_header(content: bytes) -> tuple[PcdHeader, bytes]:
         end = content.find(b"\n", position, MAX_HEADER_BYTES)
         if end < 0:
             raise CloudReadError("expected a PCD header that ends in a DATA line, but found none")
-        words = [word.decode("latin-1") for word in content[position:end].split()]  # str.split knows more blanks
+        words = [field_name(word) for word in content[position:end].split()]  # str.split knows more blanks
         position = end + 1
         if words and not words[0].startswith("#"):
             key = words[0].upper()
+            key = "FIELDS" if key == "COLUMNS" else key
             if key in entries:
                 raise CloudReadError(f"expected one {key[:20]} line in the PCD header, got two")
-            entries[key] = words[1:]
-    missing = [key for key in _REQUIRED if not entries.get(key)]
+            entries[key] = words[1 : words.index("#") if "#" in words else None]
+    if "WIDTH" not in entries and "HEIGHT" not in entries and "POINTS" in entries:
+        entries["WIDTH"] = entries["POINTS"]
+    missing = [key for key in ("FIELDS", "WIDTH", "DATA") if not entries.get(key)]
     if missing:
-        raise CloudReadError(
-            f"expected PCD header lines {', '.join(_REQUIRED)}; missing or empty: {', '.join(missing)}"
-        )
+        raise CloudReadError(f"expected PCD header lines FIELDS, WIDTH and DATA; missing: {', '.join(missing)}")
     return _checked_header(entries, content.count(b"\n", 0, position)), content[position:]
 
 
 def _checked_header(entries: dict[str, list[str]], n_lines: int) -> PcdHeader:
     names = tuple(entries["FIELDS"])
     counts = _integers(entries, "COUNT", default=[1] * len(names))
-    sizes = _integers(entries, "SIZE")
-    kinds = [kind.upper() for kind in entries["TYPE"]]
+    sizes = _integers(entries, "SIZE", default=[4] * len(names))
+    kinds = [kind.upper() for kind in entries.get("TYPE", ["F"] * len(names))]
     if not len(names) == len(sizes) == len(kinds) == len(counts):
         raise CloudReadError(
             f"expected as many SIZE, TYPE and COUNT entries as FIELDS ({len(names)}), "
@@ -116,7 +129,7 @@ def _checked_header(entries: dict[str, list[str]], n_lines: int) -> PcdHeader:
         if kind not in _KINDS or size not in _SIZES[kind] or not 1 <= count <= 4096:
             raise CloudReadError(f"field {name!r}: TYPE {kind}, SIZE {size}, COUNT {count} is not a PCD number type")
         dtypes.append(np.dtype(f"<{_KINDS[kind]}{size}"))
-    width, height = _integers(entries, "WIDTH")[0], _integers(entries, "HEIGHT")[0]
+    width, height = _integers(entries, "WIDTH")[0], _integers(entries, "HEIGHT", default=[1])[0]
     points = _integers(entries, "POINTS")[0] if entries.get("POINTS") else width * height
     if min(width, height) < 0 or points != width * height:
         raise CloudReadError(f"expected POINTS = WIDTH x HEIGHT, got {points} != {width} x {height}")
@@ -126,10 +139,10 @@ def _checked_header(entries: dict[str, list[str]], n_lines: int) -> PcdHeader:
 
 def _integers(entries: dict[str, list[str]], key: str, default: list[int] | None = None) -> list[int]:
     words = entries.get(key)
-    if not words and default is not None:
+    if words is None and default is not None:
         return default
     try:
-        numbers = [int(word) for word in words or []]
+        numbers = [int(word) for word in words or ["none"]]
     except ValueError:
         numbers = [_MAX_NUMBER + 1]
     if max(map(abs, numbers), default=0) > _MAX_NUMBER:
@@ -138,12 +151,12 @@ def _integers(entries: dict[str, list[str]], key: str, default: list[int] | None
     return numbers
 
 
-def _viewpoint(words: list[str]) -> NDArray[np.float64]:
+def _viewpoint(words: list[str]) -> NDArray[np.float64] | None:
     try:
         position = np.array([float(word) for word in words[:3]])
     except ValueError:
-        position = np.empty(0)
-    return position if position.shape == (3,) and np.isfinite(position).all() else np.zeros(3)
+        return None
+    return position if position.shape == (3,) and np.isfinite(position).all() and position.any() else None
 
 
 def _ascii_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.generic]]:
@@ -285,4 +298,49 @@ def decompress_lzf(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
     return wrote
 
 
-PCD = Format("pcd", (".pcd",), lambda file: read_pcd(file.content), organised=True)
+# ---- Writing ---------------------------------------------------------------------------------------------------------
+
+
+def encode_pcd(cloud: Cloud) -> bytes:
+    """Bytes of a binary PCD file, version 0.7.
+
+    Colours are packed as ``rgb`` and normals are called ``normal_x`` and so on, as PCL and Open3D read them. The
+    orientation of the sensor is that of its frame, 1 0 0 0.
+
+    Raises
+    ------
+    CloudWriteError
+        Two columns have one name, or one is wider than 64 bits.
+    """
+    columns = columns_of_cloud(cloud, colors=(PACKED_NAMES[:1], COLOR_NAMES), normals=NORMAL_NAMES)
+    check_words(list(columns))
+    fields = []
+    for i, (name, column) in enumerate(columns.items()):
+        kind = _INSTEAD.get(column.dtype.str[1:], column.dtype.str[1:])
+        if int(kind[1:]) > 8:
+            raise CloudWriteError(f"expected columns of at most 64 bits, got {column.dtype} in the column {name!r}")
+        fields.append((f"f{i}", f"<{kind}", column.shape[1:]))
+    rows = np.empty(cloud.points[..., 0].size, fields)
+    for i, column in enumerate(columns.values()):
+        rows[f"f{i}"] = column
+    kinds = [rows.dtype[name] for name, _, _ in fields]
+    height, width = cloud.points.shape[:2] if cloud.organised else (1, len(cloud.points))
+    at = cloud.viewpoint if cloud.viewpoint is not None and cloud.viewpoint.ndim == 1 else np.zeros(3)
+    lines = [
+        b"# .PCD v0.7 - Point Cloud Data file format",
+        b"VERSION 0.7",
+        b"FIELDS " + b" ".join(field_word(name) for name in columns),
+        b"SIZE " + b" ".join(b"%d" % kind.base.itemsize for kind in kinds),
+        b"TYPE " + b" ".join(kind.base.kind.upper().encode() for kind in kinds),
+        b"COUNT " + b" ".join(b"%d" % (kind.shape or (1,))[0] for kind in kinds),
+        b"WIDTH %d" % width,
+        b"HEIGHT %d" % height,
+        f"VIEWPOINT {' '.join(repr(float(metres)) for metres in at)} 1 0 0 0".encode(),
+        b"POINTS %d" % len(rows),
+        b"DATA binary",
+        b"",
+    ]
+    return b"\n".join(lines) + rows.tobytes()
+
+
+PCD = Format("pcd", (".pcd",), lambda file: read_pcd(file.content), lambda cloud, _: encode_pcd(cloud), organised=True)

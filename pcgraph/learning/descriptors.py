@@ -70,10 +70,10 @@ def leaf_descriptors(
     if ancestors > 0:
         heights = _finite(tree.altitudes)
         chosen = [("segment", _segments(segmentation))]
-        size = float(np.median(tree.moments.counts[: tree.n_leaves]))
+        size = float(np.median(tree.sizes[: tree.n_leaves]))
         for level in range(1, ancestors + 1):
             least = size * GROWTH**level
-            chosen.append((f"ancestor {level}", _climb(tree.parents, tree.altitudes, tree.moments.counts, least)))
+            chosen.append((f"ancestor {level}", _climb(tree.parents, tree.altitudes, tree.sizes, least)))
         for title, node in chosen:
             at = node[: tree.n_leaves]
             blocks += [nodes[at], heights[at, None], heights[tree.parents[at], None]]

@@ -188,7 +188,7 @@ def _summable(table: NDArray[Any]) -> NDArray[Any]:
 
 def _weights(weights: ArrayLike | None, tree: SegmentationTree) -> NDArray[np.float64]:
     if weights is None:
-        return tree.moments.counts[: tree.n_leaves].astype(np.float64)
+        return tree.sizes[: tree.n_leaves].astype(np.float64)
     array = np.asarray(weights, np.float64)
     if array.shape != (tree.n_leaves,) or not (np.isfinite(array) & (array >= 0)).all():
         raise ValueError(f"expected weights as ({tree.n_leaves},) finite numbers of at least 0, got {weights!r}")

@@ -27,9 +27,9 @@ def plane_energy(tree: SegmentationTree, graph: AdjacencyGraph | None = None) ->
     Raises
     ------
     ValueError
-        The graph is not of the tree's leaves.
+        The graph is not of the tree's leaves, or the tree has no moments.
     """
-    return Energy(tree.moments.counts * tree.features().residual ** 2, _complexity(tree, graph))
+    return Energy(tree.sizes * tree.features().residual ** 2, _complexity(tree, graph))
 
 
 def variance_energy(tree: SegmentationTree, values: ArrayLike, graph: AdjacencyGraph | None = None) -> Energy:
@@ -51,7 +51,7 @@ def variance_energy(tree: SegmentationTree, values: ArrayLike, graph: AdjacencyG
     rows = np.asarray(values, np.float64)
     if rows.ndim != 2 or len(rows) != tree.n_leaves or not np.isfinite(rows).all():
         raise ValueError(f"expected finite values ({tree.n_leaves}, d), got shape {rows.shape}; give one row per leaf")
-    return Energy(_variances(tree.parents, tree.moments.counts, rows), _complexity(tree, graph))
+    return Energy(_variances(tree.parents, tree.sizes, rows), _complexity(tree, graph))
 
 
 def boundary_lengths(tree: SegmentationTree, graph: AdjacencyGraph) -> NDArray[np.float64]:

@@ -4,16 +4,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.moments import Moments, moments_up_tree
 from pcgraph.features.nodes import NodeFeatures, node_features, rows, scalar_columns
-from pcgraph.hierarchy import lowest_common_ancestors, roots
+from pcgraph.hierarchy import (
+    accumulate_sequential,
+    binary_children,
+    lowest_common_ancestors,
+    propagation_sources,
+    roots,
+)
 from pcgraph.inputs import non_negative
 from pcgraph.pairs import nearest
+from pcgraph.plumbing.plain_dict import plain
 from pcgraph.plumbing.short_repr import ShortRepr
 from pcgraph.tree.cuts import horizontal_cut, numbered_segments, persistences
 from pcgraph.tree.linkage import Merges
@@ -39,23 +47,100 @@ class SegmentationTree(ShortRepr):
     altitudes : (k,) float64, the linkage's unit
         Cost at which each node came to be: 0 for leaves, not decreasing with the node's number, infinite where parts
         that do not touch were joined.
-    moments : Moments of k groups
-        Moments of the points below each node.
+    moments : Moments of k groups, or None
+        Moments of the points below each node; None of a tree that was made of a graph alone (`pcgraph.tree_of_graph`).
+    leaf_sizes : (n_leaves,) int64, or None
+        Number of points of each leaf of a tree without moments.
+
+    Examples
+    --------
+    The same words as in SciPy and Higra lead through the tree:
+
+    >>> import pcgraph
+    >>> tree = pcgraph.tree_of_graph([[0, 1], [1, 2], [2, 3]], [0.1, 0.9, 0.2])
+    >>> tree.root, tree.children[tree.root].tolist(), tree.leaves_of(4).tolist(), tree.path(0).tolist()
+    (6, [4, 5], [0, 1], [0, 4, 6])
     """
 
     parents: NDArray[np.int32]
     altitudes: NDArray[np.float64]
-    moments: Moments
+    moments: Moments | None = None
+    leaf_sizes: NDArray[np.int64] | None = None
 
     def _counts(self) -> str:
         apart = np.count_nonzero(np.isinf(self.altitudes))
         what = f", {apart + 1} parts that do not touch" if apart else ""
-        return f"{self.n_leaves} leaves, {len(self.parents)} nodes{what}"
+        return f"{self.n_leaves} leaves, {self.n_nodes} nodes{what}"
 
     @property
     def n_leaves(self) -> int:
         """Number of supervoxels."""
         return (len(self.parents) + 1) // 2
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of nodes, 2 n_leaves - 1."""
+        return len(self.parents)
+
+    @property
+    def root(self) -> int:
+        """The last node, above all others."""
+        return self.n_nodes - 1
+
+    @cached_property
+    def children(self) -> NDArray[np.int32]:
+        """The two children of each node, (k, 2) int32, the smaller number first; -1 for leaves."""
+        return binary_children(self.parents)
+
+    @cached_property
+    def sizes(self) -> NDArray[np.int64]:
+        """Number of points of each node, (k,) int64; each leaf counts 1 without moments and without `leaf_sizes`."""
+        if self.moments is not None:
+            return self.moments.counts
+        leaves = np.ones(self.n_leaves, np.int64) if self.leaf_sizes is None else self.leaf_sizes
+        return accumulate_sequential(self.parents, leaves)
+
+    def leaves_of(self, node: int) -> NDArray[np.int32]:
+        """Leaves at or below a node, ascending, (s,) int32. It takes time for all nodes of the tree.
+
+        Raises
+        ------
+        ValueError
+            The tree has no such node.
+        """
+        top = self._node("node", node)
+        above = propagation_sources(self.parents, np.arange(self.n_nodes) != top)[: self.n_leaves]
+        return np.flatnonzero(above == top).astype(np.int32)
+
+    def path(self, node: int) -> NDArray[np.int32]:
+        """Nodes from a node up to the root, both included, (d,) int32.
+
+        Raises
+        ------
+        ValueError
+            The tree has no such node.
+        """
+        nodes = [self._node("node", node)]
+        while nodes[-1] != self.root:
+            nodes.append(int(self.parents[nodes[-1]]))
+        return np.array(nodes, np.int32)
+
+    def lowest_common_ancestor(self, a: int, b: int) -> int:
+        """The lowest node above two nodes; the upper one of them if that is above the other.
+
+        Many pairs take `lowest_common_ancestors`.
+
+        Raises
+        ------
+        ValueError
+            The tree has no such node.
+        """
+        return int(self.lowest_common_ancestors([[self._node("a", a), self._node("b", b)]])[0])
+
+    def _node(self, name: str, node: int) -> int:
+        if isinstance(node, bool) or not isinstance(node, (int, np.integer)) or not 0 <= node <= self.root:
+            raise ValueError(f"expected {name} as a node of this tree, a whole number 0..{self.root}, got {node!r}")
+        return int(node)
 
     @property
     def persistence(self) -> NDArray[np.float64]:
@@ -95,7 +180,7 @@ class SegmentationTree(ShortRepr):
 
         The node is above the leaf, except for leaves that went to another segment because of `min_size`.
         """
-        return horizontal_cut(self.parents, self.altitudes, self.moments.counts, n, altitude, min_size)
+        return horizontal_cut(self.parents, self.altitudes, self.sizes, n, altitude, min_size)
 
     def levels(self, altitudes: ArrayLike) -> NDArray[np.int32]:
         """Segment of each leaf at several altitudes, (n_leaves, l) int32.
@@ -180,64 +265,100 @@ class SegmentationTree(ShortRepr):
         order = np.concatenate((np.arange(self.n_leaves), inner))
         rank = np.empty(len(order), np.int32)
         rank[order] = np.arange(len(order), dtype=np.int32)
-        return SegmentationTree(rank[self.parents[order]], levels[order], self.moments[order])
+        moments = None if self.moments is None else self.moments[order]
+        return SegmentationTree(rank[self.parents[order]], levels[order], moments, self.leaf_sizes)
 
     def edge_saliency(self, pairs: ArrayLike) -> NDArray[np.float64]:
-        """Altitude at which the two leaves of each pair become one segment, (m,) float64, the linkage's unit.
+        """Altitude at which the two nodes of each pair become one segment, (m,) float64, the linkage's unit.
 
         On the edges of the graph this is the ultrametric contour map: edges above a level are the boundaries of the cut
         at that altitude.
 
         Parameters
         ----------
-        pairs : (m, 2) int, 0..n_leaves - 1
+        pairs : (m, 2) int, 0..k - 1
             For example ``graph.edges``.
 
         Raises
         ------
         ValueError
-            Pairs are not (m, 2) whole numbers, or not leaves.
+            Pairs are not (m, 2) whole numbers, or not nodes of the tree.
         """
         return self.altitudes[self.lowest_common_ancestors(pairs)]
 
     def lowest_common_ancestors(self, pairs: ArrayLike) -> NDArray[np.int32]:
-        """Lowest common ancestor of each pair of leaves, (m,) int32; the leaf itself where the two are one.
+        """Lowest node above both nodes of each pair, (m,) int32; the upper one of them if that is above the other.
 
         Parameters
         ----------
-        pairs : (m, 2) int, 0..n_leaves - 1
+        pairs : (m, 2) int, 0..k - 1
 
         Raises
         ------
         ValueError
-            Pairs are not (m, 2) whole numbers, or not leaves of the tree.
+            Pairs are not (m, 2) whole numbers, or not nodes of the tree.
         """
-        leaves, last = np.asarray(pairs), self.n_leaves - 1
-        if leaves.ndim != 2 or leaves.shape[1] != 2 or (leaves.size and leaves.dtype.kind not in "iu"):
-            raise ValueError(
-                f"expected pairs (m, 2) of leaves, whole numbers, got {leaves.dtype} of shape {leaves.shape}"
-            )
-        if leaves.size and not 0 <= leaves.min() <= leaves.max() <= last:
-            raise ValueError(f"expected pairs of this tree's leaves 0..{last}, got {leaves.min()}..{leaves.max()}")
-        return lowest_common_ancestors(self.parents, *leaves.T)
+        nodes = np.asarray(pairs)
+        if nodes.ndim != 2 or nodes.shape[1] != 2 or (nodes.size and nodes.dtype.kind not in "iu"):
+            raise ValueError(f"expected pairs (m, 2) of nodes, whole numbers, got {nodes.dtype} of shape {nodes.shape}")
+        if nodes.size and not 0 <= nodes.min() <= nodes.max() <= self.root:
+            raise ValueError(f"expected pairs of this tree's nodes 0..{self.root}, got {nodes.min()}..{nodes.max()}")
+        return lowest_common_ancestors(self.parents, *nodes.T.astype(np.int32))
+
+    def known_moments(self) -> Moments:
+        """The moments of all k nodes.
+
+        Raises
+        ------
+        ValueError
+            The tree has none.
+        """
+        if self.moments is None:
+            raise ValueError("expected the tree of a segmented cloud, got one without moments, as of tree_of_graph")
+        return self.moments
 
     def features(self) -> NodeFeatures:
-        """Features of all k nodes, from their moments."""
-        return node_features(self.moments)
+        """Features of all k nodes, from their moments; raises ValueError if the tree has none."""
+        return node_features(self.known_moments())
+
+    def to_linkage_matrix(self) -> NDArray[np.float64]:
+        """The merges as SciPy's linkage matrix, (n_leaves - 1, 4) float64.
+
+        Row i makes node n_leaves + i: its two children, its altitude, and its number of leaves (not of points). So
+        nodes have the same numbers here and there. ``scipy.cluster.hierarchy.dendrogram(matrix)`` draws it, and
+        ``fcluster(matrix, t, "distance")`` cuts it as ``cut(altitude=t)`` does.
+
+        A drawing has no place for infinity. Parts that join at infinite altitude join at twice the largest finite one
+        instead, or at 1 if no finite one is above 0. SciPy takes no tree of one leaf; its matrix has no rows.
+        """
+        altitudes = self.altitudes[self.n_leaves :]
+        finite = altitudes[np.isfinite(altitudes)]
+        at_infinity = 2.0 * finite.max(initial=0.0) or 1.0
+        n_below = accumulate_sequential(self.parents, np.ones(self.n_leaves, np.int64))
+        merged = slice(self.n_leaves, None)
+        levels = np.where(np.isfinite(altitudes), altitudes, at_infinity)
+        return np.column_stack((self.children[merged], levels, n_below[merged])).astype(np.float64)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The tree as flat lists of numbers, one entry per node, which ``json.dumps(..., allow_nan=False)`` takes.
+
+        ``n_leaves``; ``parents``, the root its own; ``altitudes``, the linkage's unit, None where parts that do not
+        touch were joined (infinite); ``sizes``, numbers of points.
+        """
+        columns = {"parents": self.parents, "altitudes": self.altitudes, "sizes": self.sizes}
+        return {"n_leaves": self.n_leaves, **plain(columns)}
 
     def to_networkx(self) -> networkx.DiGraph:
         """The tree as ``networkx.DiGraph``, from parent to child, with ``altitude`` and features as attributes.
 
-        All attributes are numbers. A node at infinite altitude, which joins parts that do not touch, has no
-        ``altitude``, because JSON has no infinity.
+        All attributes are numbers; without moments, ``altitude`` and ``size``. What has no finite value is left out,
+        because JSON has no infinity: a node that joins parts that do not touch has no ``altitude``.
         """
         from networkx import DiGraph
 
-        columns = {"altitude": self.altitudes, **self.features().columns()}
+        features = {"size": self.sizes} if self.moments is None else self.features().columns()
         tree = DiGraph()
-        tree.add_nodes_from(enumerate(rows(scalar_columns(columns), len(self.parents))))
-        for node in np.flatnonzero(np.isinf(self.altitudes)).tolist():
-            del tree.nodes[node]["altitude"]
+        tree.add_nodes_from(enumerate(rows(scalar_columns({"altitude": self.altitudes, **features}), self.n_nodes)))
         tree.add_edges_from((up, node) for node, up in enumerate(self.parents.tolist()) if up != node)
         return tree
 
@@ -262,26 +383,40 @@ def segmentation_tree(merges: Merges, leaves: Moments) -> SegmentationTree:
     nearest larger part. So cuts below infinity never mix them, and a cut into few segments keeps the large parts apart.
     `RegionLinkage` joins specks earlier, across bridges.
     """
-    n_leaves, n_merges = len(leaves), len(merges.pairs)
+    parents, altitudes = _joined(merges, leaves.counts, leaves.centroids)
+    return SegmentationTree(parents, altitudes, moments_up_tree(leaves, parents))
+
+
+def tree_without_points(merges: Merges, leaf_sizes: NDArray[np.int64]) -> SegmentationTree:
+    """Tree over k leaves, (k,) numbers of points, that lie nowhere: parts that are left each join the largest one."""
+    return SegmentationTree(*_joined(merges, leaf_sizes, None), leaf_sizes=leaf_sizes)
+
+
+def _joined(
+    merges: Merges, sizes: NDArray[np.int64], centroids: NDArray[np.float64] | None
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Parents and altitudes of the tree of these merges; `sizes` and `centroids` are those of the leaves."""
+    n_leaves, n_merges = len(sizes), len(merges.pairs)
     parents = np.arange(2 * n_leaves - 1, dtype=np.int32)
     parents[merges.pairs] = np.arange(n_leaves, n_leaves + n_merges, dtype=np.int32)[:, None]
     parts = roots(parents[: n_leaves + n_merges])[:n_leaves]
-    gaps = _join_parts(parts, leaves, n_leaves + n_merges)
+    gaps = _join_parts(parts, sizes, centroids, n_leaves + n_merges)
     parents[gaps] = np.arange(n_leaves + n_merges, 2 * n_leaves - 1, dtype=np.int32)[:, None]
-    levels = np.concatenate((np.zeros(n_leaves), merges.altitudes, np.full(len(gaps), np.inf)))
-    return SegmentationTree(parents, levels, moments_up_tree(leaves, parents))
+    return parents, np.concatenate((np.zeros(n_leaves), merges.altitudes, np.full(len(gaps), np.inf)))
 
 
-def _join_parts(parts: NDArray[np.int32], leaves: Moments, next_node: int) -> NDArray[np.int32]:
+def _join_parts(
+    parts: NDArray[np.int32], leaf_sizes: NDArray[np.int64], centroids: NDArray[np.float64] | None, next_node: int
+) -> NDArray[np.int32]:
     """Merges, (p - 1, 2) int32, of p parts; `parts` is the root above each leaf."""
     tops, part = np.unique(parts, return_inverse=True)
     if len(tops) == 1:
         return np.empty((0, 2), np.int32)
-    sizes = np.bincount(part, leaves.counts)
+    sizes = np.bincount(part, leaf_sizes)
     order = np.lexsort((-tops, sizes))  # ascending size; of equal parts the later one merges first
     rank = np.empty(len(tops), np.int64)
     rank[order] = np.arange(len(tops))
-    target = _nearest_larger(part, rank, leaves.centroids)
+    target = np.full(len(tops), order[-1]) if centroids is None else _nearest_larger(part, rank, centroids)
     name = tops.copy()
     merges = np.empty((len(tops) - 1, 2), np.int32)
     for step, small in enumerate(order[:-1].tolist()):

@@ -16,8 +16,6 @@ from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.eigen import least_eigenvalue
 from pcgraph.voxels.grid import MAX_GAP, MAX_NEIGHBOURS, Neighbourhood, VoxelGrid, boundary_voxels, voxels_within
 
-OUTLIER = -2
-"""Label of a point that belongs to nothing; -1 is the label of holes."""
 MIN_POINTS = 1000
 """Points of a cloud: in a smaller one none is an outlier, as a thing may have few; chosen by eye, not varied."""
 _NEAREST = 16

@@ -23,6 +23,7 @@ from rangesim.cli.report import report_command
 from rangesim.cli.run import run_command
 from rangesim.cli.scan import scan_command
 from rangesim.cli.verify import verify_command
+from rangesim.cli.view import view_command
 from rangesim.environment.doctor import doctor_command
 from rangesim.errors import RangesimError, RangesimWarning, one_line, sentence
 
@@ -35,6 +36,7 @@ app.command("decode")(decode_command)
 app.command("calibrate")(calibrate_command)
 app.command("compare")(compare_command)
 app.command("report")(report_command)
+app.command("view")(view_command)
 app.command("verify")(verify_command)
 app.command("presets")(presets_command)
 app.command("doctor")(doctor_command)

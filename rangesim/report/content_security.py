@@ -9,8 +9,6 @@ styles in attributes, requests, frames and forms.
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import re
 from typing import Any
 
@@ -20,22 +18,6 @@ from rangesim.errors import visible
 
 _DECLARATIONS = re.compile(r"[a-z]+:[-#%.,() a-z0-9]+(;[a-z]+:[-#%.,() a-z0-9]+)*")
 """CSS declarations that `StyleRules` takes: properties with plain values, and no URL or quote."""
-
-
-def content_policy(style: str, script: str) -> str:
-    """Content-Security-Policy of a page that allows this style sheet, this script and pictures in the page itself."""
-    return "; ".join(
-        (
-            "default-src 'none'",
-            "img-src data:",
-            f"style-src '{_hash(style)}'",
-            f"script-src '{_hash(script)}'",
-            "base-uri 'none'",
-            "form-action 'none'",
-            "require-trusted-types-for 'script'",
-            "trusted-types 'none'",
-        )
-    )
 
 
 def visible_text(value: Any) -> Any:
@@ -78,8 +60,3 @@ class StyleRules:
         """Rules of all classes that were named so far, for the page's style sheet."""
         rules = (f".{name} {{ {declarations} }}\n" for declarations, name in self._names.items())
         return Markup("".join(rules))  # each was checked when it was named
-
-
-def _hash(text: str) -> str:
-    """Hash of a script or style sheet as the policy names it."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")

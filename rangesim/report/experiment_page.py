@@ -21,7 +21,7 @@ from rangesim.signals import GroundTruth
 FEW_PX = 64
 """Width of an image, in pixels, below which its pixels are shown as squares: a sensor of 8 x 8 zones has no image that
 could be smoothed. With a larger value the pictures of small trial runs would be squares, too."""
-SCRIPTS = ("scroll.js", "viewer.js", "report.js")
+SCRIPTS = ("scroll.js", "pcgraph.viewer:three.js", "pcgraph.viewer:points.js", "sensor_views.js", "report.js")
 """Files of the page's JavaScript, in the order in which they use each other."""
 
 

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-import base64
-import zlib
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from pcgraph.viewer.node_colors import node_colors
+from pcgraph.viewer.packing import pack
 from rangesim.report import palette
 from rangesim.report.panorama import panorama
 from rangesim.results.experiment_results import Measurement, Segmentation
@@ -21,20 +21,12 @@ ERROR_STEP_M = 1e-5
 """Unit of packed errors, in metres, chosen so that int16 reaches 0.33 m, which is more than the error scale shows."""
 MIN_PIXEL_RAD = 1e-5
 """Smallest angle between rays, radians, by which the size of points is chosen; parallel rays have none."""
-DEFLATE_LEVEL = 4
-"""Level of zlib's compression. Its default, 6, makes a page of 7 MB 1 % smaller, in twice the time."""
 FAR_FACTOR = 1.5
 """Multiple of the farthest true depth, beyond which points are not drawn.
 
 Such points are readings of mirrors and of wrong periods, far behind the scene. With a larger ratio more of them are
 drawn, and all depths are packed in coarser steps; other values were not measured.
 """
-
-
-def pack(array: np.ndarray) -> str:
-    """Base64 text of the deflated bytes of an array, little-endian, row by row."""
-    little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
-    return base64.b64encode(zlib.compress(little.tobytes(), DEFLATE_LEVEL)).decode("ascii")
 
 
 def packed_measurement(m: Measurement, title: str, view: int, far_m: float) -> dict[str, Any]:
@@ -143,35 +135,6 @@ def _packed_tree(s: Segmentation) -> dict[str, Any]:
         "supervoxel": pack((s.supervoxels + 1).astype(np.uint32 if wide else np.uint16)),
         "parents": pack(s.parents.astype(np.int32)),
         "altitudes": pack(s.altitudes.astype(np.float32)),
-        "colors": pack(_colors(s.parents, sizes)),
+        "colors": pack(node_colors(s.parents, sizes)),
         "objects": int(s.labels.max()) + 1,
     }
-
-
-def _colors(parents: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """(k, 3) uint8 colour of each node: that of its largest child, so that a finer cut changes the colours of small
-    parts only.
-
-    Parameters
-    ----------
-    parents : (k,) int, parent of each node; the leaves come first. sizes : number of pixels of each leaf.
-    """
-    leaves, nodes = len(sizes), len(parents)
-    total, largest, chief = np.zeros(nodes, np.int64), np.zeros(nodes, np.int64), np.arange(nodes)
-    total[:leaves] = sizes
-    for node in range(nodes - 1):  # children come before parents, the root is last
-        parent = parents[node]
-        total[parent] += total[node]
-        if total[node] > largest[parent]:
-            largest[parent], chief[parent] = total[node], chief[node]
-    return _distinct(leaves)[chief]
-
-
-def _distinct(count: int) -> np.ndarray:
-    """(count, 3) uint8 colours, RGB; neighbours in the list differ much in hue."""
-    from matplotlib.colors import hsv_to_rgb
-
-    i = np.arange(count)
-    hue = (i * 0.618033988749895) % 1
-    hsv = np.stack([hue, 0.45 + 0.35 * ((i * 0.754877666) % 1), 0.62 + 0.33 * ((i * 0.569840296) % 1)], axis=-1)
-    return np.rint(255 * hsv_to_rgb(hsv)).astype(np.uint8)

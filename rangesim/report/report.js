@@ -5,13 +5,6 @@ const DATA = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
 const all = (selector) => [...document.querySelectorAll(selector)];
 
-async function unpack(text, Type) {
-  const raw = atob(text), bytes = new Uint8Array(raw.length);
-  for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-  return new Type(await new Response(stream).arrayBuffer());
-}
-
 async function unpackInstrument(one) {
   const s = one.segmentation;
   const [z, error, intensity, status, cause] = await Promise.all([
@@ -137,8 +130,8 @@ class Page {
     this.levels = new Levels(DATA.instruments.map((one) => one.segmentation).filter(Boolean));
     this.view = { ...START, changed: () => this.redraw() };
     for (const one of DATA.instruments) one.middleM = this.middle(one.view);
-    this.clouds = all("canvas.cloud").map((c) => cloudView(c, this.of(c), this.of(c).z, this.view));
-    if (this.clouds.some((cloud) => cloud instanceof StillView)) this.sayStill();
+    this.clouds = all("canvas.cloud").map((c) => new CloudView(c, this.of(c), this.of(c).z, this.view));
+    if (this.clouds.some((cloud) => cloud.isStill)) this.sayStill();
     $("level").addEventListener("input", () => { this.setMode("segments"); this.setAltitude(this.levels.altitude(+$("level").value)); });
     all("input[name=mode]").forEach((input) => input.addEventListener("change", () => { this.setMode(input.value); this.paint(); }));
     $("reset").addEventListener("click", () => { Object.assign(this.view, START); this.redraw(); });

@@ -10,7 +10,8 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from rangesim.report.content_security import StyleRules, content_policy, visible_text
+from pcgraph.viewer.content_policy import content_policy
+from rangesim.report.content_security import StyleRules, visible_text
 
 
 def render_page(template: str, values: Mapping[str, Any], scripts: Sequence[str] = ("scroll.js",)) -> str:
@@ -22,7 +23,8 @@ def render_page(template: str, values: Mapping[str, Any], scripts: Sequence[str]
     Parameters
     ----------
     template : name of the template's file. values : the other variables of the template, by name.
-    scripts : names of the files whose JavaScript the page runs, in this order.
+    scripts : names of the files whose JavaScript the page runs, in this order, of this package or, such as
+        "pcgraph.viewer:points.js", of another one.
 
     Raises
     ------
@@ -42,5 +44,6 @@ def render_page(template: str, values: Mapping[str, Any], scripts: Sequence[str]
 
 
 def _file(name: str) -> str:
-    """Text of a file of this package."""
-    return (files("rangesim.report") / name).read_text(encoding="utf-8")
+    """Text of a file of this package or, as "package:name", of another one."""
+    package, _, file = name.rpartition(":")
+    return (files(package or "rangesim.report") / file).read_text(encoding="utf-8")

@@ -183,7 +183,7 @@ _CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpe
 """Type, shape and bounds of the arrays of `causes.npz`; the tolerance is in metres."""
 _SEGMENTATION = {
     "supervoxels": ArraySpec("int32", low=-1),
-    "labels": ArraySpec("int32", low=-2),
+    "labels": ArraySpec("int32", low=-1),
     "parents": ArraySpec("int32", ("nodes",), low=0, per_pixel=2),
     "altitudes": ArraySpec("float64", ("nodes",), low=0, inf=True, per_pixel=2),
 }
@@ -195,7 +195,7 @@ class Segmentation(ShortRepr):
     """Supervoxels of an organised point cloud, its objects, and the tree that merges the supervoxels.
 
     supervoxels : (h, w) int32, number of the supervoxel of each pixel; -1 where there is no point.
-    labels : (h, w) int32, number of the object of each pixel; -1 where there is no point, -2 for outliers.
+    labels : (h, w) int32, number of the object of each pixel; -1 where there is no point, and for outliers.
     parents : (k,) int32, parent of each node of the tree. The supervoxels come first; the root is its own parent.
     altitudes : (k,) float64, altitude at which the children of each node merge; it never decreases towards the root.
     """

@@ -6,7 +6,7 @@ A ray (x, y, 1) in camera coordinates meets the image plane z = 1 at (x, y). The
 
 The functions use arithmetic and comparisons only, so the same lines run on Python numbers, on NumPy arrays, on the
 renderer's arrays (Dr.Jit) and in compiled loops (numba). `rangesim.rig.Intrinsics` is their interface for users.
-`unproject` in `rangesim/report/viewer.js` repeats the pinhole without distortion, because it runs in a browser.
+`unproject` in `rangesim/report/sensor_views.js` repeats the pinhole without distortion, because it runs in a browser.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ useless for depth: depth is then at least four times as uncertain as with the ot
 class StructuredLight(Sensor):
     """A projector that shows a stack of patterns, and a camera that takes one frame of each.
 
-    Frames, in OpenCV's order [1]_: for each axis the Gray bits, most significant first, each followed by its inverse;
+    Frames, in OpenCV's order: for each axis the Gray bits, most significant first, each followed by its inverse;
     then, with `code="gray-phase"`, the `steps` fringe patterns of that axis; at the end white and black.
 
     Parameters
@@ -59,9 +59,9 @@ class StructuredLight(Sensor):
 
     References
     ----------
-    .. [1] OpenCV, structured_light module, GrayCodePattern.
-    .. [2] Sansoni, Carocci, Rodella: "Three-dimensional vision based on a combination of gray-code and
-       phase-shift light projection", Applied Optics 38 (1999).
+    - OpenCV, structured_light module, GrayCodePattern.
+    - Sansoni, Carocci, Rodella: "Three-dimensional vision based on a combination of gray-code and
+      phase-shift light projection", Applied Optics 38 (1999).
 
     Examples
     --------

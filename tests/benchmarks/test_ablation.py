@@ -75,7 +75,8 @@ def test_what_starts_from_the_default_s_voxels_is_what_all_of_it_gives(sample):
         whole = pcgraph.segment(sample.points, sample.colors)
     np.testing.assert_array_equal(found.supervoxels, whole.supervoxels)
     np.testing.assert_array_equal(found.tree.altitudes, whole.tree.altitudes)
-    assert scan_module.segment_scan.__name__ == "segment_scan"
+    assert scan_module.cluster_scan.__name__ == "cluster_scan"
+    assert scan_module.merge_supervoxels.__name__ == "merge_supervoxels"
 
 
 def test_a_part_by_which_the_default_does_not_come_changes_nothing(sample):

@@ -570,6 +570,26 @@ READERS = {
             )
             for suffix in ("obj", "stl", "off", "glb", "gltf")
         ),
+        *(
+            Reader(
+                f"cloud-{suffix}", _cloud, partial(seeds.text_clouds, suffix), refuses=_CLOUD, check=_arrays_agree,
+                share=0.5, renames=False,
+            )
+            for suffix in ("csv", "pts", "ptx")
+        ),
+        Reader(
+            "cloud-nuscenes", _cloud, seeds.nuscenes_sweeps, refuses=_CLOUD, check=_arrays_agree, share=0.2,
+            renames=False,
+        ),
+        Reader(
+            "cloud-ouster", _cloud, seeds.lidar_recordings, ("*.pcap", "*.json"), (_sidecar_trees,), refuses=_CLOUD,
+            check=_arrays_agree, share=0.2, renames=False,
+        ),
+        Reader(
+            "npz", _cloud, partial(seeds.array_files, "npz"), by_hand=(hostile.npz_files,), refuses=_CLOUD,
+            check=_arrays_agree,
+        ),
+        Reader("npy", _cloud, partial(seeds.array_files, "npy"), refuses=_CLOUD, check=_arrays_agree),
         Reader(
             "edge-model", _edge_model, seeds.edge_models, by_hand=(hostile.json_trees,),
             refuses=("ValueError", *_CLOUD),

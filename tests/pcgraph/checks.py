@@ -61,7 +61,8 @@ def assert_covered_and_connected(points: ArrayLike, result: pcgraph.Segmentation
     flat = np.asarray(points, float).reshape(-1, 3)
     outlier = result.outliers.reshape(-1)
     finite = np.isfinite(flat).all(axis=1)
-    assert np.array_equal(result.labels.reshape(-1) == -1, ~finite)
+    assert np.array_equal(result.labels.reshape(-1) == -1, ~finite | outlier)
+    assert finite[outlier].all()
     assert outlier.sum() < outliers * max(len(flat), 300)
     finite &= ~outlier
     for labels in (result.labels, result.supervoxels):

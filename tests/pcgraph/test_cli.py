@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-import errno
 import gc
+import json
 import subprocess
 import sys
 import tomllib
@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 import pcgraph
 from pcgraph.cli import app
 from pcgraph.families import member, members
+from pcgraph.io import decode_cloud
 from pcgraph.io.ply import encode_ply
 from pcgraph.tree.learned import EdgeModel
 
@@ -42,7 +43,7 @@ def scene(tmp_path):
 VIEW = ("--viewpoint", "0.8", "-1", "3")
 
 
-def test_segment_writes_both_files_and_a_summary(scene, tmp_path):
+def test_segment_writes_a_file_and_a_summary(scene, tmp_path):
     done = run(scene, "--out", tmp_path / "new" / "folder", *VIEW)
     assert done.exit_code == 0, done.output
     summary = dict(line.split(maxsplit=1) for line in done.stdout.splitlines() if line.strip())
@@ -50,13 +51,106 @@ def test_segment_writes_both_files_and_a_summary(scene, tmp_path):
     assert "supervoxels" in summary
     assert "seconds" in summary
     names = sorted(path.name for path in (tmp_path / "new" / "folder").iterdir())
-    assert names == ["scene.segments.npz", "scene.segments.ply"]
+    assert names == ["scene.segmentation.npz", "scene.segments.ply"]
+    labelled = pcgraph.read_cloud(tmp_path / "new" / "folder" / "scene.segments.ply")
+    saved = pcgraph.load_segmentation(tmp_path / "new" / "folder" / "scene.segmentation.npz")
+    assert np.array_equal(labelled.columns["object"], saved.labels)
+    assert np.array_equal(labelled.columns["part"], saved.parts)
+
+
+def records(done):
+    assert done.exit_code == 0, done.output
+    return [json.loads(line, parse_constant=pytest.fail) for line in done.stdout.splitlines()]
+
+
+def test_many_clouds_as_lines_of_json_with_levels_and_boxes(scene, tmp_path):
+    pcgraph.write_cloud(tmp_path / "other.pcd", pcgraph.read_cloud(scene))
+    options = ("--json", "--boxes", "--levels", "2,5", "--colorize", *VIEW)
+    done = run(scene, tmp_path / "other.pcd", "--out", tmp_path, *options)
+    first, second = records(done)
+    assert (first["cloud"], first["objects"], first["written"][1]) == (
+        str(scene), 3, str(tmp_path / "scene.segmentation.npz")
+    )  # fmt: skip
+    assert second["written"][0] == str(tmp_path / "other.segments.pcd")
+    assert second["boxes"] == first["boxes"]
+    assert sum(one["points"] for one in first["boxes"]) == first["segmented"]
+    assert "1 of 2" in done.stderr
+    labelled = pcgraph.read_cloud(first["written"][0])
+    assert [len(np.unique(labelled.columns[f"level_{n}"])) for n in (2, 5)] == [2, 5]
+    assert len(np.unique(labelled.colors, axis=0)) == 3
+    pcgraph.write_cloud(tmp_path / "bad.ply", pcgraph.Cloud(np.full((3, 3), np.nan)))
+    done = run(tmp_path / "bad.ply", scene, "--out", tmp_path, "--overwrite", "--json", *VIEW)
+    assert done.exit_code == 1
+    assert "at least one point" in done.stderr
+    assert json.loads(done.stdout)["cloud"] == str(scene)
+    assert_refused(run(scene, scene, "--out", tmp_path / "a.ply"), "as a folder for 2 clouds", tmp_path, [
+        "bad.ply", "other.pcd", "other.segmentation.npz", "other.segments.pcd", "scene.ply", "scene.segmentation.npz",
+        "scene.segments.ply",
+    ])  # fmt: skip
+
+
+def test_a_cloud_goes_from_pipe_to_pipe(scene, tmp_path):
+    arguments = ["segment", "-", "--from", "ply", "--out", "-", "--to", "pcd", *map(str, VIEW)]
+    done = CliRunner().invoke(app, arguments, input=scene.read_bytes())
+    assert done.exit_code == 0, done.stderr
+    labelled = decode_cloud(done.stdout_bytes, "a.pcd")
+    assert np.array_equal(labelled.columns["object"], pcgraph.segment(scene, viewpoint=(0.8, -1, 3)).labels)
+    assert [path.name for path in tmp_path.iterdir()] == [scene.name]
+    refused = CliRunner().invoke(app, ["segment", "-"], input=scene.read_bytes())
+    assert_refused(refused, "expected the format of the cloud on stdin", tmp_path, [scene.name])
+
+
+def test_a_saved_segmentation_is_cut_again(scene, tmp_path):
+    assert run(scene, "--out", tmp_path, *VIEW).exit_code == 0
+    saved = tmp_path / "scene.segmentation.npz"
+    done = CliRunner().invoke(app, ["cut", str(saved), "--objects", "6", "--levels", "9", "--boxes"])
+    assert len(records(done)) == 6
+    finer = pcgraph.read_cloud(tmp_path / "scene.cut.ply")
+    segmentation = pcgraph.load_segmentation(saved)
+    assert np.array_equal(finer.columns["object"], segmentation.cut(6))
+    assert np.array_equal(finer.columns["level_9"], segmentation.cut(9))
+    segmentation.save(tmp_path / "bare.npz")
+    names = ["bare.npz", "scene.cut.ply", "scene.ply", "scene.segmentation.npz", "scene.segments.ply"]
+    refused = CliRunner().invoke(app, ["cut", str(tmp_path / "bare.npz"), "--objects", "6"])
+    assert_refused(refused, "holds no points, as it was saved without its cloud", tmp_path, names)
+    refused = CliRunner().invoke(app, ["cut", str(scene)])
+    assert_refused(refused, "expected a file that Segmentation.save wrote", tmp_path, names)
+
+
+def test_info_tells_what_a_file_holds(scene, tmp_path):
+    cloud = pcgraph.Cloud(np.array([[0, 0, 0], [1, 2, 3], [np.nan] * 3], np.float32))
+    cloud.columns["intensity"] = np.array([3.0, np.nan, 5.0], np.float32)
+    pcgraph.write_cloud(tmp_path / "a.pcd", cloud)
+    (record,) = records(CliRunner().invoke(app, ["info", "--json", str(tmp_path / "a.pcd")]))
+    assert (record["shape"], record["finite"], record["high"]) == ([3], 2, [1, 2, 3])
+    assert record["columns"] == {"intensity": {"type": "float32", "low": 3.0, "high": 5.0}}
+    done = CliRunner().invoke(app, ["info", str(tmp_path / "none.pcd"), str(scene)])
+    assert done.exit_code == 1
+    assert "No such file" in done.stderr
+    assert "spacing" in done.stdout
 
 
 def test_number_of_objects_and_one_file(scene, tmp_path):
     done = run(scene, "--out", tmp_path / "a.ply", "--objects", 7, "--no-color", *VIEW)
     assert done.exit_code == 0, done.output
-    assert len(np.unique(pcgraph.read_cloud(tmp_path / "a.ply").labels)) == 7
+    assert len(np.unique(pcgraph.read_cloud(tmp_path / "a.ply").columns["object"])) == 7
+
+
+def test_an_output_that_exists_is_replaced_only_if_told(scene, tmp_path):
+    """And the input never."""
+    out = tmp_path / "a.ply"
+    out.write_bytes(b"a thesis")
+    assert_refused(run(scene, "--out", out), "a.ply exists: add --overwrite", tmp_path, ["a.ply", scene.name])
+    assert out.read_bytes() == b"a thesis"
+    done = run(scene, "--out", out, "--overwrite", *VIEW)
+    assert done.exit_code == 0, done.output
+    assert "object" in pcgraph.read_cloud(out).columns
+    before, link = scene.read_bytes(), tmp_path / "scene.segments.ply"
+    link.symlink_to(scene)
+    for place in (scene, tmp_path):
+        done = run(scene, "--out", place, "--overwrite")
+        assert_refused(done, "is an input: choose another --out", tmp_path, ["a.ply", scene.name, link.name])
+    assert scene.read_bytes() == before
 
 
 def test_colours_that_are_not_used_are_kept(tmp_path):
@@ -69,7 +163,7 @@ def test_colours_that_are_not_used_are_kept(tmp_path):
     assert done.exit_code == 0, done.output
     read = pcgraph.read_cloud(tmp_path / "b.ply")
     assert np.array_equal(read.colors, shades)
-    assert np.array_equal(read.labels, pcgraph.segment(points, viewpoint=(0.8, -1, 3)).labels)
+    assert np.array_equal(read.columns["object"], pcgraph.segment(points, viewpoint=(0.8, -1, 3)).labels)
 
 
 def test_compile_says_how_long_it_took():
@@ -85,8 +179,7 @@ def test_few_points_work(points, tmp_path):
     path.write_bytes(ply(points))
     done = run(path, "--out", tmp_path / "few.npz")
     assert done.exit_code == 0, done.output
-    with np.load(tmp_path / "few.npz") as arrays:
-        assert (arrays["labels"] >= 0).all()
+    assert (pcgraph.load_segmentation(tmp_path / "few.npz").labels >= 0).all()
 
 
 def assert_refused(done, message, folder, files):
@@ -106,7 +199,7 @@ CONTENTS = {
     "short.ply": (ply(np.ones((5, 3)))[:-1], "promises 5 vertices"),
     "text.ply": (b"hello", "PLY header"),
     "text.pcd": (b"hello", "PCD header"),
-    "cloud.las": (b"LASF", "expected a file ending in .pcd or .ply"),
+    "cloud.doc": (b"word", "expected a file ending in .pcd, .ply, "),
 }
 
 
@@ -135,10 +228,12 @@ def test_bad_options(scene, tmp_path):
         (("--linkage", ""), "got ''"),
         (("--linkage", tmp_path / "none.json"), "cannot read"),
         (("--method", "supervoxels"), "one of surface-growth, vccs, or FILE.py:NAME, got 'supervoxels'"),
-        (("--out", "-"), "nothing is written to a pipe, got --out -"),
-        (("--out", tmp_path / "a.txt"), ".ply or .npz"),
+        (("--out", "-"), "expected one cloud, --to and neither --json nor --boxes"),
+        (("--levels", "3,x"), "expected --levels as whole numbers with commas, such as 10,50,200, got '3,x'"),
+        (("--levels", "0"), "got '0'"),
+        (("--out", tmp_path / "a.doc"), "got 'a.doc': choose another name"),
         (("--out", tmp_path / "no" / "a.ply"), "no folder"),
-        (("--out", scene), "input itself"),
+        (("--out", scene), "is an input: choose another --out"),
         (("--out", scene / "below"), "cannot create the folder"),
     ):
         base = () if "--out" in options else ("--out", tmp_path / "out.npz")
@@ -178,20 +273,6 @@ def test_a_link_to_itself_is_one_sentence(scene, tmp_path):
     assert_refused(run(scene, "--out", loop / "a.ply"), "there is no folder", tmp_path, names)
 
 
-def test_an_older_output_that_cannot_be_read_is_one_sentence(scene, tmp_path, monkeypatch):
-    place = tmp_path / "out.npz"
-    place.write_bytes(b"older")
-
-    def refuse(path):
-        raise PermissionError(errno.EACCES, "Permission denied", str(path))
-
-    monkeypatch.setattr("pcgraph.io.segmentation_files.is_segmentation", refuse)
-    assert_refused(
-        run(scene, "--out", place), f"cannot use {place}: Permission denied", tmp_path, [scene.name, place.name]
-    )
-    assert place.read_bytes() == b"older"
-
-
 def test_a_working_directory_that_is_gone_is_one_sentence(scene, tmp_path):
     code = """if True:
         import os, sys
@@ -215,7 +296,7 @@ def test_names_give_no_orders_to_a_terminal(scene, tmp_path, order):
     done = run(hostile, "--out", tmp_path / "out", *VIEW)
     assert done.exit_code == 0, done.output
     places = [line.split(maxsplit=1)[1] for line in done.stdout.splitlines() if line.startswith("written")]
-    assert places == [f"{tmp_path}/out/red{code}evil.segments{suffix}" for suffix in (".ply", ".npz")]
+    assert places == [f"{tmp_path}/out/red{code}evil{end}" for end in (".segments.ply", ".segmentation.npz")]
     missing = run(tmp_path / f"{order}no.ply")
     assert (missing.exit_code, missing.stdout) == (1, "")
     assert missing.stderr.count("\n") == 1
@@ -267,9 +348,8 @@ def test_linkage_and_cut(linkage, scene, tmp_path):
     done = run(scene, "--out", tmp_path / "a.npz", *options, *VIEW)
     assert done.exit_code == 0, done.output
     result = pcgraph.segment(scene, viewpoint=(0.8, -1, 3), linkage=chosen)
-    with np.load(tmp_path / "a.npz") as arrays:
-        assert np.array_equal(arrays["tree_altitudes"], result.tree.altitudes)
-        assert np.array_equal(arrays["labels"], result.cut(altitude=altitude, min_size=40))
+    saved = pcgraph.load_segmentation(tmp_path / "a.npz")
+    assert np.array_equal(saved.labels, result.cut(altitude=altitude, min_size=40))
 
 
 OWN = """
@@ -299,13 +379,14 @@ class Needs(Angles):
 def test_a_linkage_of_a_file_of_ones_own(scene, tmp_path):
     own, cut = tmp_path / "own.py", {}
     own.write_text(OWN)
-    for name in ("Angles", "squared"):
-        done = run(scene, "--out", tmp_path / f"{name}.npz", "--linkage", f"{own}:{name}", *VIEW)
+    for name, altitude in (("Angles", 0.5), ("squared", 0.25)):
+        out = tmp_path / f"{name}.pcd"
+        done = run(scene, "--out", out, "--linkage", f"{own}:{name}", "--altitude", altitude, *VIEW)
         assert done.exit_code == 0, done.output
-        with np.load(tmp_path / f"{name}.npz") as arrays:
-            cut[name] = arrays["tree_altitudes"]
-        (tmp_path / f"{name}.npz").unlink()
-    assert cut["squared"] == pytest.approx(cut["Angles"] ** 2)
+        cut[name] = pcgraph.read_cloud(out).columns["object"]
+        out.unlink()
+    assert len(np.unique(cut["squared"])) > 1
+    assert np.array_equal(cut["squared"], cut["Angles"])
     (tmp_path / "fails.py").write_text("1 / 0")
     files = ["fails.py", "own.py", scene.name]
     for name, message in (
@@ -345,15 +426,12 @@ def test_features_by_name_and_columns_from_end_to_end(tmp_path):
     assert done.exit_code == 0, done.output
     expected = pcgraph.segment(points, viewpoint=(0.8, -1, 3), features=np.stack([*columns.values()], axis=1))
     read = pcgraph.read_cloud(tmp_path / "a.segments.ply")
-    assert np.array_equal(read.columns.pop("supervoxels"), expected.supervoxels)
-    with np.load(tmp_path / "a.segments.npz") as arrays:
-        assert arrays["node_features"].shape == (expected.graph.n_nodes, 2)
-        for name, column in columns.items():
-            for written in (read.columns[name], arrays[f"column_{name}"]):
-                assert written.dtype == column.dtype
-                assert np.array_equal(written, column)
+    assert np.array_equal(read.columns["supervoxel"], expected.supervoxels)
+    for name, column in columns.items():
+        assert read.columns[name].dtype == column.dtype
+        assert np.array_equal(read.columns[name], column)
     (tmp_path / "a.segments.ply").unlink()
-    (tmp_path / "a.segments.npz").unlink()
+    (tmp_path / "a.segmentation.npz").unlink()
     done = run(tmp_path / "a.ply", "--out", tmp_path / "b.ply", "--features", "rings")
     assert_refused(done, "got 'rings'; there are: Intensity, time", tmp_path, ["a.ply"])
 
@@ -382,4 +460,4 @@ def test_a_full_disk_under_what_is_printed_is_one_sentence(arguments, scene):
     assert done.stderr == "pcgraph: cannot print: no space left on the device.\n"
     assert done.returncode == 1
     written = sorted(path.name for path in scene.parent.iterdir() if path != scene)
-    assert written == (["scene.segments.npz", "scene.segments.ply"] if arguments[-1] == "scene.ply" else [])
+    assert written == (["scene.segmentation.npz", "scene.segments.ply"] if arguments[-1] == "scene.ply" else [])

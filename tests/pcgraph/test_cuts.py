@@ -188,8 +188,8 @@ def test_levels_from_leaf_to_scene(tree):
 def test_edge_saliency_of_five_leaves(tree):
     pairs = np.array([[0, 1], [1, 0], [0, 2], [1, 2], [3, 4], [0, 3], [2, 4], [1, 1]], np.int32)
     assert tree.edge_saliency(pairs).tolist() == [1, 1, 4, 4, 2, 9, 9, 0]
-    for wrong in ([[0, 5]], [[-1, 0]], [0, 1]):
-        with pytest.raises(ValueError, match="leaves"):
+    for wrong in ([[0, 9]], [[-1, 0]], [0, 1]):
+        with pytest.raises(ValueError, match="nodes"):
             tree.edge_saliency(np.array(wrong, np.int32))
 
 

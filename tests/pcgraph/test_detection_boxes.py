@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from pcgraph.detection.boxes import (
     OrientedBox,
+    boxes_of_labels,
     inside_outline,
     outline,
     smallest_rectangle,
@@ -150,3 +151,20 @@ def test_the_tight_box_is_the_smallest_on_any_facet(seed):
     volumes = [standing_box(points, normal).volume for normal in hull.equations[:, :3]]
     large = np.argsort(-np.linalg.norm(np.cross(*np.diff(points[hull.simplices], axis=1).transpose(1, 0, 2)), axis=1))
     assert tight_box(points).volume == pytest.approx(np.array(volumes)[large[:64]].min(), rel=1e-9)
+
+
+def test_boxes_of_labels_are_those_of_their_points():
+    first, _ = surface_of_a_box([0.4, 0.25, 0.1])
+    second = first @ TURN + AWAY
+    points = np.concatenate((first, second, [[np.nan, 0.0, 0.0], [90.0, 90.0, 90.0]]))
+    labels = np.repeat([5, 2, 5, -1], [len(first), len(second), 1, 1])
+    mixed = np.random.default_rng(0).permutation(len(points))
+    boxes = boxes_of_labels(points[mixed], labels[mixed])
+    assert list(boxes) == [2, 5]
+    assert boxes[5].size == pytest.approx(tight_box(first).size)
+    assert boxes[2].center == pytest.approx(tight_box(second).center)
+    upright = boxes_of_labels(points[mixed], labels[mixed], up=UP)
+    assert upright[2].center == pytest.approx(standing_box(second, UP).center)
+    assert boxes_of_labels(points, np.full(len(points), -1)) == {}
+    with pytest.raises(ValueError, match="one whole number per point"):
+        boxes_of_labels(points, labels[1:])

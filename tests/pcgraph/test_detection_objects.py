@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from scenes.surfaces import SPACING, patch, sphere
@@ -17,6 +19,12 @@ def test_objects_on_the_ground_stand_in_their_boxes(boxes):
     points, truth, result = boxes
     found = objects_on(result, points=points)
     assert len(found) == 2
+    read = json.loads(json.dumps([thing.to_dict() for thing in found], allow_nan=False))
+    assert [thing["count"] for thing in read] == [thing.count for thing in found]
+    assert read[0]["box"]["size"][2] == read[0]["height"] == found[0].height
+    assert read[0]["supervoxels"] == found[0].supervoxels.tolist()
+    assert (read[0]["shape"]["kind"], read[0]["shape"]["radius"]) == ("box", None)
+    assert read[0]["shape"]["box"]["center"] == found[0].shape.box.center.tolist()
     labels = object_labels(result, found)
     for thing, size, x, y in zip(found, (0.3, 0.25), (0.3, 1.0), (0.4, 0.5), strict=True):
         # A supervoxel at its foot may hold some ground, up to a voxel (0.035) wide.
@@ -107,7 +115,7 @@ def test_what_is_no_segmentation_is_refused_in_a_sentence(boxes, kind, tmp_path)
     calls = [lambda: find_planes(given), lambda: objects_on(given), lambda: object_labels(given, [])]
     calls += [lambda: objects_on(given, find_planes(result), points=points)]
     calls += [lambda: pcgraph.write_segmentation(tmp_path / "a.ply", points, given)]
-    calls += [lambda: pcgraph.write_segmentation(tmp_path / "a.npz", points, given)]
+    calls += [lambda: pcgraph.labelled_cloud(points, given)]
     for call in calls:
         with pytest.raises(ValueError, match=rf"expected a Segmentation, .* got {type(given).__name__}$"):
             call()

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+
 import numpy as np
 import pytest
 from scenes.images import at_depths
@@ -45,6 +48,15 @@ def test_planes_hold_their_points_and_nothing_is_lost(boxes):
         assert np.sqrt((distances[labels == i, i] ** 2).mean()) == pytest.approx(planes.residuals[i], abs=1e-9)
         assert np.array_equal(planes.supervoxels(i), np.unique(result.supervoxels[labels == i]))
         assert points[labels == i].mean(axis=0) == pytest.approx(planes.centroids[i])
+
+
+def test_json_takes_planes(boxes):
+    planes = find_planes(boxes[2])
+    read = json.loads(json.dumps(planes.to_dict(), allow_nan=False))
+    assert list(read) == [field.name for field in dataclasses.fields(planes)]
+    assert read["roles"] == planes.roles.tolist()
+    assert np.array_equal(read["corners"], planes.corners)
+    assert [np.shape(outline) for outline in read["outlines"]] == [outline.shape for outline in planes.outlines]
 
 
 def test_rigid_motion_moves_the_answer_along(boxes):

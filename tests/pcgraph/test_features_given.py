@@ -238,7 +238,7 @@ BAD = {
     "no columns": (pcgraph.Cloud(SQUARE), "x", "got 'x'; there are: none"),
     "short column": (CLOUD, ["ring", "short"], r"the column 'short' in the points' shape \(6561,\), got \(5,\)"),
     "column of text": (CLOUD, "text", "the column 'text' of a floating-point or integer dtype"),
-    "names for an array": (SQUARE, "ring", "features as numbers beside an array of points"),
+    "names for an array": (SQUARE, "ring", "got 'ring'; there are: none"),
     "few": (SQUARE, INTENSITY[:-1], r"features of the points' leading shape, \(6561,\) or \(6561,\) \+ \(d,\), got"),
     "too deep": (SQUARE, INTENSITY[:, None, None], "leading shape"),
     "none": (SQUARE, np.empty((n, 0)), "leading shape"),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import fields, replace
 
 import numpy as np
@@ -43,6 +44,15 @@ def cylinder(rng, half_angle, length=4.0):
 
 def moments(points, normals):
     return primitive_moments(points, normals, np.zeros(len(points), np.int32), 1)
+
+
+def test_json_takes_primitives_and_a_flat_group_has_no_radius():
+    flat = np.random.default_rng(0).random((50, 3)) * [1.0, 1.0, 0.0]
+    fit = fit_primitives(moments(flat, np.tile([0.0, 0.0, 1.0], (50, 1))))
+    assert not np.isfinite(fit.sphere_radius[0])
+    read = json.loads(json.dumps(fit.to_dict(), allow_nan=False))
+    assert (read["best"], read["sphere_radius"], read["sphere_center"]) == (["plane"], [None], [[None, None, None]])
+    assert read["plane_normal"] == [[0.0, 0.0, 1.0]]
 
 
 @pytest.mark.parametrize("place", PLACES)

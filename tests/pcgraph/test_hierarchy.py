@@ -98,14 +98,15 @@ def test_sweeps_follow_the_paths_to_the_root(seed: int, arity: int, trailing: tu
 
 @given(SEEDS, st.integers(2, 5))
 @settings(max_examples=50, deadline=None)
-def test_where_leaves_meet(seed: int, arity: int):
+def test_where_nodes_meet(seed: int, arity: int):
     parents = random_parents(seed, arity)
-    first, second = np.divmod(np.arange(num_leaves(parents) ** 2), num_leaves(parents))
-    paths = [path(parents, leaf) for leaf in range(num_leaves(parents))]
-    expected = [min(set(paths[i]) & set(paths[j])) for i, j in zip(first, second, strict=True)]
-    assert lowest_common_ancestors(parents, first, second).tolist() == expected
+    k = len(parents)
+    first, second = np.divmod(np.arange(k**2), k)
+    paths = [set(path(parents, node)) for node in range(k)]
+    expected = np.array([min(paths[i] & paths[j]) for i, j in zip(first, second, strict=True)])
+    assert np.array_equal(lowest_common_ancestors(parents, first, second), expected)
     index = ancestor_index(parents)
-    assert [lowest_common_ancestor(index, i, j) for i, j in zip(first, second, strict=True)] == expected
+    assert [lowest_common_ancestor(index, i, j) for i, j in zip(first, second, strict=True)] == expected.tolist()
 
 
 def test_depth_does_not_matter():

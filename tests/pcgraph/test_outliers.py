@@ -11,7 +11,7 @@ from tiers import to_validate
 
 import pcgraph
 from pcgraph.voxels.grid import grid_without, voxel_grid, with_means
-from pcgraph.voxels.outliers import OUTLIER, detached_voxels, fill_the_volume, outlier_voxels
+from pcgraph.voxels.outliers import detached_voxels, fill_the_volume, outlier_voxels
 from pcgraph.voxels.warp import Warp
 
 
@@ -50,7 +50,7 @@ def test_noise_through_the_volume_is_no_object(clean, fraction):
     covering = pcgraph.metrics.segmentation_covering(result.labels[:n], truth)
     assert covering > pcgraph.metrics.segmentation_covering(before.labels, truth) - 0.02
     assert (result.supervoxels[outliers] == -1).all()
-    assert (result.cut(n=2)[outliers] == OUTLIER).all()
+    assert (result.cut(n=2)[outliers] == -1).all()
     assert np.isnan(result.on_points(np.zeros(result.tree.n_leaves))[outliers]).all()
     assert f"{outliers.sum()} outliers" in repr(result)
 
@@ -149,12 +149,12 @@ def test_files_keep_outliers(clean, tmp_path):
     far = np.array([[3.0, 3.0, 9.0]])
     cloud = pcgraph.Cloud(np.concatenate((points, far)))
     result = pcgraph.segment(cloud, viewpoint=viewpoint)
-    assert result.labels[-1] == OUTLIER
+    assert result.outliers[-1]
+    assert result.labels[-1] == -1
     pcgraph.write_segmentation(tmp_path / "a.ply", cloud, result)
     read = pcgraph.read_cloud(tmp_path / "a.ply")
     assert len(read.points) == len(points) + 1
-    assert read.labels is not None
-    assert read.labels[-1] == OUTLIER
+    assert read.columns["object"][-1] == -1
 
 
 def test_an_update_keeps_single_points_beside_what_was_seen(clean):

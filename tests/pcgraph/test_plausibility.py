@@ -58,8 +58,10 @@ def test_more_objects_than_there_can_be_are_noticed():
 
 
 def test_a_viewpoint_that_sees_nothing_is_noticed():
-    with pytest.warns(CloudWarning, match="expected a viewpoint that sees the cloud"):
-        pcgraph.segment(POINTS, viewpoint=(0.8, 0.6, -1e-3))  # just under the plane
+    for call in (pcgraph.segment, pcgraph.supervoxel_clustering):
+        with pytest.warns(CloudWarning, match="expected a viewpoint that sees the cloud") as warned:
+            call(POINTS, viewpoint=(0.8, 0.6, -1e-3))  # just under the plane
+        assert warned[0].filename == __file__  # the line of the caller
     pcgraph.segment(POINTS, viewpoint=VIEWPOINT)
 
 

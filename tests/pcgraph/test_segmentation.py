@@ -128,3 +128,18 @@ def test_segmentations_are_compared_by_identity(boxes):
 def test_a_segmentation_shows_what_it_holds(boxes):
     points, _, result = boxes
     assert repr(result).startswith(f"Segmentation({len(points)} points, {result.graph.n_nodes} supervoxels, ")
+
+
+def test_another_cut_gives_the_objects(boxes):
+    _, _, result = boxes
+    for options in ({"n": 5}, {"altitude": 0.1}, {"n": 4, "min_size": 200}):
+        cut = result.with_objects(**options)
+        assert np.array_equal(cut.labels, result.cut(**options))
+        assert np.array_equal(cut.labels, cut.on_points(cut.objects))
+        assert cut.next_object == cut.labels.max() + 1
+        pairs = np.stack((cut.parts, cut.labels), axis=-1).reshape(-1, 2)
+        assert len(np.unique(pairs, axis=0)) == len(np.unique(pairs[:, 0]))  # parts lie within objects
+    five = result.with_objects(n=5)
+    assert np.array_equal(result.cut(altitude=five.object_altitude), five.labels)
+    assert np.array_equal(result.with_objects(altitude=result.object_altitude).labels, result.labels)
+    assert np.isfinite(result.with_objects(n=1).object_altitude)

@@ -21,6 +21,26 @@ def test_every_method_covers_and_connects(method, name):
     assert_covered_and_connected(DEGENERATE[name], pcgraph.segment(DEGENERATE[name], method=method))
 
 
+def test_supervoxels_alone_are_those_of_a_segmentation(boxes):
+    points, _, result = boxes
+    holes = points.copy()
+    holes[::7] = np.nan
+    for cloud in (holes, holes[:20_000].reshape(2, -1, 3)):
+        found = pcgraph.supervoxel_clustering(cloud, viewpoint=result.viewpoint, seed_size=0.1)
+        whole = pcgraph.segment(cloud, viewpoint=result.viewpoint, seed_size=0.1)
+        assert found.labels.dtype == np.int32
+        assert found.labels.shape == cloud.shape[:-1]
+        assert np.array_equal(found.labels, whole.supervoxels)
+        assert np.array_equal(found.labels == -1, np.isnan(cloud[..., 0]) | found.outliers)
+        assert np.array_equal(found.graph.edges, whole.graph.edges)
+        assert np.array_equal(found.moments.centroids, whole.leaves.centroids)
+        assert repr(found).startswith("Supervoxels(")
+    with pytest.raises(ValueError, match="expected a method such as"):
+        pcgraph.supervoxel_clustering(points, method="slic")
+    with pytest.raises(ValueError, match="got both"):
+        pcgraph.supervoxel_clustering(points, seed_size=0.1, n_supervoxels=10)
+
+
 @pytest.mark.parametrize("method", [pcgraph.SurfaceGrowth(), pcgraph.Vccs()], ids=["surface", "vccs"])
 @pytest.mark.parametrize("n", [20, 100, 700, 4000])
 def test_there_are_about_as_many_supervoxels_as_asked_for(method, n):

@@ -47,16 +47,16 @@ def test_surfaces_of_other_clouds_are_refused(tree, boxes):
 @pytest.mark.parametrize(
     ("pairs", "message"),
     [
-        ([[0, 5]], r"leaves 0\.\.4, got 0\.\.5"),
-        ([[-1, 0]], r"leaves 0\.\.4, got -1\.\.0"),
-        ([[0, 2**40]], r"leaves 0\.\.4"),
+        ([[0, 9]], r"nodes 0\.\.8, got 0\.\.9"),
+        ([[-1, 0]], r"nodes 0\.\.8, got -1\.\.0"),
+        ([[0, 2**40]], r"nodes 0\.\.8"),
         ([[0.0, 1.7]], "whole numbers, got float64"),
         ([["a", "b"]], "whole numbers"),
         ([0, 1], r"\(m, 2\)"),
         ([[0, 1, 2]], r"\(m, 2\)"),
     ],
 )
-def test_pairs_are_leaves(tree, pairs, message):
+def test_pairs_are_nodes(tree, pairs, message):
     with pytest.raises(ValueError, match=message):
         tree.edge_saliency(pairs)
     with pytest.raises(ValueError, match=message):

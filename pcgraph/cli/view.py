@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``pcgraph view``."""
+
+from __future__ import annotations
+
+import webbrowser
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pcgraph.cli.clouds import check_outputs, read_saved, refusals, segmented
+from pcgraph.errors import CloudReadError, CloudWriteError, one_line
+
+if TYPE_CHECKING:
+    from pcgraph.viewer.cloud_data import Shown
+
+
+def view_command(
+    source: Annotated[
+        Path, typer.Argument(help="A point cloud, a segmentation saved with its cloud (.npz), or a folder of these.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="The page's file. Default: NAME.html in the current folder.")] = None,
+    segment: Annotated[bool, typer.Option("--segment", help="Segment clouds that have no segmentation first.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a page that exists.")] = False,
+    open_page: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
+) -> None:
+    """Write one HTML page that shows a cloud in a browser, offline.
+
+    A folder becomes one page with a chooser over its files.
+
+    Example: pcgraph view scan.segmentation.npz --open
+    """
+    from pcgraph.plumbing.plain_files import write_file
+    from pcgraph.viewer.page import views_page
+
+    with refusals():
+        target = Path(f"{source.absolute().stem}.html") if out is None else out
+        check_outputs([target], [str(source)], overwrite)
+        shown = [_shown(path, segment) for path in _files(source)]
+        write_file(target, views_page(shown, source.absolute().name).encode("utf-8"), CloudWriteError)
+    typer.echo(f"{'clouds':<12} {len(shown)}")
+    typer.echo(f"{'written':<12} {one_line(target)}, {target.stat().st_size / 1e6:.1f} MB")
+    if open_page:
+        webbrowser.open(target.resolve().as_uri())
+
+
+def _files(source: Path) -> list[Path]:
+    """The file itself, or the clouds of a folder in the order of their names."""
+    from pcgraph.io import FORMATS
+
+    if not source.is_dir():
+        return [source]
+    ends = tuple(suffix for one in FORMATS for suffix in one.suffixes)
+    found = sorted(path for path in source.iterdir() if path.is_file() and path.name.lower().endswith(ends))
+    if not found:
+        raise CloudReadError(f"the folder {source} has no point cloud: expected files ending in {', '.join(ends)}")
+    return found
+
+
+def _shown(path: Path, segment: bool) -> Shown:
+    from pcgraph.io import read_cloud
+    from pcgraph.viewer.cloud_data import Shown
+
+    if _is_saved_segmentation(path):
+        return Shown.of(path.name, *read_saved(path))
+    cloud = read_cloud(path)
+    return Shown.of(path.name, cloud, segmented(str(path), cloud) if segment else None)
+
+
+def _is_saved_segmentation(path: Path) -> bool:
+    """Whether a file is an archive that holds a tree."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return "tree/parents.npy" in archive.namelist()

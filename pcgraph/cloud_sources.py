@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What counts as a point cloud: files, arrays, messages of robots, and the clouds of other libraries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.cloud import COLOR_NAMES, Cloud, as_numbers, cloud_from_array, cloud_from_columns, native
+from pcgraph.errors import CloudReadError
+
+_MESSAGE_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Types of numbers in a PointField of sensor_msgs, by its `datatype`."""
+
+
+def as_cloud(source: Any) -> Cloud:
+    """Cloud of whatever holds points.
+
+    Parameters
+    ----------
+    source : one of
+
+        - a `Cloud`, which is returned as it is
+        - the name of a file, for `read_cloud`
+        - an array (n, 3) or (h, w, 3) of numbers, which keep their type; or with more columns, (n, 4) and so on, which
+          become the cloud's columns ``column_3``, ``column_4`` and so on
+        - an array with fields, as NumPy calls them, among them ``x``, ``y`` and ``z``, as
+          ``sensor_msgs_py.point_cloud2.read_points`` returns it. Colours, normals and labels are found by their names
+        - a message like ``sensor_msgs/PointCloud2``, with ``fields``, ``data``, ``point_step`` and so on
+        - an Open3D cloud, legacy or tensor. Attributes of a tensor cloud become columns
+        - a trimesh cloud, or the vertices of a trimesh mesh
+
+        Colours in floats of at most 1 become 8 bits.
+
+    Raises
+    ------
+    CloudReadError
+        `source` names a file that cannot be read.
+    ValueError
+        It is none of these, or its arrays do not fit together.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rows = np.array([(0, 0, 1, 7), (0, 1, 1, 9)], [("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "u2")])
+    >>> as_cloud(rows).points.shape, as_cloud(rows).columns["ring"].tolist()
+    ((2, 3), [7, 9])
+    """
+    if isinstance(source, Cloud):
+        return source
+    if isinstance(source, (str, PathLike)):
+        from pcgraph.io import read_cloud
+
+        return read_cloud(source)
+    if isinstance(source, np.ndarray) and source.dtype.names is not None:
+        return cloud_from_array(source)
+    for attributes, convert in _KINDS.items():
+        if all(hasattr(source, name) for name in attributes):
+            return convert(source)
+    if not isinstance(source, (np.ndarray, Sequence)) and np.asarray(source).dtype == object:
+        kinds = "an array (n, 3) or (h, w, 3), a pcgraph.Cloud or what pcgraph.as_cloud takes"
+        hint = "; pass its .points (and .colors)" if hasattr(source, "points") else ""
+        if hasattr(source, "to_point_cloud"):
+            hint = "; pass its to_point_cloud().points"
+        raise ValueError(f"expected points as {kinds}, got {type(source).__name__}{hint}")
+    return cloud_from_array(as_numbers("points", source))
+
+
+def _of_message(message: Any) -> Cloud:
+    """Cloud of a PointCloud2: its points lie `point_step` bytes apart in rows of `row_step` bytes."""
+    names = [one.name for one in message.fields]
+    unknown = [one for one in message.fields if one.datatype not in _MESSAGE_TYPES]
+    if unknown or len(set(names)) < len(names):
+        raise ValueError(f"expected fields of distinct names and datatypes 1 to 8, got {', '.join(names)[:200]}")
+    order = ">" if message.is_bigendian else "<"
+    height, width, step = int(message.height), int(message.width), int(message.point_step)
+    try:
+        record = np.dtype(
+            {
+                "names": names,
+                "formats": [(order + _MESSAGE_TYPES[one.datatype], max(1, int(one.count))) for one in message.fields],
+                "offsets": [int(one.offset) for one in message.fields],
+                "itemsize": step,
+            }
+        )
+    except ValueError as error:
+        raise ValueError(f"expected fields within a point_step of {step} bytes: {error}") from None
+    data = np.frombuffer(bytes(message.data), np.uint8)  # it may be bytes, an array of them, or a list
+    row_step = int(message.row_step) or width * step
+    if row_step < width * step or len(data) < height * row_step:
+        raise ValueError(
+            f"expected {height} rows of {width} points of {step} bytes, got {len(data)} bytes in rows of {row_step}"
+        )
+    rows = np.ascontiguousarray(data[: height * row_step].reshape(height, row_step)[:, : width * step])
+    points = rows.reshape(-1).view(record).reshape(height, width)
+    columns = {name: points[name].reshape(height * width, -1) for name in names}
+    columns = {name: values[:, 0] if values.shape[1] == 1 else values for name, values in columns.items()}
+    return _from_columns(columns, (height, width) if height > 1 else (width,))
+
+
+def _of_open3d(cloud: Any) -> Cloud:
+    """Cloud of an open3d.geometry.PointCloud, whose empty arrays mean that it has none."""
+    points, colors, normals = (np.asarray(values) for values in (cloud.points, cloud.colors, cloud.normals))
+    columns = _columns_of(points, colors if len(colors) else None, normals if len(normals) else None)
+    return _from_columns(columns, points.shape[:1])
+
+
+def _of_open3d_tensor(cloud: Any) -> Cloud:
+    """Cloud of an open3d.t.geometry.PointCloud on any device."""
+    arrays = {name: values.cpu().numpy() for name, values in cloud.point.items()}
+    if "positions" not in arrays:
+        raise ValueError("expected an Open3D cloud with positions, got an empty one")
+    points = arrays.pop("positions")
+    columns = _columns_of(points, arrays.pop("colors", None), arrays.pop("normals", None))
+    further = {name: values[:, 0] if values.shape[1:] == (1,) else values for name, values in arrays.items()}
+    return _from_columns(columns | further, points.shape[:1])
+
+
+def _of_trimesh(mesh: Any) -> Cloud:
+    """Cloud of a trimesh.PointCloud, or of the vertices of a trimesh.Trimesh with their normals."""
+    points = np.asarray(mesh.vertices)
+    colors = np.asarray(mesh.visual.vertex_colors) if mesh.visual.kind == "vertex" else np.empty(0)
+    columns = _columns_of(
+        points,
+        colors[:, :3] if len(colors) else None,
+        np.asarray(mesh.vertex_normals) if hasattr(mesh, "vertex_normals") else None,  # clouds have none
+    )
+    return _from_columns(columns | getattr(mesh, "vertex_attributes", {}), points.shape[:1])
+
+
+def _columns_of(
+    points: NDArray[np.generic], colors: NDArray[np.generic] | None, normals: NDArray[np.generic] | None
+) -> dict[str, NDArray[np.generic]]:
+    """Points, colours and normals, (n, 3) each, as columns."""
+    columns: dict[str, NDArray[np.generic]] = {}
+    for names, rows in (("xyz", points), (COLOR_NAMES, colors), (("nx", "ny", "nz"), normals)):
+        if rows is not None:
+            columns |= dict(zip(names, rows.T, strict=True))
+    return columns
+
+
+def _from_columns(columns: dict[str, NDArray[np.generic]], shape: tuple[int, ...]) -> Cloud:
+    try:
+        return cloud_from_columns({name: native(values) for name, values in columns.items()}, shape)
+    except CloudReadError as error:
+        raise ValueError(str(error)) from None
+
+
+_KINDS: dict[tuple[str, ...], Callable[[Any], Cloud]] = {
+    ("fields", "data", "point_step", "row_step"): _of_message,
+    ("points", "colors", "normals", "has_points"): _of_open3d,
+    ("point", "is_cpu", "is_cuda"): _of_open3d_tensor,
+    ("vertices", "visual"): _of_trimesh,
+}
+"""Converters by the attributes that tell the kind of an object, so that no library need be imported to know it."""

@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""NumPy's files: .npz archives of a cloud's arrays, and single arrays, .npy.
+
+An archive has the keys ``points`` (n, 3) or (h, w, 3), and if the cloud has them ``colors``, ``normals``, ``labels``,
+``viewpoint``. Every other array of the points' leading shape is a column of its own name. The cloud of a saved
+segmentation lies under ``cloud/``: ``cloud/points`` and so on, its columns as ``cloud/columns/<name>``. Nothing is
+unpickled.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import math
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import IO, NamedTuple
+
+import numpy as np
+from numpy.lib import format as npy_format
+from numpy.typing import NDArray
+
+from pcgraph.cloud import (
+    Cloud,
+    are_labels,
+    cloud_from_array,
+    cloud_from_columns,
+    color_bytes,
+    columns_of_cloud,
+    float_points,
+    native,
+)
+from pcgraph.errors import CloudReadError
+from pcgraph.io.format import MAX_HEADER_BYTES, Format
+
+MAX_BYTES = 1 << 32
+"""Bytes of all arrays that are read of one file, decompressed: 4 GiB are 100 million points of 40 bytes, for which
+`pcgraph.segment` would need some 18 GB, as it needs 3.7 GB for 20 million. An archive of 4 MB can hold as much."""
+_MAX_MEMBERS = 4096
+"""Arrays of an archive, at most: far more than clouds have columns. Chosen by eye; not varied."""
+_MAX_RATIO = 1040
+"""Bytes of data per byte of a deflated file, at most: 1032 by the law of the format (Deutsch 1996), and some for its
+frame. A member that promises more lies."""
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_ENCRYPTED = 0x1
+_OWN = ("points", "colors", "normals", "labels", "viewpoint")
+_CLOUD = "cloud/"
+_COLUMNS = "columns/"
+_BROKEN = (
+    *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, NotImplementedError, RuntimeError),
+    *(ValueError, OverflowError, TypeError, SyntaxError, MemoryError, KeyError),
+)
+"""What zipfile, ast and NumPy raise for damaged files."""
+
+
+# ---- Reading -------------------------------------------------------------------------------------------------------
+
+
+def read_npz(content: bytes) -> Cloud:
+    """Cloud of an .npz archive, given the file's bytes.
+
+    Colours are found as `cloud_from_columns` finds them, so floats of at most 1 become uint8. Whole labels that 32 bits
+    do not hold stay a column. Arrays of another leading shape than the points are not read.
+
+    Raises
+    ------
+    CloudReadError
+        The archive is damaged, has no points, or is larger than `MAX_BYTES`.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            return _cloud(_arrays(_members(archive), archive))
+    except _BROKEN as error:
+        raise CloudReadError(f"the .npz archive is damaged: {str(error)[:200] or type(error).__name__}") from None
+
+
+def read_npy(content: bytes) -> Cloud:
+    """Cloud of an .npy array, given the file's bytes; `pcgraph.cloud.cloud_from_array` says which arrays are clouds.
+
+    Raises
+    ------
+    CloudReadError
+        The file is damaged, or the array is no cloud.
+    """
+    try:
+        stream = io.BytesIO(content)
+        header = _header(stream)
+        _check_size(header, len(content) - stream.tell(), "the array")
+        cloud = cloud_from_array(_numbers(stream, header))
+    except _BROKEN as error:
+        raise CloudReadError(f"the .npy array cannot be read: {str(error)[:200] or type(error).__name__}") from None
+    return replace(cloud, points=float_points(cloud.points))
+
+
+def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """Entries of the cloud by their keys."""
+    entries = archive.infolist()
+    if len(entries) > _MAX_MEMBERS:
+        raise CloudReadError(f"expected at most {_MAX_MEMBERS} arrays, got {len(entries)}")
+    keys = {entry.filename.removesuffix(".npy"): entry for entry in entries if entry.filename.endswith(".npy")}
+    if f"{_CLOUD}points" in keys:
+        keys = {key.removeprefix(_CLOUD): entry for key, entry in keys.items() if key.startswith(_CLOUD)}
+    if "points" not in keys and not {"x", "y", "z"} <= set(keys):
+        found = ", ".join(keys)[:150] or "none"
+        raise CloudReadError(f"expected an array 'points', or 'x', 'y' and 'z', found: {found}")
+    return keys
+
+
+def _arrays(members: Mapping[str, zipfile.ZipInfo], archive: zipfile.ZipFile) -> dict[str, NDArray[np.generic]]:
+    """The arrays of numbers that are points, belong to one point each, or are the viewpoint."""
+    arrays: dict[str, NDArray[np.generic]] = {}
+    shape: tuple[int, ...] | None = None
+    left = MAX_BYTES
+    for key in sorted(members, key=lambda key: key not in ("points", "x")):  # these tell the leading shape
+        entry, name = members[key], f"the array {ascii(key)[:80]}"
+        if entry.flag_bits & _ENCRYPTED or entry.compress_type not in _METHODS:
+            raise CloudReadError(f"expected {name} stored or deflated, as numpy.savez writes it")
+        with archive.open(entry) as stream:
+            header = _header(stream)
+            if shape is None:
+                shape = header.shape[:-1] if key == "points" else header.shape
+            is_per_point = header.shape[: len(shape)] == shape and len(header.shape) <= len(shape) + 1
+            if header.dtype.kind not in "fiub" or not (is_per_point or key in _OWN):
+                continue
+            _check_size(header, min(entry.file_size, _MAX_RATIO * entry.compress_size), name)
+            left -= header.n_bytes
+            if left < 0:
+                raise CloudReadError(f"expected arrays of at most {MAX_BYTES} bytes in all, decompressed")
+            arrays[key] = _numbers(stream, header)
+    return arrays
+
+
+def _cloud(arrays: dict[str, NDArray[np.generic]]) -> Cloud:
+    further = {key.removeprefix(_COLUMNS): values for key, values in arrays.items() if key not in _OWN}
+    if "points" not in arrays:
+        shape = arrays["x"].shape
+        columns = {name: values.reshape(-1, *values.shape[len(shape) :]) for name, values in further.items()}
+        return cloud_from_columns(columns, shape)
+    cloud = cloud_from_array(arrays["points"])
+    shape = cloud.points.shape
+    own: dict[str, NDArray[np.generic] | None] = {
+        "colors": arrays.get("colors"),
+        "normals": arrays.get("normals"),
+        "viewpoint": arrays.get("viewpoint"),
+    }
+    for name, values in own.items():
+        if values is not None and not values.size and shape[0]:
+            own[name] = None  # (0, 3), for none
+        elif values is not None and values.shape not in (shape, (3,) if name == "viewpoint" else shape):
+            raise CloudReadError(f"expected {name} of the points' shape {shape}, got {values.shape}")
+    labels = arrays.get("labels")
+    if labels is not None and not (labels.shape == shape[:-1] and are_labels(labels)):
+        further["labels"], labels = labels, None
+    colors, normals, viewpoint = own.values()
+    return Cloud(
+        float_points(cloud.points),
+        None if colors is None else color_bytes(colors),
+        None if normals is None else float_points(normals),
+        None if labels is None else labels.astype(np.int32, copy=False),
+        None if viewpoint is None else viewpoint.astype(np.float64, copy=False),
+        {**cloud.columns, **further},
+    )
+
+
+# ---- Arrays of a file ----------------------------------------------------------------------------------------------
+
+
+class _Header(NamedTuple):
+    """What the header of an .npy file tells of its array."""
+
+    shape: tuple[int, ...]
+    is_fortran: bool
+    dtype: np.dtype[np.generic]
+
+    @property
+    def n_bytes(self) -> int:
+        """Bytes of the array's numbers."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def _header(stream: IO[bytes]) -> _Header:
+    """Header at the beginning of an .npy file, versions 1 to 3; the numbers follow."""
+    magic = stream.read(8)
+    if magic[:6] != b"\x93NUMPY" or magic[6:7] not in (b"\x01", b"\x02", b"\x03"):
+        raise CloudReadError("expected an .npy array, found another beginning")
+    length = struct.Struct("<H" if magic[6] == 1 else "<I")
+    (size,) = length.unpack(stream.read(length.size))
+    if size > MAX_HEADER_BYTES:
+        raise CloudReadError(f"expected the header of an array in {MAX_HEADER_BYTES} bytes, got {size}")
+    told = ast.literal_eval(stream.read(size).decode("utf-8" if magic[6] == 3 else "latin-1").strip())
+    if not isinstance(told, dict) or set(told) != {"descr", "fortran_order", "shape"}:
+        raise CloudReadError("expected descr, fortran_order and shape in the header of an array")
+    shape, dtype = told["shape"], npy_format.descr_to_dtype(told["descr"])
+    if not isinstance(shape, tuple) or not all(type(length) is int and length >= 0 for length in shape):
+        raise CloudReadError(f"expected the shape of an array, got {ascii(shape)[:80]}")
+    if dtype.hasobject or not dtype.itemsize:
+        raise CloudReadError(f"expected an array of numbers, got {dtype}; files with objects are never unpickled")
+    return _Header(shape, told["fortran_order"] is True, dtype)
+
+
+def _check_size(header: _Header, available: int, name: str) -> None:
+    """Raise CloudReadError if an array promises more than its file holds, before memory is allocated for it."""
+    if header.n_bytes > available:
+        raise CloudReadError(f"the header of {name} promises {header.n_bytes} bytes, but only {available} can follow")
+
+
+def _numbers(stream: IO[bytes], header: _Header) -> NDArray[np.generic]:
+    content = stream.read(header.n_bytes)
+    if len(content) < header.n_bytes:
+        raise CloudReadError(f"an array is cut off: {len(content)} of {header.n_bytes} bytes are there")
+    flat = np.frombuffer(content, header.dtype).copy()  # so that it can be written to
+    return native(flat.reshape(header.shape, order="F" if header.is_fortran else "C"))
+
+
+# ---- Writing -------------------------------------------------------------------------------------------------------
+
+
+def encode_npz(cloud: Cloud) -> bytes:
+    """Bytes of an .npz archive of the cloud's arrays, not compressed.
+
+    A column has its own name as key, after ``columns/`` if that name is one of the cloud's own.
+    """
+    arrays: dict[str, NDArray[np.generic] | None] = {name: getattr(cloud, name) for name in _OWN}
+    for name, column in cloud.columns.items():
+        is_free = name not in _OWN and not name.startswith((_COLUMNS, _CLOUD))
+        arrays[name if is_free else f"{_COLUMNS}{name}"] = column
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
+        for name, values in arrays.items():
+            if values is not None:
+                with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                    npy_format.write_array(member, values, allow_pickle=False)
+    return stream.getvalue()
+
+
+def encode_npy(cloud: Cloud) -> bytes:
+    """Bytes of an .npy file: the points alone if the cloud has no more, else an array with a field for each column."""
+    columns = columns_of_cloud(cloud)
+    shape = cloud.points.shape[:-1]
+    table = np.empty(shape, [(name, column.dtype, column.shape[1:]) for name, column in columns.items()])
+    for name, column in columns.items():
+        table[name] = column.reshape(*shape, *column.shape[1:])
+    stream = io.BytesIO()
+    if len(columns) == 3:
+        npy_format.write_array(stream, cloud.points, allow_pickle=False)
+    else:
+        npy_format.write_array(stream, table, (3, 0), allow_pickle=False)  # names of fields in UTF-8
+    return stream.getvalue()
+
+
+NPZ = Format("npz", (".npz",), lambda file: read_npz(file.content), lambda cloud, _: encode_npz(cloud), organised=True)
+NPY = Format("npy", (".npy",), lambda file: read_npy(file.content), lambda cloud, _: encode_npy(cloud), organised=True)

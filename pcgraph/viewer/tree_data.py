@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A segmentation as the page holds it: the tree with colours and features of its nodes, the graph, and boxes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.detection.boxes import boxes_of_labels
+from pcgraph.features.nodes import scalar_columns
+from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.plumbing.short_repr import ShortRepr
+from pcgraph.segmentation import Segmentation
+from pcgraph.tree.tree import SegmentationTree
+from pcgraph.viewer.node_colors import distinct_colors, node_colors
+from pcgraph.viewer.packing import pack
+
+MAX_BOXES = 300
+"""Count of objects that get a box, those with most points; a box of 10^4 points takes some 10 ms."""
+CONVEX, CONCAVE, GAP = 0, 1, 2
+"""Kinds of edges."""
+MIN_CONCAVITY = math.radians(10.0)
+"""Angle of a valley, radians, below which its edge counts as convex: the tolerance of LCCP (Stein et al. 2014)."""
+LEFT_OUT = ("size", "color_covariance", "covariance", "feature_")
+"""Beginnings of features of nodes that the page does not list: the size is shown anyway, the others are long."""
+UNITS = {"centroid_x": "m", "centroid_y": "m", "centroid_z": "m", "residual": "m"}
+"""Units of features; others have none."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShownTree(ShortRepr):
+    """What the viewer needs of a segmentation, so that results of others can be shown, too.
+
+    Attributes
+    ----------
+    supervoxels : (n,) or (h, w) int
+        Leaf of the tree that each point belongs to; -1 for none.
+    tree : SegmentationTree
+    objects, parts : (n_leaves,) int
+        Object and part of each leaf.
+    linkage : str
+        What made the tree, in words.
+    graph : AdjacencyGraph, optional
+        Of the leaves; its edges can be shown.
+    """
+
+    supervoxels: NDArray[np.integer]
+    tree: SegmentationTree
+    objects: NDArray[np.integer]
+    parts: NDArray[np.integer]
+    linkage: str
+    graph: AdjacencyGraph | None = None
+
+    @classmethod
+    def of(cls, segmentation: Segmentation) -> ShownTree:
+        """The tree of a segmentation, with its own cuts into objects and parts."""
+        part_altitude = min(segmentation.linkage.default_part_altitude, segmentation.object_altitude)
+        parts = segmentation.tree.cut(altitude=part_altitude)
+        linkage = type(segmentation.linkage).__name__
+        return cls(
+            segmentation.supervoxels, segmentation.tree, segmentation.objects, parts, linkage, segmentation.graph
+        )
+
+
+def tree_data(shown: ShownTree, rows: NDArray[np.int64], points: NDArray[np.float64]) -> dict[str, Any]:
+    """Tree and graph as JSON takes them; arrays are text of `pack`.
+
+    Parameters
+    ----------
+    shown : ShownTree
+    rows : (n,) int
+        Flat indices of the points that are shown.
+    points : (n, 3) float64, metres
+        These points.
+
+    Returns
+    -------
+    leaf : uint16 or (wide) uint32 per point, 1 + its supervoxel, 0 for none
+    parents, altitudes, sizes, colors : one row per node
+    featureNames, featureUnits, features : float32, all of the first feature, then all of the second and so on
+    origin, centroids : float32, 3 per leaf, metres from the origin
+    objects, parts : per leaf, the object and the part it is in
+    objectCount, partCount : how many there are
+    edges, edgeKinds : pairs of leaves; convex 0, concave 1, gap 2
+    boxes : of objects, with their numbers of points
+
+    Raises
+    ------
+    ValueError
+        The tree has no moments.
+    """
+    tree, moments = shown.tree, shown.tree.moments
+    if moments is None:
+        raise ValueError("expected a tree with moments of its points, got one without: give it moments")
+    leaf = shown.supervoxels.reshape(-1)[rows]
+    wide = tree.n_leaves >= 65535
+    sizes = moments.counts
+    features = _features(tree)
+    centroids = moments.centroids[: tree.n_leaves]
+    origin = centroids.mean(axis=0)
+    edges, kinds = _edges(shown.graph)
+    return {
+        "leaves": tree.n_leaves,
+        "linkage": shown.linkage,
+        "wide": wide,
+        "leaf": pack((leaf + 1).astype(np.uint32 if wide else np.uint16)),
+        "parents": pack(tree.parents.astype(np.int32)),
+        "altitudes": pack(tree.altitudes.astype(np.float32)),
+        "sizes": pack(sizes.astype(np.uint32)),
+        "colors": pack(node_colors(tree.parents, sizes[: tree.n_leaves])),
+        "leafColors": pack(distinct_colors(tree.n_leaves)),
+        "featureNames": list(features),
+        "featureUnits": [UNITS.get(name, "") for name in features],
+        "features": pack(np.stack([column.astype(np.float32) for column in features.values()])),
+        "origin": origin.tolist(),
+        "centroids": pack((centroids - origin).astype(np.float32)),
+        "objects": pack(shown.objects.astype(np.int32)),
+        "parts": pack(shown.parts.astype(np.int32)),
+        "objectCount": len(np.unique(shown.objects)),
+        "partCount": len(np.unique(shown.parts)),
+        "edges": pack(edges.astype(np.int32)),
+        "edgeKinds": pack(kinds),
+        "boxes": _boxes(shown, leaf, points),
+    }
+
+
+def _features(tree: SegmentationTree) -> dict[str, NDArray[np.generic]]:
+    """Features of all nodes, one number each, by name."""
+    columns = scalar_columns(tree.features().columns())
+    return {name: column for name, column in columns.items() if not name.startswith(LEFT_OUT)}
+
+
+def _edges(graph: AdjacencyGraph | None) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
+    """Pairs of leaves, (m, 2), that touch or nearly touch, and the kind of each."""
+    if graph is None:
+        return np.empty((0, 2), np.int32), np.empty(0, np.uint8)
+    concave = graph.edge_features.convexity < -MIN_CONCAVITY
+    pairs, kinds = [graph.edges], [np.where(concave, CONCAVE, CONVEX).astype(np.uint8)]
+    if graph.gaps is not None:
+        pairs.append(graph.gaps.edges)
+        kinds.append(np.full(len(graph.gaps.edges), GAP, np.uint8))
+    return np.concatenate(pairs), np.concatenate(kinds)
+
+
+def _boxes(shown: ShownTree, leaf: NDArray[np.integer], points: NDArray[np.float64]) -> list[dict[str, Any]]:
+    """Tight box of each object, the largest first."""
+    objects = np.append(shown.objects, -1)[leaf]
+    counts = np.bincount(objects[objects >= 0])
+    boxed = np.argsort(-counts, kind="stable")[:MAX_BOXES]
+    boxes = boxes_of_labels(points, np.where(np.isin(objects, boxed), objects, -1))
+    return [{"object": k, "count": int(counts[k]), **boxes[k].to_dict()} for k in boxed.tolist() if k in boxes]
