@@ -18,6 +18,7 @@ ROOMS = [
     "pcgraph.detection",
     "pcgraph.plumbing",
     "pcgraph.tree",
+    "pcgraph.viewer",
     "rangesim.calibration",
     "rangesim.capture",
     "rangesim.causes",
