@@ -42,18 +42,19 @@ from pcgraph.voxels.warp import CameraWarp, RangeWarp, Warp
 _FOR_TYPE_CHECKERS = {"Continuations": Continuations}
 """Types of fields whose modules import them for type checkers alone."""
 _MAX_LEVEL = 4
-"""Number of times that the edge of a voxel is doubled, at most (`Grading`)."""
+"""Largest count of times that the edge of a voxel is doubled. Source: `Grading`."""
 _MAX_LENGTH = 1e102
-"""Metres, largest length: coordinates of clouds are 1e100 at most (`pcgraph.inputs`), ranges a few times that. Squares
-of far larger ones overflow, and a loop that waits for a least distance does not end where all are NaN."""
+"""Largest length, metres: coordinates of clouds are 1e100 at most (`pcgraph.inputs`), and ranges a few times that.
+Squares of far larger lengths overflow. A loop that waits for a least distance does not end where all are NaN."""
 _MAX_SCATTER = 1e225
-"""Square metres, largest scatter: the square of such lengths, of 10^18 points."""
+"""Largest scatter, square metres, because the squares of such lengths, summed over 10^18 points, are 1e222."""
 _MAX_COUNT = 1 << 53
-"""Points of a voxel or a node, less than: sums of such counts are exact as floats, too."""
+"""The count of points in a voxel or a node is below this, so that sums of counts are exact as float64, too."""
 _ROUNDING = 1e-6
-"""Relative difference that rounding may make, at most, also between two machines. Chosen by eye; not varied."""
+"""Largest relative difference that rounding may make, a fraction, also between two machines. Chosen by eye; not
+varied."""
 _UNIT = 1.0 + _ROUNDING
-"""Largest absolute value of what is 1 at most, because it was rounded."""
+"""Largest absolute value of numbers that are 1 at most, dimensionless, because they may have been rounded up."""
 
 
 class Row(NamedTuple):

@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 SAVED_FORMAT = "pcgraph segmentation"
 """Name of the format of saved segmentations, in the header of each."""
 SAVED_VERSION = 1
-"""Version of that format. It rises as soon as a file of the one before cannot be read as a file of this one."""
+"""Version of that format, a count from 1. It rises when files of the version before cannot be read as files of this
+one."""
 SAVED_MARK = "pcgraph-segmentation"
 """Mark of the seal of saved segmentations, in the comment at the end of each."""
 NOT_STORED = " (settings not stored)"

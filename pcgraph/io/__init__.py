@@ -26,8 +26,8 @@ from pcgraph.plumbing.plain_files import read_file, write_file
 __all__ = ["decode_cloud", "encode_cloud", "read_cloud", "sample_surface", "write_cloud"]
 
 MAX_REASON = 300
-"""Characters of a message about a damaged file, count: such files can make messages of any length. Chosen by eye; not
-varied."""
+"""Largest count of characters in a message about a damaged file, because it may quote text of any length from the file.
+Chosen by eye; not varied."""
 FORMATS: tuple[Format, ...] = (
     *(PCD, PLY, LAS, E57, NPZ, NPY),
     *(TEXT, PTS, PTX, XYZN, XYZRGB),

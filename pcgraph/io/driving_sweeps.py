@@ -21,9 +21,10 @@ from pcgraph.io.format import CloudFile, Format
 from pcgraph.plumbing.plain_files import read_file
 
 MAX_COORDINATE_M = 1e4
-"""Largest coordinate in a sweep, metres. Any LiDAR reaches far less."""
+"""Largest coordinate in a sweep, metres, because no LiDAR reaches that far: a file with larger ones has another
+layout. Chosen by eye; not varied."""
 MAX_RING = 255
-"""Largest number of a ring: no scanner has more than 256. nuScenes' has 32."""
+"""Largest ring number, a count from 0: no scanner has more than 256 rings; that of nuScenes has 32."""
 KITTI_COLUMNS = ("x", "y", "z", "intensity")
 NUSCENES_COLUMNS = (*KITTI_COLUMNS, "ring")
 

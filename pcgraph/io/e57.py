@@ -51,8 +51,9 @@ _BUFFERS = {"i1": np.int8, "u1": np.uint8, "i2": np.int16, "u2": np.uint16, "f4"
 int32, and it takes NumPy's own int64, which is a C long, for 32 bits."""
 _INTEGERS = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8")
 _MAX_INTEGER = (1 << 63) - 1
+"""Largest whole number of a field: integers of the standard have 64 bits with a sign (ASTM E2807)."""
 _MAX_SCANS = 1 << 16
-"""Scans of a file, at most: the column ``scan`` has 16 bits."""
+"""Largest count of scans in a file, because the column ``scan`` is uint16."""
 _PAGE_BYTES = 1024
 """Bytes of a page; the standard has no others. The last 4 are its checksum."""
 _HEADER = struct.Struct("<8sIIQQQQ")

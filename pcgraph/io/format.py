@@ -14,8 +14,8 @@ from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudWriteError
 
 MAX_HEADER_BYTES = 1 << 16
-"""Bytes in which the header of a file must end: far more than headers have, so that a file without one is refused
-before all of it is searched. Chosen by eye; not varied."""
+"""Largest header, bytes: far more than headers have, so that a file without one is refused before all of it is
+searched. Chosen by eye; not varied."""
 
 
 @dataclass(frozen=True)

@@ -24,44 +24,51 @@ from pcgraph.io.flat_columns import Arrays, described, flatten, listed_points, u
 from pcgraph.io.format import Format
 
 _HEADER_BYTES = 227
-"""Bytes of the header of LAS 1.0 to 1.2, the shortest."""
+"""Bytes of the shortest header, that of LAS 1.0 to 1.2. Source: the LAS specification of ASPRS."""
 _VLR_BYTES = 54
-"""Bytes of a variable length record without its data."""
+"""Bytes of a variable length record without its data. Source: the LAS specification of ASPRS."""
 _PIECE = 1 << 20
-"""Points that are unpacked at a time: memory grows with what the file really holds. Chosen by eye; not varied."""
+"""Count of points that are unpacked at a time, so that memory grows with what the file really holds. Chosen by eye; not
+varied."""
 _LAYERED = b"\x03\x00"
 """Compressor of LAZ for the point formats from 6 on."""
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 """Layers of each item of a compressed point: its base, colours, colours with infrared, wave packets. Extra bytes, item
 14, have one layer for each byte."""
 _MAX_OF_8_BITS = 255
-"""Largest channel of colours that were stored in 8 bits. In 16 bits, only a cloud that is all but black has no larger
-one."""
+"""Largest channel value of a cloud whose colours count as stored in 8 bits, in steps of a channel.
+
+Colours of 16 bits with no larger value would be almost black, because white is 65535.
+"""
 _WHITE_RATIO = 257
-"""White in 16 bits over white in 8 bits: 65535 / 255."""
+"""Ratio of white in 16 bits to white in 8 bits, 65535 / 255, from the limits of the two types."""
 _DESCRIPTION = ("pcgraph", 1)
-"""User and number of the variable length record with the description of the columns."""
+"""User ID and record ID of the variable length record that holds the description of the columns. The user ID is ours,
+so that any record ID is free."""
 _MAX_VLR_BYTES = 65535
-"""Bytes of the data of a variable length record, at most: the format counts them in 16 bits."""
+"""Largest size of the data of a variable length record, bytes, because the format counts them in 16 bits."""
 _MAX_EXTRA_FIELDS = _MAX_VLR_BYTES // 192
-"""Fields of extra bytes, at most: one record describes all, each in 192 bytes."""
+"""Largest count of fields of extra bytes, because one record describes all of them, each in 192 bytes."""
 _MAX_NAME = 31
-"""Characters of a field's name, at most: the format has 32 bytes, and some readers expect a NUL as the last."""
+"""Largest length of a field's name, characters, because the format has 32 bytes and some readers expect a NUL as the
+last one."""
 _UNUSED = {"return_number": 1, "number_of_returns": 1}
 """Values of dimensions that a written cloud does not have, if not 0: the standard counts returns from 1."""
 _COARSEST_STEP = 1e-4
-"""Metres: coordinates off any grid are rounded to steps of at most 0.1 mm, finer than laser scanners measure."""
+"""Largest step to which coordinates off any grid are rounded, metres: 0.1 mm, because laser scanners resolve less."""
 _STEPS_PER_EXTENT = 1e7
-"""Steps in the extent of a small cloud off any grid, at least: as many as the 24 bits of float32 tell apart."""
+"""Least count of steps in the extent of a small cloud off any grid: about as many as the 24 bits of float32
+distinguish."""
 _MAX_STEPS = 2.0**31 - 2.0
-"""Steps from the offset to a coordinate, at most: whole numbers of 32 bits, less a rounding."""
+"""Largest count of steps from the offset to a coordinate, because LAS stores it as int32; one step is left for
+rounding."""
 _GRIDS = tuple(10.0**-digits for digits in range(10))
-"""Steps of grids on which coordinates may lie already. Steps as 0.002 or 0.00025 are multiples of one of these."""
+"""Steps, metres, of the decimal grids that are tried. Other steps, such as 0.002 or 0.00025, are multiples of these."""
 _FINE_ENOUGH = 16
-"""Roundings of the coordinates per step of a grid, at least: any number is near to one of a grid that is finer. Chosen
-by eye; not varied."""
+"""Least ratio of a grid's step to the rounding of the coordinates. On a finer grid, every number would seem to lie.
+Chosen by eye; not varied."""
 _SAMPLE = 1000
-"""Coordinates that are tried on a grid before all are, for the time's sake. Chosen by eye; not varied."""
+"""Count of coordinates that are tried on a grid before all of them, to save time. Chosen by eye; not varied."""
 
 
 # ---- Reading -------------------------------------------------------------------------------------------------------

@@ -29,12 +29,13 @@ if TYPE_CHECKING:
 _KINDS = {".obj": "obj", ".stl": "stl", ".off": "off", ".glb": "gltf", ".gltf": "gltf", ".ply": "ply"}
 """Names of formats to trimesh by the ends of files' names."""
 _FEW_VERTICES = 1000
-"""Vertices, at most, that a warning calls few for a point cloud. Chosen by eye; not varied."""
+"""Largest count of vertices that a warning calls few for a point cloud. Chosen by eye; not varied."""
 _MAX_ZEROS_PER_BYTE = 10
-"""Elements of glTF accessors without data, which are zeros, per byte of the file, at most: sparse shapes of animated
-faces have less than one. Chosen by eye; not varied."""
+"""Largest count of elements of glTF accessors without data, which are zeros, per byte of the file. Sparse shapes of
+animated faces have less than one. Chosen by eye; not varied."""
 _PLASTIC = 1.32471795724474602596
-"""The plastic number, the root of x**3 = x + 1: multiples of its inverse powers fill a square evenly."""
+"""The plastic number, dimensionless, the root of x**3 = x + 1: multiples of its inverse powers fill a square evenly
+(Roberts 2018)."""
 
 
 def read_mesh(file: CloudFile, kind: str) -> Cloud:

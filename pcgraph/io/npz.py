@@ -37,15 +37,17 @@ from pcgraph.errors import CloudReadError
 from pcgraph.io.format import MAX_HEADER_BYTES, Format
 
 MAX_BYTES = 1 << 32
-"""Bytes of all arrays that are read of one file, decompressed: 4 GiB are 100 million points of 40 bytes, for which
-`pcgraph.segment` would need some 18 GB, as it needs 3.7 GB for 20 million. An archive of 4 MB can hold as much."""
+"""Largest size of all arrays that are read from one file, decompressed, bytes. A limit is needed because an archive of
+4 MB can promise as much. 4 GiB are 100 million points of 40 bytes. `pcgraph.segment` needs 3.7 GB for 20 million
+points, and would need some 18 GB for these."""
 _MAX_MEMBERS = 4096
-"""Arrays of an archive, at most: far more than clouds have columns. Chosen by eye; not varied."""
+"""Largest count of arrays in an archive: far more than clouds have columns. Chosen by eye; not varied."""
 _MAX_RATIO = 1040
-"""Bytes of data per byte of a deflated file, at most: 1032 by the law of the format (Deutsch 1996), and some for its
-frame. A member that promises more lies."""
+"""Largest ratio of the bytes of data to those of the deflated file: the format cannot exceed 1032 (Deutsch 1996), and
+some are for the frame. A member that promises more is damaged."""
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _ENCRYPTED = 0x1
+"""Bit of a member's flags that marks it as encrypted. Source: PKWARE's APPNOTE, section 4.4.4."""
 _OWN = ("points", "colors", "normals", "labels", "viewpoint")
 _CLOUD = "cloud/"
 _COLUMNS = "columns/"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packets of Ouster LiDARs, the sensor's metadata (JSON) that tell their layout, and the turns that they make.
+"""Packets of Ouster LiDARs, the sensor's metadata (JSON) with their layout, and the turns that they form.
 
 Packets and their profiles: Ouster, "Firmware User Manual", section "Lidar data" (lidar data packet format), and
 "Software User Manual" for the legacy format. Words have 32 bits, little end first. A packet holds columns; a column
@@ -23,13 +23,14 @@ from pcgraph.io.pcap import Datagram, datagrams
 from pcgraph.plumbing.short_repr import ShortRepr, in_short
 
 MAX_COLUMNS = 4_096
-"""Largest number of columns of a turn: the finest mode of any sensor has as many."""
+"""Largest count of columns in a turn, from the finest mode of any sensor."""
 MAX_RINGS = 512
-"""Largest number of rings: twice as many as the 256 of the OS1 Max."""
+"""Largest count of rings: twice the 256 of the OS1 Max."""
 MAX_PACKET = 65_507
-"""Largest number of bytes of a packet: more do not fit into a UDP datagram over IPv4 (RFC 768, RFC 791)."""
+"""Largest packet, bytes, because no more fit into a UDP datagram over IPv4 (RFC 768, RFC 791)."""
 ROTATION_TOLERANCE = 1e-4
-"""Largest entry of |R R^T - I| of a rotation in the metadata: one with five decimals is off by at most 2e-5."""
+"""Largest entry of |R R^T - I| of a rotation R in the metadata, dimensionless: five times the 2e-5 that come from
+rounding to five decimals."""
 
 # ---- Profiles: where the bits are -----------------------------------------------------------------------------------
 
@@ -118,9 +119,10 @@ PROFILES = {
 # ---- Metadata -------------------------------------------------------------------------------------------------------
 
 Degrees = Annotated[float, msgspec.Meta(ge=-360, le=360)]
-"""An angle of a beam in the metadata, degrees."""
+"""Angle of a beam in the metadata, degrees, from -360 to 360: a turn in either direction."""
 Millimetres = Annotated[float, msgspec.Meta(ge=-1e5, le=1e5)]
-"""A length in the metadata, or an entry of a transform, millimetres; 100 m exclude only nonsense."""
+"""Length in the metadata, or entry of a transform, millimetres. The limit of 100 m refuses damaged files only. Chosen
+by eye; not varied."""
 
 
 class _DataFormat(msgspec.Struct):

@@ -15,12 +15,12 @@ from typing import IO, NamedTuple
 from pcgraph.errors import CloudReadError
 
 MAX_RECORD = 262_144
-"""Largest number of bytes of one record: libpcap's own limit (its MAXIMUM_SNAPLEN for networks)."""
+"""Largest record, bytes. Source: libpcap's limit for networks, MAXIMUM_SNAPLEN."""
 MAX_PENDING = 64
-"""Largest number of datagrams whose fragments are waited for. A sensor sends one after the other, and a datagram that
-lost a fragment never becomes whole; 64 are enough for several sensors at once."""
+"""Largest count of incomplete datagrams that are kept. A sensor sends the fragments of one datagram after the other, so
+that more are needed for several sensors only. Chosen by eye; not varied."""
 MAX_DATAGRAM = 65_535
-"""Largest number of bytes of an IPv4 packet, and therefore of its fragments together (RFC 791)."""
+"""Largest IPv4 packet, and so the largest sum of its fragments, bytes, because its length has 16 bits (RFC 791)."""
 _MAGIC = {b"\xd4\xc3\xb2\xa1": "<", b"\xa1\xb2\xc3\xd4": ">", b"\x4d\x3c\xb2\xa1": "<", b"\xa1\xb2\x3c\x4d": ">"}
 """First four bytes of a file, and the order of bytes that they mean; the last two are of times in nanoseconds."""
 _NEXT_GENERATION = b"\x0a\x0d\x0d\x0a"
@@ -29,10 +29,10 @@ _LINK_HEADERS = {0: 4, 1: 14, 101: 0, 113: 16, 228: 0, 276: 20}
 """Number of bytes before the IP packet, by type of link: BSD loopback, Ethernet, raw IP, Linux cooked, IPv4, Linux
 cooked 2."""
 _VLAN = (0x8100, 0x88A8)
-"""Types of Ethernet frames with a tag of a virtual network (IEEE 802.1Q, 802.1ad): they have four more bytes before the
-type of what they carry."""
+"""Types of Ethernet frames with a tag of a virtual network: four more bytes before the type of their content. Source:
+IEEE 802.1Q and 802.1ad."""
 _UDP = 17
-"""Number of UDP among the protocols of IP (IANA)."""
+"""Protocol number of UDP in an IP header. Source: IANA."""
 
 
 class Datagram(NamedTuple):

@@ -27,7 +27,7 @@ _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _INSTEAD = {"f2": "f4", "b1": "u1"}
 """Types that PCD does not have, and those that are written in their place."""
 _MAX_NUMBER = 10**15
-"""Largest number of a header, count of points and the like: no file holds as many, and numpy still takes it as the
+"""Largest whole number of a header, such as the count of points: no file holds as many, and NumPy still takes it as the
 length of an array of no bytes. Chosen by eye; not varied."""
 
 

@@ -23,11 +23,11 @@ from pcgraph.io.format import CloudFile, Format
 from pcgraph.io.text import MIN_ROW_BYTES, TextLines, column_of_numbers, is_number, numbers
 
 _COUNTS = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
-"""Numbers in each of the lines above the points of a scan."""
+"""Count of the numbers in each of the ten lines above a scan's points, from the module's description of the format."""
 _NAMES = {4: ("intensity",), 7: ("intensity", *COLOR_NAMES)}
 """Names of the columns after x y z, by the number of all columns."""
 _MAX_SIDE = 10**9
-"""Columns or rows of a scan, at most: more do not fit into a file. Chosen by eye; not varied."""
+"""Largest count of columns or of rows in a scan: no file holds more. Chosen by eye; not varied."""
 
 
 @dataclass(frozen=True, eq=False)

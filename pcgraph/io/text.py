@@ -60,20 +60,20 @@ from pcgraph.io.format import MAX_HEADER_BYTES, CloudFile, Format
 from pcgraph.io.text_numbers import INFINITY_OF_WINDOWS, NAN_OF_WINDOWS
 
 MAX_LINE = 1 << 16
-"""Bytes of a line, count: far more than rows have, so that one endless line does not fill the memory. Chosen by
-eye; not varied."""
+"""Largest line, bytes: far more than rows have, so that one endless line does not fill the memory. Chosen by eye; not
+varied."""
 MAX_COLUMNS = 1024
-"""Columns of a table, count: a guard. Chosen by eye; not varied."""
+"""Largest count of columns in a table: far more than tables of points have. Chosen by eye; not varied."""
 MAX_OFF_UNIT = 0.01
-"""Difference between the length of a normal and 1, at most: writers give at least three digits after the point. Chosen
-by eye; not varied."""
+"""Largest difference between the length of a normal and 1, a fraction: programs write three digits after the point or
+more. Chosen by eye; not varied."""
 MAX_EXACT = 2.0**53
-"""Whole numbers up to here are exact in float64."""
+"""Largest whole number up to which all are exact in float64, because it has 53 bits for the digits."""
 MIN_ROW_BYTES = 6
-"""Bytes of a row, at least: three digits, two blanks and a line end."""
+"""Least size of a row, bytes: three digits, two blanks and a line end."""
 ROWS_AT_ONCE = 100_000
-"""Rows whose words are made at a time, count, so that a large cloud does not become as many strings at once. Chosen by
-eye; not varied."""
+"""Count of rows that become text at a time, so that the strings of a large cloud are not all in memory at once. Chosen
+by eye; not varied."""
 COMMENTS = ("#", "//", "%")
 
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
