@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""NumPy's files: .npz archives of a cloud's arrays, and single arrays, .npy.
+"""NumPy's files: archives (.npz) with the arrays of a cloud, and single arrays (.npy).
 
-An archive has the keys ``points`` (n, 3) or (h, w, 3), and if the cloud has them ``colors``, ``normals``, ``labels``,
-``viewpoint``. Every other array of the points' leading shape is a column of its own name. The cloud of a saved
-segmentation lies under ``cloud/``: ``cloud/points`` and so on, its columns as ``cloud/columns/<name>``. Nothing is
-unpickled.
+An archive has the key ``points`` (n, 3) or (h, w, 3), and the keys ``colors``, ``normals``, ``labels`` and
+``viewpoint`` if the cloud has these. Every other array with the points' leading shape is a column; its key is the name.
+The file of a saved segmentation has the cloud below ``cloud/``: ``cloud/points`` and so on, the columns as
+``cloud/columns/<name>``. Pickled objects are never loaded.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ _BROKEN = (
 def read_npz(content: bytes) -> Cloud:
     """Cloud of an .npz archive, given the file's bytes.
 
-    Colours are found as `cloud_from_columns` finds them, so floats of at most 1 become uint8. Whole labels that 32 bits
-    do not hold stay a column. Arrays of another leading shape than the points are not read.
+    Colours of other types become uint8, as in `cloud_from_columns`. Labels that int32 cannot hold stay a column. Arrays
+    whose leading shape is not that of the points are not read.
 
     Raises
     ------
@@ -80,12 +80,12 @@ def read_npz(content: bytes) -> Cloud:
 
 
 def read_npy(content: bytes) -> Cloud:
-    """Cloud of an .npy array, given the file's bytes; `pcgraph.cloud.cloud_from_array` says which arrays are clouds.
+    """Cloud of an .npy array, given the file's bytes; `pcgraph.cloud.cloud_from_array` lists the shapes and types.
 
     Raises
     ------
     CloudReadError
-        The file is damaged, or the array is no cloud.
+        The file is damaged, or the array is not a cloud.
     """
     try:
         stream = io.BytesIO(content)
@@ -98,7 +98,7 @@ def read_npy(content: bytes) -> Cloud:
 
 
 def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """Entries of the cloud by their keys."""
+    """Members of the archive that may belong to the cloud, by key."""
     entries = archive.infolist()
     if len(entries) > _MAX_MEMBERS:
         raise CloudReadError(f"expected at most {_MAX_MEMBERS} arrays, got {len(entries)}")
@@ -112,7 +112,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _arrays(members: Mapping[str, zipfile.ZipInfo], archive: zipfile.ZipFile) -> dict[str, NDArray[np.generic]]:
-    """The arrays of numbers that are points, belong to one point each, or are the viewpoint."""
+    """The points, the arrays with one row per point, and the viewpoint, by key."""
     arrays: dict[str, NDArray[np.generic]] = {}
     shape: tuple[int, ...] | None = None
     left = MAX_BYTES
@@ -164,7 +164,7 @@ def _cloud(arrays: dict[str, NDArray[np.generic]]) -> Cloud:
 
 
 def _own(arrays: dict[str, NDArray[np.generic]], name: str, *shapes: tuple[int, ...]) -> NDArray[np.generic] | None:
-    """The array of a name, which must have one of the shapes; None if it is missing, or empty in place of that."""
+    """The array of a name, which must have one of the shapes; None if it is missing or empty."""
     values = arrays.get(name)
     if values is None or values.shape in shapes:
         return values
@@ -177,7 +177,7 @@ def _own(arrays: dict[str, NDArray[np.generic]], name: str, *shapes: tuple[int, 
 
 
 class _Header(NamedTuple):
-    """What the header of an .npy file tells of its array."""
+    """Shape, order and type of an array, from the header of an .npy file."""
 
     shape: tuple[int, ...]
     is_fortran: bool
@@ -190,10 +190,10 @@ class _Header(NamedTuple):
 
 
 def _header(stream: IO[bytes]) -> _Header:
-    """Header at the beginning of an .npy file, versions 1 to 3; the numbers follow."""
+    """Header of an .npy file, versions 1 to 3; the stream is then at the first number."""
     magic = stream.read(8)
     if magic[:6] != b"\x93NUMPY" or magic[6:7] not in (b"\x01", b"\x02", b"\x03"):
-        raise CloudReadError("expected an .npy array, found another beginning")
+        raise CloudReadError("expected an .npy array, but its first bytes are not those of version 1, 2 or 3")
     length = struct.Struct("<H" if magic[6] == 1 else "<I")
     (size,) = length.unpack(stream.read(length.size))
     if size > MAX_HEADER_BYTES:
@@ -210,7 +210,7 @@ def _header(stream: IO[bytes]) -> _Header:
 
 
 def _check_size(header: _Header, available: int, name: str) -> None:
-    """Raise CloudReadError if an array promises more than its file holds, before memory is allocated for it."""
+    """Raise CloudReadError if the header promises more than the file holds, before memory is allocated."""
     if header.n_bytes > available:
         raise CloudReadError(f"the header of {name} promises {header.n_bytes} bytes, but only {available} can follow")
 
@@ -229,7 +229,7 @@ def _numbers(stream: IO[bytes], header: _Header) -> NDArray[np.generic]:
 def encode_npz(cloud: Cloud) -> bytes:
     """Bytes of an .npz archive of the cloud's arrays, not compressed.
 
-    A column has its own name as key, after ``columns/`` if that name is one of the cloud's own.
+    The key of a column is its name, or ``columns/<name>`` if the name would be taken for another array of the cloud.
     """
     arrays: dict[str, NDArray[np.generic] | None] = {name: getattr(cloud, name) for name in _OWN}
     for name, column in cloud.columns.items():
@@ -245,7 +245,7 @@ def encode_npz(cloud: Cloud) -> bytes:
 
 
 def encode_npy(cloud: Cloud) -> bytes:
-    """Bytes of an .npy file: the points alone if the cloud has no more, else an array with a field for each column."""
+    """Bytes of an .npy file: the points if the cloud has nothing else, or a structured array of all columns."""
     columns = columns_of_cloud(cloud)
     shape = cloud.points.shape[:-1]
     table = np.empty(shape, [(name, column.dtype, column.shape[1:]) for name, column in columns.items()])
