@@ -30,7 +30,7 @@ def info_command(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one line of JSON for each file.")] = False,
 ) -> None:
-    """Print what files hold: points, extent, spacing, columns with their types and ranges.
+    """Print the content of files: points, extent, spacing, and columns with their types and ranges.
 
     Example: pcgraph info scan.laz
     """
@@ -51,7 +51,7 @@ def info_command(
 
 
 def _record(cloud: Cloud) -> dict[str, Any]:
-    """What a cloud holds, as JSON takes it."""
+    """Content of a cloud as plain values for JSON."""
     import numpy as np
 
     from pcgraph.voxels.spacing import median_spacing
