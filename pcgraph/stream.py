@@ -83,10 +83,10 @@ def update(
     -----
     A supervoxel is remembered or forgotten as a whole: its points are not kept, so that no part can be subtracted from
     its moments. It is seen through if most of its voxels that nothing nearer hides have a measurement more than two
-    voxel edges behind them. Rays that met nothing do not count, so supervoxels before the sky stay, and so do hidden
-    ones. A still scene loses up to 0.005 of its voxels per scan if poses are right to two voxel edges, its leaves and
-    glass up to 0.08 (docs/pcgraph_method.md). Sources: free space as in OctoMap (Hornung et al. 2013), but without
-    counts of hits and misses; `max_age` as in trackers such as SORT (Bewley et al. 2016).
+    voxel edges behind them. A ray that met nothing is no measurement, so supervoxels before the sky stay, and so do
+    hidden ones. A still scene loses up to 0.005 of its voxels per scan if poses are right to two voxel edges, its
+    leaves and glass up to 0.08 (docs/pcgraph_method.md). Sources: free space as in OctoMap (Hornung et al. 2013), but
+    without counts of hits and misses; `max_age` as in trackers such as SORT (Bewley et al. 2016).
 
     Voxels keep the size that the first scan needed, even where a later scan is denser. Where voxels grow with depth or
     range, these are measured from the first viewpoint. If the sensor moves, segment the first scan with
