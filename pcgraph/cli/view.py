@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pcgraph.cli.clouds import check_outputs, read_saved, refusals, segmented
+from pcgraph.cli.clouds import SAVED, check_outputs, read_saved, refusals, segmented
 from pcgraph.errors import CloudReadError, CloudWriteError, one_line
 
 if TYPE_CHECKING:
@@ -36,7 +36,8 @@ def view_command(
     from pcgraph.viewer.page import views_page
 
     with refusals():
-        target = Path(f"{source.absolute().stem}.html") if out is None else out
+        name = Path(source.absolute().name.removesuffix(SAVED)).stem
+        target = Path(f"{name}.html") if out is None else out
         check_outputs([target], [str(source)], overwrite)
         shown = [_shown(path, segment) for path in _files(source)]
         write_file(target, views_page(shown, source.absolute().name).encode("utf-8"), CloudWriteError)

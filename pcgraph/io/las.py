@@ -13,7 +13,7 @@ from collections.abc import Callable
 from io import BytesIO
 from itertools import chain
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,6 @@ from pcgraph.cloud import COLOR_NAMES, Cloud
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, library_reason
 from pcgraph.io.flat_columns import Arrays, described, flatten, listed_points, unflatten
 from pcgraph.io.format import Format
-
-if TYPE_CHECKING:
-    import laspy
 
 _HEADER_BYTES = 227
 """Bytes of the header of LAS 1.0 to 1.2, the shortest."""
@@ -167,7 +164,7 @@ def _check_length(content: bytes) -> None:
         )
 
 
-def _largest_chunk(content: bytes, header: laspy.LasHeader) -> int:
+def _largest_chunk(content: bytes, header: Any) -> int:
     """Points in the largest chunk of a LAZ file, whose parallel reader has room for all of them.
 
     Raises CloudReadError if the file promises chunks longer than itself, or layers longer than their chunk: lazrs takes

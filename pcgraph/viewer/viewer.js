@@ -290,7 +290,7 @@ class Viewer {
   }
 
   resetView() {
-    const { cloud } = this, up = this.up(), away = (cloud.camera ? 0.75 : 0.92) * cloud.radius / Math.tan(FIELD_OF_VIEW / 2 * Math.PI / 180) / Math.min(1, this.aspect());
+    const { cloud } = this, up = this.up(), away = (cloud.camera ? 0.85 : 0.92) * cloud.radius / Math.tan(FIELD_OF_VIEW / 2 * Math.PI / 180) / Math.min(1, this.aspect());
     let from = START_FROM;
     if (cloud.camera && up[1] === -1) from = [-0.22, -0.16, -1];
     else if (up[2] !== 1) from = [...[0, 1, 2].map((a) => (up[a] ? 0.5 * up[a] : a === 2 ? 0.8 : 0.55))];

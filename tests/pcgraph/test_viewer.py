@@ -383,6 +383,36 @@ def test_a_folder_becomes_one_page_with_a_chooser(tmp_path: Path) -> None:
         assert page.evaluate("[...document.querySelectorAll('.of-tree')].every((part) => part.hidden)")
 
 
+@needs_browser
+@pytest.mark.validation
+def test_clouds_of_few_points_and_of_no_extent_are_shown(tmp_path: Path) -> None:
+    """No point, one, equal ones, columns without a value, and a tree of one supervoxel."""
+    one = np.random.default_rng(0).random((40, 3)) * 1e-3
+    shown = [
+        Shown("none", pcgraph.Cloud(np.empty((0, 3)))),
+        Shown("unmeasured", pcgraph.Cloud(np.full((4, 5, 3), np.nan), columns={"a": np.full((4, 5), np.nan)})),
+        Shown("one", pcgraph.Cloud(np.zeros((1, 3)), columns={"a": np.array([np.nan])})),
+        Shown("equal", pcgraph.Cloud(np.full((5, 3), 1e7), columns={"same": np.full(5, 2.5)})),
+        Shown.of("few", pcgraph.Cloud(one), pcgraph.segment(one, voxel_size=0.1)),
+    ]
+    path = tmp_path / "few.html"
+    path.write_text(views_page(shown, "Few"))
+    for number, entry in enumerate(shown):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        with opened(path, folder, state=f"cloud={number}") as page:
+            for name in page.evaluate("[...document.querySelectorAll('#color option')].map((o) => o.value)"):
+                page.evaluate(f"viewer.color({json.dumps(name)})")
+            page.evaluate("viewer.pick(viewer.canvas.clientWidth / 2, viewer.canvas.clientHeight / 2, 500)")
+            said = page.evaluate("document.getElementById('panel').innerText")
+            assert "NaN" not in said
+            assert "undefined" not in said
+            if entry.tree is not None:
+                page.evaluate("document.getElementById('show-branches').click()")
+                set_slider(page, 1000)
+                assert page.evaluate("viewer.count") == entry.tree.tree.n_leaves
+
+
 @pytest.fixture(scope="session")
 def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The script of axe-core, from npm."""
