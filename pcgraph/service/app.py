@@ -45,7 +45,7 @@ from pcgraph.service.models import (
 from pcgraph.service.problems import Problem, busy
 from pcgraph.service.settings import ServiceSettings
 from pcgraph.service.store import Job, Store
-from pcgraph.service.uploads import FILE_FIELD, Upload, receive_upload, said
+from pcgraph.service.uploads import FILE_FIELD, METADATA_FIELD, Upload, receive_upload, said
 from pcgraph.service.worker_pool import RETRY_SECONDS, WorkerPool
 
 SAVED = "segmentation.npz"
@@ -112,14 +112,14 @@ class Service:
         finally:
             self.n_uploads -= 1
 
-    def begin(self, upload: Upload, path: Path) -> Job:
-        """A job that waits for a worker; Problem if too many wait."""
+    def begin(self, upload: Upload, folder: Path) -> Job:
+        """A job that waits for a worker, and owns the folder of its upload from now on; Problem if too many wait."""
         job = self.store.new()
         job.title = Path(upload.name or "points").name
-        path = path.rename(job.folder / "upload")
+        folder = folder.rename(job.folder / "upload")
         task = {
             "task": "segment_upload",
-            "upload": str(path),
+            "upload": str(folder / FILE_FIELD),
             "name": upload.name,
             "saved": str(job.folder / SAVED),
             "max_points": self.settings.max_points,
@@ -130,13 +130,13 @@ class Service:
         except Problem:
             self.store.remove(job)
             raise
-        job.order.answer.add_done_callback(lambda answer: self._end(job, path, answer))
+        job.order.answer.add_done_callback(lambda answer: self._end(job, folder, answer))
         return job
 
     def _end(self, job: Job, upload: Path, answer: asyncio.Future[dict[str, Any]]) -> None:
         if answer.cancelled():  # with the job, whose files are gone
             return
-        upload.unlink(missing_ok=True)
+        shutil.rmtree(upload, ignore_errors=True)
         error = answer.exception()
         if isinstance(error, Problem):
             job.problem = error
@@ -242,6 +242,12 @@ _UPLOAD = {
                             "format": "binary",
                             "description": "The file; the end of its name tells the format.",
                         },
+                        METADATA_FIELD: {
+                            "type": "string",
+                            "format": "binary",
+                            "description": "A second file, if the format needs one: the metadata of an Ouster "
+                            "recording.",
+                        },
                         **SegmentParameters.model_json_schema()["properties"],
                     },
                     "additionalProperties": False,
@@ -311,9 +317,9 @@ async def segment(request: Request, service: Here, query: Annotated[UploadQuery,
     The answer comes when the segmentation is done, or after `wait` seconds, whatever is first. A client that hangs up
     before has no id, so its segmentation is ended.
     """
-    with service.upload_slot(), service.store.upload_file() as path:
-        upload = await receive_upload(request, query, path)
-        job = service.begin(upload, path)
+    with service.upload_slot(), service.store.upload_folder() as folder:
+        upload = await receive_upload(request, query, folder)
+        job = service.begin(upload, folder)
     try:
         if not await _finished(job, upload.parameters.wait, request):
             service.store.remove(job)
