@@ -129,7 +129,7 @@ class Store:
 
     def finish(self, job: Job) -> None:
         """Note that a job has ended, well or not, and make room."""
-        job.ended = time.monotonic()
+        job.ended = job.used = time.monotonic()  # what has waited for long is not the first to go
         job.stage = job.order = None
         job.n_bytes = sum(path.stat().st_size for path in job.folder.iterdir()) if job.folder.is_dir() else 0
         job.finished.set()
