@@ -306,6 +306,7 @@ def test_bad_requests_are_one_sentence(service, tmp_path):
     for method, path, status, words in (
         ("GET", "/segmentations/none", 404, "there is no such segmentation"),
         ("GET", "/segmentations/none/labels?format=plz", 422, "got 'plz'; did you mean"),
+        ("GET", "/segmentations/none/labels?format=bin", 422, "got 'bin'"),  # has no place for labels
         ("GET", "/segmentations/none/labels?n=2&altitude=1", 422, "n or altitude, got both"),
         ("GET", "/segmentations/none/boxes?m=2", 422, "there is no parameter 'm'"),
         ("GET", "/segmentations/..%2f..%2fetc", 404, "Not Found"),
