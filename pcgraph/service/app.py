@@ -17,11 +17,10 @@ from fastapi import Path as PathParameter
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from starlette.background import BackgroundTask
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match, Route
-from starlette.types import Scope
+from starlette.types import Receive, Scope, Send
 
 from pcgraph import __version__
 from pcgraph.service.guards import Guards, problem_response
@@ -160,7 +159,8 @@ class Service:
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
-        return _file(folder / written["file"], media_type, f"{Path(job.title).stem}.{written['file']}")
+        name = f"{Path(job.title).stem}.{written['file']}"
+        return AnswerFile(folder / written["file"], media_type=media_type, filename=name)
 
     def done(self, name: str) -> Job:
         """A job that is done; Problem if it is not, or failed."""
@@ -196,10 +196,14 @@ def _note(job: Job, words: str) -> None:
     job.stage = words
 
 
-def _file(path: Path, media_type: str, name: str, headers: dict[str, str] | None = None) -> FileResponse:
-    """An answer with a file of an answer's folder, which is removed after it."""
-    remove = BackgroundTask(shutil.rmtree, path.parent, ignore_errors=True)
-    return FileResponse(path, media_type=media_type, filename=name, headers=headers, background=remove)
+class AnswerFile(FileResponse):
+    """An answer with a file of an answer's folder, which is removed after it, however it ends."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            shutil.rmtree(Path(self.path).parent, ignore_errors=True)
 
 
 def _declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -463,7 +467,7 @@ async def file(service: Here, segmentation_id: Id) -> Response:
     """The saved segmentation, with the cloud: `pcgraph.load_segmentation` opens it."""
     job = service.done(segmentation_id)
     path = service.store.answer_folder(job, SAVED) / SAVED
-    return _file(path, "application/octet-stream", f"{Path(job.title).stem}.{SAVED}")
+    return AnswerFile(path, media_type="application/octet-stream", filename=f"{Path(job.title).stem}.{SAVED}")
 
 
 # ---- The application -----------------------------------------------------------------------------------------------
