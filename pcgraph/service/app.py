@@ -197,9 +197,14 @@ def _note(job: Job, words: str) -> None:
 
 
 class AnswerFile(FileResponse):
-    """An answer with a file of an answer's folder, which is removed after it, however it ends."""
+    """An answer with a file of an answer's folder, which is removed after it, however it ends.
+
+    It is sent whole: the file is made for one request, so that there is none to ask for further ranges of.
+    """
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        scope = {**scope, "headers": [pair for pair in scope["headers"] if pair[0] != b"range"]}
+        del self.headers["Accept-Ranges"]
         try:
             await super().__call__(scope, receive, send)
         finally:
