@@ -51,7 +51,7 @@ SAVED = "segmentation.npz"
 """Name of the file of a saved segmentation."""
 JANITOR_SECONDS = 30.0
 """Time between two looks for segmentations that are too old. Chosen by eye; not varied."""
-VIEW_POLICY = "sandbox allow-scripts"
+VIEW_POLICY = "sandbox allow-scripts allow-downloads"
 """Content-Security-Policy of the viewer page: its script, which shows names of strangers, cannot call the service."""
 PROBLEMS = {
     400: "The request is damaged, or names a host that is not this computer.",

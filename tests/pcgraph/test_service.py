@@ -190,7 +190,7 @@ def test_answers_are_those_of_pcgraph(service, scene, tmp_path):
     assert client.get(job["links"]["tree"]).json() == right.tree.to_dict()
     view = client.get(job["links"]["view"])
     assert "<html" in view.text
-    assert view.headers["Content-Security-Policy"] == "sandbox allow-scripts"
+    assert view.headers["Content-Security-Policy"] == "sandbox allow-scripts allow-downloads"
     assert client.get(job["links"]["file"], headers={"Range": "bytes=foo"}).status_code == 200
     (folder,) = tmp_path.iterdir()
     assert sorted(path.name for path in folder.iterdir()) == sorted([job["id"], "lock"])  # no answer is kept
