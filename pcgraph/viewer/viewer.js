@@ -5,6 +5,7 @@ const $ = (id) => document.getElementById(id);
 const FIELD_OF_VIEW = 45;  // degrees, from top to bottom
 const START_FROM = [-0.55, -0.8, 0.5];  // where the viewer is, seen from the middle, for a cloud whose z is up
 const PICK_REACH = 5;  // pixels
+const CLICK_REACH = 4;  // pixels that the pointer may move during a click
 const SIZE_IN_SPACINGS = 2.6;  // so that three quarters of a surface of random points are covered; by eye, not varied
 const SLOW_MS = 50;  // time between two frames of a moving view above which fewer points are drawn until it rests
 const REST_MS = 200;  // time without a movement after which the view rests
@@ -582,10 +583,14 @@ class Viewer {
     on("reset", "click", () => this.resetView());
     on("save", "click", () => this.savePicture());
     on("forget", "click", () => this.forget());
-    let start = null;
+    let start = null;  // where a press began that has not moved since
     this.canvas.addEventListener("pointerdown", (e) => { start = e.button === 0 ? [e.clientX, e.clientY] : null; });
+    this.canvas.addEventListener("pointermove", (e) => {
+      if (start && Math.hypot(e.clientX - start[0], e.clientY - start[1]) > CLICK_REACH) start = null;
+    });
     this.canvas.addEventListener("pointerup", (e) => {
-      if (!start || Math.hypot(e.clientX - start[0], e.clientY - start[1]) > 4) return;
+      if (!start) return;
+      start = null;
       const box = this.canvas.getBoundingClientRect();
       this.pick(e.clientX - box.left, e.clientY - box.top);
     });

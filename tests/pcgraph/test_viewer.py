@@ -342,6 +342,12 @@ def test_a_drag_turns_and_the_wheel_zooms(page_of_boxes: Path, tmp_path: Path) -
         turned = page.evaluate("viewer.eye.position.toArray()")
         assert np.linalg.norm(np.subtract(before, turned)) > 0.1 * np.linalg.norm(before)
         assert page.evaluate("viewer.chosen") is None
+        x, y = page.place("#view")  # a drag that ends where it began is no click
+        page.mouse("mousePressed", (x, y), button="left", clickCount=1)
+        for place in (x + 60, x):
+            page.mouse("mouseMoved", (place, y), button="left", buttons=1)
+        page.mouse("mouseReleased", (x, y), button="left", clickCount=1)
+        assert page.evaluate("viewer.chosen") is None
         page.mouse("mouseWheel", page.place("#view"), deltaX=0, deltaY=-300)
         page.wait_for(f"viewer.eye.position.length() < {0.99 * float(np.linalg.norm(turned))}")
 
