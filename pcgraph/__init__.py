@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from pcgraph.graph.continuations import Continuations as Continuations
     from pcgraph.graph.occlusion import Occlusions as Occlusions
     from pcgraph.io import read_cloud as read_cloud
+    from pcgraph.io import sample_surface as sample_surface
     from pcgraph.io import write_cloud as write_cloud
     from pcgraph.labelling import labelled_cloud as labelled_cloud
     from pcgraph.labelling import write_segmentation as write_segmentation
@@ -85,7 +86,7 @@ else:
             "graph.boundary": ["BoundaryCost", "BoundaryStrength"],
             "graph.continuations": ["Continuations"],
             "graph.occlusion": ["Occlusions"],
-            "io": ["read_cloud", "write_cloud"],
+            "io": ["read_cloud", "sample_surface", "write_cloud"],
             "labelling": ["labelled_cloud", "write_segmentation"],
             "plausibility": ["CloudWarning"],
             "saved_segmentation": ["load_segmentation"],

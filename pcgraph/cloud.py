@@ -3,28 +3,19 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from io import BytesIO
 from itertools import chain, product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.errors import CloudReadError, CloudWriteError
 from pcgraph.plumbing.short_repr import ShortRepr
 
 Columns = Mapping[str, NDArray[np.generic]]
 """One array per field of a file."""
-
-TextField = tuple[str, DTypeLike, int]
-"""A field of a text file: its name, its type, and the count of its numbers for each point."""
-
-MAX_HEADER_BYTES = 1 << 16
-"""Bytes in which the header of a file must end: far more than headers have, so that a file without one is refused
-before all of it is searched. Chosen by eye; not varied."""
 
 NORMAL_NAMES = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
 PACKED_NAMES = ("rgb", "rgba")
@@ -245,12 +236,12 @@ def _kept(column: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.gen
     return column.reshape(*shape, *column.shape[1:]).copy()
 
 
-def cloud_from_array(array: NDArray[np.generic]) -> Cloud:
+def cloud_from_array(values: ArrayLike) -> Cloud:
     """Cloud of an array whose last axis, or whose fields, are the columns.
 
     Parameters
     ----------
-    array : (n, 3 + c) or (h, w, 3 + c) numbers; or (n,) or (h, w) with fields x, y, z and others
+    values : (n, 3 + c) or (h, w, 3 + c) numbers; or (n,) or (h, w) with fields x, y, z and others
         Further columns of an array without fields are called ``column_3``, ``column_4`` and so on, as NumPy counts
         them, because nothing tells whether they are intensities, colours or labels. Numbers stay in their type. Fields
         are found as `cloud_from_columns` finds columns.
@@ -260,23 +251,27 @@ def cloud_from_array(array: NDArray[np.generic]) -> Cloud:
     ValueError
         The shape is another, a coordinate is missing, or a field is not of numbers.
     """
-    if array.dtype.names is not None:
-        table: NDArray[np.void] = array  # type: ignore[assignment]
-        fields: dict[str, NDArray[np.generic]] = {name: np.atleast_1d(table[name]) for name in array.dtype.names}
-        wrong = [name for name, values in fields.items() if values.dtype.kind not in "fiub"]
-        if wrong:
-            raise ValueError(f"expected fields of numbers, got {fields[wrong[0]].dtype} in the field {wrong[0]!r}")
-        n, shape = array.size, array.shape if array.ndim else (1,)
-        columns = {name: native(values).reshape(n, *_rest(values, shape)) for name, values in fields.items()}
-        try:
-            return cloud_from_columns(columns, shape)
-        except CloudReadError as error:
-            raise ValueError(str(error)) from None
+    if isinstance(values, np.ndarray) and values.dtype.names is not None:
+        return _cloud_from_fields(values)
+    array = as_numbers("points", values)
     if array.ndim not in (2, 3) or array.shape[-1] < 3:
         expected = "points of shape (n, 3) or (h, w, 3), or with further columns, (n, 4) and so on"
         raise ValueError(f"expected {expected}, got {array.shape}")
     further = {f"column_{i}": array[..., i] for i in range(3, array.shape[-1])}
     return Cloud(array[..., :3] if further else array, columns=further)  # type: ignore[arg-type]
+
+
+def _cloud_from_fields(table: NDArray[np.void]) -> Cloud:
+    fields: dict[str, NDArray[np.generic]] = {name: np.atleast_1d(table[name]) for name in table.dtype.names or ()}
+    wrong = [name for name, values in fields.items() if values.dtype.kind not in "fiub"]
+    if wrong:
+        raise ValueError(f"expected fields of numbers, got {fields[wrong[0]].dtype} in the field {wrong[0]!r}")
+    shape = table.shape if table.ndim else (1,)
+    columns = {name: native(values).reshape(table.size, *_rest(values, shape)) for name, values in fields.items()}
+    try:
+        return cloud_from_columns(columns, shape)
+    except CloudReadError as error:
+        raise ValueError(str(error)) from None
 
 
 def _rest(values: NDArray[np.generic], shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -358,8 +353,8 @@ def _whole_labels(labels: NDArray[np.generic]) -> NDArray[np.int32]:
 
 
 def _checked_column(name: str, column: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.generic]:
-    if not isinstance(name, str) or not name.split():
-        raise CloudWriteError(f"expected names of columns as words, got {ascii(name)[:80]}")
+    if not isinstance(name, str) or not name.split() or not "".join(name.split()).isprintable():
+        raise CloudWriteError(f"expected names of columns as printable words, got {ascii(name)[:80]}")
     if not isinstance(column, np.ndarray) or column.dtype.kind not in "fiub":
         kind = column.dtype if isinstance(column, np.ndarray) else type(column).__name__
         raise CloudWriteError(f"expected the column {name!r} as an array of numbers, got {kind}")
@@ -401,23 +396,14 @@ def columns_of_cloud(
     clash = [name for name in further if name in (*axes, "_")]
     if clash:
         raise CloudWriteError(f"expected a column of another name than {clash[0]!r}, which files keep for themselves")
-    per_point = cloud.viewpoint is not None and cloud.viewpoint.ndim > 1
-    no_names: Sequence[tuple[str, ...]] = [()]
-    for names in product(
-        no_names if cloud.colors is None else colors,
-        no_names if cloud.normals is None else normals,
-        no_names if cloud.labels is None else [(name,) for name in LABEL_NAMES],
-        [VIEWPOINT_NAMES] if per_point else no_names,
-    ):
-        chosen = Roles(*names)
-        own = {
-            **_named(chosen.colors, cloud.colors),
-            **_named(chosen.normals, cloud.normals),
-            **_named(chosen.labels, cloud.labels),
-            **_named(chosen.viewpoint, cloud.viewpoint),
-        }
+    places = cloud.viewpoint if cloud.viewpoint is not None and cloud.viewpoint.ndim > 1 else None
+    given = (cloud.colors, cloud.normals, cloud.labels, places)
+    choices: list[Sequence[tuple[str, ...]]] = [colors, normals, [(name,) for name in LABEL_NAMES], [VIEWPOINT_NAMES]]
+    choices = [[()] if values is None else of for values, of in zip(given, choices, strict=True)]
+    for names in product(*choices):
+        own = dict(chain.from_iterable(_named(role, values) for role, values in zip(names, given, strict=True)))
         columns = {**axes, **own, **further}
-        if len(columns) == len(axes) + len(own) + len(further) and _is_found(chosen, columns):
+        if len(columns) == len(axes) + len(own) + len(further) and _is_found(names, columns):
             return columns
     raise CloudWriteError(
         f"expected columns of other names than the cloud's own colours, normals and labels have, "
@@ -425,160 +411,24 @@ def columns_of_cloud(
     )
 
 
-def _named(names: tuple[str, ...], values: NDArray[np.generic] | None) -> Columns:
-    """The values under their names; three bytes under one name are packed as PCL packs colours."""
+def _named(names: tuple[str, ...], values: NDArray[np.generic] | None) -> Iterable[tuple[str, NDArray[np.generic]]]:
+    """The values with their names; three bytes under one name are packed as PCL packs colours."""
     if not names or values is None:
-        return {}
+        return ()
     if names[0] in PACKED_NAMES:
         rows = values.reshape(-1, 3).astype(np.uint32)
-        return {names[0]: rows[:, 0] << 16 | rows[:, 1] << 8 | rows[:, 2]}
-    return dict(zip(names, values.reshape(-1, len(names)).T, strict=True))
+        return ((names[0], rows[:, 0] << 16 | rows[:, 1] << 8 | rows[:, 2]),)
+    return zip(names, values.reshape(-1, len(names)).T, strict=True)
 
 
-def _is_found(chosen: Roles, columns: Columns) -> bool:
+def _is_found(chosen: Iterable[tuple[str, ...]], columns: Columns) -> bool:
     """Whether `cloud_from_columns` finds these roles; what a cloud has not may be found, too, among its columns."""
     lower = _names_by_lower_case(columns)
     found = Roles.of({name: columns[stored] for name, stored in lower.items() if columns[stored].ndim == 1})
     return all(names in ((), role) for names, role in zip(chosen, found, strict=True))
 
 
-# ---- Numbers in text -----------------------------------------------------------------------------------------------
-
-
-def columns_from_text(table: NDArray[np.float64], fields: Iterable[TextField]) -> dict[str, NDArray[np.generic]]:
-    """One array per field of a text file, in the types that the header names.
-
-    A packed colour of nan means no colour, because a text does not keep the bits of a nan. It becomes 0, black; a field
-    with no other colours is left out. Packed colours in whole numbers of 32 bits may have a sign or not, whatever the
-    header says.
-
-    Parameters
-    ----------
-    table : (n, m) float64
-        Numbers of the text, row by row.
-    fields : (name, dtype, count) of each field; the counts add up to m
-
-    Returns
-    -------
-    dict of field name to (n,) array, (n, c) where the count is above 1
-
-    Raises
-    ------
-    CloudReadError
-        A field of integers has a number that is not whole, or out of the range of its type.
-    """
-    columns: dict[str, NDArray[np.generic]] = {}
-    end = 0
-    for name, dtype, count in fields:
-        first, end = end, end + count
-        numbers = table[:, first] if count == 1 else table[:, first:end]
-        kind = np.dtype(dtype)
-        is_packed = name.lower() in PACKED_NAMES and kind.itemsize == 4
-        if is_packed and (none := np.isnan(numbers)).any():
-            if none.all():
-                continue
-            numbers = np.where(none, 0.0, numbers)
-        if kind.kind in "iu":
-            limits = np.iinfo(kind)
-            least, most = (-(1 << 31), (1 << 32) - 1) if is_packed else (int(limits.min), int(limits.max))
-            _check_whole(name, numbers, least, most)
-        if is_packed and kind.kind in "iu":
-            numbers = numbers.astype(np.int64)
-        with np.errstate(over="ignore", invalid="ignore"):
-            columns[name] = numbers.astype(kind)
-    return columns
-
-
-def _check_whole(name: str, numbers: NDArray[np.float64], least: int, most: int) -> None:
-    """Raise CloudReadError if a field of integers cannot hold one of the numbers, (n,) or (n, c)."""
-    wrong = ~((numbers >= float(least)) & (numbers <= float(most)) & (numbers == np.rint(numbers)))
-    if wrong.any():
-        row = int(np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))[0])
-        got = f"{numbers[wrong][0]:.12g}"
-        raise CloudReadError(
-            f"the header says that {name!r} holds whole numbers from {least} to {most}, "
-            f"but row {row + 1} of numbers has {got}: correct the type in the header, or the number"
-        )
-
-
-def numbers_from_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> NDArray[np.float64]:
-    """The first `n_rows` rows of numbers in a text, one row per line; empty lines do not count.
-
-    Parameters
-    ----------
-    body : bytes
-        Lines that end in a line feed. Text after the last row is not read.
-    n_rows, n_columns : int
-    first_line : int
-        Number of the body's first line in the file, from 1, for messages.
-
-    Returns
-    -------
-    (n_rows, n_columns) float64
-        ``nan`` and ``inf`` in any case are numbers too.
-
-    Raises
-    ------
-    CloudReadError
-        Too few rows, a row of more or fewer words than columns, or a word that is not a number.
-    """
-    needed = n_rows * n_columns
-    if needed > len(body):  # a number takes at least a byte: no memory for numbers that only the header has
-        raise CloudReadError(f"the header promises {needed} numbers, but only {len(body)} bytes follow")
-    rows = _rows_of_text(body, n_rows, n_columns, first_line)
-    # Not through an array of the words: each would take as many bytes as the longest.
-    return np.fromiter(chain.from_iterable(rows), np.float64, needed).reshape(n_rows, n_columns)
-
-
-def _rows_of_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> Iterator[list[float]]:
-    """Numbers of each row."""
-    left = n_rows
-    lines = enumerate(BytesIO(body), first_line)
-    while left:
-        number, line = next(lines, (0, b""))
-        if not number:
-            raise CloudReadError(f"the header promises {n_rows} points, but {n_rows - left} rows of numbers follow")
-        words = line.split(None, n_columns)
-        if not words:
-            continue
-        if b"_" in line:  # only Python reads 1_000 as a number
-            word = next((word for word in words if b"_" in word), line).decode("latin-1")
-            raise CloudReadError(f"expected numbers only in the ascii data, got in line {number}: {word[:80]!r}")
-        if len(words) != n_columns:
-            got = f"more than {n_columns}" if len(words) > n_columns else f"{len(words)}"
-            raise CloudReadError(
-                f"expected {n_columns} numbers in each line, one for each field of the header, "
-                f"but line {number} has {got}: correct the line or the header{_about_commas(line)}"
-            )
-        yield numbers_of_words(words, number)
-        left -= 1
-
-
-def numbers_of_words(words: Sequence[bytes], line: int) -> list[float]:
-    """Numbers of the words of a line; the C library of Windows writes NaN as ``1.#QNAN`` or ``-nan(ind)``.
-
-    Raises
-    ------
-    CloudReadError
-        A word is no number; the message names the line.
-    """
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        pass
-    try:
-        return [float(_INFINITE.sub(rb"\1inf", _NO_NUMBER.sub(b"nan", word))) for word in words]
-    except ValueError as error:
-        reason = f"{str(error)[:120]}{_about_commas(b' '.join(words))}"
-        raise CloudReadError(f"expected numbers only in the ascii data, got in line {line}: {reason}") from None
-
-
-_NO_NUMBER = re.compile(rb"[-+]?(1\.#(QNAN|SNAN|IND)0*|nan\(\w+\))", re.IGNORECASE)
-_INFINITE = re.compile(rb"([-+]?)1\.#INF0*", re.IGNORECASE)
-
-
-def _about_commas(line: bytes) -> str:
-    return "; it has commas: write decimal points, and blanks between numbers" if b"," in line else ""
+# ---- Arrays of callers ----------------------------------------------------------------------------------------------
 
 
 def without_mask(values: ArrayLike) -> ArrayLike:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.cloud import COLOR_NAMES, Cloud, as_numbers, cloud_from_array, cloud_from_columns, native
+from pcgraph.cloud import COLOR_NAMES, Cloud, cloud_from_array, cloud_from_columns, native
 from pcgraph.errors import CloudReadError
 
 _MESSAGE_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -56,8 +56,6 @@ def as_cloud(source: Any) -> Cloud:
         from pcgraph.io import read_cloud
 
         return read_cloud(source)
-    if isinstance(source, np.ndarray) and source.dtype.names is not None:
-        return cloud_from_array(source)
     for attributes, convert in _KINDS.items():
         if all(hasattr(source, name) for name in attributes):
             return convert(source)
@@ -67,7 +65,7 @@ def as_cloud(source: Any) -> Cloud:
         if hasattr(source, "to_point_cloud"):
             hint = "; pass its to_point_cloud().points"
         raise ValueError(f"expected points as {kinds}, got {type(source).__name__}{hint}")
-    return cloud_from_array(as_numbers("points", source))
+    return cloud_from_array(source)
 
 
 def _of_message(message: Any) -> Cloud:
@@ -122,12 +120,14 @@ def _of_open3d_tensor(cloud: Any) -> Cloud:
 
 def _of_trimesh(mesh: Any) -> Cloud:
     """Cloud of a trimesh.PointCloud, or of the vertices of a trimesh.Trimesh with their normals."""
-    points, visual = np.asarray(mesh.vertices), mesh.visual
-    colors = np.asarray(visual.vertex_colors)[:, :3] if getattr(visual, "kind", None) == "vertex" else None
-    normals = np.asarray(mesh.vertex_normals) if hasattr(mesh, "vertex_normals") else None
-    return _from_columns(
-        _columns_of(points, colors, normals) | dict(getattr(mesh, "vertex_attributes", {})), points.shape[:1]
+    points = np.asarray(mesh.vertices)
+    colors = np.asarray(mesh.visual.vertex_colors) if mesh.visual.kind == "vertex" else np.empty(0)
+    columns = _columns_of(
+        points,
+        colors[:, :3] if len(colors) else None,
+        np.asarray(mesh.vertex_normals) if hasattr(mesh, "vertex_normals") else None,  # clouds have none
     )
+    return _from_columns(columns | getattr(mesh, "vertex_attributes", {}), points.shape[:1])
 
 
 def _columns_of(
@@ -151,7 +151,7 @@ def _from_columns(columns: dict[str, NDArray[np.generic]], shape: tuple[int, ...
 _KINDS: dict[tuple[str, ...], Callable[[Any], Cloud]] = {
     ("fields", "data", "point_step", "row_step"): _of_message,
     ("points", "colors", "normals", "has_points"): _of_open3d,
-    ("point", "is_gpu", "is_cpu"): _of_open3d_tensor,
+    ("point", "is_cpu", "is_cuda"): _of_open3d_tensor,
     ("vertices", "visual"): _of_trimesh,
 }
 """Converters by the attributes that tell the kind of an object, so that no library need be imported to know it."""

@@ -33,6 +33,12 @@ def without_long_words(message: str) -> str:
     return " ".join(w if len(w) <= MAX_WORD else f"{w[: MAX_WORD // 2]}...{w[3 - MAX_WORD // 2 :]}" for w in words)
 
 
+def library_reason(error: BaseException) -> str:
+    """Class and first line of what a library raised about a file: further lines tell places in its source."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0][:MAX_WORD]}" if lines else type(error).__name__
+
+
 def visible(text: str) -> str:
     """Text with its control characters spelt out, such as `\\u202e`; line ends and tabs stay.
 

@@ -348,10 +348,10 @@ def fraction(name: str, value: float) -> float:
     return number
 
 
-def whole_number(name: str, value: int) -> int:
-    """The value as int, if it is a whole number of at least 1; ValueError otherwise."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"expected {name} as a whole number of at least 1, got {value!r}")
+def whole_number(name: str, value: int, least: int = 1) -> int:
+    """The value as int, if it is a whole number of at least the least; ValueError otherwise."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise ValueError(f"expected {name} as a whole number of at least {least}, got {value!r}")
     return int(value)
 
 

@@ -29,6 +29,9 @@ class WarningThresholds:
     max_around: float = 18.0  # voxels around one: on a surface some 6 to 13, on one as thick as a voxel 17
     min_points: int = 1000  # of fewer points one voxel may be wanted
     min_seen: float = 0.1  # fraction of the voxels that a viewpoint sees
+    max_gone: float = 0.75  # fraction of earlier voxels in sight that are gone: 0 to 0.14 in one frame
+    min_in_sight: float = 0.25  # voxels in sight over those of the new scan: or a pose just off counts
+    min_voxels_in_sight: int = 1000  # count; the same
 
 
 _WARN = WarningThresholds()
@@ -112,6 +115,25 @@ def warn_of_viewpoint(viewpoint: NDArray[np.float64], grid: VoxelGrid) -> None:
         _warn(
             f"expected a viewpoint that sees the cloud, but from {np.round(viewpoint, 3).tolist()} m only "
             f"{100.0 * seen:.0f} % of it is visible; it may lie inside or under a surface, or be of another frame"
+        )
+
+
+def warn_of_frame(n_gone: int, n_there: int, n_new: int) -> None:
+    """Warn if most of what a new scan should see of the earlier ones is not there, as in another frame.
+
+    Parameters
+    ----------
+    n_gone, n_there : int
+        Voxels of the earlier scans which the new scan sees through, and in which it has points.
+    n_new : int
+        Voxels of the new scan.
+    """
+    in_sight = n_gone + n_there
+    is_enough = in_sight >= max(_WARN.min_in_sight * n_new, _WARN.min_voxels_in_sight)
+    if is_enough and n_gone > _WARN.max_gone * in_sight:
+        _warn(
+            f"expected a scan that meets what earlier scans met, but it sees through {100.0 * n_gone / in_sight:.0f} % "
+            "of the voxels in its sight; are its points and its viewpoint in the frame of the first scan?"
         )
 
 

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from os import PathLike
@@ -15,6 +16,8 @@ from typing import Any, NamedTuple, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.columns import CLIP
+from pcgraph.disjoint_sets import connected_components
 from pcgraph.errors import MAX_WORD, CloudReadError, one_line
 from pcgraph.graph.continuations import Continuations
 from pcgraph.hierarchy import checked_parents
@@ -32,14 +35,25 @@ from pcgraph.plumbing.plain_files import check_file, is_sealed, read_file
 from pcgraph.segmentation import NOT_STORED, SAVED_FORMAT, SAVED_MARK, SAVED_VERSION, Segmentation, Settings
 from pcgraph.supervoxels.method import SupervoxelMethod
 from pcgraph.tree.linkage import Linkage
+from pcgraph.voxels.grading import enlarged
+from pcgraph.voxels.grid import VoxelGrid
 from pcgraph.voxels.warp import CameraWarp, RangeWarp, Warp
 
 _FOR_TYPE_CHECKERS = {"Continuations": Continuations}
 """Types of fields whose modules import them for type checkers alone."""
 _MAX_LEVEL = 4
 """Number of times that the edge of a voxel is doubled, at most (`Grading`)."""
-_MAX_OFF_UNIT = 1e-6
-"""Difference of the length of a unit vector from 1, at most, because it was rounded."""
+_MAX_LENGTH = 1e102
+"""Metres, largest length: coordinates of clouds are 1e100 at most (`pcgraph.inputs`), ranges a few times that. Squares
+of far larger ones overflow, and a loop that waits for a least distance does not end where all are NaN."""
+_MAX_SCATTER = 1e225
+"""Square metres, largest scatter: the square of such lengths, of 10^18 points."""
+_MAX_COUNT = 1 << 53
+"""Points of a voxel or a node, less than: sums of such counts are exact as floats, too."""
+_ROUNDING = 1e-6
+"""Relative difference that rounding may make, at most, also between two machines. Chosen by eye; not varied."""
+_UNIT = 1.0 + _ROUNDING
+"""Largest absolute value of what is 1 at most, because it was rounded."""
 
 
 class Row(NamedTuple):
@@ -50,18 +64,18 @@ class Row(NamedTuple):
     shape : str
         Numbers and names of dimensions, separated by spaces. A name stands for one number throughout the file: n
         points that have a supervoxel; v voxels; e entries of the lists of touching voxels; k supervoxels; t nodes of
-        the tree; m edges, g gaps, r continuations and b bridges; d columns of features; c blocks. "points" is the
-        leading shape of the input. "..." is any shape.
+        the tree; m edges, g gaps, r continuations and b bridges; d columns of features; c blocks;
+        p supervoxels before the last update. "points" is the leading shape of the input. "..." is any shape.
     least, below : int, or the name of a dimension
         Range of whole numbers. None: there is no such limit.
-    is_finite : bool
-        Whether floats are neither NaN nor infinite.
+    largest : float, or None
+        Largest absolute value of floats. None: NaN and infinite numbers may be there.
     """
 
     shape: str
     least: int | None = None
     below: int | str | None = None
-    is_finite: bool = True
+    largest: float | None = _MAX_LENGTH
 
 
 ARRAYS: dict[str, Row] = {
@@ -69,17 +83,19 @@ ARRAYS: dict[str, Row] = {
     "outliers": Row("points"),
     "supervoxels": Row("points", -1, "k"),
     "objects": Row("k", 0),
+    "ages": Row("k", 0),
+    "supervoxel_of_earlier": Row("p", -1, "k"),
     "viewpoint": Row("..."),
-    "feature_scaling/*": Row("d", is_finite=False),
+    "feature_scaling/*": Row("d", largest=None),
     "graph/edges": Row("m 2", 0, "k"),
     "graph/edge_features/contact_voxels": Row("m", 1),
     "graph/edge_features/*": Row("m"),
     "graph/node_features/size": Row("k", 1),
     "graph/node_features/centroid": Row("k 3"),
     "graph/node_features/normal": Row("k 3"),
-    "graph/node_features/covariance": Row("k 3 3"),
-    "graph/node_features/color": Row("k 3", is_finite=False),
-    "graph/node_features/color_covariance": Row("k 3 3", is_finite=False),
+    "graph/node_features/covariance": Row("k 3 3", largest=_MAX_SCATTER),
+    "graph/node_features/color": Row("k 3", largest=None),
+    "graph/node_features/color_covariance": Row("k 3 3", largest=None),
     "graph/node_features/deviations": Row("k 3"),
     "graph/node_features/features": Row("k d"),
     "graph/node_features/*": Row("k"),
@@ -90,29 +106,32 @@ ARRAYS: dict[str, Row] = {
     "graph/continuations/*": Row("r"),
     "graph/bridges/edges": Row("b 2", 0, "k"),
     "graph/bridges/*": Row("b"),
-    "graph/acquisition*/places": Row("...", is_finite=False),
+    "graph/acquisition*/places": Row("...", largest=None),
     "graph/acquisition*": Row("3"),
     "tree/parents": Row("t", 0, "t"),
-    "tree/altitudes": Row("t", is_finite=False),
-    "tree/moments/counts": Row("t", 1),
-    "tree/moments/features": Row("t d"),
-    "tree/moments/*scatters": Row("t 3 3"),
-    "tree/moments/*": Row("t 3"),
-    "surface/normals": Row("v 3"),
+    "tree/altitudes": Row("t", largest=None),
+    "tree/moments/counts": Row("t", 1, _MAX_COUNT),
+    "tree/moments/centroids": Row("t 3"),
+    "tree/moments/scatters": Row("t 3 3", largest=_MAX_SCATTER),
+    "tree/moments/colors": Row("t 3", largest=_UNIT),
+    "tree/moments/color_scatters": Row("t 3 3", largest=float(_MAX_COUNT)),
+    "tree/moments/normals": Row("t 3", largest=_UNIT),
+    "tree/moments/features": Row("t d", largest=CLIP * _UNIT),
+    "surface/normals": Row("v 3", largest=_UNIT),
     "surface/supervoxels": Row("v", 0, "k"),
     "surface/grid/warp/*": Row("3"),
-    "surface/grid/cells": Row("v 3"),
+    "surface/grid/cells": Row("v 3", largest=sys.float_info.max),
     "surface/grid/voxel_of_point": Row("n", 0, "v"),
     "surface/grid/order": Row("n", 0, "n"),
     "surface/grid/starts": Row("v+1", 0),
-    "surface/grid/counts": Row("v", 1),
+    "surface/grid/counts": Row("v", 1, _MAX_COUNT),
     "surface/grid/warped": Row("v 3"),
     "surface/grid/centroids": Row("v 3"),
     "surface/grid/edge_lengths": Row("v"),
-    "surface/grid/colors": Row("v 3"),
+    "surface/grid/colors": Row("v 3", largest=_UNIT),
     "surface/grid/indptr": Row("v+1", 0),
     "surface/grid/neighbours": Row("e", 0, "v"),
-    "surface/grid/features": Row("v d"),
+    "surface/grid/features": Row("v d", largest=CLIP * _UNIT),
     "surface/grid/levels": Row("v", 0, _MAX_LEVEL + 1),
     "surface/grid/grading/blocks": Row("c 3"),
     "surface/grid/grading/levels": Row("c", 1, _MAX_LEVEL + 1),
@@ -264,8 +283,8 @@ def _check_shape(name: str, array: NDArray[Any], row: Row, sizes: dict[str, tupl
 
 def _check_range(name: str, array: NDArray[Any], row: Row, below: int | None) -> None:
     if array.dtype.kind == "f":
-        if row.is_finite and not np.isfinite(array).all():
-            raise DamagedError(f"expected finite numbers in the array {name}")
+        if row.largest is not None and not (np.abs(array) <= row.largest).all():
+            raise DamagedError(f"expected numbers up to {row.largest:g} in size in the array {name}")
     elif array.size and array.dtype.kind in "iu":
         least, most = int(array.min()), int(array.max())
         if (row.least is not None and least < row.least) or (below is not None and most >= below):
@@ -279,7 +298,10 @@ def _check_range(name: str, array: NDArray[Any], row: Row, below: int | None) ->
 def _check(found: Segmentation) -> None:
     """Raise DamagedError unless the parts of a segmentation, whose arrays are sound, fit each other."""
     _expect(found.tree.moments is not None, "moments of the tree")
-    _check_grid(found)
+    _check_lists(found.surface.grid)
+    with np.errstate(all="ignore"):  # of numbers that are then refused
+        _check_places(found.surface.grid)
+    _check_columns(found)
     _check_tree(found)
     _check_graph(found)
     inside = found.supervoxels >= 0
@@ -287,22 +309,24 @@ def _check(found: Segmentation) -> None:
     surface, k = found.surface, found.tree.n_leaves
     _expect(np.count_nonzero(inside) == len(surface.grid.voxel_of_point), "as many points as have a supervoxel")
     _expect(bool(np.bincount(surface.supervoxels, minlength=k).all()), "a voxel of each supervoxel")
-    _expect(bool((np.linalg.norm(surface.normals, axis=1) <= 1.0 + _MAX_OFF_UNIT).all()), "normals of unit length")
+    touching = surface.grid.touching_pairs()
+    within = touching[surface.supervoxels[touching[:, 0]] == surface.supervoxels[touching[:, 1]]]
+    n_pieces = int(connected_components(within, surface.grid.n_voxels).max()) + 1
+    _expect(n_pieces == k, "each supervoxel in one piece")
+    _expect(bool((np.linalg.norm(surface.normals, axis=1) <= _UNIT).all()), "normals of unit length")
     _expect(0 <= int(found.objects.max()) < found.next_object, "numbers of objects below the next one")
     _expect(found.viewpoint.shape in ((3,), (np.count_nonzero(inside), 3)), "one viewpoint, or one for each point")
-    _expect(0.0 < found.seed_size < np.inf, "a positive distance of seeds")
+    _expect(_is_length(found.seed_size), "a positive distance of seeds")
     _expect(0.0 <= found.object_altitude < np.inf, "an altitude of objects that is not negative")
 
 
-def _check_grid(found: Segmentation) -> None:
-    grid, moments = found.surface.grid, found.leaves
+def _check_lists(grid: VoxelGrid) -> None:
+    """Raise DamagedError unless each point is in one voxel, and voxels that touch are listed with each other."""
     n, v = len(grid.voxel_of_point), len(grid.counts)
     _expect(v > 0, "a voxel")
-    _expect(0.0 < grid.size < np.inf and bool((grid.edge_lengths > 0.0).all()), "voxels of positive size")
-    _check_warp(grid.warp)
     for starts, end, name in ((grid.starts, n, "points"), (grid.indptr, len(grid.neighbours), "neighbours")):
-        ascends = starts[0] == 0 and starts[-1] == end and bool((np.diff(starts) >= 0).all())
-        _expect(bool(ascends), f"lists of the {name} of each voxel, one after the other")
+        follow = starts[0] == 0 and starts[-1] == end and bool((np.diff(starts) >= 0).all())
+        _expect(bool(follow), f"lists of the {name} of each voxel, one after the other")
     held = np.diff(grid.starts)
     listed = np.array_equal(grid.voxel_of_point[grid.order], np.repeat(np.arange(v), held))
     _expect(listed and bool((np.bincount(grid.order, minlength=n) == 1).all()), "each point in the list of its voxel")
@@ -312,13 +336,31 @@ def _check_grid(found: Segmentation) -> None:
     _expect(bool((np.diff(pairs) > 0).all()) and bool((owner != grid.neighbours).all()), "neighbours that ascend")
     there_and_back = np.sort(grid.neighbours * np.int64(v) + owner)
     _expect(np.array_equal(there_and_back, pairs), "voxels that touch each other")
+
+
+def _check_places(grid: VoxelGrid) -> None:
+    """Raise DamagedError unless each voxel lies in its cell, and the cells ascend."""
+    _check_warp(grid.warp)
+    _expect(_is_length(grid.size) and bool((grid.edge_lengths > 0.0).all()), "voxels of positive size")
     _expect((grid.levels is None) == (grid.grading is None), "levels and their grading, or neither")
-    levels = np.zeros(v, np.int8) if grid.levels is None else grid.levels
-    _expect(_are_ascending(np.column_stack((levels, grid.cells))), "voxels in the order of their cells")
+    levels = np.zeros(grid.n_voxels, np.int8) if grid.levels is None else grid.levels
     _expect(bool((grid.cells == np.floor(grid.cells)).all()), "cells at whole numbers")
+    _expect(_are_ascending(np.column_stack((levels, grid.cells))), "voxels in the order of their cells")
+    in_cells = grid.warped / grid.warped_edges[:, None] - grid.cells
+    slack = _ROUNDING * (1.0 + np.abs(grid.cells))
+    _expect(bool(((in_cells >= -slack) & (in_cells <= 1.0 + slack)).all()), "voxels in their cells")
+    reach = _ROUNDING * (grid.edge_lengths[:, None] + np.abs(grid.centroids).max())
+    off = np.abs(grid.warp.backward(grid.warped) - grid.centroids)
+    _expect(bool((off <= reach).all()), "centroids where the warp has them")
+    edges = enlarged(grid.size * grid.warp.scale(grid.centroids), grid.levels)
+    _expect(bool((np.abs(edges - grid.edge_lengths) <= _ROUNDING * edges).all()), "edges as the warp has them")
     if grid.grading is not None:
         blocks = grid.grading.blocks
         _expect(len(np.unique(blocks, axis=0)) == len(blocks), "each block once")
+
+
+def _check_columns(found: Segmentation) -> None:
+    grid, moments = found.surface.grid, found.leaves
     colored = {part is not None for part in (grid.colors, moments.colors, moments.color_scatters)}
     with_features = {part is not None for part in (grid.features, moments.features, found.feature_scaling)}
     _expect(len(colored) == len(with_features) == 1, "colours, and features, of voxels and supervoxels or of neither")
@@ -327,10 +369,14 @@ def _check_grid(found: Segmentation) -> None:
 
 def _check_warp(warp: Warp) -> None:
     if isinstance(warp, RangeWarp):
-        _expect(0.0 < warp.reference_range < np.inf and 0.0 <= warp.growth < 1.0, "a range and a growth of voxels")
+        _expect(_is_length(warp.reference_range) and 0.0 <= warp.growth < 1.0, "a range and a growth of voxels")
     if isinstance(warp, CameraWarp):
-        is_unit = abs(float(np.linalg.norm(warp.axis)) - 1.0) <= _MAX_OFF_UNIT
-        _expect(is_unit and 0.0 < warp.reference_depth < np.inf, "an axis and a depth of a camera")
+        is_unit = abs(float(np.linalg.norm(warp.axis)) - 1.0) <= _ROUNDING
+        _expect(is_unit and _is_length(warp.reference_depth), "an axis and a depth of a camera")
+
+
+def _is_length(value: float) -> bool:
+    return 0.0 < value <= _MAX_LENGTH
 
 
 def _check_tree(found: Segmentation) -> None:
@@ -341,6 +387,8 @@ def _check_tree(found: Segmentation) -> None:
         raise DamagedError(f"tree/parents: {error}") from None
     children = np.bincount(tree.parents[:-1], minlength=len(tree.parents))
     _expect(len(tree.parents) == 2 * k - 1 and bool((children[k:] == 2).all()), "two children of each inner node")
+    counts = np.bincount(tree.parents[:-1], tree.sizes[:-1], len(tree.parents))
+    _expect(bool((counts[k:] == tree.sizes[k:]).all()), "the points of two nodes in the one above them")
     levels = tree.altitudes
     _expect(not levels[:k].any() and bool((levels[1:] >= levels[:-1]).all()), "altitudes from 0 that do not decrease")
 

@@ -21,6 +21,7 @@ from pcgraph.graph.bridges import bridges
 from pcgraph.graph.contacts import contacts, edge_features
 from pcgraph.graph.continuations import continuations, faces_of
 from pcgraph.graph.gaps import gaps
+from pcgraph.history import History
 from pcgraph.inputs import CleanCloud, Features, Points, as_arrays, clean_cloud, whole_number
 from pcgraph.parallel import side_by_side
 from pcgraph.plausibility import (
@@ -243,12 +244,12 @@ class Scan:
     seed_size: float
 
 
-def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -> Segmentation:
-    """Segmentation of a scan: the algorithm from voxels on."""
+def segment_scan(scan: Scan, earlier: History | None, settings: Settings) -> Segmentation:
+    """Segmentation of a scan, and of what is kept of earlier ones: the algorithm from voxels on."""
     return merge_supervoxels(cluster_scan(scan, earlier, settings.method), earlier, settings)
 
 
-def cluster_scan(scan: Scan, earlier: Segmentation | None, method: SupervoxelMethod) -> Supervoxels:
+def cluster_scan(scan: Scan, earlier: History | None, method: SupervoxelMethod) -> Supervoxels:
     """Supervoxels of a scan and their graph: the algorithm from voxels to the graph."""
     cloud, grid, planes = scan.voxelised.cloud, scan.voxelised.grid, scan.oriented.planes
     normals = _normals(cloud, scan.oriented, grid)
@@ -291,7 +292,7 @@ def cluster_scan(scan: Scan, earlier: Segmentation | None, method: SupervoxelMet
     )
 
 
-def merge_supervoxels(found: Supervoxels, earlier: Segmentation | None, settings: Settings) -> Segmentation:
+def merge_supervoxels(found: Supervoxels, earlier: History | None, settings: Settings) -> Segmentation:
     """Segmentation of supervoxels: the algorithm from the graph to tree and objects."""
     linkage, leaves = settings.linkage, found.moments
     tree = segmentation_tree(checked_merges(linkage.merges(found.graph, leaves), len(leaves), linkage), leaves)
@@ -308,6 +309,8 @@ def merge_supervoxels(found: Supervoxels, earlier: Segmentation | None, settings
         surface=found.surface,
         seed_size=found.seed_size,
         viewpoint=found.viewpoint,
+        ages=_ages(found.labels[found.labels >= 0], len(leaves), earlier),
+        supervoxel_of_earlier=np.empty(0, np.int32) if earlier is None else earlier.numbers,
         feature_scaling=found.feature_scaling,
         next_object=max(int(objects.max()) + 1, 0 if earlier is None else earlier.next_object),
         **vars(settings),
@@ -333,9 +336,7 @@ def _oriented(voxelisation: Voxelisation, method: SupervoxelMethod) -> OrientedP
     return oriented._replace(planes=replace(planes, normals=flipped))
 
 
-def _leaves(
-    cloud: CleanCloud, surface: Surface, leaf_of_point: NDArray[np.int32], earlier: Segmentation | None
-) -> Moments:
+def _leaves(cloud: CleanCloud, surface: Surface, leaf_of_point: NDArray[np.int32], earlier: History | None) -> Moments:
     """Moments of the supervoxels' points, with those of earlier scans."""
     n_leaves = int(surface.supervoxels.max()) + 1
     if earlier is None:
@@ -344,12 +345,21 @@ def _leaves(
         is_seen = np.bincount(leaf_of_point, minlength=n_leaves) > 0
         found, group = np.flatnonzero(is_seen), (np.cumsum(is_seen) - 1).astype(np.int32)[leaf_of_point]
         gained = moments_of_groups(cloud.points, cloud.colors, group, len(found), cloud.features)
-        leaves = joined_moments(replace(earlier.leaves, normals=None), gained, found, n_leaves)
+        leaves = joined_moments(earlier.leaves, gained, found, n_leaves)
     return replace(leaves, normals=surface.mean_normals(n_leaves))
 
 
-def _renumbered(objects: NDArray[np.int32], earlier: Segmentation, weights: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Objects of k supervoxels, (k,), with their numbers in an earlier segmentation of the first of these supervoxels.
+def _ages(leaf_of_point: NDArray[np.int32], n_leaves: int, earlier: History | None) -> NDArray[np.int32]:
+    """Number of scans since the last one that saw each supervoxel, (n_leaves,) int32."""
+    ages = np.zeros(n_leaves, np.int32)
+    if earlier is not None:
+        ages[: len(earlier.ages)] = earlier.ages + 1
+        ages[leaf_of_point] = 0
+    return ages
+
+
+def _renumbered(objects: NDArray[np.int32], earlier: History, weights: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Objects of k supervoxels, (k,), with the numbers that they had when the first of these supervoxels were all.
 
     An object keeps the number of that with which it shares most points, if no other object shares more with that. The
     other objects get numbers that were not used before.

@@ -133,6 +133,11 @@ class Segmentation:
     viewpoint : (3,) or (n, 3) float64, metres, the points' frame
         Sensor position, given or estimated: one for all points, or one row per point that has a supervoxel, if it was
         given per point.
+    ages : (k,) int32
+        Number of scans since the last one that saw a point of each supervoxel; 0 for those of the last scan.
+    supervoxel_of_earlier : (k_earlier,) int32
+        Number that each supervoxel of the segmentation before the last update has in this one, -1 if it was forgotten.
+        After `pcgraph.segment` there is none.
     feature_scaling : RobustScaling, or None
         Center and spread of each column of the features; None if none were given.
     next_object : int
@@ -151,6 +156,8 @@ class Segmentation:
     linkage: Linkage
     object_altitude: float
     viewpoint: NDArray[np.float64]
+    ages: NDArray[np.int32]
+    supervoxel_of_earlier: NDArray[np.int32]
     feature_scaling: RobustScaling | None = None
     next_object: int = 0
 
@@ -282,6 +289,28 @@ class Segmentation:
             raise ValueError(f"expected values as numbers or truth values, got {rows.dtype}")
         missing = {"f": np.nan, "i": -1, "b": False}[rows.dtype.kind]
         return np.concatenate((rows, np.full((1, *rows.shape[1:]), missing, rows.dtype)))[self.supervoxels]
+
+    def of_earlier(self, supervoxels: ArrayLike) -> NDArray[np.int32]:
+        """Supervoxels of this segmentation, given their numbers before the last update, any shape; -1 if forgotten.
+
+        Parameters
+        ----------
+        supervoxels : (...) int
+            Such as the earlier segmentation's `supervoxels`, of its points; -1, of points without one, stays -1.
+
+        Examples
+        --------
+        >>> import numpy as np, pcgraph
+        >>> x, y = np.meshgrid(np.linspace(-1.0, 1.0, 64), np.linspace(-1.0, 1.0, 64))
+        >>> wall = np.stack((x, y, np.full_like(x, 2.0)), axis=-1)
+        >>> earlier = pcgraph.segment(wall)
+        >>> result = pcgraph.update(earlier, wall)
+        >>> now = result.of_earlier(earlier.supervoxels)
+        >>> labels = np.where(now >= 0, result.objects[now], -1)  # today's objects of the earlier points
+        >>> bool((labels == earlier.labels).all())
+        True
+        """
+        return np.append(self.supervoxel_of_earlier, np.int32(-1))[np.asarray(supervoxels)]
 
     def saliency(self) -> NDArray[np.float64]:
         """Boundary strength of each point in the input's shape, the altitudes' unit; NaN without a supervoxel.

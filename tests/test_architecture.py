@@ -191,13 +191,14 @@ STOREYS = [
     "segmentation",
     "saved_segmentation",
     "labelling",
+    "history",
     "plausibility",
     "scan",
     "stream",
     "all_kernels",
 ]
 """Of pcgraph, from the ground up: nobody imports from above."""
-ON_TOP = ("detection", "learning", "viewer", "cli", "__main__")
+ON_TOP = ("detection", "learning", "viewer", "service", "cli", "__main__")
 """What stands on these and may import all of them."""
 
 
@@ -298,6 +299,7 @@ def test_decoders_know_neither_scene_nor_renderer() -> None:
 
 
 LOADED_WHEN_USED = {"open3d": None, "cv2": ("geometry", "calibration"), "skimage": ("fusion",)}
+LOADED_WHEN_USED |= dict.fromkeys(("laspy", "lazrs", "pye57"), ("io",))
 """Packages that take long to import, or that may be missing, and the rooms that use them; None: any room may."""
 
 

@@ -16,6 +16,7 @@ from rangesim import AmcwToF, Detector, compare, decode, expose
 
 ROOMS = [
     "pcgraph.detection",
+    "pcgraph.io",
     "pcgraph.plumbing",
     "pcgraph.tree",
     "pcgraph.viewer",
@@ -48,6 +49,9 @@ ROOMS = [
 ]
 """Packages whose docstrings are run, all of their modules."""
 MODULES = [
+    "pcgraph.cloud",
+    "pcgraph.cloud_sources",
+    "pcgraph.labelling",
     "pcgraph.scan",
     "rangesim",
     "rangesim.errors",

@@ -28,6 +28,7 @@ from made_recordings import (
     small_turns,
 )
 
+import pcgraph
 from rangesim.errors import FileFormatError
 from rangesim.recordings import (
     datagrams,
@@ -125,6 +126,19 @@ def test_a_real_sweep_takes_a_tenth_of_a_second_and_destaggers_to_directions(rea
     assert ranges.shape == sweep.range_m.shape
     across = np.nanmedian(np.abs(np.diff(ranges[0], axis=0)))
     assert across < np.nanmedian(np.abs(np.diff(sweep.range_m[0], axis=0)))  # neighbours see neighbouring things
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_pcgraph_has_the_same_points(real_data: Path, name: str) -> None:
+    """By the formula of the manual, to a step of single precision."""
+    path = real_data / "lidar" / f"{name}.pcap"
+    cloud = pcgraph.read_cloud(path)
+    sweep = read_ouster(path).to_point_cloud(coordinates="world", destaggered=True)
+    np.testing.assert_array_equal(np.isnan(cloud.points), np.isnan(sweep.points))
+    step = np.spacing(np.float32(np.nanmax(np.abs(sweep.points))))
+    assert np.nanmax(np.abs(cloud.points - sweep.points)) <= step
+    for mine, theirs in (("time", sweep.time_s), ("ring", sweep.ring), ("reflectivity", sweep.intensity)):
+        np.testing.assert_array_equal(cloud.columns[mine], theirs)
 
 
 def test_a_sweep_of_kitti_gets_its_rings_back(real_data: Path) -> None:

@@ -15,6 +15,7 @@ from pcgraph.cli.compile import compile_command
 from pcgraph.cli.cut import cut_command
 from pcgraph.cli.info import info_command
 from pcgraph.cli.segment import segment_command
+from pcgraph.cli.serve import serve_command
 from pcgraph.cli.view import view_command
 from pcgraph.errors import one_line
 from pcgraph.plumbing.plain_files import said
@@ -25,6 +26,7 @@ app.command("cut")(cut_command)
 app.command("info")(info_command)
 app.command("view")(view_command)
 app.command("compile")(compile_command)
+app.command("serve")(serve_command)
 
 
 def _version(wanted: bool) -> None:

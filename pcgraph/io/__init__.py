@@ -10,18 +10,30 @@ from pathlib import Path
 
 from pcgraph.cloud import Cloud, plain_cloud
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
+from pcgraph.io.driving_sweeps import KITTI, NUSCENES, SWEEP
+from pcgraph.io.e57 import E57
 from pcgraph.io.format import CloudFile, Format
+from pcgraph.io.las import LAS
+from pcgraph.io.mesh import GLTF, OBJ, OFF, STL, sample_surface
 from pcgraph.io.npz import NPY, NPZ
+from pcgraph.io.ouster import OUSTER
 from pcgraph.io.pcd import PCD
 from pcgraph.io.ply import PLY
+from pcgraph.io.ptx import PTX
+from pcgraph.io.text import PTS, TEXT, XYZN, XYZRGB
 from pcgraph.plumbing.plain_files import read_file, write_file
 
-__all__ = ["decode_cloud", "encode_cloud", "read_cloud", "write_cloud"]
+__all__ = ["decode_cloud", "encode_cloud", "read_cloud", "sample_surface", "write_cloud"]
 
 MAX_REASON = 300
 """Characters of a message about a damaged file, count: such files can make messages of any length. Chosen by eye; not
 varied."""
-FORMATS: tuple[Format, ...] = (PCD, PLY, NPZ, NPY)
+FORMATS: tuple[Format, ...] = (
+    *(PCD, PLY, LAS, E57, NPZ, NPY),
+    *(TEXT, PTS, PTX, XYZN, XYZRGB),
+    *(KITTI, NUSCENES, SWEEP, OUSTER),
+    *(OBJ, STL, OFF, GLTF),
+)
 _WRITABLE = tuple(one for one in FORMATS if one.encode is not None)
 
 
@@ -33,8 +45,9 @@ def read_cloud(
     Parameters
     ----------
     path : str or path
-        ``.pcd`` (ascii, binary, binary_compressed), ``.ply`` (ascii, binary of either byte order; the vertices of a
-        mesh), ``.npz`` or ``.npy``.
+        Of any format of docs/files.md: LAS, LAZ, COPC, E57, PLY, PCD, text (``.xyz``, ``.csv``, ``.pts``, ``.ptx`` and
+        others), ``.npz``, ``.npy``, sweeps of KITTI, nuScenes and Ouster, the vertices of meshes (``.obj``, ``.stl``,
+        ``.off``, ``.glb``).
     file_format : str, optional
         Name of the format, such as "ply". Default: by the end of the file's name.
     columns : names, optional
@@ -50,7 +63,7 @@ def read_cloud(
     if os.path.isdir(path):  # unlike Path.is_dir it takes names that no file can have
         raise CloudReadError(f"{path} is a directory: expected a file ending in {_either(_suffixes(FORMATS))}")
     chosen, _ = _format(path.name, file_format, FORMATS, CloudReadError)
-    return _read(chosen, CloudFile(read_file(path, CloudReadError), path, _named(columns)), str(path))
+    return _read(chosen, CloudFile(read_file(path, CloudReadError), path, _named(columns, chosen)), str(path))
 
 
 def decode_cloud(content: bytes, name: str, columns: Sequence[str] | None = None) -> Cloud:
@@ -76,24 +89,15 @@ def decode_cloud(content: bytes, name: str, columns: Sequence[str] | None = None
     [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
     """
     chosen, _ = _format(Path(name).name, None, FORMATS, CloudReadError)
-    return _read(chosen, CloudFile(content, None, _named(columns)), name)
+    return _read(chosen, CloudFile(content, None, _named(columns, chosen)), name)
 
 
 def write_cloud(path: str | PathLike[str], cloud: Cloud, file_format: str | None = None) -> None:
     """Write a cloud as a whole file, or none; an older file of that name is replaced.
 
-    `read_cloud` of the file gives the same points, colours, normals, labels and columns, in their types and under their
-    names, but for what a format cannot hold:
-
-    | format | what is lost |
-    |---|---|
-    | ``.pcd`` | half floats and truth values become float32 and uint8 |
-    | ``.ply`` | rows and columns of an image, points that are not finite, the viewpoint of all points; integers of 64 bits become doubles, vectors the columns ``name_0``, ``name_1``; and as in PCD |
-    | ``.npy`` | the viewpoint of all points |
-    | ``.npz`` | nothing |
-
-    Colours are kept in 8 bits and labels in 32. Blanks in names of columns become underscores in PCD and PLY. A
-    viewpoint of (0, 0, 0) in a PCD file counts as none.
+    `read_cloud` of the file gives the same points, colours, normals, labels and columns, in their types and under
+    their names, but for what a format cannot hold: docs/files.md lists it. Lists of points, which all formats but PCD,
+    NPZ and NPY are, hold the finite points only.
 
     Parameters
     ----------
@@ -117,7 +121,7 @@ def write_cloud(path: str | PathLike[str], cloud: Cloud, file_format: str | None
     >>> write_cloud(path, Cloud(np.ones((2, 3)), columns={"ring": np.array([0, 1], np.uint16)}))
     >>> read_cloud(path).columns
     {'ring': array([0, 1], dtype=uint16)}
-    """  # noqa: E501
+    """
     path = Path(path)
     write_file(path, _encode(cloud, path.name, file_format), CloudWriteError)
 
@@ -171,7 +175,7 @@ def _format(
             known = ", ".join(one.name for one in formats)
             raise error(f"expected file_format as one of {known}, got {ascii(file_format)[:80]}")
         own = [suffix for suffix, one in ends.items() if one is named[0]]
-        return named[0], max(own, key=len) if own else named[0].suffixes[0]
+        return named[0], max(own or named[0].suffixes[:1], key=len, default="")
     if not ends:
         hint = "convert it first" if error is CloudReadError else "choose another name"
         raise error(f"expected a file ending in {_either(_suffixes(formats))}, got {name!r}: {hint}")
@@ -179,7 +183,9 @@ def _format(
     return ends[suffix], suffix
 
 
-def _named(columns: Sequence[str] | None) -> tuple[str, ...] | None:
+def _named(columns: Sequence[str] | None, chosen: Format) -> tuple[str, ...] | None:
+    if columns is not None and not chosen.takes_names:
+        raise CloudReadError(f"expected columns for text files only, as a .{chosen.name} names its own: leave it out")
     return None if columns is None else tuple(columns)
 
 

@@ -13,6 +13,10 @@ from pathlib import Path
 from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudWriteError
 
+MAX_HEADER_BYTES = 1 << 16
+"""Bytes in which the header of a file must end: far more than headers have, so that a file without one is refused
+before all of it is searched. Chosen by eye; not varied."""
+
 
 @dataclass(frozen=True)
 class CloudFile:
@@ -54,6 +58,8 @@ class Format:
         the finite points.
     holds_columns : bool
         Whether a file takes columns of any name and number.
+    takes_names : bool
+        Whether `CloudFile.columns` may name the columns.
     """
 
     name: str
@@ -62,6 +68,7 @@ class Format:
     encode: Callable[[Cloud, str], bytes] | None = None
     organised: bool = False
     holds_columns: bool = True
+    takes_names: bool = False
 
 
 # ---- Names of fields in headers of words ---------------------------------------------------------------------------

@@ -12,17 +12,15 @@ from numpy.typing import NDArray
 
 from pcgraph.cloud import (
     COLOR_NAMES,
-    MAX_HEADER_BYTES,
     NORMAL_NAMES,
     PACKED_NAMES,
     Cloud,
     cloud_from_columns,
-    columns_from_text,
     columns_of_cloud,
-    numbers_from_text,
 )
 from pcgraph.errors import CloudReadError, CloudWriteError
-from pcgraph.io.format import Format, check_words, field_name, field_word
+from pcgraph.io.format import MAX_HEADER_BYTES, Format, check_words, field_name, field_word
+from pcgraph.io.text_numbers import columns_from_text, numbers_from_text
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
@@ -75,7 +73,7 @@ def read_pcd(content: bytes) -> Cloud:
     """Cloud of a PCD file, given the file's bytes, with organisation, NaN, colours, normals and labels.
 
     What older versions leave out is taken as PCL takes it: ``COLUMNS`` are FIELDS, numbers without SIZE and TYPE are
-    float32, and a cloud without HEIGHT is a list.
+    float32, and a cloud without HEIGHT is a list. The orientation in VIEWPOINT and the alpha of ``rgba`` are not read.
 
     Raises
     ------

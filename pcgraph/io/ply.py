@@ -15,17 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.cloud import (
-    MAX_HEADER_BYTES,
     Cloud,
     cloud_from_columns,
-    columns_from_text,
     columns_of_cloud,
     native,
-    numbers_from_text,
-    numbers_of_words,
 )
 from pcgraph.errors import CloudReadError
-from pcgraph.io.format import Format, check_words, field_name, field_word
+from pcgraph.io.format import MAX_HEADER_BYTES, Format, check_words, field_name, field_word
+from pcgraph.io.text_numbers import columns_from_text, numbers_from_text, numbers_of_words
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -209,11 +206,11 @@ def _listed_rows(element: PlyElement, body: bytes, first_line: int) -> Columns:
     """Columns of rows with lists, whose lengths stand before their numbers."""
     if element.count * len(element.properties) > len(body):
         raise CloudReadError(f"the PLY header promises {element.count} vertices, but only {len(body)} bytes follow")
-    lines = ((number, words) for number, line in enumerate(BytesIO(body), first_line) if (words := line.split()))
+    lines = ((number, line) for number, line in enumerate(BytesIO(body), first_line) if line.strip())
     values: list[list[list[float]]] = [[] for _ in element.properties]
     n_rows = 0
-    for number, words in islice(lines, element.count):
-        numbers, at = numbers_of_words(words, number), 0
+    for number, line in islice(lines, element.count):
+        numbers, at = numbers_of_words(line.split(), line, number), 0
         for one, rows in zip(element.properties, values, strict=True):
             length = 1
             if one.count_kind:

@@ -277,6 +277,29 @@ def depth_order_along(
     return depth_order(centres[-k:], centres[:-k], widths, facing, n * c, finer).reshape(k, n, c)
 
 
+def depth_order_of(
+    grid: VoxelGrid, normals: NDArray[np.float64], place: NDArray[np.float64], shown: VoxelGrid, depth: float
+) -> NDArray[np.int8]:
+    """Whether what another grid shows in the direction of each voxel is nearer, -1, farther, 1, or neither, 0; (v,).
+
+    Parameters
+    ----------
+    grid : VoxelGrid of v voxels
+    normals : (v, 3) float64
+    place : (3,) float64, metres
+        From where it is seen.
+    shown : VoxelGrid
+        The voxels that are seen.
+    depth : float, voxel edges
+        Difference of depth from which on something is nearer or farther.
+    """
+    middle, reach = unit_frame(shown, np.concatenate((grid.centroids, shown.centroids, place[None])))
+    centres = (np.concatenate((shown.centroids, grid.centroids)) - middle) / reach
+    widths = np.concatenate((shown.edge_lengths, depth * grid.edge_lengths)) / reach
+    facing = np.concatenate((either_normals(shown), normals))
+    return depth_order((place - middle)[None] / reach, centres, widths, facing, grid.n_voxels)[0]
+
+
 def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
     """Fraction of the voxels that are visible from a place, (3,) float64, metres."""
     return _visible_fraction(grid, place, either_normals(grid))

@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.errors import CloudReadError
+from pcgraph.io.driving_sweeps import KITTI_COLUMNS, sweep_table
 from pcgraph.plumbing.plain_files import read_file
 from rangesim.errors import FileFormatError
 from rangesim.point_cloud import PointCloud
@@ -32,8 +34,6 @@ any order, most of them lie in such rings."""
 MIN_SPREAD = 1.02
 """Least ratio of the farthest to the nearest point of a ring, both measured from the axis, at which its cone is given:
 points at one distance lie on many cones."""
-MAX_COORDINATE_M = 1e4
-"""Largest coordinate in a sweep, metres. Any LiDAR reaches far less."""
 
 
 class Rings(NamedTuple):
@@ -62,15 +62,11 @@ def read_kitti(path: str | Path) -> PointCloud:
         The file cannot be read, or is no list of points.
     """
     content = read_file(path, FileFormatError)
-    if not content or len(content) % 16:
-        raise FileFormatError(
-            f"{path}: expected four numbers of 4 bytes for each point, x, y, z and reflectance, got {len(content)} "
-            "bytes."
-        )
     limits.check("points", len(content) // 16, f"points in {path}", FileFormatError)
-    table = np.frombuffer(content, dtype="<f4").reshape(-1, 4)
-    if not (np.abs(table[:, :3]) <= MAX_COORDINATE_M).all() or not np.isfinite(table[:, 3]).all():
-        raise FileFormatError(f"{path}: expected points within {MAX_COORDINATE_M:g} m, got others or no numbers.")
+    try:
+        table = sweep_table(content, KITTI_COLUMNS)
+    except CloudReadError as error:
+        raise FileFormatError(f"{path}: {error}.") from error
     points = table[:, :3].astype(np.float32)
     rings = rings_of_order(points)
     intensity = table[:, 3].astype(np.float32)

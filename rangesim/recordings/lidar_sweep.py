@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.io.ouster_packets import columns_of_directions
 from rangesim.point_cloud import PointCloud
 from rangesim.rig.scan_patterns import ScanRays
 from rangesim.settings.config import ShortRepr, shown
@@ -84,7 +85,7 @@ class LidarSweep(ShortRepr):
             The array has other rows or columns.
         """
         h, w = self.range_m.shape[1:]
-        source = (np.arange(w) - self.pixel_shift[:, None]) % w
+        source = columns_of_directions(self.pixel_shift, w)
         if values.shape[-2:] == (h, w):
             return np.take_along_axis(values, np.broadcast_to(source, values.shape), axis=-1)
         if values.shape == (h, w, 3):

@@ -75,6 +75,27 @@ def ply(code: str, fields, n: int) -> bytes:
     return "\n".join(lines).encode() + struct.pack(order + "h", 7) + body + face
 
 
+def ply_with_lists(code: str, n: int = 4) -> bytes:
+    """PLY file with faces before the vertices, and lists among the vertices' properties: `seen` differs in length."""
+    order = ORDERS[code]
+    lines = ["ply", f"format {code} 1.0", "element face 2", "property uchar material"]
+    lines += ["property list uchar int vertex_indices", f"element vertex {n}", "property float x"]
+    lines += ["property list ushort int seen", "property double y", "property list uchar float descriptor"]
+    lines += ["property float z", "property uchar intensity", "end_header", ""]
+    faces = [(1, [0, 1, 2]), (2, [3, 2, 1, 0])]
+    rows = [(i + 0.5, list(range(i % 3)), -1.0 * i, [i / 4, 1.0], i * 2.0, 10 * i) for i in range(n)]
+    if code == "ascii":
+        texts = [f"{material} {len(indices)} {' '.join(map(str, indices))}" for material, indices in faces]
+        for x, seen, y, descriptor, z, intensity in rows:
+            words = [x, len(seen), *seen, y, 2, *descriptor, z, intensity]
+            texts.append(" ".join(map(str, words)))
+        return "\n".join([*lines[:-1], *texts, ""]).encode()
+    body = b"".join(struct.pack(f"{order}BB{len(i)}i", material, len(i), *i) for material, i in faces)
+    for x, seen, y, descriptor, z, intensity in rows:
+        body += struct.pack(f"{order}fH{len(seen)}idB2ffB", x, len(seen), *seen, y, 2, *descriptor, z, intensity)
+    return "\n".join(lines).encode() + body
+
+
 def fields_of(rng, n, counts=True):
     """Fields x y z with others before, between and behind, of all types."""
     names = ["x", "y", "z", *rng.permutation(["label", "rgb", "nx", "ny", "nz", "red", "green", "blue", "t"])[:4]]

@@ -125,6 +125,14 @@ def _cloud(path: Path, _: Arguments) -> Any:
     return pcgraph.read_cloud(path)
 
 
+def _vertices(path: Path, arguments: Arguments) -> Any:
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "read the .* vertices of the mesh")
+        return _cloud(path, arguments)
+
+
 def _edge_model(path: Path, _: Arguments) -> Any:
     from pcgraph.tree.learned import EdgeModel
 
@@ -551,6 +559,37 @@ READERS = {
             )
             for suffix in ("ply", "pcd")
         ),
+        *(
+            Reader(suffix, _cloud, partial(seeds.scanner_files, suffix), refuses=_CLOUD, check=_arrays_agree)
+            for suffix in ("las", "laz", "e57")
+        ),
+        *(
+            Reader(
+                f"vertices-{suffix}", _vertices, partial(seeds.mesh_files, suffix), by_hand=(hostile.meshes,),
+                refuses=_CLOUD, check=_arrays_agree,
+            )
+            for suffix in ("obj", "stl", "off", "glb", "gltf")
+        ),
+        *(
+            Reader(
+                f"cloud-{suffix}", _cloud, partial(seeds.text_clouds, suffix), refuses=_CLOUD, check=_arrays_agree,
+                share=0.5, renames=False,
+            )
+            for suffix in ("csv", "pts", "ptx")
+        ),
+        Reader(
+            "cloud-nuscenes", _cloud, seeds.nuscenes_sweeps, refuses=_CLOUD, check=_arrays_agree, share=0.2,
+            renames=False,
+        ),
+        Reader(
+            "cloud-ouster", _cloud, seeds.lidar_recordings, ("*.pcap", "*.json"), (_sidecar_trees,), refuses=_CLOUD,
+            check=_arrays_agree, share=0.2, renames=False,
+        ),
+        Reader(
+            "npz", _cloud, partial(seeds.array_files, "npz"), by_hand=(hostile.npz_files,), refuses=_CLOUD,
+            check=_arrays_agree,
+        ),
+        Reader("npy", _cloud, partial(seeds.array_files, "npy"), refuses=_CLOUD, check=_arrays_agree),
         Reader(
             "edge-model", _edge_model, seeds.edge_models, by_hand=(hostile.json_trees,),
             refuses=("ValueError", *_CLOUD),

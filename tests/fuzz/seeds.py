@@ -277,6 +277,32 @@ def lidar_recordings() -> Seeds:
     }
 
 
+def text_clouds(suffix: str) -> Seeds:
+    """Text files of points with colours, in several dialects; PTX files of one scan and of two."""
+    rows = ["1.5 -2 3e-1 7 10 20 30", "nan 4 5.25 -8 40 50 60", "0 0 0 0 0 0 0", "-1e2 5 6 9 255 0 1"]
+    text = "\n".join(rows) + "\n"
+    if suffix == "ptx":
+        scan = "2\n2\n1 2 3\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n1 2 3 1\n" + text
+        return {"scan": of_file("a.ptx", scan.encode()), "scans": of_file("a.ptx", 2 * scan.encode())}
+    if suffix == "pts":
+        return {"blocks": of_file("a.pts", 2 * ("4\n" + text).encode())}
+    names = "x y z intensity r g b"
+    texts = {
+        "commas": f"{names}\n{text}".replace(" ", ","),
+        "semicolons": f"{names}\n{text}".replace(" ", ";").replace(".", ","),
+        "cloudcompare": f"//{names.upper()}\n4\n{text}",
+        "bare": text,
+        "integers": "x y z id\n1 2 3 9007199254740993\n4 5 6 18446744073709551615\n",
+    }
+    return {name: of_file(f"a.{suffix}", content.encode()) for name, content in texts.items()}
+
+
+def nuscenes_sweeps() -> Seeds:
+    """A sweep with rings."""
+    table = np.column_stack([np.random.default_rng(5).normal(size=(30, 4)), np.arange(30) % 8])
+    return {"rings": of_file("a.pcd.bin", table.astype("<f4").tobytes())}
+
+
 def kitti_sweeps() -> Seeds:
     """A sweep of three rings."""
     azimuth, elevation = np.meshgrid(np.linspace(0.1, 6.2, 40), np.radians([2.0, -3.0, -8.0]))
@@ -390,7 +416,7 @@ BARE_FRAMES = 14
 
 def cloud_files(suffix: str) -> Seeds:
     """Clouds of all codings, by hand and by the package's writers."""
-    from fuzz.cloud_files import CORPUS
+    from fuzz.cloud_files import CORPUS, ORDERS, ply_with_lists
     from pcgraph.io.ply import encode_ply
     from rangesim.point_cloud import PointCloud
     from rangesim.point_cloud.point_cloud_files import save_point_cloud
@@ -404,7 +430,47 @@ def cloud_files(suffix: str) -> Seeds:
     if suffix == "ply":
         columns = {axis: rng.random(20) for axis in "xyz"} | {"labels": np.arange(20, dtype=np.int32)}
         seeds["pcgraph"] = of_file(name, encode_ply(columns))
+        seeds |= {f"lists {code}": of_file(name, ply_with_lists(code)) for code in ORDERS}
     return seeds
+
+
+def scanner_files(suffix: str) -> Seeds:
+    """Clouds of laser scanners with columns of their own, as pcgraph writes them, and LAS files as laspy does."""
+    from pcgraph.cloud import Cloud
+    from pcgraph.io.e57 import encode_e57
+    from pcgraph.io.las import encode_las
+
+    rng, name = np.random.default_rng(5), f"cloud.{suffix}"
+    points = rng.random((40, 3))
+    columns = {"intensity": np.arange(40, dtype=np.uint16), "ring": rng.integers(0, 9, 40), "beam": rng.random((40, 2))}
+    full = Cloud(points, np.zeros((40, 3), np.uint8), points, np.arange(40, dtype=np.int32), np.ones(3), columns)
+    encode = encode_e57 if suffix == "e57" else encode_las
+    seeds = {
+        "full": of_file(name, encode(full, f".{suffix}")),
+        "bare": of_file(name, encode(Cloud(points), f".{suffix}")),
+    }
+    if suffix != "e57":
+        import laspy
+
+        for version, point_format in (("1.2", 3), ("1.4", 10)):
+            las = laspy.create(point_format=point_format, file_version=version)
+            las.x, las.y, las.z = points.T
+            content = written(name, lambda path, las=las: las.write(str(path)))
+            seeds[f"format {point_format}"] = of_file(name, content)
+    return seeds
+
+
+def array_files(suffix: str) -> Seeds:
+    """Clouds as NumPy's files, with columns and without."""
+    from pcgraph.cloud import Cloud
+    from pcgraph.io import encode_cloud
+
+    rng = np.random.default_rng(4)
+    points = rng.random((3, 4, 3)).astype(np.float32)
+    whole = Cloud(points, np.zeros((3, 4, 3), np.uint8), points, columns={"ring": np.zeros((3, 4), np.uint16)})
+    name = f"cloud.{suffix}"
+    clouds = {"plain": Cloud(rng.random((20, 3))), "whole": whole}
+    return {key: of_file(name, encode_cloud(cloud, name)) for key, cloud in clouds.items()}
 
 
 def mesh_files(suffix: str) -> Seeds:

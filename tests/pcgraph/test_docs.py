@@ -45,7 +45,7 @@ def table_with_a_box() -> str:
     return HEADER + "\n".join(lines) + "\n"
 
 
-@pytest.mark.parametrize("name", ["pcgraph", "tree", "detection", "learning", "metrics"])
+@pytest.mark.parametrize("name", ["pcgraph", "files", "recipes", "tree", "detection", "learning", "metrics"])
 def test_snippets_run(name, tmp_path, monkeypatch):
     (tmp_path / "scan.pcd").write_text(table_with_a_box())
     monkeypatch.chdir(tmp_path)

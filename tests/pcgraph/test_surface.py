@@ -67,6 +67,7 @@ def test_public_names():
         "metrics",
         "plane_energy",
         "read_cloud",
+        "sample_surface",
         "segment",
         "supervoxel_clustering",
         "tree_of_graph",

@@ -1,0 +1,632 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text files of points, a row of numbers for each: .xyz, .txt, .csv, .asc, .pts and their kin.
+
+There is no standard. CloudCompare documents what files in use have in common ("ASCII cloud"). Leica documents .pts: a
+count of points, then rows of x y z, intensity, red green blue.
+
+Rows. Numbers stand between blanks, tabs, commas or semicolons. Between semicolons, a comma is the decimal sign. An
+empty cell between commas or semicolons is NaN, and so are ``NA``, ``null`` and the like. All rows have as many numbers
+as the first. Lines that begin with ``#``, ``//`` or ``%`` are comments, and so is what follows a ``#``.
+
+Names. The columns are named by, in this order: `columns` of `read_cloud`; a line of names before the rows, with or
+without quotes or a comment sign, such as ``//X Y Z R G B Scalar field``; the format (.xyzn, .xyzrgb); the number of
+columns, where it leaves no doubt:
+
+===========  ==================================  =========================================================
+columns      names                               condition
+===========  ==================================  =========================================================
+3            x y z
+4            x y z intensity
+6            x y z red green blue                all of the last three are whole numbers from 0 to 255
+6            x y z nx ny nz                      all of the last three are unit vectors
+7            x y z intensity red green blue      the last three are whole numbers from 0 to 255; the fourth to
+                                                 sixth are not, or the file is a .pts
+7            x y z red green blue, then          the fourth to sixth are whole numbers from 0 to 255, the last
+             column_7                            three are not
+===========  ==================================  =========================================================
+
+All other columns keep their numbers as names, as NumPy counts them: ``column_3`` is the fourth.
+
+Types. A column is of whole numbers if they are written as such: int32, or int64 or uint64 if they need it. All other
+columns are float32 if this loses nothing, else float64. `encode_text` writes floats with all their digits, so values
+come back as they were, whatever the width of their types.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import io
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.cloud import (
+    COLOR_NAMES,
+    LABEL_NAMES,
+    NORMAL_NAMES,
+    PACKED_NAMES,
+    Cloud,
+    cloud_from_columns,
+    columns_of_cloud,
+)
+from pcgraph.errors import CloudReadError, CloudWriteError
+from pcgraph.io.format import MAX_HEADER_BYTES, CloudFile, Format
+from pcgraph.io.text_numbers import INFINITY_OF_WINDOWS, NAN_OF_WINDOWS
+
+MAX_LINE = 1 << 16
+"""Bytes of a line, count: far more than rows have, so that one endless line does not fill the memory. Chosen by
+eye; not varied."""
+MAX_COLUMNS = 1024
+"""Columns of a table, count: a guard. Chosen by eye; not varied."""
+MAX_OFF_UNIT = 0.01
+"""Difference between the length of a normal and 1, at most: writers give at least three digits after the point. Chosen
+by eye; not varied."""
+MAX_EXACT = 2.0**53
+"""Whole numbers up to here are exact in float64."""
+MIN_ROW_BYTES = 6
+"""Bytes of a row, at least: three digits, two blanks and a line end."""
+ROWS_AT_ONCE = 100_000
+"""Rows whose words are made at a time, count, so that a large cloud does not become as many strings at once. Chosen by
+eye; not varied."""
+COMMENTS = ("#", "//", "%")
+
+UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+"""First bytes of a text in UTF-16."""
+
+_WHOLE = re.compile(r"[-+]?[0-9]+")
+_COUNT = re.compile(r"[0-9]{1,15}")
+_DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+(,[0-9]+([eE][-+]?[0-9]+)?)?")
+_UNIT = re.compile(r"\s*[\[(][^\])]*[\])]$")
+_MISSING = ("NA", "N/A", "n/a", "null", "NULL", "None")
+"""Words that stand for NaN in tables of R and pandas, of databases and of Python."""
+_OF_NUMBERS = b"0123456789.+- \t,;\r\n"
+"""Bytes of which most rows consist: what is left of a text without them is searched soon."""
+_IS_NAN = re.compile(rf"(?<![^\s,;])[-+]?(?:{'|'.join(_MISSING)}|{NAN_OF_WINDOWS})(?![^\s,;])")
+_IS_INFINITE = re.compile(INFINITY_OF_WINDOWS)
+_SHORT_COLORS = (("r", "g", "b"), ("rf", "gf", "bf"))
+"""Names of red, green and blue that CloudCompare writes, as bytes and as floats within 0..1."""
+_NAMES_BEFORE_A_FIELD = {"x", "y", "z", *COLOR_NAMES, *NORMAL_NAMES[1], "intensity"}
+"""Names in lower case that CloudCompare writes before the only scalar field, whose name may have blanks."""
+_PTS = (
+    ("x", "y", "z"),
+    ("x", "y", "z", "intensity"),
+    ("x", "y", "z", *COLOR_NAMES),
+    ("x", "y", "z", "intensity", *COLOR_NAMES),
+)
+"""Columns that a .pts file may have."""
+
+
+# ---- Rows ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How the numbers of a row are separated.
+
+    Attributes
+    ----------
+    separator : str
+        A comma or a semicolon; a blank for rows of words between blanks and tabs.
+    has_last : bool
+        Whether rows end in a separator with nothing behind it.
+    has_empty : bool
+        Whether cells may be empty.
+    """
+
+    separator: str
+    has_last: bool = False
+    has_empty: bool = True
+
+    @staticmethod
+    def of(line: str) -> Dialect | None:
+        """The dialect of a row of numbers; None if the line is no such row."""
+        separator = next((sign for sign in ";," if sign in line), " ")
+        found = Dialect(separator, has_last=separator != " " and line.rstrip().endswith(separator))
+        words = found.row(line.partition("#")[0]).split()
+        return found if words and all(is_number(word) for word in words) else None
+
+    def row(self, line: str) -> str:
+        """The numbers of a row, separated by blanks, with points as decimal signs."""
+        if '"' in line:
+            line = line.replace('"', "")
+        if self.separator == " ":
+            return line
+        separator = self.separator
+        if self.has_last:
+            line = line.rstrip().removesuffix(separator)
+        if self.has_empty:
+            line = separator.join(cell if cell.strip() else "nan" for cell in line.split(separator))
+        if separator == ";":
+            line = line.replace(",", ".")
+        return line.replace(separator, " ")
+
+
+def is_number(word: str) -> bool:
+    """Whether a word is a number as C's strtod reads it."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return "_" not in word and word.isascii()  # only Python reads 1_000 and other digits as numbers
+
+
+class TextLines:
+    """The lines of a text that are not empty, one after the other, without the blanks before them.
+
+    Attributes
+    ----------
+    number : int
+        Number of the last line that was read, from 1; 0 before the first.
+    size : int
+        Bytes of the whole text.
+    """
+
+    def __init__(self, content: bytes) -> None:
+        self.number, self.size = 0, len(content)
+        encoding = encoding_of(content)
+        _refuse_long_lines(content)
+        rare = content.translate(None, _OF_NUMBERS)
+        is_odd = b".#" in content or any(word.encode() in rare for word in (*_MISSING, "an(", "AN("))
+        self._has_odd_numbers = is_odd or encoding == "utf-16"
+        self._stream = io.TextIOWrapper(io.BytesIO(content), encoding, errors="replace", newline=None)
+
+    def __iter__(self) -> Iterator[str]:
+        try:
+            for line in self._stream:
+                self.number += 1
+                if not line.isspace():
+                    yield self._usual(line.lstrip()) if self._has_odd_numbers else line.lstrip()
+        except UnicodeError:
+            raise CloudReadError("expected a text in UTF-16, as its first bytes say, but the others are none") from None
+
+    @staticmethod
+    def _usual(line: str) -> str:
+        """The line with the usual spellings of NaN and infinity."""
+        return _IS_INFINITE.sub("inf", _IS_NAN.sub("nan", line))
+
+
+def _refuse_long_lines(content: bytes) -> None:
+    """Raise CloudReadError if no line ends within some `MAX_LINE` bytes."""
+    for start in range(0, len(content) - MAX_LINE, MAX_LINE):
+        if all(content.find(end, start, start + MAX_LINE) < 0 for end in (b"\n", b"\r")):
+            number = max(content.count(end, 0, start) for end in (b"\n", b"\r")) + 1
+            raise CloudReadError(f"expected rows of numbers, but line {number} has {MAX_LINE} bytes or more")
+
+
+def encoding_of(content: bytes) -> str:
+    """UTF-8, or UTF-16 by the mark at its beginning, or else Latin-1. Raises CloudReadError if it is no text."""
+    if content.startswith(UTF_16):
+        return "utf-16"
+    if content.startswith(codecs.BOM_UTF8):
+        return "utf-8-sig"
+    start = content[:MAX_HEADER_BYTES]
+    if b"\0" in start:
+        raise CloudReadError("expected a text with a row of numbers for each point, got binary data")
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(start)
+    except UnicodeDecodeError:
+        return "latin-1"
+    return "utf-8"
+
+
+def numbers(rows: Iterable[str], lines: TextLines) -> NDArray[np.float64]:
+    """(n, m) float64 table of rows of numbers between blanks, m the count in the first row.
+
+    Parameters
+    ----------
+    rows : iterator over the rows, taken from `lines`
+    lines : TextLines
+        It knows the number of the line for messages.
+
+    Raises
+    ------
+    CloudReadError
+        There is no row, or one has more or fewer numbers than the first, or a word that is no number.
+    """
+    rows = iter(rows)
+    first = next(rows, None)
+    if first is None:
+        raise CloudReadError(f"expected a row of numbers after line {lines.number}, but there is none")
+    try:
+        return np.loadtxt(chain((first,), rows), np.float64, comments="#", ndmin=2)
+    except ValueError as error:
+        reason = str(error)
+        if found := re.search(r"changed from (\d+) to (\d+)", reason):
+            wanted, got = found.groups()
+            raise CloudReadError(
+                f"expected {wanted} numbers in each row, as in the first, but line {lines.number} has {got}"
+            ) from None
+        word = re.search(r"could not convert string (.*) to ", reason, re.DOTALL)
+        got = word[1][:80] if word else reason[:80]
+        raise CloudReadError(f"expected numbers only in the rows, but line {lines.number} has {got}") from None
+
+
+# ---- Names ---------------------------------------------------------------------------------------------------------
+
+
+def known_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Names with those of coordinates and colours as `cloud_from_columns` knows them; the others as they are."""
+    names = [name or f"column_{i}" for i, name in enumerate(names)]
+    bare = [_UNIT.sub("", name) for name in names]
+    found = [short if short.lower() in ("x", "y", "z") else name for short, name in zip(bare, names, strict=True)]
+    lower = [name.lower() for name in names]
+    for short in _SHORT_COLORS:
+        if all(name in lower for name in short) and not any(name in lower for name in COLOR_NAMES):
+            full = dict(zip(short, COLOR_NAMES, strict=True))
+            return tuple(full.get(name.lower(), name) for name in found)
+    return tuple(found)
+
+
+def _words(line: str, separator: str | None) -> list[str]:
+    """Words of a line of names; those in quotes may have blanks. separator : None for blanks and tabs."""
+    text = line.rstrip("\r\n")
+    for sign in COMMENTS:
+        text = text.removeprefix(sign)
+    text = text.lstrip()
+    if separator is not None:
+        names = [
+            name.strip().strip("'") for name in next(csv.reader([text], delimiter=separator, skipinitialspace=True))
+        ]
+        return names[:-1] if names and not names[-1] else names
+    return [quoted or word for quoted, word in re.findall(r'"([^"]+)"|(\S+)', text)]
+
+
+def _header(line: str, count: int | None) -> tuple[str, ...] | None:
+    """The names in a line, `count` of them; None if it has another number of names, or none of x, y, z."""
+    for separator in (",", ";", "\t", None):
+        try:
+            names = _words(line, separator)
+        except csv.Error:
+            continue
+        found = known_names(names)
+        if count is not None and separator is None and len(found) > count:  # CloudCompare: X Y Z Scalar field
+            before = known_names(names[: count - 1])
+            if _NAMES_BEFORE_A_FIELD.issuperset(name.lower() for name in before):
+                found = (*before, " ".join(names[count - 1 :]))
+        if count in (None, len(found)) and {"x", "y", "z"} <= {name.lower() for name in found}:
+            return found
+    return None
+
+
+def names_of_numbers(table: NDArray[np.float64], is_pts: bool) -> tuple[str, ...]:
+    """Names of the columns of a table that has none, as the module's table says; raises CloudReadError below three."""
+    count = table.shape[1]
+    if count < 3:
+        raise CloudReadError(f"expected x, y and z in each row, got {count} numbers")
+    xyz, named = ("x", "y", "z"), tuple(f"column_{i}" for i in range(3, count))
+    if count == 4:
+        named = ("intensity",)
+    elif count == 6 and _are_bytes(table[:, 3:6]):
+        named = COLOR_NAMES
+    elif count == 6 and _are_unit_vectors(table[:, 3:6]):
+        named = NORMAL_NAMES[1]
+    elif count == 7:
+        first, last = _are_bytes(table[:, 3:6]), _are_bytes(table[:, 4:7])
+        if last and (not first or is_pts):
+            named = ("intensity", *COLOR_NAMES)
+        elif first and not last:
+            named = (*COLOR_NAMES, "column_6")
+    return (*xyz, *named)
+
+
+def _are_bytes(values: NDArray[np.float64]) -> bool:
+    return bool(((values >= 0) & (values <= 255) & (values == np.rint(values))).all())
+
+
+def _are_unit_vectors(values: NDArray[np.float64]) -> bool:
+    return bool((np.abs(np.linalg.norm(values, axis=1) - 1) <= MAX_OFF_UNIT).all())
+
+
+# ---- Reading -------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class TextTable:
+    """The rows of a text, and what stands above them.
+
+    Attributes
+    ----------
+    lines : TextLines
+        The lines from which `rows` comes; it knows the number of the last one.
+    names : tuple of str, or None
+        Names of the columns, if a line above the rows has them.
+    first : list of str
+        Words of the first row; empty if there is no row.
+    rows : iterator of str
+        All rows, with blanks between the numbers. It can be used once.
+    """
+
+    lines: TextLines
+    names: tuple[str, ...] | None
+    first: list[str]
+    rows: Iterator[str]
+
+
+def open_table(content: bytes, is_named: bool = False) -> TextTable:
+    """The table in a text. is_named : whether the user named the columns, so that any line may stand above the rows.
+
+    Raises
+    ------
+    CloudReadError
+        The content is no text, or has no rows, or a line above them is neither a comment nor names nor a count.
+    """
+    lines = TextLines(content)
+    above: list[tuple[int, str]] = []
+    promised: int | None = None
+    characters = 0
+    stream = iter(lines)
+    for line in stream:
+        dialect = None if line.startswith(COMMENTS) else Dialect.of(line)
+        if dialect is None:
+            above.append((lines.number, line))
+            characters += len(line)
+            if characters > MAX_HEADER_BYTES:
+                raise CloudReadError(f"expected rows of numbers, but the first {lines.number} lines have none")
+        elif not promised and _COUNT.fullmatch(line.strip()):
+            promised = _promise(line, lines)
+        else:
+            _refuse_decimal_commas(line, lines.number)
+            whole = replace(dialect, has_last=False)  # the last cell may be empty, if the names say that there is one
+            if dialect.has_last and _names(above, len(whole.row(line).split())):
+                dialect = whole
+            dialect = replace(dialect, has_empty=_has_empty(content, dialect.separator))
+            first = dialect.row(line).partition("#")[0].split()
+            names = _names(above, len(first))
+            _refuse_strangers(above, len(first), is_named)
+            return TextTable(lines, names, first, _rows(chain((line,), stream), dialect, promised, lines))
+    names = _names(above, None)
+    if promised is None and names is None:
+        number, line = above[0] if above else (1, "")
+        raise CloudReadError(f"expected rows of numbers, but line {number} and all others have none: {line[:80]!r}")
+    return TextTable(lines, names, [], iter(()))
+
+
+def _has_empty(content: bytes, separator: str) -> bool:
+    """Whether there may be empty cells: between separators, or between one and the beginning or end of a line."""
+    signs = [f"{separator}{sign}" for sign in (separator, f" {separator}", "\n", "\r")]
+    return content.startswith(UTF_16) or any(sign.encode() in content for sign in (*signs, f"\n{separator}"))
+
+
+def _promise(line: str, lines: TextLines) -> int:
+    """The count of points in the last line; raises CloudReadError if the file is too small for it."""
+    count = int(line)
+    if count * MIN_ROW_BYTES > lines.size + 1:  # the last row may have no end
+        raise CloudReadError(
+            f"line {lines.number} promises {count} points, but the whole file has only {lines.size} bytes"
+        )
+    return count
+
+
+def _refuse_decimal_commas(line: str, number: int) -> None:
+    words = line.split()
+    has_commas = len(words) > 2 and ";" not in line and "," in line
+    if has_commas and all(_DECIMAL_COMMA.fullmatch(word) for word in words):
+        raise CloudReadError(
+            f"line {number} seems to have decimal commas, which are read between semicolons only: "
+            "write points, or put semicolons between the columns"
+        )
+
+
+def _names(above: list[tuple[int, str]], count: int | None) -> tuple[str, ...] | None:
+    """The names in the last line above the rows that has `count` of them; None if there is no such line."""
+    return next((names for _, line in reversed(above) if (names := _header(line, count))), None)
+
+
+def _refuse_strangers(above: list[tuple[int, str]], count: int, is_named: bool) -> None:
+    """Raise CloudReadError if a line above the rows is neither a comment nor the names of columns."""
+    for number, line in above:
+        if not is_named and not line.startswith(COMMENTS) and _header(line, count) is None:
+            raise CloudReadError(
+                f"line {number} is neither a comment (# or //) nor {count} names of columns, x, y and z among them: "
+                f"{line.strip()[:80]!r}; name the columns by columns=[...]"
+            )
+
+
+def _rows(stream: Iterator[str], dialect: Dialect, promised: int | None, lines: TextLines) -> Iterator[str]:
+    """The rows in a stream of lines; where counts of points stand above them, of each block."""
+    left = promised
+    for line in stream:
+        if line.startswith(COMMENTS):
+            continue
+        if left == 0:
+            if not _COUNT.fullmatch(line.strip()):
+                raise CloudReadError(f"line {lines.number} has one point more than the count above the points says")
+            left = _promise(line, lines)
+            continue
+        if left is not None:
+            left -= 1
+        yield dialect.row(line)
+    if left:
+        raise CloudReadError(f"the count above the points says that there are {left} more than the file has")
+
+
+def read_text(file: CloudFile, is_pts: bool = False, usual: tuple[str, ...] | None = None) -> Cloud:
+    """Cloud of a text file; see the module's text for what is understood.
+
+    Parameters
+    ----------
+    file : CloudFile
+    is_pts : bool
+        Whether seven columns are x y z, intensity, red green blue.
+    usual : names, optional
+        Names of the columns in this format, if the file has as many and does not name them.
+
+    Raises
+    ------
+    CloudReadError
+        The content is no text, or not one of numbers; rows have different numbers of columns; there are fewer rows than
+        a count says; the names do not fit the columns, or x, y or z is not among them.
+
+    Examples
+    --------
+    >>> cloud = read_text(CloudFile(b"//X Y Z R G B Scalar field\\n1.5 2 3 255 0 0 7\\n4 5 6 0 0 255 8\\n"))
+    >>> cloud.points.tolist(), cloud.colors.tolist(), cloud.columns
+    ([[1.5, 2.0, 3.0], [4.0, 5.0, 6.0]], [[255, 0, 0], [0, 0, 255]], {'Scalar field': array([7, 8], dtype=int32)})
+    """
+    table = open_table(file.content, file.columns is not None)
+    if not table.first:
+        names = file.columns or table.names or ("x", "y", "z")
+        empty = {name: np.zeros(0, np.int32 if name.lower() in LABEL_NAMES else np.float32) for name in names}
+        return cloud_from_columns(empty, (0,))
+    if len(table.first) > MAX_COLUMNS:
+        raise CloudReadError(f"expected at most {MAX_COLUMNS} numbers in a row, got {len(table.first)}")
+    values = numbers(table.rows, table.lines)
+    if file.columns is not None:
+        names = known_names(file.columns)
+        if len(names) != len(table.first):
+            raise CloudReadError(f"expected {len(names)} numbers in each row, as columns names, got {len(table.first)}")
+    elif table.names is not None:
+        names = table.names
+    else:
+        fits = usual is not None and len(usual) == len(table.first)
+        names = usual if fits and usual else names_of_numbers(values, is_pts)
+    if len(set(names)) != len(names):
+        raise CloudReadError(f"expected distinct names of columns, got {' '.join(names)[:200]}")
+    is_whole = [_WHOLE.fullmatch(word) is not None for word in table.first]
+    columns = {
+        name: _whole(values[:, i], file.content, i) if is_whole[i] else _floats(values[:, i])
+        for i, name in enumerate(names)
+    }
+    return cloud_from_columns(_in_types_of_colors(columns), (len(values),))
+
+
+def column_of_numbers(values: NDArray[np.float64]) -> NDArray[np.generic]:
+    """A column as int32 if all its numbers are whole and fit, else as floats."""
+    limits = np.iinfo(np.int32)
+    fits = (values == np.rint(values)) & (values >= limits.min) & (values <= limits.max)
+    return values.astype(np.int32) if fits.all() else _floats(values)
+
+
+def _floats(values: NDArray[np.float64]) -> NDArray[np.generic]:
+    """The values as float32 if this loses nothing, else as float64."""
+    with np.errstate(over="ignore"):
+        narrow = values.astype(np.float32)
+    return narrow if np.array_equal(narrow, values, equal_nan=True) else values.copy()
+
+
+def _whole(values: NDArray[np.float64], content: bytes, column: int) -> NDArray[np.generic]:
+    """A column of whole numbers as int32, or with as many bits as it needs; as floats if some are not whole."""
+    if not (np.isfinite(values).all() and (values == np.rint(values)).all()):
+        return _floats(values)
+    if np.abs(values).max() < MAX_EXACT:
+        fits = np.iinfo(np.int32).min <= values.min() and values.max() <= np.iinfo(np.int32).max
+        return values.astype(np.int32 if fits else np.int64)
+    for kind in (np.int64, np.uint64):  # float64 has rounded them
+        table = open_table(content, is_named=True)
+        try:
+            return np.asarray(np.loadtxt(table.rows, kind, comments="#", usecols=column, ndmin=1))
+        except ValueError:
+            continue
+    return _floats(values)
+
+
+def _in_types_of_colors(columns: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
+    """The columns with colours of whole numbers in types that say what white is: uint8, or uint16 beyond 255."""
+    lower = {name.lower(): name for name in columns}
+    channels = {lower[name]: columns[lower[name]] for name in COLOR_NAMES if name in lower}
+    if any(one.dtype.kind == "f" for one in channels.values()):
+        columns = columns | {name: one.astype(np.float64) for name, one in channels.items()}
+    elif all(one.min() >= 0 and one.max() <= np.iinfo(np.uint16).max for one in channels.values()):
+        is_byte = all(one.max() <= np.iinfo(np.uint8).max for one in channels.values())
+        columns = columns | {name: one.astype(np.uint8 if is_byte else np.uint16) for name, one in channels.items()}
+    for name in columns.keys() & {lower[name] for name in PACKED_NAMES if name in lower}:
+        one = columns[name]
+        if one.dtype.kind == "f":  # as float32, they would be taken for the bits of packed colours
+            columns = columns | {name: one.astype(np.float64)}
+        elif one.dtype == np.int64 and one.min() >= 0 and one.max() <= np.iinfo(np.uint32).max:
+            columns = columns | {name: one.astype(np.uint32)}
+    return columns
+
+
+# ---- Writing -------------------------------------------------------------------------------------------------------
+
+
+def encode_text(cloud: Cloud, suffix: str) -> bytes:
+    """Bytes of a text file: a line of names, and a row for each point.
+
+    Parameters
+    ----------
+    cloud : Cloud
+        As `pcgraph.cloud.plain_cloud` returns it. Vectors of c numbers become columns ``name_0`` and so on.
+    suffix : str
+        ".csv": names and numbers between commas. Others: between blanks, the names behind ``//``, as CloudCompare has
+        them.
+
+    Raises
+    ------
+    CloudWriteError
+        A column has no numbers that a text can hold, or a name that would be read as another one.
+    """
+    columns = _scalars(columns_of_cloud(cloud))
+    separator = "," if suffix == ".csv" else " "
+    line = separator.join(_quoted(name, separator) for name in columns)
+    line = line if separator == "," else f"//{line}"
+    if "\n" in line or "\r" in line or _header(line, len(columns)) != tuple(columns):
+        raise CloudWriteError(f"expected names of columns that a text keeps, got {line[:200]!r}: rename them")
+    return f"{line}\n".encode() + _body(columns, separator)
+
+
+def encode_pts(cloud: Cloud, suffix: str) -> bytes:
+    """Bytes of a .pts file: the count of points, then x y z, intensity, red green blue, the last four if there are any.
+
+    Raises
+    ------
+    CloudWriteError
+        The cloud has other columns.
+    """
+    columns = _scalars(columns_of_cloud(cloud))
+    names = tuple(name for name in _PTS[-1] if name in columns)
+    if names not in _PTS or len(names) < len(columns):
+        others = ", ".join(name for name in columns if name not in names)
+        raise CloudWriteError(
+            f"a .pts file holds x y z, intensity and colours, but the cloud has also {others[:200]}: "
+            "write a .csv or .txt file"
+        )
+    return f"{len(columns['x'])}\n".encode() + _body({name: columns[name] for name in names}, " ")
+
+
+def _scalars(columns: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
+    """The columns with one column for each number of a vector."""
+    parts: dict[str, NDArray[np.generic]] = {}
+    for name, column in columns.items():
+        own = {name: column} if column.ndim == 1 else {f"{name}_{i}": part for i, part in enumerate(column.T)}
+        if not own.keys().isdisjoint(parts):
+            raise CloudWriteError(f"expected distinct columns, but {name!r} comes twice as a text has it: rename it")
+        parts |= own
+    return parts
+
+
+def _quoted(name: str, separator: str) -> str:
+    """The name in quotes if it would fall apart without."""
+    return f'"{name}"' if separator in name or any(letter.isspace() for letter in name) else name
+
+
+def _body(columns: dict[str, NDArray[np.generic]], separator: str) -> bytes:
+    """A row for each point, each number as short as it can be without becoming another one."""
+    n = len(columns["x"])
+    blocks = []
+    for start in range(0, n, ROWS_AT_ONCE):
+        words = [_number_words(name, column[start : start + ROWS_AT_ONCE]) for name, column in columns.items()]
+        blocks.append("".join(f"{row}\n" for row in map(separator.join, zip(*words, strict=True))).encode())
+    return b"".join(blocks)
+
+
+def _number_words(name: str, column: NDArray[np.generic]) -> list[str]:
+    kind, size = column.dtype.kind, column.dtype.itemsize
+    if kind == "b":
+        column = column.astype(np.uint8)
+    elif kind not in "iuf" or size > 8:
+        raise CloudWriteError(f"expected the column {name!r} as numbers of at most 64 bits, got {column.dtype}")
+    return list(map(repr, column.astype(np.float64).tolist() if kind == "f" else column.tolist()))
+
+
+TEXT = Format("text", (".xyz", ".txt", ".csv", ".asc"), read_text, encode_text, takes_names=True)
+PTS = Format("pts", (".pts",), partial(read_text, is_pts=True), encode_pts, holds_columns=False, takes_names=True)
+XYZN = Format("xyzn", (".xyzn",), partial(read_text, usual=("x", "y", "z", *NORMAL_NAMES[1])), takes_names=True)
+XYZRGB = Format("xyzrgb", (".xyzrgb",), partial(read_text, usual=("x", "y", "z", *COLOR_NAMES)), takes_names=True)

@@ -1,0 +1,557 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The operations of the service. FastAPI is imported here at the top: this file is loaded only by `create_app`."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import shutil
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
+from fastapi import Path as PathParameter
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.background import BackgroundTask
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+from starlette.routing import Match, Route
+from starlette.types import Scope
+
+from pcgraph import __version__
+from pcgraph.service.guards import Guards, problem_response
+from pcgraph.service.models import (
+    LABEL_FORMATS,
+    BoxesModel,
+    CutQuery,
+    Health,
+    LabelQuery,
+    LabelsModel,
+    ObjectsModel,
+    Points,
+    ProblemModel,
+    SegmentationModel,
+    SegmentParameters,
+    TreeModel,
+    UploadQuery,
+    Wait,
+    did_you_mean,
+)
+from pcgraph.service.problems import Problem, busy
+from pcgraph.service.settings import ServiceSettings
+from pcgraph.service.store import Job, Store
+from pcgraph.service.uploads import FILE_FIELD, Upload, receive_upload, said
+from pcgraph.service.worker_pool import RETRY_SECONDS, WorkerPool
+
+SAVED = "segmentation.npz"
+"""Name of the file of a saved segmentation."""
+JANITOR_SECONDS = 30.0
+"""Time between two looks for segmentations that are too old. Chosen by eye; not varied."""
+VIEW_POLICY = "sandbox allow-scripts"
+"""Content-Security-Policy of the viewer page: its script, which shows names of strangers, cannot call the service."""
+PROBLEMS = {
+    400: "The request is damaged, or names a host that is not this computer.",
+    401: "The token is missing or wrong.",
+    403: "The request comes from another web site's page.",
+    404: "There is no such segmentation.",
+    405: "There is no such method here.",
+    408: "The upload arrived too slowly.",
+    409: "The segmentation is not done yet, or it failed.",
+    413: "The cloud is too large.",
+    415: "The body is of another type.",
+    422: "The cloud or a parameter is not as expected.",
+    500: "The worker process ended, or the service failed.",
+    503: "Too many requests are waiting: try again after `Retry-After` seconds.",
+    504: "The worker took too long.",
+}
+"""What each status of a problem means."""
+
+
+class Service:
+    """Workers and stored segmentations of one server."""
+
+    def __init__(self, settings: ServiceSettings) -> None:
+        self.settings = settings
+        self.store = Store(settings)
+        self.segmenting = WorkerPool(settings.workers, settings)
+        self.answering = WorkerPool(1, settings)
+        self.n_uploads = 0
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Start the workers; at the end, end them and remove all files."""
+        janitor = asyncio.create_task(self._make_room())
+        try:
+            await self.segmenting.start()
+            await self.answering.start()
+            yield
+        finally:
+            janitor.cancel()
+            await self.segmenting.stop()
+            await self.answering.stop()
+            self.store.close()
+
+    async def _make_room(self) -> None:
+        while True:
+            await asyncio.sleep(JANITOR_SECONDS)
+            self.store.make_room()
+
+    @contextlib.contextmanager
+    def upload_slot(self) -> Any:
+        """One of the uploads that are received at a time."""
+        if self.n_uploads >= self.settings.max_uploads:
+            raise busy(f"{self.n_uploads} uploads arrive already: try again later", RETRY_SECONDS)
+        self.n_uploads += 1
+        try:
+            yield
+        finally:
+            self.n_uploads -= 1
+
+    def begin(self, upload: Upload, path: Path) -> Job:
+        """A job that waits for a worker; Problem if too many wait."""
+        job = self.store.new()
+        job.title = Path(upload.name or "points").name
+        path = path.rename(job.folder / "upload")
+        task = {
+            "task": "segment_upload",
+            "upload": str(path),
+            "name": upload.name,
+            "saved": str(job.folder / SAVED),
+            "max_points": self.settings.max_points,
+            **upload.parameters.model_dump(exclude={"wait"}),
+        }
+        try:
+            job.order = self.segmenting.put(task, lambda words: _note(job, words))
+        except Problem:
+            self.store.remove(job)
+            raise
+        job.order.answer.add_done_callback(lambda answer: self._end(job, path, answer))
+        return job
+
+    def _end(self, job: Job, upload: Path, answer: asyncio.Future[dict[str, Any]]) -> None:
+        if answer.cancelled():  # with the job, whose files are gone
+            return
+        upload.unlink(missing_ok=True)
+        error = answer.exception()
+        if isinstance(error, Problem):
+            job.problem = error
+        else:
+            job.summary = answer.result()
+        self.store.finish(job)
+
+    async def answer(self, name: str, task: str, media_type: str, **arguments: Any) -> FileResponse:
+        """A file that a worker writes about a finished segmentation."""
+        job = self.done(name)
+        folder = self.store.answer_folder(job, SAVED)
+        try:
+            order = self.answering.put(
+                {"task": task, "segmentation_id": job.id, "saved": str(folder / SAVED), **arguments}
+            )
+            try:
+                written = await order.answer
+            except asyncio.CancelledError:
+                order.cancel()
+                raise
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        return _file(folder / written["file"], media_type, f"{Path(job.title).stem}.{written['file']}")
+
+    def done(self, name: str) -> Job:
+        """A job that is done; Problem if it is not, or failed."""
+        job = self.store.job(name)
+        if job.problem is not None:
+            raise Problem(409, f"this segmentation failed: {job.problem.detail}")
+        if job.summary is None:
+            raise Problem(
+                409, f"this segmentation is {job.state}: ask again later", {"Retry-After": str(RETRY_SECONDS)}
+            )
+        return job
+
+    def model(self, job: Job, root: str) -> SegmentationModel:
+        """A job as clients see it."""
+        own = f"{root}/segmentations/{job.id}"
+        names = {name: name for name in ("labels", "boxes", "objects", "tree", "view")} | {"file": SAVED}
+        problem = None if job.problem is None else ProblemModel(**job.problem.to_dict())
+        return SegmentationModel(
+            id=job.id,
+            state=job.state,  # type: ignore[arg-type]
+            stage=job.stage,
+            ahead=None if job.order is None else self.segmenting.position(job.order),
+            seconds=round(job.seconds, 3),
+            summary=job.summary,  # type: ignore[arg-type]
+            problem=problem,
+            links={"self": own, **{key: f"{own}/{end}" for key, end in names.items()}},
+        )
+
+
+def _note(job: Job, words: str) -> None:
+    if job.began is None:
+        job.began = time.monotonic()
+    job.stage = words
+
+
+def _file(path: Path, media_type: str, name: str, headers: dict[str, str] | None = None) -> FileResponse:
+    """An answer with a file of an answer's folder, which is removed after it."""
+    remove = BackgroundTask(shutil.rmtree, path.parent, ignore_errors=True)
+    return FileResponse(path, media_type=media_type, filename=name, headers=headers, background=remove)
+
+
+def _declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Problems of an operation, as OpenAPI declares them."""
+    schema = {"$ref": "#/components/schemas/ProblemModel"}
+    return {
+        status: {
+            "description": PROBLEMS[status],
+            "content": {
+                "application/problem+json": {
+                    "schema": schema,
+                    "example": {**Problem(status, PROBLEMS[status]).to_dict()},
+                }
+            },
+        }
+        for status in (400, 401, 403, 408, 413, 422, *statuses)
+    }
+
+
+# ---- Operations ----------------------------------------------------------------------------------------------------
+
+_UPLOAD = {
+    "requestBody": {
+        "required": True,
+        "description": "A form with the file in the field `cloud`; or the file itself, with its name in the query; or "
+        "a small cloud as JSON. Every format that `pcgraph.read_cloud` reads is taken, .npz with arrays too.",
+        "content": {
+            "application/json": {
+                "schema": {"$ref": "#/components/schemas/Points"},
+                "example": {"points": [[0.1 * x, 0.1 * y, 2.0] for y in range(6) for x in range(6)]},
+            },
+            "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": [FILE_FIELD],
+                    "properties": {
+                        FILE_FIELD: {
+                            "type": "string",
+                            "format": "binary",
+                            "description": "The file; the end of its name tells the format.",
+                        },
+                        **SegmentParameters.model_json_schema()["properties"],
+                    },
+                    "additionalProperties": False,
+                }
+            },
+        },
+    }
+}
+"""OpenAPI's description of an upload's body; the parameters of the query may be fields of a form, too."""
+
+
+_LOCATION = {"Location": {"description": "Path of the segmentation.", "schema": {"type": "string"}}}
+_OF_ID = {"segmentation_id": "$response.body#/id"}
+_LINKS = {
+    name: {"operationId": name, "parameters": _OF_ID}
+    for name in ("state", "labels", "boxes", "objects", "tree", "view", "file", "remove")
+}
+"""What can be asked about a segmentation, as OpenAPI's links."""
+
+
+def _service(request: Request) -> Service:
+    service: Service = request.app.state.service
+    return service
+
+
+Here = Annotated[Service, Depends(_service)]
+Id = Annotated[str, PathParameter(min_length=1, max_length=64, description="Its id, as the upload's answer says.")]
+open_router = APIRouter()
+"""Operations without a token."""
+router = APIRouter()
+"""Operations that need the token, if there is one."""
+
+
+@open_router.get("/health", operation_id="health", responses=_declared())
+async def health(service: Here) -> Health:
+    """How the service is. It answers without a token, and only after the kernels are compiled."""
+    pools = (service.segmenting, service.answering)
+    return Health(
+        ready=all(pool.n_ready for pool in pools),
+        version=__version__,
+        workers=sum(pool.n_ready for pool in pools),
+        queued=service.segmenting.n_waiting,
+        segmentations=len(service.store),
+    )
+
+
+@router.post(
+    "/segmentations",
+    operation_id="segment",
+    status_code=201,
+    response_model=SegmentationModel,
+    responses={
+        201: {"description": "The cloud is segmented.", "headers": _LOCATION, "links": _LINKS},
+        202: {
+            "model": SegmentationModel,
+            "description": "The cloud waits or is being segmented: ask at `Location`.",
+            "headers": _LOCATION,
+            "links": _LINKS,
+        },
+        **_declared(415, 500, 503, 504),
+    },
+    openapi_extra=_UPLOAD,
+)
+async def segment(request: Request, service: Here, query: Annotated[UploadQuery, Query()]) -> Response:
+    """Segment a cloud.
+
+    The answer comes when the segmentation is done, or after `wait` seconds, whatever is first. A client that hangs up
+    before has no id, so its segmentation is ended.
+    """
+    with service.upload_slot(), service.store.upload_file() as path:
+        upload = await receive_upload(request, query, path)
+        job = service.begin(upload, path)
+    try:
+        if not await _finished(job, upload.parameters.wait, request):
+            service.store.remove(job)
+    except asyncio.CancelledError:
+        service.store.remove(job)
+        raise
+    if job.problem is not None:
+        service.store.remove(job)
+        raise job.problem
+    model = service.model(job, request.scope.get("root_path", ""))
+    location = {"Location": model.links["self"]}
+    return JSONResponse(model.model_dump(mode="json"), 201 if model.state == "done" else 202, location)
+
+
+async def _finished(job: Job, seconds: float, request: Request) -> bool:
+    """Wait until a job has finished, for so many seconds at most; False if the client hangs up."""
+    finished = asyncio.create_task(job.finished.wait())
+    hung_up = asyncio.create_task(_hung_up(request))
+    try:
+        await asyncio.wait({finished, hung_up}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        return not hung_up.done()
+    finally:
+        finished.cancel()
+        hung_up.cancel()
+
+
+async def _hung_up(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+@router.get(
+    "/segmentations/{segmentation_id}", operation_id="state", responses=_declared(404), response_model=SegmentationModel
+)
+async def state(request: Request, service: Here, segmentation_id: Id, wait: Annotated[Wait, Query()] = 0.0) -> Any:
+    """How far a segmentation is, and what came of it. With `wait` the answer comes when it is done, or then."""
+    job = service.store.job(segmentation_id)
+    await _finished(job, wait, request)
+    return service.model(job, request.scope.get("root_path", ""))
+
+
+@router.delete("/segmentations/{segmentation_id}", operation_id="remove", status_code=204, responses=_declared(404))
+async def remove(service: Here, segmentation_id: Id) -> None:
+    """End a segmentation, if it is not done, and remove it."""
+    service.store.remove(service.store.job(segmentation_id))
+
+
+@router.get(
+    "/segmentations/{segmentation_id}/labels",
+    operation_id="labels",
+    response_class=FileResponse,
+    responses={
+        200: {
+            "description": "The labels, in the format that was asked for.",
+            "content": {
+                "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
+                "application/json": {"schema": {"$ref": "#/components/schemas/LabelsModel"}},
+            },
+        },
+        **_declared(404, 409, 500, 503, 504),
+    },
+)
+async def labels(service: Here, segmentation_id: Id, query: Annotated[LabelQuery, Query()]) -> FileResponse:
+    """Labels of the points: the objects, or a cut of the tree at any level. Nothing is segmented again.
+
+    Give `n` for a number of segments, or `altitude` for a level; neither for the objects.
+    """
+    if query.format not in LABEL_FORMATS:
+        hint = did_you_mean(query.format, list(LABEL_FORMATS))
+        raise Problem(422, f"expected format as one of {', '.join(LABEL_FORMATS)}, got {query.format[:80]!r}{hint}")
+    _check_cut(query)
+    media_type = "application/json" if query.format == "json" else "application/octet-stream"
+    arguments = query.model_dump(exclude={"format"})
+    return await service.answer(segmentation_id, "write_labels", media_type, file_format=query.format, **arguments)
+
+
+def _check_cut(query: CutQuery) -> None:
+    if query.n is not None and query.altitude is not None:
+        raise Problem(422, "expected n or altitude, got both: choose one")
+
+
+@router.get(
+    "/segmentations/{segmentation_id}/boxes",
+    operation_id="boxes",
+    response_model=BoxesModel,
+    responses=_declared(404, 409, 500, 503, 504),
+)
+async def boxes(service: Here, segmentation_id: Id, query: Annotated[CutQuery, Query()]) -> Response:
+    """Oriented boxes around the objects, or around the segments of a cut at any level."""
+    _check_cut(query)
+    return await service.answer(segmentation_id, "write_boxes", "application/json", **query.model_dump())
+
+
+@router.get(
+    "/segmentations/{segmentation_id}/objects",
+    operation_id="objects",
+    response_model=ObjectsModel,
+    responses=_declared(404, 409, 500, 503, 504),
+)
+async def objects(service: Here, segmentation_id: Id) -> Response:
+    """What stands on the largest horizontal plane, with boxes and shapes: see `pcgraph.detection.objects_on`."""
+    return await service.answer(segmentation_id, "write_objects", "application/json")
+
+
+@router.get(
+    "/segmentations/{segmentation_id}/tree",
+    operation_id="tree",
+    response_model=TreeModel,
+    responses=_declared(404, 409, 500, 503, 504),
+)
+async def tree(service: Here, segmentation_id: Id) -> Response:
+    """The segmentation tree: parents, altitudes and sizes of its nodes."""
+    return await service.answer(segmentation_id, "write_tree", "application/json")
+
+
+@router.get(
+    "/segmentations/{segmentation_id}/view",
+    operation_id="view",
+    response_class=HTMLResponse,
+    responses=_declared(404, 409, 500, 503, 504),
+)
+async def view(service: Here, segmentation_id: Id) -> Response:
+    """The viewer: one HTML page that works offline."""
+    title = service.done(segmentation_id).title
+    page = await service.answer(segmentation_id, "write_view", "text/html", title=title)
+    page.headers["Content-Disposition"] = "inline"
+    page.headers["Content-Security-Policy"] = VIEW_POLICY
+    return page
+
+
+@router.get(
+    f"/segmentations/{{segmentation_id}}/{SAVED}",
+    operation_id="file",
+    response_class=FileResponse,
+    responses={
+        200: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}},
+        **_declared(404, 409),
+    },
+)
+async def file(service: Here, segmentation_id: Id) -> Response:
+    """The saved segmentation, with the cloud: `pcgraph.load_segmentation` opens it."""
+    job = service.done(segmentation_id)
+    path = service.store.answer_folder(job, SAVED) / SAVED
+    return _file(path, "application/octet-stream", f"{Path(job.title).stem}.{SAVED}")
+
+
+# ---- The application -----------------------------------------------------------------------------------------------
+
+
+def application(settings: ServiceSettings) -> FastAPI:
+    """The service as an ASGI application; see `pcgraph.service.create_app`."""
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        app.state.service = Service(settings)
+        async with app.state.service.running():
+            yield
+
+    app = FastAPI(
+        title="pcgraph",
+        version=__version__,
+        description="Segments point clouds: objects, parts, supervoxels, the graph and the tree between them.",
+        lifespan=lifespan,
+        redirect_slashes=False,
+        docs_url=None,  # FastAPI's pages load their scripts from another web site
+        redoc_url=None,
+    )
+    app.add_middleware(Guards, settings=settings)
+    for kind, respond in _RESPONDERS.items():
+        app.add_exception_handler(kind, respond)
+    app.include_router(open_router)
+    app.include_router(router, dependencies=[] if settings.token is None else [Depends(_check_token)])
+    _describe(app)
+    return app
+
+
+def _check_token(
+    service: Here, given: Annotated[HTTPAuthorizationCredentials | None, Depends(HTTPBearer(auto_error=False))]
+) -> None:
+    """Raise a 401 unless the request has the token; how long this takes tells nothing about the token."""
+    token = service.settings.token or ""
+    if given is None or not hmac.compare_digest(given.credentials.encode(), token.encode()):
+        raise Problem(
+            401,
+            "expected the token of the service in the header: Authorization: Bearer TOKEN",
+            {"WWW-Authenticate": "Bearer"},
+        )
+
+
+async def _of_problem(request: Request, error: Exception) -> Response:
+    assert isinstance(error, Problem)
+    return problem_response(error)
+
+
+async def _of_validation(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    known = UploadQuery if request.method == "POST" else LabelQuery  # the operations that refuse unknown names
+    return problem_response(Problem(422, said(error.errors(), list(known.model_fields))))
+
+
+async def _of_http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    detail, headers = f"{error.detail}: {request.method} {request.url.path[:200]}", dict(error.headers or {})
+    if error.status_code == 405:
+        headers["Allow"] = ", ".join(sorted(_methods(request.scope)))
+    return problem_response(Problem(error.status_code, detail, headers))
+
+
+def _methods(scope: Scope) -> set[str]:
+    """Methods of a path. FastAPI has one route for each, so that its own header `Allow` names the first only."""
+    routes = [route for one in (open_router, router) for route in one.routes if isinstance(route, Route)]
+    return {m for route in routes if route.matches(scope)[0] != Match.NONE for m in route.methods or ()}
+
+
+async def _of_disconnect(request: Request, error: Exception) -> Response:
+    return problem_response(Problem(400, "the upload was cut off"))  # nobody hears it
+
+
+async def _of_bug(request: Request, error: Exception) -> Response:
+    return problem_response(Problem(500, "the service failed at this request; its log says where"))  # uvicorn logs it
+
+
+_RESPONDERS = {
+    Problem: _of_problem,
+    RequestValidationError: _of_validation,
+    HTTPException: _of_http,
+    ClientDisconnect: _of_disconnect,
+    Exception: _of_bug,
+}
+"""Answers to exceptions, all of them problems."""
+
+
+def _describe(app: FastAPI) -> None:
+    """Add the schemas to the OpenAPI document that no type of an operation names."""
+    document = app.openapi()
+    schemas = document["components"]["schemas"]
+    for model in (ProblemModel, Points, LabelsModel):
+        schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+        schemas[model.__name__] = schema
+    for name in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(name, None)

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Uploads: a body that is a file, a form with a file, or JSON with points, received into a file."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fastapi import Request
+from pydantic import ValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import UploadFile
+from starlette.exceptions import HTTPException
+
+from pcgraph.service.models import MAX_NAME, Points, SegmentParameters, UploadQuery, did_you_mean
+from pcgraph.service.problems import Problem
+
+FILE_FIELD = "cloud"
+"""Field of a form that holds the file."""
+RAW_TYPES = ("", "application/octet-stream", "application/x-www-form-urlencoded")
+"""Types of a body that is the file itself; the last is what ``curl --data-binary`` says unless told."""
+MAX_JSON_BYTES = 1 << 20
+"""Bytes of a cloud in JSON, some 20 000 points: it is checked in the server itself. Chosen by eye; not varied."""
+MAX_FIELDS = 200
+"""Fields of a form: every parameter once, and lists of columns. Chosen by eye; not varied."""
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A received upload.
+
+    Attributes
+    ----------
+    name : str, or None
+        The user's name of the file; None if it is JSON.
+    parameters : SegmentParameters
+    """
+
+    name: str | None
+    parameters: SegmentParameters
+
+
+async def receive_upload(request: Request, query: UploadQuery, target: Path) -> Upload:
+    """Write the cloud of a request to a file, and collect its parameters.
+
+    Raises
+    ------
+    Problem
+        The body is of another kind than those that are taken, or the form is damaged or has unknown fields.
+    """
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    parameters = SegmentParameters(**query.model_dump(exclude={"name"}, exclude_unset=True))
+    if kind == "multipart/form-data":
+        return await _receive_form(request, parameters, target)
+    if kind != "application/json" and kind not in RAW_TYPES:
+        raise Problem(
+            415, f"expected multipart/form-data, application/octet-stream or application/json, got {kind[:80]}"
+        )
+    if kind != "application/json" and query.name is None:
+        raise Problem(
+            422, "expected the name of the file in the query, such as ?name=scan.laz: its end tells the format"
+        )
+    if kind == "application/json":
+        target.write_bytes(await _checked_json(request))
+        return Upload(None, parameters)
+    with target.open("wb") as file:
+        async for block in request.stream():
+            await run_in_threadpool(file.write, block)
+    return Upload(query.name, parameters)
+
+
+async def _checked_json(request: Request) -> bytes:
+    content = bytearray()
+    async for block in request.stream():
+        content += block
+        if len(content) > MAX_JSON_BYTES:
+            raise Problem(413, f"expected at most {MAX_JSON_BYTES} bytes of JSON: send a file, or NPZ with arrays")
+    try:
+        Points.model_validate_json(bytes(content))
+    except ValidationError as error:
+        raise Problem(422, said(error.errors(), list(Points.model_fields))) from None
+    return bytes(content)
+
+
+async def _receive_form(request: Request, parameters: SegmentParameters, target: Path) -> Upload:
+    try:
+        async with request.form(max_files=1, max_fields=MAX_FIELDS) as form:  # removes its temporary file at the end
+            file = form.get(FILE_FIELD)
+            if not isinstance(file, UploadFile) or not file.filename:
+                raise Problem(
+                    422, f"expected a form with a file in the field {FILE_FIELD!r} that has a name, such as scan.laz"
+                )
+            fields = [(name, value) for name, value in form.multi_items() if name != FILE_FIELD]
+            parameters = with_fields(parameters, fields)
+            with target.open("wb") as copy:
+                await run_in_threadpool(shutil.copyfileobj, file.file, copy)
+            return Upload(file.filename[-MAX_NAME:], parameters)
+    except HTTPException as error:  # as which Starlette raises what its parser says
+        raise Problem(400, f"expected a whole form of type multipart/form-data: {error.detail}") from None
+
+
+def with_fields(parameters: SegmentParameters, fields: list[tuple[str, Any]]) -> SegmentParameters:
+    """Parameters with those of a form's fields in place of the same ones."""
+    given: dict[str, Any] = {}
+    for name, value in fields:
+        is_list = name in ("viewpoint", "features", "columns")
+        given[name] = [*given.get(name, []), value] if is_list else value
+    try:
+        read = SegmentParameters(**given)
+    except ValidationError as error:
+        raise Problem(422, said(error.errors(), list(SegmentParameters.model_fields))) from None
+    return parameters.model_copy(update=read.model_dump(exclude_unset=True))
+
+
+def said(errors: Any, known: list[str]) -> str:
+    """One sentence about the first of the errors that pydantic found; `known` are the names of the parameters."""
+    first = errors[0]
+    name = next((part for part in reversed(first["loc"]) if isinstance(part, str)), "body")
+    if first["type"] == "extra_forbidden":
+        return f"there is no parameter {name[:80]!r}{did_you_mean(name, known) or ': there are ' + ', '.join(known)}"
+    if first["type"] == "value_error":  # one of our own sentences
+        return f"{name}: {first['ctx']['error']}"
+    return f"{name}: {first['msg'][:1].lower()}{first['msg'][1:]}, got {str(first.get('input'))[:80]!r}"

@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Worker processes of the service, and the tasks that wait for them.
+
+A worker that crashes, takes too long or is killed ends its own task only: a new one takes its place.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import signal
+import sys
+from asyncio.subprocess import PIPE, Process
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+from pcgraph.service.problems import Problem, busy
+from pcgraph.service.settings import ServiceSettings
+
+_log = logging.getLogger("pcgraph.service")
+
+MAX_LINE = 1 << 20
+"""Bytes of a line from a worker: a summary with all its warnings takes some thousands. Chosen by eye; not varied."""
+MAX_START_SECONDS = 600.0
+"""Time in which a worker must be ready: compiling the kernels takes half a minute, and three on a busy machine."""
+PAUSE_SECONDS = 1.0
+"""Time before a worker is started again that could not start, so that a broken installation does not fill the log.
+Chosen by eye; not varied."""
+RETRY_SECONDS = 2
+"""Time after which a client may ask a busy service again. Chosen by eye; not varied."""
+
+
+@dataclass(eq=False)
+class Order:
+    """A task that waits for a worker, or is in one.
+
+    Attributes
+    ----------
+    task : dict
+        Name and arguments, plain values.
+    on_stage : callable
+        Called with what the task has come to, in words.
+    answer : future of dict
+        Fails with a `Problem`. Cancelled with the order.
+    worker : Worker, or None
+        Where it is done now.
+    """
+
+    task: dict[str, Any]
+    on_stage: Callable[[str], None]
+    answer: asyncio.Future[dict[str, Any]] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
+    worker: Worker | None = None
+
+    def cancel(self) -> None:
+        """End the task; the worker that does it is killed."""
+        self.answer.cancel()
+        if self.worker is not None:
+            self.worker.kill()
+
+
+class Worker:
+    """A worker process, started and ready."""
+
+    def __init__(self, process: Process) -> None:
+        self._process = process
+        self.ended = asyncio.ensure_future(process.wait())
+        """Its exit status, as soon as it has ended."""
+        self._killed = False
+
+    @classmethod
+    async def start(cls, settings: ServiceSettings) -> Worker:
+        """A worker whose kernels are compiled; Problem if it does not become ready."""
+        threads = str(settings.threads_per_worker)
+        environment = {name: value for name, value in os.environ.items() if name != "PCGRAPH_TOKEN"}
+        environment |= dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
+        limit = str(int(settings.max_memory_gb * 1e9))
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-P", "-m", "pcgraph.service.worker_process", limit),
+            stdin=PIPE,
+            stdout=PIPE,
+            env=environment,
+            limit=MAX_LINE,
+            start_new_session=True,  # Ctrl-C is for the server, which ends its workers itself
+        )
+        worker = cls(process)
+        try:
+            async with asyncio.timeout(MAX_START_SECONDS):
+                ready = await worker._line()
+        except BaseException:
+            worker.kill()
+            raise
+        if not ready.get("ready"):
+            raise Problem(500, f"a worker process ended ({in_words(await worker.ended)}) before it was ready")
+        return worker
+
+    async def do(self, order: Order, max_seconds: float) -> dict[str, Any]:
+        """Result of a task; Problem if there is none: then the worker ends, too, unless it told the problem itself."""
+        assert self._process.stdin is not None
+        order.worker = self
+        try:
+            async with asyncio.timeout(max_seconds):
+                with suppress(ConnectionError):  # it has ended, which the next line tells
+                    self._process.stdin.write(json.dumps(order.task).encode() + b"\n")
+                    await self._process.stdin.drain()
+                while "stage" in (message := await self._line()):
+                    order.on_stage(message["stage"])
+        except TimeoutError:
+            self.kill()
+            raise Problem(
+                504, f"took longer than {max_seconds:g} s and was ended: send fewer points, or a larger voxel_size"
+            ) from None
+        finally:
+            order.worker = None
+        if "problem" in message:
+            raise Problem(**message["problem"])
+        if "result" not in message:
+            self.kill()
+            raise Problem(
+                500,
+                f"the worker process ended ({in_words(await self.ended)}): try again; if it ends again, the cloud is "
+                "the cause",
+            )
+        result: dict[str, Any] = message["result"]
+        return result
+
+    async def _line(self) -> dict[str, Any]:
+        """The next message of the worker; empty if it has ended, or is no longer to be understood."""
+        assert self._process.stdout is not None
+        try:
+            line = await self._process.stdout.readline()
+            message = json.loads(line) if line else {}
+        except ValueError:
+            message = None
+        if not isinstance(message, dict):
+            self.kill()
+            return {}
+        return message
+
+    @property
+    def usable(self) -> bool:
+        """Whether it can be given an order."""
+        return not (self._killed or self.ended.done())
+
+    def kill(self) -> None:
+        """End the process at once."""
+        self._killed = True
+        with suppress(ProcessLookupError):
+            self._process.kill()
+
+
+def in_words(status: int) -> str:
+    """Exit status of a process: "signal SIGKILL", "exit status 1"."""
+    return f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+
+
+class WorkerPool:
+    """A number of worker processes, kept alive, and a queue of orders."""
+
+    def __init__(self, n_workers: int, settings: ServiceSettings) -> None:
+        self._n_workers, self._settings = n_workers, settings
+        self._waiting: deque[Order] = deque()
+        self._arrived = asyncio.Event()
+        self._keepers: list[asyncio.Task[None]] = []
+        self._first_ready: asyncio.Future[None] | None = None
+        self.n_ready = 0
+
+    async def start(self) -> None:
+        """Start the workers, and wait until one is ready: it has compiled the kernels.
+
+        Raises
+        ------
+        Problem
+            It could not start.
+        """
+        self._first_ready = asyncio.get_running_loop().create_future()
+        self._keepers = [asyncio.create_task(self._keep(self._first_ready))]
+        await self._first_ready
+        self._keepers += [asyncio.create_task(self._keep()) for _ in range(self._n_workers - 1)]
+
+    async def stop(self) -> None:
+        """End all workers and refuse what waits."""
+        for order in self._waiting:
+            order.cancel()
+        self._waiting.clear()
+        for keeper in self._keepers:
+            keeper.cancel()
+        await asyncio.gather(*self._keepers, return_exceptions=True)
+
+    @property
+    def n_waiting(self) -> int:
+        return len(self._waiting)
+
+    def position(self, order: Order) -> int | None:
+        """Number of orders that come before this one; None if it waits no more."""
+        return self._waiting.index(order) if order in self._waiting else None
+
+    def put(self, task: dict[str, Any], on_stage: Callable[[str], None] = lambda _: None) -> Order:
+        """Order a task.
+
+        Raises
+        ------
+        Problem
+            Too many wait already.
+        """
+        if len(self._waiting) >= self._settings.max_queued:
+            raise busy(f"{len(self._waiting)} requests wait for a worker already: try again later", RETRY_SECONDS)
+        order = Order(task, on_stage)
+        order.answer.add_done_callback(lambda answer: self._forget(order) if answer.cancelled() else answer.exception())
+        self._waiting.append(order)
+        self._arrived.set()
+        return order
+
+    def _forget(self, order: Order) -> None:
+        with suppress(ValueError):  # it is in a worker, or done
+            self._waiting.remove(order)
+
+    async def _keep(self, first_ready: asyncio.Future[None] | None = None) -> None:
+        """Keep one worker alive, and let it do one order after the other."""
+        while True:
+            try:
+                worker = await Worker.start(self._settings)
+            except (OSError, TimeoutError, Problem) as error:
+                _log.error("cannot start a worker process: %s", error)
+                if first_ready is not None and not first_ready.done():
+                    first_ready.set_exception(error)
+                    return
+                await asyncio.sleep(PAUSE_SECONDS)
+                continue
+            if first_ready is not None and not first_ready.done():
+                first_ready.set_result(None)
+            self.n_ready += 1
+            try:
+                await self._serve(worker)
+            finally:
+                self.n_ready -= 1
+                worker.kill()
+                status = await worker.ended
+            _log.warning("a worker process ended (%s); a new one takes its place", in_words(status))
+
+    async def _serve(self, worker: Worker) -> None:
+        """Let a worker do orders until it ends."""
+        while order := await self._next(worker):
+            try:
+                result = await worker.do(order, self._settings.max_seconds)
+            except Problem as problem:
+                if not order.answer.done():
+                    order.answer.set_exception(problem)
+            except (KeyError, TypeError):  # no message of ours: whatever it is now, it is a worker no more
+                worker.kill()
+                if not order.answer.done():
+                    order.answer.set_exception(Problem(500, "the worker process failed"))
+            else:
+                if not order.answer.done():
+                    order.answer.set_result(result)
+
+    async def _next(self, worker: Worker) -> Order | None:
+        """The order that has waited longest; None if the worker has ended."""
+        while worker.usable:
+            if self._waiting:
+                return self._waiting.popleft()
+            self._arrived.clear()
+            arrival = asyncio.create_task(self._arrived.wait())
+            try:
+                await asyncio.wait({arrival, worker.ended}, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                arrival.cancel()
+        return None

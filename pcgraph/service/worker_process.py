@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A worker process of the service: it reads tasks from its standard input and answers each, one line of JSON each.
+
+    python -m pcgraph.service.worker_process MAX_MEMORY_BYTES
+
+Lines to the worker: {"task": name, ...arguments}. Lines from it: {"ready": true} after the kernels are compiled; then
+for each task any number of {"stage": words}, and {"result": {...}} or {"problem": {"status": ..., "detail": ...}}.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import queue
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any, TextIO
+
+from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, one_line, without_long_words
+from pcgraph.service.problems import Problem
+
+_log = logging.getLogger("pcgraph.service")
+
+
+def main() -> None:
+    """Do tasks until the standard input is closed, as it is when the server ends."""
+    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(message)s")
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what libraries print must not come between the answers
+
+    def say(message: dict[str, Any]) -> None:
+        answers.write(json.dumps(message, allow_nan=False) + "\n")
+        answers.flush()
+
+    from pcgraph.all_kernels import compile_kernels
+    from pcgraph.service.tasks import TASKS, warm_up
+
+    tasks: queue.SimpleQueue[str] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=(sys.stdin, tasks), daemon=True).start()
+    compile_kernels()
+    warm_up()
+    _limit_memory(int(sys.argv[1]))
+    say({"ready": True})
+    while True:
+        arguments = json.loads(tasks.get())
+        say(_answer(TASKS[arguments.pop("task")], arguments, lambda words: say({"stage": words})))
+
+
+def _read(stream: TextIO, tasks: queue.SimpleQueue[str]) -> None:
+    """Put the lines of a stream into a queue; end the process, whatever it does, where the stream ends."""
+    for line in stream:
+        tasks.put(line)
+    os._exit(0)
+
+
+def _limit_memory(n_bytes: int) -> None:
+    """Make allocations fail beyond so many bytes of private memory; the address space as such costs nothing."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits
+        return
+    resource.setrlimit(resource.RLIMIT_DATA, (n_bytes, n_bytes))
+
+
+def _answer(do: Callable[..., Any], arguments: dict[str, Any], stage: Callable[[str], None]) -> dict[str, Any]:
+    own = os.path.join(os.path.dirname(arguments["saved"]), "")  # no path of the server comes into a message
+    try:
+        return {"result": do(stage=stage, **arguments)}
+    except Problem as problem:
+        return _problem(problem.status, problem.detail.replace(own, ""))
+    except MemoryError:
+        return _problem(413, "the cloud needs more memory than this service gives to one: send fewer points")
+    except (CloudReadError, CloudWriteError, PcgraphError, ValueError) as error:
+        return _problem(422, str(error).replace(own, ""))
+    except OSError as error:
+        _log.exception("the worker cannot use a file")
+        return _problem(500, f"the service cannot keep its files: {error.strerror or 'the disk fails'}")
+    except Exception as error:  # noqa: BLE001  # it belongs to this task, and the worker goes on
+        _log.exception("the worker failed")
+        return _problem(500, f"the service failed at this cloud ({type(error).__name__}); its log says where")
+
+
+def _problem(status: int, detail: str) -> dict[str, Any]:
+    return {"problem": {"status": status, "detail": one_line(without_long_words(detail)).rstrip(".")}}
+
+
+if __name__ == "__main__":
+    main()
