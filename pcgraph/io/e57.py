@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, library_reason
-from pcgraph.io.flat_columns import NORMALS, Arrays, described, flatten, listed_points, unflatten
+from pcgraph.io.flat_columns import NORMALS, Arrays, described, flatten, unflatten
 from pcgraph.io.format import CloudFile, Format
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -315,9 +315,9 @@ def encode_e57(cloud: Cloud, suffix: str) -> bytes:
     Raises
     ------
     CloudWriteError
-        A point is not finite; a column has whole numbers beyond 63 bits; or pye57 is missing.
+        A column has whole numbers beyond 63 bits; or pye57 is missing.
     """
-    points = listed_points(cloud)
+    points = cloud.points
     library = _library(CloudWriteError, "writing")
     kept = [name for name, column in cloud.columns.items() if name in _KEPT and column.ndim == cloud.points.ndim - 1]
     fields, description = flatten(cloud, kept, _TAKEN, _safe_name)

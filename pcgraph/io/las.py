@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pcgraph.cloud import COLOR_NAMES, Cloud
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, library_reason
-from pcgraph.io.flat_columns import Arrays, described, flatten, listed_points, unflatten
+from pcgraph.io.flat_columns import Arrays, described, flatten, unflatten
 from pcgraph.io.format import Format
 
 _HEADER_BYTES = 227
@@ -257,10 +257,10 @@ def encode_las(cloud: Cloud, suffix: str) -> bytes:
     Raises
     ------
     CloudWriteError
-        A point is not finite; there are more than 341 fields of extra bytes; or the points are so far apart that 32
+        There are more than 341 fields of extra bytes; or the points are so far apart that 32
         bits per coordinate would lose what their type resolves.
     """
-    points = listed_points(cloud)
+    points = cloud.points
     laspy = _laspy(CloudWriteError, "writing", compressed=suffix == ".laz")
     header = laspy.LasHeader(version="1.4", point_format=_point_format(cloud))
     header.global_encoding.wkt = True  # the standard demands it for formats from 6 on

@@ -32,7 +32,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
     Raises
     ------
     PcgraphError
-        FastAPI or python-multipart is missing.
+        FastAPI, uvicorn or python-multipart is missing.
     ValueError
         The settings allow a host that is not loopback without a token.
     """
@@ -41,6 +41,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
     try:
         import fastapi  # noqa: F401
         import python_multipart  # noqa: F401
+        import uvicorn  # noqa: F401
     except ImportError as error:
         raise PcgraphError(
             f"the service needs FastAPI, uvicorn and python-multipart, but {error.name} is missing: "

@@ -17,11 +17,10 @@ from fastapi import Path as PathParameter
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from starlette.background import BackgroundTask
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match, Route
-from starlette.types import Scope
+from starlette.types import Receive, Scope, Send
 
 from pcgraph import __version__
 from pcgraph.service.guards import Guards, problem_response
@@ -45,14 +44,14 @@ from pcgraph.service.models import (
 from pcgraph.service.problems import Problem, busy
 from pcgraph.service.settings import ServiceSettings
 from pcgraph.service.store import Job, Store
-from pcgraph.service.uploads import FILE_FIELD, Upload, receive_upload, said
+from pcgraph.service.uploads import FILE_FIELD, METADATA_FIELD, Upload, receive_upload, said
 from pcgraph.service.worker_pool import RETRY_SECONDS, WorkerPool
 
 SAVED = "segmentation.npz"
 """Name of the file of a saved segmentation."""
 JANITOR_SECONDS = 30.0
 """Time between two looks for segmentations that are too old. Chosen by eye; not varied."""
-VIEW_POLICY = "sandbox allow-scripts"
+VIEW_POLICY = "sandbox allow-scripts allow-downloads"
 """Content-Security-Policy of the viewer page: its script, which shows names of strangers, cannot call the service."""
 PROBLEMS = {
     400: "The request is damaged, or names a host that is not this computer.",
@@ -112,14 +111,14 @@ class Service:
         finally:
             self.n_uploads -= 1
 
-    def begin(self, upload: Upload, path: Path) -> Job:
-        """A job that waits for a worker; Problem if too many wait."""
+    def begin(self, upload: Upload, folder: Path) -> Job:
+        """A job that waits for a worker, and owns the folder of its upload from now on; Problem if too many wait."""
         job = self.store.new()
         job.title = Path(upload.name or "points").name
-        path = path.rename(job.folder / "upload")
+        folder = folder.rename(job.folder / "upload")
         task = {
             "task": "segment_upload",
-            "upload": str(path),
+            "upload": str(folder / FILE_FIELD),
             "name": upload.name,
             "saved": str(job.folder / SAVED),
             "max_points": self.settings.max_points,
@@ -130,13 +129,13 @@ class Service:
         except Problem:
             self.store.remove(job)
             raise
-        job.order.answer.add_done_callback(lambda answer: self._end(job, path, answer))
+        job.order.answer.add_done_callback(lambda answer: self._end(job, folder, answer))
         return job
 
     def _end(self, job: Job, upload: Path, answer: asyncio.Future[dict[str, Any]]) -> None:
         if answer.cancelled():  # with the job, whose files are gone
             return
-        upload.unlink(missing_ok=True)
+        shutil.rmtree(upload, ignore_errors=True)
         error = answer.exception()
         if isinstance(error, Problem):
             job.problem = error
@@ -160,7 +159,8 @@ class Service:
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
-        return _file(folder / written["file"], media_type, f"{Path(job.title).stem}.{written['file']}")
+        name = f"{Path(job.title).stem}.{written['file']}"
+        return AnswerFile(folder / written["file"], media_type=media_type, filename=name)
 
     def done(self, name: str) -> Job:
         """A job that is done; Problem if it is not, or failed."""
@@ -196,10 +196,19 @@ def _note(job: Job, words: str) -> None:
     job.stage = words
 
 
-def _file(path: Path, media_type: str, name: str, headers: dict[str, str] | None = None) -> FileResponse:
-    """An answer with a file of an answer's folder, which is removed after it."""
-    remove = BackgroundTask(shutil.rmtree, path.parent, ignore_errors=True)
-    return FileResponse(path, media_type=media_type, filename=name, headers=headers, background=remove)
+class AnswerFile(FileResponse):
+    """An answer with a file of an answer's folder, which is removed after it, however it ends.
+
+    It is sent whole: the file is made for one request, so that there is none to ask for further ranges of.
+    """
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        scope = {**scope, "headers": [pair for pair in scope["headers"] if pair[0] != b"range"]}
+        del self.headers["Accept-Ranges"]
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            shutil.rmtree(Path(self.path).parent, ignore_errors=True)
 
 
 def _declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -241,6 +250,12 @@ _UPLOAD = {
                             "type": "string",
                             "format": "binary",
                             "description": "The file; the end of its name tells the format.",
+                        },
+                        METADATA_FIELD: {
+                            "type": "string",
+                            "format": "binary",
+                            "description": "A second file, if the format needs one: the metadata of an Ouster "
+                            "recording.",
                         },
                         **SegmentParameters.model_json_schema()["properties"],
                     },
@@ -311,9 +326,9 @@ async def segment(request: Request, service: Here, query: Annotated[UploadQuery,
     The answer comes when the segmentation is done, or after `wait` seconds, whatever is first. A client that hangs up
     before has no id, so its segmentation is ended.
     """
-    with service.upload_slot(), service.store.upload_file() as path:
-        upload = await receive_upload(request, query, path)
-        job = service.begin(upload, path)
+    with service.upload_slot(), service.store.upload_folder() as folder:
+        upload = await receive_upload(request, query, folder)
+        job = service.begin(upload, folder)
     try:
         if not await _finished(job, upload.parameters.wait, request):
             service.store.remove(job)
@@ -457,7 +472,7 @@ async def file(service: Here, segmentation_id: Id) -> Response:
     """The saved segmentation, with the cloud: `pcgraph.load_segmentation` opens it."""
     job = service.done(segmentation_id)
     path = service.store.answer_folder(job, SAVED) / SAVED
-    return _file(path, "application/octet-stream", f"{Path(job.title).stem}.{SAVED}")
+    return AnswerFile(path, media_type="application/octet-stream", filename=f"{Path(job.title).stem}.{SAVED}")
 
 
 # ---- The application -----------------------------------------------------------------------------------------------

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from difflib import get_close_matches
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from pcgraph.cloud import Cloud
+from pcgraph.errors import CloudWriteError
 from pcgraph.families import members
-from pcgraph.io import FORMATS
+from pcgraph.io import FORMATS, encode_cloud
 
 MAX_WAIT_SECONDS = 60.0
 """Longest time for which a request waits for a segmentation: proxies end requests after about as long (nginx after
@@ -18,12 +22,20 @@ WAIT_SECONDS = 4.0
 """Time for which an upload waits for its segmentation, unless told: httpx gives up after 5 s."""
 MAX_NAME = 255
 """Characters of a file's name, the limit of common file systems."""
-LABEL_FORMATS = (
-    "npz",
-    "json",
-    *(end[1:] for one in FORMATS if one.encode is not None for end in one.suffixes if end != ".npz"),
-)
-"""Formats of labels: arrays alone, and every format of clouds that is written."""
+
+
+def _label_formats() -> tuple[str, ...]:
+    """Formats of arrays alone, and ends of files of clouds that hold our columns and whose libraries are here."""
+    cloud = Cloud(np.zeros((1, 3)), columns={"object": np.zeros(1, np.int32)})
+    found = ["npz", "json"]
+    for end in (end.removeprefix(".") for one in FORMATS for end in one.suffixes):
+        with suppress(CloudWriteError):
+            encode_cloud(cloud, f"labels.{end}")
+            found.append(end)
+    return tuple(dict.fromkeys(found))
+
+
+LABEL_FORMATS = _label_formats()
 
 Wait = Annotated[
     float,

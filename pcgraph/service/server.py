@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 HEADER_SECONDS = 10.0
 """Time in which the headers of a request must arrive on a connection, or else it is closed. Chosen by eye; not
 varied."""
-KEEP_ALIVE_SECONDS = 5
-"""Time for which an idle connection is kept, uvicorn's own default."""
+KEEP_ALIVE_SECONDS = 65
+"""Time for which an idle connection is kept: longer than by clients (httpx 5 s, nginx 60 s), as a request that crosses
+the closing of its connection is lost."""
 GRACE_SECONDS = 5
 """Time that answers have to be sent when the server ends. Chosen by eye; not varied."""
 MAX_CONNECTIONS = 1000

@@ -129,7 +129,7 @@ class Store:
 
     def finish(self, job: Job) -> None:
         """Note that a job has ended, well or not, and make room."""
-        job.ended = time.monotonic()
+        job.ended = job.used = time.monotonic()  # what has waited for long is not the first to go
         job.stage = job.order = None
         job.n_bytes = sum(path.stat().st_size for path in job.folder.iterdir()) if job.folder.is_dir() else 0
         job.finished.set()
@@ -147,13 +147,14 @@ class Store:
                 self.remove(job)
 
     @contextlib.contextmanager
-    def upload_file(self) -> Iterator[Path]:
-        """A path for an upload, whose file is removed at the end."""
-        path = self.folder / f"{secrets.token_urlsafe(16)}.upload"
+    def upload_folder(self) -> Iterator[Path]:
+        """A folder for the files of an upload, which is removed at the end unless it has been moved."""
+        folder = self.folder / f"{secrets.token_urlsafe(16)}.upload"
+        folder.mkdir(mode=0o700)
         try:
-            yield path
+            yield folder
         finally:
-            path.unlink(missing_ok=True)
+            shutil.rmtree(folder, ignore_errors=True)
 
     def answer_folder(self, job: Job, name: str) -> Path:
         """A new folder for an answer about a job, with a link to the job's file `name`.

@@ -58,7 +58,7 @@ def segment_upload(
     ----------
     stage : callable
     upload : str
-        Path of the upload; its name says nothing.
+        Path of the upload, whose name says nothing; its metadata may lie beside it.
     name : str, or None
         Name that the user gave the file, whose end tells the format; None: the upload is JSON.
     saved : str
@@ -74,9 +74,7 @@ def segment_upload(
     """
     start = time.perf_counter()
     stage("reading")
-    content = Path(upload).read_bytes()
-    cloud = _cloud_of_json(content) if name is None else decode_cloud(content, name, columns=columns)
-    del content
+    cloud = _cloud_of_json(Path(upload)) if name is None else _cloud_of_file(Path(upload), name, columns)
     n_points = cloud.points.size // 3
     if n_points > max_points:
         raise Problem(
@@ -109,9 +107,20 @@ def segment_upload(
     }
 
 
-def _cloud_of_json(content: bytes) -> Cloud:
+def _cloud_of_file(path: Path, name: str, columns: Sequence[str] | None) -> Cloud:
+    """Cloud of a file that the user calls `name`, with the second file beside it if that was sent, too."""
+    if not path.with_suffix(".json").exists():
+        return decode_cloud(path.read_bytes(), name, columns)
+    path = path.rename(path.with_suffix(Path(name).suffix))
+    try:
+        return read_cloud(path, columns=columns)
+    except CloudReadError as error:
+        raise CloudReadError(str(error).replace(str(path), name)) from None
+
+
+def _cloud_of_json(path: Path) -> Cloud:
     """Cloud of JSON that is a `pcgraph.service.models.Points`."""
-    given = json.loads(content)
+    given = json.loads(path.read_bytes())
     arrays = {name: np.array(rows, np.float64) for name, rows in given.items() if rows is not None}
     points, colors, normals = (arrays.get(name) for name in ("points", "colors", "normals"))
     assert points is not None

@@ -18,7 +18,11 @@ from pcgraph.service.models import MAX_NAME, Points, SegmentParameters, UploadQu
 from pcgraph.service.problems import Problem
 
 FILE_FIELD = "cloud"
-"""Field of a form that holds the file."""
+"""Field of a form that holds the file, and the file's name while it is here."""
+METADATA_FIELD = "metadata"
+"""Field of a form that holds a second file, which some formats need: the metadata of an Ouster recording."""
+METADATA_FILE = f"{FILE_FIELD}.json"
+"""Name of that file while it is here: such formats look for it beside the first."""
 RAW_TYPES = ("", "application/octet-stream", "application/x-www-form-urlencoded")
 """Types of a body that is the file itself; the last is what ``curl --data-binary`` says unless told."""
 MAX_JSON_BYTES = 1 << 20
@@ -42,8 +46,8 @@ class Upload:
     parameters: SegmentParameters
 
 
-async def receive_upload(request: Request, query: UploadQuery, target: Path) -> Upload:
-    """Write the cloud of a request to a file, and collect its parameters.
+async def receive_upload(request: Request, query: UploadQuery, folder: Path) -> Upload:
+    """Write the cloud of a request to a file in a folder, and collect its parameters.
 
     Raises
     ------
@@ -53,7 +57,7 @@ async def receive_upload(request: Request, query: UploadQuery, target: Path) -> 
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     parameters = SegmentParameters(**query.model_dump(exclude={"name"}, exclude_unset=True))
     if kind == "multipart/form-data":
-        return await _receive_form(request, parameters, target)
+        return await _receive_form(request, parameters, folder)
     if kind != "application/json" and kind not in RAW_TYPES:
         raise Problem(
             415, f"expected multipart/form-data, application/octet-stream or application/json, got {kind[:80]}"
@@ -63,9 +67,9 @@ async def receive_upload(request: Request, query: UploadQuery, target: Path) -> 
             422, "expected the name of the file in the query, such as ?name=scan.laz: its end tells the format"
         )
     if kind == "application/json":
-        target.write_bytes(await _checked_json(request))
+        (folder / FILE_FIELD).write_bytes(await _checked_json(request))
         return Upload(None, parameters)
-    with target.open("wb") as file:
+    with (folder / FILE_FIELD).open("wb") as file:
         async for block in request.stream():
             await run_in_threadpool(file.write, block)
     return Upload(query.name, parameters)
@@ -84,21 +88,28 @@ async def _checked_json(request: Request) -> bytes:
     return bytes(content)
 
 
-async def _receive_form(request: Request, parameters: SegmentParameters, target: Path) -> Upload:
+async def _receive_form(request: Request, parameters: SegmentParameters, folder: Path) -> Upload:
     try:
-        async with request.form(max_files=1, max_fields=MAX_FIELDS) as form:  # removes its temporary file at the end
+        async with request.form(max_files=2, max_fields=MAX_FIELDS) as form:  # removes its temporary files at the end
             file = form.get(FILE_FIELD)
             if not isinstance(file, UploadFile) or not file.filename:
                 raise Problem(
                     422, f"expected a form with a file in the field {FILE_FIELD!r} that has a name, such as scan.laz"
                 )
-            fields = [(name, value) for name, value in form.multi_items() if name != FILE_FIELD]
+            fields = [(name, value) for name, value in form.multi_items() if value is not file]
+            if isinstance(metadata := form.get(METADATA_FIELD), UploadFile):
+                fields = [(name, value) for name, value in fields if value is not metadata]
+                await _copy(metadata, folder / METADATA_FILE)
             parameters = with_fields(parameters, fields)
-            with target.open("wb") as copy:
-                await run_in_threadpool(shutil.copyfileobj, file.file, copy)
+            await _copy(file, folder / FILE_FIELD)
             return Upload(file.filename[-MAX_NAME:], parameters)
     except HTTPException as error:  # as which Starlette raises what its parser says
         raise Problem(400, f"expected a whole form of type multipart/form-data: {error.detail}") from None
+
+
+async def _copy(file: UploadFile, target: Path) -> None:
+    with target.open("wb") as copy:
+        await run_in_threadpool(shutil.copyfileobj, file.file, copy)
 
 
 def with_fields(parameters: SegmentParameters, fields: list[tuple[str, Any]]) -> SegmentParameters:

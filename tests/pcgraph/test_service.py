@@ -190,7 +190,10 @@ def test_answers_are_those_of_pcgraph(service, scene, tmp_path):
     assert client.get(job["links"]["tree"]).json() == right.tree.to_dict()
     view = client.get(job["links"]["view"])
     assert "<html" in view.text
-    assert view.headers["Content-Security-Policy"] == "sandbox allow-scripts"
+    assert view.headers["Content-Security-Policy"] == "sandbox allow-scripts allow-downloads"
+    assert client.get(job["links"]["file"], headers={"Range": "bytes=foo"}).status_code == 200
+    (folder,) = tmp_path.iterdir()
+    assert sorted(path.name for path in folder.iterdir()) == sorted([job["id"], "lock"])  # no answer is kept
     (tmp_path / "again.npz").write_bytes(client.get(job["links"]["file"]).content)
     assert np.array_equal(pcgraph.load_segmentation(tmp_path / "again.npz").cut(7), right.cut(7))
     assert np.array_equal(pcgraph.read_cloud(tmp_path / "again.npz").points, cloud.points)
@@ -278,7 +281,9 @@ REFUSED: dict[str, tuple[dict[str, Any], int, str]] = {
     "path": ({"params": {"name": "../../a\u202e.ply"}, "content": b"?"}, 422, "../../a\\u202e.ply: expected a PLY"),
     "type": ({"content": b"?", "headers": {"Content-Type": "text/html"}}, 415, "got text/html"),
     "form": ({"files": {"cluod": ("a.ply", b"?")}}, 422, "a file in the field 'cloud'"),
-    "two files": ({"files": [("cloud", ("a.ply", b"?")), ("cloud", ("b.ply", b"?"))]}, 400, "Too many files"),
+    "three files": ({"files": [("cloud", ("a.ply", b"?")) for _ in range(3)]}, 400, "Too many files"),
+    "two clouds": ({"files": [("cloud", ("a.ply", b"?")) for _ in range(2)]}, 422, "there is no parameter 'cloud'"),
+    "metadata": ({"files": {"cloud": ("a.pcap", b"?"), "metadata": ("a.json", b"?")}}, 422, "a.pcap: cloud.json: "),
     "form's field": (
         {"files": {"cloud": ("a.ply", b"?")}, "data": {"metod": "vccs"}}, 422, "'metod'; did you mean method?"),
     "torn form": (
@@ -304,6 +309,7 @@ def test_bad_requests_are_one_sentence(service, tmp_path):
     for method, path, status, words in (
         ("GET", "/segmentations/none", 404, "there is no such segmentation"),
         ("GET", "/segmentations/none/labels?format=plz", 422, "got 'plz'; did you mean"),
+        ("GET", "/segmentations/none/labels?format=bin", 422, "got 'bin'"),  # has no place for labels
         ("GET", "/segmentations/none/labels?n=2&altitude=1", 422, "n or altitude, got both"),
         ("GET", "/segmentations/none/boxes?m=2", 422, "there is no parameter 'm'"),
         ("GET", "/segmentations/..%2f..%2fetc", 404, "Not Found"),
@@ -627,6 +633,17 @@ def test_clients_in_three_languages_find_the_boxes(server, scene, tmp_path):
     assert len(np.unique(decode_cloud(done.stdout, "labelled.pcd").columns["object"])) == 3
     path.unlink()
     program.unlink()
+
+
+def test_a_recording_comes_with_its_metadata(service):
+    recording = ROOT.parent / "shared" / "data" / "lidar" / "OS-1-32-G_v2.1.1_1024x10.pcap"
+    if not recording.exists():
+        pytest.skip(f"the recording is not here: {recording}")
+    metadata = recording.with_suffix(".json")
+    files = {"cloud": (recording.name, recording.read_bytes()), "metadata": (metadata.name, metadata.read_bytes())}
+    made = service().post("/segmentations", files=files, data={"wait": 60, "voxel_size": 0.5})
+    assert made.status_code == 201, made.text
+    assert made.json()["summary"]["points"] == 32 * 1024
 
 
 @pytest.mark.validation
