@@ -49,7 +49,7 @@ def read_input(name: str, file_format: str | None = None, columns: str | None = 
 
 
 def is_saved(path: Path) -> bool:
-    """Whether a file is an archive that holds the tree of a segmentation."""
+    """Whether a file is an archive with the tree of a segmentation."""
     return _is_in_archive("tree/parents.npy", path)
 
 
@@ -190,7 +190,7 @@ def sentence(error: Exception) -> str:
 
 
 def result_record(result: Segmentation) -> dict[str, Any]:
-    """Counts, sizes and the acquisition of a segmentation, as JSON takes them."""
+    """Counts, sizes and the acquisition of a segmentation as plain values for JSON."""
     import numpy as np
 
     return {

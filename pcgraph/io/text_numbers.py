@@ -27,9 +27,9 @@ _INFINITE = re.compile(rf"([-+]?){INFINITY_OF_WINDOWS}".encode())
 def columns_of_rows(
     body: bytes, n_rows: int, fields: Sequence[TextField], first_line: int
 ) -> dict[str, NDArray[np.generic]]:
-    """One array per field of the rows of a text; whole numbers of 64 bits are exact.
+    """One array per field from the rows of a text; whole numbers of 64 bits are exact.
 
-    Parameters and errors are those of `numbers_from_text` and `columns_from_text`.
+    Parameters and errors are as for `numbers_from_text` and `columns_from_text`.
     """
     width = sum(count for _, _, count in fields)
     columns = columns_from_text(numbers_from_text(body, n_rows, width, first_line), fields)
@@ -101,7 +101,7 @@ def _check_whole(name: str, numbers: NDArray[np.float64], least: int, most: int)
 
 
 def _exact(values: NDArray[np.generic], body: bytes, place: tuple[int, int, int]) -> NDArray[np.generic]:
-    """Exact whole numbers of 64 bits of a text, in place of those that doubles have rounded.
+    """Exact whole numbers of 64 bits from a text, in place of those that doubles have rounded.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def _exact(values: NDArray[np.generic], body: bytes, place: tuple[int, int, int]
         Rounded numbers.
     body : bytes
         The text.
-    place : first column, column after the last, number of columns of the text
+    place : (first column, column after the last, number of columns in the text)
     """
     first, end, width = place
     words = body.split(None, len(values) * width)[: len(values) * width]
