@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One HTML file that shows a cloud and its segmentation; names load on first use. See docs/viewer.md."""
+"""The viewer: one HTML file that shows a cloud and its segmentation. Names load on first use. See docs/viewer.md."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cloud as the page holds it: positions in steps of its box, and columns in steps of their range."""
+"""Data of a cloud in the page: positions and columns as whole numbers of steps within their ranges."""
 
 from __future__ import annotations
 
@@ -20,39 +20,44 @@ from pcgraph.viewer.tree_data import ShownTree, tree_data
 from pcgraph.voxels.spacing import median_spacing
 
 POSITION_STEPS = 65535
-"""Steps along each axis of the box of the points: the most that uint16 counts."""
+"""Count of steps along each axis of the box of the points, because positions are uint16."""
 VALUE_STEPS = 65534
-"""Steps of a column's range, count: as many as uint16 has beside 0, which means that there is no value."""
+"""Count of steps of a column's range, because values are uint16 from 1; 0 means that there is no value."""
 TAIL = 0.001
-"""Fraction of the points that may lie outside at either end of each axis when the extent of the cloud is taken. Chosen
-by eye; not varied."""
+"""Fraction of the points at either end of each axis that the extent of the cloud leaves out. Chosen by eye; not
+varied."""
 FIRST_VIEW_TAIL = 0.02
-"""The same fraction for the extent that the first view shows: sweeps of a LiDAR have a few points far ahead. Chosen by
+"""The same fraction for the extent that the first view shows; sweeps of a LiDAR have few points far away. Chosen by
 eye; not varied."""
 MAX_REACH = 2.0
-"""Distance from the extent, in lengths of its longest side, beyond which points are not drawn.
+"""Ratio of a point's distance from the extent to the longest side of that, beyond which the point is not drawn.
 
-They are readings of mirrors and dust; one of them at a kilometre would make the steps of all others centimetres. Chosen
-by eye; not varied.
+Such points come from mirrors and dust. A single one at a kilometre would make the steps of all positions centimetres.
+Chosen by eye; not varied.
 """
 SHOWN_TAIL = 0.01
-"""Fraction of a column's values beyond either end of its colour bar, so that single ones do not take all colours.
+"""Fraction of a column's values beyond either end of its colour bar, so that outliers do not take most of the colours.
 Chosen by eye; not varied."""
 MAX_CATEGORIES = 32
-"""Count of different whole numbers up to which a column is shown as categories: ASPRS classes are 19, rings 16 to 128.
-Chosen by eye; not varied."""
+"""Largest count of different whole numbers in a column that is shown as categories. ASPRS has 19 classes; scanners have
+16 to 128 rings. Chosen by eye; not varied."""
 CATEGORY_NAMES = ("label", "labels", "class", "classification", "instance", "semantic", "object", "part", "supervoxel")
-"""Names of columns of whole numbers that are categories however many there are."""
+"""Names of columns of whole numbers that are always shown as categories."""
 MAX_COLUMNS = 32
-"""Count of columns that a page holds, the file's first; each takes 2 bytes per point. Splats have up to 62. Chosen by
-eye; not varied."""
+"""Largest count of columns in a page, the first ones of the file; each takes 2 bytes per point. Gaussian splats have up
+to 62. Chosen by eye; not varied."""
 
 
 class Drawn(NamedTuple):
     """The points that a page shows.
 
-    rows : (n,) int64, their flat indices in the input. points : (n, 3) float64, metres, the file's frame.
-    far : number of points that lie too far away to be shown.
+    Attributes
+    ----------
+    rows : (n,) int64
+        Flat indices of the points in the input.
+    points : (n, 3) float64, metres, the file's frame
+    far : int
+        Number of points that are too far away to be shown.
     """
 
     rows: NDArray[np.int64]
@@ -62,14 +67,14 @@ class Drawn(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Categories(ShortRepr):
-    """What the whole numbers of a column stand for.
+    """Names and colours of the categories that a column of whole numbers holds.
 
     Attributes
     ----------
     names : sequence of str
-        Of 0, 1 and so on.
+        Name of category 0, 1 and so on.
     colors : (c, 3) uint8, red green blue
-        One for each name.
+        Colour of each category.
 
     Examples
     --------
@@ -85,18 +90,19 @@ class Categories(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Shown(ShortRepr):
-    """What one entry of a page's chooser shows.
+    """One cloud of a page, with its tree, categories and units if there are any.
 
     Attributes
     ----------
     name : str
+        Name in the page's menu.
     cloud : Cloud
     tree : ShownTree, optional
-        Of this very cloud.
+        Segmentation tree of this cloud.
     outliers : (n,) or (h, w) bool, optional
-        Which points were noise.
+        Whether each point is noise.
     camera : bool, optional
-        Whether x points right, y down and z ahead. Default: whether an organised cloud lies ahead of z = 0.
+        Whether x points right, y down and z ahead. Default: True for an organised cloud with no negative z.
     categories : mapping of a column's name to Categories, optional
     units : mapping of a column's name to its unit, optional
 
@@ -119,12 +125,12 @@ class Shown(ShortRepr):
 
     @classmethod
     def of(cls, name: str, cloud: Cloud, segmentation: Segmentation | None) -> Shown:
-        """A cloud and its segmentation, if there is one.
+        """A cloud, and its segmentation if there is one.
 
         Raises
         ------
         ValueError
-            The cloud or the segmentation is none, or the segmentation is that of another cloud.
+            The cloud is not a `Cloud`, the segmentation is not a `Segmentation`, or it is that of another cloud.
         """
         if not isinstance(cloud, Cloud):
             raise ValueError(f"expected a Cloud, as pcgraph.read_cloud returns it, got {type(cloud).__name__}")
@@ -141,7 +147,7 @@ class Shown(ShortRepr):
 
 
 def cloud_data(shown: Shown) -> dict[str, Any]:
-    """A cloud, with its segmentation if there is one, as JSON takes it; arrays are text of `pack`.
+    """A cloud, and its segmentation if there is one, as plain values for JSON; arrays are strings made by `pack`.
 
     Returns
     -------
@@ -182,7 +188,7 @@ def cloud_data(shown: Shown) -> dict[str, Any]:
 
 
 def _drawn(cloud: Cloud) -> Drawn:
-    """The measured points, without those far outside the extent."""
+    """The points with finite coordinates, without those far outside the extent."""
     flat = cloud.points.reshape(-1, 3)
     measured = np.flatnonzero(np.isfinite(flat).all(axis=1))
     points = flat[measured].astype(np.float64)
@@ -195,7 +201,7 @@ def _drawn(cloud: Cloud) -> Drawn:
 
 
 def _extent(points: NDArray[np.float64], tail: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Ends of a box, metres, that a fraction of the points lies outside of at either end of each axis."""
+    """Lower and upper corner, metres, of the box that leaves out a fraction `tail` at either end of each axis."""
     if not len(points):
         return np.zeros(3), np.zeros(3)
     ends = np.quantile(points, [tail, 1.0 - tail], axis=0)
@@ -203,7 +209,7 @@ def _extent(points: NDArray[np.float64], tail: float) -> tuple[NDArray[np.float6
 
 
 def _is_ahead(cloud: Cloud, points: NDArray[np.float64]) -> bool:
-    """Whether this is an image of what lies ahead along z, as clouds in the axes of a camera are."""
+    """Whether the cloud is an image without negative z, as clouds in the frame of a camera are."""
     return cloud.organised and bool(len(points)) and bool((points[:, 2] >= 0.0).all())
 
 
@@ -213,7 +219,7 @@ def _direction_bytes(normals: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 def _columns(shown: Shown) -> list[tuple[str, NDArray[np.generic]]]:
-    """Names and values, one number per point, of all columns; those of several numbers are split."""
+    """Names and values of all columns, one number per point; a column of vectors is split."""
     cloud = shown.cloud
     given: list[tuple[str, NDArray[np.generic]]] = []
     if cloud.labels is not None:
@@ -228,14 +234,16 @@ def _columns(shown: Shown) -> list[tuple[str, NDArray[np.generic]]]:
 
 
 def _column(shown: Shown, name: str, values: NDArray[np.generic]) -> dict[str, Any]:
-    """One column: categories, or numbers in steps.
+    """One column as plain values for JSON: categories, or numbers in steps.
 
     Returns
     -------
     name, unit : str
-    values, colors, keys : of categories, their texts, a colour each, and per point 1 + the place of its own
-    low, step, shown, keys : of numbers, value = low + step * (key - 1), 0 for none; ends of the colour bar
-    whole : whether the numbers are whole
+    values, colors, keys : for categories
+        Name and colour of each category; 1 + the index of each point's category.
+    low, step, shown, keys, whole : for numbers
+        value = low + step * (key - 1), where key 0 means no value; both ends of the colour bar; whether the numbers are
+        whole.
     """
     about = {"name": visible(name), "unit": shown.units.get(name, "")}
     if _are_categories(name, values) or name in shown.categories:

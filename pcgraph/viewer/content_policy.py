@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Content-Security-Policy of pages that run one script of ours and ask the network for nothing."""
+"""Content-Security-Policy of pages that run one script of ours and send no request."""
 
 from __future__ import annotations
 

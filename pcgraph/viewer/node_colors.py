@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colours of segments that stay the same from level to level."""
+"""Colours of a tree's nodes, which segments keep from level to level."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 
 def node_colors(parents: NDArray[np.integer], sizes: NDArray[np.integer]) -> NDArray[np.uint8]:
-    """Colour of each node of a tree, (k, 3) uint8, red green blue: that of its largest child.
+    """Colour of each node of a tree, (k, 3) uint8, red green blue; a node has the colour of its largest child.
 
-    A finer cut therefore changes the colours of small parts only. The cut into n segments has the first n colours of
+    So a finer cut changes the colours of small parts only. The cut into n segments has the first n colours of
     `distinct_colors`.
 
     Parameters
@@ -42,7 +42,7 @@ def node_colors(parents: NDArray[np.integer], sizes: NDArray[np.integer]) -> NDA
 
 
 def distinct_colors(count: int) -> NDArray[np.uint8]:
-    """Colours, (count, 3) uint8, red green blue, whose neighbours in the list differ much in hue."""
+    """Colours, (count, 3) uint8, red green blue; neighbours in the list have very different hues."""
     from matplotlib.colors import hsv_to_rgb
 
     i = np.arange(count)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays as a page holds them: bytes, deflated, in base64."""
+"""Arrays as strings in a page: their bytes, deflated and in base64."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 DEFLATE_LEVEL = 4
-"""Level of zlib's compression. Its default, 6, makes a report of 7 MB 1 % smaller, in twice the time."""
+"""Compression level of zlib, dimensionless. Measured: zlib's default, 6, makes a report of 7 MB 1 % smaller, in twice
+the time."""
 
 
 def pack(array: NDArray[np.generic]) -> str:

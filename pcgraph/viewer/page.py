@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer's page: one HTML file with style sheet, script and data inside, which asks the network for nothing."""
+"""The viewer's page: one HTML file that contains its style sheet, script and data, and sends no request."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from pcgraph.viewer.cloud_data import Shown, cloud_data
 from pcgraph.viewer.content_policy import content_policy
 
 SCRIPTS = ("three.js", "points.js", "boxes.js", "tree.js", "viewer.js")
-"""Files of this package whose JavaScript a page runs, in this order."""
+"""Files of this package with the page's JavaScript, in the order in which they run."""
 MAX_PAGE_BYTES = 1 << 29
-"""Largest page, bytes: V8, which most browsers run, has no longer strings (2**29 - 24 characters)."""
+"""Largest page, bytes, because V8, the JavaScript engine of most browsers, limits strings to 2**29 - 24 characters."""
 
 
 def view_page(cloud: Cloud, segmentation: Segmentation | None = None, title: str | None = None) -> str:
@@ -33,18 +33,19 @@ def view_page(cloud: Cloud, segmentation: Segmentation | None = None, title: str
     ----------
     cloud : Cloud
     segmentation : Segmentation, optional
-        Of this very cloud; it adds the slider through the tree, objects, graph and boxes.
+        Segmentation of this cloud. It adds the slider through the tree, objects, graph and boxes.
     title : str, optional
         Default: "Point cloud".
 
     Raises
     ------
     ValueError
-        The segmentation is none, or that of another cloud, or the page would be larger than browsers load.
+        The segmentation is not a `Segmentation`, it is that of another cloud, or the page would be too large for
+        browsers.
 
     Notes
     -----
-    Positions are rounded to 1/65535 of the box of the points along each axis, from a float64 corner.
+    Along each axis, positions are rounded to 1/65535 of the box of the points; the corner of the box is float64.
 
     Examples
     --------
@@ -61,12 +62,12 @@ def view_page(cloud: Cloud, segmentation: Segmentation | None = None, title: str
 def write_view(
     path: str | PathLike[str], cloud: Cloud, segmentation: Segmentation | None = None, title: str | None = None
 ) -> None:
-    """Write the page of `view_page` to a file: the whole page, or nothing.
+    """Write the page of `view_page` to a file, and replace an existing one; after an error the file is as before.
 
     Raises
     ------
     CloudWriteError
-        The place cannot be written.
+        The file cannot be written.
     ValueError
         As for `view_page`.
 
@@ -83,12 +84,12 @@ def write_view(
 
 
 def views_page(shown: Sequence[Shown], title: str) -> str:
-    """HTML page with a chooser over several clouds; see `view_page`.
+    """HTML page with a menu of several clouds; see `view_page`.
 
     Raises
     ------
     ValueError
-        There is no cloud, or the page would be larger than browsers load.
+        There is no cloud, or the page would be too large for browsers.
 
     Examples
     --------
@@ -122,13 +123,13 @@ def views_page(shown: Sequence[Shown], title: str) -> str:
 
 
 def _data_blocks(shown: Sequence[Shown]) -> Iterator[str]:
-    """JSON of each cloud; no text in it can end the element that holds it."""
+    """JSON of each cloud, without ``<``, so that no text in it can end the script element."""
     for one in shown:
         yield json.dumps({**cloud_data(one), "colorTable": _color_table()}, allow_nan=False).replace("<", "\\u003c")
 
 
 def _color_table() -> list[int]:
-    """256 colours from low to high, 768 numbers 0..255: viridis, which people without some cones read, too."""
+    """256 colours from low to high as 768 numbers 0..255: viridis, which colour-blind people can read, too."""
     from matplotlib import colormaps
 
     return [int(v) for v in np.rint(colormaps["viridis"](np.arange(256) / 255)[:, :3] * 255).astype(np.uint8).ravel()]

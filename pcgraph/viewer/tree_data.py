@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A segmentation as the page holds it: the tree with colours and features of its nodes, the graph, and boxes."""
+"""Data of a segmentation in the page: the tree with colours and features of its nodes, the graph, and boxes."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from pcgraph.viewer.node_colors import distinct_colors, node_colors
 from pcgraph.viewer.packing import pack
 
 MAX_BOXES = 300
-"""Count of objects that get a box, those with most points; a box of 10^4 points takes some 10 ms."""
+"""Largest count of objects with a box, those with the most points, because a box of 10^4 points takes some 10 ms."""
 CONVEX, CONCAVE, GAP = 0, 1, 2
-"""Kinds of edges."""
+"""Codes of the kinds of edges in the page's data."""
 MIN_CONCAVITY = math.radians(10.0)
 """Angle of a valley, radians, below which its edge counts as convex: the tolerance of LCCP (Stein et al. 2014)."""
 LEFT_OUT = ("size", "color_covariance", "covariance", "feature_")
-"""Beginnings of features of nodes that the page does not list: the size is shown anyway, the others are long."""
+"""Prefixes of node features that the page does not list: it shows the size elsewhere, and the others are long."""
 UNITS = {"centroid_x": "m", "centroid_y": "m", "centroid_z": "m", "residual": "m"}
-"""Units of features; others have none."""
+"""Units of node features; the others are dimensionless."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShownTree(ShortRepr):
-    """What the viewer needs of a segmentation, so that results of others can be shown, too.
+    """A tree, its leaves' objects and parts, and the points' leaves; other programs' results can be shown with it, too.
 
     Attributes
     ----------
@@ -43,9 +43,9 @@ class ShownTree(ShortRepr):
     objects, parts : (n_leaves,) int
         Object and part of each leaf.
     linkage : str
-        What made the tree, in words.
+        Name of the method that made the tree.
     graph : AdjacencyGraph, optional
-        Of the leaves; its edges can be shown.
+        Graph of the leaves, whose edges can be shown.
 
     Examples
     --------
@@ -66,7 +66,7 @@ class ShownTree(ShortRepr):
 
     @classmethod
     def of(cls, segmentation: Segmentation) -> ShownTree:
-        """The tree of a segmentation, with its own cuts into objects and parts."""
+        """The tree of a segmentation, with the segmentation's objects and parts."""
         part_altitude = min(segmentation.linkage.default_part_altitude, segmentation.object_altitude)
         parts = segmentation.tree.cut(altitude=part_altitude)
         linkage = type(segmentation.linkage).__name__
@@ -76,7 +76,7 @@ class ShownTree(ShortRepr):
 
 
 def tree_data(shown: ShownTree, rows: NDArray[np.int64], points: NDArray[np.float64]) -> dict[str, Any]:
-    """Tree and graph as JSON takes them; arrays are text of `pack`.
+    """Tree and graph as plain values for JSON; arrays are strings made by `pack`.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def tree_data(shown: ShownTree, rows: NDArray[np.int64], points: NDArray[np.floa
 
     Returns
     -------
-    leaf : uint16 or (wide) uint32 per point, 1 + its supervoxel, 0 for none
+    leaf : 1 + the supervoxel of each point, 0 for none; uint16, or uint32 if `wide`
     parents, altitudes, sizes, colors : one row per node
     featureNames, featureUnits, features : float32, all of the first feature, then all of the second and so on
     origin, centroids : float32, 3 per leaf, metres from the origin
@@ -138,13 +138,13 @@ def tree_data(shown: ShownTree, rows: NDArray[np.int64], points: NDArray[np.floa
 
 
 def _features(tree: SegmentationTree) -> dict[str, NDArray[np.generic]]:
-    """Features of all nodes, one number each, by name."""
+    """Features of all nodes by name, one number per node."""
     columns = scalar_columns(tree.features().columns())
     return {name: column for name, column in columns.items() if not name.startswith(LEFT_OUT)}
 
 
 def _edges(graph: AdjacencyGraph | None) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
-    """Pairs of leaves, (m, 2), that touch or nearly touch, and the kind of each."""
+    """Pairs of leaves, (m, 2), that touch or nearly touch, and the kind of each edge, (m,)."""
     if graph is None:
         return np.empty((0, 2), np.int32), np.empty(0, np.uint8)
     concave = graph.edge_features.convexity < -MIN_CONCAVITY
@@ -156,7 +156,7 @@ def _edges(graph: AdjacencyGraph | None) -> tuple[NDArray[np.int32], NDArray[np.
 
 
 def _boxes(shown: ShownTree, leaf: NDArray[np.integer], points: NDArray[np.float64]) -> list[dict[str, Any]]:
-    """Tight box of each object, the largest first."""
+    """Tight boxes of the objects with the most points, the largest object first."""
     objects = np.append(shown.objects, -1)[leaf]
     counts = np.bincount(objects[objects >= 0])
     boxed = np.argsort(-counts, kind="stable")[:MAX_BOXES]
