@@ -236,12 +236,12 @@ def _kept(column: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.gen
     return column.reshape(*shape, *column.shape[1:]).copy()
 
 
-def cloud_from_array(array: NDArray[np.generic]) -> Cloud:
+def cloud_from_array(values: ArrayLike) -> Cloud:
     """Cloud of an array whose last axis, or whose fields, are the columns.
 
     Parameters
     ----------
-    array : (n, 3 + c) or (h, w, 3 + c) numbers; or (n,) or (h, w) with fields x, y, z and others
+    values : (n, 3 + c) or (h, w, 3 + c) numbers; or (n,) or (h, w) with fields x, y, z and others
         Further columns of an array without fields are called ``column_3``, ``column_4`` and so on, as NumPy counts
         them, because nothing tells whether they are intensities, colours or labels. Numbers stay in their type. Fields
         are found as `cloud_from_columns` finds columns.
@@ -251,23 +251,27 @@ def cloud_from_array(array: NDArray[np.generic]) -> Cloud:
     ValueError
         The shape is another, a coordinate is missing, or a field is not of numbers.
     """
-    if array.dtype.names is not None:
-        table: NDArray[np.void] = array  # type: ignore[assignment]
-        fields: dict[str, NDArray[np.generic]] = {name: np.atleast_1d(table[name]) for name in array.dtype.names}
-        wrong = [name for name, values in fields.items() if values.dtype.kind not in "fiub"]
-        if wrong:
-            raise ValueError(f"expected fields of numbers, got {fields[wrong[0]].dtype} in the field {wrong[0]!r}")
-        n, shape = array.size, array.shape if array.ndim else (1,)
-        columns = {name: native(values).reshape(n, *_rest(values, shape)) for name, values in fields.items()}
-        try:
-            return cloud_from_columns(columns, shape)
-        except CloudReadError as error:
-            raise ValueError(str(error)) from None
+    if isinstance(values, np.ndarray) and values.dtype.names is not None:
+        return _cloud_from_fields(values)
+    array = as_numbers("points", values)
     if array.ndim not in (2, 3) or array.shape[-1] < 3:
         expected = "points of shape (n, 3) or (h, w, 3), or with further columns, (n, 4) and so on"
         raise ValueError(f"expected {expected}, got {array.shape}")
     further = {f"column_{i}": array[..., i] for i in range(3, array.shape[-1])}
     return Cloud(array[..., :3] if further else array, columns=further)  # type: ignore[arg-type]
+
+
+def _cloud_from_fields(table: NDArray[np.void]) -> Cloud:
+    fields: dict[str, NDArray[np.generic]] = {name: np.atleast_1d(table[name]) for name in table.dtype.names or ()}
+    wrong = [name for name, values in fields.items() if values.dtype.kind not in "fiub"]
+    if wrong:
+        raise ValueError(f"expected fields of numbers, got {fields[wrong[0]].dtype} in the field {wrong[0]!r}")
+    shape = table.shape if table.ndim else (1,)
+    columns = {name: native(values).reshape(table.size, *_rest(values, shape)) for name, values in fields.items()}
+    try:
+        return cloud_from_columns(columns, shape)
+    except CloudReadError as error:
+        raise ValueError(str(error)) from None
 
 
 def _rest(values: NDArray[np.generic], shape: tuple[int, ...]) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.cloud import COLOR_NAMES, Cloud, as_numbers, cloud_from_array, cloud_from_columns, native
+from pcgraph.cloud import COLOR_NAMES, Cloud, cloud_from_array, cloud_from_columns, native
 from pcgraph.errors import CloudReadError
 
 _MESSAGE_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -56,8 +56,6 @@ def as_cloud(source: Any) -> Cloud:
         from pcgraph.io import read_cloud
 
         return read_cloud(source)
-    if isinstance(source, np.ndarray) and source.dtype.names is not None:
-        return cloud_from_array(source)
     for attributes, convert in _KINDS.items():
         if all(hasattr(source, name) for name in attributes):
             return convert(source)
@@ -67,7 +65,7 @@ def as_cloud(source: Any) -> Cloud:
         if hasattr(source, "to_point_cloud"):
             hint = "; pass its to_point_cloud().points"
         raise ValueError(f"expected points as {kinds}, got {type(source).__name__}{hint}")
-    return cloud_from_array(as_numbers("points", source))
+    return cloud_from_array(source)
 
 
 def _of_message(message: Any) -> Cloud:

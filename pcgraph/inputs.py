@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from os import PathLike
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,7 +34,7 @@ _RANGE_SAMPLE = 1 << 12
 """Points off which the median range is read, about; chosen by eye, for the time's sake."""
 
 
-Points = ArrayLike | Cloud | PathLike[str] | Any
+Points = Any
 """What `pcgraph.segment` takes: whatever `pcgraph.as_cloud` takes."""
 
 

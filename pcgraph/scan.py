@@ -70,6 +70,7 @@ def segment(
     Parameters
     ----------
     points : (n, 3) or (h, w, 3) float or integer, metres, any frame; or a Cloud, or the name of a file
+        Or whatever else `pcgraph.as_cloud` takes: arrays of more columns, messages of robots, Open3D's clouds.
         Colours, normals and viewpoint of a `Cloud` or file are used where none are given beside it. Points that are
         NaN, infinite, masked, or (0, 0, 0) as drivers write holes, are labelled -1, and so are outliers.
     colors : same shape, uint8 0..255 or float 0..1, optional

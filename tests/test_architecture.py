@@ -299,6 +299,7 @@ def test_decoders_know_neither_scene_nor_renderer() -> None:
 
 
 LOADED_WHEN_USED = {"open3d": None, "cv2": ("geometry", "calibration"), "skimage": ("fusion",)}
+LOADED_WHEN_USED |= dict.fromkeys(("laspy", "lazrs", "pye57"), ("io",))
 """Packages that take long to import, or that may be missing, and the rooms that use them; None: any room may."""
 
 

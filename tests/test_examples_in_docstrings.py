@@ -19,6 +19,7 @@ ROOMS = [
     "pcgraph.io",
     "pcgraph.plumbing",
     "pcgraph.tree",
+    "pcgraph.viewer",
     "rangesim.calibration",
     "rangesim.capture",
     "rangesim.causes",

@@ -155,11 +155,13 @@ def test_a_foreign_file_named_like_segments_stays(command: Command, tmp_path: Pa
     shutil.copy(small_result() / "lines" / "cloud.ply", cloud)
     out.write_bytes(b"ply\ncomment mine\nend_header\n")
     for place in (tmp_path, out):
-        assert_refused(command("segment", cloud, "--out", place, package="pcgraph"), f"{out.name} exists; choose")
+        assert_refused(
+            command("segment", cloud, "--out", place, package="pcgraph"), f"{out.name} exists: add --overwrite"
+        )
     assert out.read_bytes() == b"ply\ncomment mine\nend_header\n"
     for _ in range(2):
         assert command("segment", cloud, "--out", tmp_path, "--overwrite", package="pcgraph").returncode == 0
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["scan.ply", "scan.segments.ply"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["scan.ply", "scan.segmentation.npz", out.name]
 
 
 # ---- Durable and clean ----------------------------------------------------------------------------------------------
@@ -217,7 +219,8 @@ def test_a_signal_after_the_last_line_is_one_line_too_or_comes_too_late(
     if package == "rangesim":
         arguments = ["compare", str(small_result())]
     else:
-        arguments = ["segment", str(small_result() / "lines" / "cloud.ply"), "--out", str(tmp_path / "out")]
+        arguments = ["segment", str(small_result() / "lines" / "cloud.ply")]
+        arguments += ["--out", str(tmp_path / "out"), "--overwrite"]
     code = f"""if True:
         import atexit, sys, time
         from {package}.__main__ main

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -47,18 +48,34 @@ def read_input(name: str, file_format: str | None = None, columns: str | None = 
     return decode_cloud(sys.stdin.buffer.read(), f"stdin.{file_format}", named)
 
 
+def is_saved(path: Path) -> bool:
+    """Whether a file is an archive that holds the tree of a segmentation."""
+    return _is_in_archive("tree/parents.npy", path)
+
+
+def has_cloud(path: Path) -> bool:
+    """Whether a saved segmentation holds its cloud, too."""
+    return _is_in_archive("cloud/points.npy", path)
+
+
+def _is_in_archive(name: str, path: Path) -> bool:
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return name in archive.namelist()
+
+
 def read_saved(path: Path) -> tuple[Cloud, Segmentation]:
     """A saved segmentation and the cloud in its file."""
     from pcgraph.io import read_cloud
     from pcgraph.saved_segmentation import load_segmentation
 
     result = load_segmentation(path)
-    try:
-        return read_cloud(path), result
-    except CloudReadError:
+    if not has_cloud(path):
         raise CloudReadError(
             f"{path} holds no points, as it was saved without its cloud: save it with save(path, cloud)"
-        ) from None
+        )
+    return read_cloud(path), result
 
 
 def segmented(name: str, cloud: Cloud, **settings: Any) -> Segmentation:
@@ -170,6 +187,37 @@ def sentence(error: Exception) -> str:
     message = said(error) if isinstance(error, OSError) else str(error)
     message = without_long_words(message) or "the cloud does not fit into memory: choose a larger voxel size"
     return f"{one_line(message).rstrip('.')}."
+
+
+def result_record(result: Segmentation) -> dict[str, Any]:
+    """Counts, sizes and the acquisition of a segmentation, as JSON takes them."""
+    import numpy as np
+
+    return {
+        "segmented": int((result.supervoxels >= 0).sum()),
+        "outliers": int(result.outliers.sum()),
+        "acquisition": result.acquisition.in_words,
+        "voxel_size": result.voxel_size,
+        "seed_size": result.seed_size,
+        "supervoxels": result.graph.n_nodes,
+        "edges": len(result.graph.edges),
+        "objects": len(np.unique(result.labels[result.labels >= 0])),
+    }
+
+
+def print_result(record: dict[str, Any], n_points: int) -> None:
+    """Print the rows of a `result_record`."""
+    print_row("points", f"{record['segmented']} of {n_points} segmented, {record['outliers']} outliers")
+    print_row("acquisition", record["acquisition"])
+    print_row("voxel size", f"{record['voxel_size']:.3g} m")
+    print_row("seed size", f"{record['seed_size']:.3g} m")
+    for name in ("supervoxels", "edges", "objects"):
+        print_row(name, record[name])
+
+
+def print_row(name: str, value: object) -> None:
+    """Print a row of a table of names and values."""
+    typer.echo(f"{name:<12} {value}")
 
 
 def object_records(cloud: Cloud, result: Segmentation) -> list[dict[str, Any]]:

@@ -4,11 +4,21 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pcgraph.cli.clouds import read_input, sentence
+from pcgraph.cli.clouds import (
+    PIPE,
+    has_cloud,
+    is_saved,
+    print_result,
+    print_row,
+    read_input,
+    result_record,
+    sentence,
+)
 from pcgraph.errors import PcgraphError, one_line
 
 if TYPE_CHECKING:
@@ -37,7 +47,7 @@ def info_command(
     failed = False
     for name in files:
         try:
-            record = {"file": name, **_record(read_input(name, from_format, columns))}
+            record = {"file": name, **_record(name, from_format, columns)}
         except (PcgraphError, ValueError, MemoryError, OSError) as error:
             typer.echo(f"pcgraph: {sentence(error)}", err=True)
             failed = True
@@ -50,8 +60,19 @@ def info_command(
         raise typer.Exit(1)
 
 
-def _record(cloud: Cloud) -> dict[str, Any]:
-    """What a cloud holds, as JSON takes it."""
+def _record(name: str, file_format: str | None, columns: str | None) -> dict[str, Any]:
+    """The content of a file, as JSON takes it: of a cloud, of a saved segmentation, or of both."""
+    if name == PIPE or not is_saved(Path(name)):
+        return _cloud_record(read_input(name, file_format, columns))
+    from pcgraph.saved_segmentation import load_segmentation
+
+    result = load_segmentation(name)
+    saved = {"segmentation": {"points": result.labels.size, **result_record(result)}}
+    return saved if not has_cloud(Path(name)) else {**_cloud_record(read_input(name)), **saved}
+
+
+def _cloud_record(cloud: Cloud) -> dict[str, Any]:
+    """The content of a cloud, as JSON takes it."""
     import numpy as np
 
     from pcgraph.voxels.spacing import median_spacing
@@ -80,20 +101,24 @@ def _column(values: NDArray[np.generic]) -> dict[str, Any]:
 
 
 def _print(record: dict[str, Any]) -> None:
+    print_row("file", one_line(record["file"]))
+    if "shape" in record:
+        _print_cloud(record)
+    if "segmentation" in record:
+        print_row("holds", "a segmentation:")
+        print_result(record["segmentation"], record["segmentation"]["points"])
+
+
+def _print_cloud(record: dict[str, Any]) -> None:
     shape = " x ".join(map(str, record["shape"]))
-    rows = [
-        ("file", one_line(record["file"])),
-        ("points", f"{shape}, {record['finite']} finite, {record['coordinates']}"),
-    ]
+    print_row("points", f"{shape}, {record['finite']} finite, {record['coordinates']}")
     if record["low"] is not None:
         for axis, low, high in zip("xyz", record["low"], record["high"], strict=True):
-            rows.append((axis, f"{low:.10g} to {high:.10g}"))
+            print_row(axis, f"{low:.10g} to {high:.10g}")
     if record["spacing"] is not None:
-        rows.append(("spacing", f"{record['spacing']:.3g}, median"))
+        print_row("spacing", f"{record['spacing']:.3g}, median")
     if record["viewpoint"] is not None:
-        rows.append(("viewpoint", " ".join(f"{value:.6g}" for value in record["viewpoint"])))
+        print_row("viewpoint", " ".join(f"{value:.6g}" for value in record["viewpoint"]))
     for name, column in record["columns"].items():
         ends = "no number" if column["low"] is None else f"{column['low']:.6g} to {column['high']:.6g}"
-        rows.append((one_line(name), f"{column['type']}, {ends}"))
-    for name, text in rows:
-        typer.echo(f"{name:<12} {text}")
+        print_row(one_line(name), f"{column['type']}, {ends}")

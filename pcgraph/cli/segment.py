@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from dataclasses import replace
@@ -18,8 +19,11 @@ from pcgraph.cli.clouds import (
     numbers,
     object_records,
     output_paths,
+    print_result,
+    print_row,
     read_input,
     refusals,
+    result_record,
     segmented,
     sentence,
     write_results,
@@ -207,19 +211,10 @@ def _linkage(name: str) -> Linkage:
 
 def _summary(name: str, cloud: Cloud, result: Segmentation, written: list[Path], seconds: float) -> dict[str, Any]:
     """Record of one cloud, as JSON takes it."""
-    import numpy as np
-
     return {
         "cloud": name,
-        "points": int(np.prod(cloud.points.shape[:-1])),
-        "segmented": int((result.supervoxels >= 0).sum()),
-        "outliers": int(result.outliers.sum()),
-        "acquisition": result.acquisition.in_words,
-        "voxel_size": result.voxel_size,
-        "seed_size": result.seed_size,
-        "supervoxels": result.graph.n_nodes,
-        "edges": len(result.graph.edges),
-        "objects": len(np.unique(result.labels[result.labels >= 0])),
+        "points": math.prod(cloud.points.shape[:-1]),
+        **result_record(result),
         "seconds": round(seconds, 3),
         "written": [str(path) for path in written],
     }
@@ -229,17 +224,9 @@ def _print(record: dict[str, Any], as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps(record, allow_nan=False))
         return
-    points = f"{record['segmented']} of {record['points']} segmented, {record['outliers']} outliers"
-    for name, value in (
-        ("points", points),
-        ("acquisition", record["acquisition"]),
-        ("voxel size", f"{record['voxel_size']:.3g} m"),
-        ("seed size", f"{record['seed_size']:.3g} m"),
-        ("supervoxels", record["supervoxels"]),
-        ("edges", record["edges"]),
-        ("objects", record["objects"]),
-        ("seconds", f"{record['seconds']:.2f}"),
-        *(("written", one_line(path)) for path in record["written"]),
-        *(("box", json.dumps(one, allow_nan=False)) for one in record.get("boxes", [])),
-    ):
-        typer.echo(f"{name:<12} {value}")
+    print_result(record, record["points"])
+    print_row("seconds", f"{record['seconds']:.2f}")
+    for path in record["written"]:
+        print_row("written", one_line(path))
+    for box in record.get("boxes", []):
+        print_row("box", json.dumps(box, allow_nan=False))

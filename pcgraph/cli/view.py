@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import webbrowser
-import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pcgraph.cli.clouds import check_outputs, read_saved, refusals, segmented
+from pcgraph.cli.clouds import SAVED, check_outputs, is_saved, read_saved, refusals, segmented
 from pcgraph.errors import CloudReadError, CloudWriteError, one_line
 
 if TYPE_CHECKING:
@@ -36,7 +35,8 @@ def view_command(
     from pcgraph.viewer.page import views_page
 
     with refusals():
-        target = Path(f"{source.absolute().stem}.html") if out is None else out
+        name = Path(source.absolute().name.removesuffix(SAVED)).stem
+        target = Path(f"{name}.html") if out is None else out
         check_outputs([target], [str(source)], overwrite)
         shown = [_shown(path, segment) for path in _files(source)]
         write_file(target, views_page(shown, source.absolute().name).encode("utf-8"), CloudWriteError)
@@ -63,15 +63,7 @@ def _shown(path: Path, segment: bool) -> Shown:
     from pcgraph.io import read_cloud
     from pcgraph.viewer.cloud_data import Shown
 
-    if _is_saved_segmentation(path):
+    if is_saved(path):
         return Shown.of(path.name, *read_saved(path))
     cloud = read_cloud(path)
     return Shown.of(path.name, cloud, segmented(str(path), cloud) if segment else None)
-
-
-def _is_saved_segmentation(path: Path) -> bool:
-    """Whether a file is an archive that holds a tree."""
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return "tree/parents.npy" in archive.namelist()

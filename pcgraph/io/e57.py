@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, library_reason
-from pcgraph.io.flat_columns import NORMALS, Arrays, described, flatten, listed_points, unflatten
+from pcgraph.io.flat_columns import NORMALS, Arrays, described, flatten, unflatten
 from pcgraph.io.format import CloudFile, Format
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -86,7 +86,8 @@ def read_e57(file: CloudFile) -> Cloud:
                 nodes = list(image.root()["data3D"])
                 if not 0 < len(nodes) <= _MAX_SCANS:
                     raise CloudReadError(f"expected an E57 file with 1 to {_MAX_SCANS} scans, got {len(nodes)}")
-                scans = [_scan(library, image, node, 8 * len(file.content)) for node in nodes]
+                _check_counts(library, nodes, len(file.content))
+                scans = [_scan(library, image, node) for node in nodes]
             finally:
                 image.close()
         except CloudReadError:
@@ -122,15 +123,27 @@ def _check_xml(content: bytes) -> None:
         raise CloudReadError("expected the XML of an E57 file without a DOCTYPE")
 
 
-def _scan(library: ModuleType, image: Any, node: Any, max_bits: int) -> _Scan:
-    stored = node["points"]
-    prototype = library.StructureNode(stored.prototype())
+def _check_counts(library: ModuleType, nodes: list[Any], n_bytes: int) -> None:
+    """Raise CloudReadError if the scans promise more points than the file can hold, before memory is taken for them."""
+    count = n_bits = 0
+    for node in nodes:
+        here = int(node["points"].childCount())
+        count += here
+        n_bits += here * max(1, sum(_bits(library, element) for element in _elements(library, node).values()))
+        if here < 0 or n_bits > 8 * n_bytes:
+            raise CloudReadError(f"the E57 file promises {count} points, but it is only {n_bytes} bytes long")
+
+
+def _elements(library: ModuleType, node: Any) -> dict[str, Any]:
+    """The fields of a scan's points that are numbers."""
+    prototype = library.StructureNode(node["points"].prototype())
     names = [prototype.get(i).elementName() for i in range(prototype.childCount())]
-    elements = {name: prototype[name] for name in names if not isinstance(prototype[name], library.StringNode)}
-    count = int(stored.childCount())
-    if not 0 <= count * max(1, sum(_bits(library, element) for element in elements.values())) <= max_bits:
-        raise CloudReadError(f"the E57 file promises {count} points, but it is only {max_bits // 8} bytes long")
-    fields = _read_fields(library, image, stored, elements, count)
+    return {name: prototype[name] for name in names if not isinstance(prototype[name], library.StringNode)}
+
+
+def _scan(library: ModuleType, image: Any, node: Any) -> _Scan:
+    elements = _elements(library, node)
+    fields = _read_fields(library, image, node["points"], elements)
     system = next((s for s in (_CARTESIAN, _SPHERICAL) if all(name in fields for name in s)), None)
     if system is None:
         raise CloudReadError(f"expected the fields {', '.join(_CARTESIAN)} in an E57 scan, got {', '.join(fields)}")
@@ -150,8 +163,9 @@ def _scan(library: ModuleType, image: Any, node: Any, max_bits: int) -> _Scan:
     return _Scan(points, colors, fields, described(text), place)
 
 
-def _read_fields(library: ModuleType, image: Any, stored: Any, elements: dict[str, Any], count: int) -> Arrays:
-    """Arrays (count,) of the numbers of a scan, in the smallest types that hold what the fields may hold."""
+def _read_fields(library: ModuleType, image: Any, stored: Any, elements: dict[str, Any]) -> Arrays:
+    """Arrays (n,) of the numbers of a scan, in the smallest types that hold what the fields may hold."""
+    count = int(stored.childCount())
     types = {name: _type(library, element) for name, element in elements.items()}
     arrays: Arrays = {name: np.zeros(count, _BUFFERS.get(kind, np.longlong)) for name, kind in types.items()}
     buffers = library.VectorSourceDestBuffer()
@@ -299,9 +313,9 @@ def encode_e57(cloud: Cloud, suffix: str) -> bytes:
     Raises
     ------
     CloudWriteError
-        A point is not finite; a column has whole numbers beyond 63 bits; or pye57 is missing.
+        A column has whole numbers beyond 63 bits; or pye57 is missing.
     """
-    points = listed_points(cloud)
+    points = cloud.points
     library = _library(CloudWriteError, "writing")
     kept = [name for name, column in cloud.columns.items() if name in _KEPT and column.ndim == cloud.points.ndim - 1]
     fields, description = flatten(cloud, kept, _TAKEN, _safe_name)

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.cloud import COLOR_NAMES, NORMAL_NAMES, Cloud, cloud_from_columns
-from pcgraph.errors import CloudWriteError
 
 Arrays = dict[str, NDArray[np.generic]]
 NORMALS = ("NormalX", "NormalY", "NormalZ")
@@ -27,15 +26,6 @@ _VIEWPOINTS = ("vp_x", "vp_y", "vp_z")
 """Fields of viewpoints, one for each point, as in PCL's PointWithViewpoint."""
 _STORED = {"b1": "u1", "f2": "f4", "f16": "f8"}
 """Types that no such format has, and those that are stored in their place. All but the last hold the same numbers."""
-
-
-def listed_points(cloud: Cloud) -> NDArray[np.floating]:
-    """Points of a cloud, (n, 3); raises CloudWriteError if one is not finite."""
-    points = cloud.points.reshape(-1, 3)
-    n_bad = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
-    if n_bad:
-        raise CloudWriteError(f"expected finite points, got {n_bad} with NaN or infinity: leave them out first")
-    return points
 
 
 def flatten(

@@ -13,18 +13,15 @@ from collections.abc import Callable
 from io import BytesIO
 from itertools import chain
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.cloud import COLOR_NAMES, Cloud
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, library_reason
-from pcgraph.io.flat_columns import Arrays, described, flatten, listed_points, unflatten
+from pcgraph.io.flat_columns import Arrays, described, flatten, unflatten
 from pcgraph.io.format import Format
-
-if TYPE_CHECKING:
-    import laspy
 
 _HEADER_BYTES = 227
 """Bytes of the header of LAS 1.0 to 1.2, the shortest."""
@@ -167,7 +164,7 @@ def _check_length(content: bytes) -> None:
         )
 
 
-def _largest_chunk(content: bytes, header: laspy.LasHeader) -> int:
+def _largest_chunk(content: bytes, header: Any) -> int:
     """Points in the largest chunk of a LAZ file, whose parallel reader has room for all of them.
 
     Raises CloudReadError if the file promises chunks longer than itself, or layers longer than their chunk: lazrs takes
@@ -248,10 +245,10 @@ def encode_las(cloud: Cloud, suffix: str) -> bytes:
     Raises
     ------
     CloudWriteError
-        A point is not finite; there are more than 341 fields of extra bytes; or the points are so far apart that 32
+        There are more than 341 fields of extra bytes; or the points are so far apart that 32
         bits per coordinate would lose what their type resolves.
     """
-    points = listed_points(cloud)
+    points = cloud.points
     laspy = _laspy(CloudWriteError, "writing", compressed=suffix == ".laz")
     header = laspy.LasHeader(version="1.4", point_format=_point_format(cloud))
     header.global_encoding.wkt = True  # the standard demands it for formats from 6 on

@@ -7,6 +7,7 @@ The files are read by trimesh. Meshes in PLY files are read by `pcgraph.io.ply`:
 from __future__ import annotations
 
 import json
+import logging
 import warnings
 from dataclasses import dataclass
 from io import BytesIO
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudReadError, library_reason
 from pcgraph.io.format import CloudFile, Format
-from pcgraph.plumbing.plain_files import read_file
+from pcgraph.plumbing.plain_files import check_file, read_file
 
 if TYPE_CHECKING:
     import trimesh
@@ -169,19 +170,21 @@ def _parts(file: CloudFile, kind: str) -> list[_Part]:
     """The meshes of a file; raises CloudReadError if there is no vertex."""
     import trimesh
 
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else its errors are printed beside our sentence
     if file.content.startswith(b"glTF"):
         kind = "glb"
     resolver = None  # only .gltf needs other files, and gets none but those beside it
     if kind == "gltf" and file.path is not None:
-        resolver = trimesh.resolvers.FilePathResolver(str(file.path))
+        resolver = _beside(file.path)
     try:
         if kind in ("glb", "gltf"):
             _check_accessors(file.content)
-        scene = trimesh.load_scene(
-            BytesIO(file.content), file_type=kind, resolver=resolver, process=False, skip_materials=True
-        )
-        placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
-        parts = [_part(scene.geometry[name], transform) for transform, name in placed]
+        with np.errstate(all="ignore"):
+            scene = trimesh.load_scene(
+                BytesIO(file.content), file_type=kind, resolver=resolver, process=False, skip_materials=True
+            )
+            placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+            parts = [_part(scene.geometry[name], transform) for transform, name in placed]
     except CloudReadError:
         raise
     except MemoryError:
@@ -192,6 +195,18 @@ def _parts(file: CloudFile, kind: str) -> list[_Part]:
     if not parts:
         raise CloudReadError("expected a mesh with vertices, but the file has none")
     return parts
+
+
+def _beside(path: Path) -> trimesh.resolvers.Resolver:
+    """What finds the files that a file names, if they are plain ones in its folder."""
+    import trimesh
+
+    class Beside(trimesh.resolvers.FilePathResolver):
+        def get(self, name: str) -> bytes:
+            check_file(path.parent / name, CloudReadError)
+            return super().get(name)
+
+    return Beside(str(path))
 
 
 def _check_accessors(content: bytes) -> None:

@@ -51,7 +51,7 @@ _CLOUD = "cloud/"
 _COLUMNS = "columns/"
 _BROKEN = (
     *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, NotImplementedError, RuntimeError),
-    *(ValueError, OverflowError, TypeError, SyntaxError, MemoryError, KeyError),
+    *(ValueError, OverflowError, TypeError, SyntaxError, MemoryError, LookupError),
 )
 """What zipfile, ast and NumPy raise for damaged files."""
 
@@ -74,7 +74,7 @@ def read_npz(content: bytes) -> Cloud:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             return _cloud(_arrays(_members(archive), archive))
     except _BROKEN as error:
-        raise CloudReadError(f"the .npz archive is damaged: {str(error)[:200] or type(error).__name__}") from None
+        raise CloudReadError(f"the .npz archive cannot be read: {str(error)[:200] or type(error).__name__}") from None
 
 
 def read_npy(content: bytes) -> Cloud:
@@ -114,7 +114,8 @@ def _arrays(members: Mapping[str, zipfile.ZipInfo], archive: zipfile.ZipFile) ->
     arrays: dict[str, NDArray[np.generic]] = {}
     shape: tuple[int, ...] | None = None
     left = MAX_BYTES
-    for key in sorted(members, key=lambda key: key not in ("points", "x")):  # these tell the leading shape
+    coordinates = ("points",) if "points" in members else ("x", "y", "z")
+    for key in sorted(members, key=lambda key: key != coordinates[0]):  # which tells the leading shape of all others
         entry, name = members[key], f"the array {ascii(key)[:80]}"
         if entry.flag_bits & _ENCRYPTED or entry.compress_type not in _METHODS:
             raise CloudReadError(f"expected {name} stored or deflated, as numpy.savez writes it")
@@ -124,6 +125,8 @@ def _arrays(members: Mapping[str, zipfile.ZipInfo], archive: zipfile.ZipFile) ->
                 shape = header.shape[:-1] if key == "points" else header.shape
             is_per_point = header.shape[: len(shape)] == shape and len(header.shape) <= len(shape) + 1
             if header.dtype.kind not in "fiub" or not (is_per_point or key in _OWN):
+                if key in coordinates:
+                    raise CloudReadError(f"expected {name} as numbers, got {header.dtype}")
                 continue
             _check_size(header, min(entry.file_size, _MAX_RATIO * entry.compress_size), name)
             left -= header.n_bytes
@@ -135,34 +138,37 @@ def _arrays(members: Mapping[str, zipfile.ZipInfo], archive: zipfile.ZipFile) ->
 
 def _cloud(arrays: dict[str, NDArray[np.generic]]) -> Cloud:
     further = {key.removeprefix(_COLUMNS): values for key, values in arrays.items() if key not in _OWN}
-    if "points" not in arrays:
-        shape = arrays["x"].shape
-        columns = {name: values.reshape(-1, *values.shape[len(shape) :]) for name, values in further.items()}
-        return cloud_from_columns(columns, shape)
-    cloud = cloud_from_array(arrays["points"])
-    shape = cloud.points.shape
-    own: dict[str, NDArray[np.generic] | None] = {
-        "colors": arrays.get("colors"),
-        "normals": arrays.get("normals"),
-        "viewpoint": arrays.get("viewpoint"),
-    }
-    for name, values in own.items():
-        if values is not None and not values.size and shape[0]:
-            own[name] = None  # (0, 3), for none
-        elif values is not None and values.shape not in (shape, (3,) if name == "viewpoint" else shape):
-            raise CloudReadError(f"expected {name} of the points' shape {shape}, got {values.shape}")
-    labels = arrays.get("labels")
-    if labels is not None and not (labels.shape == shape[:-1] and are_labels(labels)):
-        further["labels"], labels = labels, None
-    colors, normals, viewpoint = own.values()
-    return Cloud(
-        float_points(cloud.points),
-        None if colors is None else color_bytes(colors),
-        None if normals is None else float_points(normals),
-        None if labels is None else labels.astype(np.int32, copy=False),
-        None if viewpoint is None else viewpoint.astype(np.float64, copy=False),
-        {**cloud.columns, **further},
+    if "points" in arrays:
+        base = cloud_from_array(arrays["points"])
+        base = replace(base, points=float_points(base.points), columns={**base.columns, **further})
+    else:
+        leading = arrays["x"].shape
+        if len(leading) not in (1, 2):
+            raise CloudReadError(f"expected x, y and z of shape (n,) or (h, w), got {leading}")
+        columns = {name: values.reshape(-1, *values.shape[len(leading) :]) for name, values in further.items()}
+        base = cloud_from_columns(columns, leading)
+    shape = base.points.shape
+    colors, normals = _own(arrays, "colors", shape), _own(arrays, "normals", shape)
+    labels, viewpoint = _own(arrays, "labels", shape[:-1]), _own(arrays, "viewpoint", (3,), shape)
+    if labels is not None and not are_labels(labels):
+        base, labels = replace(base, columns=base.columns | {"labels": labels}), None
+    return replace(
+        base,
+        colors=base.colors if colors is None else color_bytes(colors),
+        normals=base.normals if normals is None else float_points(normals),
+        labels=base.labels if labels is None else labels.astype(np.int32, copy=False),
+        viewpoint=base.viewpoint if viewpoint is None else viewpoint.astype(np.float64, copy=False),
     )
+
+
+def _own(arrays: dict[str, NDArray[np.generic]], name: str, *shapes: tuple[int, ...]) -> NDArray[np.generic] | None:
+    """The array of a name, which must have one of the shapes; None if it is missing, or empty in place of that."""
+    values = arrays.get(name)
+    if values is None or values.shape in shapes:
+        return values
+    if not values.size:
+        return None
+    raise CloudReadError(f"expected {name} of shape {' or '.join(map(str, shapes))}, got {values.shape}")
 
 
 # ---- Arrays of a file ----------------------------------------------------------------------------------------------

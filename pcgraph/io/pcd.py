@@ -20,7 +20,7 @@ from pcgraph.cloud import (
 )
 from pcgraph.errors import CloudReadError, CloudWriteError
 from pcgraph.io.format import MAX_HEADER_BYTES, Format, check_words, field_name, field_word
-from pcgraph.io.text_numbers import columns_from_text, numbers_from_text
+from pcgraph.io.text_numbers import columns_of_rows
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
@@ -160,15 +160,8 @@ def _viewpoint(words: list[str]) -> NDArray[np.float64] | None:
 
 
 def _ascii_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.generic]]:
-    table = numbers_from_text(body, header.n_points, sum(header.counts), header.n_lines + 1)
     fields = list(zip(header.names, header.dtypes, header.counts, strict=True))
-    columns = columns_from_text(table, fields)
-    first = 0
-    for name, dtype, count in fields:
-        if dtype.itemsize == 8 and dtype.kind in "iu":
-            columns[name] = _exact(columns[name], body, (first, first + count, table.shape[1]))
-        first += count
-    return columns
+    return columns_of_rows(body, header.n_points, fields, header.n_lines + 1)
 
 
 def _binary_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.generic]]:
@@ -203,34 +196,6 @@ def _compressed_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.
 def _without_axis(values: NDArray[np.generic]) -> NDArray[np.generic]:
     """Columns (n, c) of a field; (n,) if it has one number per point."""
     return values[:, 0] if values.shape[1] == 1 else values
-
-
-def _exact(values: NDArray[np.generic], body: bytes, place: tuple[int, int, int]) -> NDArray[np.generic]:
-    """Exact whole numbers of 64 bits of a text, in place of those that doubles have rounded.
-
-    Parameters
-    ----------
-    values : (n,) or (n, c) int64 or uint64
-        Rounded numbers.
-    body : bytes
-        The text.
-    place : first column, column after the last, number of columns of the text
-    """
-    first, end, width = place
-    words = body.split(None, len(values) * width)[: len(values) * width]
-    rows = [words[row + first : row + end] for row in range(0, len(words), width)]
-    try:
-        return np.array([[_whole(word) for word in row] for row in rows], values.dtype).reshape(values.shape)
-    except OverflowError:  # a number beyond the limits by less than a double resolves
-        limits = np.iinfo(values.dtype.name)
-        raise CloudReadError(f"expected whole numbers from {limits.min} to {limits.max}, as the header says") from None
-
-
-def _whole(word: bytes) -> int:
-    try:
-        return int(word)
-    except ValueError:
-        return int(float(word))  # with a decimal point or an exponent
 
 
 def _check_length(available: int, needed: int, header: PcdHeader) -> None:

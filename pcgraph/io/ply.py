@@ -22,7 +22,7 @@ from pcgraph.cloud import (
 )
 from pcgraph.errors import CloudReadError
 from pcgraph.io.format import MAX_HEADER_BYTES, Format, check_words, field_name, field_word
-from pcgraph.io.text_numbers import columns_from_text, numbers_from_text, numbers_of_words
+from pcgraph.io.text_numbers import columns_from_text, columns_of_rows, numbers_of_words
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -198,8 +198,7 @@ def _vertices(elements: list[PlyElement]) -> PlyElement:
 
 
 def _ascii_columns(element: PlyElement, body: bytes, first_line: int) -> Columns:
-    table = numbers_from_text(body, element.count, len(element.properties), first_line)
-    return columns_from_text(table, ((one.name, one.kind, 1) for one in element.properties))
+    return columns_of_rows(body, element.count, [(one.name, one.kind, 1) for one in element.properties], first_line)
 
 
 def _listed_rows(element: PlyElement, body: bytes, first_line: int) -> Columns:

@@ -70,6 +70,13 @@ class Categories(ShortRepr):
         Of 0, 1 and so on.
     colors : (c, 3) uint8, red green blue
         One for each name.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pcgraph.viewer import Categories
+    >>> Categories(["ground", "tree"], np.array([[120, 90, 60], [40, 160, 60]], np.uint8)).names
+    ['ground', 'tree']
     """
 
     names: Sequence[str]
@@ -92,6 +99,14 @@ class Shown(ShortRepr):
         Whether x points right, y down and z ahead. Default: whether an organised cloud lies ahead of z = 0.
     categories : mapping of a column's name to Categories, optional
     units : mapping of a column's name to its unit, optional
+
+    Examples
+    --------
+    >>> import numpy as np, pcgraph
+    >>> from pcgraph.viewer import Shown, views_page
+    >>> cloud = pcgraph.Cloud(np.zeros((2, 3)), columns={"speed": np.array([1.0, 2.0])})
+    >>> '"unit": "m/s"' in views_page([Shown("two points", cloud, units={"speed": "m/s"})], "Speeds")
+    True
     """
 
     name: str

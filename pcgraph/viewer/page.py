@@ -69,6 +69,15 @@ def write_view(
         The place cannot be written.
     ValueError
         As for `view_page`.
+
+    Examples
+    --------
+    >>> import numpy as np, pathlib, pcgraph, tempfile
+    >>> from pcgraph.viewer import write_view
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "cloud.html"
+    >>> write_view(path, pcgraph.Cloud(np.zeros((5, 3))), title="Five points")
+    >>> path.stat().st_size > 500_000
+    True
     """
     write_file(Path(path), view_page(cloud, segmentation, title).encode("utf-8"), CloudWriteError)
 
@@ -80,6 +89,14 @@ def views_page(shown: Sequence[Shown], title: str) -> str:
     ------
     ValueError
         There is no cloud, or the page would be larger than browsers load.
+
+    Examples
+    --------
+    >>> import numpy as np, pcgraph
+    >>> from pcgraph.viewer import Shown, views_page
+    >>> page = views_page([Shown(name, pcgraph.Cloud(np.zeros((1, 3)))) for name in ("first", "second")], "Both")
+    >>> '<option value="1">second</option>' in page
+    True
     """
     if not shown:
         raise ValueError("expected at least one cloud to show, got none")

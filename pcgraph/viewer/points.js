@@ -153,6 +153,14 @@ function colorOf(paint, leaf, i) {
   return [from[at] * left, from[at + 1] * left, from[at + 2] * left];
 }
 
+// Order of n points of which every beginning is spread over all: every 16th point, then those between, and so on.
+function thinningOrder(n) {
+  const order = new Uint32Array(n);
+  let k = 0;
+  for (const first of [0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15]) for (let i = first; i < n; i += 16) order[k++] = i;
+  return order;
+}
+
 // Near and far planes that hold a ball around a centre, as seen by a camera.
 function setPlanes(camera, centre, radius) {
   const away = camera.position.distanceTo(centre);
@@ -209,6 +217,7 @@ class PointScene {
         size: { value: 1 }, least: { value: 1 }, seen: { value: cloud.seenFrom ? [...cloud.seenFrom, 1] : [0, 0, 0, 0] },
       },
     });
+    geometry.setIndex(new THREE.BufferAttribute(thinningOrder(cloud.leaf.length), 1));
     this.key = null;
     this.points = new THREE.Points(geometry, material);
     this.points.frustumCulled = false;
@@ -278,14 +287,15 @@ class PointScene {
   }
 
   // camera: one of three.js; size: pixels of a point at w = 1 (of one that a sensor saw, at 1 m from it); least: pixels of the
-  // smallest point; slack: steps in depth, in metres, that the shading leaves out
-  draw(camera, size, least, slack = 0) {
+  // smallest point; slack: steps in depth, in metres, that the shading leaves out; part: fraction of the points to draw
+  draw(camera, size, least, slack = 0, part = 1) {
     const { renderer, target } = this, ratio = Math.min(window.devicePixelRatio || 1, 2), [width, height] = fit(this.canvas);
     if (!(width && height && this.points)) return;
     renderer.setViewport(0, 0, width, height);
     if (target.width !== width || target.height !== height) target.setSize(width, height);
     const uniforms = this.points.material.uniforms;
-    uniforms.size.value = size;
+    this.points.geometry.setDrawRange(0, Math.ceil(part * this.points.geometry.index.count));
+    uniforms.size.value = size / Math.sqrt(part);  // so that fewer points cover as much
     uniforms.least.value = least * ratio;
     Object.assign(this.screen.uniforms, {
       range: { value: [camera.near, camera.far] }, parallel: { value: camera.isOrthographicCamera ? 1 : 0 },

@@ -46,6 +46,15 @@ class ShownTree(ShortRepr):
         What made the tree, in words.
     graph : AdjacencyGraph, optional
         Of the leaves; its edges can be shown.
+
+    Examples
+    --------
+    >>> import numpy as np, pcgraph
+    >>> from pcgraph.viewer import ShownTree
+    >>> x, y = np.meshgrid(np.linspace(-1.0, 1.0, 64), np.linspace(-1.0, 1.0, 64))
+    >>> roof = ShownTree.of(pcgraph.segment(np.stack((x, y, 2.0 + np.abs(x)), axis=-1)))
+    >>> roof.linkage, len(roof.objects) == roof.tree.n_leaves
+    ('RegionLinkage', True)
     """
 
     supervoxels: NDArray[np.integer]

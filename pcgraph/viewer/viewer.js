@@ -5,7 +5,11 @@ const $ = (id) => document.getElementById(id);
 const FIELD_OF_VIEW = 45;  // degrees, from top to bottom
 const START_FROM = [-0.55, -0.8, 0.5];  // where the viewer is, seen from the middle, for a cloud whose z is up
 const PICK_REACH = 5;  // pixels
+const CLICK_REACH = 4;  // pixels that the pointer may move during a click
 const SIZE_IN_SPACINGS = 2.6;  // so that three quarters of a surface of random points are covered; by eye, not varied
+const SLOW_MS = 50;  // time between two frames of a moving view above which fewer points are drawn until it rests
+const REST_MS = 200;  // time without a movement after which the view rests
+const LEAST_PART = 1 / 16;  // of the points, that is drawn however slow the graphics are
 const LARGEST_LEGEND = 12;
 const EDGE_COLORS = [[0.33, 0.64, 0.96], [0.95, 0.55, 0.22], [0.73, 0.76, 0.8]];  // convex, concave, gap; as in viewer.css
 const CHOSEN_COLOR = [1, 0.83, 0.25];
@@ -94,7 +98,7 @@ class Viewer {
   async load(at) {
     const block = $(`cloud-${at}`);
     const cloud = this.cloud = await unpackCloud(JSON.parse(block.textContent)), { tree } = cloud;
-    this.chosen = null;
+    Object.assign(this, { chosen: null, part: 1, moving: false, drawn: -Infinity });
     this.paint = painting(tree ? tree.leaves : 0);
     this.scene.show(cloud);
     for (const name of ["boxLines", "edgeLines", "chosenLines"]) { this.scene.removeLines(this[name]); this[name] = null; }
@@ -290,7 +294,7 @@ class Viewer {
   }
 
   resetView() {
-    const { cloud } = this, up = this.up(), away = (cloud.camera ? 0.75 : 0.92) * cloud.radius / Math.tan(FIELD_OF_VIEW / 2 * Math.PI / 180) / Math.min(1, this.aspect());
+    const { cloud } = this, up = this.up(), away = (cloud.camera ? 0.85 : 0.92) * cloud.radius / Math.tan(FIELD_OF_VIEW / 2 * Math.PI / 180) / Math.min(1, this.aspect());
     let from = START_FROM;
     if (cloud.camera && up[1] === -1) from = [-0.22, -0.16, -1];
     else if (up[2] !== 1) from = [...[0, 1, 2].map((a) => (up[a] ? 0.5 * up[a] : a === 2 ? 0.8 : 0.55))];
@@ -307,7 +311,7 @@ class Viewer {
     controls.zoomToCursor = true;
     controls.minDistance = 1e-3 * this.cloud.radius;
     controls.maxDistance = 30 * this.cloud.radius;
-    controls.addEventListener("change", () => this.redraw());
+    controls.addEventListener("change", () => this.move());
     controls.update();
   }
 
@@ -330,6 +334,14 @@ class Viewer {
     return parallelEye;
   }
 
+  // Draws a view that moves; on slow graphics with a part of the points, until it rests.
+  move() {
+    this.moving = true;
+    clearTimeout(this.resting);
+    this.resting = setTimeout(() => { this.moving = false; this.redraw(); }, REST_MS);
+    this.redraw();
+  }
+
   redraw() {
     if (this.waiting) return;
     this.waiting = requestAnimationFrame(() => { this.waiting = 0; this.draw(); });
@@ -338,7 +350,10 @@ class Viewer {
   draw() {
     if (!this.cloud || !this.paint) return;
     const camera = this.camera(), { canvas } = this, bigger = 2 ** +$("size").value, size = SIZE_IN_SPACINGS * bigger * this.cloud.spacing;
-    this.scene.draw(camera, size * pixelsPerMetre(camera, fit(canvas)[1]), Math.max(1, 1.5 * bigger), size);
+    const now = performance.now(), since = now - this.drawn;
+    if (this.moving && since > SLOW_MS && since < 10 * REST_MS) this.part = Math.max(LEAST_PART, this.part / 2);
+    this.drawn = this.moving ? now : -Infinity;
+    this.scene.draw(camera, size * pixelsPerMetre(camera, fit(canvas)[1]), Math.max(1, 1.5 * bigger), size, this.moving ? this.part : 1);
     const ring = $("ring");
     ring.hidden = this.pickedPoint === undefined || this.pickedPoint < 0;
     if (ring.hidden) return;
@@ -370,7 +385,7 @@ class Viewer {
 
   moved() {
     this.controls.update();
-    this.redraw();
+    this.move();
   }
 
   press(event) {
@@ -568,10 +583,14 @@ class Viewer {
     on("reset", "click", () => this.resetView());
     on("save", "click", () => this.savePicture());
     on("forget", "click", () => this.forget());
-    let start = null;
+    let start = null;  // where a press began that has not moved since
     this.canvas.addEventListener("pointerdown", (e) => { start = e.button === 0 ? [e.clientX, e.clientY] : null; });
+    this.canvas.addEventListener("pointermove", (e) => {
+      if (start && Math.hypot(e.clientX - start[0], e.clientY - start[1]) > CLICK_REACH) start = null;
+    });
     this.canvas.addEventListener("pointerup", (e) => {
-      if (!start || Math.hypot(e.clientX - start[0], e.clientY - start[1]) > 4) return;
+      if (!start) return;
+      start = null;
       const box = this.canvas.getBoundingClientRect();
       this.pick(e.clientX - box.left, e.clientY - box.top);
     });

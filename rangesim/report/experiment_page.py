@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pcgraph.plumbing.plain_files import write_file
+from pcgraph.viewer.packing import pack
 from rangesim.errors import FileFormatError
 from rangesim.report import figures, palette, point_viewer, tables
 from rangesim.report.content_security import visible_text
@@ -227,7 +228,7 @@ def _pass_materials(truth: GroundTruth) -> dict[str, Any]:
     return {
         "materials": [visible_text(n) for n in truth.material_names],
         "materialColors": [palette.MATERIAL_COLORS.get(n, palette.NO_DATA) for n in truth.material_names],
-        "material": point_viewer.pack(truth.material.astype("int8")),
+        "material": pack(truth.material.astype("int8")),
     }
 
 

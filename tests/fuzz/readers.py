@@ -125,6 +125,14 @@ def _cloud(path: Path, _: Arguments) -> Any:
     return pcgraph.read_cloud(path)
 
 
+def _vertices(path: Path, arguments: Arguments) -> Any:
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "read the .* vertices of the mesh")
+        return _cloud(path, arguments)
+
+
 def _edge_model(path: Path, _: Arguments) -> Any:
     from pcgraph.tree.learned import EdgeModel
 
@@ -550,6 +558,17 @@ READERS = {
                 check=_arrays_agree,
             )
             for suffix in ("ply", "pcd")
+        ),
+        *(
+            Reader(suffix, _cloud, partial(seeds.scanner_files, suffix), refuses=_CLOUD, check=_arrays_agree)
+            for suffix in ("las", "laz", "e57")
+        ),
+        *(
+            Reader(
+                f"vertices-{suffix}", _vertices, partial(seeds.mesh_files, suffix), by_hand=(hostile.meshes,),
+                refuses=_CLOUD, check=_arrays_agree,
+            )
+            for suffix in ("obj", "stl", "off", "glb", "gltf")
         ),
         *(
             Reader(

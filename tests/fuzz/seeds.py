@@ -434,6 +434,32 @@ def cloud_files(suffix: str) -> Seeds:
     return seeds
 
 
+def scanner_files(suffix: str) -> Seeds:
+    """Clouds of laser scanners with columns of their own, as pcgraph writes them, and LAS files as laspy does."""
+    from pcgraph.cloud import Cloud
+    from pcgraph.io.e57 import encode_e57
+    from pcgraph.io.las import encode_las
+
+    rng, name = np.random.default_rng(5), f"cloud.{suffix}"
+    points = rng.random((40, 3))
+    columns = {"intensity": np.arange(40, dtype=np.uint16), "ring": rng.integers(0, 9, 40), "beam": rng.random((40, 2))}
+    full = Cloud(points, np.zeros((40, 3), np.uint8), points, np.arange(40, dtype=np.int32), np.ones(3), columns)
+    encode = encode_e57 if suffix == "e57" else encode_las
+    seeds = {
+        "full": of_file(name, encode(full, f".{suffix}")),
+        "bare": of_file(name, encode(Cloud(points), f".{suffix}")),
+    }
+    if suffix != "e57":
+        import laspy
+
+        for version, point_format in (("1.2", 3), ("1.4", 10)):
+            las = laspy.create(point_format=point_format, file_version=version)
+            las.x, las.y, las.z = points.T
+            content = written(name, lambda path, las=las: las.write(str(path)))
+            seeds[f"format {point_format}"] = of_file(name, content)
+    return seeds
+
+
 def array_files(suffix: str) -> Seeds:
     """Clouds as NumPy's files, with columns and without."""
     from pcgraph.cloud import Cloud

@@ -113,6 +113,11 @@ def test_a_saved_segmentation_is_cut_again(scene, tmp_path):
     names = ["bare.npz", "scene.cut.ply", "scene.ply", "scene.segmentation.npz", "scene.segments.ply"]
     refused = CliRunner().invoke(app, ["cut", str(tmp_path / "bare.npz"), "--objects", "6"])
     assert_refused(refused, "holds no points, as it was saved without its cloud", tmp_path, names)
+    told = CliRunner().invoke(app, ["info", str(saved), str(tmp_path / "bare.npz"), "--json"])
+    whole, bare = records(told)
+    assert whole["segmentation"] == bare["segmentation"]
+    assert (whole["segmentation"]["objects"], whole["finite"], "finite" in bare) == (3, segmentation.labels.size, False)
+    assert "a segmentation" in CliRunner().invoke(app, ["info", str(saved)]).stdout
     refused = CliRunner().invoke(app, ["cut", str(scene)])
     assert_refused(refused, "expected a file that Segmentation.save wrote", tmp_path, names)
 

@@ -183,8 +183,8 @@ PLY = {
         {"ring": np.uint8([3, 4])},
     ),
     "whole numbers of 64 bits": (
-        ply(XYZ + "property int64 stamp\n", (f"{A} 4294967296", f"{B} -1")),
-        {"stamp": np.int64([4294967296, -1])},
+        ply(XYZ + "property int64 stamp\n", (f"{A} 1700000000000000001", f"{B} -1")),
+        {"stamp": np.int64([1_700_000_000_000_000_001, -1])},
     ),
     "element vertices": (ply(XYZ, (A, B), name="vertices"), {}),
     "element point": (ply(XYZ, (A, B), name="point"), {}),

@@ -808,3 +808,55 @@ def test_columns_of_any_language_are_written_back():
     for suffix in ("ply", "pcd"):
         with pytest.raises(pcgraph.CloudWriteError, match="several are called 'a_b'"):
             encode_cloud(twice, f"a.{suffix}")
+
+
+KINDS = ("i1", "u1", "i2", ">u2", "i4", "u4", "i8", "u8", "f2", "f4", ">f4", "f8", "?")
+
+
+def cloud_of(rng) -> pcgraph.Cloud:
+    """A cloud of any size, shape and parts, with columns of any types."""
+    h, w = int(rng.integers(2, 4)), int(rng.integers(1, 5))
+    shape = (h, w) if rng.random() < 0.5 else (h * w,)
+    points = (rng.standard_normal((*shape, 3)) * 10.0 ** rng.integers(-3, 7)).astype(rng.choice(["f4", "f8"]))
+    points[rng.random(shape) < 0.3] = np.nan
+    parts = {
+        "colors": rng.integers(0, 256, (*shape, 3), np.uint8),
+        "normals": rng.standard_normal((*shape, 3)).astype(rng.choice(["f4", "f8"])),
+        "labels": rng.integers(-(2**31), 2**31, shape, np.int32),
+        "viewpoint": rng.standard_normal((*shape, 3) if rng.random() < 0.5 else 3),
+    }
+    columns = {}
+    for i in range(rng.integers(0, 5)):
+        kind, depth = np.dtype(rng.choice(KINDS)), () if rng.random() < 0.7 else (2,)
+        columns[f"c{i}"] = (rng.random((*shape, *depth)) * 200).astype(kind)
+    return pcgraph.Cloud(points, **{k: part for k, part in parts.items() if rng.random() < 0.5}, columns=columns)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), suffix=st.sampled_from(SUFFIXES))
+def test_any_cloud_comes_back(seed, suffix):
+    cloud = cloud_of(np.random.default_rng(seed))
+    read = decode_cloud(encode_cloud(cloud, f"a.{suffix}"), f"a.{suffix}")
+    expected = cloud.finite() if suffix == "ply" else cloud
+    columns = dict(expected.columns)
+    if suffix in ("ply", "pcd"):
+        instead = {"b1": "u1", "f2": "f4"} | ({"i8": "f8", "u8": "f8"} if suffix == "ply" else {})
+        columns = {n: column.astype(instead.get(column.dtype.str[1:], column.dtype)) for n, column in columns.items()}
+    if suffix == "ply":
+        parts = [
+            (f"{n}_{i}" * (c.ndim > 1) or n, p) for n, c in columns.items() for i, p in enumerate(np.atleast_2d(c.T))
+        ]
+        columns = dict(parts)
+    viewpoint = expected.viewpoint
+    if suffix in ("ply", "npy") and viewpoint is not None and viewpoint.ndim == 1:
+        viewpoint = None
+    for found, wanted in zip(
+        (read.points, read.colors, read.normals, read.labels, read.viewpoint, *read.columns.values()),
+        (expected.points, expected.colors, expected.normals, expected.labels, viewpoint, *columns.values()),
+        strict=True,
+    ):
+        assert (found is None) == (wanted is None)
+        if wanted is not None:
+            assert found.dtype == wanted.dtype.newbyteorder("=")
+            assert np.array_equal(found, wanted, equal_nan=wanted.dtype.kind == "f")
+    assert list(read.columns) == list(columns)

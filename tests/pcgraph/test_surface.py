@@ -110,7 +110,7 @@ def test_the_public_names_of_rooms_are_these():
     ]
 
 
-@pytest.mark.parametrize("room", [pcgraph, pcgraph.detection, pcgraph.learning])
+@pytest.mark.parametrize("room", [pcgraph, pcgraph.detection, pcgraph.learning, pcgraph.viewer])
 def test_type_checkers_see_what_loads(room):
     """The imports under TYPE_CHECKING, which editors read, name the objects that are loaded."""
     tree = ast.parse(Path(room.__file__).read_text(encoding="utf-8"))
