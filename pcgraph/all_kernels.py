@@ -38,8 +38,10 @@ from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.visibility import visible_fraction, visible_sides
 from pcgraph.voxels.warp import CameraWarp, Warp
 
-_EDGE = 24  # points along the edges of the clouds
-_SPACING = 0.01  # metres between neighbouring points
+_EDGE = 24
+"""Count of points along each edge of the small clouds. Chosen by eye; not varied."""
+_SPACING = 0.01
+"""Distance of neighbouring points, metres. Chosen by eye; not varied."""
 
 
 def compile_kernels() -> None:

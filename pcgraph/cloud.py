@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The point cloud as files hold it, and its making from the files' named columns, and back."""
+"""Point clouds: the class `Cloud`, and its conversion from and to the named columns of files."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Cloud(ShortRepr):
         The file's own ``label`` or ``labels`` field, for example ground truth. Labels of unsigned 32 bits keep their
         bits: 4294967295, as PCL stores -1, is -1. A field of 64 bits that int32 does not hold stays in `columns`.
     viewpoint : (3,) or points' shape float64, metres, the file's frame, or None
-        Position of the sensor, one for all points or one for each, as of several scans; None where none is known.
+        Position of the sensor: one for all points, or one for each point, as in files of several scans. None: unknown.
     columns : dict of name to array of the same leading shape, or that + (c,), of any dtype of numbers
         All other fields of the file, as stored: intensity, ring, time, classification and the like.
         `pcgraph.segment` takes them as `features` by name; `write_cloud` and `write_segmentation` write them back.
@@ -69,7 +69,7 @@ class Cloud(ShortRepr):
         return self.points.ndim == 3
 
     def finite(self) -> Cloud:
-        """The points whose coordinates are finite, as a list in the points' order, with all that is known of them."""
+        """The points with finite coordinates as a list, in their order, with their colours, columns and so on."""
         seen = np.isfinite(self.points).all(axis=-1)
         return Cloud(
             self.points[seen],
@@ -85,13 +85,16 @@ class Cloud(ShortRepr):
 
 
 class Roles(NamedTuple):
-    """Lower-case names of the columns that are colours, normals, labels and viewpoint of a cloud; () if there are none.
+    """Lower-case names of the columns that are a cloud's colours, normals, labels and viewpoint; () if there are none.
 
     Attributes
     ----------
-    colors : one name of packed colours, or those of red, green and blue
-    normals, viewpoint : names of x, y and z
-    labels : one name
+    colors : tuple of str
+        The name of packed colours, or the names of red, green and blue.
+    normals, viewpoint : tuple of str
+        The names of x, y and z.
+    labels : tuple of str
+        One name.
     """
 
     colors: tuple[str, ...]
@@ -113,7 +116,7 @@ class Roles(NamedTuple):
 
 
 def _all_of(choices: Iterable[tuple[str, ...]], columns: Columns) -> tuple[str, ...]:
-    """The first of the choices all names of which are columns; () if there is none."""
+    """The first choice whose names are all columns; () if there is none."""
     return next((names for names in choices if all(name in columns for name in names)), ())
 
 
@@ -126,12 +129,12 @@ def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDAr
         Must hold ``x``, ``y``, ``z``. Colours (``rgb``/``rgba`` packed, or ``red``/``green``/``blue``, or these after
         ``diffuse_``, or ``r``/``g``/``b``), normals, labels and viewpoints (``vp_x`` and so on) are found under the
         names that PCL, Open3D and MeshLab write, in upper or lower case. White is 65535 in unsigned 16 bits, 1 in
-        floats of at most 1, else 255. All other fields, and those of several numbers for each point, are kept as they
-        are, but for ``_``, the name of padding in PCD files.
+        floats of at most 1, else 255. All other fields, and those of several numbers for each point, stay as they are.
+        Fields called ``_``, the name of padding in PCD files, are left out.
     shape : (n,) or (h, w)
         Leading shape of the result.
     viewpoint : (3,) float64, metres, optional
-        Place of the sensor where no columns tell one for each point.
+        Position of the sensor, unless columns have one for each point.
 
     Raises
     ------
@@ -242,14 +245,14 @@ def cloud_from_array(values: ArrayLike) -> Cloud:
     Parameters
     ----------
     values : (n, 3 + c) or (h, w, 3 + c) numbers; or (n,) or (h, w) with fields x, y, z and others
-        Further columns of an array without fields are called ``column_3``, ``column_4`` and so on, as NumPy counts
-        them, because nothing tells whether they are intensities, colours or labels. Numbers stay in their type. Fields
-        are found as `cloud_from_columns` finds columns.
+        Further columns of an array without fields are called ``column_3``, ``column_4`` and so on, because it is not
+        known whether they are intensities, colours or labels. The type of the numbers stays. `cloud_from_columns`
+        interprets the fields of a structured array.
 
     Raises
     ------
     ValueError
-        The shape is another, a coordinate is missing, or a field is not of numbers.
+        The array has another shape, a coordinate is missing, or a field does not hold numbers.
     """
     if isinstance(values, np.ndarray) and values.dtype.names is not None:
         return _cloud_from_fields(values)
@@ -275,7 +278,7 @@ def _cloud_from_fields(table: NDArray[np.void]) -> Cloud:
 
 
 def _rest(values: NDArray[np.generic], shape: tuple[int, ...]) -> tuple[int, ...]:
-    """The axis behind the points' axes: () of scalars, (c,) of vectors and of all that have more axes."""
+    """Shape of the values of one point: () for numbers, (c,) for vectors; further axes are flattened into c."""
     rest = values.shape[len(shape) :]
     return (int(np.prod(rest)),) if rest else ()
 
@@ -289,10 +292,9 @@ def native(values: NDArray[np.generic]) -> NDArray[np.generic]:
 
 
 def plain_cloud(cloud: Cloud) -> Cloud:
-    """The cloud in the types that `Cloud` states.
+    """The cloud with arrays of the types that `Cloud` documents.
 
-    Masked numbers are NaN, points of any numbers are float32 or float64, colours within 0..1 are uint8, and labels are
-    int32.
+    Masked numbers become NaN, points float32 or float64, colours within 0..1 uint8, and labels int32.
 
     Raises
     ------
@@ -333,7 +335,7 @@ def _own(name: str, given: ArrayLike | None, wanted: tuple[int, ...]) -> NDArray
 
 
 def _bytes_of(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Colours as uint8, from floats within 0..1, which `segment` takes, too; black where they are NaN."""
+    """Colours as uint8, from uint8 or from floats within 0..1; black where they are NaN."""
     if colors.dtype == np.uint8:
         return colors  # type: ignore[return-value]
     shades = np.nan_to_num(colors.astype(np.float64)) if colors.dtype.kind == "f" else np.array([np.inf])
@@ -370,9 +372,9 @@ def columns_of_cloud(
 ) -> dict[str, NDArray[np.generic]]:
     """One array per field of a cloud: the inverse of `cloud_from_columns`.
 
-    Colours, normals, labels and viewpoints of each point get the first of their names under which they are found again.
-    Usually these are ``red``, ``nx``, ``label`` and ``vp_x``; if the cloud has a further column ``red``, its colours
-    are packed as ``rgb``. A viewpoint that all points share is not among the columns.
+    Colours, normals, labels and viewpoints of each point get the first names under which `cloud_from_columns` finds
+    them again. Usually these are ``red``, ``nx``, ``label`` and ``vp_x``. If the cloud has a further column ``red``,
+    its colours are packed as ``rgb``. A viewpoint that all points share is not among the columns.
 
     Parameters
     ----------
@@ -387,7 +389,7 @@ def columns_of_cloud(
     Raises
     ------
     CloudWriteError
-        A further column has the name of a coordinate, or is in the way of the cloud's own under all their names.
+        A further column has the name of a coordinate, or takes all names that the cloud's own arrays could have.
     """
     n = cloud.points[..., 0].size
     axes = dict(zip("xyz", cloud.points.reshape(-1, 3).T, strict=True))
@@ -422,7 +424,7 @@ def _named(names: tuple[str, ...], values: NDArray[np.generic] | None) -> Iterab
 
 
 def _is_found(chosen: Iterable[tuple[str, ...]], columns: Columns) -> bool:
-    """Whether `cloud_from_columns` finds these roles; what a cloud has not may be found, too, among its columns."""
+    """Whether `cloud_from_columns` finds the chosen roles; it may find further roles among the cloud's columns."""
     lower = _names_by_lower_case(columns)
     found = Roles.of({name: columns[stored] for name, stored in lower.items() if columns[stored].ndim == 1})
     return all(names in ((), role) for names, role in zip(chosen, found, strict=True))
@@ -441,7 +443,7 @@ def without_mask(values: ArrayLike) -> ArrayLike:
 
 
 def as_numbers(name: str, values: ArrayLike) -> NDArray[np.generic]:
-    """The values as an array of numbers, masked ones as NaN; ValueError if they are none."""
+    """The values as an array of numbers, with NaN for masked ones; ValueError if they are not numbers."""
     values = without_mask(values)
     try:
         array = np.asarray(values)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What counts as a point cloud: files, arrays, messages of robots, and the clouds of other libraries."""
+"""Sources of point clouds: files, arrays, ROS messages, and the clouds of other libraries."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from pcgraph.cloud import COLOR_NAMES, Cloud, cloud_from_array, cloud_from_colum
 from pcgraph.errors import CloudReadError
 
 _MESSAGE_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""Types of numbers in a PointField of sensor_msgs, by its `datatype`."""
+"""Types of the numbers in a PointField, by its `datatype`. Source: sensor_msgs of ROS."""
 
 
 def as_cloud(source: Any) -> Cloud:
-    """Cloud of whatever holds points.
+    """Cloud of an array, a file, a ROS message, or a cloud or mesh of another library.
 
     Parameters
     ----------
     source : one of
 
-        - a `Cloud`, which is returned as it is
-        - the name of a file, for `read_cloud`
-        - an array (n, 3) or (h, w, 3) of numbers, which keep their type; or with more columns, (n, 4) and so on, which
-          become the cloud's columns ``column_3``, ``column_4`` and so on
-        - an array with fields, as NumPy calls them, among them ``x``, ``y`` and ``z``, as
-          ``sensor_msgs_py.point_cloud2.read_points`` returns it. Colours, normals and labels are found by their names
-        - a message like ``sensor_msgs/PointCloud2``, with ``fields``, ``data``, ``point_step`` and so on
+        - a `Cloud`, which is returned unchanged
+        - the path of a file, for `read_cloud`
+        - an array (n, 3) or (h, w, 3) of numbers, whose type stays. Further columns of an array (n, 4) and so on become
+          the cloud's columns ``column_3``, ``column_4`` and so on
+        - a structured array of NumPy with the fields ``x``, ``y`` and ``z``, such as
+          ``sensor_msgs_py.point_cloud2.read_points`` returns. Colours, normals and labels are found by their names
+        - a message such as ``sensor_msgs/PointCloud2``, with ``fields``, ``data``, ``point_step`` and so on
         - an Open3D cloud, legacy or tensor. Attributes of a tensor cloud become columns
-        - a trimesh cloud, or the vertices of a trimesh mesh
+        - a trimesh cloud, or a trimesh mesh, whose vertices are the points
 
-        Colours in floats of at most 1 become 8 bits.
+        Colours that are floats of at most 1 become uint8.
 
     Raises
     ------
     CloudReadError
-        `source` names a file that cannot be read.
+        `source` is the path of a file that cannot be read.
     ValueError
-        It is none of these, or its arrays do not fit together.
+        `source` is none of these, or its arrays do not fit together.
 
     Examples
     --------
@@ -69,7 +69,7 @@ def as_cloud(source: Any) -> Cloud:
 
 
 def _of_message(message: Any) -> Cloud:
-    """Cloud of a PointCloud2: its points lie `point_step` bytes apart in rows of `row_step` bytes."""
+    """Cloud of a PointCloud2, whose points are `point_step` bytes apart, in rows of `row_step` bytes."""
     names = [one.name for one in message.fields]
     unknown = [one for one in message.fields if one.datatype not in _MESSAGE_TYPES]
     if unknown or len(set(names)) < len(names):
@@ -101,7 +101,7 @@ def _of_message(message: Any) -> Cloud:
 
 
 def _of_open3d(cloud: Any) -> Cloud:
-    """Cloud of an open3d.geometry.PointCloud, whose empty arrays mean that it has none."""
+    """Cloud of an open3d.geometry.PointCloud, in which an empty array means no colours or no normals."""
     points, colors, normals = (np.asarray(values) for values in (cloud.points, cloud.colors, cloud.normals))
     columns = _columns_of(points, colors if len(colors) else None, normals if len(normals) else None)
     return _from_columns(columns, points.shape[:1])
@@ -154,4 +154,4 @@ _KINDS: dict[tuple[str, ...], Callable[[Any], Cloud]] = {
     ("point", "is_cpu", "is_cuda"): _of_open3d_tensor,
     ("vertices", "visual"): _of_trimesh,
 }
-"""Converters by the attributes that tell the kind of an object, so that no library need be imported to know it."""
+"""Converters by the attributes that identify a class, so that its library need not be imported for that."""

@@ -34,7 +34,7 @@ def without_long_words(message: str) -> str:
 
 
 def library_reason(error: BaseException) -> str:
-    """Class and first line of what a library raised about a file: further lines tell places in its source."""
+    """Class and first line of an error that a library raised about a file; further lines are about its source code."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0][:MAX_WORD]}" if lines else type(error).__name__
 

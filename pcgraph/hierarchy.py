@@ -191,7 +191,7 @@ def ancestor_index(parents: NDArray[np.int32]) -> AncestorIndex:
 def lowest_common_ancestors(
     parents: NDArray[np.int32], first: NDArray[np.integer], second: NDArray[np.integer]
 ) -> NDArray[np.int32]:
-    """Lowest common ancestor of each pair of nodes, (m,) int32; the upper node where one is above the other.
+    """Lowest common ancestor of each pair of nodes, (m,) int32; the upper node if one is above the other.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def lowest_common_ancestors(
 
 @kernel
 def lowest_common_ancestor(index: AncestorIndex, a: int, b: int) -> int:
-    """Lowest common ancestor of two nodes; the upper one where it is above the other.
+    """Lowest common ancestor of two nodes; the upper one if it is above the other.
 
     Of the two representatives, the one that was linked first climbs until both meet. If neither node is above the
     other, the nodes meet at the same place, above both. Otherwise the representatives meet at the upper node or below

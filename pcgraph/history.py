@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory of earlier scans, and how it forgets: by age, and what a new scan sees through.
+"""History of a scene: the voxels and supervoxels of earlier scans, and which of them are forgotten.
 
-A supervoxel is kept or forgotten as a whole. The points behind its moments are not kept, so that no part of it could be
-taken out of them; and what is left of it might not be connected.
+A supervoxel is kept or forgotten as a whole. Its moments are sums over points that are not kept, so that a part cannot
+be subtracted; and the rest might not be connected.
 """
 
 from __future__ import annotations
@@ -19,27 +19,30 @@ from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.visibility import depth_order_of
 
 _CLEARLY_BEHIND = 2.0
-"""Distance, in voxel edges, from which on what is seen past a voxel is behind it. At 1 a still scene loses two to five
-times as much; at 3 a box that has moved by less than its length keeps 0.2 to 0.3 of its voxels in place of 0.1."""
+"""Distance, in voxel edges: a point farther than this behind a voxel was seen through the voxel.
+
+Measured: at 1, a still scene loses two to five times as many voxels. At 3, a box that has moved by less than its length
+keeps 0.2 to 0.3 of its voxels instead of 0.1.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """What is known of a scene from the scans so far: v voxels in k supervoxels.
+    """History of a scene from all scans so far: v voxels in k supervoxels.
 
     Attributes
     ----------
     surface : Surface of v voxels
     leaves : Moments of k supervoxels
-        Without normals.
+        They have no normals.
     objects : (k,) int32
         Object of each supervoxel.
     ages : (k,) int32
-        Number of scans since the last one that saw a point of the supervoxel; 0 if the last one did.
+        Number of scans since a scan last saw a point of the supervoxel; 0 if the last scan did.
     next_object : int
-        Least number that no object has had.
+        Smallest number that no object has had yet.
     numbers : (k_earlier,) int32
-        Number of each supervoxel of the segmentation from which this was made, -1 if it is forgotten.
+        New number of each supervoxel of the segmentation from which this was made; -1 if it is forgotten.
     """
 
     surface: Surface
@@ -51,13 +54,13 @@ class History:
 
     @classmethod
     def of(cls, earlier: Segmentation) -> History:
-        """All that a segmentation knows of its scans."""
+        """The history that a segmentation holds, with nothing forgotten."""
         numbers = np.arange(earlier.tree.n_leaves, dtype=np.int32)
         leaves = replace(earlier.leaves, normals=None)
         return cls(earlier.surface, leaves, earlier.objects, earlier.ages, earlier.next_object, numbers)
 
     def without(self, forgotten: NDArray[np.bool_]) -> History:
-        """The same without some supervoxels, (k,) bool; the others are numbered without gaps, in their order."""
+        """The history without some supervoxels, (k,) bool; the others are numbered without gaps, in the same order."""
         if not forgotten.any():
             return self
         stays = ~forgotten
@@ -75,12 +78,24 @@ class History:
         )
 
     def depth_order(self, place: NDArray[np.float64], shown: VoxelGrid) -> NDArray[np.int8]:
-        """Whether a new scan, seen from a place, (3,) metres, is nearer in the direction of each voxel, -1, farther, 1,
-        or neither, 0: there is something, or nothing was measured; (v,) int8."""
+        """Order of a new scan and each voxel along the ray from a place, (v,) int8.
+
+        Parameters
+        ----------
+        place : (3,) float64, metres
+            Position of the sensor.
+        shown : VoxelGrid of the new scan
+
+        Returns
+        -------
+        (v,) int8
+            -1: the scan is nearer than the voxel. 1: it is farther. 0: neither, because it met something at the voxel
+            or measured nothing there.
+        """
         return depth_order_of(self.surface.grid, self.surface.normals, place, shown, _CLEARLY_BEHIND)
 
     def seen_through(self, order: NDArray[np.int8]) -> NDArray[np.bool_]:
-        """Supervoxels, (k,) bool, through more of whose voxels than not a new scan sees; hidden ones do not count.
+        """Whether a new scan sees through most voxels of each supervoxel, (k,) bool; hidden voxels do not count.
 
         Parameters
         ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Segmentations as columns of their clouds, and their files."""
+"""Labelled clouds: the labels of a segmentation as columns of its cloud, in memory and in files."""
 
 from __future__ import annotations
 
@@ -20,37 +20,37 @@ from pcgraph.segmentation import Segmentation, check_segmentation, segmented_clo
 
 
 def labelled_cloud(cloud: Any, segmentation: Segmentation, levels: Sequence[int] = (), colorize: bool = False) -> Cloud:
-    """The cloud with its segmentation as further columns.
+    """The cloud with the labels of its segmentation as further columns.
 
     Parameters
     ----------
     cloud : Cloud, or anything else that `as_cloud` takes
         The cloud that was segmented. Its own colours, normals, labels and columns keep their names.
     segmentation : Segmentation
-    levels : whole numbers, optional
-        Numbers of segments of further cuts.
+    levels : sequence of int, optional
+        Numbers of segments; each adds the column of one more cut.
     colorize : bool
-        Whether the colours of the result are those of the objects. The cloud's own are then columns.
+        Whether the result has a colour for each object. The cloud's own colours then become columns.
 
     Returns
     -------
     Cloud
-        With int32 columns of the points' leading shape, negative where a point has none:
+        The cloud with further int32 columns of the points' leading shape; -1 for points without a label:
 
         - ``object``: `Segmentation.labels`
         - ``part``: `Segmentation.parts`
         - ``supervoxel``: `Segmentation.supervoxels`
         - ``level_10`` and so on: the cut into 10 segments
-        - ``original_red``, ``original_green``, ``original_blue``, uint8: if colorized, the colours the cloud had
+        - ``original_red``, ``original_green``, ``original_blue``, uint8: with `colorize`, the cloud's own colours
 
-        If the cloud has a column of such a name, in upper or lower case, ours is called ``pcgraph_object`` and so on;
-        if it has that, too, ``pcgraph2_object``.
+        If the cloud has a column of such a name, in upper or lower case, the new column is called ``pcgraph_object``
+        and so on; if it has that too, ``pcgraph2_object``.
 
     Raises
     ------
     ValueError
-        The cloud has another shape than the points that were segmented, there is no `Segmentation`, or no cut into so
-        many segments.
+        The cloud has another shape than the points that were segmented, `segmentation` is not a `Segmentation`, or the
+        tree has no cut into that many segments.
 
     Examples
     --------
@@ -83,22 +83,23 @@ def write_segmentation(
     levels: Sequence[int] = (),
     colorize: bool = False,
 ) -> None:
-    """Write a cloud with its segmentation as a whole file, or none; an older file of that name is replaced.
+    """Write a cloud with the labels of its segmentation to a file, and replace an existing one.
 
-    The file holds what `labelled_cloud` returns: the cloud with all its columns, and the columns ``object``, ``part``,
-    ``supervoxel`` and those of the levels. `Segmentation.save` keeps the graph and the tree as well.
+    The file holds the cloud that `labelled_cloud` returns: all its own columns, and the columns ``object``, ``part``,
+    ``supervoxel`` and those of the levels. After an error the file is as it was before. `Segmentation.save` writes the
+    graph and the tree, too.
 
     Parameters
     ----------
     path : str or path
-        Any format that `write_cloud` writes. Formats other than PCD, NPY and NPZ hold the finite points only.
+        File in any format that `write_cloud` writes. Formats other than PCD, NPY and NPZ hold the finite points only.
     cloud, segmentation, levels, colorize
         As for `labelled_cloud`.
 
     Raises
     ------
     CloudWriteError
-        The extension is another, the place cannot be written, or the format cannot hold a column.
+        The suffix is unknown, the file cannot be written, or the format cannot hold a column.
     ValueError
         As for `labelled_cloud`.
 
@@ -116,8 +117,9 @@ def write_segmentation(
 
 
 def label_colors(labels: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Colour of each label, its shape + (3,) uint8: hues a golden angle apart, so that near numbers differ; grey if
-    negative.
+    """Colour of each label, uint8 of the labels' shape + (3,); grey for negative labels.
+
+    Hues are a golden angle apart, so that labels with close numbers look different.
     """
     hue = labels * 0.618033988749895 % 1.0
     value = 0.95 - 0.25 * (labels // 8 % 3) / 2.0
@@ -128,7 +130,7 @@ def label_colors(labels: NDArray[np.int32]) -> NDArray[np.uint8]:
 
 
 def _beside(taken: Iterable[str], ours: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
-    """Our columns under names that no column of the cloud has, in upper or lower case."""
+    """The new columns under names that no column of the cloud has, in upper or lower case."""
     lower = {name.lower() for name in taken}
     prefixes = ("", "pcgraph_", *(f"pcgraph{i}_" for i in range(2, len(lower) + 2)))
     return {next(p + name for p in prefixes if (p + name) not in lower): column for name, column in ours.items()}

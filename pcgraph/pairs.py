@@ -25,7 +25,8 @@ def not_among(pairs: NDArray[np.int32], others: NDArray[np.int32]) -> NDArray[np
 
 
 _FEW_DISTANCES = 1 << 18
-"""Distances that are computed one by one, which takes 4 ms; to import SciPy's trees takes a quarter of a second."""
+"""Largest count of distances that are computed one by one, because that takes 4 ms, and the import of SciPy's trees
+takes a quarter of a second."""
 
 
 def nearest(

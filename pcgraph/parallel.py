@@ -36,9 +36,10 @@ inlined = _compiled(inline="always")
 _A = TypeVar("_A")
 _B = TypeVar("_B")
 MIN_BLOCK = 4096
-"""Elements; starting a thread costs as much as some thousands of them."""
+"""Least count of elements in a thread's block, because the start of a thread costs as much as some thousands of
+them."""
 MIN_ROWS = 16
-"""The same for elements that are rows of an image."""
+"""Least count of image rows in a thread's block, for the same reason."""
 
 
 def in_blocks(loop: Callable[..., _A], n: int, *arguments: object, smallest: int = MIN_BLOCK) -> list[_A]:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening a saved segmentation: no array comes to a kernel before its shape, range and order are checked.
+"""Saved segmentations: `load_segmentation` opens the files that `Segmentation.save` writes.
 
-`Segmentation.save` writes the file. The rows of `ARRAYS` are the arrays that it may hold.
+Shape, range and order of each array are checked before a kernel uses it. `ARRAYS` has a row for each array that a file
+may hold.
 """
 
 from __future__ import annotations
@@ -40,36 +41,37 @@ from pcgraph.voxels.grid import VoxelGrid
 from pcgraph.voxels.warp import CameraWarp, RangeWarp, Warp
 
 _FOR_TYPE_CHECKERS = {"Continuations": Continuations}
-"""Types of fields whose modules import them for type checkers alone."""
+"""Types of fields that their modules import only for type checkers."""
 _MAX_LEVEL = 4
-"""Number of times that the edge of a voxel is doubled, at most (`Grading`)."""
+"""Largest count of times that the edge of a voxel is doubled. Source: `Grading`."""
 _MAX_LENGTH = 1e102
-"""Metres, largest length: coordinates of clouds are 1e100 at most (`pcgraph.inputs`), ranges a few times that. Squares
-of far larger ones overflow, and a loop that waits for a least distance does not end where all are NaN."""
+"""Largest length, metres: coordinates of clouds are 1e100 at most (`pcgraph.inputs`), and ranges a few times that.
+Squares of far larger lengths overflow. A loop that waits for a least distance does not end where all are NaN."""
 _MAX_SCATTER = 1e225
-"""Square metres, largest scatter: the square of such lengths, of 10^18 points."""
+"""Largest scatter, square metres, because the squares of such lengths, summed over 10^18 points, are 1e222."""
 _MAX_COUNT = 1 << 53
-"""Points of a voxel or a node, less than: sums of such counts are exact as floats, too."""
+"""The count of points in a voxel or a node is below this, so that sums of counts are exact as float64, too."""
 _ROUNDING = 1e-6
-"""Relative difference that rounding may make, at most, also between two machines. Chosen by eye; not varied."""
+"""Largest relative difference that rounding may make, a fraction, also between two machines. Chosen by eye; not
+varied."""
 _UNIT = 1.0 + _ROUNDING
-"""Largest absolute value of what is 1 at most, because it was rounded."""
+"""Largest absolute value of numbers that are 1 at most, dimensionless, because they may have been rounded up."""
 
 
 class Row(NamedTuple):
-    """An array of a saved segmentation, or several alike.
+    """Shape and range of one array of a saved segmentation, or of several similar ones.
 
     Attributes
     ----------
     shape : str
-        Numbers and names of dimensions, separated by spaces. A name stands for one number throughout the file: n
+        Numbers and names of dimensions, separated by spaces. A name means the same number throughout the file: n
         points that have a supervoxel; v voxels; e entries of the lists of touching voxels; k supervoxels; t nodes of
         the tree; m edges, g gaps, r continuations and b bridges; d columns of features; c blocks;
         p supervoxels before the last update. "points" is the leading shape of the input. "..." is any shape.
     least, below : int, or the name of a dimension
-        Range of whole numbers. None: there is no such limit.
+        Range of whole numbers, least <= number < below. None: no limit.
     largest : float, or None
-        Largest absolute value of floats. None: NaN and infinite numbers may be there.
+        Largest absolute value of floats. None: no limit; NaN and infinite numbers are allowed.
     """
 
     shape: str
@@ -136,30 +138,30 @@ ARRAYS: dict[str, Row] = {
     "surface/grid/grading/blocks": Row("c 3"),
     "surface/grid/grading/levels": Row("c", 1, _MAX_LEVEL + 1),
 }
-"""The arrays of a saved segmentation by path; of several rows that fit, the first counts. * is any text."""
+"""The arrays of a saved segmentation by path, in which * is any text. If several rows fit a path, the first counts."""
 
 
 def load_segmentation(
     path: str | PathLike[str], *, linkage: Linkage | None = None, method: SupervoxelMethod | None = None
 ) -> Segmentation:
-    """Segmentation of a file that `Segmentation.save` wrote, equal to the saved one in every field and every bit.
+    """Segmentation from a file that `Segmentation.save` wrote, equal to the saved one in every field and every bit.
 
-    Cuts, detection, metrics and `pcgraph.update` go on from it as from the saved one.
+    Cuts, detection, metrics and `pcgraph.update` continue from it as from the saved one.
 
     Parameters
     ----------
     path : str or path
     linkage, method : optional
-        Linkage and method, if the segmentation was made with a class of your own, unless the class is loaded already
-        and is a dataclass of plain values. A file runs nothing, and imports nothing.
+        Needed if the segmentation was made with a linkage or method class of your own, unless that is a loaded
+        dataclass of plain values. Opening a file imports no module and runs no code from it.
 
     Raises
     ------
     CloudReadError
-        The file cannot be read, is no saved segmentation or of another version, was changed or cut off, or was made
-        with a linkage or a method that is not loaded.
+        The file cannot be read, is not a saved segmentation, has another version, or was changed or cut off. Or it was
+        made with a linkage or a method whose class is not loaded.
     ValueError
-        `linkage` or `method` is none, or has another class than the one that was saved.
+        `linkage` or `method` is not one, or its class is not the saved one.
 
     Examples
     --------
@@ -188,7 +190,7 @@ def load_segmentation(
 
 
 def _archive(path: Path) -> Archive:
-    """The content of a file, if `Segmentation.save` wrote it, without the cloud."""
+    """The archive in a file that `Segmentation.save` wrote, without the cloud."""
     try:
         is_whole = is_sealed(path, SAVED_MARK, at_end=True)
     except OSError as error:
@@ -209,7 +211,7 @@ def _archive(path: Path) -> Archive:
 
 
 def _segmentation(archive: Archive, given: Mapping[str, Any]) -> Segmentation:
-    """The segmentation of an archive, checked, with the linkage and the method of the caller, if these are given."""
+    """The checked segmentation of an archive, with the linkage and the method that the caller gave, if any."""
     kinds, found = get_type_hints(Segmentation), {}
     for name in field_names(Segmentation):
         if given.get(name) is None:
@@ -227,7 +229,7 @@ def _segmentation(archive: Archive, given: Mapping[str, Any]) -> Segmentation:
 
 
 def _check_all_used(archive: Archive, result: Segmentation, given: list[str]) -> None:
-    """Raise DamagedError if an archive holds something that is not in the result."""
+    """Raise DamagedError if an archive holds values that the result does not have."""
     used = Archive()
     for name in field_names(Segmentation):
         if name not in given:
@@ -242,7 +244,7 @@ def _check_all_used(archive: Archive, result: Segmentation, given: list[str]) ->
 
 
 def _check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Raise DamagedError if an array is not as its row of `ARRAYS` says."""
+    """Raise DamagedError if an array has not the shape and range of its row of `ARRAYS`."""
     sizes: dict[str, tuple[int, ...]] = {}
     rows = {name: row for name in arrays if (row := row_of(name)) is not None}
     for name, row in rows.items():
@@ -253,7 +255,7 @@ def _check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def row_of(name: str) -> Row | None:
-    """The row of `ARRAYS` for an array; None for those of a method or linkage."""
+    """The row of `ARRAYS` for an array; None for the arrays of a method or linkage."""
     if name.startswith(("method/", "linkage/")):
         return None
     found = next((row for pattern, row in ARRAYS.items() if fnmatchcase(name, pattern)), None)
@@ -263,7 +265,7 @@ def row_of(name: str) -> Row | None:
 
 
 def _check_shape(name: str, array: NDArray[Any], row: Row, sizes: dict[str, tuple[int, ...]]) -> None:
-    """Raise DamagedError unless dimensions of one name have one size; `sizes` takes those that are new."""
+    """Raise DamagedError if a dimension has another size than in `sizes`; new dimensions are added to `sizes`."""
     if row.shape == "...":
         return
     names = row.shape.split()
@@ -292,11 +294,11 @@ def _check_range(name: str, array: NDArray[Any], row: Row, below: int | None) ->
             raise DamagedError(f"expected numbers from {row.least}{upper} in the array {name}, got {least} to {most}")
 
 
-# --- checks of what arrays say together -------------------------------------------------------------------------------
+# --- checks of several arrays together --------------------------------------------------------------------------------
 
 
 def _check(found: Segmentation) -> None:
-    """Raise DamagedError unless the parts of a segmentation, whose arrays are sound, fit each other."""
+    """Raise DamagedError unless the parts of a segmentation fit each other; each array was checked before."""
     _expect(found.tree.moments is not None, "moments of the tree")
     _check_lists(found.surface.grid)
     with np.errstate(all="ignore"):  # of numbers that are then refused

@@ -70,7 +70,7 @@ def segment(
     Parameters
     ----------
     points : (n, 3) or (h, w, 3) float or integer, metres, any frame; or a Cloud, or the name of a file
-        Or whatever else `pcgraph.as_cloud` takes: arrays of more columns, messages of robots, Open3D's clouds.
+        Or any other source that `pcgraph.as_cloud` takes: arrays with further columns, ROS messages, Open3D's clouds.
         Colours, normals and viewpoint of a `Cloud` or file are used where none are given beside it. Points that are
         NaN, infinite, masked, or (0, 0, 0) as drivers write holes, are labelled -1, and so are outliers.
     colors : same shape, uint8 0..255 or float 0..1, optional
@@ -159,7 +159,7 @@ def supervoxel_clustering(
     range_growth: float | None = None,
     method: SupervoxelMethod | None = None,
 ) -> Supervoxels:
-    """Supervoxels of a point cloud and their adjacency graph: the first half of `segment`, for those who need no tree.
+    """Supervoxels of a point cloud and their adjacency graph, without a tree: the first half of `segment`.
 
     Parameters
     ----------
@@ -246,7 +246,7 @@ class Scan:
 
 
 def segment_scan(scan: Scan, earlier: History | None, settings: Settings) -> Segmentation:
-    """Segmentation of a scan, and of what is kept of earlier ones: the algorithm from voxels on."""
+    """Segmentation of a scan together with the history of earlier ones: the algorithm from voxels on."""
     return merge_supervoxels(cluster_scan(scan, earlier, settings.method), earlier, settings)
 
 
@@ -351,7 +351,7 @@ def _leaves(cloud: CleanCloud, surface: Surface, leaf_of_point: NDArray[np.int32
 
 
 def _ages(leaf_of_point: NDArray[np.int32], n_leaves: int, earlier: History | None) -> NDArray[np.int32]:
-    """Number of scans since the last one that saw each supervoxel, (n_leaves,) int32."""
+    """Number of scans since a scan last saw each supervoxel, (n_leaves,) int32."""
     ages = np.zeros(n_leaves, np.int32)
     if earlier is not None:
         ages[: len(earlier.ages)] = earlier.ages + 1

@@ -36,13 +36,14 @@ if TYPE_CHECKING:
     from pcgraph.graph.occlusion import Occlusions
 
 SAVED_FORMAT = "pcgraph segmentation"
-"""Name of the format of saved segmentations, in the header of each."""
+"""Name of the format in the header of each saved segmentation."""
 SAVED_VERSION = 1
-"""Version of that format. It rises as soon as a file of the one before cannot be read as a file of this one."""
+"""Version of that format, a count from 1. It rises when files of the version before cannot be read as files of this
+one."""
 SAVED_MARK = "pcgraph-segmentation"
 """Mark of the seal of saved segmentations, in the comment at the end of each."""
 NOT_STORED = " (settings not stored)"
-"""What follows the name of a method or linkage in the header if an archive has no form for its settings."""
+"""Suffix of the name of a method or linkage in the header, if an archive cannot hold its settings."""
 
 
 @dataclass(frozen=True)
@@ -136,8 +137,8 @@ class Segmentation:
     ages : (k,) int32
         Number of scans since the last one that saw a point of each supervoxel; 0 for those of the last scan.
     supervoxel_of_earlier : (k_earlier,) int32
-        Number that each supervoxel of the segmentation before the last update has in this one, -1 if it was forgotten.
-        After `pcgraph.segment` there is none.
+        New number of each supervoxel of the segmentation before the last update; -1 if it was forgotten. It is empty
+        after `pcgraph.segment`.
     feature_scaling : RobustScaling, or None
         Center and spread of each column of the features; None if none were given.
     next_object : int
@@ -235,8 +236,8 @@ class Segmentation:
     def with_objects(self, n: int | None = None, altitude: float | None = None, min_size: int = 1) -> Segmentation:
         """The same segmentation with another cut of its tree as its objects; parameters as for `SegmentationTree.cut`.
 
-        `labels`, `objects` and `object_altitude` change; whatever asks for objects (`parts`, `groups`, `update`,
-        detection, `write_segmentation`) then works with these.
+        `labels`, `objects` and `object_altitude` change. `parts`, `groups`, `update`, detection and
+        `write_segmentation` then use the new objects.
 
         Raises
         ------
@@ -291,12 +292,12 @@ class Segmentation:
         return np.concatenate((rows, np.full((1, *rows.shape[1:]), missing, rows.dtype)))[self.supervoxels]
 
     def of_earlier(self, supervoxels: ArrayLike) -> NDArray[np.int32]:
-        """Supervoxels of this segmentation, given their numbers before the last update, any shape; -1 if forgotten.
+        """New numbers of supervoxels, given those before the last update; -1 for forgotten ones.
 
         Parameters
         ----------
         supervoxels : (...) int
-            Such as the earlier segmentation's `supervoxels`, of its points; -1, of points without one, stays -1.
+            For example the earlier segmentation's `supervoxels`. -1, for points without a supervoxel, stays -1.
 
         Examples
         --------
@@ -369,15 +370,15 @@ class Segmentation:
         return fit_primitives(primitive_moments_up_tree(leaves, self.tree.parents))
 
     def save(self, path: str | PathLike[str], cloud: Any = None) -> None:
-        """Write the segmentation, whole or not at all; an older file of that name is replaced.
+        """Write the segmentation to a file, and replace an existing one; after an error the file is as it was before.
 
-        `pcgraph.load_segmentation` opens it again, and goes on from it as from this one.
+        `pcgraph.load_segmentation` returns an equal segmentation.
 
         Parameters
         ----------
         path : str or path, ``.npz``
-            One array for each field, under a name such as ``graph/edges`` (docs/pcgraph.md lists them), and all other
-            values as JSON in the array ``header``. Nothing is pickled or compressed.
+            The file has one array for each field, under a name such as ``graph/edges`` (docs/files.md lists them). All
+            other values are JSON in the array ``header``. Nothing is pickled or compressed.
         cloud : Cloud, or anything else that `as_cloud` takes, optional
             The cloud that was segmented, after an update the last scan. It is stored, too, under ``cloud/points``,
             ``cloud/columns/intensity`` and the like, and `pcgraph.read_cloud` reads it from the same file.
@@ -428,7 +429,7 @@ class Segmentation:
 
 
 def segmented_cloud(cloud: Any, segmentation: Segmentation) -> Cloud:
-    """The cloud that was segmented, of anything that `as_cloud` takes; ValueError if it has another shape."""
+    """The cloud that was segmented, from anything that `as_cloud` takes; ValueError if it has another shape."""
     found, shape = as_cloud(cloud), segmentation.supervoxels.shape
     if np.shape(found.points) != (*shape, 3):
         expected = f"the points that were segmented, of shape {(*shape, 3)}"

@@ -35,11 +35,11 @@ def update(
 ) -> Segmentation:
     """Segmentation of a scene after one more scan of it.
 
-    Supervoxels keep what they hold: the new points join those whose voxels they fall into, or beside which they lie on
-    the same surface, or found new ones. Graph and tree are made anew, over all that is remembered. An object keeps its
-    number as long as most of it stays together; the number of an object that has joined another is not given to a
-    third. The points of earlier scans are not needed, and a scan costs time for its own points and for the voxels of
-    the scene, not for the points seen before. What is old, or has moved away, is forgotten if that is asked for.
+    Supervoxels keep their points. A new point joins the supervoxel whose voxel it falls into, or one beside it on the
+    same surface; other points form new supervoxels. Graph and tree are computed again for all that is remembered. An
+    object keeps its number as long as most of it stays together. The number of an object that has joined another is not
+    used again. The points of earlier scans are not needed: a scan takes time for its own points and for the voxels of
+    the scene. `max_age` and `carve_free_space` forget what is old or has moved away.
 
     Parameters
     ----------
@@ -50,48 +50,47 @@ def update(
     method, linkage, object_altitude
         As for `pcgraph.segment`; default: those of the earlier scan.
     max_age : int, >= 0, optional
-        Number of scans for which a supervoxel is remembered after the last one that saw it. What is older is forgotten
-        before the new scan is added; 0: all of it. A stream without end needs it, so that time and memory have a bound.
-        Default: nothing is too old.
+        Number of scans for which a supervoxel is remembered after a scan last saw it. Older ones are forgotten before
+        the new scan is added; 0 forgets all. A stream without end needs a limit, so that time and memory are bounded.
+        Default: no limit.
     carve_free_space : bool
-        Whether supervoxels are forgotten that the new scan sees through, as those of what has moved away. It takes one
-        viewpoint of the scan. True is for a scene as it is now, False for a map of all that was seen.
+        Whether to forget supervoxels that the new scan sees through, because they have moved away. The scan must have
+        one viewpoint. True keeps the scene as it is now, False keeps a map of everything that was seen.
 
     Returns
     -------
     Segmentation
         `labels` and `supervoxels` are those of the new points; `graph`, `tree` and `surface` those of the whole
-        scene. Supervoxels keep their numbers if none is forgotten, so that the objects of an earlier scan's points are
-        now ``result.objects[earlier.supervoxels]``. If some are, the others are numbered without gaps, in their order;
-        `Segmentation.of_earlier` tells the new numbers. Objects keep theirs.
+        scene. If no supervoxel is forgotten, all keep their numbers. The objects of an earlier scan's points are then
+        ``result.objects[earlier.supervoxels]``. If some are forgotten, the others are numbered without gaps, in the
+        same order; `Segmentation.of_earlier` returns the new numbers. Objects keep their numbers.
 
     Raises
     ------
     ValueError
         As for `pcgraph.segment`; or the earlier scan's voxels grow with a camera's depth and a new point does not
         lie in front of that camera (segment the first scan with ``camera=False``); or one scan has colours or
-        features and the other none; or `max_age` is no whole number; or free space shall be carved, but the new scan
+        features and the other none. Or `max_age` is not a whole number. Or `carve_free_space` is True, but the new scan
         has no viewpoint, or one for each point.
 
     Warns
     -----
     CloudWarning
-        As `pcgraph.segment`; or the new scan sees through most of what it should see of the earlier ones, as in another
-        frame. That is looked at if it has one viewpoint.
+        As `pcgraph.segment`. Also if the new scan sees through most earlier voxels in its view, as it would in another
+        frame; this needs one viewpoint.
 
     Notes
     -----
-    A supervoxel is remembered or forgotten as a whole: the points of which it is made are not kept, so that no part of
-    it could be taken out of its moments. It is seen through if something is measured more than two voxel edges behind
-    more of its voxels than not, of those that nothing nearer hides; a measurement that met nothing tells nothing. So
-    what stood before the sky, or is hidden now, stays. A still scene loses up to 0.005 of its voxels per scan if poses
-    are right to two voxel edges, its leaves and glass up to 0.08 (docs/pcgraph_method.md). Source: free space as in
-    OctoMap (Hornung et al. 2013), but without counts of hits and misses. `max_age` is that of trackers such as SORT
-    (Bewley et al. 2016).
+    A supervoxel is remembered or forgotten as a whole: its points are not kept, so that no part can be subtracted from
+    its moments. It is seen through if most of its voxels that nothing nearer hides have a measurement more than two
+    voxel edges behind them. A ray that met nothing is no measurement, so supervoxels before the sky stay, and so do
+    hidden ones. A still scene loses up to 0.005 of its voxels per scan if poses are right to two voxel edges, its
+    leaves and glass up to 0.08 (docs/pcgraph_method.md). Sources: free space as in OctoMap (Hornung et al. 2013), but
+    without counts of hits and misses; `max_age` as in trackers such as SORT (Bewley et al. 2016).
 
-    Voxels stay as large as the first scan needed, also where that had points far apart and a later one has many. Where
-    voxels grow with depth or range, they grow with that from the first place: give the first scan of a sensor that
-    moves on ``camera=False, range_growth=0``.
+    Voxels keep the size that the first scan needed, even where a later scan is denser. Where voxels grow with depth or
+    range, these are measured from the first viewpoint. If the sensor moves, segment the first scan with
+    ``camera=False, range_growth=0``.
 
     Examples
     --------

@@ -51,7 +51,8 @@ scores as well (docs/pcgraph_experiments.md)."""
 _SAMPLED_VOXELS = 64
 """Count of voxels whose points' viewpoints are candidates for these places: chosen by eye, not varied."""
 _FAR_AWAY = 1e3
-"""Distance, in voxel edges, of the points that fix the sign of a plane's normal: so far that rays are parallel."""
+"""Distance, in voxel edges, of the points that fix the sign of a plane's normal: far enough, so that rays are nearly
+parallel."""
 _UPWARDS = np.array([0.0, 0.0, 1.0])
 
 PlanesFrom = Callable[[VoxelGrid, NDArray[np.float64]], LocalPlanes]

@@ -24,7 +24,8 @@ from pcgraph.voxels.outliers import MIN_POINTS
 
 _SAMPLE = 4096
 """Values of which it is asked first whether they are even; chosen by eye, for the time's sake."""
-_NOTHING = -1  # stands for an axis to divide by, if there is none
+_NOTHING = -1
+"""Value of the axis to divide by where there is none: the axes are 0, 1 and 2."""
 _MIN_FILLED = 0.2
 """Fraction of an image's pixels that are points, at least: with less, accidents are likelier; chosen by eye."""
 

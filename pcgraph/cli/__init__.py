@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command ``pcgraph``, with one module for each subcommand.
 
-Modules that take long to import are imported inside the functions of the commands, so that `--help` is quick.
+Slow imports are inside the functions of the commands, so that `--help` is quick.
 """
 
 from __future__ import annotations

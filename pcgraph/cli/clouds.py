@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds and results that commands read and write: files, folders and pipes."""
+"""Input and output of the commands: clouds and segmentations in files, folders and pipes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 PIPE = "-"
 """Argument that stands for stdin or stdout."""
 SAVED = ".segmentation.npz"
-"""End of the name of a segmentation that opens again."""
+"""Suffix of the files of saved segmentations."""
 
 
 def read_input(name: str, file_format: str | None = None, columns: str | None = None) -> Cloud:
@@ -34,7 +34,7 @@ def read_input(name: str, file_format: str | None = None, columns: str | None = 
     ----------
     name : str
     file_format : str, optional
-        Name of the format; stdin needs one.
+        Name of the format. Stdin needs one.
     columns : str, optional
         Names of the columns of a text file without a header, separated by commas.
     """
@@ -49,7 +49,7 @@ def read_input(name: str, file_format: str | None = None, columns: str | None = 
 
 
 def is_saved(path: Path) -> bool:
-    """Whether a file is an archive that holds the tree of a segmentation."""
+    """Whether a file is an archive with the tree of a segmentation."""
     return _is_in_archive("tree/parents.npy", path)
 
 
@@ -66,7 +66,7 @@ def _is_in_archive(name: str, path: Path) -> bool:
 
 
 def read_saved(path: Path) -> tuple[Cloud, Segmentation]:
-    """A saved segmentation and the cloud in its file."""
+    """The cloud and the segmentation in the file of a saved segmentation."""
     from pcgraph.io import read_cloud
     from pcgraph.saved_segmentation import load_segmentation
 
@@ -98,16 +98,16 @@ def segmented(name: str, cloud: Cloud, **settings: Any) -> Segmentation:
 
 
 def output_paths(name: str, out: Path | None, suffix: str | None) -> list[Path]:
-    """The files that a command writes for one input: the labelled cloud and the segmentation that opens again.
+    """Files that a command writes for one input: the labelled cloud and the saved segmentation.
 
     Parameters
     ----------
     name : str
-        The input.
+        Name of the input.
     out : Path, optional
-        A file is the only output. In a folder, by default the current one, there are both.
+        A file is the only output. A folder gets both files. Default: the current folder.
     suffix : str, optional
-        End of the labelled cloud's name. Default: that of the input if its format holds columns, else ``.ply``.
+        Suffix of the labelled cloud. Default: that of the input if its format holds columns, else ``.ply``.
     """
     from pcgraph.io import check_writable, holds_columns, without_suffix
 
@@ -126,11 +126,11 @@ def output_paths(name: str, out: Path | None, suffix: str | None) -> list[Path]:
 
 
 def check_outputs(paths: list[Path], inputs: list[str], overwrite: bool) -> None:
-    """Raise CloudWriteError if an output is an input, exists already or cannot be written; this writes nothing."""
+    """Raise CloudWriteError if an output is an input, exists already or cannot be written; nothing is written."""
     given = {os.path.realpath(name) for name in inputs if name != PIPE}
     if len(set(paths)) < len(paths):
         twice = next(path for path in paths if paths.count(path) > 1)
-        raise CloudWriteError(f"two inputs would be written to {twice}: give their outputs folders of their own")
+        raise CloudWriteError(f"two inputs would be written to {twice}: choose another --out for one of them")
     for path in paths:
         if os.path.realpath(path) in given:
             raise CloudWriteError(f"{path} is an input: choose another --out")
@@ -148,7 +148,7 @@ def check_outputs(paths: list[Path], inputs: list[str], overwrite: bool) -> None
 def write_results(
     paths: list[Path], cloud: Cloud, result: Segmentation, levels: tuple[int, ...] = (), colorize: bool = False
 ) -> None:
-    """Write all files of a result or none: ``.npz`` opens again as a segmentation, others are the labelled cloud."""
+    """Write all files of a result, or none: saved segmentations (``.npz``) and labelled clouds (other suffixes)."""
     from pcgraph.io import encode_cloud
     from pcgraph.labelling import labelled_cloud
     from pcgraph.plumbing.plain_files import write_files
@@ -165,7 +165,7 @@ def write_results(
 
 
 def numbers(text: str | None, option: str) -> tuple[int, ...]:
-    """Whole numbers of at least 1, separated by commas."""
+    """Whole numbers of at least 1 from a text in which commas separate them; ValueError for any other text."""
     words = [] if text is None else [word.strip() for word in text.split(",")]
     if not all(word.isascii() and word.isdigit() and int(word) for word in words):
         raise ValueError(f"expected {option} as whole numbers with commas, such as 10,50,200, got {text!r}")
@@ -174,7 +174,7 @@ def numbers(text: str | None, option: str) -> tuple[int, ...]:
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Errors of files and arguments as one sentence on stderr and exit status 1."""
+    """Context in which an error of a file or an argument becomes one sentence on stderr and the exit status 1."""
     try:
         yield
     except (PcgraphError, ValueError, MemoryError, OSError) as error:
@@ -183,14 +183,14 @@ def refusals() -> Iterator[None]:
 
 
 def sentence(error: Exception) -> str:
-    """The message of an error on one line."""
+    """Message of an error as one sentence on one line."""
     message = said(error) if isinstance(error, OSError) else str(error)
     message = without_long_words(message) or "the cloud does not fit into memory: choose a larger voxel size"
     return f"{one_line(message).rstrip('.')}."
 
 
 def result_record(result: Segmentation) -> dict[str, Any]:
-    """Counts, sizes and the acquisition of a segmentation, as JSON takes them."""
+    """Counts, sizes and the acquisition of a segmentation as plain values for JSON."""
     import numpy as np
 
     return {
@@ -221,7 +221,7 @@ def print_row(name: str, value: object) -> None:
 
 
 def object_records(cloud: Cloud, result: Segmentation) -> list[dict[str, Any]]:
-    """Number, count of points and box of each object, as JSON takes them; the largest object first."""
+    """Number, count of points and box of each object as plain values for JSON, with the largest object first."""
     import numpy as np
 
     from pcgraph.detection.boxes import boxes_of_labels

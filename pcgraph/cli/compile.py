@@ -10,13 +10,13 @@ import typer
 
 
 def compile_command() -> None:
-    """Compile what the first segmentation of an installation would compile, so that it need not wait.
+    """Compile all kernels now, so that the first segmentation of an installation does not wait for them.
 
-    What is compiled already is left as it is.
+    Kernels that are compiled already stay as they are.
     """
     from pcgraph.all_kernels import compile_kernels
 
-    logging.getLogger("pcgraph").setLevel(logging.ERROR)  # whoever asks for it knows what is waited for
+    logging.getLogger("pcgraph").setLevel(logging.ERROR)  # the message about compiling is no news to this user
     start = time.perf_counter()
     compile_kernels()
     typer.echo(f"{'seconds':<12} {time.perf_counter() - start:.2f}")

@@ -32,7 +32,7 @@ def cut_command(
     boxes: Annotated[bool, typer.Option("--boxes", help="Print each object with its box as a line of JSON.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an output that exists.")] = False,
 ) -> None:
-    """Cut a saved segmentation at another level, without computing it again.
+    """Cut the tree of a saved segmentation at another level; nothing is segmented again.
 
     Example: pcgraph cut scan.segmentation.npz --objects 200 --out finer.laz
     """

@@ -40,7 +40,7 @@ def info_command(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one line of JSON for each file.")] = False,
 ) -> None:
-    """Print what files hold: points, extent, spacing, columns with their types and ranges.
+    """Print the content of files: points, extent, spacing, and columns with their types and ranges.
 
     Example: pcgraph info scan.laz
     """
@@ -61,7 +61,7 @@ def info_command(
 
 
 def _record(name: str, file_format: str | None, columns: str | None) -> dict[str, Any]:
-    """The content of a file, as JSON takes it: of a cloud, of a saved segmentation, or of both."""
+    """Content of a file as plain values for JSON: of a cloud, of a saved segmentation, or of both."""
     if name == PIPE or not is_saved(Path(name)):
         return _cloud_record(read_input(name, file_format, columns))
     from pcgraph.saved_segmentation import load_segmentation
@@ -72,7 +72,7 @@ def _record(name: str, file_format: str | None, columns: str | None) -> dict[str
 
 
 def _cloud_record(cloud: Cloud) -> dict[str, Any]:
-    """The content of a cloud, as JSON takes it."""
+    """Content of a cloud as plain values for JSON."""
     import numpy as np
 
     from pcgraph.voxels.spacing import median_spacing

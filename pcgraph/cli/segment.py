@@ -128,9 +128,9 @@ def segment_command(
 ) -> None:
     """Segment point clouds into objects, and write labels, supervoxels, graph and tree.
 
-    For scan.laz it writes scan.segments.laz, the cloud with all its columns and the columns object, part and
-    supervoxel, and scan.segmentation.npz, which `pcgraph view`, `pcgraph cut` and load_segmentation open again.
-    With --out FILE only that file is written: the segmentation if it ends in .npz, else the labelled cloud.
+    For scan.laz it writes two files. scan.segments.laz is the cloud with all its columns and the columns object, part
+    and supervoxel. scan.segmentation.npz is for `pcgraph view`, `pcgraph cut` and load_segmentation.
+    With --out FILE it writes that file only: the segmentation if it ends in .npz, else the labelled cloud.
     If one of several clouds cannot be read or segmented, the others are still done, and the exit status is 1.
 
     Examples:
@@ -210,7 +210,7 @@ def _linkage(name: str) -> Linkage:
 
 
 def _summary(name: str, cloud: Cloud, result: Segmentation, written: list[Path], seconds: float) -> dict[str, Any]:
-    """Record of one cloud, as JSON takes it."""
+    """Summary of the segmentation of one cloud, as plain values for JSON."""
     return {
         "cloud": name,
         "points": math.prod(cloud.points.shape[:-1]),

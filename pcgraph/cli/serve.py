@@ -42,9 +42,9 @@ def serve_command(
         Path | None, typer.Option(help="Where the private folder is made. Default: the one for temporary files.")
     ] = None,
 ) -> None:
-    """Serve segmentations over HTTP: clouds in; labels at any level, objects, trees and views out.
+    """Segment clouds over HTTP; clients get labels at any level, objects, trees and viewer pages.
 
-    docs/service.md describes the operations; /openapi.json does so for programs. Ctrl-C ends the service.
+    docs/service.md describes the operations, and /openapi.json does so for programs. Ctrl-C ends the service.
 
     Example: pcgraph serve --port 8000
     """

@@ -25,9 +25,9 @@ def view_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a page that exists.")] = False,
     open_page: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
 ) -> None:
-    """Write one HTML page that shows a cloud in a browser, offline.
+    """Write one HTML page that shows a cloud in a browser, also without a network.
 
-    A folder becomes one page with a chooser over its files.
+    For a folder it writes one page with a menu of the folder's files.
 
     Example: pcgraph view scan.segmentation.npz --open
     """

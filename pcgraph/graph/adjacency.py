@@ -186,7 +186,7 @@ class AdjacencyGraph(ShortRepr):
         """The graph as ``networkx.Graph``, with features and `boundary_strength` as attributes of the same names.
 
         Vectors are split (``normal_x``), and all numbers are Python's, so that JSON, GEXF and GraphML take the graph.
-        What has no finite value is left out, as colours of a cloud without any: JSON has neither NaN nor infinity.
+        Values that are not finite, such as missing colours, are left out, because JSON has neither NaN nor infinity.
 
         Parameters
         ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds in files: one function reads all formats, one writes them."""
+"""Point clouds in files: `read_cloud` reads all formats, and `write_cloud` writes most of them."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from pcgraph.plumbing.plain_files import read_file, write_file
 __all__ = ["decode_cloud", "encode_cloud", "read_cloud", "sample_surface", "write_cloud"]
 
 MAX_REASON = 300
-"""Characters of a message about a damaged file, count: such files can make messages of any length. Chosen by eye; not
-varied."""
+"""Largest count of characters in a message about a damaged file, because it may quote text of any length from the file.
+Chosen by eye; not varied."""
 FORMATS: tuple[Format, ...] = (
     *(PCD, PLY, LAS, E57, NPZ, NPY),
     *(TEXT, PTS, PTX, XYZN, XYZRGB),
@@ -45,18 +45,18 @@ def read_cloud(
     Parameters
     ----------
     path : str or path
-        Of any format of docs/files.md: LAS, LAZ, COPC, E57, PLY, PCD, text (``.xyz``, ``.csv``, ``.pts``, ``.ptx`` and
-        others), ``.npz``, ``.npy``, sweeps of KITTI, nuScenes and Ouster, the vertices of meshes (``.obj``, ``.stl``,
-        ``.off``, ``.glb``).
+        A file in any format of docs/files.md: LAS, LAZ, COPC, E57, PLY, PCD, text (``.xyz``, ``.csv``, ``.pts``,
+        ``.ptx`` and others), ``.npz``, ``.npy``, sweeps of KITTI, nuScenes and Ouster, the vertices of meshes
+        (``.obj``, ``.stl``, ``.off``, ``.glb``).
     file_format : str, optional
-        Name of the format, such as "ply". Default: by the end of the file's name.
-    columns : names, optional
+        Name of the format, such as "ply". Default: the suffix of the file's name tells the format.
+    columns : sequence of str, optional
         Names of the columns of a text file without a header, such as ["x", "y", "z", "intensity"].
 
     Raises
     ------
     CloudReadError
-        There is no such file, it is a directory, it has another extension, or its content is cut off or contradicts its
+        There is no such file, it is a directory, its suffix is unknown, or its content is cut off or contradicts its
         header.
     """
     path = Path(path)
@@ -67,13 +67,13 @@ def read_cloud(
 
 
 def decode_cloud(content: bytes, name: str, columns: Sequence[str] | None = None) -> Cloud:
-    """Cloud of the bytes of a file, as of an upload or from a pipe; its name tells the format.
+    """Cloud from the bytes of a file, for uploads and pipes; the file's name tells the format.
 
     Parameters
     ----------
     content : bytes
     name : str
-        Name of the file, such as "scan.ply"; nothing of that name need exist.
+        Name of the file, such as "scan.ply". No file of that name has to exist.
     columns : as for `read_cloud`
 
     Raises
@@ -93,11 +93,11 @@ def decode_cloud(content: bytes, name: str, columns: Sequence[str] | None = None
 
 
 def write_cloud(path: str | PathLike[str], cloud: Cloud, file_format: str | None = None) -> None:
-    """Write a cloud as a whole file, or none; an older file of that name is replaced.
+    """Write a cloud to a file, and replace an existing one; after an error the file is as it was before.
 
-    `read_cloud` of the file gives the same points, colours, normals, labels and columns, in their types and under
-    their names, but for what a format cannot hold: docs/files.md lists it. Lists of points, which all formats but PCD,
-    NPZ and NPY are, hold the finite points only.
+    `read_cloud` returns the same points, colours, normals, labels and columns, with their types and names.
+    docs/files.md lists what a format cannot hold. PCD, NPZ and NPY keep every point; all other formats keep the finite
+    points only.
 
     Parameters
     ----------
@@ -105,14 +105,14 @@ def write_cloud(path: str | PathLike[str], cloud: Cloud, file_format: str | None
     cloud : Cloud
         `pcgraph.as_cloud` makes one of arrays and of the clouds of other libraries.
     file_format : str, optional
-        Name of the format, such as "ply". Default: by the end of the file's name.
+        Name of the format, such as "ply". Default: the suffix of the file's name tells the format.
 
     Raises
     ------
     CloudWriteError
-        The extension is another, the place cannot be written, or the format cannot hold a column.
+        The suffix is unknown, the file cannot be written, or the format cannot hold a column.
     ValueError
-        `cloud` is no `Cloud`.
+        `cloud` is not a `Cloud`.
 
     Examples
     --------
@@ -127,22 +127,22 @@ def write_cloud(path: str | PathLike[str], cloud: Cloud, file_format: str | None
 
 
 def encode_cloud(cloud: Cloud, name: str) -> bytes:
-    """Bytes that `write_cloud` writes to a file of that name, which tells the format."""
+    """Bytes that `write_cloud` writes to a file of this name; the name tells the format."""
     return _encode(cloud, Path(name).name, None)
 
 
 def check_writable(name: str) -> None:
-    """Raise CloudWriteError unless `write_cloud` knows the format of a file of that name."""
+    """Raise CloudWriteError unless `write_cloud` can write a file of this name."""
     _format(name, None, _WRITABLE, CloudWriteError)
 
 
 def holds_columns(suffix: str) -> bool:
-    """Whether `write_cloud` can write a file that ends so, with columns of any name."""
+    """Whether `write_cloud` can write files with this suffix, and these hold columns of any name."""
     return any(suffix.lower() in one.suffixes and one.holds_columns for one in _WRITABLE)
 
 
 def without_suffix(name: str) -> str:
-    """The name of a file without the end that tells its format, or without its extension."""
+    """Name of a file without the suffix of its format, such as ``.copc.laz``; without its last suffix if none fits."""
     end = max((suffix for suffix in _suffixes(FORMATS) if name.lower().endswith(suffix)), key=len, default="")
     return name[: -len(end)] if end else Path(name).stem
 
@@ -167,7 +167,7 @@ def _encode(cloud: Cloud, name: str, file_format: str | None) -> bytes:
 def _format(
     name: str, file_format: str | None, formats: tuple[Format, ...], error: type[PcgraphError]
 ) -> tuple[Format, str]:
-    """The format of a name, or the one whose end the file's name has, and that end; of several ends the longest."""
+    """Format called `file_format`, else the format of the longest suffix that the file's name has; and that suffix."""
     ends = {suffix: one for one in formats for suffix in one.suffixes if name.lower().endswith(suffix)}
     if file_format is not None:
         named = [one for one in formats if one.name == file_format]
@@ -185,7 +185,9 @@ def _format(
 
 def _named(columns: Sequence[str] | None, chosen: Format) -> tuple[str, ...] | None:
     if columns is not None and not chosen.takes_names:
-        raise CloudReadError(f"expected columns for text files only, as a .{chosen.name} names its own: leave it out")
+        raise CloudReadError(
+            f"expected the argument columns for text files only: leave it out, as {chosen.name} files name their own"
+        )
     return None if columns is None else tuple(columns)
 
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sweeps of LiDARs in data sets of driving: KITTI's .bin, and nuScenes' .pcd.bin, which is no PCD file.
+"""Sweeps of LiDARs in driving data sets: ``.bin`` of KITTI, and ``.pcd.bin`` of nuScenes, which is not a PCD file.
 
-Both are float32, little end first, without a header; x to the front or right, z up, metres. KITTI has x, y, z,
-reflectance (Geiger et al., IJRR 32, 2013), nuScenes x, y, z, intensity, ring (Caesar et al., CVPR 2020). SemanticKITTI
-(Behley et al., ICCV 2019) adds ``labels/000000.label`` to ``velodyne/000000.bin``: 32 bits for each point, the lower 16
-are its class, the upper 16 number its object.
+Both hold float32 numbers, little-endian, without a header, in metres; x points forwards (KITTI) or right (nuScenes), z
+up. KITTI has x, y, z, reflectance (Geiger et al., IJRR 32, 2013). nuScenes has x, y, z, intensity, ring (Caesar et al.,
+CVPR 2020). SemanticKITTI (Behley et al., ICCV 2019) adds ``labels/000000.label`` to ``velodyne/000000.bin``. It has 32
+bits for each point: the lower 16 are the class, the upper 16 are the number of the object.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ from pcgraph.io.format import CloudFile, Format
 from pcgraph.plumbing.plain_files import read_file
 
 MAX_COORDINATE_M = 1e4
-"""Largest coordinate in a sweep, metres. Any LiDAR reaches far less."""
+"""Largest coordinate in a sweep, metres, because no LiDAR reaches that far: a file with larger ones has another
+layout. Chosen by eye; not varied."""
 MAX_RING = 255
-"""Largest number of a ring: no scanner has more than 256. nuScenes' has 32."""
+"""Largest ring number, a count from 0: no scanner has more than 256 rings; that of nuScenes has 32."""
 KITTI_COLUMNS = ("x", "y", "z", "intensity")
 NUSCENES_COLUMNS = (*KITTI_COLUMNS, "ring")
 
 
 def sweep_table(content: bytes, columns: tuple[str, ...]) -> NDArray[np.float32]:
-    """(n, c) float32 numbers of a sweep, one column for each of the names; a view of the content.
+    """(n, c) float32 numbers of a sweep, one column for each name; a view of the content.
 
     Raises
     ------
     CloudReadError
-        The content is empty, has another number of bytes, or points farther than `MAX_COORDINATE_M`.
+        The content is empty, its length is no multiple of a point's, or a coordinate is above `MAX_COORDINATE_M`.
     """
     if not content or len(content) % (4 * len(columns)):
         raise CloudReadError(
@@ -42,7 +43,7 @@ def sweep_table(content: bytes, columns: tuple[str, ...]) -> NDArray[np.float32]
         )
     table = np.frombuffer(content, "<f4").reshape(-1, len(columns))
     if not (np.abs(table[:, :3]) <= MAX_COORDINATE_M).all() or not np.isfinite(table[:, 3:]).all():
-        raise CloudReadError(f"expected points within {MAX_COORDINATE_M:g} m, got others or no numbers")
+        raise CloudReadError(f"expected finite numbers, and points within {MAX_COORDINATE_M:g} m, got others")
     return table
 
 
@@ -55,7 +56,7 @@ def read_kitti(file: CloudFile) -> Cloud:
     Raises
     ------
     CloudReadError
-        The content is no list of such points, or there are more or fewer labels than points.
+        The content is not a list of such points, or the number of labels differs from that of points.
     """
     table = sweep_table(file.content, KITTI_COLUMNS)
     cloud = _cloud(table, KITTI_COLUMNS)
@@ -76,7 +77,7 @@ def read_nuscenes(file: CloudFile) -> Cloud:
     Raises
     ------
     CloudReadError
-        The content is no list of such points, or a ring is no whole number from 0 to 255.
+        The content is not a list of such points, or a ring is not a whole number from 0 to 255.
     """
     table = sweep_table(file.content, NUSCENES_COLUMNS)
     if not _are_rings(table[:, 4]):
@@ -86,12 +87,12 @@ def read_nuscenes(file: CloudFile) -> Cloud:
 
 
 def read_sweep(file: CloudFile) -> Cloud:
-    """Cloud of a sweep: of nuScenes if the fifth number of each point is a ring, else of KITTI.
+    """Cloud of a sweep of nuScenes, if the fifth number of each point is a ring, else of KITTI.
 
     Raises
     ------
     CloudReadError
-        The bytes fit neither; or they fit both, because the fourth number of each point is also from 0 to 1.
+        The bytes fit neither format, or they fit both, because every fourth number is also from 0 to 1.
     """
     is_nuscenes = _is_nuscenes(file.content)
     if is_nuscenes and _is_kitti(file.content):
@@ -108,7 +109,7 @@ def encode_sweep(cloud: Cloud, columns: tuple[str, ...]) -> bytes:
     Raises
     ------
     CloudWriteError
-        The cloud has others, or numbers that are not those of float32.
+        The cloud has other columns, or numbers that float32 would round.
     """
     own = columns_of_cloud(cloud)
     if set(own) != set(columns):
@@ -164,7 +165,7 @@ def _is_nuscenes(content: bytes) -> bool:
 
 
 def _labels_beside(path: Path) -> Path | None:
-    """SemanticKITTI's labels of a sweep, if the folders are named as it names them and the file is there."""
+    """SemanticKITTI's file of labels for a sweep, if it exists; the sweep has to be in a folder ``velodyne``."""
     if path.parent.name != "velodyne":
         return None
     labels = path.parent.parent / "labels" / f"{path.stem}.label"

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""E57 files (ASTM E2807), of terrestrial laser scanners.
+"""E57 files (ASTM E2807) of terrestrial laser scanners.
 
-Reading and writing are done by libE57Format, which pye57 brings: the extra ``e57``.
+The library libE57Format, which pye57 contains, reads and writes them: the extra ``e57``.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ _KEPT = (
     *("intensity", "isIntensityInvalid", "isColorInvalid", "rowIndex", "columnIndex", "returnIndex", "returnCount"),
     *("timeStamp", "isTimeStampInvalid", *_SPHERICAL),
 )
-"""Fields of the standard that are columns under their own names."""
+"""Fields of the standard that become columns of the same names."""
 _TAKEN = (*_CARTESIAN, *_COLORS, *_KEPT, "cartesianInvalidState", "sphericalInvalidState")
 _OWN = "pcgraph"
-"""Prefix of fields that are columns under names of other formats."""
+"""Prefix of our extension, for columns that the standard has no field for."""
 _EXTENSIONS = {
     _OWN: "https://pypi.org/project/rangesim/pcgraph",
     "nor": "http://www.libe57.org/E57_NOR_surface_normals.txt",
@@ -47,16 +47,17 @@ _NORMAL_FIELDS = ("nor:normalX", "nor:normalY", "nor:normalZ")
 _DESCRIPTION = f"{_OWN}:columns"
 _SCAN = "scan"
 _BUFFERS = {"i1": np.int8, "u1": np.uint8, "i2": np.int16, "u2": np.uint16, "f4": np.float32, "f8": np.float64}
-"""Types of arrays that the library fills. All other whole numbers go through `numpy.longlong`: pye57 does not take
-int32, and it takes NumPy's own int64, which is a C long, for 32 bits."""
+"""Types of arrays that the library fills. All other whole numbers go through `numpy.longlong`: pye57 refuses int32, and
+mistakes NumPy's int64, which is a C long, for 32 bits."""
 _INTEGERS = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8")
 _MAX_INTEGER = (1 << 63) - 1
+"""Largest whole number of a field: integers of the standard have 64 bits with a sign (ASTM E2807)."""
 _MAX_SCANS = 1 << 16
-"""Scans of a file, at most: the column ``scan`` has 16 bits."""
+"""Largest count of scans in a file, because the column ``scan`` is uint16."""
 _PAGE_BYTES = 1024
-"""Bytes of a page; the standard has no others. The last 4 are its checksum."""
+"""Bytes of a page, from the standard, which has no other size. The last 4 are its checksum."""
 _HEADER = struct.Struct("<8sIIQQQQ")
-"""Header: signature, version, length of the file, place and length of its XML, size of a page."""
+"""Header: signature, version (two numbers), length of the file, offset and length of the XML, size of a page."""
 
 
 # ---- Reading -------------------------------------------------------------------------------------------------------
@@ -65,17 +66,18 @@ _HEADER = struct.Struct("<8sIIQQQQ")
 def read_e57(file: CloudFile) -> Cloud:
     """Cloud of all scans of an E57 file, in the file's frame: each scan's pose is applied to its points and normals.
 
-    Coordinates may be Cartesian or spherical. Points that the file calls invalid are left out. Fields are columns under
-    the standard's names: ``intensity`` as stored, ``rowIndex``, ``columnIndex``, ``timeStamp`` in seconds from the
-    scan's start, and so on; those of extensions lose their prefix. Scaled integers are float64. Texts and images are
-    not read. The viewpoint is the place of the scanner in the pose. If there are several scans, there is one for each
-    point, and a column ``scan`` (uint16) numbers the scans from 0; fields that only some scans have are NaN, or 0 in
-    whole numbers, in the others.
+    Coordinates may be Cartesian or spherical. Points that the file marks as invalid are left out. Fields are columns
+    with the standard's names: ``intensity`` as stored, ``rowIndex``, ``columnIndex``, ``timeStamp`` in seconds from the
+    scan's start, and so on. Fields of extensions lose their prefix. Scaled integers are float64. Texts and images are
+    not read. The viewpoint is the translation of the pose.
+
+    Several scans have one viewpoint for each point, and a column ``scan`` (uint16) with the number of the scan, from 0.
+    A field that only some scans have is NaN in the others, or 0 if it holds whole numbers.
 
     Raises
     ------
     CloudReadError
-        The file is damaged or shorter than it says, has no scan, or pye57 is missing.
+        The file is damaged or shorter than its header says, has no scan, or pye57 is missing.
     """
     _check_xml(file.content)
     library = _library(CloudReadError, "reading")
@@ -109,7 +111,7 @@ class _Scan:
 
 
 def _check_xml(content: bytes) -> None:
-    """Raise CloudReadError if there is no header, or if the XML has definitions of its own, which could fill memory."""
+    """Raise CloudReadError if there is no header, or if the XML defines entities, which could fill the memory."""
     if len(content) < _HEADER.size or not content.startswith(b"ASTM-E57"):
         raise CloudReadError("expected an E57 header that begins with 'ASTM-E57', but found none")
     _, _, _, length, start, _, page = _HEADER.unpack_from(content)
@@ -124,7 +126,7 @@ def _check_xml(content: bytes) -> None:
 
 
 def _check_counts(library: ModuleType, nodes: list[Any], n_bytes: int) -> None:
-    """Raise CloudReadError if the scans promise more points than the file can hold, before memory is taken for them."""
+    """Raise CloudReadError if the scans promise more points than the file can hold, before memory is allocated."""
     count = n_bits = 0
     for node in nodes:
         here = int(node["points"].childCount())
@@ -164,7 +166,7 @@ def _scan(library: ModuleType, image: Any, node: Any) -> _Scan:
 
 
 def _read_fields(library: ModuleType, image: Any, stored: Any, elements: dict[str, Any]) -> Arrays:
-    """Arrays (n,) of the numbers of a scan, in the smallest types that hold what the fields may hold."""
+    """Arrays (n,) of the fields of a scan, in the smallest types that hold the limits of each field."""
     count = int(stored.childCount())
     types = {name: _type(library, element) for name, element in elements.items()}
     arrays: Arrays = {name: np.zeros(count, _BUFFERS.get(kind, np.longlong)) for name, kind in types.items()}
@@ -181,7 +183,7 @@ def _read_fields(library: ModuleType, image: Any, stored: Any, elements: dict[st
 
 
 def _type(library: ModuleType, element: Any) -> str:
-    """The type that holds a field: of whole numbers, the smallest that holds its limits."""
+    """Type of a field's array; for whole numbers the smallest that holds the limits of the field."""
     if isinstance(element, library.IntegerNode):
         low, high = element.minimum(), element.maximum()
         return next(kind for kind in _INTEGERS if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max)
@@ -191,20 +193,20 @@ def _type(library: ModuleType, element: Any) -> str:
 
 
 def _bits(library: ModuleType, element: Any) -> int:
-    """Bits that a number of a field takes in the file."""
+    """Number of bits of each value of a field in the file."""
     if isinstance(element, library.FloatNode):
         return 32 if element.precision() == library.E57_SINGLE else 64
     return ceil(log2(max(1, element.maximum() - element.minimum() + 1)))
 
 
 def _floats(fields: Arrays, names: tuple[str, ...]) -> NDArray[np.floating]:
-    """Fields side by side, (n, c), taken out."""
+    """Some fields as one array (n, c), removed from `fields`."""
     values = np.stack([fields.pop(name) for name in names], axis=1)
     return values.astype(np.result_type(values, np.float32), copy=False)
 
 
 def _colors(library: ModuleType, node: Any, elements: dict[str, Any], fields: Arrays) -> NDArray[np.uint8] | None:
-    """Colours, taken out; white is the limit that the scan states, else that of the field, else 1 in floats."""
+    """Colours, removed from `fields`. White is the limit that the scan states, else the field's limit, for floats 1."""
     if not all(name in fields for name in _COLORS):
         return None
     channels = []
@@ -228,7 +230,7 @@ def _column_name(name: str, fields: Arrays) -> str:
 
 
 def _pose(node: Any) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
-    """Rotation (3, 3) and place (3,) of the scanner in the file's frame; None for what is not there or changes nothing.
+    """Rotation (3, 3) and place (3,) of the scanner in the file's frame; None for a missing pose or no rotation.
 
     The rotation is a unit quaternion q = w + xi + yj + zk, so that p' = q p q* + place.
     """
@@ -261,7 +263,7 @@ def _pose(node: Any) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | 
 def _moved(
     vectors: NDArray[np.floating], rotation: NDArray[np.float64] | None, place: NDArray[np.float64] | None
 ) -> NDArray[np.floating]:
-    """Vectors (n, 3) in the file's frame; unchanged, in their own type, if nothing moves them."""
+    """Vectors (n, 3) in the file's frame; the same array, in its own type, if the pose changes nothing."""
     if rotation is not None:
         vectors = vectors.astype(np.float64) @ rotation.T
     return vectors if place is None or not place.any() else vectors + place
@@ -303,12 +305,12 @@ def _joined(scans: list[_Scan]) -> Cloud:
 def encode_e57(cloud: Cloud, suffix: str) -> bytes:
     """Bytes of an E57 file of one scan with every column of a cloud.
 
-    Columns that the standard knows, ``intensity``, ``rowIndex``, ``columnIndex``, ``returnIndex``, ``returnCount``,
-    ``timeStamp`` and so on, go under their names. Normals go into the common extension ``nor``, all others into one
-    called ``pcgraph``, vectors as ``name_0``, ``name_1`` and so on. Characters that XML does not take in names become
-    ``_`` there; `read_e57` gives back the names. Types stay, but bools become uint8 and float16 becomes float32. A
-    viewpoint (3,) becomes the scan's pose; then coordinates are relative to it, in float64, and come back the same but
-    for the rounding of doubles.
+    Columns that the standard defines keep their names: ``intensity``, ``rowIndex``, ``columnIndex``, ``returnIndex``,
+    ``returnCount``, ``timeStamp`` and so on. Normals go into the common extension ``nor``. All other columns go into
+    the extension ``pcgraph``, vectors as ``name_0``, ``name_1`` and so on. Characters that XML forbids in names become
+    ``_`` in the file; `read_e57` returns the original names. Types stay, but bools become uint8 and float16 becomes
+    float32. A viewpoint (3,) becomes the scan's pose. Coordinates are then relative to it, in float64, and come back
+    the same but for the rounding of doubles.
 
     Raises
     ------
@@ -413,7 +415,7 @@ def _write(
 
 
 def _element(library: ModuleType, image: Any, kind: np.dtype[np.generic]) -> Any:
-    """Field of a type; limits of whole numbers are those of the type, so that it comes back."""
+    """Field of a type; its limits are those of the type, so that `read_e57` finds the same type."""
     if kind.kind == "f":
         return library.FloatNode(image, 0.0, library.E57_SINGLE if kind.itemsize == 4 else library.E57_DOUBLE)
     limits = np.iinfo(kind.name)
@@ -424,7 +426,7 @@ def _element(library: ModuleType, image: Any, kind: np.dtype[np.generic]) -> Any
 
 
 def _library(error: type[PcgraphError], what: str) -> ModuleType:
-    """The library; raises `error`, with a sentence that names the extra, if it is missing."""
+    """The module pye57.libe57; raises `error`, which names the extra, if it is missing."""
     try:
         from pye57 import libe57
     except ImportError:
@@ -434,7 +436,7 @@ def _library(error: type[PcgraphError], what: str) -> ModuleType:
 
 @contextmanager
 def _named(file: CloudFile) -> Iterator[Path]:
-    """Path of a file that the library can open; a temporary one if the content came from elsewhere."""
+    """Path of a file that the library can open: a temporary file if the content came from a pipe or an upload."""
     if file.path is not None:
         yield file.path
         return

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Columns of a cloud as lists of numbers under names that a format takes, and the cloud made of them again.
+"""Columns of a cloud as fields of one number per point, with names that a format allows, and back to the cloud.
 
-Formats of laser scanners hold one number per point and field, under names of few characters. The writer keeps a
-description in the file, a JSON object, which says what stands for what; other programs skip it. Fields that it does not
-name, for example those that another program added, become columns of their own.
+Formats of laser scanners hold one number per point and field, under short names. The writer keeps a description in the
+file, a JSON object with the column that each field belongs to; other programs skip it. Fields that it does not name,
+for example those that another program added, become columns of their own.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ LABEL = "label"
 _VIEWPOINTS = ("vp_x", "vp_y", "vp_z")
 """Fields of viewpoints, one for each point, as in PCL's PointWithViewpoint."""
 _STORED = {"b1": "u1", "f2": "f4", "f16": "f8"}
-"""Types that no such format has, and those that are stored in their place. All but the last hold the same numbers."""
+"""Types that no such format has, and the types that are stored instead. Only float128 (``f16``) loses digits."""
 
 
 def flatten(
     cloud: Cloud, kept: Collection[str], taken: Collection[str], safe_name: Callable[[str, int], str]
 ) -> tuple[Arrays, bytes]:
-    """Fields, (n,) each, of a cloud's columns, normals, labels and viewpoints, and the description of them.
+    """Fields, (n,) each, of a cloud's columns, normals, labels and viewpoints, and their description.
 
     Parameters
     ----------
     cloud : Cloud
     kept : names of columns
-        Columns that go into the format's own fields, under their own names.
+        Columns that go into fields of the format itself, which have the same names.
     taken : names of fields
-        Other fields have other names than these, in whatever case.
+        Names, in upper or lower case, that the fields of other columns must not have.
     safe_name : (name, room) -> str
-        A name that the format takes, made of any name, and cut so that it leaves room for so many more characters.
+        Function that turns any name into one that the format allows, with room for that many more characters.
     """
     fields: Arrays = {}
     used = {name.lower() for name in (*taken, *kept, *NORMALS, *_VIEWPOINTS, LABEL)}
@@ -76,7 +76,7 @@ def flatten(
 
 
 def described(text: bytes | None) -> dict[str, Any] | None:
-    """The description that `flatten` made; None if there is none, or if it is damaged."""
+    """The description that `flatten` wrote; None if it is missing or damaged."""
     if text is None:
         return None
     try:
@@ -93,16 +93,17 @@ def unflatten(
     description: dict[str, Any] | None,
     viewpoint: NDArray[np.float64] | None = None,
 ) -> Cloud:
-    """Cloud of points and fields; what the description does not name is found as `cloud_from_columns` finds it.
+    """Cloud of points and fields; `cloud_from_columns` interprets the fields that the description does not name.
 
     Parameters
     ----------
     points, colors : (n, 3)
         Colours uint8, or uint16 where white is 65535.
     fields : dict of name to (n,) or (n, c) array
-    description : of `described`
+    description : dict, or None
+        As `described` returns it.
     viewpoint : (3,) or (n, 3) float64, metres, or None
-        Position of the sensor that the file itself states.
+        Position of the sensor as the file itself states it.
     """
     left = dict(fields)
     columns: Arrays = {}
@@ -123,7 +124,7 @@ def unflatten(
 
 
 def _taken(fields: Arrays, stored: object) -> NDArray[np.generic] | None:
-    """The field of a name, or those of a list of names side by side, taken out; None if one is not there."""
+    """The field of a name, or those of a list of names as (n, c), removed from `fields`; None if one is missing."""
     if isinstance(stored, str):
         return fields.pop(stored, None)
     if not (isinstance(stored, list) and stored and all(isinstance(name, str) and name in fields for name in stored)):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a file format of point clouds is: its names, its reader and its writer.
+"""The interface of file formats of point clouds: `Format` has the names, the reader and the writer of one.
 
-A new format is one file in this folder with a `Format`, and its name in the list `FORMATS` of the folder.
+A new format is one file in this folder that defines a `Format`, which `FORMATS` in `__init__.py` lists.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudWriteError
 
 MAX_HEADER_BYTES = 1 << 16
-"""Bytes in which the header of a file must end: far more than headers have, so that a file without one is refused
-before all of it is searched. Chosen by eye; not varied."""
+"""Largest header, bytes: far more than headers have, so that a file without one is refused before all of it is
+searched. Chosen by eye; not varied."""
 
 
 @dataclass(frozen=True)
 class CloudFile:
-    """The content of a file, and the place where it lies.
+    """The content of a file, and its path.
 
     Attributes
     ----------
     content : bytes
     path : Path, or None
-        For formats that read a second file beside it, and for libraries that open files themselves; None if the content
+        Some formats read a second file beside this one, and some libraries open files themselves. None: the content
         came from a pipe or over a network.
     columns : tuple of str, or None
         Names that the user gave to the columns of a text file without a header.
@@ -44,22 +44,22 @@ class Format:
     Attributes
     ----------
     name : str
-        Name in messages and of the argument `file_format`, in lower case: "ply".
+        Name in messages and in the argument `file_format`, in lower case, such as "ply".
     suffixes : tuple of str
-        Ends of file names in lower case, with the dot: (".las", ".laz").
+        Suffixes of file names in lower case, with the dot, such as (".las", ".laz").
     read : CloudFile -> Cloud
-        Raises CloudReadError.
+        Reader. It raises CloudReadError.
     encode : (Cloud, suffix) -> bytes, or None
-        Bytes of a file that `read` reads back: every column, in its type and under its name. Raises CloudWriteError
-        where the format cannot hold one. The cloud is as `pcgraph.cloud.plain_cloud` returns it, and a list of finite
-        points unless `organised`; `pcgraph.cloud.columns_of_cloud` names its columns. None: the format is only read.
+        Writer. `read` returns every column of its bytes, with the type and the name. It raises CloudWriteError for a
+        column that the format cannot hold. The cloud is as `pcgraph.cloud.plain_cloud` returns it, and a list of finite
+        points unless `organised`. `pcgraph.cloud.columns_of_cloud` names its columns. None: the format is only read.
     organised : bool
-        Whether a file keeps images of points, (h, w, 3), and NaN where nothing was measured. Other formats are lists of
-        the finite points.
+        Whether a file keeps images of points, (h, w, 3), with NaN where nothing was measured. Files of other formats
+        are lists of the finite points.
     holds_columns : bool
-        Whether a file takes columns of any name and number.
+        Whether a file holds columns of any name and number.
     takes_names : bool
-        Whether `CloudFile.columns` may name the columns.
+        Whether the user may name the columns (`CloudFile.columns`).
     """
 
     name: str
@@ -71,11 +71,11 @@ class Format:
     takes_names: bool = False
 
 
-# ---- Names of fields in headers of words ---------------------------------------------------------------------------
+# ---- Names of fields in text headers -------------------------------------------------------------------------------
 
 
 def field_name(word: bytes) -> str:
-    """Name of a field from the word of a header: UTF-8, or Latin-1 if it is none."""
+    """Name of a field from a word of a header, which is UTF-8, or else Latin-1."""
     try:
         return word.decode()
     except UnicodeDecodeError:
@@ -83,7 +83,7 @@ def field_name(word: bytes) -> str:
 
 
 def field_word(name: str) -> bytes:
-    """Word of a header for the name of a field; its blanks become underscores, as CloudCompare writes them."""
+    """Word of a header for the name of a field; blanks become underscores, as in files of CloudCompare."""
     return "_".join(name.split()).encode(errors="backslashreplace")
 
 

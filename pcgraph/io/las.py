@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LAS 1.0 to 1.4 and LAZ, of airborne and terrestrial laser scanners; COPC files are LAZ files, and read as such.
+"""LAS 1.0 to 1.4 and LAZ files of airborne and terrestrial laser scanners; COPC files are read as LAZ files.
 
-Reading and writing are done by laspy, and by lazrs for LAZ: the extra ``las``.
+The libraries laspy and, for LAZ, lazrs read and write them: the extra ``las``.
 """
 
 from __future__ import annotations
@@ -24,44 +24,51 @@ from pcgraph.io.flat_columns import Arrays, described, flatten, unflatten
 from pcgraph.io.format import Format
 
 _HEADER_BYTES = 227
-"""Bytes of the header of LAS 1.0 to 1.2, the shortest."""
+"""Bytes of the shortest header, that of LAS 1.0 to 1.2. Source: the LAS specification of ASPRS."""
 _VLR_BYTES = 54
-"""Bytes of a variable length record without its data."""
+"""Bytes of a variable length record without its data. Source: the LAS specification of ASPRS."""
 _PIECE = 1 << 20
-"""Points that are unpacked at a time: memory grows with what the file really holds. Chosen by eye; not varied."""
+"""Count of points that are unpacked at a time, so that memory grows with what the file really holds. Chosen by eye; not
+varied."""
 _LAYERED = b"\x03\x00"
 """Compressor of LAZ for the point formats from 6 on."""
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 """Layers of each item of a compressed point: its base, colours, colours with infrared, wave packets. Extra bytes, item
 14, have one layer for each byte."""
 _MAX_OF_8_BITS = 255
-"""Largest channel of colours that were stored in 8 bits. In 16 bits, only a cloud that is all but black has no larger
-one."""
+"""Largest channel value of a cloud whose colours count as stored in 8 bits, in steps of a channel.
+
+Colours of 16 bits with no larger value would be almost black, because white is 65535.
+"""
 _WHITE_RATIO = 257
-"""White in 16 bits over white in 8 bits: 65535 / 255."""
+"""Ratio of white in 16 bits to white in 8 bits, 65535 / 255, from the limits of the two types."""
 _DESCRIPTION = ("pcgraph", 1)
-"""User and number of the variable length record with the description of the columns."""
+"""User ID and record ID of the variable length record that holds the description of the columns. The user ID is ours,
+so that any record ID is free."""
 _MAX_VLR_BYTES = 65535
-"""Bytes of the data of a variable length record, at most: the format counts them in 16 bits."""
+"""Largest size of the data of a variable length record, bytes, because the format counts them in 16 bits."""
 _MAX_EXTRA_FIELDS = _MAX_VLR_BYTES // 192
-"""Fields of extra bytes, at most: one record describes all, each in 192 bytes."""
+"""Largest count of fields of extra bytes, because one record describes all of them, each in 192 bytes."""
 _MAX_NAME = 31
-"""Characters of a field's name, at most: the format has 32 bytes, and some readers expect a NUL as the last."""
+"""Largest length of a field's name, characters, because the format has 32 bytes and some readers expect a NUL as the
+last one."""
 _UNUSED = {"return_number": 1, "number_of_returns": 1}
 """Values of dimensions that a written cloud does not have, if not 0: the standard counts returns from 1."""
 _COARSEST_STEP = 1e-4
-"""Metres: coordinates off any grid are rounded to steps of at most 0.1 mm, finer than laser scanners measure."""
+"""Largest step to which coordinates off any grid are rounded, metres: 0.1 mm, because laser scanners resolve less."""
 _STEPS_PER_EXTENT = 1e7
-"""Steps in the extent of a small cloud off any grid, at least: as many as the 24 bits of float32 tell apart."""
+"""Least count of steps in the extent of a small cloud off any grid: about as many as the 24 bits of float32
+distinguish."""
 _MAX_STEPS = 2.0**31 - 2.0
-"""Steps from the offset to a coordinate, at most: whole numbers of 32 bits, less a rounding."""
+"""Largest count of steps from the offset to a coordinate, because LAS stores it as int32; one step is left for
+rounding."""
 _GRIDS = tuple(10.0**-digits for digits in range(10))
-"""Steps of grids on which coordinates may lie already. Steps as 0.002 or 0.00025 are multiples of one of these."""
+"""Steps, metres, of the decimal grids that are tried. Other steps, such as 0.002 or 0.00025, are multiples of these."""
 _FINE_ENOUGH = 16
-"""Roundings of the coordinates per step of a grid, at least: any number is near to one of a grid that is finer. Chosen
-by eye; not varied."""
+"""Least ratio of a grid's step to the rounding of the coordinates. On a finer grid, every number would seem to lie.
+Chosen by eye; not varied."""
 _SAMPLE = 1000
-"""Coordinates that are tried on a grid before all are, for the time's sake. Chosen by eye; not varied."""
+"""Count of coordinates that are tried on a grid before all of them, to save time. Chosen by eye; not varied."""
 
 
 # ---- Reading -------------------------------------------------------------------------------------------------------
@@ -70,19 +77,21 @@ _SAMPLE = 1000
 def read_las(content: bytes) -> Cloud:
     """Cloud of a LAS or LAZ file, given the file's bytes.
 
-    Points are float64: stored whole numbers times the scale, plus the offset. Each dimension of the file's point format
-    and of its extra bytes is a column under laspy's name: ``intensity``, ``classification``, ``gps_time`` and so on,
-    also where it is zero at all points, so that all tiles of a survey have the same columns. Bit fields are uint8.
-    Scaled extra bytes are float64; their values for "no data" stay as they are. Classes are a column, not `labels`,
-    because they are no instances; extra bytes ``label`` or ``labels`` of whole numbers are labels. Extra bytes
-    ``NormalX``, ``NormalY``, ``NormalZ``, or ``nx`` and so on, are normals. Colours are 8 bits of 16. If none is above
-    255, they were stored in 8 bits, against the standard. If all are black, the file has none. Coordinate reference
-    systems are not read.
+    - Points are float64: stored whole numbers times the scale, plus the offset. Coordinate reference systems are not
+      read.
+    - Each dimension of the point format and of the extra bytes is a column under laspy's name: ``intensity``,
+      ``classification``, ``gps_time`` and so on. Dimensions that are zero at all points are columns too, so that all
+      tiles of a survey have the same columns. Bit fields are uint8.
+    - Scaled extra bytes are float64; their values for "no data" stay as they are.
+    - Classes are a column, not `labels`, because they are not instances. Extra bytes ``label`` or ``labels`` of whole
+      numbers are labels. Extra bytes ``NormalX``, ``NormalY``, ``NormalZ``, or ``nx`` and so on, are normals.
+    - Colours of 16 bits are scaled to 8. If no channel is above 255, they count as stored in 8 bits, which the standard
+      does not allow. If all points are black, the cloud has no colours.
 
     Raises
     ------
     CloudReadError
-        The header is broken, the file is shorter than the header says, or a library is missing.
+        The header is damaged, the file is shorter than the header says, or a library is missing.
     """
     _check_length(content)
     laspy = _laspy(CloudReadError, "reading", compressed=bool(content[104] & 0xC0))
@@ -105,17 +114,17 @@ def read_las(content: bytes) -> Cloud:
 
 
 class _Unpacked(NamedTuple):
-    """What a file holds.
+    """The content of a LAS file.
 
     Attributes
     ----------
     points : (n, 3) float64
     fields : dict of name to (n,) or (n, c) array
-        The other dimensions.
-    standard : names of dimensions
-        Those of the point format.
+        All other dimensions.
+    standard : set of str
+        Names of the dimensions of the point format.
     description : bytes, or None
-        Record of `flatten`.
+        The record that `flatten` made, if the file has one.
     """
 
     points: NDArray[np.floating]
@@ -165,7 +174,7 @@ def _check_length(content: bytes) -> None:
 
 
 def _largest_chunk(content: bytes, header: Any) -> int:
-    """Points in the largest chunk of a LAZ file, whose parallel reader has room for all of them.
+    """Number of points in the largest chunk of a LAZ file; the parallel reader allocates memory for all of them.
 
     Raises CloudReadError if the file promises chunks longer than itself, or layers longer than their chunk: lazrs takes
     memory for what is promised, and ends the process if there is none. Source: the LASzip specification. Chunks of the
@@ -200,7 +209,10 @@ def _largest_chunk(content: bytes, header: Any) -> int:
 
 
 def _colors(fields: Arrays, is_own: bool) -> NDArray[np.generic] | None:
-    """Colours, (n, 3) uint8, or uint16 where white is 65535, taken out; None if all are black in a file of others."""
+    """Colours, (n, 3) uint8, or uint16 where white is 65535; removed from `fields`.
+
+    None: the file has none, or another program wrote it and all points are black.
+    """
     if not all(name in fields for name in COLOR_NAMES):
         return None
     colors = np.stack([fields.pop(name) for name in COLOR_NAMES], axis=1)
@@ -211,7 +223,7 @@ def _colors(fields: Arrays, is_own: bool) -> NDArray[np.generic] | None:
 
 
 def _laspy(error: type[PcgraphError], what: str, compressed: bool) -> ModuleType:
-    """The library; raises `error`, with a sentence that names the extra, if it or that for LAZ is missing."""
+    """The module laspy; raises `error`, which names the extra, if laspy, or lazrs for LAZ, is missing."""
     try:
         import laspy
 
@@ -231,15 +243,15 @@ def _laspy(error: type[PcgraphError], what: str, compressed: bool) -> ModuleType
 def encode_las(cloud: Cloud, suffix: str) -> bytes:
     """Bytes of a LAS 1.4 file, or of a LAZ file if `suffix` is ``.laz``, with every column of a cloud.
 
-    Coordinates are whole numbers of steps from an offset. Those that lie on a decimal grid already, as all of LAS files
-    do, stay on it: they come back the same but for the rounding of doubles. Others are rounded to steps of 0.1 mm at
-    most, in small clouds to a ten millionth of the extent. Colours are stored in 16 bits, times 257.
+    Coordinates are whole numbers of steps from an offset. Coordinates on a decimal grid, as all from LAS files are,
+    stay on that grid: they come back the same but for the rounding of doubles. Others are rounded to steps of at most
+    0.1 mm, in small clouds to a ten millionth of the extent. Colours are stored in 16 bits, times 257.
 
-    Columns go into the point format's own dimensions if they have the name, the type and no larger numbers. The format
-    is 6; with colours it is 7; with colours and a column ``nir`` it is 8. All others go into extra bytes of their own
-    types: normals as ``NormalX``, ``NormalY``, ``NormalZ``, labels as ``label``, vectors as ``name_0``, ``name_1`` and
-    so on. Bools become uint8, float16 becomes float32. Names are cut to 31 characters of ASCII there; `read_las` gives
-    back the full ones, and the vectors, by a record that other programs skip. A coordinate reference system is not
+    The point format is 6; with colours it is 7; with colours and a column ``nir`` it is 8. A column is stored in a
+    dimension of the point format if that has its name and type, and enough bits. All other columns are extra bytes of
+    their own types: normals ``NormalX``, ``NormalY``, ``NormalZ``, labels ``label``, vectors ``name_0``, ``name_1`` and
+    so on. Bools become uint8, float16 becomes float32. Names of extra bytes are cut to 31 characters of ASCII. A record
+    that other programs skip tells `read_las` the full names and the vectors. A coordinate reference system is not
     written.
 
     Raises
@@ -293,7 +305,7 @@ def _point_format(cloud: Cloud) -> int:
 
 
 def _fits(column: NDArray[np.generic], dimension: Any) -> bool:
-    """Whether a column has the type of a dimension of a point format, and no number with more bits."""
+    """Whether a column has the type of a dimension of the point format, and its numbers fit into the bits of that."""
     if dimension.name in ("X", "Y", "Z", *COLOR_NAMES):
         return False
     if dimension.kind.name != "BitField":
@@ -302,19 +314,19 @@ def _fits(column: NDArray[np.generic], dimension: Any) -> bool:
 
 
 def _safe_name(name: str, room: int) -> str:
-    """A name in printable ASCII without blanks, so short that `room` more characters fit."""
+    """The name in printable ASCII without blanks, cut so that `room` more characters fit."""
     return re.sub(r"[^!-~]", "_", name)[: _MAX_NAME - room] or "_"
 
 
 class Grid(NamedTuple):
-    """Numbers that a coordinate of a LAS file can be: whole numbers of 32 bits times the step, plus the offset."""
+    """Grid of the coordinates of a LAS file along an axis: int32 numbers times the step, plus the offset."""
 
     step: float
     offset: float
 
 
 def _grid(values: NDArray[np.floating]) -> Grid:
-    """The coarsest decimal grid on which all coordinates of an axis lie; else one so fine that nothing is lost."""
+    """The coarsest decimal grid that has all coordinates of an axis; else one with the steps of `encode_las`."""
     if not len(values):
         return Grid(_COARSEST_STEP, 0.0)
     low, high = float(values.min()), float(values.max())

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Meshes as point clouds: the vertices of OBJ, STL, OFF and glTF files, or points all over a surface.
+"""Meshes as point clouds: the vertices of OBJ, STL, OFF and glTF files, or points sampled on the surface.
 
-The files are read by trimesh. Meshes in PLY files are read by `pcgraph.io.ply`: their vertices.
+The library trimesh reads the files. `pcgraph.io.ply` reads the vertices of meshes in PLY files.
 """
 
 from __future__ import annotations
@@ -27,28 +27,29 @@ if TYPE_CHECKING:
     import trimesh
 
 _KINDS = {".obj": "obj", ".stl": "stl", ".off": "off", ".glb": "gltf", ".gltf": "gltf", ".ply": "ply"}
-"""Names of formats to trimesh by the ends of files' names."""
+"""Trimesh's names of formats by the suffix of the file."""
 _FEW_VERTICES = 1000
-"""Vertices, at most, that a warning calls few for a point cloud. Chosen by eye; not varied."""
+"""Largest count of vertices that a warning calls few for a point cloud. Chosen by eye; not varied."""
 _MAX_ZEROS_PER_BYTE = 10
-"""Elements of glTF accessors without data, which are zeros, per byte of the file, at most: sparse shapes of animated
-faces have less than one. Chosen by eye; not varied."""
+"""Largest count of elements of glTF accessors without data, which are zeros, per byte of the file. Sparse shapes of
+animated faces have less than one. Chosen by eye; not varied."""
 _PLASTIC = 1.32471795724474602596
-"""The plastic number, the root of x**3 = x + 1: multiples of its inverse powers fill a square evenly."""
+"""The plastic number, dimensionless, the root of x**3 = x + 1: multiples of its inverse powers fill a square evenly
+(Roberts 2018)."""
 
 
 def read_mesh(file: CloudFile, kind: str) -> Cloud:
-    """Cloud of the vertices of a mesh file, with their colours and normals where the file has them.
+    """Cloud of the vertices of a mesh file, with their colours and normals if the file has them.
 
-    The vertices of all meshes of a scene are in the scene's frame. Those of an STL file, which repeats them in each
-    triangle, are merged where they are equal. OBJ files repeat a vertex that has several normals. Textures and
-    materials are not read. Points between the vertices are not made: `sample_surface` does that.
+    The vertices of all meshes of a scene are in the scene's frame. An STL file repeats a vertex in each triangle; equal
+    ones are merged. An OBJ file repeats a vertex that has several normals; these stay. Textures and materials are not
+    read. `sample_surface` makes points between the vertices.
 
     Parameters
     ----------
     file : CloudFile
     kind : str
-        Name of the file's format to trimesh: "obj", "stl", "off", or "gltf", which may be binary.
+        Trimesh's name of the format: "obj", "stl", "off", or "gltf", which may be binary.
 
     Raises
     ------
@@ -58,7 +59,7 @@ def read_mesh(file: CloudFile, kind: str) -> Cloud:
     Warns
     -----
     UserWarning
-        The mesh has faces, and so few vertices that they say little of its surface.
+        The mesh has faces, but too few vertices to describe its surface.
     """
     parts = _parts(file, kind)
     points = np.concatenate([part.points for part in parts])
@@ -77,34 +78,33 @@ def read_mesh(file: CloudFile, kind: str) -> Cloud:
 
 
 def sample_surface(mesh: str | PathLike[str] | trimesh.Trimesh, n_points: int) -> Cloud:
-    """Cloud of points all over the surface of a mesh, as many per area everywhere; the same in each run.
+    """Cloud of points sampled evenly on the surface of a mesh; every run gives the same points.
 
     Parameters
     ----------
     mesh : str, path or trimesh.Trimesh
         ``.obj``, ``.stl``, ``.off``, ``.glb``, ``.gltf`` or ``.ply``, or a mesh in memory.
     n_points : int
-        From 1.
+        Number of points, at least 1.
 
     Returns
     -------
     Cloud
-        Points (n_points, 3) float64 in the mesh's frame and unit; normals of their faces; colours, if faces or vertices
-        have some; and the column ``face`` (int32), the number of each point's face, which tells that the points were
-        sampled.
+        Points (n_points, 3) float64 in the mesh's frame and unit; the normals of their faces; colours, if faces or
+        vertices have some; and the column ``face`` (int32), the number of each point's face.
 
     Raises
     ------
     CloudReadError
-        The file cannot be read, or the mesh has no faces of any area.
+        The file cannot be read, or the mesh has no face with an area.
     ValueError
         `n_points` is less than 1.
 
     Notes
     -----
-    Systematic sampling by area gives each face its fraction of the points, to less than one point. Within a face, they
-    follow the R2 sequence (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences"), folded into the
-    triangle.
+    Systematic sampling gives each face a number of points in proportion to its area, to less than one point. Within a
+    face, the points follow the R2 sequence (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences"),
+    folded into the triangle.
 
     Examples
     --------
@@ -154,9 +154,9 @@ class _Part:
     points : (n, 3) float64
     faces : (m, 3) int64
     colors, normals : (n, 3), or None
-        Of the vertices, if the file has them; colours are 0..255.
+        Colours (0..255) and normals of the vertices, if the file has them.
     corner_colors : (m, 3, 3), or None
-        Colours of the faces' three corners, from those of the vertices or of the faces.
+        Colours of the three corners of each face, taken from the vertices or from the faces.
     """
 
     points: NDArray[np.float64]
@@ -198,7 +198,7 @@ def _parts(file: CloudFile, kind: str) -> list[_Part]:
 
 
 def _beside(path: Path) -> trimesh.resolvers.Resolver:
-    """What finds the files that a file names, if they are plain ones in its folder."""
+    """Resolver that opens the files that a .gltf file refers to; they must be regular files in its folder."""
     import trimesh
 
     class Beside(trimesh.resolvers.FilePathResolver):
@@ -221,7 +221,7 @@ def _check_accessors(content: bytes) -> None:
 
 
 def _part(mesh: Any, transform: NDArray[np.float64]) -> _Part:
-    """A mesh or a point cloud of trimesh, moved by a matrix (4, 4)."""
+    """A mesh or point cloud of trimesh, transformed by a matrix (4, 4)."""
     points = np.asarray(mesh.vertices, np.float64).reshape(-1, 3) @ transform[:3, :3].T + transform[:3, 3]
     faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))), np.int64).reshape(-1, 3)
     if faces.size and not (faces.min() >= 0 and faces.max() < len(points)):
@@ -241,7 +241,7 @@ def _part(mesh: Any, transform: NDArray[np.float64]) -> _Part:
 
 
 def _together(arrays: list[NDArray[np.float64] | None]) -> NDArray[np.float64] | None:
-    """Arrays one after the other; None if there is none, or if one is not there."""
+    """The arrays, concatenated; None if the list is empty or one of them is None."""
     known = [array for array in arrays if array is not None]
     return np.concatenate(known) if known and len(known) == len(arrays) else None
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""NumPy's files: .npz archives of a cloud's arrays, and single arrays, .npy.
+"""NumPy's files: archives (.npz) with the arrays of a cloud, and single arrays (.npy).
 
-An archive has the keys ``points`` (n, 3) or (h, w, 3), and if the cloud has them ``colors``, ``normals``, ``labels``,
-``viewpoint``. Every other array of the points' leading shape is a column of its own name. The cloud of a saved
-segmentation lies under ``cloud/``: ``cloud/points`` and so on, its columns as ``cloud/columns/<name>``. Nothing is
-unpickled.
+An archive has the key ``points`` (n, 3) or (h, w, 3), and the keys ``colors``, ``normals``, ``labels`` and
+``viewpoint`` if the cloud has these. Every other array with the points' leading shape is a column; its key is the name.
+The file of a saved segmentation has the cloud below ``cloud/``: ``cloud/points`` and so on, the columns as
+``cloud/columns/<name>``. Pickled objects are never loaded.
 """
 
 from __future__ import annotations
@@ -37,15 +37,17 @@ from pcgraph.errors import CloudReadError
 from pcgraph.io.format import MAX_HEADER_BYTES, Format
 
 MAX_BYTES = 1 << 32
-"""Bytes of all arrays that are read of one file, decompressed: 4 GiB are 100 million points of 40 bytes, for which
-`pcgraph.segment` would need some 18 GB, as it needs 3.7 GB for 20 million. An archive of 4 MB can hold as much."""
+"""Largest size of all arrays that are read from one file, decompressed, bytes. A limit is needed because an archive of
+4 MB can promise as much. 4 GiB are 100 million points of 40 bytes. `pcgraph.segment` needs 3.7 GB for 20 million
+points, and would need some 18 GB for these."""
 _MAX_MEMBERS = 4096
-"""Arrays of an archive, at most: far more than clouds have columns. Chosen by eye; not varied."""
+"""Largest count of arrays in an archive: far more than clouds have columns. Chosen by eye; not varied."""
 _MAX_RATIO = 1040
-"""Bytes of data per byte of a deflated file, at most: 1032 by the law of the format (Deutsch 1996), and some for its
-frame. A member that promises more lies."""
+"""Largest ratio of the bytes of data to those of the deflated file: the format cannot exceed 1032 (Deutsch 1996), and
+some are for the frame. A member that promises more is damaged."""
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _ENCRYPTED = 0x1
+"""Bit of a member's flags that marks it as encrypted. Source: PKWARE's APPNOTE, section 4.4.4."""
 _OWN = ("points", "colors", "normals", "labels", "viewpoint")
 _CLOUD = "cloud/"
 _COLUMNS = "columns/"
@@ -62,8 +64,8 @@ _BROKEN = (
 def read_npz(content: bytes) -> Cloud:
     """Cloud of an .npz archive, given the file's bytes.
 
-    Colours are found as `cloud_from_columns` finds them, so floats of at most 1 become uint8. Whole labels that 32 bits
-    do not hold stay a column. Arrays of another leading shape than the points are not read.
+    Colours of other types become uint8, as in `cloud_from_columns`. Labels that int32 cannot hold stay a column. Arrays
+    whose leading shape is not that of the points are not read.
 
     Raises
     ------
@@ -78,12 +80,12 @@ def read_npz(content: bytes) -> Cloud:
 
 
 def read_npy(content: bytes) -> Cloud:
-    """Cloud of an .npy array, given the file's bytes; `pcgraph.cloud.cloud_from_array` says which arrays are clouds.
+    """Cloud of an .npy array, given the file's bytes; `pcgraph.cloud.cloud_from_array` lists the shapes and types.
 
     Raises
     ------
     CloudReadError
-        The file is damaged, or the array is no cloud.
+        The file is damaged, or the array is not a cloud.
     """
     try:
         stream = io.BytesIO(content)
@@ -96,7 +98,7 @@ def read_npy(content: bytes) -> Cloud:
 
 
 def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """Entries of the cloud by their keys."""
+    """Members of the archive that may belong to the cloud, by key."""
     entries = archive.infolist()
     if len(entries) > _MAX_MEMBERS:
         raise CloudReadError(f"expected at most {_MAX_MEMBERS} arrays, got {len(entries)}")
@@ -110,7 +112,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _arrays(members: Mapping[str, zipfile.ZipInfo], archive: zipfile.ZipFile) -> dict[str, NDArray[np.generic]]:
-    """The arrays of numbers that are points, belong to one point each, or are the viewpoint."""
+    """The points, the arrays with one row per point, and the viewpoint, by key."""
     arrays: dict[str, NDArray[np.generic]] = {}
     shape: tuple[int, ...] | None = None
     left = MAX_BYTES
@@ -162,7 +164,7 @@ def _cloud(arrays: dict[str, NDArray[np.generic]]) -> Cloud:
 
 
 def _own(arrays: dict[str, NDArray[np.generic]], name: str, *shapes: tuple[int, ...]) -> NDArray[np.generic] | None:
-    """The array of a name, which must have one of the shapes; None if it is missing, or empty in place of that."""
+    """The array of a name, which must have one of the shapes; None if it is missing or empty."""
     values = arrays.get(name)
     if values is None or values.shape in shapes:
         return values
@@ -175,7 +177,7 @@ def _own(arrays: dict[str, NDArray[np.generic]], name: str, *shapes: tuple[int, 
 
 
 class _Header(NamedTuple):
-    """What the header of an .npy file tells of its array."""
+    """Shape, order and type of an array, from the header of an .npy file."""
 
     shape: tuple[int, ...]
     is_fortran: bool
@@ -188,10 +190,10 @@ class _Header(NamedTuple):
 
 
 def _header(stream: IO[bytes]) -> _Header:
-    """Header at the beginning of an .npy file, versions 1 to 3; the numbers follow."""
+    """Header of an .npy file, versions 1 to 3; the stream is then at the first number."""
     magic = stream.read(8)
     if magic[:6] != b"\x93NUMPY" or magic[6:7] not in (b"\x01", b"\x02", b"\x03"):
-        raise CloudReadError("expected an .npy array, found another beginning")
+        raise CloudReadError("expected an .npy array, but its first bytes are not those of version 1, 2 or 3")
     length = struct.Struct("<H" if magic[6] == 1 else "<I")
     (size,) = length.unpack(stream.read(length.size))
     if size > MAX_HEADER_BYTES:
@@ -208,7 +210,7 @@ def _header(stream: IO[bytes]) -> _Header:
 
 
 def _check_size(header: _Header, available: int, name: str) -> None:
-    """Raise CloudReadError if an array promises more than its file holds, before memory is allocated for it."""
+    """Raise CloudReadError if the header promises more than the file holds, before memory is allocated."""
     if header.n_bytes > available:
         raise CloudReadError(f"the header of {name} promises {header.n_bytes} bytes, but only {available} can follow")
 
@@ -227,7 +229,7 @@ def _numbers(stream: IO[bytes], header: _Header) -> NDArray[np.generic]:
 def encode_npz(cloud: Cloud) -> bytes:
     """Bytes of an .npz archive of the cloud's arrays, not compressed.
 
-    A column has its own name as key, after ``columns/`` if that name is one of the cloud's own.
+    The key of a column is its name, or ``columns/<name>`` if the name would be taken for another array of the cloud.
     """
     arrays: dict[str, NDArray[np.generic] | None] = {name: getattr(cloud, name) for name in _OWN}
     for name, column in cloud.columns.items():
@@ -243,7 +245,7 @@ def encode_npz(cloud: Cloud) -> bytes:
 
 
 def encode_npy(cloud: Cloud) -> bytes:
-    """Bytes of an .npy file: the points alone if the cloud has no more, else an array with a field for each column."""
+    """Bytes of an .npy file: the points if the cloud has nothing else, or a structured array of all columns."""
     columns = columns_of_cloud(cloud)
     shape = cloud.points.shape[:-1]
     table = np.empty(shape, [(name, column.dtype, column.shape[1:]) for name, column in columns.items()])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of Ouster LiDARs: packets in a pcap file, and the sensor's metadata (JSON) beside it.
 
-The geometry: Ouster, "Software User Manual", section "Coordinate frames and XYZ calculation". `ouster_packets` has the
-packets.
+Source of the geometry: Ouster, "Software User Manual", section "Coordinate frames and XYZ calculation". The module
+`ouster_packets` reads the packets.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from pcgraph.plumbing.plain_files import read_file
 def read_ouster(file: CloudFile) -> Cloud:
     """Cloud of one turn in a recording, in the sensor's own frame (x to the front, y to the left, z up).
 
-    It is the first turn that has all its columns; if none has, the one with most columns, the first of these.
+    It is the first turn with all its columns. If no turn has all, it is the first one with the most columns.
 
     Raises
     ------
     CloudReadError
-        The metadata are not beside the recording under its name with the end .json, or are broken; or the recording is
-        no pcap file, or has no packets of that sensor, or those of several.
+        There is no file of metadata beside the recording, with the same name and the suffix ``.json``, or it is
+        damaged. Or the recording is not a pcap file, has no packets of that sensor, or has packets of several sensors.
     """
     if file.path is None:
-        raise CloudReadError("a recording is read with the sensor's metadata beside it: give the path of a file")
+        raise CloudReadError("expected a recording with the sensor's metadata beside it: give the path of a file")
     beside = file.path.with_suffix(".json")
     if not beside.exists():
         raise CloudReadError(f"expected the sensor's metadata in {beside.name} beside the recording, found none")
@@ -53,10 +53,13 @@ def read_ouster(file: CloudFile) -> Cloud:
 def cloud_of_turn(turn: OusterTurn, metadata: SensorMetadata) -> Cloud:
     """Organised cloud (rings, columns) of the first return of each ray of a turn, in the sensor's own frame.
 
-    Columns are directions, not moments: rows are shifted (destaggered). NaN where there was no return. The `columns`
-    are ``range``, float32 metres from where the beam begins; ``reflectivity``, ``signal`` and ``near_ir``, uint16, if
-    the sensor sent them; ``time``, float64 seconds after the turn's first column, NaN for a column that is missing;
-    ``ring``, uint16. `viewpoint` is the middle of the head.
+    All points of a column have one direction, not one time: the rows are shifted (destaggered). Points are NaN where
+    there was no return. `viewpoint` is the centre of the rotating head. The `columns` of the cloud are
+
+    - ``range``, float32, metres from the origin of the beam
+    - ``reflectivity``, ``signal`` and ``near_ir``, uint16, if the sensor sent them
+    - ``time``, float64, seconds after the turn's first column; NaN for a missing column
+    - ``ring``, uint16
     """
     h, w = turn.range_m.shape[1:]
     source = columns_of_directions(metadata.pixel_shift, w)
@@ -78,7 +81,7 @@ def cloud_of_turn(turn: OusterTurn, metadata: SensorMetadata) -> Cloud:
 
 
 def _points(ranges: NDArray[np.float32], metadata: SensorMetadata) -> NDArray[np.float32]:
-    """(h, w, 3) float32 metres, sensor frame, of (h, w) ranges as the sensor fires, by the formula of the manual."""
+    """Points, (h, w, 3) float32, metres, sensor frame, of ranges (h, w) in firing order, by the manual's formula."""
     head = 2 * np.pi * (1 - np.arange(ranges.shape[1]) / ranges.shape[1])  # the encoder's angle, to the left
     azimuth = head - metadata.azimuths_rad[:, None]
     elevation = metadata.elevations_rad[:, None]

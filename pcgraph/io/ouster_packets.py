@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packets of Ouster LiDARs, the sensor's metadata (JSON) that tell their layout, and the turns that they make.
+"""Packets of Ouster LiDARs, the sensor's metadata (JSON) with their layout, and the turns that they form.
 
-Packets and their profiles: Ouster, "Firmware User Manual", section "Lidar data" (lidar data packet format), and
-"Software User Manual" for the legacy format. Words have 32 bits, little end first. A packet holds columns; a column
-holds its time, its number within the turn (measurement), a status, and for each ring a block of words, in whose bits
-the profile places range, reflectivity and the others.
+Source of the packets and their profiles: Ouster, "Firmware User Manual", section "Lidar data" (lidar data packet
+format), and "Software User Manual" for the legacy format.
+
+Words have 32 bits and are little-endian. A packet holds columns. A column holds its time, its number within the turn
+(measurement), a status, and a block of words for each ring. The profile says which bits of a block are the range, the
+reflectivity and the other numbers.
 """
 
 from __future__ import annotations
@@ -23,13 +25,14 @@ from pcgraph.io.pcap import Datagram, datagrams
 from pcgraph.plumbing.short_repr import ShortRepr, in_short
 
 MAX_COLUMNS = 4_096
-"""Largest number of columns of a turn: the finest mode of any sensor has as many."""
+"""Largest count of columns in a turn, from the finest mode of any sensor."""
 MAX_RINGS = 512
-"""Largest number of rings: twice as many as the 256 of the OS1 Max."""
+"""Largest count of rings: twice the 256 of the OS1 Max."""
 MAX_PACKET = 65_507
-"""Largest number of bytes of a packet: more do not fit into a UDP datagram over IPv4 (RFC 768, RFC 791)."""
+"""Largest packet, bytes, because no more fit into a UDP datagram over IPv4 (RFC 768, RFC 791)."""
 ROTATION_TOLERANCE = 1e-4
-"""Largest entry of |R R^T - I| of a rotation in the metadata: one with five decimals is off by at most 2e-5."""
+"""Largest entry of |R R^T - I| of a rotation R in the metadata, dimensionless: five times the 2e-5 that come from
+rounding to five decimals."""
 
 # ---- Profiles: where the bits are -----------------------------------------------------------------------------------
 
@@ -112,19 +115,20 @@ PROFILES = {
     "FUSA_RNG15_RFL8_NIR8_DUAL": Profile(2, _LOW_RATE_DUAL),
     "FIVE_WORD_PIXEL": Profile(5, _DUAL),
 }
-"""The profiles by their names in the metadata (`udp_profile_lidar`); ranges are in millimetres."""
+"""The profiles by name, as in the metadata (`udp_profile_lidar`); ranges are in millimetres."""
 
 
 # ---- Metadata -------------------------------------------------------------------------------------------------------
 
 Degrees = Annotated[float, msgspec.Meta(ge=-360, le=360)]
-"""An angle of a beam in the metadata, degrees."""
+"""Angle of a beam in the metadata, degrees, from -360 to 360: a turn in either direction."""
 Millimetres = Annotated[float, msgspec.Meta(ge=-1e5, le=1e5)]
-"""A length in the metadata, or an entry of a transform, millimetres; 100 m exclude only nonsense."""
+"""Length in the metadata, or entry of a transform, millimetres. The limit of 100 m refuses damaged files only. Chosen
+by eye; not varied."""
 
 
 class _DataFormat(msgspec.Struct):
-    """The part of the metadata that tells the layout of packets; other keys are left out."""
+    """The part of the metadata that describes the layout of packets; other keys are ignored."""
 
     columns_per_frame: Annotated[int, msgspec.Meta(ge=1, le=MAX_COLUMNS)]
     columns_per_packet: Annotated[int, msgspec.Meta(ge=1, le=MAX_COLUMNS)]
@@ -134,7 +138,7 @@ class _DataFormat(msgspec.Struct):
 
 
 class _Metadata(msgspec.Struct):
-    """The parts of the metadata that are used; other keys are left out."""
+    """The parts of the metadata that are used; other keys are ignored."""
 
     data_format: _DataFormat
     lidar_mode: str
@@ -206,7 +210,7 @@ def metadata_of(data: Any) -> SensorMetadata:
     Raises
     ------
     CloudReadError
-        A key is missing, numbers are out of bounds or contradict each other, or the profile is none of `PROFILES`.
+        A key is missing, numbers are out of bounds or contradict each other, or the profile is not in `PROFILES`.
     """
     if not isinstance(data, dict):
         raise CloudReadError(f"expected metadata as a table, got {in_short(data)}")
@@ -226,7 +230,7 @@ def metadata_of(data: Any) -> SensorMetadata:
 
 
 def _checked_metadata(found: _Metadata) -> SensorMetadata:
-    """The metadata; raises CloudReadError where they contradict themselves."""
+    """The checked metadata; raises CloudReadError if values contradict each other."""
     layout, rings = found.data_format, found.data_format.pixels_per_column
     if layout.udp_profile_lidar not in PROFILES:
         raise CloudReadError(
@@ -271,7 +275,7 @@ def _checked_metadata(found: _Metadata) -> SensorMetadata:
 
 
 def _beam_origin(found: _Metadata) -> NDArray[np.float64]:
-    """(3,) float64, metres, the place where the beams begin at azimuth 0, in the lidar frame."""
+    """Origin of the beams at azimuth 0, (3,) float64, metres, in the lidar frame."""
     if found.beam_to_lidar_transform is not None:
         return _transform("beam_to_lidar_transform", found.beam_to_lidar_transform)[:3, 3]
     if not np.isfinite(found.lidar_origin_to_beam_origin_mm):
@@ -280,7 +284,7 @@ def _beam_origin(found: _Metadata) -> NDArray[np.float64]:
 
 
 def _transform(name: str, numbers: list[float]) -> NDArray[np.float64]:
-    """A rigid transform of 16 numbers, row by row, millimetres, in metres."""
+    """Rigid transform (4, 4) in metres from 16 numbers, row by row, in millimetres."""
     if len(numbers) != 16:
         raise CloudReadError(f"expected 16 numbers in {name}, got {len(numbers)}")
     matrix = np.array(numbers, dtype=np.float64).reshape(4, 4)
@@ -298,7 +302,7 @@ def _transform(name: str, numbers: list[float]) -> NDArray[np.float64]:
 
 
 def _serial(value: str | int) -> int:
-    """A serial number of digits; 0 for any other text."""
+    """Serial number; 0 if the text has other characters than digits."""
     text = str(value) if isinstance(value, str) or abs(value) < 1 << 63 else ""
     return int(text) if text.isascii() and text.isdecimal() and len(text) < 19 else 0
 
@@ -307,9 +311,12 @@ def _serial(value: str | int) -> int:
 
 
 class PacketLayout:
-    """The places of columns and words in the packets of a sensor.
+    """The layout of a sensor's packets: where their columns and words are.
 
-    size : bytes of a packet.
+    Attributes
+    ----------
+    size : int
+        Bytes of a packet.
     """
 
     def __init__(self, metadata: SensorMetadata) -> None:
@@ -349,9 +356,10 @@ class PacketLayout:
         return int.from_bytes(payload[start : start + 5], "little")
 
     def _is_safety(self, payload: bytes) -> bool:
-        """Whether a packet has the header of functional safety, which places the numbers elsewhere.
+        """Whether a packet has the header for functional safety, in which the numbers are at other places.
 
-        Firmware has either header with the same profile, so the serial number tells, where it is known.
+        Firmware uses either header with the same profile. If the serial number is known, its place in the packet tells
+        which header it is.
         """
         if self.metadata.serial:
             return int.from_bytes(payload[11:16], "little") == self.metadata.serial
@@ -363,7 +371,7 @@ class PacketLayout:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OusterTurn(ShortRepr):
-    """One turn of a sensor: h rings, w columns, k returns for each ray, as the sensor fires.
+    """One turn of a sensor in firing order: h rings, w columns, k returns for each ray.
 
     Parameters
     ----------
@@ -391,10 +399,10 @@ class OusterTurn(ShortRepr):
 
 
 def ouster_turns(file: IO[bytes], metadata: SensorMetadata, port: int | None = None) -> Iterator[OusterTurn]:
-    """Iterator over the turns in an open pcap file, in little memory. The first and the last one may lack columns.
+    """Iterator over the turns in an open pcap file, which keeps one turn in memory.
 
-    Packets that arrive after one of the next turn are left out: their columns count as missing, as do those that the
-    sensor marks as invalid.
+    The first and the last turn may lack columns. A packet that arrives after one of the next turn is left out. Its
+    columns count as missing, as do those that the sensor marks as invalid.
 
     Parameters
     ----------
@@ -405,8 +413,8 @@ def ouster_turns(file: IO[bytes], metadata: SensorMetadata, port: int | None = N
     Raises
     ------
     CloudReadError
-        It is no pcap file, or has no packets of the size that the metadata state, or those of another sensor or of
-        several; it is raised at the first step of the iteration, or where the packet is met.
+        The file is not a pcap file. It has no packets of the size that follows from the metadata, or packets of another
+        sensor, or of several sensors. The error comes at the first step of the iteration, or at the packet.
     """
     layout = PacketLayout(metadata)
     turn: _Columns | None = None
@@ -430,7 +438,7 @@ def ouster_turns(file: IO[bytes], metadata: SensorMetadata, port: int | None = N
 
 
 def _lidar_packets(file: IO[bytes], layout: PacketLayout, port: int | None) -> Iterator[bytes]:
-    """Payloads of the packets with ranges, of one sensor."""
+    """Payloads of the packets with ranges, all from one sensor."""
     sender: tuple[str, int] | None = None
     sizes: set[int] = set()
     for datagram in datagrams(file):
@@ -450,7 +458,7 @@ def _lidar_packets(file: IO[bytes], layout: PacketLayout, port: int | None) -> I
 
 
 def _check_sender(datagram: Datagram, sender: tuple[str, int], layout: PacketLayout) -> None:
-    """Raise CloudReadError if a packet is not of the one sensor that the metadata describe."""
+    """Raise CloudReadError if a packet comes from another sensor than the metadata."""
     if (datagram.source, datagram.port) != sender:
         raise CloudReadError(
             f"the recording has packets of several sensors, from {sender[0]} to port {sender[1]} and from "
@@ -462,7 +470,7 @@ def _check_sender(datagram: Datagram, sender: tuple[str, int], layout: PacketLay
 
 
 class _Columns:
-    """The columns of a turn, which arrive packet by packet."""
+    """Buffer for the columns of a turn, which arrive packet by packet."""
 
     def __init__(self, metadata: SensorMetadata, frame: int) -> None:
         self.metadata, self.frame = metadata, frame
@@ -472,7 +480,7 @@ class _Columns:
         self.is_there = np.zeros(w, dtype=bool)
 
     def add(self, columns: np.ndarray) -> None:
-        """Add the columns that are valid."""
+        """Add those columns that the sensor marks as valid."""
         columns = columns[(columns["status"] & 1) == 1]
         places = columns["column"]
         if places.size and places.max() >= self.metadata.columns:
@@ -512,5 +520,5 @@ def _returns(values: dict[str, NDArray[np.uint32]], name: str, kind: type[Any]) 
 
 
 def columns_of_directions(pixel_shift: NDArray[np.int64], w: int) -> NDArray[np.int64]:
-    """(h, w) int64, the column of each row whose ray looks in the direction of a column: it destaggers an image."""
+    """Columns, (h, w) int64, from which each row takes its pixels so that a column has one direction (destaggering)."""
     return np.asarray((np.arange(w) - pixel_shift[:, None]) % w)

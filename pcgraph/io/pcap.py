@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""UDP datagrams of a recording of network traffic (pcap), one after the other, in little memory.
+"""UDP datagrams of a recorded network traffic (pcap), read one by one.
 
-The formats: the capture file of libpcap ("pcap-savefile", tcpdump.org; draft-ietf-opsawg-pcap), IPv4 (RFC 791) with
-its fragments, UDP (RFC 768). IPv6 and what is no UDP are left out.
+Sources: the capture file of libpcap ("pcap-savefile", tcpdump.org; draft-ietf-opsawg-pcap), IPv4 (RFC 791) with its
+fragments, UDP (RFC 768). IPv6 and other protocols than UDP are left out.
 """
 
 from __future__ import annotations
@@ -15,31 +15,36 @@ from typing import IO, NamedTuple
 from pcgraph.errors import CloudReadError
 
 MAX_RECORD = 262_144
-"""Largest number of bytes of one record: libpcap's own limit (its MAXIMUM_SNAPLEN for networks)."""
+"""Largest record, bytes. Source: libpcap's limit for networks, MAXIMUM_SNAPLEN."""
 MAX_PENDING = 64
-"""Largest number of datagrams whose fragments are waited for. A sensor sends one after the other, and a datagram that
-lost a fragment never becomes whole; 64 are enough for several sensors at once."""
+"""Largest count of incomplete datagrams that are kept. A sensor sends the fragments of one datagram after the other, so
+that more are needed for several sensors only. Chosen by eye; not varied."""
 MAX_DATAGRAM = 65_535
-"""Largest number of bytes of an IPv4 packet, and therefore of its fragments together (RFC 791)."""
+"""Largest IPv4 packet, and so the largest sum of its fragments, bytes, because its length has 16 bits (RFC 791)."""
 _MAGIC = {b"\xd4\xc3\xb2\xa1": "<", b"\xa1\xb2\xc3\xd4": ">", b"\x4d\x3c\xb2\xa1": "<", b"\xa1\xb2\x3c\x4d": ">"}
-"""First four bytes of a file, and the order of bytes that they mean; the last two are of times in nanoseconds."""
+"""Byte order by the first four bytes of a file; the last two belong to files with times in nanoseconds."""
 _NEXT_GENERATION = b"\x0a\x0d\x0d\x0a"
-"""First four bytes of the other format that Wireshark writes, pcapng."""
+"""First four bytes of pcapng, the other format that Wireshark writes."""
 _LINK_HEADERS = {0: 4, 1: 14, 101: 0, 113: 16, 228: 0, 276: 20}
 """Number of bytes before the IP packet, by type of link: BSD loopback, Ethernet, raw IP, Linux cooked, IPv4, Linux
 cooked 2."""
 _VLAN = (0x8100, 0x88A8)
-"""Types of Ethernet frames with a tag of a virtual network (IEEE 802.1Q, 802.1ad): they have four more bytes before the
-type of what they carry."""
+"""Types of Ethernet frames with a tag of a virtual network: four more bytes before the type of their content. Source:
+IEEE 802.1Q and 802.1ad."""
 _UDP = 17
-"""Number of UDP among the protocols of IP (IANA)."""
+"""Protocol number of UDP in an IP header. Source: IANA."""
 
 
 class Datagram(NamedTuple):
     """A UDP datagram.
 
-    source, port : the sender's address as text, and the port that the datagram was sent to.
-    payload : the bytes.
+    Attributes
+    ----------
+    source : str
+        Address of the sender.
+    port : int
+        Port to which the datagram was sent.
+    payload : bytes
     """
 
     source: str
@@ -48,16 +53,16 @@ class Datagram(NamedTuple):
 
 
 def datagrams(file: IO[bytes]) -> Iterator[Datagram]:
-    """Iterator over the whole UDP datagrams of an open pcap file, in its order; fragments are put together.
+    """Iterator over the UDP datagrams of an open pcap file, in the file's order, joined from their fragments.
 
-    A file that ends within a record ends there: so does a recording that was interrupted. Datagrams that the recording
-    cut short or that lost a fragment are left out.
+    A recording that was interrupted may end within a record; that record is left out. So are datagrams that the
+    recording truncated, and those that lost a fragment.
 
     Raises
     ------
     CloudReadError
-        The file is no pcap file, or a record is damaged; it is raised at the first step of the iteration, or where the
-        record is met.
+        The file is not a pcap file, or a record is damaged. The error comes at the first step of the iteration, or at
+        the record.
 
     Examples
     --------
@@ -78,13 +83,13 @@ def datagrams(file: IO[bytes]) -> Iterator[Datagram]:
 
 
 def _file_header(file: IO[bytes]) -> tuple[str, int]:
-    """Order of bytes and type of link."""
+    """Byte order of a pcap file, and its type of link."""
     header = file.read(24)
     if header[:4] == _NEXT_GENERATION:
         raise CloudReadError("this is a pcapng file; convert it to pcap, for example with editcap -F pcap")
     order = _MAGIC.get(header[:4], "")
     if len(header) < 24 or not order:
-        raise CloudReadError("this is no pcap file: it does not start as one")
+        raise CloudReadError("this is no pcap file: it does not begin as one")
     link: int = struct.unpack(order + "I", header[20:24])[0] & 0xFFFF  # the upper bits tell of checksums
     if link not in _LINK_HEADERS:
         raise CloudReadError(f"expected packets of Ethernet, raw IP or Linux cooked capture, got link {link}")
@@ -115,13 +120,13 @@ def _ip_packet(record: bytes, link: int) -> memoryview | None:
 
 
 class _Fragments:
-    """Fragments of datagrams that are not whole yet. The datagrams are in the order of their first fragments."""
+    """Fragments of incomplete datagrams, in the order of their first fragments."""
 
     def __init__(self) -> None:
         self.pending: OrderedDict[bytes, tuple[dict[int, bytes], list[int]]] = OrderedDict()
 
     def whole(self, packet: memoryview) -> Datagram | None:
-        """The datagram that an IPv4 packet is or completes; None if it is none, or some of it is missing."""
+        """The datagram in an IPv4 packet, or the one that it completes; None if there is none or parts are missing."""
         header, total = 4 * (packet[0] & 15), int.from_bytes(packet[2:4], "big")
         if packet[9] != _UDP or header < 20 or not header <= total <= len(packet):
             return None
@@ -148,7 +153,7 @@ class _Fragments:
 
 
 def _joined(parts: dict[int, bytes], size: int) -> bytes | None:
-    """Fragments by their offset as one; None unless they follow each other without gap or overlap."""
+    """The joined fragments, given by their offsets; None if they leave a gap or overlap."""
     joined = bytearray()
     for offset in sorted(parts):
         if offset != len(joined):

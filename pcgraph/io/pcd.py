@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PCD files (Point Cloud Data, PCL's format): versions 0.5 to 0.7 are read, in ascii, binary and binary_compressed."""
+"""PCD files, PCL's Point Cloud Data format: versions 0.5 to 0.7 in ascii, binary and binary_compressed."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from pcgraph.io.text_numbers import columns_of_rows
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _INSTEAD = {"f2": "f4", "b1": "u1"}
-"""Types that PCD does not have, and those that are written in their place."""
+"""Types that PCD does not have, and the types that are written instead."""
 _MAX_NUMBER = 10**15
-"""Largest number of a header, count of points and the like: no file holds as many, and numpy still takes it as the
+"""Largest whole number of a header, such as the count of points: no file holds as many, and NumPy still takes it as the
 length of an array of no bytes. Chosen by eye; not varied."""
 
 
@@ -37,12 +37,12 @@ class PcdHeader:
 
     Attributes
     ----------
-    names, dtypes, counts : one per field
+    names, dtypes, counts : tuples with an entry for each field
         Name, little-endian scalar type, and count of numbers per point.
     width, height : int
         Size of the lattice; an unorganised cloud has the height 1.
     viewpoint : (3,) float64, metres, or None
-        Position of the sensor. None if it is missing, damaged, or (0, 0, 0), which PCL writes where it knows nothing.
+        Position of the sensor. None if it is missing, damaged, or (0, 0, 0), which PCL writes for an unknown position.
     data : str
         ``ascii``, ``binary`` or ``binary_compressed``.
     n_lines : int
@@ -72,7 +72,7 @@ class PcdHeader:
 def read_pcd(content: bytes) -> Cloud:
     """Cloud of a PCD file, given the file's bytes, with organisation, NaN, colours, normals and labels.
 
-    What older versions leave out is taken as PCL takes it: ``COLUMNS`` are FIELDS, numbers without SIZE and TYPE are
+    Headers of older versions are understood as PCL does: ``COLUMNS`` means FIELDS, numbers without SIZE and TYPE are
     float32, and a cloud without HEIGHT is a list. The orientation in VIEWPOINT and the alpha of ``rgba`` are not read.
 
     Raises
@@ -194,7 +194,7 @@ def _compressed_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.
 
 
 def _without_axis(values: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Columns (n, c) of a field; (n,) if it has one number per point."""
+    """Values of a field: (n, c) unchanged, but (n, 1) as (n,)."""
     return values[:, 0] if values.shape[1] == 1 else values
 
 
@@ -210,14 +210,15 @@ def _check_length(available: int, needed: int, header: PcdHeader) -> None:
 
 @cache
 def lzf_decompressor() -> Callable[[NDArray[np.uint8], NDArray[np.uint8]], int]:
-    """The compiled `decompress_lzf`; only compressed files import numba."""
+    """The compiled `decompress_lzf`; numba is imported here, so that only compressed files need it."""
     from pcgraph.kernel_cache import cached_njit
 
     return cached_njit()(decompress_lzf)
 
 
 def decompress_lzf(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
-    """Number of bytes written to `target`; -1 if the stream is broken or does not fit.
+    """Decompress an LZF stream; returns the number of bytes written to `target`, or -1 if it is damaged or does not
+    fit.
 
     Parameters
     ----------
@@ -269,13 +270,13 @@ def decompress_lzf(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
 def encode_pcd(cloud: Cloud) -> bytes:
     """Bytes of a binary PCD file, version 0.7.
 
-    Colours are packed as ``rgb`` and normals are called ``normal_x`` and so on, as PCL and Open3D read them. The
-    orientation of the sensor is that of its frame, 1 0 0 0.
+    Colours are packed as ``rgb`` and normals are called ``normal_x`` and so on, as PCL and Open3D expect. The
+    orientation of the sensor is the identity, 1 0 0 0.
 
     Raises
     ------
     CloudWriteError
-        Two columns have one name, or one is wider than 64 bits.
+        Two columns have the same name once blanks are underscores, or a column has numbers of more than 64 bits.
     """
     columns = columns_of_cloud(cloud, colors=(PACKED_NAMES[:1], COLOR_NAMES), normals=NORMAL_NAMES)
     check_words(list(columns))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PLY files (Stanford polygon format 1.0), ascii and both binary byte orders; only vertices are read."""
+"""PLY files (Stanford polygon format 1.0) in ascii and in either binary byte order; only the vertices are read."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ _TYPES = {
 }  # fmt: skip
 _NAMES = {kind: name for name, kind in _TYPES.items() if name.isalpha()}
 _LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}
-"""Letters of the module struct for the types of lengths."""
+"""Format characters of Python's module struct for the types of list lengths."""
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 _VERTICES = ("vertex", "vertices", "point", "points")
-"""Names of the element that holds the points, the standard's first; the others are those of hand-made writers."""
+"""Names of the element that holds the points: first that of the standard, then those that other programs write."""
 _INSTEAD = {"i8": "f8", "u8": "f8", "f2": "f4", "b1": "u1"}
-"""Types that PLY does not have, and those that are written in their place."""
+"""Types that PLY does not have, and the types that are written instead."""
 
 
 class PlyProperty(NamedTuple):
-    """A property: its name, its type, and the type of its count if it is a list, else ""."""
+    """A property of an element: its name, its type, and for a list the type of its length, else ""."""
 
     name: str
     kind: str
@@ -59,21 +59,21 @@ class PlyElement:
 
     @property
     def has_list(self) -> bool:
-        """Whether rows differ in length, perhaps."""
+        """Whether a property is a list, so that rows may differ in length."""
         return any(one.count_kind for one in self.properties)
 
 
 def read_ply(content: bytes) -> Cloud:
     """Cloud of the vertices of a PLY file, given the file's bytes, with colours, normals and labels.
 
-    The element of the vertices may be called ``vertices``, ``point`` or ``points``, too. A list of the vertices, such
-    as the views of a point, is a column (n, c) if all have the same length c, else it is left out, because a cloud has
-    no columns of rows that differ in length.
+    The element of the vertices may also be called ``vertices``, ``point`` or ``points``. A list property of the
+    vertices, such as the views of a point, becomes a column (n, c) if all lists have the same length c. Else it is left
+    out, because the rows of a column must have one length.
 
     Raises
     ------
     CloudReadError
-        The header is broken, vertices have no coordinates, the data are shorter than the header says, or a row of text
+        The header is damaged, vertices have no coordinates, the data are shorter than the header says, or a row of text
         has more or fewer numbers than the header has properties.
     """
     code, elements, body = _parse_header(content)
@@ -98,7 +98,7 @@ def encode_ply(columns: Columns) -> bytes:
     Parameters
     ----------
     columns : mapping of property name to (n,) array
-        Types are those of PLY: integers of up to 32 bits, float32 or float64.
+        The types must be those of PLY: integers of up to 32 bits, float32 or float64.
     """
     record = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
     n_points = len(next(iter(columns.values())))
@@ -166,7 +166,7 @@ def _parse_header(content: bytes) -> tuple[str, list[PlyElement], bytes]:
 
 
 def _with_line_feeds(content: bytes) -> bytes:
-    """The content of a file of old Macintosh systems, whose lines end in a carriage return; binary data stay."""
+    """The content of a file from old Macintosh systems with line feeds for carriage returns; binary data stay."""
     end = content.find(b"\r", content.find(b"\rend_header", 0, MAX_HEADER_BYTES) + 1) + 1
     header, body = content[:end].replace(b"\r", b"\n"), content[end:]
     return header + (body.replace(b"\r", b"\n") if b"\nformat ascii" in header else body)
@@ -202,7 +202,7 @@ def _ascii_columns(element: PlyElement, body: bytes, first_line: int) -> Columns
 
 
 def _listed_rows(element: PlyElement, body: bytes, first_line: int) -> Columns:
-    """Columns of rows with lists, whose lengths stand before their numbers."""
+    """Columns of text rows with lists; the length of a list stands before its numbers."""
     if element.count * len(element.properties) > len(body):
         raise CloudReadError(f"the PLY header promises {element.count} vertices, but only {len(body)} bytes follow")
     lines = ((number, line) for number, line in enumerate(BytesIO(body), first_line) if line.strip())
@@ -235,7 +235,7 @@ def _listed_rows(element: PlyElement, body: bytes, first_line: int) -> Columns:
 
 
 def _length(word: list[float], number: int) -> int:
-    """Length of a list from its first number; -1, which no row fits, if it is none."""
+    """Length of a list from the number before it; raises CloudReadError if that is not a length."""
     if word and word[0] >= 0 and word[0].is_integer():
         return int(word[0])
     raise CloudReadError(f"expected the length of a list in line {number}, got {word[0] if word else 'nothing'}")
@@ -245,7 +245,7 @@ def _length(word: list[float], number: int) -> int:
 
 
 def _skip(element: PlyElement, code: str, body: bytes) -> bytes:
-    """The bytes after an element; of a text, the lines after its rows, where empty lines are no rows."""
+    """The bytes after the rows of an element; empty lines of a text are not rows."""
     if code == "ascii":
         lines = BytesIO(body)
         rows = (line for line in lines if line.strip())
@@ -276,7 +276,7 @@ def _binary_columns(element: PlyElement, order: str, body: bytes) -> Columns:
 
 
 def _common_record(element: PlyElement, order: str, body: bytes) -> np.dtype[np.void] | None:
-    """The record of every row of an element; None if lists differ in length, or if the data end before that is known.
+    """The record type of all rows of an element; None if lists differ in length, or if the data end too soon to tell.
 
     It has the fields ``length i`` and ``value i`` of each property i.
     """
@@ -306,16 +306,16 @@ def _common_record(element: PlyElement, order: str, body: bytes) -> np.dtype[np.
 
 
 class _Scattered(NamedTuple):
-    """Places of the numbers of rows that differ in length.
+    """Byte offsets of the numbers in rows of different lengths.
 
     Attributes
     ----------
     starts : (n, p) int64
-        First byte of each row's value of each property.
+        Offset of the first number of each row and property.
     lengths : (n, p) int64
-        How many numbers the value has: 1 if it is no list.
+        Count of the numbers of each row and property; 1 if the property is not a list.
     end : int
-        The byte after the last row.
+        Offset after the last row.
     """
 
     starts: NDArray[np.int64]
@@ -323,7 +323,7 @@ class _Scattered(NamedTuple):
     end: int
 
     def columns(self, element: PlyElement, order: str, body: bytes) -> Columns:
-        """Columns of the values that are equally long in all rows."""
+        """Columns of the properties that have the same length in all rows."""
         content = np.frombuffer(body, np.uint8)
         columns: Columns = {}
         for one, starts, lengths in zip(element.properties, self.starts.T, self.lengths.T, strict=True):
@@ -336,7 +336,7 @@ class _Scattered(NamedTuple):
 
 
 def _scattered(element: PlyElement, order: str, body: bytes) -> _Scattered:
-    """Places of an element's numbers, found row by row."""
+    """Byte offsets of an element's numbers, found row by row."""
     sizes = [np.dtype(one.kind).itemsize for one in element.properties]
     counts = [struct.Struct(order + _LETTERS[one.count_kind]) if one.count_kind else None for one in element.properties]
     least = sum(size if count is None else count.size for size, count in zip(sizes, counts, strict=True))

@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PTX files of terrestrial scanners (Leica Cyclone): scans, each on its lattice of directions.
+"""PTX files of terrestrial scanners (Leica Cyclone), which hold scans as lattices of directions.
 
-A scan has ten lines above its points: the number of columns; the number of rows; place and axes of the scanner, in
-four lines of three numbers; a matrix M of 4 x 4. (x, y, z, 1) M is a point in the common frame. M also says where the
-scanner is in that frame; place and axes may be those of another one. The points follow column by column, in the
-scanner's own frame: x y z intensity, or x y z intensity red green blue. Where nothing was measured, x y z are zero.
-Leica's manual of Cyclone and P. Bourke (paulbourke.net/dataformats/ptx) describe the format.
+A scan has ten lines above its points:
+
+- the number of columns
+- the number of rows
+- four lines of three numbers: place and axes of the scanner. Their frame may be another one, so they are not used.
+- four lines of four numbers: a matrix M. (x, y, z, 1) M is a point in the common frame, and the last row of M is the
+  place of the scanner in it.
+
+The points follow column by column, in the scanner's own frame: x y z intensity, or x y z intensity red green blue.
+Where nothing was measured, x y z are zero. Source: Leica's manual of Cyclone; P. Bourke
+(paulbourke.net/dataformats/ptx).
 """
 
 from __future__ import annotations
@@ -23,11 +29,11 @@ from pcgraph.io.format import CloudFile, Format
 from pcgraph.io.text import MIN_ROW_BYTES, TextLines, column_of_numbers, is_number, numbers
 
 _COUNTS = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
-"""Numbers in each of the lines above the points of a scan."""
+"""Count of the numbers in each of the ten lines above a scan's points, from the module's description of the format."""
 _NAMES = {4: ("intensity",), 7: ("intensity", *COLOR_NAMES)}
-"""Names of the columns after x y z, by the number of all columns."""
+"""Names of the columns after x y z, by the count of all columns in a row."""
 _MAX_SIDE = 10**9
-"""Columns or rows of a scan, at most: more do not fit into a file. Chosen by eye; not varied."""
+"""Largest count of columns or of rows in a scan: no file holds more. Chosen by eye; not varied."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +45,7 @@ class Scan:
     width, height : int
         Columns and rows.
     place : (3,) float64, metres, the common frame
-        Of the scanner.
+        Position of the scanner.
     points : (width x height, 3) float64, metres, the common frame
         Column by column; NaN where nothing was measured.
     values : (width x height, 1 or 4) float64
@@ -56,14 +62,14 @@ class Scan:
 def read_ptx(file: CloudFile) -> Cloud:
     """Cloud of a PTX file, in the common frame; points are float64.
 
-    One scan is organised, (rows, columns), in the order of the file: row 0 has the first point of each column. Several
-    scans are a list, scan after scan, with a column ``scan``, int32, from 0. `viewpoint` is the place of the scanner,
-    (3,), or the place of each point's scanner, (n, 3).
+    A single scan becomes an organised cloud (rows, columns): row 0 has the first point of each column. Several scans
+    become a list of points, scan after scan, and the column ``scan`` (int32) has the number of the scan, from 0.
+    `viewpoint` is the place of the scanner, (3,), or that of each point's scanner, (n, 3).
 
     Raises
     ------
     CloudReadError
-        The lines above a scan are broken, the matrix does not end in the column 0 0 0 1, or there are fewer points than
+        The lines above a scan are damaged, the last column of the matrix is not 0 0 0 1, or there are fewer points than
         columns times rows.
     """
     scans = list(_scans(file.content))

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text files of points, a row of numbers for each: .xyz, .txt, .csv, .asc, .pts and their kin.
+"""Text files with a row of numbers for each point: ``.xyz``, ``.txt``, ``.csv``, ``.asc``, ``.pts`` and similar ones.
 
-There is no standard. CloudCompare documents what files in use have in common ("ASCII cloud"). Leica documents .pts: a
-count of points, then rows of x y z, intensity, red green blue.
+There is no standard. CloudCompare documents what files in use have in common ("ASCII cloud"). Leica documents ``.pts``:
+a count of points, then rows of x y z, intensity, red green blue.
 
-Rows. Numbers stand between blanks, tabs, commas or semicolons. Between semicolons, a comma is the decimal sign. An
-empty cell between commas or semicolons is NaN, and so are ``NA``, ``null`` and the like. All rows have as many numbers
-as the first. Lines that begin with ``#``, ``//`` or ``%`` are comments, and so is what follows a ``#``.
+**Rows.** Numbers are separated by blanks, tabs, commas or semicolons. In rows with semicolons, a comma is the decimal
+sign. An empty cell between commas or semicolons is NaN, and so are words such as ``NA`` and ``null``. All rows have as
+many numbers as the first. Lines that begin with ``#``, ``//`` or ``%`` are comments, and so is any text after a ``#``.
 
-Names. The columns are named by, in this order: `columns` of `read_cloud`; a line of names before the rows, with or
-without quotes or a comment sign, such as ``//X Y Z R G B Scalar field``; the format (.xyzn, .xyzrgb); the number of
-columns, where it leaves no doubt:
+**Names.** The names of the columns come from the first of these that is there:
+
+1. the argument `columns` of `read_cloud`
+2. a line of names above the rows, with or without quotes or a comment sign, such as ``//X Y Z R G B Scalar field``
+3. the format (``.xyzn``, ``.xyzrgb``)
+4. the number of columns, if it leaves no doubt:
 
 ===========  ==================================  =========================================================
 columns      names                               condition
@@ -25,11 +28,11 @@ columns      names                               condition
              column_7                            three are not
 ===========  ==================================  =========================================================
 
-All other columns keep their numbers as names, as NumPy counts them: ``column_3`` is the fourth.
+All other columns have their index as name, counted from 0: ``column_3`` is the fourth.
 
-Types. A column is of whole numbers if they are written as such: int32, or int64 or uint64 if they need it. All other
-columns are float32 if this loses nothing, else float64. `encode_text` writes floats with all their digits, so values
-come back as they were, whatever the width of their types.
+**Types.** A column of numbers that are written as whole ones is int32, or int64 or uint64 if it needs 64 bits. All
+other columns are float32 if this loses nothing, else float64. `encode_text` writes all digits of a number, so values
+come back exactly, though perhaps in a narrower type.
 """
 
 from __future__ import annotations
@@ -60,39 +63,39 @@ from pcgraph.io.format import MAX_HEADER_BYTES, CloudFile, Format
 from pcgraph.io.text_numbers import INFINITY_OF_WINDOWS, NAN_OF_WINDOWS
 
 MAX_LINE = 1 << 16
-"""Bytes of a line, count: far more than rows have, so that one endless line does not fill the memory. Chosen by
-eye; not varied."""
+"""Largest line, bytes: far more than rows have, so that one endless line does not fill the memory. Chosen by eye; not
+varied."""
 MAX_COLUMNS = 1024
-"""Columns of a table, count: a guard. Chosen by eye; not varied."""
+"""Largest count of columns in a table: far more than tables of points have. Chosen by eye; not varied."""
 MAX_OFF_UNIT = 0.01
-"""Difference between the length of a normal and 1, at most: writers give at least three digits after the point. Chosen
-by eye; not varied."""
+"""Largest difference between the length of a normal and 1, a fraction: programs write three digits after the point or
+more. Chosen by eye; not varied."""
 MAX_EXACT = 2.0**53
-"""Whole numbers up to here are exact in float64."""
+"""Largest whole number up to which all are exact in float64, because it has 53 bits for the digits."""
 MIN_ROW_BYTES = 6
-"""Bytes of a row, at least: three digits, two blanks and a line end."""
+"""Least size of a row, bytes: three digits, two blanks and a line end."""
 ROWS_AT_ONCE = 100_000
-"""Rows whose words are made at a time, count, so that a large cloud does not become as many strings at once. Chosen by
-eye; not varied."""
+"""Count of rows that become text at a time, so that the strings of a large cloud are not all in memory at once. Chosen
+by eye; not varied."""
 COMMENTS = ("#", "//", "%")
 
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-"""First bytes of a text in UTF-16."""
+"""Byte order marks of a text in UTF-16."""
 
 _WHOLE = re.compile(r"[-+]?[0-9]+")
 _COUNT = re.compile(r"[0-9]{1,15}")
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+(,[0-9]+([eE][-+]?[0-9]+)?)?")
 _UNIT = re.compile(r"\s*[\[(][^\])]*[\])]$")
 _MISSING = ("NA", "N/A", "n/a", "null", "NULL", "None")
-"""Words that stand for NaN in tables of R and pandas, of databases and of Python."""
+"""Words for a missing number in tables of R, pandas, databases and Python; they are read as NaN."""
 _OF_NUMBERS = b"0123456789.+- \t,;\r\n"
-"""Bytes of which most rows consist: what is left of a text without them is searched soon."""
+"""Bytes of which most rows consist. A text without them is short, and so is quickly searched for other words."""
 _IS_NAN = re.compile(rf"(?<![^\s,;])[-+]?(?:{'|'.join(_MISSING)}|{NAN_OF_WINDOWS})(?![^\s,;])")
 _IS_INFINITE = re.compile(INFINITY_OF_WINDOWS)
 _SHORT_COLORS = (("r", "g", "b"), ("rf", "gf", "bf"))
-"""Names of red, green and blue that CloudCompare writes, as bytes and as floats within 0..1."""
+"""Names of red, green and blue in files of CloudCompare: as bytes, and as floats from 0 to 1."""
 _NAMES_BEFORE_A_FIELD = {"x", "y", "z", *COLOR_NAMES, *NORMAL_NAMES[1], "intensity"}
-"""Names in lower case that CloudCompare writes before the only scalar field, whose name may have blanks."""
+"""Names, in lower case, that CloudCompare writes before the name of a single scalar field, which may have blanks."""
 _PTS = (
     ("x", "y", "z"),
     ("x", "y", "z", "intensity"),
@@ -107,14 +110,14 @@ _PTS = (
 
 @dataclass(frozen=True)
 class Dialect:
-    """How the numbers of a row are separated.
+    """Separator of the numbers in a row, as in the CSV dialects of Python's csv module.
 
     Attributes
     ----------
     separator : str
-        A comma or a semicolon; a blank for rows of words between blanks and tabs.
+        A comma or a semicolon; a blank means any blanks and tabs.
     has_last : bool
-        Whether rows end in a separator with nothing behind it.
+        Whether rows end in a separator.
     has_empty : bool
         Whether cells may be empty.
     """
@@ -125,7 +128,7 @@ class Dialect:
 
     @staticmethod
     def of(line: str) -> Dialect | None:
-        """The dialect of a row of numbers; None if the line is no such row."""
+        """The dialect of a line; None if the line is not a row of numbers."""
         separator = next((sign for sign in ";," if sign in line), " ")
         found = Dialect(separator, has_last=separator != " " and line.rstrip().endswith(separator))
         words = found.row(line.partition("#")[0]).split()
@@ -157,7 +160,7 @@ def is_number(word: str) -> bool:
 
 
 class TextLines:
-    """The lines of a text that are not empty, one after the other, without the blanks before them.
+    """Iterator over the lines of a text, without empty lines and without leading blanks.
 
     Attributes
     ----------
@@ -183,16 +186,16 @@ class TextLines:
                 if not line.isspace():
                     yield self._usual(line.lstrip()) if self._has_odd_numbers else line.lstrip()
         except UnicodeError:
-            raise CloudReadError("expected a text in UTF-16, as its first bytes say, but the others are none") from None
+            raise CloudReadError("expected a text in UTF-16, as its first bytes say, but it is damaged") from None
 
     @staticmethod
     def _usual(line: str) -> str:
-        """The line with the usual spellings of NaN and infinity."""
+        """The line with NaN and infinity spelled ``nan`` and ``inf``."""
         return _IS_INFINITE.sub("inf", _IS_NAN.sub("nan", line))
 
 
 def _refuse_long_lines(content: bytes) -> None:
-    """Raise CloudReadError if no line ends within some `MAX_LINE` bytes."""
+    """Raise CloudReadError if a block of `MAX_LINE` bytes has no line end."""
     for start in range(0, len(content) - MAX_LINE, MAX_LINE):
         if all(content.find(end, start, start + MAX_LINE) < 0 for end in (b"\n", b"\r")):
             number = max(content.count(end, 0, start) for end in (b"\n", b"\r")) + 1
@@ -200,7 +203,10 @@ def _refuse_long_lines(content: bytes) -> None:
 
 
 def encoding_of(content: bytes) -> str:
-    """UTF-8, or UTF-16 by the mark at its beginning, or else Latin-1. Raises CloudReadError if it is no text."""
+    """Encoding of a text: UTF-16 if it has the byte order mark, else UTF-8 if it is valid, else Latin-1.
+
+    Raises CloudReadError if the content is binary.
+    """
     if content.startswith(UTF_16):
         return "utf-16"
     if content.startswith(codecs.BOM_UTF8):
@@ -216,18 +222,19 @@ def encoding_of(content: bytes) -> str:
 
 
 def numbers(rows: Iterable[str], lines: TextLines) -> NDArray[np.float64]:
-    """(n, m) float64 table of rows of numbers between blanks, m the count in the first row.
+    """Table (n, m) float64 of the rows, with m numbers in each.
 
     Parameters
     ----------
-    rows : iterator over the rows, taken from `lines`
+    rows : iterable of str
+        Rows of numbers between blanks, which come from `lines`.
     lines : TextLines
-        It knows the number of the line for messages.
+        It has the number of the line for messages.
 
     Raises
     ------
     CloudReadError
-        There is no row, or one has more or fewer numbers than the first, or a word that is no number.
+        There is no row, a row has more or fewer numbers than the first, or a word is not a number.
     """
     rows = iter(rows)
     first = next(rows, None)
@@ -251,7 +258,7 @@ def numbers(rows: Iterable[str], lines: TextLines) -> NDArray[np.float64]:
 
 
 def known_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Names with those of coordinates and colours as `cloud_from_columns` knows them; the others as they are."""
+    """The names, with those of coordinates and colours replaced by the ones that `cloud_from_columns` expects."""
     names = [name or f"column_{i}" for i, name in enumerate(names)]
     bare = [_UNIT.sub("", name) for name in names]
     found = [short if short.lower() in ("x", "y", "z") else name for short, name in zip(bare, names, strict=True)]
@@ -264,7 +271,7 @@ def known_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _words(line: str, separator: str | None) -> list[str]:
-    """Words of a line of names; those in quotes may have blanks. separator : None for blanks and tabs."""
+    """Names in a line; those in quotes may have blanks. Without a separator, blanks and tabs separate them."""
     text = line.rstrip("\r\n")
     for sign in COMMENTS:
         text = text.removeprefix(sign)
@@ -278,7 +285,7 @@ def _words(line: str, separator: str | None) -> list[str]:
 
 
 def _header(line: str, count: int | None) -> tuple[str, ...] | None:
-    """The names in a line, `count` of them; None if it has another number of names, or none of x, y, z."""
+    """The `count` names in a line; None if it has more or fewer names, or x, y or z is missing."""
     for separator in (",", ";", "\t", None):
         try:
             names = _words(line, separator)
@@ -295,7 +302,10 @@ def _header(line: str, count: int | None) -> tuple[str, ...] | None:
 
 
 def names_of_numbers(table: NDArray[np.float64], is_pts: bool) -> tuple[str, ...]:
-    """Names of the columns of a table that has none, as the module's table says; raises CloudReadError below three."""
+    """Names for the columns of a table without names, by the rules in the module's docstring.
+
+    Raises CloudReadError if there are fewer than three columns.
+    """
     count = table.shape[1]
     if count < 3:
         raise CloudReadError(f"expected x, y and z in each row, got {count} numbers")
@@ -328,12 +338,12 @@ def _are_unit_vectors(values: NDArray[np.float64]) -> bool:
 
 @dataclass
 class TextTable:
-    """The rows of a text, and what stands above them.
+    """The rows of a text, and the names above them.
 
     Attributes
     ----------
     lines : TextLines
-        The lines from which `rows` comes; it knows the number of the last one.
+        The lines from which `rows` comes; it has the number of the last line that was read.
     names : tuple of str, or None
         Names of the columns, if a line above the rows has them.
     first : list of str
@@ -349,12 +359,18 @@ class TextTable:
 
 
 def open_table(content: bytes, is_named: bool = False) -> TextTable:
-    """The table in a text. is_named : whether the user named the columns, so that any line may stand above the rows.
+    """The table in a text.
+
+    Parameters
+    ----------
+    content : bytes
+    is_named : bool
+        Whether the user named the columns. Then any lines may be above the rows.
 
     Raises
     ------
     CloudReadError
-        The content is no text, or has no rows, or a line above them is neither a comment nor names nor a count.
+        The content is not a text, it has no rows, or a line above them is neither a comment nor names nor a count.
     """
     lines = TextLines(content)
     above: list[tuple[int, str]] = []
@@ -388,13 +404,13 @@ def open_table(content: bytes, is_named: bool = False) -> TextTable:
 
 
 def _has_empty(content: bytes, separator: str) -> bool:
-    """Whether there may be empty cells: between separators, or between one and the beginning or end of a line."""
+    """Whether there may be empty cells: between two separators, or between a separator and an end of a line."""
     signs = [f"{separator}{sign}" for sign in (separator, f" {separator}", "\n", "\r")]
     return content.startswith(UTF_16) or any(sign.encode() in content for sign in (*signs, f"\n{separator}"))
 
 
 def _promise(line: str, lines: TextLines) -> int:
-    """The count of points in the last line; raises CloudReadError if the file is too small for it."""
+    """The count of points in a line; raises CloudReadError if the file is too small for that many."""
     count = int(line)
     if count * MIN_ROW_BYTES > lines.size + 1:  # the last row may have no end
         raise CloudReadError(
@@ -414,7 +430,7 @@ def _refuse_decimal_commas(line: str, number: int) -> None:
 
 
 def _names(above: list[tuple[int, str]], count: int | None) -> tuple[str, ...] | None:
-    """The names in the last line above the rows that has `count` of them; None if there is no such line."""
+    """The names in the last line above the rows with `count` names; None if there is no such line."""
     return next((names for _, line in reversed(above) if (names := _header(line, count))), None)
 
 
@@ -429,7 +445,7 @@ def _refuse_strangers(above: list[tuple[int, str]], count: int, is_named: bool) 
 
 
 def _rows(stream: Iterator[str], dialect: Dialect, promised: int | None, lines: TextLines) -> Iterator[str]:
-    """The rows in a stream of lines; where counts of points stand above them, of each block."""
+    """The rows in a stream of lines, of all blocks if the text has blocks with counts of points."""
     left = promised
     for line in stream:
         if line.startswith(COMMENTS):
@@ -447,7 +463,7 @@ def _rows(stream: Iterator[str], dialect: Dialect, promised: int | None, lines: 
 
 
 def read_text(file: CloudFile, is_pts: bool = False, usual: tuple[str, ...] | None = None) -> Cloud:
-    """Cloud of a text file; see the module's text for what is understood.
+    """Cloud of a text file; the module's docstring describes the rows, names and types.
 
     Parameters
     ----------
@@ -455,13 +471,13 @@ def read_text(file: CloudFile, is_pts: bool = False, usual: tuple[str, ...] | No
     is_pts : bool
         Whether seven columns are x y z, intensity, red green blue.
     usual : names, optional
-        Names of the columns in this format, if the file has as many and does not name them.
+        Names of the format's columns, for files that have as many and do not name them.
 
     Raises
     ------
     CloudReadError
-        The content is no text, or not one of numbers; rows have different numbers of columns; there are fewer rows than
-        a count says; the names do not fit the columns, or x, y or z is not among them.
+        The content is not a text, or not one of numbers; rows have different numbers of columns; there are fewer rows
+        than a count says; the names do not fit the columns, or x, y or z is not among them.
 
     Examples
     --------
@@ -497,7 +513,7 @@ def read_text(file: CloudFile, is_pts: bool = False, usual: tuple[str, ...] | No
 
 
 def column_of_numbers(values: NDArray[np.float64]) -> NDArray[np.generic]:
-    """A column as int32 if all its numbers are whole and fit, else as floats."""
+    """The column as int32 if all its numbers are whole and fit, else as floats."""
     limits = np.iinfo(np.int32)
     fits = (values == np.rint(values)) & (values >= limits.min) & (values <= limits.max)
     return values.astype(np.int32) if fits.all() else _floats(values)
@@ -511,7 +527,7 @@ def _floats(values: NDArray[np.float64]) -> NDArray[np.generic]:
 
 
 def _whole(values: NDArray[np.float64], content: bytes, column: int) -> NDArray[np.generic]:
-    """A column of whole numbers as int32, or with as many bits as it needs; as floats if some are not whole."""
+    """A column of whole numbers as int32, or as int64 or uint64 if needed; as floats if some are not whole."""
     if not (np.isfinite(values).all() and (values == np.rint(values)).all()):
         return _floats(values)
     if np.abs(values).max() < MAX_EXACT:
@@ -527,7 +543,7 @@ def _whole(values: NDArray[np.float64], content: bytes, column: int) -> NDArray[
 
 
 def _in_types_of_colors(columns: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
-    """The columns with colours of whole numbers in types that say what white is: uint8, or uint16 beyond 255."""
+    """The columns with colours of whole numbers as uint8, or as uint16 beyond 255, so that the type tells white."""
     lower = {name.lower(): name for name in columns}
     channels = {lower[name]: columns[lower[name]] for name in COLOR_NAMES if name in lower}
     if any(one.dtype.kind == "f" for one in channels.values()):
@@ -555,13 +571,13 @@ def encode_text(cloud: Cloud, suffix: str) -> bytes:
     cloud : Cloud
         As `pcgraph.cloud.plain_cloud` returns it. Vectors of c numbers become columns ``name_0`` and so on.
     suffix : str
-        ".csv": names and numbers between commas. Others: between blanks, the names behind ``//``, as CloudCompare has
-        them.
+        ".csv": commas separate names and numbers. Other suffixes: blanks separate them, and the line of names begins
+        with ``//``, as in files of CloudCompare.
 
     Raises
     ------
     CloudWriteError
-        A column has no numbers that a text can hold, or a name that would be read as another one.
+        A column has no numbers, or numbers of more than 64 bits, or a name that would be read as another one.
     """
     columns = _scalars(columns_of_cloud(cloud))
     separator = "," if suffix == ".csv" else " "
@@ -592,7 +608,7 @@ def encode_pts(cloud: Cloud, suffix: str) -> bytes:
 
 
 def _scalars(columns: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
-    """The columns with one column for each number of a vector."""
+    """The columns, with a column of vectors split into one column for each of their numbers."""
     parts: dict[str, NDArray[np.generic]] = {}
     for name, column in columns.items():
         own = {name: column} if column.ndim == 1 else {f"{name}_{i}": part for i, part in enumerate(column.T)}
@@ -603,12 +619,12 @@ def _scalars(columns: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.ge
 
 
 def _quoted(name: str, separator: str) -> str:
-    """The name in quotes if it would fall apart without."""
+    """The name, in quotes if it has blanks or separators."""
     return f'"{name}"' if separator in name or any(letter.isspace() for letter in name) else name
 
 
 def _body(columns: dict[str, NDArray[np.generic]], separator: str) -> bytes:
-    """A row for each point, each number as short as it can be without becoming another one."""
+    """Rows of text, one for each point; each number has the fewest digits that are read as the same number."""
     n = len(columns["x"])
     blocks = []
     for start in range(0, n, ROWS_AT_ONCE):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers in the text of files that say in a header how many there are: ascii PLY and PCD."""
+"""Numbers in text after a header that has their count: ascii PLY and PCD files."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _INFINITE = re.compile(rf"([-+]?){INFINITY_OF_WINDOWS}".encode())
 def columns_of_rows(
     body: bytes, n_rows: int, fields: Sequence[TextField], first_line: int
 ) -> dict[str, NDArray[np.generic]]:
-    """One array per field of the rows of a text; whole numbers of 64 bits are exact.
+    """One array per field from the rows of a text; whole numbers of 64 bits are exact.
 
-    Parameters and errors are those of `numbers_from_text` and `columns_from_text`.
+    Parameters and errors are as for `numbers_from_text` and `columns_from_text`.
     """
     width = sum(count for _, _, count in fields)
     columns = columns_from_text(numbers_from_text(body, n_rows, width, first_line), fields)
@@ -45,24 +45,26 @@ def columns_of_rows(
 def columns_from_text(table: NDArray[np.float64], fields: Iterable[TextField]) -> dict[str, NDArray[np.generic]]:
     """One array per field of a text file, in the types that the header names.
 
-    A packed colour of nan means no colour, because a text does not keep the bits of a nan. It becomes 0, black; a field
-    with no other colours is left out. Packed colours in whole numbers of 32 bits may have a sign or not, whatever the
-    header says.
+    A packed colour of nan means no colour, because a text does not keep the bits of a nan. It becomes 0, black. If all
+    are nan, the field is left out. Packed colours that are whole numbers of 32 bits may have a sign or not, whatever
+    type the header names.
 
     Parameters
     ----------
     table : (n, m) float64
         Numbers of the text, row by row.
-    fields : (name, dtype, count) of each field; the counts add up to m
+    fields : iterable of (name, dtype, count)
+        The counts add up to m.
 
     Returns
     -------
-    dict of field name to (n,) array, (n, c) where the count is above 1
+    dict of field name to array
+        (n,), or (n, c) if the count c is above 1.
 
     Raises
     ------
     CloudReadError
-        A field of integers has a number that is not whole, or out of the range of its type.
+        A field of integers has a number that is not whole, or is out of the range of its type.
     """
     columns: dict[str, NDArray[np.generic]] = {}
     end = 0
@@ -99,7 +101,7 @@ def _check_whole(name: str, numbers: NDArray[np.float64], least: int, most: int)
 
 
 def _exact(values: NDArray[np.generic], body: bytes, place: tuple[int, int, int]) -> NDArray[np.generic]:
-    """Exact whole numbers of 64 bits of a text, in place of those that doubles have rounded.
+    """Exact whole numbers of 64 bits from a text, in place of those that doubles have rounded.
 
     Parameters
     ----------
@@ -107,7 +109,7 @@ def _exact(values: NDArray[np.generic], body: bytes, place: tuple[int, int, int]
         Rounded numbers.
     body : bytes
         The text.
-    place : first column, column after the last, number of columns of the text
+    place : (first column, column after the last, number of columns in the text)
     """
     first, end, width = place
     words = body.split(None, len(values) * width)[: len(values) * width]
@@ -127,9 +129,9 @@ def _whole(word: bytes) -> int:
 
 
 def numbers_from_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> NDArray[np.float64]:
-    """The first `n_rows` rows of numbers in a text, one row per line; empty lines do not count.
+    """The first `n_rows` rows of numbers in a text; empty lines are skipped.
 
-    If the first row is spread over several lines, all others must be so in the same way.
+    A row is one line. If the first row takes several lines, all others must take as many.
 
     Parameters
     ----------
@@ -142,12 +144,12 @@ def numbers_from_text(body: bytes, n_rows: int, n_columns: int, first_line: int)
     Returns
     -------
     (n_rows, n_columns) float64
-        ``nan`` and ``inf`` in any case are numbers too.
+        ``nan`` and ``inf``, in upper or lower case, are numbers too.
 
     Raises
     ------
     CloudReadError
-        Too few rows, a row of more or fewer words than columns, or a word that is not a number.
+        There are too few rows, a row has more or fewer words than columns, or a word is not a number.
     """
     needed = n_rows * n_columns
     if needed > len(body):  # a number takes at least a byte: no memory for numbers that only the header has
@@ -158,7 +160,7 @@ def numbers_from_text(body: bytes, n_rows: int, n_columns: int, first_line: int)
 
 
 def _rows_of_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> Iterator[list[float]]:
-    """Numbers of each line; the lines of a row are as long as those of the first row."""
+    """Numbers of each line, which must be as many as in the same line of the first row."""
     lengths = _line_lengths(body, n_columns)
     n_lines, read = n_rows * len(lengths), 0
     lines = enumerate(BytesIO(body), first_line)
@@ -182,9 +184,9 @@ def _rows_of_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> 
 
 
 def _line_lengths(body: bytes, n_columns: int) -> tuple[int, ...]:
-    """Count of the words of each line of the first row.
+    """Count of the words in each line of the first row.
 
-    It is one line, but the viewer of RealSense cameras puts coordinates and colours in two.
+    Most files have one line per row. The viewer of RealSense cameras writes coordinates and colours in two lines.
     """
     lengths: list[int] = []
     for line in BytesIO(body):
@@ -201,7 +203,7 @@ def numbers_of_words(words: Sequence[bytes], line: bytes, number: int) -> list[f
     Raises
     ------
     CloudReadError
-        A word is no number; the message names the number of the line.
+        A word is not a number. The message has the number of the line.
     """
     if b"_" in line:  # only Python reads 1_000 as a number
         word = next((word for word in words if b"_" in word), line).decode("latin-1")

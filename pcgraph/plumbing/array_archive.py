@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nested dataclasses of arrays as one .npz file without pickle: an array for each path, and all else as JSON.
+"""Archive of nested dataclasses in one .npz file without pickle: arrays by path, and all other values as JSON.
 
-A structure is a dataclass, a NamedTuple or a msgspec.Struct. The path of a value is the names of the fields that lead
+A structure is a dataclass, a NamedTuple or a msgspec.Struct. The path of a value has the names of the fields that lead
 to it, as in ``graph/edge_features/convexity``. `flatten` turns a structure into arrays and plain values by path, and
-`rebuild` turns these into an equal structure. The types that the fields declare say what a file may hold there. So a
-file names no module, and nothing of it runs.
+`rebuild` turns these into an equal structure. The declared types of the fields limit what a file may hold. A file names
+no module, and no code in it is run.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ HEADER = "header"
 OWN = "own:"
 """Mark before the name of a user's class, so that it never passes for one of this package's."""
 _MAX_JSON = 1 << 20
-"""Bytes of the JSON, at most: a segmentation has some 3000. Chosen by eye; not varied."""
+"""Largest JSON, bytes: a segmentation has some 3000. Chosen by eye; not varied."""
 _NUMBERS = "fiub"
-"""Kinds of arrays that are stored: floats, whole numbers of either sign, and truth values."""
+"""NumPy's kinds of the arrays that can be stored: floats, signed and unsigned integers, and bools."""
 
 Values = dict[str, Any]
-"""Plain values by path: numbers, texts, truth values, None, lists of these, and the class of each structure."""
+"""Plain values by path: numbers, strings, bools, None, lists of these, and the name of each structure's class."""
 
 
 class DamagedError(ValueError):
-    """A file is no such archive, or does not hold the structure; the message does not name the file."""
+    """The file is not an archive, or does not hold the expected structure; the message does not name the file."""
 
 
 class UnknownClassError(DamagedError):
-    """The file names a class that is not loaded, or that cannot be made anew.
+    """The file names a class that is not loaded, or whose object cannot be built from the stored values.
 
     Attributes
     ----------
     path, name : str
-        Path of the structure and name of its class.
+        Path of the structure, and name of its class.
     """
 
     def __init__(self, path: str, name: str) -> None:
@@ -61,7 +61,7 @@ class UnknownClassError(DamagedError):
 
 @dataclass
 class Archive:
-    """A structure, or several, as arrays and plain values by path.
+    """One or more structures as arrays and plain values by path.
 
     Examples
     --------
@@ -79,12 +79,12 @@ class Archive:
     values: Values = field(default_factory=dict)
 
     def flatten(self, value: Any, path: str) -> None:
-        """Add a value, and all that it holds, below a path.
+        """Add a value, and all values within it, below a path.
 
         Raises
         ------
         TypeError
-            The archive has no form for a value. Nothing is added then.
+            A value is of a type that an archive cannot hold. Nothing is added then.
         """
         parts = Archive()
         parts._add(value, path)
@@ -124,7 +124,7 @@ def _is_finite(value: object) -> bool:
 
 
 def _has_fields_alone(value: object) -> bool:
-    """Whether an object is a structure, or one of a class without settings, and holds nothing else but caches."""
+    """Whether the fields of an object are all it holds, except for cached properties."""
     kind, held = type(value), getattr(value, "__dict__", None)
     if held is None:
         return is_structure(kind)
@@ -136,24 +136,24 @@ def _has_fields_alone(value: object) -> bool:
 
 
 def rebuild(archive: Archive, kind: Any, path: str, names: Mapping[str, Any]) -> Any:
-    """The value at a path of an archive, of a type as fields declare it.
+    """The value at a path of an archive, of the type that a field declares.
 
     Parameters
     ----------
     archive : Archive
     kind : type
-        A structure, an array with its dtype, an Enum, a plain type, a tuple of these, or one of these or None. Where it
-        has subclasses that are loaded, the archive may name one of them.
+        A structure, an array with its dtype, an Enum, a plain type, a tuple of plain types, or one of these or None.
+        The archive may name a loaded subclass of a structure.
     path : str
     names : mapping of str to type
-        Types that modules import for type checkers alone.
+        Types that modules import only for type checkers.
 
     Raises
     ------
     UnknownClassError
-        The archive names a user's class that is not loaded, or that cannot be made of what is stored.
+        The archive names a user's class that is not loaded, or that does not accept the stored values.
     DamagedError
-        What is stored is missing, is of another type, or is refused by the class.
+        A stored value is missing, has another type, or is refused by the class.
     """
     if get_origin(kind) in (Union, UnionType):
         options = [one for one in get_args(kind) if one is not NoneType]
@@ -235,14 +235,14 @@ def is_structure(kind: type[Any]) -> bool:
 
 
 def field_names(kind: type[Any]) -> tuple[str, ...]:
-    """Names of the fields of a structure that its constructor takes; none of another class."""
+    """Names of the fields that the constructor of a structure takes; empty for other classes."""
     if is_dataclass(kind):
         return tuple(one.name for one in fields(kind) if one.init)
     return getattr(kind, "_fields", getattr(kind, "__struct_fields__", ()))
 
 
 def class_name(kind: type[Any]) -> str:
-    """The name of a class in an archive, marked with `OWN` if it is a user's."""
+    """Name of a class in an archive, with the prefix `OWN` if it is a user's class."""
     package = f"{__name__.partition('.')[0]}."
     is_ours = kind.__module__.startswith(package) and not kind.__module__.startswith(f"{package}user_modules.")
     return kind.__name__ if is_ours else OWN + kind.__name__
@@ -258,9 +258,9 @@ def _and_subclasses(kind: type[Any]) -> Iterator[type[Any]]:
 
 
 def encode_archive(archive: Archive, header: Mapping[str, Any], mark: str) -> bytes:
-    """Bytes of an .npz file: the arrays by path, and the header and the values as JSON in the array `HEADER`.
+    """Bytes of an .npz file with the arrays by path; the array `HEADER` has the header and the values as JSON.
 
-    Its comment is a seal (`pcgraph.plumbing.plain_files`). Equal archives have equal bytes.
+    The comment of the file is a seal (`pcgraph.plumbing.plain_files`). Equal archives have equal bytes.
     """
     text = json.dumps({**header, "values": archive.values}, allow_nan=False, indent=1)
     stream = io.BytesIO()
@@ -278,7 +278,7 @@ def decode_archive(content: bytes, skipped: str) -> tuple[dict[str, Any], Archiv
     Raises
     ------
     DamagedError
-        The content is something else.
+        The content is not such a file, or is damaged.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as file:
@@ -314,7 +314,7 @@ def _refuse(constant: str) -> None:
 
 
 def _member(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """One array of an .npz file, whose bytes are all that the member has: no memory for numbers that are not there."""
+    """One array of an .npz file; memory is allocated only for the bytes that the member really has."""
     with file.open(member) as stream:
         version = npy.read_magic(stream)  # type: ignore[no-untyped-call]
         read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]

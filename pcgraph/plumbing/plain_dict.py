@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results as dictionaries of plain values, which every JSON reader takes."""
+"""Results as dictionaries of plain values, which any JSON reader accepts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 class PlainDict:
-    """A mixin for dataclasses: `to_dict` gives their attributes as plain values.
+    """Mixin for dataclasses; `to_dict` returns their attributes as plain values.
 
     Examples
     --------
@@ -24,15 +24,15 @@ class PlainDict:
     """
 
     def to_dict(self) -> dict[str, Any]:
-        """The attributes by name, in their units, as ``json.dumps(..., allow_nan=False)`` takes them.
+        """The attributes by name, in their units, for ``json.dumps(..., allow_nan=False)``.
 
-        Arrays are nested lists. A number that is not finite is None.
+        Arrays become nested lists. A number that is not finite becomes None.
         """
         return {field.name: plain(getattr(self, field.name)) for field in dataclasses.fields(self)}  # type: ignore[arg-type]
 
 
 def plain(value: Any) -> Any:
-    """A value, and all within it, as Python's own numbers, text, lists and dictionaries; None where not finite."""
+    """The value as Python's own numbers, strings, lists and dictionaries; numbers that are not finite become None."""
     if isinstance(value, PlainDict):
         return value.to_dict()
     if isinstance(value, Mapping):

@@ -48,13 +48,12 @@ class SegmentationTree(ShortRepr):
         Cost at which each node came to be: 0 for leaves, not decreasing with the node's number, infinite where parts
         that do not touch were joined.
     moments : Moments of k groups, or None
-        Moments of the points below each node; None of a tree that was made of a graph alone (`pcgraph.tree_of_graph`).
+        Moments of the points below each node; None for a tree of a graph without points (`pcgraph.tree_of_graph`).
     leaf_sizes : (n_leaves,) int64, or None
         Number of points of each leaf of a tree without moments.
 
     Examples
     --------
-    The same words as in SciPy and Higra lead through the tree:
 
     >>> import pcgraph
     >>> tree = pcgraph.tree_of_graph([[0, 1], [1, 2], [2, 3]], [0.1, 0.9, 0.2])
@@ -128,7 +127,7 @@ class SegmentationTree(ShortRepr):
     def lowest_common_ancestor(self, a: int, b: int) -> int:
         """The lowest node above two nodes; the upper one of them if that is above the other.
 
-        Many pairs take `lowest_common_ancestors`.
+        For many pairs use `lowest_common_ancestors`.
 
         Raises
         ------
@@ -324,12 +323,12 @@ class SegmentationTree(ShortRepr):
     def to_linkage_matrix(self) -> NDArray[np.float64]:
         """The merges as SciPy's linkage matrix, (n_leaves - 1, 4) float64.
 
-        Row i makes node n_leaves + i: its two children, its altitude, and its number of leaves (not of points). So
-        nodes have the same numbers here and there. ``scipy.cluster.hierarchy.dendrogram(matrix)`` draws it, and
+        Row i is node n_leaves + i: its two children, its altitude, and its number of leaves (not of points). Nodes have
+        the same numbers in the tree and in the matrix. ``scipy.cluster.hierarchy.dendrogram(matrix)`` draws it, and
         ``fcluster(matrix, t, "distance")`` cuts it as ``cut(altitude=t)`` does.
 
-        A drawing has no place for infinity. Parts that join at infinite altitude join at twice the largest finite one
-        instead, or at 1 if no finite one is above 0. SciPy takes no tree of one leaf; its matrix has no rows.
+        Infinite altitudes cannot be drawn. They are replaced by twice the largest finite altitude, or by 1 if none is
+        above 0. The matrix of a tree of one leaf has no rows; SciPy does not accept it.
         """
         altitudes = self.altitudes[self.n_leaves :]
         finite = altitudes[np.isfinite(altitudes)]
@@ -340,10 +339,10 @@ class SegmentationTree(ShortRepr):
         return np.column_stack((self.children[merged], levels, n_below[merged])).astype(np.float64)
 
     def to_dict(self) -> dict[str, Any]:
-        """The tree as flat lists of numbers, one entry per node, which ``json.dumps(..., allow_nan=False)`` takes.
+        """The tree as flat lists with one entry per node, for ``json.dumps(..., allow_nan=False)``.
 
-        ``n_leaves``; ``parents``, the root its own; ``altitudes``, the linkage's unit, None where parts that do not
-        touch were joined (infinite); ``sizes``, numbers of points.
+        The keys are ``n_leaves``; ``parents``, where the root is its own parent; ``altitudes``, in the linkage's unit,
+        None for infinite ones, where parts that do not touch were joined; and ``sizes``, numbers of points.
         """
         columns = {"parents": self.parents, "altitudes": self.altitudes, "sizes": self.sizes}
         return {"n_leaves": self.n_leaves, **plain(columns)}
@@ -351,8 +350,8 @@ class SegmentationTree(ShortRepr):
     def to_networkx(self) -> networkx.DiGraph:
         """The tree as ``networkx.DiGraph``, from parent to child, with ``altitude`` and features as attributes.
 
-        All attributes are numbers; without moments, ``altitude`` and ``size``. What has no finite value is left out,
-        because JSON has no infinity: a node that joins parts that do not touch has no ``altitude``.
+        All attributes are numbers; without moments they are ``altitude`` and ``size``. Values that are not finite are
+        left out, because JSON has no infinity: a node that joins parts that do not touch has no ``altitude``.
         """
         from networkx import DiGraph
 
@@ -388,7 +387,7 @@ def segmentation_tree(merges: Merges, leaves: Moments) -> SegmentationTree:
 
 
 def tree_without_points(merges: Merges, leaf_sizes: NDArray[np.int64]) -> SegmentationTree:
-    """Tree over k leaves, (k,) numbers of points, that lie nowhere: parts that are left each join the largest one."""
+    """Tree over k leaves without positions, given their numbers of points; unconnected parts join the largest."""
     return SegmentationTree(*_joined(merges, leaf_sizes, None), leaf_sizes=leaf_sizes)
 
 

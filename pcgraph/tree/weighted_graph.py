@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trees of weighted graphs from anywhere: pairs of nodes and a dissimilarity for each pair, without points."""
+"""Trees of weighted graphs without points: pairs of nodes, and a dissimilarity for each pair."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pcgraph.tree.single_linkage import single_linkage
 from pcgraph.tree.tree import SegmentationTree, tree_without_points
 
 _MAX_NODES = 2**30
-"""Largest number of nodes of a graph: a tree has twice as many, less one, and numbers them in 32 bits."""
+"""Largest count of nodes in a graph, because a tree has twice as many, less one, and numbers them in int32."""
 _LINKAGES: dict[str, Callable[[int, NDArray[np.int32], NDArray[np.float64]], Merges]] = {
     "single": single_linkage,
     "average": lambda n_nodes, edges, weights: average_linkage(n_nodes, edges, weights, np.ones(len(edges))),
@@ -46,19 +46,19 @@ def tree_of_graph(
         "average": the mean weight of the edges between them (UPGMA along the graph). "felzenszwalb": Felzenszwalb and
         Huttenlocher's scale k, in units of the weights times nodes.
     sizes : (n_nodes,) int, >= 1, optional
-        Number of points that each node stands for. It counts for `min_size` and for parts that no edge connects; not
+        Number of points that each node stands for. It matters for `min_size` and for parts that no path connects, not
         for the altitudes. Default: 1.
 
     Returns
     -------
     SegmentationTree
-        Its leaves are the nodes. It has no moments, and so no `features` and no `plane_energy`. Parts that no edge
-        connects join at infinite altitude, the smallest first, each to the largest part.
+        Tree whose leaves are the nodes. It has no moments, and so no `features` and no `plane_energy`. Parts that no
+        path connects join at infinite altitude, the smallest first, each to the largest part.
 
     Raises
     ------
     ValueError
-        An argument is not as above.
+        An argument has another type, shape or range than described above.
 
     Notes
     -----
@@ -99,7 +99,7 @@ def _checked_edges(edges: ArrayLike) -> NDArray[np.integer]:
 
 
 def _node_count(n_nodes: int | None, last: int) -> int:
-    """Number of nodes of a graph whose edges name no node above `last`."""
+    """Number of nodes of a graph; `last` is the largest node in its edges."""
     n = last + 1 if n_nodes is None else n_nodes
     if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not max(last, 0) < n <= _MAX_NODES:
         raise ValueError(f"expected n_nodes as a whole number from {max(last, 0) + 1} to {_MAX_NODES}, got {n!r}")

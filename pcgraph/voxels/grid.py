@@ -21,7 +21,8 @@ from pcgraph.voxels.warp import Warp
 _STEPS_PER_VOXEL = float(1 << 20)
 """Steps per voxel edge in which offsets are summed as whole numbers: such sums do not depend on the points' order."""
 _COLOR_STEPS = 65535.0
-"""Steps per unit in which colours are summed, for the same reason; 257 per step of 8 bits, which are exact so."""
+"""Steps per unit in which colours are summed, for the same reason: 257 for each step of 8 bits, so that those are
+exact."""
 MAX_NEIGHBOURS = 26
 """Count of voxels around one of the same size, at most: 3^3 - 1, as in a cube. A larger one may have more."""
 MIN_NEIGHBOURS_ON_SURFACE = 5

@@ -29,7 +29,8 @@ _NEIGHBOUR = 8
 _MAX_BESIDE = 512
 """Points in the 27 cells around one that are looked at, at most; chosen by eye, for the time's sake."""
 _ROWS_OF_CELLS = ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
-"""Offsets along x and y, in cells, of the rows of cells around one: near ones first, so that the search ends soon."""
+"""Offsets along x and y, in cell edges, of the rows of cells around one: near ones first, so that the search ends
+soon."""
 
 
 @dataclass(frozen=True)

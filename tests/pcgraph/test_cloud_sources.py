@@ -246,7 +246,7 @@ def deflated(content: bytes) -> bytes:
 HEADER = "{'descr': '<f4', 'fortran_order': False, 'shape': (%s, 3)}"
 NO_NUMBERS = "of a floating-point or integer dtype, got|expected the array 'points' as numbers, got"
 LIES = {
-    "no array": (b"hello", "another beginning"),
+    "no array": (b"hello", "its first bytes"),
     "too long": (npy(HEADER % 10**12, bytes(12)), "promises 12000000000000 bytes, but only"),
     "longer than any": (npy(HEADER % 10**30, bytes(12)), "promises"),
     "negative": (npy(HEADER % -1, bytes(12)), "expected the shape of an array"),
