@@ -149,8 +149,9 @@ class Worker:
     def kill(self) -> None:
         """End the process at once."""
         self._killed = True
-        with suppress(ProcessLookupError):
-            self._process.kill()
+        if self._process.returncode is None:
+            with suppress(ProcessLookupError):  # Process.kill would take the exit status, for which asyncio waits
+                os.kill(self._process.pid, signal.SIGKILL)
 
 
 def in_words(status: int) -> str:

@@ -18,7 +18,7 @@ import threading
 from collections.abc import Callable
 from typing import Any, TextIO
 
-from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, one_line, without_long_words
+from pcgraph.errors import PcgraphError, one_line, without_long_words
 from pcgraph.service.problems import Problem
 
 _log = logging.getLogger("pcgraph.service")
@@ -65,25 +65,34 @@ def _limit_memory(n_bytes: int) -> None:
 
 
 def _answer(do: Callable[..., Any], arguments: dict[str, Any], stage: Callable[[str], None]) -> dict[str, Any]:
-    own = os.path.join(os.path.dirname(arguments["saved"]), "")  # no path of the server comes into a message
     try:
         return {"result": do(stage=stage, **arguments)}
-    except Problem as problem:
-        return _problem(problem.status, problem.detail.replace(own, ""))
-    except MemoryError:
-        return _problem(413, "the cloud needs more memory than this service gives to one: send fewer points")
-    except (CloudReadError, CloudWriteError, PcgraphError, ValueError) as error:
-        return _problem(422, str(error).replace(own, ""))
-    except OSError as error:
-        _log.exception("the worker cannot use a file")
-        return _problem(500, f"the service cannot keep its files: {error.strerror or 'the disk fails'}")
-    except Exception as error:  # noqa: BLE001  # it belongs to this task, and the worker goes on
-        _log.exception("the worker failed")
-        return _problem(500, f"the service failed at this cloud ({type(error).__name__}); its log says where")
+    except Exception as error:  # noqa: BLE001  # whatever it is, it belongs to this task, and the worker goes on
+        problem = _problem_of(error)
+        own = os.path.join(os.path.dirname(arguments["saved"]), "")  # no path of the server comes into a message
+        detail = one_line(without_long_words(problem.detail.replace(own, ""))).rstrip(".")
+        return {"problem": {"status": problem.status, "detail": detail}}
 
 
-def _problem(status: int, detail: str) -> dict[str, Any]:
-    return {"problem": {"status": status, "detail": one_line(without_long_words(detail)).rstrip(".")}}
+def _problem_of(error: Exception) -> Problem:
+    """What a client is told of a task's exception."""
+    if _memory_was_short(error):
+        return Problem(413, "the cloud needs more memory than this service gives to one: send fewer points")
+    if isinstance(error, Problem):
+        return error
+    if isinstance(error, (PcgraphError, ValueError)):
+        return Problem(422, str(error))
+    _log.error("a task failed", exc_info=error)
+    if isinstance(error, OSError):
+        return Problem(500, f"the service cannot keep its files: {error.strerror or 'the disk fails'}")
+    return Problem(500, f"the service failed at this cloud ({type(error).__name__}); its log says where")
+
+
+def _memory_was_short(error: BaseException | None) -> bool:
+    """Whether a MemoryError is behind an exception: closing a file after one may raise another."""
+    while error is not None and not isinstance(error, MemoryError):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 if __name__ == "__main__":
