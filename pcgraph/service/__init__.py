@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The HTTP service of `pcgraph serve`: clouds in, segmentations, cuts, objects and views out. See docs/service.md.
+"""The HTTP service of `pcgraph serve`: it segments clouds, and answers with cuts, objects and views (docs/service.md).
 
-The server process does HTTP only. Worker processes read clouds, segment them and write the answers to files, so that a
-cloud that crashes a parser, hangs, or takes all memory ends one worker and nothing else.
+The server process handles HTTP only. Worker processes read clouds, segment them and write the answers to files. So a
+cloud that crashes a parser, hangs, or needs too much memory ends one worker and nothing else.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["create_app"]
 
 
 def create_app(settings: ServiceSettings | None = None) -> FastAPI:
-    """The service as an ASGI application, for uvicorn or another server; one process of it.
+    """The service as an ASGI application, for one process of uvicorn or another server.
 
     Its lifespan starts the worker processes, which compile the kernels first, and ends them.
 

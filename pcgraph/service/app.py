@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The operations of the service. FastAPI is imported here at the top: this file is loaded only by `create_app`."""
+"""The operations of the service. Only `create_app` imports this module, because it needs FastAPI."""
 
 from __future__ import annotations
 
@@ -62,11 +62,11 @@ PROBLEMS = {
     503: "Too many requests are waiting: try again after `Retry-After` seconds.",
     504: "The worker took too long.",
 }
-"""What each status of a problem means."""
+"""Meaning of each status of a problem."""
 
 
 def _declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Problems of an operation, as OpenAPI declares them."""
+    """Declarations for OpenAPI of the problems of an operation."""
     schema = {"$ref": "#/components/schemas/ProblemModel"}
     return {
         status: {
@@ -119,7 +119,7 @@ _UPLOAD = {
         },
     }
 }
-"""OpenAPI's description of an upload's body; the parameters of the query may be fields of a form, too."""
+"""Description of an upload's body for OpenAPI; the parameters of the query may also be fields of a form."""
 
 
 _LOCATION = {"Location": {"description": "Path of the segmentation.", "schema": {"type": "string"}}}
@@ -128,7 +128,7 @@ _LINKS = {
     name: {"operationId": name, "parameters": _OF_ID}
     for name in ("state", "labels", "boxes", "objects", "tree", "view", "file", "remove")
 }
-"""What can be asked about a segmentation, as OpenAPI's links."""
+"""Operations on a segmentation, as links for OpenAPI."""
 
 
 def _service(request: Request) -> Service:
@@ -146,7 +146,7 @@ router = APIRouter()
 
 @open_router.get("/health", operation_id="health", responses=_declared())
 async def health(service: Here) -> Health:
-    """How the service is. It answers without a token, and only after the kernels are compiled."""
+    """State of the service. It needs no token, and answers only after the kernels are compiled."""
     pools = (service.segmenting, service.answering)
     return Health(
         ready=all(pool.n_ready for pool in pools),
@@ -177,8 +177,8 @@ async def health(service: Here) -> Health:
 async def segment(request: Request, service: Here, query: Annotated[UploadQuery, Query()]) -> Response:
     """Segment a cloud.
 
-    The answer comes when the segmentation is done, or after `wait` seconds, whatever is first. A client that hangs up
-    before has no id, so its segmentation is ended.
+    The answer comes when the segmentation is done, or after `wait` seconds if that is earlier. If a client hangs up
+    before the answer, its segmentation is ended, because it has no id.
     """
     with service.upload_slot(), service.store.upload_folder() as folder:
         upload = await receive_upload(request, query, folder)
@@ -198,7 +198,7 @@ async def segment(request: Request, service: Here, query: Annotated[UploadQuery,
 
 
 async def _finished(job: Job, seconds: float, request: Request) -> bool:
-    """Wait until a job has finished, for so many seconds at most; False if the client hangs up."""
+    """Wait until a job has finished, at most for some seconds; False if the client hangs up."""
     finished = asyncio.create_task(job.finished.wait())
     hung_up = asyncio.create_task(_hung_up(request))
     try:
@@ -218,7 +218,10 @@ async def _hung_up(request: Request) -> None:
     "/segmentations/{segmentation_id}", operation_id="state", responses=_declared(404), response_model=SegmentationModel
 )
 async def state(request: Request, service: Here, segmentation_id: Id, wait: Annotated[Wait, Query()] = 0.0) -> Any:
-    """How far a segmentation is, and what came of it. With `wait` the answer comes when it is done, or then."""
+    """State of a segmentation, and its summary if it is done.
+
+    With `wait`, the answer comes when the segmentation is done, or after `wait` seconds if that is earlier.
+    """
     job = service.store.job(segmentation_id)
     await _finished(job, wait, request)
     return service.model(job, request.scope.get("root_path", ""))
@@ -226,7 +229,7 @@ async def state(request: Request, service: Here, segmentation_id: Id, wait: Anno
 
 @router.delete("/segmentations/{segmentation_id}", operation_id="remove", status_code=204, responses=_declared(404))
 async def remove(service: Here, segmentation_id: Id) -> None:
-    """End a segmentation, if it is not done, and remove it."""
+    """Remove a segmentation; if it is not done, end it first."""
     service.store.remove(service.store.job(segmentation_id))
 
 
@@ -246,9 +249,9 @@ async def remove(service: Here, segmentation_id: Id) -> None:
     },
 )
 async def labels(service: Here, segmentation_id: Id, query: Annotated[LabelQuery, Query()]) -> FileResponse:
-    """Labels of the points: the objects, or a cut of the tree at any level. Nothing is segmented again.
+    """Labels of the points: the objects, or a cut of the tree at any level; nothing is segmented again.
 
-    Give `n` for a number of segments, or `altitude` for a level; neither for the objects.
+    `n` is a number of segments, and `altitude` a level of the tree. Without both, the labels are the objects.
     """
     if query.format not in LABEL_FORMATS:
         hint = did_you_mean(query.format, list(LABEL_FORMATS))
@@ -283,7 +286,7 @@ async def boxes(service: Here, segmentation_id: Id, query: Annotated[CutQuery, Q
     responses=_declared(404, 409, 500, 503, 504),
 )
 async def objects(service: Here, segmentation_id: Id) -> Response:
-    """What stands on the largest horizontal plane, with boxes and shapes: see `pcgraph.detection.objects_on`."""
+    """Objects on the largest horizontal plane, with boxes and shapes, as `pcgraph.detection.objects_on` finds them."""
     return await service.answer(segmentation_id, "write_objects", "application/json")
 
 
@@ -323,7 +326,7 @@ async def view(service: Here, segmentation_id: Id) -> Response:
     },
 )
 async def file(service: Here, segmentation_id: Id) -> Response:
-    """The saved segmentation, with the cloud: `pcgraph.load_segmentation` opens it."""
+    """The saved segmentation with its cloud, for `pcgraph.load_segmentation`."""
     job = service.done(segmentation_id)
     path = service.store.answer_folder(job, SAVED) / SAVED
     return AnswerFile(path, media_type="application/octet-stream", filename=f"{Path(job.title).stem}.{SAVED}")
@@ -362,7 +365,7 @@ def application(settings: ServiceSettings) -> FastAPI:
 def _check_token(
     service: Here, given: Annotated[HTTPAuthorizationCredentials | None, Depends(HTTPBearer(auto_error=False))]
 ) -> None:
-    """Raise a 401 unless the request has the token; how long this takes tells nothing about the token."""
+    """Raise a 401 unless the request has the token; the time of the comparison does not depend on the token."""
     token = service.settings.token or ""
     if given is None or not hmac.compare_digest(given.credentials.encode(), token.encode()):
         raise Problem(
@@ -392,7 +395,7 @@ async def _of_http(request: Request, error: Exception) -> Response:
 
 
 def _methods(scope: Scope) -> set[str]:
-    """Methods of a path. FastAPI has one route for each, so that its own header `Allow` names the first only."""
+    """Methods of a path. FastAPI has one route for each method, and its own header `Allow` names only the first."""
     routes = [route for one in (open_router, router) for route in one.routes if isinstance(route, Route)]
     return {m for route in routes if route.matches(scope)[0] != Match.NONE for m in route.methods or ()}
 
@@ -412,11 +415,11 @@ _RESPONDERS = {
     ClientDisconnect: _of_disconnect,
     Exception: _of_bug,
 }
-"""Answers to exceptions, all of them problems."""
+"""Functions that answer exceptions with a problem, by class."""
 
 
 def _describe(app: FastAPI) -> None:
-    """Add the schemas to the OpenAPI document that no type of an operation names."""
+    """Add the schemas to the OpenAPI document that FastAPI does not find in the operations."""
     document = app.openapi()
     schemas = document["components"]["schemas"]
     for model in (ProblemModel, Points, LabelsModel):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every request passes first: its host, and the size and duration of its body."""
+"""Checks of every request before its operation: the host, and the size and duration of the body."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 AT_ONCE_SECONDS = 0.05
-"""Time in which the rest of a short upload, which an answer did not need, is here. Chosen by eye; not varied."""
+"""Seconds within which the rest of a short upload arrives, if an answer did not need it. Chosen by eye; not varied."""
 LINGER_SECONDS = 10.0
-"""Time for which the rest of a long refused upload is received and dropped behind the answer. If the connection were
-closed at once, the client's system would drop the answer with it. Chosen by eye; not varied."""
+"""Seconds for which the rest of a long refused upload is received and dropped after the answer. If the connection were
+closed at once, the client's system would drop the answer, too. Chosen by eye; not varied."""
 LOCAL_NAMES = ("localhost", "127.0.0.1", "[::1]")
-"""Names by which this computer calls itself."""
+"""Names of this computer for itself, in the header Host."""
 
 
 def problem_response(problem: Problem) -> JSONResponse:
-    """Answer with a problem."""
+    """The HTTP response for a problem."""
     return JSONResponse(problem.to_dict(), problem.status, problem.headers, "application/problem+json")
 
 
 class Guards:
     """ASGI middleware that refuses foreign hosts, bodies that are too large, and bodies that arrive too slowly.
 
-    Without a token, only requests to this computer's own names are answered. Otherwise a web page of a stranger could
-    reach the service through the user's browser, by a name that is made to point to 127.0.0.1.
+    Without a token, only requests to this computer's own names are answered. Otherwise a stranger's web page could
+    reach the service through the user's browser, with a host name that points to 127.0.0.1 (DNS rebinding).
     """
 
     def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
@@ -80,7 +80,7 @@ class Guards:
 
 
 class _Body:
-    """The body of a request, received within limits."""
+    """The body of a request, with limits on its size and on the time that it takes."""
 
     def __init__(self, receive: Receive, settings: ServiceSettings, headers: Headers) -> None:
         self._receive, self._settings = receive, settings
@@ -88,7 +88,7 @@ class _Body:
         self._n_bytes = 0
         self.complete = "content-length" not in headers and "transfer-encoding" not in headers  # there is none
         self._unasked = headers.get("expect", "").lower() == "100-continue"
-        """Whether the client waits to be asked for the body, which the first call of `receive` does."""
+        """Whether the client waits for a go-ahead to send the body; the first call of `receive` gives it."""
 
     async def receive(self) -> Message:
         if self.complete:
@@ -108,7 +108,7 @@ class _Body:
         return message
 
     async def drop(self, seconds: float) -> None:
-        """Receive the rest and drop it, for so many seconds at most."""
+        """Receive and drop the rest of the body, at most for some seconds."""
         if self._unasked:
             return
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One server's segmentations: from an upload to a finished one, and to the files that answer questions about it."""
+"""Jobs of the service: segmentations from the upload to the result, and the files that answer requests about them."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from pcgraph.service.uploads import FILE_FIELD, Upload
 from pcgraph.service.worker_pool import RETRY_SECONDS, WorkerPool
 
 SAVED = "segmentation.npz"
-"""Name of the file of a saved segmentation."""
+"""Name of the file of the saved segmentation in a job's folder."""
 JANITOR_SECONDS = 30.0
-"""Time between two looks for segmentations that are too old. Chosen by eye; not varied."""
+"""Seconds between two checks for segmentations that are too old. Chosen by eye; not varied."""
 
 
 class Service:
-    """Workers and stored segmentations of one server."""
+    """The workers and the stored segmentations of one server."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self.settings = settings
@@ -39,7 +39,7 @@ class Service:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Start the workers; at the end, end them and remove all files."""
+        """Context with running workers; at its end they are ended, and all files are removed."""
         janitor = asyncio.create_task(self._make_room())
         try:
             await self.segmenting.start()
@@ -58,9 +58,9 @@ class Service:
 
     @contextlib.contextmanager
     def upload_slot(self) -> Any:
-        """One of the uploads that are received at a time."""
+        """Context of one upload that is being received; Problem if there are too many at the same time."""
         if self.n_uploads >= self.settings.max_uploads:
-            raise busy(f"{self.n_uploads} uploads arrive already: try again later", RETRY_SECONDS)
+            raise busy(f"{self.n_uploads} uploads are being received already: try again later", RETRY_SECONDS)
         self.n_uploads += 1
         try:
             yield
@@ -68,7 +68,7 @@ class Service:
             self.n_uploads -= 1
 
     def begin(self, upload: Upload, folder: Path) -> Job:
-        """A job that waits for a worker, and owns the folder of its upload from now on; Problem if too many wait."""
+        """A new job that waits for a worker, and takes over the folder of its upload; Problem if too many wait."""
         job = self.store.new()
         job.title = Path(upload.name or "points").name
         folder = folder.rename(job.folder / "upload")
@@ -100,7 +100,7 @@ class Service:
         self.store.finish(job)
 
     async def answer(self, name: str, task: str, media_type: str, **arguments: Any) -> FileResponse:
-        """A file that a worker writes about a finished segmentation."""
+        """The file that a worker writes to answer a request about a finished segmentation."""
         job = self.done(name)
         folder = self.store.answer_folder(job, SAVED)
         try:
@@ -119,7 +119,7 @@ class Service:
         return AnswerFile(folder / written["file"], media_type=media_type, filename=name)
 
     def done(self, name: str) -> Job:
-        """A job that is done; Problem if it is not, or failed."""
+        """The job of an id; Problem if it is not done, or failed."""
         job = self.store.job(name)
         if job.problem is not None:
             raise Problem(409, f"this segmentation failed: {job.problem.detail}")
@@ -153,9 +153,9 @@ def _note(job: Job, words: str) -> None:
 
 
 class AnswerFile(FileResponse):
-    """An answer with a file of an answer's folder, which is removed after it, however it ends.
+    """An answer with a file from an answer folder; the folder is removed after the answer, also after an error.
 
-    It is sent whole: the file is made for one request, so that there is none to ask for further ranges of.
+    The file is sent as a whole, because it is made for one request: a later request for a range would not find it.
     """
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes in and out of the service, as its OpenAPI document describes it."""
+"""Models of the requests and answers of the service, from which its OpenAPI document is made."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from pcgraph.families import members
 from pcgraph.io import FORMATS, encode_cloud
 
 MAX_WAIT_SECONDS = 60.0
-"""Longest time for which a request waits for a segmentation: proxies end requests after about as long (nginx after
-60 s)."""
+"""Largest time in seconds for which a request waits for a segmentation, because proxies end requests after about that
+time (nginx after 60 s)."""
 WAIT_SECONDS = 4.0
-"""Time for which an upload waits for its segmentation, unless told: httpx gives up after 5 s."""
+"""Default time in seconds for which an upload waits for its segmentation, because httpx gives up after 5 s."""
 MAX_NAME = 255
-"""Characters of a file's name, the limit of common file systems."""
+"""Largest count of characters in a file's name, from the limit of common file systems."""
 
 
 def _label_formats() -> tuple[str, ...]:
-    """Formats of arrays alone, and ends of files of clouds that hold our columns and whose libraries are here."""
+    """Formats of bare labels, and of clouds: those that hold any column and whose libraries are installed."""
     cloud = Cloud(np.zeros((1, 3)), columns={"object": np.zeros(1, np.int32)})
     found = ["npz", "json"]
     for end in (end.removeprefix(".") for one in FORMATS for end in one.suffixes):
@@ -50,7 +50,7 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 def _one_of(family: str, default: str, text: str) -> Any:
-    """Type of the name of a member of a family."""
+    """Type of a parameter that names a member of a family."""
     known = sorted(members(family))
 
     def check(name: str) -> str:
@@ -63,13 +63,13 @@ def _one_of(family: str, default: str, text: str) -> Any:
 
 
 def did_you_mean(given: str, known: list[str]) -> str:
-    """Hint at the nearest valid name, to be put behind a message; empty if none is near."""
+    """Hint with the nearest valid name, for the end of a message; empty if no name is near."""
     near = get_close_matches(given.lower(), known, 1)
     return f"; did you mean {near[0]}?" if near else ""
 
 
 class SegmentParameters(BaseModel):
-    """Parameters of `pcgraph.segment`, in the query or, with a form, in its fields."""
+    """Parameters of `pcgraph.segment`, in the query or in the fields of a form."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -113,7 +113,7 @@ class SegmentParameters(BaseModel):
 
 
 class UploadQuery(SegmentParameters):
-    """Parameters of `pcgraph.segment`, and the name of a file that is the body itself."""
+    """Parameters of `pcgraph.segment`, and the name of the file if that is the body itself."""
 
     name: str | None = Field(
         None,
@@ -125,7 +125,7 @@ class UploadQuery(SegmentParameters):
 
 
 class CutQuery(BaseModel):
-    """A cut of the tree: `n` segments, or at an altitude; neither: the objects."""
+    """A cut of the tree into `n` segments, or at an altitude; without both, the objects."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -150,7 +150,7 @@ class LabelQuery(CutQuery):
 
 
 class ProblemModel(BaseModel):
-    """An error, as RFC 9457 has it."""
+    """An error, in the form of RFC 9457."""
 
     title: str = Field(examples=["Unprocessable Content"])
     status: int = Field(examples=[422])
@@ -158,7 +158,7 @@ class ProblemModel(BaseModel):
 
 
 class Health(BaseModel):
-    """How the service is."""
+    """State of the service."""
 
     ready: bool = Field(description="Whether a worker process is ready for clouds.")
     version: str = Field(description="Version of pcgraph.")
@@ -168,12 +168,12 @@ class Health(BaseModel):
 
 
 class Summary(BaseModel):
-    """What came of a segmentation."""
+    """Summary of a finished segmentation."""
 
     points: int = Field(description="Points of the cloud, also those that are not finite.")
     segmented: int = Field(description="Points that have a supervoxel.")
     outliers: int = Field(description="Points that are noise.")
-    acquisition: str = Field(description="What was found of the sensor, in words.")
+    acquisition: str = Field(description="Kind of the sensor that was found, in words.")
     voxel_size: float = Field(description="Edge of a voxel, metres.")
     seed_size: float = Field(description="Spacing of supervoxels, metres.")
     supervoxels: int
@@ -181,19 +181,19 @@ class Summary(BaseModel):
     objects: int
     object_altitude: float = Field(description="Altitude of the cut that gives the objects, the linkage's unit.")
     seconds: float = Field(description="Time that the worker took.")
-    warnings: list[str] = Field(description="What about the cloud cannot be right, one sentence each.")
+    warnings: list[str] = Field(description="What seems to be wrong with the cloud, one sentence each.")
 
 
 class SegmentationModel(BaseModel):
-    """A segmentation: how far it is, and what came of it."""
+    """A segmentation: its state, and its summary or its problem."""
 
     id: str
     state: Literal["queued", "running", "done", "failed"]
     stage: str | None = Field(description="What the worker does now: reading, segmenting, saving.")
-    ahead: int | None = Field(description="Number of segmentations that come first, while it is queued.")
+    ahead: int | None = Field(description="Number of segmentations before it, while it is queued.")
     seconds: float = Field(description="Time that a worker has spent on it.")
-    summary: Summary | None = Field(description="What came of it, if it is done.")
-    problem: ProblemModel | None = Field(description="Why nothing came of it, if it failed.")
+    summary: Summary | None = Field(description="Summary of the segmentation, if it is done.")
+    problem: ProblemModel | None = Field(description="Reason of the failure, if it failed.")
     links: dict[str, str] = Field(description="Paths of its labels, objects, tree, view and file.")
 
 
@@ -238,7 +238,7 @@ class BoxesModel(BaseModel):
 
 
 class ObjectsModel(BaseModel):
-    """What stands on the largest horizontal plane."""
+    """Objects on the largest horizontal plane."""
 
     support: dict[str, list[float]] | None = Field(
         description="Normal and centroid of the plane, metres; null if there is no horizontal plane."
@@ -249,7 +249,7 @@ class ObjectsModel(BaseModel):
 
 
 class TreeModel(BaseModel):
-    """A segmentation tree, one entry for each node; the supervoxels come first, the root is the last."""
+    """A segmentation tree with one entry for each node; the supervoxels come first, and the root is the last."""
 
     n_leaves: int = Field(description="Number of supervoxels.")
     parents: list[int] = Field(description="Parent of each node; the root is its own.")

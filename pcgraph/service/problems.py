@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of the service: one shape of JSON for all of them, as RFC 9457 has it."""
+"""Errors of the service, which all have the same form of JSON: that of RFC 9457."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 class Problem(Exception):
-    """An answer other than the one that was asked for.
+    """An error as the answer to a request.
 
     Attributes
     ----------
@@ -26,10 +26,10 @@ class Problem(Exception):
         self.status, self.detail, self.headers = status, detail, dict(headers or {})
 
     def to_dict(self) -> dict[str, Any]:
-        """Title, status and detail, the body of the answer."""
+        """Title, status and detail: the body of the answer."""
         return {"title": HTTPStatus(self.status).phrase, "status": self.status, "detail": self.detail}
 
 
 def busy(detail: str, seconds: int) -> Problem:
-    """Problem of a server that has too much to do; the client may ask again after some seconds."""
+    """Problem of a server that is too busy; the client may ask again after some seconds."""
     return Problem(503, detail, {"Retry-After": str(seconds)})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The HTTP server of the service: uvicorn, with a limit on the time in which a request's headers must arrive."""
+"""The HTTP server of the service: uvicorn, with a time limit for the headers of a request."""
 
 from __future__ import annotations
 
@@ -19,15 +19,16 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
 HEADER_SECONDS = 10.0
-"""Time in which the headers of a request must arrive on a connection, or else it is closed. Chosen by eye; not
+"""Seconds within which the headers of a request must arrive, else the connection is closed. Chosen by eye; not
 varied."""
 KEEP_ALIVE_SECONDS = 65
-"""Time for which an idle connection is kept: longer than by clients (httpx 5 s, nginx 60 s), as a request that crosses
-the closing of its connection is lost."""
+"""Seconds for which an idle connection is kept: longer than clients keep it (httpx 5 s, nginx 60 s), because a request
+that arrives while the server closes the connection is lost."""
 GRACE_SECONDS = 5
-"""Time that answers have to be sent when the server ends. Chosen by eye; not varied."""
+"""Seconds for answers that are being sent when the server ends. Chosen by eye; not varied."""
 MAX_CONNECTIONS = 1000
-"""Connections at a time: each takes a file descriptor, of which a process has 1024 on most systems."""
+"""Largest count of connections at a time, because each takes a file descriptor, and most systems give a process
+1024."""
 
 
 class ImpatientProtocol(H11Protocol):  # type: ignore[misc]
@@ -49,7 +50,7 @@ class ImpatientProtocol(H11Protocol):  # type: ignore[misc]
             self._timer.cancel()
 
     def _watch(self) -> None:
-        """Begin to count if a request is expected, and stop as soon as its headers are here."""
+        """Start the timer if a request is expected, and stop it as soon as the headers have arrived."""
         expected = self.cycle is None or self.cycle.response_complete
         if not expected and self._timer is not None:
             self._timer.cancel()
@@ -59,7 +60,7 @@ class ImpatientProtocol(H11Protocol):  # type: ignore[misc]
 
 
 def run(app: FastAPI, settings: ServiceSettings, on_ready: Callable[[str], None]) -> int:
-    """Serve until a signal comes; the exit status.
+    """Serve until a signal comes; returns the exit status.
 
     Parameters
     ----------

@@ -22,32 +22,32 @@ class ServiceSettings:
     Attributes
     ----------
     host : str
-        Address to listen at. Other computers reach the service only if it is not a loopback address.
+        Address to listen at. At a loopback address, other computers cannot reach the service.
     port : int
     token : str, or None
         Secret that clients send as ``Authorization: Bearer TOKEN``. None: no client needs one.
     workers : int
         Processes that segment clouds. One more answers questions about finished segmentations.
     max_upload_mb : float, megabytes (10**6 bytes)
-        Size of the body of a request.
+        Largest size of the body of a request.
     max_points : int
-        Points of a cloud.
+        Largest count of points in a cloud.
     max_seconds : float
-        Time that a worker may take for a segmentation or for an answer; then it is ended.
+        Time that a worker may take for a segmentation or for an answer; then the worker is killed.
     max_memory_gb : float, gigabytes (10**9 bytes)
-        Private memory of a worker process (RLIMIT_DATA, which Linux enforces and macOS does not).
+        Largest private memory of a worker process (RLIMIT_DATA, which Linux enforces and macOS does not).
     max_queued : int
-        Segmentations that wait for a worker; also answers that wait for theirs.
+        Largest count of segmentations that wait for a worker; the same for answers.
     max_uploads : int
-        Uploads that are received at the same time.
+        Largest count of uploads that are received at the same time.
     max_upload_seconds : float
         Time in which an upload must have arrived.
     max_stored_gb : float, gigabytes (10**9 bytes)
-        Size of all finished segmentations on the disk; beyond it those not used for longest are removed.
+        Largest size of all finished segmentations on the disk; beyond it, those unused for longest are removed.
     max_age_minutes : float
         Time after its last use at which a segmentation is removed.
     folder : Path, or None
-        Where the private folder of the service is made. Default: the system's folder for temporary files.
+        Folder in which the private folder of the service is made. Default: the system's folder for temporary files.
     """
 
     host: str = "127.0.0.1"

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Segmentations of the service: their state in memory, their files in a private folder that goes with the server."""
+"""Store of the service's segmentations: their state in memory, and their files in a private folder.
+
+The folder is removed when the server ends.
+"""
 
 from __future__ import annotations
 
@@ -28,36 +31,38 @@ _PREFIX = "pcgraph-serve-"
 _NEW_PREFIX = ".pcgraph-serve-new-"
 _LOCK = "lock"
 MAX_JOBS = 10_000
-"""Count of segmentations that are remembered, the failed ones included, which have no files but take some memory.
-Chosen by eye; not varied."""
+"""Largest count of segmentations that are kept, with the failed ones, which have no files but take some memory. Chosen
+by eye; not varied."""
 
 
 @dataclass(eq=False)
 class Job:
-    """A segmentation from the upload on.
+    """A segmentation of the service: queued, running, done or failed.
 
     Attributes
     ----------
     id : str
-        Random, and so long that nobody guesses it.
+        Random name, too long to guess.
     folder : Path
-        Its files.
+        Folder with its files.
     title : str
         Name of the upload, for people.
     stage : str, or None
-        What a worker does for it now.
+        What a worker is doing for it.
     order : Order, or None
         Its segmentation in the queue or in a worker; None while the upload arrives.
     began, ended : float, seconds of `time.monotonic`, or None
+        Start and end of the work.
     summary : dict, or None
-        What came of it.
+        Summary of the segmentation, if it is done.
     problem : Problem, or None
-        Why nothing came of it.
+        Reason of the failure, if it failed.
     n_bytes : int
-        Size of its files.
+        Size of its files, bytes.
     used : float, seconds of `time.monotonic`
-        When it was last asked about.
+        Time of the last request about it.
     finished : Event
+        Set when it is done or has failed.
     """
 
     id: str
@@ -75,21 +80,21 @@ class Job:
 
     @property
     def state(self) -> str:
-        """Word for how far it is: queued, running, done or failed."""
+        """State of the job: queued, running, done or failed."""
         if self.finished.is_set():
             return "failed" if self.problem else "done"
         return "queued" if self.began is None else "running"
 
     @property
     def seconds(self) -> float:
-        """Time that a worker has spent on it."""
+        """Time that a worker has spent on it, seconds."""
         if self.began is None:
             return 0.0
         return (time.monotonic() if self.ended is None else self.ended) - self.began
 
 
 class Store:
-    """Jobs by their ids. Those not used for longest are removed when there are too many, too large or too old."""
+    """Jobs by id. If there are too many, or their files are too large, those unused for longest are removed."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self._settings = settings
@@ -105,7 +110,7 @@ class Store:
         return len(self._jobs)
 
     def new(self) -> Job:
-        """A job with an empty folder."""
+        """A new job with an empty folder."""
         name = secrets.token_urlsafe(16)
         folder = self.folder / name
         folder.mkdir(mode=0o700)
@@ -113,7 +118,7 @@ class Store:
         return self._jobs[name]
 
     def job(self, name: str) -> Job:
-        """The job of an id, which counts as used; Problem if there is none."""
+        """The job of an id, which counts as a use; Problem if there is none."""
         found = self._jobs.get(name)
         if found is None:
             raise Problem(404, "there is no such segmentation: it was removed, or has not been used for too long")
@@ -121,14 +126,14 @@ class Store:
         return found
 
     def remove(self, job: Job) -> None:
-        """Forget a job and remove its files; what is done for it is ended."""
+        """Remove a job and its files, and end the work on it."""
         self._jobs.pop(job.id, None)
         if job.order is not None:
             job.order.cancel()
         shutil.rmtree(job.folder, ignore_errors=True)
 
     def finish(self, job: Job) -> None:
-        """Note that a job has ended, well or not, and make room."""
+        """Mark a job as finished, whether done or failed, and make room."""
         job.ended = job.used = time.monotonic()  # what has waited for long is not the first to go
         job.stage = job.order = None
         job.n_bytes = sum(path.stat().st_size for path in job.folder.iterdir()) if job.folder.is_dir() else 0
@@ -136,7 +141,7 @@ class Store:
         self.make_room()
 
     def make_room(self) -> None:
-        """Remove finished jobs not used for long, and the oldest while there are too many or they are too large."""
+        """Remove finished jobs that are too old, and those unused for longest if all are too many or too large."""
         oldest_first = sorted((job for job in self._jobs.values() if job.finished.is_set()), key=lambda job: job.used)
         n_bytes = sum(job.n_bytes for job in oldest_first)
         earliest = time.monotonic() - 60.0 * self._settings.max_age_minutes
@@ -148,7 +153,7 @@ class Store:
 
     @contextlib.contextmanager
     def upload_folder(self) -> Iterator[Path]:
-        """A folder for the files of an upload, which is removed at the end unless it has been moved."""
+        """Context with a folder for the files of an upload; at its end the folder is removed, unless it was moved."""
         folder = self.folder / f"{secrets.token_urlsafe(16)}.upload"
         folder.mkdir(mode=0o700)
         try:
@@ -157,9 +162,9 @@ class Store:
             shutil.rmtree(folder, ignore_errors=True)
 
     def answer_folder(self, job: Job, name: str) -> Path:
-        """A new folder for an answer about a job, with a link to the job's file `name`.
+        """A new folder for an answer about a job, with a hard link to the job's file `name`.
 
-        So the file is there until the answer is sent, even if the job is removed meanwhile.
+        The link keeps the file until the answer is sent, even if the job is removed in the meantime.
         """
         folder = self.folder / f"{secrets.token_urlsafe(16)}.answer"
         folder.mkdir(mode=0o700)
@@ -168,9 +173,10 @@ class Store:
 
 
 def _private_folder(parent: Path) -> tuple[Path, int]:
-    """A new folder that others cannot read, and its open lock; folders that killed servers left are removed.
+    """A new folder that other users cannot read, and its open lock; folders of killed servers are removed.
 
-    The lock is held before the folder gets its name, so that no other server takes it for one that was left.
+    The lock is taken before the folder gets its final name, so that no other server mistakes it for one of a killed
+    server.
     """
     for left in parent.glob(f"{_PREFIX}*"):
         _remove_if_left(left)
@@ -182,7 +188,7 @@ def _private_folder(parent: Path) -> tuple[Path, int]:
 
 
 def _remove_if_left(folder: Path) -> None:
-    """Remove a folder of another server unless that still runs, or belongs to another user."""
+    """Remove the folder of another server, unless that server is running or the folder belongs to another user."""
     if fcntl is None or folder.is_symlink() or folder.stat().st_uid != os.getuid():
         return
     with contextlib.suppress(OSError):  # its server runs, or another one removes it, too

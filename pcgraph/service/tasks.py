@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What worker processes do: segment a cloud, and answer questions about a finished segmentation, into files.
+"""Tasks of the worker processes: they segment a cloud, and write files that answer requests about a segmentation.
 
 Every task is a function of plain values, because they come as JSON, and returns a dictionary that becomes JSON.
 """
@@ -34,7 +34,7 @@ from pcgraph.segmentation import Segmentation
 from pcgraph.service.problems import Problem
 
 Stage = Callable[[str], None]
-"""Told in words what a task has come to."""
+"""Function that a task calls with its current stage in words."""
 
 
 # ---- Segmenting ----------------------------------------------------------------------------------------------------
@@ -52,7 +52,7 @@ def segment_upload(
     linkage: str,
     **parameters: Any,
 ) -> dict[str, Any]:
-    """Segment an upload, save the segmentation, and say what came of it.
+    """Segment an upload, save the segmentation, and return its summary.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def _cloud_of_json(path: Path) -> Cloud:
 # ---- Answers about a saved segmentation ----------------------------------------------------------------------------
 
 _opened: dict[str, tuple[Cloud, Segmentation]] = {}
-"""The segmentation that was asked about last: questions about one mostly follow each other."""
+"""The segmentation of the last request, because most requests about one segmentation follow each other."""
 
 
 def _open(segmentation_id: str, saved: str) -> tuple[Cloud, Segmentation]:
@@ -146,7 +146,7 @@ def _open(segmentation_id: str, saved: str) -> tuple[Cloud, Segmentation]:
 
 
 def _cut(result: Segmentation, n: int | None, altitude: float | None, min_size: int) -> tuple[bool, NDArray[np.int32]]:
-    """Labels of a cut, and whether it is the default one; without `n` and `altitude` it is at that of the objects."""
+    """Whether a cut is the default one, and its labels; without `n` and `altitude` it is at the objects' altitude."""
     if n is None and altitude is None:
         if min_size == 1:
             return True, result.labels
@@ -166,8 +166,8 @@ def write_labels(
 ) -> dict[str, Any]:
     """Write the labels of a cut, or the cloud with its labels, to a file beside the saved segmentation.
 
-    Formats npz and json hold the labels alone, in the input's shape; all others hold the cloud with its own columns,
-    and ours: object, part, supervoxel, and, if a cut was asked for, segment.
+    Formats npz and json hold the labels alone, in the input's shape. All others hold the cloud with its own columns and
+    the columns object, part, supervoxel, and segment if the request is for a cut.
     """
     cloud, result = _open(segmentation_id, saved)
     is_default, labels = _cut(result, n, altitude, min_size)
@@ -191,7 +191,7 @@ def write_labels(
 def write_boxes(
     stage: Stage, segmentation_id: str, saved: str, n: int | None, altitude: float | None, min_size: int
 ) -> dict[str, Any]:
-    """Write the free box around each segment of a cut as JSON."""
+    """Write the oriented box around each segment of a cut as JSON."""
     cloud, result = _open(segmentation_id, saved)
     _, labels = _cut(result, n, altitude, min_size)
     found = boxes_of_labels(cloud.points, labels)
@@ -234,7 +234,7 @@ def _write_json(saved: str, name: str, content: dict[str, Any]) -> dict[str, Any
 
 
 def warm_up() -> None:
-    """Do every task once, on a small cloud of a box on a table, so that all kernels are compiled and loaded."""
+    """Run every task once on a small cloud of a box on a table, so that all kernels are compiled and loaded."""
     x, y = np.meshgrid(*2 * [np.linspace(0.0, 1.0, 40)])
     on_box = (abs(x - 0.5) < 0.2) & (abs(y - 0.5) < 0.2)
     cloud = Cloud(np.stack((x, y, np.where(on_box, 1.2, 1.0)), axis=-1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Uploads: a body that is a file, a form with a file, or JSON with points, received into a file."""
+"""Uploads: the cloud of a request is written to a file, whether the body is a file, a form with a file, or JSON."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ METADATA_FIELD = "metadata"
 METADATA_FILE = f"{FILE_FIELD}.json"
 """Name of that file while it is here: such formats look for it beside the first."""
 RAW_TYPES = ("", "application/octet-stream", "application/x-www-form-urlencoded")
-"""Types of a body that is the file itself; the last is what ``curl --data-binary`` says unless told."""
+"""Content types of a body that is the file itself; the last one is the default of ``curl --data-binary``."""
 MAX_JSON_BYTES = 1 << 20
-"""Bytes of a cloud in JSON, some 20 000 points: it is checked in the server itself. Chosen by eye; not varied."""
+"""Largest cloud in JSON, bytes, some 20 000 points, because the server process itself checks it. Chosen by eye; not
+varied."""
 MAX_FIELDS = 200
-"""Fields of a form: every parameter once, and lists of columns. Chosen by eye; not varied."""
+"""Largest count of fields in a form: every parameter once, and lists of columns. Chosen by eye; not varied."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Upload:
     Attributes
     ----------
     name : str, or None
-        The user's name of the file; None if it is JSON.
+        The client's name of the file; None for a cloud in JSON.
     parameters : SegmentParameters
     """
 
@@ -52,7 +53,7 @@ async def receive_upload(request: Request, query: UploadQuery, folder: Path) -> 
     Raises
     ------
     Problem
-        The body is of another kind than those that are taken, or the form is damaged or has unknown fields.
+        The body has an unknown content type, or the form is damaged or has unknown fields.
     """
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     parameters = SegmentParameters(**query.model_dump(exclude={"name"}, exclude_unset=True))
@@ -113,7 +114,7 @@ async def _copy(file: UploadFile, target: Path) -> None:
 
 
 def with_fields(parameters: SegmentParameters, fields: list[tuple[str, Any]]) -> SegmentParameters:
-    """Parameters with those of a form's fields in place of the same ones."""
+    """The parameters, replaced by those in the fields of a form."""
     given: dict[str, Any] = {}
     for name, value in fields:
         is_list = name in ("viewpoint", "features", "columns")
@@ -126,7 +127,7 @@ def with_fields(parameters: SegmentParameters, fields: list[tuple[str, Any]]) ->
 
 
 def said(errors: Any, known: list[str]) -> str:
-    """One sentence about the first of the errors that pydantic found; `known` are the names of the parameters."""
+    """One sentence about the first error that pydantic found; `known` are the names of the parameters."""
     first = errors[0]
     name = next((part for part in reversed(first["loc"]) if isinstance(part, str)), "body")
     if first["type"] == "extra_forbidden":

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Worker processes of the service, and the tasks that wait for them.
+"""Pool of the service's worker processes, and the queue of tasks for them.
 
-A worker that crashes, takes too long or is killed ends its own task only: a new one takes its place.
+If a worker crashes, takes too long or is killed, only its own task ends, and a new worker replaces it.
 """
 
 from __future__ import annotations
@@ -25,30 +25,31 @@ from pcgraph.service.settings import ServiceSettings
 _log = logging.getLogger("pcgraph.service")
 
 MAX_LINE = 1 << 20
-"""Bytes of a line from a worker: a summary with all its warnings takes some thousands. Chosen by eye; not varied."""
+"""Largest line from a worker, bytes: a summary with all its warnings has some thousands. Chosen by eye; not varied."""
 MAX_START_SECONDS = 600.0
-"""Time in which a worker must be ready: compiling the kernels takes half a minute, and three on a busy machine."""
+"""Seconds within which a worker must be ready: to compile the kernels takes half a minute, and three minutes on a busy
+machine. Chosen by eye; not varied."""
 PAUSE_SECONDS = 1.0
-"""Time before a worker is started again that could not start, so that a broken installation does not fill the log.
-Chosen by eye; not varied."""
+"""Seconds before another try to start a worker that could not start, so that a broken installation does not fill the
+log. Chosen by eye; not varied."""
 RETRY_SECONDS = 2
-"""Time after which a client may ask a busy service again. Chosen by eye; not varied."""
+"""Seconds after which a client may ask a busy service again. Chosen by eye; not varied."""
 
 
 @dataclass(eq=False)
 class Order:
-    """A task that waits for a worker, or is in one.
+    """A task that waits for a worker, or that a worker is doing.
 
     Attributes
     ----------
     task : dict
-        Name and arguments, plain values.
+        Name and arguments of the task, as plain values.
     on_stage : callable
-        Called with what the task has come to, in words.
+        Function that is called with each stage of the task, in words.
     answer : future of dict
-        Fails with a `Problem`. Cancelled with the order.
+        Result of the task, or a `Problem`. It is cancelled with the order.
     worker : Worker, or None
-        Where it is done now.
+        The worker that does the task now.
     """
 
     task: dict[str, Any]
@@ -57,7 +58,7 @@ class Order:
     worker: Worker | None = None
 
     def cancel(self) -> None:
-        """End the task; the worker that does it is killed."""
+        """Cancel the task; a worker that does it is killed."""
         self.answer.cancel()
         if self.worker is not None:
             self.worker.kill()
@@ -74,7 +75,7 @@ class Worker:
 
     @classmethod
     async def start(cls, settings: ServiceSettings) -> Worker:
-        """A worker whose kernels are compiled; Problem if it does not become ready."""
+        """A new worker with compiled kernels; Problem if it does not become ready."""
         threads = str(settings.threads_per_worker)
         environment = {name: value for name, value in os.environ.items() if name != "PCGRAPH_TOKEN"}
         environment |= dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
@@ -99,7 +100,7 @@ class Worker:
         return worker
 
     async def do(self, order: Order, max_seconds: float) -> dict[str, Any]:
-        """Result of a task; Problem if there is none: then the worker ends, too, unless it told the problem itself."""
+        """Result of a task, or the Problem that the worker reports; if it reports neither, it is killed."""
         assert self._process.stdin is not None
         order.worker = self
         try:
@@ -129,7 +130,7 @@ class Worker:
         return result
 
     async def _line(self) -> dict[str, Any]:
-        """The next message of the worker; empty if it has ended, or is no longer to be understood."""
+        """The next message of the worker; empty if the worker has ended, or if the message is not valid."""
         assert self._process.stdout is not None
         try:
             line = await self._process.stdout.readline()
@@ -143,7 +144,7 @@ class Worker:
 
     @property
     def usable(self) -> bool:
-        """Whether it can be given an order."""
+        """True while the worker can take an order."""
         return not (self._killed or self.ended.done())
 
     def kill(self) -> None:
@@ -160,7 +161,7 @@ def in_words(status: int) -> str:
 
 
 class WorkerPool:
-    """A number of worker processes, kept alive, and a queue of orders."""
+    """A number of worker processes, which are replaced when they end, and a queue of orders."""
 
     def __init__(self, n_workers: int, settings: ServiceSettings) -> None:
         self._n_workers, self._settings = n_workers, settings
@@ -171,12 +172,12 @@ class WorkerPool:
         self.n_ready = 0
 
     async def start(self) -> None:
-        """Start the workers, and wait until one is ready: it has compiled the kernels.
+        """Start the workers, and wait until the first one has compiled the kernels.
 
         Raises
         ------
         Problem
-            It could not start.
+            The first worker could not start.
         """
         self._first_ready = asyncio.get_running_loop().create_future()
         self._keepers = [asyncio.create_task(self._keep(self._first_ready))]
@@ -184,7 +185,7 @@ class WorkerPool:
         self._keepers += [asyncio.create_task(self._keep()) for _ in range(self._n_workers - 1)]
 
     async def stop(self) -> None:
-        """End all workers and refuse what waits."""
+        """End all workers and cancel the orders that wait."""
         for order in self._waiting:
             order.cancel()
         self._waiting.clear()
@@ -197,16 +198,16 @@ class WorkerPool:
         return len(self._waiting)
 
     def position(self, order: Order) -> int | None:
-        """Number of orders that come before this one; None if it waits no more."""
+        """Number of orders before this one in the queue; None if it does not wait."""
         return self._waiting.index(order) if order in self._waiting else None
 
     def put(self, task: dict[str, Any], on_stage: Callable[[str], None] = lambda _: None) -> Order:
-        """Order a task.
+        """Put a task into the queue, and return its order.
 
         Raises
         ------
         Problem
-            Too many wait already.
+            Too many orders wait already.
         """
         if len(self._waiting) >= self._settings.max_queued:
             raise busy(f"{len(self._waiting)} requests wait for a worker already: try again later", RETRY_SECONDS)
@@ -221,7 +222,7 @@ class WorkerPool:
             self._waiting.remove(order)
 
     async def _keep(self, first_ready: asyncio.Future[None] | None = None) -> None:
-        """Keep one worker alive, and let it do one order after the other."""
+        """Keep one worker running, and give it one order after the other."""
         while True:
             try:
                 worker = await Worker.start(self._settings)
@@ -244,7 +245,7 @@ class WorkerPool:
             _log.warning("a worker process ended (%s); a new one takes its place", in_words(status))
 
     async def _serve(self, worker: Worker) -> None:
-        """Let a worker do orders until it ends."""
+        """Give orders to a worker until it ends."""
         while order := await self._next(worker):
             try:
                 result = await worker.do(order, self._settings.max_seconds)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A worker process of the service: it reads tasks from its standard input and answers each, one line of JSON each.
+"""A worker process of the service: it reads tasks from standard input, and answers each on standard output, as JSON.
 
     python -m pcgraph.service.worker_process MAX_MEMORY_BYTES
 
@@ -49,14 +49,14 @@ def main() -> None:
 
 
 def _read(stream: TextIO, tasks: queue.SimpleQueue[str]) -> None:
-    """Put the lines of a stream into a queue; end the process, whatever it does, where the stream ends."""
+    """Put the lines of a stream into a queue; at the end of the stream, end the process at once."""
     for line in stream:
         tasks.put(line)
     os._exit(0)
 
 
 def _limit_memory(n_bytes: int) -> None:
-    """Make allocations fail beyond so many bytes of private memory; the address space as such costs nothing."""
+    """Make allocations of private memory beyond `n_bytes` fail; reserved address space does not count."""
     try:
         import resource
     except ImportError:  # Windows has no such limits
@@ -75,7 +75,7 @@ def _answer(do: Callable[..., Any], arguments: dict[str, Any], stage: Callable[[
 
 
 def _problem_of(error: Exception) -> Problem:
-    """What a client is told of a task's exception."""
+    """The problem that tells a client about the exception of a task."""
     if _memory_was_short(error):
         return Problem(413, "the cloud needs more memory than this service gives to one: send fewer points")
     if isinstance(error, Problem):
@@ -89,7 +89,7 @@ def _problem_of(error: Exception) -> Problem:
 
 
 def _memory_was_short(error: BaseException | None) -> bool:
-    """Whether a MemoryError is behind an exception: closing a file after one may raise another."""
+    """Whether a MemoryError caused an exception; closing a file after one may raise another exception."""
     while error is not None and not isinstance(error, MemoryError):
         error = error.__cause__ or error.__context__
     return error is not None
