@@ -43,7 +43,7 @@ Features = ArrayLike | str | Sequence[str] | None
 
 
 class Arrays(NamedTuple):
-    """Points, and the further values that are known of each; None for those that are not."""
+    """Points, and their colours, normals, features and viewpoints; None for those that are not given."""
 
     points: ArrayLike
     colors: ArrayLike | None
@@ -89,7 +89,7 @@ def _names(features: Features) -> list[str]:
 
 
 def _columns(cloud: Cloud, names: list[str]) -> NDArray[np.float64]:
-    """The columns of these names side by side, points' leading shape + (d,); a vector gives one for each element."""
+    """The columns of these names as one array, points' leading shape + (d,); a vector adds each of its numbers."""
     shape = np.shape(cloud.points)[:-1]
     columns = []
     for name in names:
@@ -308,7 +308,7 @@ def _one_place(places: NDArray[np.float64], points: NDArray[np.float64]) -> NDAr
 
 
 def _excerpt(values: NDArray[np.float64]) -> str:
-    """The part of a message that tells the fault of a viewpoint."""
+    """End of the message about a viewpoint of a wrong shape or value."""
     if values.size <= 4:
         return f" of {values.tolist()}"
     if values.shape == (4, 4):

@@ -244,7 +244,7 @@ def _check_all_used(archive: Archive, result: Segmentation, given: list[str]) ->
 
 
 def _check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Raise DamagedError if an array has not the shape and range of its row of `ARRAYS`."""
+    """Raise DamagedError unless each array has the shape and range of its row of `ARRAYS`."""
     sizes: dict[str, tuple[int, ...]] = {}
     rows = {name: row for name in arrays if (row := row_of(name)) is not None}
     for name, row in rows.items():

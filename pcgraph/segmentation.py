@@ -107,7 +107,7 @@ class Supervoxels(ShortRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Segmentation:
-    """A cloud from fine to coarse.
+    """Segmentation of a cloud: supervoxels, their graph, the tree and the objects.
 
     Attributes
     ----------

@@ -130,7 +130,7 @@ def check_outputs(paths: list[Path], inputs: list[str], overwrite: bool) -> None
     given = {os.path.realpath(name) for name in inputs if name != PIPE}
     if len(set(paths)) < len(paths):
         twice = next(path for path in paths if paths.count(path) > 1)
-        raise CloudWriteError(f"two inputs would be written to {twice}: choose another --out for one of them")
+        raise CloudWriteError(f"two inputs would be written to {twice}: run the command for each, with its own --out")
     for path in paths:
         if os.path.realpath(path) in given:
             raise CloudWriteError(f"{path} is an input: choose another --out")

@@ -95,7 +95,7 @@ def read_e57(file: CloudFile) -> Cloud:
         except CloudReadError:
             raise
         except MemoryError:
-            raise CloudReadError("the points do not fit into memory") from None
+            raise CloudReadError("the points do not fit into memory: split the file, or thin out its points") from None
         except Exception as error:  # noqa: BLE001 - E57Exception, and what nodes of unexpected types cause
             raise CloudReadError(f"the E57 file is damaged: {library_reason(error)}") from None
     return _joined(scans)
@@ -343,7 +343,7 @@ def encode_e57(cloud: Cloud, suffix: str) -> bytes:
 
 
 def _safe_name(name: str, room: int) -> str:
-    """A name that XML takes; names may be of any length."""
+    """The name with ``_`` for characters that XML forbids; it may have any length."""
     return re.sub(r"^(?=[^A-Za-z_])", "_", re.sub(r"[^A-Za-z0-9_.-]", "_", name)) or "_"
 
 

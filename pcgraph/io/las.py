@@ -100,7 +100,7 @@ def read_las(content: bytes) -> Cloud:
     except CloudReadError:
         raise
     except MemoryError:
-        raise CloudReadError("the points do not fit into memory") from None
+        raise CloudReadError("the points do not fit into memory: split the file, or thin out its points") from None
     except BaseException as error:  # of damaged files, laspy raises whatever its parts raise, lazrs a panic of Rust
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise

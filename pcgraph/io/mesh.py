@@ -188,7 +188,7 @@ def _parts(file: CloudFile, kind: str) -> list[_Part]:
     except CloudReadError:
         raise
     except MemoryError:
-        raise CloudReadError("the mesh does not fit into memory") from None
+        raise CloudReadError("the mesh does not fit into memory: split the file, or simplify the mesh") from None
     except Exception as error:  # noqa: BLE001 - of damaged files, trimesh raises whatever its parts raise
         raise CloudReadError(f"the mesh file is damaged: {library_reason(error)}") from None
     parts = [part for part in parts if len(part.points)]

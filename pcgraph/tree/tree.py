@@ -83,7 +83,7 @@ class SegmentationTree(ShortRepr):
 
     @property
     def root(self) -> int:
-        """The last node, above all others."""
+        """The root, which is the last node."""
         return self.n_nodes - 1
 
     @cached_property
@@ -100,7 +100,7 @@ class SegmentationTree(ShortRepr):
         return accumulate_sequential(self.parents, leaves)
 
     def leaves_of(self, node: int) -> NDArray[np.int32]:
-        """Leaves at or below a node, ascending, (s,) int32. It takes time for all nodes of the tree.
+        """Leaves at or below a node, ascending, (s,) int32; each call takes time in proportion to the whole tree.
 
         Raises
         ------

@@ -33,7 +33,9 @@ UNITS = {"centroid_x": "m", "centroid_y": "m", "centroid_z": "m", "residual": "m
 
 @dataclass(frozen=True, eq=False)
 class ShownTree(ShortRepr):
-    """A tree, its leaves' objects and parts, and the points' leaves; other programs' results can be shown with it, too.
+    """Tree of a cloud for the viewer: the leaf of each point, and the object and the part of each leaf.
+
+    It can also hold the result of another program.
 
     Attributes
     ----------

@@ -280,18 +280,23 @@ def depth_order_along(
 def depth_order_of(
     grid: VoxelGrid, normals: NDArray[np.float64], place: NDArray[np.float64], shown: VoxelGrid, depth: float
 ) -> NDArray[np.int8]:
-    """Whether what another grid shows in the direction of each voxel is nearer, -1, farther, 1, or neither, 0; (v,).
+    """Order of each voxel and another grid along the ray from a place, (v,) int8.
 
     Parameters
     ----------
     grid : VoxelGrid of v voxels
     normals : (v, 3) float64
     place : (3,) float64, metres
-        From where it is seen.
+        Viewpoint.
     shown : VoxelGrid
-        The voxels that are seen.
+        The other grid.
     depth : float, voxel edges
-        Difference of depth from which on something is nearer or farther.
+        Least difference of depth that counts.
+
+    Returns
+    -------
+    (v,) int8
+        -1: the other grid is nearer than the voxel. 1: it is farther. 0: neither, or it has nothing in that direction.
     """
     middle, reach = unit_frame(shown, np.concatenate((grid.centroids, shown.centroids, place[None])))
     centres = (np.concatenate((shown.centroids, grid.centroids)) - middle) / reach
