@@ -50,7 +50,7 @@ def segment_command(
     ] = None,
     to_format: Annotated[
         str | None,
-        typer.Option("--to", help="End of the labelled cloud's name, such as laz. Default: as the input, or ply."),
+        typer.Option("--to", help="Suffix of the labelled cloud, such as laz. Default: as the input, or ply."),
     ] = None,
     columns: Annotated[
         str | None, typer.Option(help="Names of the columns of a text without a header: x,y,z,intensity.")

@@ -103,7 +103,7 @@ _UPLOAD = {
                         FILE_FIELD: {
                             "type": "string",
                             "format": "binary",
-                            "description": "The file; the end of its name tells the format.",
+                            "description": "The file; the suffix of its name tells the format.",
                         },
                         METADATA_FIELD: {
                             "type": "string",

@@ -119,7 +119,7 @@ class UploadQuery(SegmentParameters):
         None,
         min_length=1,
         max_length=MAX_NAME,
-        description="Name of the file, if the body is the file itself: its end tells the format.",
+        description="Name of the file, if the body is the file itself: its suffix tells the format.",
         examples=["scan.laz"],
     )
 

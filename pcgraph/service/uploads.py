@@ -65,7 +65,7 @@ async def receive_upload(request: Request, query: UploadQuery, folder: Path) -> 
         )
     if kind != "application/json" and query.name is None:
         raise Problem(
-            422, "expected the name of the file in the query, such as ?name=scan.laz: its end tells the format"
+            422, "expected the name of the file in the query, such as ?name=scan.laz: its suffix tells the format"
         )
     if kind == "application/json":
         (folder / FILE_FIELD).write_bytes(await _checked_json(request))
