@@ -3,18 +3,21 @@
 
     python benchmarks/service.py [--clients 64] [--seconds 60] [--seed 0]
 
-Starts `pcgraph serve` on a free port of 127.0.0.1 and ends it. Each client does one thing after the other, chosen at
-random: most often it uploads one of some clouds whose segmentation is known from `pcgraph.segment` in this process, and
-asks for its labels and for a finer cut, which must be equal. Else it uploads something bad, which must be refused with
-the right status: a file that is cut off, garbage, a file beyond the limit of size (with and without saying so before),
-a wrong parameter; or an upload that arrives so slowly that the server has to end it. At half time one worker is killed
-with SIGKILL. One cloud needs longer than the server's limit of time; its job must fail with the status 504.
+It starts `pcgraph serve` on a free port of 127.0.0.1, and ends it. Each client repeats one of these steps, at random:
+
+- Most often it uploads a cloud that `pcgraph.segment` has segmented in this process, and asks for its labels and for a
+  finer cut. Both must be equal.
+- Else it uploads something bad, which must be refused with the right status: a truncated file, random bytes, a file
+  above the limit of size (with and without a Content-Length), a wrong parameter, or an upload that arrives too slowly.
+
+At half time one worker is killed with SIGKILL. One cloud takes longer than the server's time limit; its job must fail
+with the status 504.
 
     requests    answers of the server
-    wrong       answers with a wrong status, wrong labels, or none, but for those of the killed worker (`lost`)
-    p50_ms      from the start of a good upload until its segmentation is done, median; p95_ms: 95 %
-    refused     answers 503: too much to do, try again
-    rss_growth  of the server and its workers together: median of the last quarter of the time over that of the second
+    wrong       answers with a wrong status, wrong labels or no labels, except those of the killed worker (`lost`)
+    p50_ms      time from the start of a good upload until its segmentation is done, median; p95_ms: 95 %
+    refused     answers with the status 503: the service is busy
+    rss_growth  memory of the server and its workers: median of the last quarter of the time over that of the second
 
 The last line is JSON.
 """
@@ -45,26 +48,26 @@ import pcgraph
 from pcgraph.io import encode_cloud
 
 LIMITS = {"max-seconds": 10, "max-upload-mb": 100, "max-upload-seconds": 5, "max-stored-gb": 0.05, "max-memory-gb": 3}
-"""Of the server: short times, so that slow uploads and the stuck job end within the minute, and a small store, so that
-it has to make room."""
+"""Settings of the server: short times, so that slow uploads and the stuck job end within the minute, and a small store,
+so that it has to make room."""
 CUT = 12
-"""Segments of the finer cut."""
+"""Count of segments in the finer cut. Chosen by eye; not varied."""
 MAX_REQUESTS = 200_000
-"""Requests after which the clients stop, whatever the time."""
+"""Largest count of requests; the clients stop then even before the time is over."""
 ACTIONS = {"good": 0.80, "cut off": 0.04, "garbage": 0.04, "too large": 0.03, "too large, unsaid": 0.02,
            "wrong parameter": 0.04, "slow": 0.03}  # fmt: skip
-"""How often a client does what."""
+"""Relative frequency of each step of a client."""
 STUCK_POINTS = 3_000_000
 """Points of the stuck cloud, noise in a cube."""
 STUCK_VOXEL = 0.01
 """Edge of its voxels, metres: a million of them."""
 RECOVERY_SECONDS = 20
-"""Time in which a new worker must be ready; it takes some three seconds on a free core."""
+"""Seconds within which a new worker must be ready; it takes some three on a free core."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """A cloud as a file, and the labels that are right."""
+    """A cloud as a file, and its expected labels."""
 
     name: str
     content: bytes
@@ -74,7 +77,7 @@ class Known:
 
 @dataclass
 class Tally:
-    """What happened."""
+    """Counts and times of all requests."""
 
     answers: Counter[str] = field(default_factory=Counter)
     wrong: Counter[str] = field(default_factory=Counter)
@@ -108,7 +111,7 @@ def known_clouds(rng: np.random.Generator) -> list[Known]:
 
 
 class Client:
-    """One client, which asks one thing after the other."""
+    """One client, which sends one request after the other."""
 
     def __init__(self, http: httpx.AsyncClient, known: list[Known], tally: Tally, seed: int) -> None:
         self.http, self.known, self.tally = http, known, tally
@@ -125,7 +128,7 @@ class Client:
                 self.tally.wrong[f"{action}: no answer, {type(error).__name__} {error}"] += 1
 
     async def ask(self, method: str, path: str, **arguments: Any) -> httpx.Response:
-        """An answer other than 503, after which it asks again."""
+        """The answer to a request, which is repeated as long as the answer is 503."""
         while True:
             answer = await self.http.request(method, path, **arguments)
             self.tally.answers[str(answer.status_code)] += 1
@@ -159,7 +162,7 @@ class Client:
         return None
 
     async def outcome(self, made: httpx.Response) -> dict[str, Any]:
-        """The finished job of an upload's answer, or its problem."""
+        """The finished job of an upload, or its problem."""
         job: dict[str, Any] = made.json()
         while job.get("state") in ("queued", "running"):
             job = (await self.ask("GET", job["links"]["self"], params={"wait": 10})).json()
@@ -236,7 +239,7 @@ def children(pid: int) -> list[int]:
 
 
 def resident_bytes(pid: int) -> int:
-    """Resident memory of a process and its children; of one that has just ended 0."""
+    """Resident memory of a process and its children; 0 if it has just ended."""
     total = 0
     for one in (pid, *children(pid)):
         try:
@@ -260,7 +263,7 @@ async def kill_one(pid: int, at: float) -> int:
 
 
 async def begin_stuck_job(http: httpx.AsyncClient, rng: np.random.Generator) -> str:
-    """Path of a job that takes too long, after its beginning."""
+    """Path of a job that takes too long, returned when it has begun."""
     points = rng.uniform(0.0, 1.0, (STUCK_POINTS, 3)).astype(np.float32)
     content = encode_cloud(pcgraph.Cloud(points), "stuck.ply")
     parameters: dict[str, Any] = {"name": "stuck.ply", "voxel_size": STUCK_VOXEL, "wait": 0}

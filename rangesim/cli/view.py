@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command `rangesim view`, which shows the clouds of a result in a page that turns them."""
+"""The command `rangesim view`, which shows the clouds of a result in an interactive page."""
 
 from __future__ import annotations
 

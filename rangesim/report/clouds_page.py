@@ -22,12 +22,12 @@ STATUS = Categories(list(palette.STATUS_NAMES.values()), palette.STATUS_COLORS)
 
 
 def render_clouds_page(result: Result) -> str:
-    """HTML page with a chooser over the clouds of all instruments, in the axes of their cameras.
+    """HTML page with a menu of the clouds of all instruments, in the axes of their cameras.
 
     Raises
     ------
     ValueError
-        The page would be larger than browsers load.
+        The page would be too large for browsers.
     """
     titles = tables.titles(result.measurements)
     return views_page([_shown(m, titles[m.name]) for m in result.measurements], one_line(result.info.scene.name))
