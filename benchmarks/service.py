@@ -14,7 +14,8 @@ with SIGKILL. One cloud needs longer than the server's limit of time; its job mu
     wrong       answers with a wrong status, wrong labels, or none, but for those of the killed worker (`lost`)
     p50_ms      from the start of a good upload until its segmentation is done, median; p95_ms: 95 %
     refused     answers 503: too much to do, try again
-    rss_growth  of the server and its workers together: median of the last quarter of the time over that of the second
+    rss_growth  of the server and its workers together: median of the last quarter of the time over that of the second,
+                minus 1; in less than a minute it is that of the warm-up
 
 The last line is JSON.
 """
