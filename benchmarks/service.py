@@ -17,7 +17,8 @@ with the status 504.
     wrong       answers with a wrong status, wrong labels or no labels, except those of the killed worker (`lost`)
     p50_ms      time from the start of a good upload until its segmentation is done, median; p95_ms: 95 %
     refused     answers with the status 503: the service is busy
-    rss_growth  memory of the server and its workers: median of the last quarter of the time over that of the second
+    rss_growth  memory of the server and its workers: median of the last quarter of the time over that of the second,
+                minus 1; in less than a minute it shows the warm-up only
 
 The last line is JSON.
 """

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pcgraph.columns import CLIP
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.errors import MAX_WORD, CloudReadError, one_line
+from pcgraph.families import members
 from pcgraph.graph.continuations import Continuations
 from pcgraph.hierarchy import checked_parents
 from pcgraph.plumbing.array_archive import (
@@ -176,6 +177,8 @@ def load_segmentation(
     """
     path = Path(path)
     Settings.of(method, linkage, None)
+    for family in ("SupervoxelMethod", "Linkage"):  # a class is known once it is loaded
+        members(family)
     check_file(path, CloudReadError)
     try:
         return _segmentation(_archive(path), {"linkage": linkage, "method": method})

@@ -6,6 +6,8 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import subprocess
+import sys
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
@@ -576,3 +578,13 @@ def test_the_header_is_plain_json(saved: dict[str, Any]) -> None:
         header = json.loads(bytes(file["header"]), parse_constant=refuse)
     assert (header["format"], header["version"]) == ("pcgraph segmentation", 1)
     assert header["values"]["graph/acquisition"] == "SeveralScans"
+
+
+def test_a_new_process_knows_all_methods_and_linkages(tmp_path: Path) -> None:
+    """Only what a file needs is loaded before: it was refused there."""
+    points = np.random.default_rng(0).random((500, 3)) * [1.0, 1.0, 0.01]
+    result = pcgraph.segment(points, method=pcgraph.Vccs(), linkage=pcgraph.WardLinkage())
+    result.save(tmp_path / "x.npz")
+    code = "import sys, pcgraph; found = pcgraph.load_segmentation(sys.argv[1]); print(found.method, found.linkage)"
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "x.npz"], capture_output=True, text=True)
+    assert done.stdout == f"{result.method} {result.linkage}\n", done.stderr
