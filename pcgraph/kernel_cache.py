@@ -145,6 +145,6 @@ def _say_once() -> None:
     if not _said:
         _said = True
         logging.getLogger(_PACKAGE).warning(
-            "pcgraph: compiling kernels before their first use, once per installation, which takes up to half a "
-            "minute; `pcgraph compile` does it ahead."
+            "pcgraph: compiling kernels that this installation has not used before, which takes up to half a minute; "
+            "`pcgraph compile` compiles all of them ahead."
         )

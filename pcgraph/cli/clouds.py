@@ -146,7 +146,12 @@ def check_outputs(paths: list[Path], inputs: list[str], overwrite: bool) -> None
 
 
 def write_results(
-    paths: list[Path], cloud: Cloud, result: Segmentation, levels: tuple[int, ...] = (), colorize: bool = False
+    paths: list[Path],
+    cloud: Cloud,
+    result: Segmentation,
+    levels: tuple[int, ...] = (),
+    colorize: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Write all files of a result, or none: saved segmentations (``.npz``) and labelled clouds (other suffixes)."""
     from pcgraph.io import encode_cloud
@@ -161,7 +166,7 @@ def write_results(
             if is_saved
             else encode_cloud(labelled_cloud(cloud, result, levels, colorize), path.name)
         )
-    write_files(contents, CloudWriteError, make_parents=True)
+    write_files(contents, CloudWriteError, make_parents=True, overwrite=overwrite)
 
 
 def numbers(text: str | None, option: str) -> tuple[int, ...]:

@@ -45,7 +45,7 @@ def cut_command(
         if objects is not None or altitude is not None or min_size != 1:
             level = result.object_altitude if objects is None and altitude is None else altitude
             result = result.with_objects(objects, level, min_size)
-        write_results([target], cloud, result, cuts, colorize)
+        write_results([target], cloud, result, cuts, colorize, overwrite)
         if boxes:
             for record in object_records(cloud, result):
                 typer.echo(json.dumps(record, allow_nan=False))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -85,7 +86,7 @@ def _cloud_record(cloud: Cloud) -> dict[str, Any]:
         "finite": len(finite),
         "low": finite.min(axis=0).tolist() if len(finite) else None,
         "high": finite.max(axis=0).tolist() if len(finite) else None,
-        "spacing": median_spacing(finite) if len(finite) > 1 else None,
+        "spacing": median_spacing(finite) if len(finite) and np.ptp(finite, axis=0).any() else None,
         "coordinates": str(cloud.points.dtype),
         "viewpoint": None if cloud.viewpoint is None or cloud.viewpoint.ndim > 1 else cloud.viewpoint.tolist(),
         "columns": {name: _column(values) for name, values in held.items() if values is not None},
@@ -120,5 +121,14 @@ def _print_cloud(record: dict[str, Any]) -> None:
     if record["viewpoint"] is not None:
         print_row("viewpoint", " ".join(f"{value:.6g}" for value in record["viewpoint"]))
     for name, column in record["columns"].items():
-        ends = "no number" if column["low"] is None else f"{column['low']:.6g} to {column['high']:.6g}"
+        ends = "no number" if column["low"] is None else _range(column["low"], column["high"])
         print_row(one_line(name), f"{column['type']}, {ends}")
+
+
+def _range(low: float, high: float) -> str:
+    """Both ends, with six digits or as many as it takes to tell them apart: GPS times differ in the tenth."""
+    if isinstance(low, int):
+        return f"{low} to {high}"
+    span = high - low
+    digits = 6 if not 0.0 < span < math.inf else 3 + math.ceil(math.log10(max(abs(low), abs(high)) / span))
+    return f"{low:.{min(max(digits, 6), 17)}g} to {high:.{min(max(digits, 6), 17)}g}"

@@ -184,7 +184,7 @@ def segment_command(
                 level = None if objects is not None else result.object_altitude
                 result = result.with_objects(objects, level, min_size)
             check_outputs(targets[name], clouds, overwrite)  # again, as files may have appeared
-            write_results(targets[name], cloud, result, cuts, colorize)
+            write_results(targets[name], cloud, result, cuts, colorize, overwrite)
             content = encode_cloud(labelled_cloud(cloud, result, cuts, colorize), f"stdout{suffix}") if piped else None
             record = _summary(name, cloud, result, targets[name], time.perf_counter() - start)
             if boxes:

@@ -39,7 +39,8 @@ def view_command(
         target = Path(f"{name}.html") if out is None else out
         check_outputs([target], [str(source)], overwrite)
         shown = [_shown(path, segment) for path in _files(source)]
-        write_file(target, views_page(shown, source.absolute().name).encode("utf-8"), CloudWriteError)
+        page = views_page(shown, source.absolute().name).encode("utf-8")
+        write_file(target, page, CloudWriteError, overwrite=overwrite)
     typer.echo(f"{'clouds':<12} {len(shown)}")
     typer.echo(f"{'written':<12} {one_line(target)}, {target.stat().st_size / 1e6:.1f} MB")
     if open_page:

@@ -120,22 +120,28 @@ def is_sealed(path: Path, mark: str, at_end: bool = False) -> bool:
 # ---- Writing -------------------------------------------------------------------------------------------------------
 
 
-def write_file(path: Path, content: bytes, error: type[Exception], make_parents: bool = False) -> None:
+def write_file(
+    path: Path, content: bytes, error: type[Exception], make_parents: bool = False, overwrite: bool = True
+) -> None:
     """Write one file, as `write_files` does."""
-    write_files({path: content}, error, make_parents)
+    write_files({path: content}, error, make_parents, overwrite)
 
 
-def write_files(contents: Mapping[Path, bytes], error: type[Exception], make_parents: bool = False) -> None:
+def write_files(
+    contents: Mapping[Path, bytes], error: type[Exception], make_parents: bool = False, overwrite: bool = True
+) -> None:
     """Write files so that a reader finds the old or the new content of each, never a part, also after a crash.
 
-    Older files are replaced. So names must come from the user, or the caller must first check that a file is its own.
+    Older files are replaced, unless `overwrite` is False. So names must come from the user, or the caller must first
+    check that a file is its own.
     No file is replaced before all are on the disk, and a signal leaves all or none. Links are followed. Temporary files
     that killed processes left beside the files are removed.
 
     Raises
     ------
     error
-        A path is no plain file, its directory does not exist, or the disk is full.
+        A path is no plain file, its directory does not exist, or the disk is full; or a file exists, perhaps since a
+        moment ago, and shall not be replaced.
     """
     for path in contents:
         target = Path(os.path.realpath(path))
@@ -150,6 +156,8 @@ def write_files(contents: Mapping[Path, bytes], error: type[Exception], make_par
             parts.append(_Part(path))
             parts[-1].write(content, make_parents)
         with _lock:
+            if not overwrite and (taken := [part.named for part in parts if part.target.exists()]):
+                raise error(f"cannot write {taken[0]}: it exists by now; choose another path.")
             for part in parts:
                 path = part.named
                 part.place()
@@ -174,7 +182,7 @@ def replace_file(target: Path, content: bytes) -> None:
 
 
 class _Part:
-    """A temporary file beside a file, with the file's new content; it is locked while it is written."""
+    """A temporary file beside a file, with the file's new content; it is locked until it is moved or removed."""
 
     def __init__(self, named: Path) -> None:
         self.named, target = named, Path(os.path.realpath(named))
@@ -185,6 +193,7 @@ class _Part:
         if len(os.fsencode(self.path.name)) > _MAX_NAME:
             self.path = target.with_name(f".{digest}.{os.urandom(8).hex()}.part")
         self.made: list[Path] = []
+        self._held: int | None = None
 
     def write(self, content: bytes, make_parents: bool = False) -> None:
         """Write and flush the temporary file; its directory is made if need be."""
@@ -195,15 +204,25 @@ class _Part:
             if make_parents:
                 self.target.parent.mkdir(parents=True, exist_ok=True)
             clear_parts(self.target.parent, self.names)
-            handle = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+            handle = self._opened()
         with os.fdopen(handle, "wb") as stream:
-            if fcntl is not None:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             stream.write(content)
             stream.flush()
             os.fsync(handle)
         if self.target.exists():
             os.chmod(self.path, stat.S_IMODE(self.target.stat().st_mode))
+
+    def _opened(self) -> int:
+        """Handle of the new temporary file, locked: another process takes a file without a lock for one left behind."""
+        while True:
+            handle = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+            if fcntl is None:
+                return handle
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            if os.fstat(handle).st_nlink:  # else another process has removed it before it was locked
+                self._held = os.dup(handle)  # keeps the lock when `handle` is closed
+                return handle
+            os.close(handle)
 
     def place(self) -> None:
         """Move the temporary file to the place of the file."""
@@ -217,6 +236,9 @@ class _Part:
                 _parts.remove(self)
             with suppress(OSError):  # it was moved, was never made, or its directory is gone
                 self.path.unlink()
+            if self._held is not None:
+                os.close(self._held)
+                self._held = None
             if and_directories:
                 remove_empty(self.made)
 

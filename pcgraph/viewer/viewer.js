@@ -46,8 +46,8 @@ function valueText(column, value) {
 
 function counted(count, one, many = `${one}s`) { return `${count.toLocaleString("en")} ${count === 1 ? one : many}`; }
 
-// Digits after the point that a coordinate in steps of this size has.
-function digitsOf(step) { return Math.max(0, Math.min(9, Math.ceil(-Math.log10(step)))); }
+// Digits after the point that a coordinate in steps of this size has; 1 is the step of a constant, which is exact.
+function digitsOf(step) { return step === 1 ? 6 : Math.max(0, Math.min(9, Math.ceil(-Math.log10(step)))); }
 
 function metres(length) { return length >= 1 ? `${number(length, 3)} m` : length >= 1e-3 ? `${number(1e3 * length, 3)} mm` : `${number(1e6 * length, 2)} µm`; }
 

@@ -129,6 +129,13 @@ def test_info_tells_what_a_file_holds(scene, tmp_path):
     (record,) = records(CliRunner().invoke(app, ["info", "--json", str(tmp_path / "a.pcd")]))
     assert (record["shape"], record["finite"], record["high"]) == ([3], 2, [1, 2, 3])
     assert record["columns"] == {"intensity": {"type": "float32", "low": 3.0, "high": 5.0}}
+    columns = {"gps_time": 3.1e8 + 0.001 * np.arange(9), "n": np.arange(9) + 10**8}
+    copies = pcgraph.Cloud(np.ones((9, 3)), columns=columns)
+    pcgraph.write_cloud(tmp_path / "copies.npz", copies)
+    told = CliRunner().invoke(app, ["info", str(tmp_path / "copies.npz")]).stdout
+    assert "float64, 310000000 to 310000000.008\n" in told
+    assert "int64, 100000000 to 100000008\n" in told
+    assert "spacing" not in told
     done = CliRunner().invoke(app, ["info", str(tmp_path / "none.pcd"), str(scene)])
     assert done.exit_code == 1
     assert "No such file" in done.stderr

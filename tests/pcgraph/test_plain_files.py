@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
@@ -54,6 +56,27 @@ def test_parts_of_dead_writers_are_cleared_and_those_of_living_ones_stay(tmp_pat
         fcntl.flock(stream, fcntl.LOCK_EX)
         write_file(tmp_path / "x.bin", b"", Refused)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted([alive.name, mine.name, other.name, "x.bin"])
+
+
+def test_writers_of_one_file_in_several_processes_all_succeed(tmp_path: Path) -> None:
+    """A part is locked until it is in its place, so that no other process takes it for one that was left behind."""
+    pytest.importorskip("fcntl")
+    code = (
+        "import sys; from pathlib import Path; from pcgraph.plumbing.plain_files import write_files\n"
+        "both = {Path(sys.argv[1]) / name: sys.argv[2].encode() * 1000 for name in 'xy'}\n"
+        "for _ in range(100): write_files(both, OSError)"
+    )
+    writers = [subprocess.Popen([sys.executable, "-c", code, tmp_path, letter]) for letter in "abc"]
+    assert [writer.wait(60) for writer in writers] == [0, 0, 0]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["x", "y"]
+    assert {len(set((tmp_path / name).read_bytes())) for name in "xy"} == {1}
+
+
+def test_a_file_that_has_appeared_meanwhile_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "y").write_bytes(b"theirs")
+    with pytest.raises(Refused, match="y: it exists by now"):
+        write_files({tmp_path / "n" / "x": b"1", tmp_path / "y": b"2"}, Refused, make_parents=True, overwrite=False)
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("y", b"theirs")]
 
 
 @pytest.mark.parametrize("failing", ["open", "fsync", "replace"])

@@ -627,13 +627,19 @@ def test_clients_in_three_languages_find_the_boxes(server, scene, tmp_path):
     folder = ROOT / "examples" / "service"
     program = tmp_path / "client"
     build = ["g++", "-std=c++17", "-Wall", "-Werror", str(folder / "client.cpp"), "-lcurl", "-o", str(program)]
-    for command in ([sys.executable, str(folder / "client.py")], ["node", str(folder / "client.mjs")]):
+    scripts = [sys.executable, str(folder / "client.py")], ["node", str(folder / "client.mjs")]
+    for command in scripts:
         done = subprocess.run([*command, str(path), one.address], capture_output=True, text=True, check=True)
         sizes = np.array([line.split() for line in done.stdout.splitlines()], float)
         assert sizes[:, 1:] == pytest.approx(np.array([[1.6, 1.2, 0], [0.3, 0.3, 0.3], [0.25, 0.25, 0.25]]), abs=0.04)
     subprocess.run(build, check=True)
     done = subprocess.run([str(program), str(path), one.address], capture_output=True, check=True)
     assert len(np.unique(decode_cloud(done.stdout, "labelled.pcd").columns["object"])) == 3
+    path.write_bytes(b"no cloud")
+    for command in (*scripts, [str(program)]):
+        done = subprocess.run([*command, str(path), one.address], capture_output=True, text=True)
+        assert done.returncode == 1
+        assert "expected a PLY header" in done.stderr
     path.unlink()
     program.unlink()
 

@@ -398,7 +398,7 @@ def test_clouds_of_few_points_and_of_no_extent_are_shown(tmp_path: Path) -> None
         Shown("none", pcgraph.Cloud(np.empty((0, 3)))),
         Shown("unmeasured", pcgraph.Cloud(np.full((4, 5, 3), np.nan), columns={"a": np.full((4, 5), np.nan)})),
         Shown("one", pcgraph.Cloud(np.zeros((1, 3)), columns={"a": np.array([np.nan])})),
-        Shown("equal", pcgraph.Cloud(np.full((5, 3), 1e7), columns={"same": np.full(5, 2.5)})),
+        Shown("equal", pcgraph.Cloud(np.full((5, 3), 1e7 + 0.25), columns={"same": np.full(5, 2.5)})),
         Shown.of("few", pcgraph.Cloud(one), pcgraph.segment(one, voxel_size=0.1)),
     ]
     path = tmp_path / "few.html"
@@ -413,6 +413,7 @@ def test_clouds_of_few_points_and_of_no_extent_are_shown(tmp_path: Path) -> None
             said = page.evaluate("document.getElementById('panel').innerText")
             assert "NaN" not in said
             assert "undefined" not in said
+            assert entry.name != "equal" or ("2.500000" in said and "10000000.250000 m" in said)
             if entry.tree is not None:
                 page.evaluate("document.getElementById('show-branches').click()")
                 set_slider(page, 1000)
