@@ -210,12 +210,18 @@ def _beside(path: Path) -> trimesh.resolvers.Resolver:
 
 
 def _check_accessors(content: bytes) -> None:
-    """Raise CloudReadError if a glTF file promises many more zeros than it has bytes, before they are allocated."""
+    """Raise CloudReadError if a glTF file promises many more zeros than it has bytes, before they are allocated.
+
+    Also if it is of version 1, which has other structures.
+    """
+    if content[:4] == b"glTF" and content[4:8] == b"\1\0\0\0":
+        raise CloudReadError("expected glTF of version 2, got version 1: convert it first")
     start = 20  # of the JSON in a binary file: after 12 bytes of the header, its length and its type
     text = content[start : start + int.from_bytes(content[12:16], "little")] if content[:4] == b"glTF" else content
-    promised = sum(
-        accessor["count"] for accessor in json.loads(text).get("accessors", []) if "bufferView" not in accessor
-    )
+    accessors = json.loads(text).get("accessors", [])
+    if isinstance(accessors, dict):
+        raise CloudReadError("expected glTF of version 2, got version 1: convert it first")
+    promised = sum(accessor["count"] for accessor in accessors if "bufferView" not in accessor)
     if promised > _MAX_ZEROS_PER_BYTE * len(content):
         raise CloudReadError(f"the glTF file promises {promised} elements, but it is only {len(content)} bytes long")
 

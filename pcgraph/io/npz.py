@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """NumPy's files: .npz archives of a cloud's arrays, and single arrays, .npy.
 
-An archive has the keys ``points`` (n, 3) or (h, w, 3), and if the cloud has them ``colors``, ``normals``, ``labels``,
-``viewpoint``. Every other array of the points' leading shape is a column of its own name. The cloud of a saved
-segmentation lies under ``cloud/``: ``cloud/points`` and so on, its columns as ``cloud/columns/<name>``. Nothing is
-unpickled.
+An archive has the keys ``points`` (n, 3) or (h, w, 3), or Open3D's ``positions``, and if the cloud has them ``colors``,
+``normals``, ``labels``, ``viewpoint``. Every other array of the points' leading shape is a column of its own name. The
+cloud of a saved segmentation lies under ``cloud/``: ``cloud/points`` and so on, its columns as
+``cloud/columns/<name>``. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import ast
 import io
 import math
 import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -63,12 +64,18 @@ def read_npz(content: bytes) -> Cloud:
     """Cloud of an .npz archive, given the file's bytes.
 
     Colours are found as `cloud_from_columns` finds them, so floats of at most 1 become uint8. Whole labels that 32 bits
-    do not hold stay a column. Arrays of another leading shape than the points are not read.
+    do not hold stay a column. Matrices of each point become vectors, (n, 3, 3) for example (n, 9). Arrays of another
+    leading shape than the points are not read.
 
     Raises
     ------
     CloudReadError
         The archive is damaged, has no points, or is larger than `MAX_BYTES`.
+
+    Warns
+    -----
+    UserWarning
+        An array with a row for each point is left out, because it holds texts, dates or other things than numbers.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -103,6 +110,8 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     keys = {entry.filename.removesuffix(".npy"): entry for entry in entries if entry.filename.endswith(".npy")}
     if f"{_CLOUD}points" in keys:
         keys = {key.removeprefix(_CLOUD): entry for key, entry in keys.items() if key.startswith(_CLOUD)}
+    if "points" not in keys and "positions" in keys:  # Open3D's name
+        keys["points"] = keys.pop("positions")
     if "points" not in keys and not {"x", "y", "z"} <= set(keys):
         found = ", ".join(keys)[:150] or "none"
         raise CloudReadError(f"expected an array 'points', or 'x', 'y' and 'z', found: {found}")
@@ -113,7 +122,7 @@ def _arrays(members: Mapping[str, zipfile.ZipInfo], archive: zipfile.ZipFile) ->
     """The arrays of numbers that are points, belong to one point each, or are the viewpoint."""
     arrays: dict[str, NDArray[np.generic]] = {}
     shape: tuple[int, ...] | None = None
-    left = MAX_BYTES
+    left, no_numbers = MAX_BYTES, []
     coordinates = ("points",) if "points" in members else ("x", "y", "z")
     for key in sorted(members, key=lambda key: key != coordinates[0]):  # which tells the leading shape of all others
         entry, name = members[key], f"the array {ascii(key)[:80]}"
@@ -123,16 +132,22 @@ def _arrays(members: Mapping[str, zipfile.ZipInfo], archive: zipfile.ZipFile) ->
             header = _header(stream)
             if shape is None:
                 shape = header.shape[:-1] if key == "points" else header.shape
-            is_per_point = header.shape[: len(shape)] == shape and len(header.shape) <= len(shape) + 1
+            is_per_point = header.shape[: len(shape)] == shape
             if header.dtype.kind not in "fiub" or not (is_per_point or key in _OWN):
                 if key in coordinates:
                     raise CloudReadError(f"expected {name} as numbers, got {header.dtype}")
+                no_numbers += [name] if is_per_point else []
                 continue
             _check_size(header, min(entry.file_size, _MAX_RATIO * entry.compress_size), name)
             left -= header.n_bytes
             if left < 0:
                 raise CloudReadError(f"expected arrays of at most {MAX_BYTES} bytes in all, decompressed")
             arrays[key] = _numbers(stream, header)
+            rest = header.shape[len(shape) :]
+            if len(rest) > 1 and key not in _OWN:
+                arrays[key] = arrays[key].reshape(*shape, math.prod(rest))
+    if no_numbers:
+        warnings.warn(f"left out what holds no numbers: {', '.join(no_numbers)[:200]}", stacklevel=2)
     return arrays
 
 

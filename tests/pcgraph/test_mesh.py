@@ -178,6 +178,12 @@ def test_broken_files_are_refused(kind, content):
         read(content, kind)
 
 
+@pytest.mark.parametrize("content", [b"glTF\1\0\0\0" + bytes(16), b'{"accessors": {"one": {"count": 3}}}'])
+def test_gltf_of_version_1_is_refused(content):
+    with pytest.raises(CloudReadError, match="expected glTF of version 2, got version 1"):
+        read(content, "gltf")
+
+
 def test_zeros_that_a_gltf_file_promises():
     """Accessors without data are zeros; 10**10 of them would take 120 GB."""
     scene = {
