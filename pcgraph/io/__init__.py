@@ -154,6 +154,8 @@ def _read(chosen: Format, file: CloudFile, name: str) -> Cloud:
         # Names of fields may have any characters.
         said = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(error))
         raise CloudReadError(f"{name}: {said[:MAX_REASON]}") from None
+    except MemoryError:
+        raise CloudReadError(f"{name}: the points do not fit into memory") from None
 
 
 def _encode(cloud: Cloud, name: str, file_format: str | None) -> bytes:
