@@ -107,7 +107,7 @@ def _scans(content: bytes) -> Iterator[Scan]:
         promised = int(width) * int(height)
         if promised * MIN_ROW_BYTES > len(content):
             raise CloudReadError(
-                f"the header of a scan, which ends in line {lines.number}, promises {promised} points, "
+                f"the header of a scan that ends in line {lines.number} promises {promised} points, "
                 f"but the whole file has only {len(content)} bytes"
             )
         matrix = np.array(header[6:])
