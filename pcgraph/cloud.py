@@ -265,7 +265,7 @@ def cloud_from_array(values: ArrayLike) -> Cloud:
 
 
 def _cloud_from_fields(table: NDArray[np.void]) -> Cloud:
-    fields: dict[str, NDArray[np.generic]] = {name: np.atleast_1d(table[name]) for name in table.dtype.names or ()}
+    fields = {name: np.atleast_1d(np.asarray(without_mask(table[name]))) for name in table.dtype.names or ()}
     wrong = [name for name, values in fields.items() if values.dtype.kind not in "fiub"]
     if wrong:
         raise ValueError(f"expected fields of numbers, got {fields[wrong[0]].dtype} in the field {wrong[0]!r}")
@@ -423,11 +423,15 @@ def _named(names: tuple[str, ...], values: NDArray[np.generic] | None) -> Iterab
     return zip(names, values.reshape(-1, len(names)).T, strict=True)
 
 
-def _is_found(chosen: Iterable[tuple[str, ...]], columns: Columns) -> bool:
-    """Whether `cloud_from_columns` finds the chosen roles; it may find further roles among the cloud's columns."""
-    lower = _names_by_lower_case(columns)
-    found = Roles.of({name: columns[stored] for name, stored in lower.items() if columns[stored].ndim == 1})
-    return all(names in ((), role) for names, role in zip(chosen, found, strict=True))
+def _is_found(chosen: Sequence[tuple[str, ...]], columns: Columns) -> bool:
+    """Whether `cloud_from_columns` finds the chosen roles.
+
+    It may find further roles among the cloud's columns, but not colours that 8 bits cannot hold.
+    """
+    lower = {name: columns[stored] for name, stored in _names_by_lower_case(columns).items()}
+    found = Roles.of({name: values for name, values in lower.items() if values.ndim == 1})
+    are_kept = found.colors in chosen or all(lower[name].dtype == np.uint8 for name in found.colors)
+    return are_kept and all(names in ((), role) for names, role in zip(chosen, found, strict=True))
 
 
 # ---- Arrays of callers ----------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from os import PathLike
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.cloud import COLOR_NAMES, Cloud, cloud_from_array, cloud_from_columns, native
-from pcgraph.errors import CloudReadError
+from pcgraph.errors import CloudReadError, library_reason
 
 _MESSAGE_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Types of the numbers in a PointField, by its `datatype`. Source: sensor_msgs of ROS."""
@@ -31,10 +32,11 @@ def as_cloud(source: Any) -> Cloud:
         - a structured array of NumPy with the fields ``x``, ``y`` and ``z``, such as
           ``sensor_msgs_py.point_cloud2.read_points`` returns. Colours, normals and labels are found by their names
         - a message such as ``sensor_msgs/PointCloud2``, with ``fields``, ``data``, ``point_step`` and so on
-        - an Open3D cloud, legacy or tensor. Attributes of a tensor cloud become columns
+        - a table of pandas or Polars, whose columns are named like the fields of a structured array
+        - an Open3D cloud, legacy or tensor. ``covariances``, and attributes of a tensor cloud, become columns
         - a trimesh cloud, or a trimesh mesh, whose vertices are the points
 
-        Colours that are floats of at most 1 become uint8.
+        Colours that are floats of at most 1 become uint8; their alpha is not read. Masked numbers become NaN.
 
     Raises
     ------
@@ -59,13 +61,21 @@ def as_cloud(source: Any) -> Cloud:
     for attributes, convert in _KINDS.items():
         if all(hasattr(source, name) for name in attributes):
             return convert(source)
-    if not isinstance(source, (np.ndarray, Sequence)) and np.asarray(source).dtype == object:
+    if not isinstance(source, (np.ndarray, Sequence)) and _plain_array(source).dtype == object:
         kinds = "an array (n, 3) or (h, w, 3), a pcgraph.Cloud or what pcgraph.as_cloud takes"
         hint = "; pass its .points (and .colors)" if hasattr(source, "points") else ""
         if hasattr(source, "to_point_cloud"):
             hint = "; pass its to_point_cloud().points"
         raise ValueError(f"expected points as {kinds}, got {type(source).__name__}{hint}")
     return cloud_from_array(source)
+
+
+def _plain_array(source: Any) -> NDArray[Any]:
+    try:
+        return np.asarray(source)
+    except Exception as error:  # noqa: BLE001 - what its own conversion raises, as that of tensors on a GPU
+        kind = type(source).__name__
+        raise ValueError(f"expected points that NumPy can take, but {kind} refuses: {library_reason(error)}") from None
 
 
 def _of_message(message: Any) -> Cloud:
@@ -89,21 +99,22 @@ def _of_message(message: Any) -> Cloud:
         raise ValueError(f"expected fields within a point_step of {step} bytes: {error}") from None
     data = np.frombuffer(bytes(message.data), np.uint8)  # it may be bytes, an array of them, or a list
     row_step = int(message.row_step) or width * step
-    if row_step < width * step or len(data) < height * row_step:
+    if min(height, width) < 0 or row_step < width * step or len(data) < height * row_step:
         raise ValueError(
             f"expected {height} rows of {width} points of {step} bytes, got {len(data)} bytes in rows of {row_step}"
         )
     rows = np.ascontiguousarray(data[: height * row_step].reshape(height, row_step)[:, : width * step])
     points = rows.reshape(-1).view(record).reshape(height, width)
-    columns = {name: points[name].reshape(height * width, -1) for name in names}
-    columns = {name: values[:, 0] if values.shape[1] == 1 else values for name, values in columns.items()}
-    return _from_columns(columns, (height, width) if height > 1 else (width,))
+    columns = {name: points[name].reshape(height * width, *points[name].shape[2:]) for name in names}
+    return _from_columns(columns, (height, width) if height > 1 else (height * width,))
 
 
 def _of_open3d(cloud: Any) -> Cloud:
     """Cloud of an open3d.geometry.PointCloud, in which an empty array means no colours or no normals."""
     points, colors, normals = (np.asarray(values) for values in (cloud.points, cloud.colors, cloud.normals))
     columns = _columns_of(points, colors if len(colors) else None, normals if len(normals) else None)
+    if len(cloud.covariances):
+        columns["covariances"] = np.asarray(cloud.covariances)
     return _from_columns(columns, points.shape[:1])
 
 
@@ -114,8 +125,22 @@ def _of_open3d_tensor(cloud: Any) -> Cloud:
         raise ValueError("expected an Open3D cloud with positions, got an empty one")
     points = arrays.pop("positions")
     columns = _columns_of(points, arrays.pop("colors", None), arrays.pop("normals", None))
-    further = {name: values[:, 0] if values.shape[1:] == (1,) else values for name, values in arrays.items()}
-    return _from_columns(columns | further, points.shape[:1])
+    clash = sorted(columns.keys() & arrays.keys())
+    if clash:
+        raise ValueError(f"expected attributes of other names than {', '.join(clash)}, which positions have: rename")
+    return _from_columns(columns | arrays, points.shape[:1])
+
+
+def _of_frame(frame: Any) -> Cloud:
+    """Cloud of a DataFrame of pandas or Polars; columns without names are taken like those of an array."""
+    if all(isinstance(name, int) for name in frame.columns):
+        return cloud_from_array(frame.to_numpy())
+    columns = {str(name): np.asarray(frame[name]) for name in frame.columns}
+    wrong = [name for name, values in columns.items() if values.ndim != 1 or values.dtype.kind not in "fiub"]
+    if wrong or len(columns) < len(frame.columns):
+        got = f"{columns[wrong[0]].dtype} in {wrong[0]!r}" if wrong else ", ".join(map(str, frame.columns))[:200]
+        raise ValueError(f"expected columns of numbers under distinct names, got {got}")
+    return _from_columns(columns, (len(frame),))
 
 
 def _of_trimesh(mesh: Any) -> Cloud:
@@ -142,8 +167,11 @@ def _columns_of(
 
 
 def _from_columns(columns: dict[str, NDArray[np.generic]], shape: tuple[int, ...]) -> Cloud:
+    """Cloud of columns (n,), or (n, ...) with several numbers for each point; (n, 1) becomes (n,)."""
+    rows = {name: native(values).reshape(len(values), math.prod(values.shape[1:])) for name, values in columns.items()}
+    columns = {name: values[:, 0] if values.shape[1] == 1 else values for name, values in rows.items()}
     try:
-        return cloud_from_columns({name: native(values) for name, values in columns.items()}, shape)
+        return cloud_from_columns(columns, shape)
     except CloudReadError as error:
         raise ValueError(str(error)) from None
 
@@ -153,5 +181,6 @@ _KINDS: dict[tuple[str, ...], Callable[[Any], Cloud]] = {
     ("points", "colors", "normals", "has_points"): _of_open3d,
     ("point", "is_cpu", "is_cuda"): _of_open3d_tensor,
     ("vertices", "visual"): _of_trimesh,
+    ("columns", "dtypes", "to_numpy"): _of_frame,
 }
 """Converters by the attributes that identify a class, so that its library need not be imported for that."""

@@ -13,7 +13,7 @@ from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
 from pcgraph.io.driving_sweeps import KITTI, NUSCENES, SWEEP
 from pcgraph.io.e57 import E57
 from pcgraph.io.format import CloudFile, Format
-from pcgraph.io.las import LAS
+from pcgraph.io.las import COPC, LAS
 from pcgraph.io.mesh import GLTF, OBJ, OFF, STL, sample_surface
 from pcgraph.io.npz import NPY, NPZ
 from pcgraph.io.ouster import OUSTER
@@ -29,7 +29,7 @@ MAX_REASON = 300
 """Largest count of characters in a message about a damaged file, because it may quote text of any length from the file.
 Chosen by eye; not varied."""
 FORMATS: tuple[Format, ...] = (
-    *(PCD, PLY, LAS, E57, NPZ, NPY),
+    *(PCD, PLY, LAS, COPC, E57, NPZ, NPY),
     *(TEXT, PTS, PTX, XYZN, XYZRGB),
     *(KITTI, NUSCENES, SWEEP, OUSTER),
     *(OBJ, STL, OFF, GLTF),
@@ -154,6 +154,8 @@ def _read(chosen: Format, file: CloudFile, name: str) -> Cloud:
         # Names of fields may have any characters.
         said = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(error))
         raise CloudReadError(f"{name}: {said[:MAX_REASON]}") from None
+    except MemoryError:
+        raise CloudReadError(f"{name}: the points do not fit into memory") from None
 
 
 def _encode(cloud: Cloud, name: str, file_format: str | None) -> bytes:
@@ -168,7 +170,7 @@ def _format(
     name: str, file_format: str | None, formats: tuple[Format, ...], error: type[PcgraphError]
 ) -> tuple[Format, str]:
     """Format called `file_format`, else the format of the longest suffix that the file's name has; and that suffix."""
-    ends = {suffix: one for one in formats for suffix in one.suffixes if name.lower().endswith(suffix)}
+    ends = {suffix: one for one in FORMATS for suffix in one.suffixes if name.lower().endswith(suffix)}
     if file_format is not None:
         named = [one for one in formats if one.name == file_format]
         if not named:
@@ -176,10 +178,11 @@ def _format(
             raise error(f"expected file_format as one of {known}, got {ascii(file_format)[:80]}")
         own = [suffix for suffix, one in ends.items() if one is named[0]]
         return named[0], max(own or named[0].suffixes[:1], key=len, default="")
-    if not ends:
+    suffix = max(ends, key=len, default="")
+    if not ends or ends[suffix] not in formats:
         hint = "convert it first" if error is CloudReadError else "choose another name"
+        hint = f"files ending in {suffix} are only read" if ends else hint
         raise error(f"expected a file ending in {_either(_suffixes(formats))}, got {name!r}: {hint}")
-    suffix = max(ends, key=len)
     return ends[suffix], suffix
 
 

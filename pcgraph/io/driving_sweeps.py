@@ -92,13 +92,19 @@ def read_sweep(file: CloudFile) -> Cloud:
     Raises
     ------
     CloudReadError
-        The bytes fit neither format, or they fit both, because every fourth number is also from 0 to 1.
+        The bytes fit neither format, or they fit both, because every fourth number is also from 0 to 1. Or a fourth
+        number is negative, which no reflectance is: the points may have six numbers.
     """
     is_nuscenes = _is_nuscenes(file.content)
     if is_nuscenes and _is_kitti(file.content):
         raise CloudReadError(
             "the bytes may be points of four numbers (KITTI) or of five (nuScenes): "
             "read it with file_format='kitti' or file_format='nuscenes'"
+        )
+    if not is_nuscenes and _has_negative_reflectance(file.content):
+        raise CloudReadError(
+            "expected the fourth number of each point as its reflectance, got negative ones: if these are such points, "
+            "read them with file_format='kitti'"
         )
     return read_nuscenes(file) if is_nuscenes else read_kitti(file)
 
@@ -135,6 +141,11 @@ def _encode_bin(cloud: Cloud) -> bytes:
             "these points would be read as those of nuScenes, because their numbers look like rings: "
             "write and read them with file_format='kitti'"
         )
+    if _has_negative_reflectance(content):
+        raise CloudWriteError(
+            "expected intensities of at least 0, as those of KITTI, got negative ones: "
+            "write and read them with file_format='kitti'"
+        )
     return content
 
 
@@ -154,6 +165,10 @@ def _is_kitti(content: bytes) -> bool:
     except CloudReadError:
         return False
     return bool(((reflectance >= 0) & (reflectance <= 1)).all())
+
+
+def _has_negative_reflectance(content: bytes) -> bool:
+    return bool((sweep_table(content, KITTI_COLUMNS)[:, 3] < 0).any())
 
 
 def _is_nuscenes(content: bytes) -> bool:

@@ -29,13 +29,14 @@ from pcgraph.io.format import CloudFile, Format
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+_INVALID = "cartesianInvalidState"
 _COLORS = ("colorRed", "colorGreen", "colorBlue")
 _KEPT = (
     *("intensity", "isIntensityInvalid", "isColorInvalid", "rowIndex", "columnIndex", "returnIndex", "returnCount"),
     *("timeStamp", "isTimeStampInvalid", *_SPHERICAL),
 )
 """Fields of the standard that become columns of the same names."""
-_TAKEN = (*_CARTESIAN, *_COLORS, *_KEPT, "cartesianInvalidState", "sphericalInvalidState")
+_TAKEN = (*_CARTESIAN, *_COLORS, *_KEPT, _INVALID, "sphericalInvalidState")
 _OWN = "pcgraph"
 """Prefix of our extension, for columns that the standard has no field for."""
 _EXTENSIONS = {
@@ -149,7 +150,7 @@ def _scan(library: ModuleType, image: Any, node: Any) -> _Scan:
     system = next((s for s in (_CARTESIAN, _SPHERICAL) if all(name in fields for name in s)), None)
     if system is None:
         raise CloudReadError(f"expected the fields {', '.join(_CARTESIAN)} in an E57 scan, got {', '.join(fields)}")
-    invalid = fields.pop("cartesianInvalidState" if system is _CARTESIAN else "sphericalInvalidState", None)
+    invalid = fields.pop(_INVALID if system is _CARTESIAN else "sphericalInvalidState", None)
     if invalid is not None and invalid.any():
         fields = {name: values[invalid == 0] for name, values in fields.items()}
     points = _floats(fields, system)
@@ -324,6 +325,7 @@ def encode_e57(cloud: Cloud, suffix: str) -> bytes:
     place = cloud.viewpoint if cloud.viewpoint is not None and cloud.viewpoint.ndim == 1 else None
     local = points if place is None or not place.any() else points - place
     stored: Arrays = dict(zip(_CARTESIAN, local.T, strict=True))
+    stored[_INVALID] = np.zeros(len(points), np.uint8)  # all are valid; pye57 reads no scan that does not say it
     if cloud.colors is not None:
         stored |= dict(zip(_COLORS, cloud.colors.reshape(-1, 3).T, strict=True))
     normals = dict(zip(NORMALS, _NORMAL_FIELDS, strict=True)) if cloud.normals is not None else {}
@@ -402,7 +404,8 @@ def _write(
     prototype, buffers = structure(), library.VectorSourceDestBuffer()
     arrays: list[NDArray[np.generic]] = []  # which the buffers point into
     for name, values in stored.items():
-        prototype.set(name, _element(library, image, values.dtype))
+        states = library.IntegerNode(image, 0, 0, 0)
+        prototype.set(name, states if name == _INVALID else _element(library, image, values.dtype))
         arrays.append(np.empty(len(values), _BUFFERS.get(values.dtype.str[1:], np.longlong)))
         arrays[-1][:] = values
         buffers.append(library.SourceDestBuffer(image, name, arrays[-1], len(values), True, True))

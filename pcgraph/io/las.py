@@ -360,3 +360,5 @@ def _power_of_ten(value: float, rounded: Callable[[float], float]) -> float:
 
 
 LAS = Format("las", (".las", ".laz"), lambda file: read_las(file.content), encode_las)
+COPC = Format("copc", (".copc.laz",), lambda file: read_las(file.content))
+"""Files of this name are LAZ files whose points lie in an octree, which is not written."""

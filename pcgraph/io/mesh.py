@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import warnings
 from dataclasses import dataclass
 from io import BytesIO
@@ -33,6 +34,8 @@ _FEW_VERTICES = 1000
 _MAX_ZEROS_PER_BYTE = 10
 """Largest count of elements of glTF accessors without data, which are zeros, per byte of the file. Sparse shapes of
 animated faces have less than one. Chosen by eye; not varied."""
+_GLTF_POINTS = 0
+"""Mode of glTF primitives that are points. Source: the glTF 2.0 specification."""
 _PLASTIC = 1.32471795724474602596
 """The plastic number, dimensionless, the root of x**3 = x + 1: multiples of its inverse powers fill a square evenly
 (Roberts 2018)."""
@@ -59,9 +62,14 @@ def read_mesh(file: CloudFile, kind: str) -> Cloud:
     Warns
     -----
     UserWarning
-        The mesh has faces, but too few vertices to describe its surface.
+        The mesh has faces, but too few vertices to describe its surface. Or trimesh does not read something: colours
+        and normals of OFF files, normals of OBJ files without faces, normals of points in glTF files, and attributes of
+        glTF files with names of an application.
     """
     parts = _parts(file, kind)
+    left_out = _left_out(file.content, kind, any(len(part.faces) for part in parts))
+    if left_out:
+        warnings.warn(f"left out what the mesh file has besides: {', '.join(left_out)[:200]}", stacklevel=2)
     points = np.concatenate([part.points for part in parts])
     n_faces = sum(len(part.faces) for part in parts)
     colors = _together([part.colors for part in parts])
@@ -210,14 +218,43 @@ def _beside(path: Path) -> trimesh.resolvers.Resolver:
 
 
 def _check_accessors(content: bytes) -> None:
-    """Raise CloudReadError if a glTF file promises many more zeros than it has bytes, before they are allocated."""
-    start = 20  # of the JSON in a binary file: after 12 bytes of the header, its length and its type
-    text = content[start : start + int.from_bytes(content[12:16], "little")] if content[:4] == b"glTF" else content
-    promised = sum(
-        accessor["count"] for accessor in json.loads(text).get("accessors", []) if "bufferView" not in accessor
-    )
+    """Raise CloudReadError if a glTF file promises many more zeros than it has bytes, before they are allocated.
+
+    Also if it is of version 1, which has other structures.
+    """
+    if content[:4] == b"glTF" and content[4:8] == b"\1\0\0\0":
+        raise CloudReadError("expected glTF of version 2, got version 1: convert it first")
+    accessors = _gltf_scene(content).get("accessors", [])
+    if isinstance(accessors, dict):
+        raise CloudReadError("expected glTF of version 2, got version 1: convert it first")
+    promised = sum(accessor["count"] for accessor in accessors if "bufferView" not in accessor)
     if promised > _MAX_ZEROS_PER_BYTE * len(content):
         raise CloudReadError(f"the glTF file promises {promised} elements, but it is only {len(content)} bytes long")
+
+
+def _gltf_scene(content: bytes) -> dict[str, Any]:
+    """The JSON of a glTF file; in a binary file it follows the header of 12 bytes, its own length and its type."""
+    text = content[20 : 20 + int.from_bytes(content[12:16], "little")] if content[:4] == b"glTF" else content
+    scene: dict[str, Any] = json.loads(text)
+    return scene
+
+
+def _left_out(content: bytes, kind: str, has_faces: bool) -> list[str]:
+    """Names of the data of its vertices that a file has and trimesh did not read."""
+    if kind == "off":
+        word = re.search(rb"(?m)^\s*(\w*)OFF\b", content)
+        letters = word[1] if word else b""
+        return [name for letter, name in ((b"C", "colors"), (b"N", "normals")) if letter in letters]
+    if kind == "obj":
+        return ["normals"] if not has_faces and b"\nvn " in b"\n" + content else []
+    if kind != "gltf":
+        return []
+    names = set()
+    for mesh in _gltf_scene(content).get("meshes", []):
+        for one in mesh["primitives"]:
+            are_points = one.get("mode") == _GLTF_POINTS
+            names |= {name for name in one["attributes"] if name[0] == "_" or (name == "NORMAL" and are_points)}
+    return sorted(names)
 
 
 def _part(mesh: Any, transform: NDArray[np.float64]) -> _Part:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """NumPy's files: archives (.npz) with the arrays of a cloud, and single arrays (.npy).
 
-An archive has the key ``points`` (n, 3) or (h, w, 3), and the keys ``colors``, ``normals``, ``labels`` and
-``viewpoint`` if the cloud has these. Every other array with the points' leading shape is a column; its key is the name.
-The file of a saved segmentation has the cloud below ``cloud/``: ``cloud/points`` and so on, the columns as
-``cloud/columns/<name>``. Pickled objects are never loaded.
+An archive has the key ``points`` (n, 3) or (h, w, 3), or Open3D's ``positions``, and the keys ``colors``, ``normals``,
+``labels`` and ``viewpoint`` if the cloud has these. Every other array with the points' leading shape is a column; its
+key is the name. The file of a saved segmentation has the cloud below ``cloud/``: ``cloud/points`` and so on, the
+columns as ``cloud/columns/<name>``. Pickled objects are never loaded.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import ast
 import io
 import math
 import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -64,13 +65,19 @@ _BROKEN = (
 def read_npz(content: bytes) -> Cloud:
     """Cloud of an .npz archive, given the file's bytes.
 
-    Colours of other types become uint8, as in `cloud_from_columns`. Labels that int32 cannot hold stay a column. Arrays
-    whose leading shape is not that of the points are not read.
+    Colours of other types become uint8, as in `cloud_from_columns`. Labels that int32 cannot hold stay a column.
+    Matrices of each point become vectors, for example (n, 3, 3) becomes (n, 9). Arrays whose leading shape is not that
+    of the points are not read.
 
     Raises
     ------
     CloudReadError
         The archive is damaged, has no points, or is larger than `MAX_BYTES`.
+
+    Warns
+    -----
+    UserWarning
+        An array with a row for each point is left out, because it holds texts, dates or other things than numbers.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -105,6 +112,8 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     keys = {entry.filename.removesuffix(".npy"): entry for entry in entries if entry.filename.endswith(".npy")}
     if f"{_CLOUD}points" in keys:
         keys = {key.removeprefix(_CLOUD): entry for key, entry in keys.items() if key.startswith(_CLOUD)}
+    if "points" not in keys and "positions" in keys:  # Open3D's name
+        keys["points"] = keys.pop("positions")
     if "points" not in keys and not {"x", "y", "z"} <= set(keys):
         found = ", ".join(keys)[:150] or "none"
         raise CloudReadError(f"expected an array 'points', or 'x', 'y' and 'z', found: {found}")
@@ -115,7 +124,7 @@ def _arrays(members: Mapping[str, zipfile.ZipInfo], archive: zipfile.ZipFile) ->
     """The points, the arrays with one row per point, and the viewpoint, by key."""
     arrays: dict[str, NDArray[np.generic]] = {}
     shape: tuple[int, ...] | None = None
-    left = MAX_BYTES
+    left, no_numbers = MAX_BYTES, []
     coordinates = ("points",) if "points" in members else ("x", "y", "z")
     for key in sorted(members, key=lambda key: key != coordinates[0]):  # which tells the leading shape of all others
         entry, name = members[key], f"the array {ascii(key)[:80]}"
@@ -125,16 +134,22 @@ def _arrays(members: Mapping[str, zipfile.ZipInfo], archive: zipfile.ZipFile) ->
             header = _header(stream)
             if shape is None:
                 shape = header.shape[:-1] if key == "points" else header.shape
-            is_per_point = header.shape[: len(shape)] == shape and len(header.shape) <= len(shape) + 1
+            is_per_point = header.shape[: len(shape)] == shape
             if header.dtype.kind not in "fiub" or not (is_per_point or key in _OWN):
                 if key in coordinates:
                     raise CloudReadError(f"expected {name} as numbers, got {header.dtype}")
+                no_numbers += [name] if is_per_point else []
                 continue
             _check_size(header, min(entry.file_size, _MAX_RATIO * entry.compress_size), name)
             left -= header.n_bytes
             if left < 0:
                 raise CloudReadError(f"expected arrays of at most {MAX_BYTES} bytes in all, decompressed")
             arrays[key] = _numbers(stream, header)
+            rest = header.shape[len(shape) :]
+            if len(rest) > 1 and key not in _OWN:
+                arrays[key] = arrays[key].reshape(*shape, math.prod(rest))
+    if no_numbers:
+        warnings.warn(f"left out what holds no numbers: {', '.join(no_numbers)[:200]}", stacklevel=2)
     return arrays
 
 

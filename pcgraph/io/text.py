@@ -5,8 +5,9 @@ There is no standard. CloudCompare documents what files in use have in common ("
 a count of points, then rows of x y z, intensity, red green blue.
 
 **Rows.** Numbers are separated by blanks, tabs, commas or semicolons. In rows with semicolons, a comma is the decimal
-sign. An empty cell between commas or semicolons is NaN, and so are words such as ``NA`` and ``null``. All rows have as
-many numbers as the first. Lines that begin with ``#``, ``//`` or ``%`` are comments, and so is any text after a ``#``.
+sign. An empty cell between commas or semicolons is NaN, and so are words such as ``NA`` and ``null``. ``True`` and
+``FALSE`` are 1 and 0. All rows have as many numbers as the first. Lines that begin with ``#``, ``//`` or ``%`` are
+comments, and so is any text after a ``#``.
 
 **Names.** The names of the columns come from the first of these that is there:
 
@@ -86,12 +87,15 @@ _WHOLE = re.compile(r"[-+]?[0-9]+")
 _COUNT = re.compile(r"[0-9]{1,15}")
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+(,[0-9]+([eE][-+]?[0-9]+)?)?")
 _UNIT = re.compile(r"\s*[\[(][^\])]*[\])]$")
-_MISSING = ("NA", "N/A", "n/a", "null", "NULL", "None")
-"""Words for a missing number in tables of R, pandas, databases and Python; they are read as NaN."""
+_MISSING = ("NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None")
+"""Words for a missing number in tables of R, pandas, spreadsheets, databases and Python; they are read as NaN."""
+_TRUTHS = {"True": "1", "TRUE": "1", "False": "0", "FALSE": "0"}
+"""Truth values in tables of pandas, R and spreadsheets, and the numbers as which they are read."""
 _OF_NUMBERS = b"0123456789.+- \t,;\r\n"
 """Bytes of which most rows consist. A text without them is short, and so is quickly searched for other words."""
 _IS_NAN = re.compile(rf"(?<![^\s,;])[-+]?(?:{'|'.join(_MISSING)}|{NAN_OF_WINDOWS})(?![^\s,;])")
 _IS_INFINITE = re.compile(INFINITY_OF_WINDOWS)
+_IS_TRUTH = re.compile(rf"(?<![^\s,;\"])(?:{'|'.join(_TRUTHS)})(?![^\s,;\"])")
 _SHORT_COLORS = (("r", "g", "b"), ("rf", "gf", "bf"))
 """Names of red, green and blue in files of CloudCompare: as bytes, and as floats from 0 to 1."""
 _NAMES_BEFORE_A_FIELD = {"x", "y", "z", *COLOR_NAMES, *NORMAL_NAMES[1], "intensity"}
@@ -175,7 +179,7 @@ class TextLines:
         encoding = encoding_of(content)
         _refuse_long_lines(content)
         rare = content.translate(None, _OF_NUMBERS)
-        is_odd = b".#" in content or any(word.encode() in rare for word in (*_MISSING, "an(", "AN("))
+        is_odd = b".#" in content or any(word.encode() in rare for word in (*_MISSING, *_TRUTHS, "an(", "AN("))
         self._has_odd_numbers = is_odd or encoding == "utf-16"
         self._stream = io.TextIOWrapper(io.BytesIO(content), encoding, errors="replace", newline=None)
 
@@ -190,7 +194,8 @@ class TextLines:
 
     @staticmethod
     def _usual(line: str) -> str:
-        """The line with NaN and infinity spelled ``nan`` and ``inf``."""
+        """The line with NaN and infinity spelled ``nan`` and ``inf``, and with truth values as numbers."""
+        line = _IS_TRUTH.sub(lambda found: _TRUTHS[found[0]], line)
         return _IS_INFINITE.sub("inf", _IS_NAN.sub("nan", line))
 
 
@@ -383,6 +388,8 @@ def open_table(content: bytes, is_named: bool = False) -> TextTable:
             above.append((lines.number, line))
             characters += len(line)
             if characters > MAX_HEADER_BYTES:
+                if _names(above, None):
+                    _refuse_words(above)
                 raise CloudReadError(f"expected rows of numbers, but the first {lines.number} lines have none")
         elif not promised and _COUNT.fullmatch(line.strip()):
             promised = _promise(line, lines)
@@ -400,6 +407,7 @@ def open_table(content: bytes, is_named: bool = False) -> TextTable:
     if promised is None and names is None:
         number, line = above[0] if above else (1, "")
         raise CloudReadError(f"expected rows of numbers, but line {number} and all others have none: {line[:80]!r}")
+    _refuse_words(above)
     return TextTable(lines, names, [], iter(()))
 
 
@@ -441,6 +449,17 @@ def _refuse_strangers(above: list[tuple[int, str]], count: int, is_named: bool) 
             raise CloudReadError(
                 f"line {number} is neither a comment (# or //) nor {count} names of columns, x, y and z among them: "
                 f"{line.strip()[:80]!r}; name the columns by columns=[...]"
+            )
+
+
+def _refuse_words(above: list[tuple[int, str]]) -> None:
+    """Raise CloudReadError for the first line that is neither a comment nor names, in a text that has no row."""
+    for number, line in above:
+        if not line.startswith(COMMENTS) and _header(line, None) is None:
+            word = next(word for word in re.split(r"[\s,;]+", f"{line} ") if not is_number(word))
+            raise CloudReadError(
+                f"expected numbers only in the rows, but line {number} has {word[:80]!r}: "
+                "leave out columns of words and of dates"
             )
 
 

@@ -52,6 +52,14 @@ def test_arrays_with_fields(order, shape):
     check_rows(pcgraph.as_cloud(rows(order, shape).view(np.recarray)), shape)
 
 
+def test_masked_numbers_of_arrays_with_fields_are_nan():
+    table = np.ma.array(rows())
+    table["x"][3] = table["ring"][4] = np.ma.masked
+    cloud = pcgraph.as_cloud(table)
+    assert np.isnan(cloud.points[3, 0])
+    assert np.isnan(cloud.columns["ring"]).nonzero()[0].tolist() == [4]
+
+
 def test_further_columns_of_an_array_are_columns():
     table = np.column_stack((POINTS, RING, RING * 2)).astype(np.float32)
     for given, shape in ((table, (12,)), (table.tolist(), (12,)), (table.reshape(3, 4, 5), (3, 4))):
@@ -119,6 +127,7 @@ def message(shape=(1, 12), order: str = "<", row_gap: int = 0, **changed) -> Sim
 def test_messages_of_robots(kind, order):
     check_rows(pcgraph.as_cloud(message(order=order, data=kind(message(order=order).data))))
     check_rows(pcgraph.as_cloud(message((3, 4), order, row_gap=7)), (3, 4))
+    assert pcgraph.as_cloud(message(width=0, data=kind(b""), row_step=0)).points.shape == (0, 3)
 
 
 @pytest.mark.parametrize(
@@ -126,6 +135,7 @@ def test_messages_of_robots(kind, order):
     [
         ({"data": b"short"}, "expected 1 rows of 12 points of 32 bytes, got 5 bytes"),
         ({"row_step": 5}, "in rows of 5"),
+        ({"height": -1, "width": -12}, "expected -1 rows of -12 points"),
         ({"point_step": 20}, "fields within a point_step of 20 bytes"),
         ({"fields": [SimpleNamespace(name="x", offset=0, datatype=9, count=1)]}, "datatypes 1 to 8, got x"),
         ({"fields": [SimpleNamespace(name="x", offset=0, datatype=7, count=1)] * 2}, "distinct names .* got x, x"),
@@ -158,6 +168,63 @@ def test_clouds_of_open3d():
         pcgraph.as_cloud(o3d.t.geometry.PointCloud())
 
 
+def test_attributes_of_open3d_that_are_matrices():
+    o3d = pytest.importorskip("open3d")
+    matrices = np.arange(108.0).reshape(12, 3, 3)
+    legacy = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(POINTS))
+    legacy.covariances = o3d.utility.Matrix3dVector(matrices)
+    assert np.array_equal(pcgraph.as_cloud(legacy).columns["covariances"], matrices.reshape(12, 9))
+    tensor = o3d.t.geometry.PointCloud(o3d.core.Tensor(POINTS))
+    tensor.point["own"] = o3d.core.Tensor(matrices)
+    assert np.array_equal(pcgraph.as_cloud(tensor).columns["own"], matrices.reshape(12, 9))
+    tensor.point["x"] = o3d.core.Tensor(RING[:, None])
+    with pytest.raises(ValueError, match="attributes of other names than x"):
+        pcgraph.as_cloud(tensor)
+
+
+class Frame:
+    """A DataFrame as pandas and Polars have it."""
+
+    def __init__(self, **columns: np.ndarray) -> None:
+        self.table = columns
+        self.columns, self.dtypes = list(columns), [values.dtype for values in columns.values()]
+
+    def __len__(self) -> int:
+        return len(self.table["x"])
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.table[name]
+
+    def to_numpy(self) -> np.ndarray:
+        return np.column_stack(list(self.table.values()))
+
+
+def test_tables_with_named_columns():
+    x, y, z = POINTS.T
+    check = pcgraph.as_cloud(Frame(ring=RING, z=z, x=x, y=y))
+    assert np.array_equal(check.points, POINTS)
+    assert check.columns["ring"].dtype == np.uint16
+    with pytest.raises(ValueError, match="columns of numbers under distinct names, got <U1 in 'name'"):
+        pcgraph.as_cloud(Frame(x=x, y=y, z=z, name=np.full(12, "a")))
+
+
+def test_what_numpy_cannot_take_is_refused_in_a_sentence():
+    class OnDevice:
+        def __array__(self, dtype=None, copy=None) -> np.ndarray:
+            raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+    with pytest.raises(ValueError, match="points that NumPy can take, but OnDevice refuses: TypeError: can't convert"):
+        pcgraph.as_cloud(OnDevice())
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.pcd", "a.csv", "a.npy"])
+def test_columns_that_would_become_colors_of_8_bits_are_refused(name):
+    shades = dict.fromkeys("rgb", np.linspace(0.0, 1.0, 12))
+    with pytest.raises(pcgraph.CloudWriteError, match="got r, g, b; rename those columns"):
+        encode_cloud(pcgraph.Cloud(POINTS, columns=shades), name)
+    assert decode_cloud(encode_cloud(pcgraph.Cloud(POINTS, COLORS, columns=shades), name), name).columns["g"][5] > 0
+
+
 def test_clouds_and_meshes_of_trimesh():
     trimesh = pytest.importorskip("trimesh")
     cloud = pcgraph.as_cloud(trimesh.PointCloud(POINTS, colors=COLORS))
@@ -183,7 +250,8 @@ def npz_of(**arrays) -> bytes:
 def test_archives_of_any_writer():
     shades, wide = (COLORS / 255).astype(np.float32), np.arange(12) + 2**40
     content = npz_of(points=POINTS, colors=shades, labels=RING, stamp=wide, other=np.zeros(5), names=np.full(12, "a"))
-    cloud = decode_cloud(content, "a.npz")
+    with pytest.warns(UserWarning, match="left out what holds no numbers: the array 'names'"):
+        cloud = decode_cloud(content, "a.npz")
     assert np.array_equal(cloud.points, POINTS)
     assert np.array_equal(cloud.colors, COLORS)
     assert cloud.labels.tolist() == RING.tolist()
@@ -191,6 +259,10 @@ def test_archives_of_any_writer():
     none = decode_cloud(npz_of(points=POINTS, colors=np.empty((0, 3), np.uint8), labels=wide), "a.npz")
     assert none.colors is none.labels is None
     assert none.columns["labels"].tolist() == wide.tolist()
+    matrices = np.arange(108.0).reshape(12, 3, 3)
+    cloud = decode_cloud(npz_of(positions=POINTS, covariance=matrices), "a.npz")  # the name is Open3D's
+    assert np.array_equal(cloud.points, POINTS)
+    assert np.array_equal(cloud.columns["covariance"], matrices.reshape(12, 9))
     x, y, z = POINTS.T
     apart = decode_cloud(npz_of(x=x, y=y, z=z, intensity=RING, colors=COLORS, labels=RING), "a.npz")
     assert np.array_equal(apart.points, POINTS)

@@ -279,13 +279,21 @@ def test_files_that_are_cut_off_or_damaged():
         read(bytes(damaged))
 
 
-def test_more_points_than_there_are():
-    content = encode_e57(Cloud(XYZ), ".e57")
+def test_more_points_than_there_are(writer):
+    writer.add(writer.xyz())
+    content = writer.content()
     with pytest.raises(CloudReadError, match="promises 9 points, but 3 follow"):
         read(edited(content, b'recordCount="3"', b'recordCount="9"'))
     many = encode_e57(Cloud(np.zeros((1000, 3))), ".e57")
     with pytest.raises(CloudReadError, match=r"promises 9999 points, but it is only .* bytes long"):
         read(edited(many, b'recordCount="1000"', b'recordCount="9999"'))
+
+
+def test_pye57_reads_our_files_as_its_own(tmp_path):
+    (tmp_path / "a.e57").write_bytes(encode_e57(mixed_cloud(), ".e57"))
+    with pye57.E57(str(tmp_path / "a.e57")) as file:
+        found = file.read_scan(0, colors=True, intensity=True)
+    assert np.array_equal(np.stack([found[name] for name in CARTESIAN], axis=1), mixed_cloud().points)
 
 
 def test_xml_with_definitions_of_its_own():

@@ -426,6 +426,15 @@ def test_lying_pcd_files_are_refused(name):
         read_pcd(LIES[name])
 
 
+def test_files_whose_points_do_not_fit_into_memory(monkeypatch):
+    def full() -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("pcgraph.io.pcd.lzf_decompressor", full)
+    with pytest.raises(CloudReadError, match=r"a\.pcd: the points do not fit into memory"):
+        decode_cloud(pcd_header("binary_compressed") + struct.pack("<II", 4, 80) + b"four", "a.pcd")
+
+
 PLY = encode_ply({"x": XYZ[:, 0], "y": XYZ[:, 1], "z": XYZ[:, 2]})
 
 PLY_LIES = {

@@ -19,6 +19,7 @@ from laspy.vlrs.vlrlist import VLRList
 import pcgraph
 from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudReadError, CloudWriteError
+from pcgraph.io import decode_cloud, encode_cloud
 from pcgraph.io.las import encode_las, read_las
 
 WHITE = {"red": 65535, "green": 65535, "blue": 65535}
@@ -413,3 +414,10 @@ def test_cloudcompare_shows_all_columns(suffix, tmp_path):
     shown = {name.lower(): column for name, column in table.items()}
     for name in set(shown).intersection(cloud.columns):
         assert np.allclose(shown[name], cloud.columns[name])
+
+
+def test_copc_files_are_only_read():
+    content = encode_cloud(Cloud(np.ones((2, 3))), "a.laz")
+    assert decode_cloud(content, "a.copc.laz").points.tolist() == [[1.0, 1.0, 1.0]] * 2
+    with pytest.raises(CloudWriteError, match=r"files ending in \.copc\.laz are only read"):
+        encode_cloud(Cloud(np.ones((2, 3))), "a.copc.laz")

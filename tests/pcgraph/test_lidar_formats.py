@@ -79,6 +79,7 @@ def test_labels_of_semantickitti_are_read_beside_the_sweep(tmp_path: Path) -> No
         ("a.pcd.bin", np.array([1, 2, 3, 4, 0.5], "<f4").tobytes(), "whole numbers from 0 to 255 as rings"),
         ("a.bin", np.array([1e30, 0, 0, 0], "<f4").tobytes(), "within 10000 m"),
         ("a.bin", np.array([0, 0, 0, np.nan], "<f4").tobytes(), "within 10000 m"),
+        ("a.bin", np.tile(np.array([1, 2, 3, -1, -2, -3], "<f4"), 2).tobytes(), "reflectance, got negative ones"),
     ],
 )
 def test_other_bytes_are_refused(tmp_path: Path, name: str, content: bytes, words: str) -> None:
@@ -105,6 +106,9 @@ def test_sweeps_that_would_be_read_as_others_are_written_by_name_only(tmp_path: 
         pcgraph.write_cloud(tmp_path / "a.bin", cloud)
     pcgraph.write_cloud(tmp_path / "a.bin", cloud, "kitti")
     assert pcgraph.read_cloud(tmp_path / "a.bin", "kitti").points.shape == (5, 3)
+    cloud.columns["intensity"] -= 0.5
+    with pytest.raises(CloudWriteError, match="intensities of at least 0"):
+        pcgraph.write_cloud(tmp_path / "b.bin", cloud)
 
 
 # ---- Ouster --------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 import pcgraph
 from pcgraph.errors import CloudReadError
 from pcgraph.io.format import CloudFile
-from pcgraph.io.mesh import read_mesh, sample_surface
+from pcgraph.io.mesh import _left_out, read_mesh, sample_surface
 
 BALL = trimesh.creation.icosphere(subdivisions=3)
 TRIANGLE = b"v 0 0 0\nv 1 0 0\nv 1 1 0\n"
@@ -176,6 +176,31 @@ def test_what_cannot_be_sampled(tmp_path):
 def test_broken_files_are_refused(kind, content):
     with pytest.raises(CloudReadError, match=r"the mesh file is damaged: |expected a mesh with vertices"):
         read(content, kind)
+
+
+@pytest.mark.parametrize(
+    ("kind", "content", "names"),
+    [
+        ("off", b"# CN\nCNOFF\n1 0 0\n0 0 0 255 0 0 0 0 1\n", "colors, normals"),
+        ("obj", b"v 0 0 0\nvn 0 0 1\n", "normals"),
+    ],
+)
+def test_what_trimesh_leaves_out_is_told(kind, content, names):
+    with pytest.warns(UserWarning, match=f"left out what the mesh file has besides: {names}$"):
+        assert len(read(content, kind).points) == 1
+    assert len(read(content.replace(b"CNOFF", b"OFF").replace(b"vn", b"#"), kind).points) == 1  # warnings are errors
+
+
+def test_attributes_of_gltf_files_that_are_left_out():
+    primitives = [{"mode": 0, "attributes": {"POSITION": 0, "NORMAL": 1, "_RING": 2}}, {"attributes": {"NORMAL": 1}}]
+    scene = json.dumps({"meshes": [{"primitives": primitives}]}).encode()
+    assert _left_out(scene, "gltf", has_faces=True) == ["NORMAL", "_RING"]
+
+
+@pytest.mark.parametrize("content", [b"glTF\1\0\0\0" + bytes(16), b'{"accessors": {"one": {"count": 3}}}'])
+def test_gltf_of_version_1_is_refused(content):
+    with pytest.raises(CloudReadError, match="expected glTF of version 2, got version 1"):
+        read(content, "gltf")
 
 
 def test_zeros_that_a_gltf_file_promises():
