@@ -239,6 +239,11 @@ def _kept(column: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.gen
     return column.reshape(*shape, *column.shape[1:]).copy()
 
 
+_MAX_COLUMNS_OF_SO_FEW = 64
+"""Most columns of three or four points. Beyond them the rows are x, y, z and perhaps 1 of as many points. By eye:
+sensors give some twenty columns."""
+
+
 def cloud_from_array(values: ArrayLike) -> Cloud:
     """Cloud of an array whose last axis, or whose fields, are the columns.
 
@@ -260,6 +265,8 @@ def cloud_from_array(values: ArrayLike) -> Cloud:
     if array.ndim not in (2, 3) or array.shape[-1] < 3:
         expected = "points of shape (n, 3) or (h, w, 3), or with further columns, (n, 4) and so on"
         raise ValueError(f"expected {expected}, got {array.shape}")
+    if array.ndim == 2 and array.shape[0] in (3, 4) and array.shape[1] > _MAX_COLUMNS_OF_SO_FEW:
+        raise ValueError(f"expected a row for each point, got {array.shape}: transpose the array")
     further = {f"column_{i}": array[..., i] for i in range(3, array.shape[-1])}
     return Cloud(array[..., :3] if further else array, columns=further)  # type: ignore[arg-type]
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pcgraph.cli.clouds import SAVED, check_outputs, is_saved, read_saved, refusals, segmented
+from pcgraph.cli.clouds import PIPE, SAVED, check_outputs, is_saved, read_saved, refusals, segmented
 from pcgraph.errors import CloudReadError, CloudWriteError, one_line
 
 if TYPE_CHECKING:
@@ -37,6 +37,8 @@ def view_command(
     with refusals():
         name = Path(source.absolute().name.removesuffix(SAVED)).stem
         target = Path(f"{name}.html") if out is None else out
+        if str(target) == PIPE:
+            raise ValueError("expected --out as the name of a file, got '-'")
         check_outputs([target], [str(source)], overwrite)
         shown = [_shown(path, segment) for path in _files(source)]
         page = views_page(shown, source.absolute().name).encode("utf-8")

@@ -52,6 +52,8 @@ _MAX_EXTRA_FIELDS = _MAX_VLR_BYTES // 192
 _MAX_NAME = 31
 """Largest length of a field's name, characters, because the format has 32 bytes and some readers expect a NUL as the
 last one."""
+_SECONDS_PER_WEEK = 604800
+"""GPS times from 0 to below this are seconds of the week; LAS counts all others from 2011, with a flag that says so."""
 _UNUSED = {"return_number": 1, "number_of_returns": 1}
 """Values of dimensions that a written cloud does not have, if not 0: the standard counts returns from 1."""
 _COARSEST_STEP = 1e-4
@@ -252,7 +254,7 @@ def encode_las(cloud: Cloud, suffix: str) -> bytes:
     their own types: normals ``NormalX``, ``NormalY``, ``NormalZ``, labels ``label``, vectors ``name_0``, ``name_1`` and
     so on. Bools become uint8, float16 becomes float32. Names of extra bytes are cut to 31 characters of ASCII. A record
     that other programs skip tells `read_las` the full names and the vectors. A coordinate reference system is not
-    written.
+    written. GPS times beyond a week are flagged as standard time (less 1e9 s), others as seconds of the week.
 
     Raises
     ------
@@ -266,6 +268,9 @@ def encode_las(cloud: Cloud, suffix: str) -> bytes:
     header.global_encoding.wkt = True  # the standard demands it for formats from 6 on
     header.generating_software = "pcgraph"
     header.creation_date = None  # the same cloud gives the same bytes
+    times = np.asarray(cloud.columns.get("gps_time", 0.0), np.float64)
+    if ((times < 0) | (times >= _SECONDS_PER_WEEK)).any():
+        header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD  # else seconds of the week
     standard = {dimension.name: dimension for dimension in header.point_format.dimensions}
     taken = {*laspy.PointFormat(8).dimension_names, "x", "y", "z", "xyz"}
     scalars = {name: column for name, column in cloud.columns.items() if column.ndim == cloud.points.ndim - 1}

@@ -309,11 +309,17 @@ def _header(line: str, count: int | None) -> tuple[str, ...] | None:
 def names_of_numbers(table: NDArray[np.float64], is_pts: bool) -> tuple[str, ...]:
     """Names for the columns of a table without names, by the rules in the module's docstring.
 
-    Raises CloudReadError if there are fewer than three columns.
+    Raises CloudReadError if there are fewer than three columns, or if the first seems to be the number of the point, as
+    total stations write it.
     """
     count = table.shape[1]
     if count < 3:
         raise CloudReadError(f"expected x, y and z in each row, got {count} numbers")
+    if not is_pts and count > 3 and len(table) > 2 and _counts(table[:, 0]) and not _are_whole(table[:, 1:4]):
+        raise CloudReadError(
+            "expected x, y and z first, but the first column seems to count the points: name the columns, "
+            "as by columns=['id', 'x', 'y', 'z'] or --columns id,x,y,z"
+        )
     xyz, named = ("x", "y", "z"), tuple(f"column_{i}" for i in range(3, count))
     if count == 4:
         named = ("intensity",)
@@ -328,6 +334,14 @@ def names_of_numbers(table: NDArray[np.float64], is_pts: bool) -> tuple[str, ...
         elif first and not last:
             named = (*COLOR_NAMES, "column_6")
     return (*xyz, *named)
+
+
+def _are_whole(values: NDArray[np.float64]) -> bool:
+    return bool((values == np.rint(values)).all())
+
+
+def _counts(values: NDArray[np.float64]) -> bool:
+    return _are_whole(values) and bool((np.diff(values) > 0).all())
 
 
 def _are_bytes(values: NDArray[np.float64]) -> bool:
@@ -448,7 +462,7 @@ def _refuse_strangers(above: list[tuple[int, str]], count: int, is_named: bool) 
         if not is_named and not line.startswith(COMMENTS) and _header(line, count) is None:
             raise CloudReadError(
                 f"line {number} is neither a comment (# or //) nor {count} names of columns, x, y and z among them: "
-                f"{line.strip()[:80]!r}; name the columns by columns=[...]"
+                f"{line.strip()[:80]!r}; name the columns by columns=[...] or --columns"
             )
 
 

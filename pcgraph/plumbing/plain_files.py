@@ -219,7 +219,7 @@ class _Part:
             if fcntl is None:
                 return handle
             fcntl.flock(handle, fcntl.LOCK_EX)
-            if os.fstat(handle).st_nlink:  # else another process has removed it before it was locked
+            if os.path.lexists(self.path):  # else another process has removed it before it was locked
                 self._held = os.dup(handle)  # keeps the lock when `handle` is closed
                 return handle
             os.close(handle)
@@ -234,11 +234,11 @@ class _Part:
         with _lock:
             if self in _parts:
                 _parts.remove(self)
-            with suppress(OSError):  # it was moved, was never made, or its directory is gone
-                self.path.unlink()
             if self._held is not None:
                 os.close(self._held)
                 self._held = None
+            with suppress(OSError):  # it was moved, was never made, or its directory is gone
+                self.path.unlink()
             if and_directories:
                 remove_empty(self.made)
 

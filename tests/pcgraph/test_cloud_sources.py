@@ -85,6 +85,7 @@ def test_segment_and_update_take_any_source(boxes):
     ("given", "message"),
     [
         (np.zeros((4, 2)), r"points of shape \(n, 3\) or \(h, w, 3\), or with further columns, .* got \(4, 2\)"),
+        (np.zeros((3, 100)), r"expected a row for each point, got \(3, 100\): transpose the array"),
         (np.zeros((2, 2, 2, 3)), r"got \(2, 2, 2, 3\)"),
         (np.zeros(3, [("x", "f4"), ("y", "f4")]), "expected the fields x, y and z, but z is missing; found: x, y"),
         (np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("name", "U3")]), "fields of numbers, got <U3 .* 'name'"),

@@ -227,6 +227,14 @@ def test_others_find_columns_in_their_places(suffix):
     assert np.allclose(las.header.mins, cloud.points.min(axis=0), rtol=0.0, atol=1e-4)
 
 
+@pytest.mark.parametrize(("time", "kind"), [(3.1e8, 1), (-5.0, 1), (604799.5, 0), (0.0, 0)])
+def test_gps_times_beyond_a_week_are_flagged_as_standard_times(time, kind):
+    cloud = Cloud(np.zeros((2, 3)), columns={"gps_time": np.array([np.nan, time])})
+    header = laspy.read(BytesIO(encode_las(cloud, ".las"))).header
+    assert header.global_encoding.gps_time_type == kind
+    assert header.global_encoding.wkt
+
+
 def test_the_smallest_point_format():
     cloud = mixed_cloud()
     nir = {"nir": np.arange(50, dtype=np.uint16)}

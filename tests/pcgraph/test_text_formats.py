@@ -130,6 +130,15 @@ def test_colours_of_other_ranges() -> None:
     assert packed.colors.tolist() == [[0, 0, 255], [0, 255, 0]]
 
 
+def test_numbers_of_points_are_no_coordinates() -> None:
+    text = "1 691234.5 5334567.25 512.1\n2 691235.5 5334568.25 512.2\n7 691236.5 5334569.25 512.3\n"
+    with pytest.raises(CloudReadError, match="the first column seems to count the points"):
+        read(text)
+    cloud = read(text, ("id", "x", "y", "z"))
+    assert (cloud.points[0].tolist(), cloud.columns["id"].tolist()) == ([691234.5, 5334567.25, 512.1], [1, 2, 7])
+    assert read("1 5 6 7\n2 5 6 7\n3 5 6 8\n").points[2].tolist() == [3, 5, 6]
+
+
 def test_the_user_names_the_columns() -> None:
     rows = "7 1 2 3 10 20 30\n8 4 5 6 0 128 255\n"
     names = ("label", "X", "y", "z", "r", "g", "b")

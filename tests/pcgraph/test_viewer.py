@@ -188,6 +188,7 @@ def test_view_writes_one_page_for_a_file_or_a_folder_and_replaces_none(tmp_path:
     assert [data_of(page, i)["name"] for i in range(2)] == ["0.ply", "1.ply"]
     (tmp_path / "empty").mkdir()
     assert "has no point cloud" in view(tmp_path / "empty", "--overwrite").output
+    assert "expected --out as the name of a file" in view(tmp_path / "clouds", "--out", "-").output
     assert data_of((tmp_path / "page.html").read_text(), 1)["count"] == 51
 
 
