@@ -86,8 +86,8 @@ _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+(,[0-9]+([eE][-+]?[0-9]+)?)?")
 _UNIT = re.compile(r"\s*[\[(][^\])]*[\])]$")
 _MISSING = ("NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None")
 """Words that stand for NaN in tables of R, of pandas and of spreadsheets, of databases and of Python."""
-_TRUTHS = {"True": "1", "TRUE": "1", "False": "0", "FALSE": "0"}
-"""Truth values of pandas, R and spreadsheets, and the numbers that are read in their place."""
+_TRUTHS = {"True": "1", "TRUE": "1", "true": "1", "False": "0", "FALSE": "0", "false": "0"}
+"""Truth values of pandas, R, Polars and spreadsheets, and the numbers that are read in their place."""
 _OF_NUMBERS = b"0123456789.+- \t,;\r\n"
 """Bytes of which most rows consist: what is left of a text without them is searched soon."""
 _IS_NAN = re.compile(rf"(?<![^\s,;])[-+]?(?:{'|'.join(_MISSING)}|{NAN_OF_WINDOWS})(?![^\s,;])")
@@ -392,6 +392,7 @@ def open_table(content: bytes, is_named: bool = False) -> TextTable:
         number, line = above[0] if above else (1, "")
         raise CloudReadError(f"expected rows of numbers, but line {number} and all others have none: {line[:80]!r}")
     _refuse_words(above)
+    _refuse_missing(promised)
     return TextTable(lines, names, [], iter(()))
 
 
@@ -447,6 +448,11 @@ def _refuse_words(above: list[tuple[int, str]]) -> None:
             )
 
 
+def _refuse_missing(left: int | None) -> None:
+    if left:
+        raise CloudReadError(f"the count above the points says that there are {left} more than the file has")
+
+
 def _rows(stream: Iterator[str], dialect: Dialect, promised: int | None, lines: TextLines) -> Iterator[str]:
     """The rows in a stream of lines; where counts of points stand above them, of each block."""
     left = promised
@@ -461,8 +467,7 @@ def _rows(stream: Iterator[str], dialect: Dialect, promised: int | None, lines: 
         if left is not None:
             left -= 1
         yield dialect.row(line)
-    if left:
-        raise CloudReadError(f"the count above the points says that there are {left} more than the file has")
+    _refuse_missing(left)
 
 
 def read_text(file: CloudFile, is_pts: bool = False, usual: tuple[str, ...] | None = None) -> Cloud:
