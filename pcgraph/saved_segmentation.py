@@ -320,6 +320,7 @@ def _check(found: Segmentation) -> None:
     _expect(n_pieces == k, "each supervoxel in one piece")
     _expect(bool((np.linalg.norm(surface.normals, axis=1) <= _UNIT).all()), "normals of unit length")
     _expect(0 <= int(found.objects.max()) < found.next_object, "numbers of objects below the next one")
+    _expect(found.next_object < 1 << 31, "numbers of objects in 31 bits")
     _expect(found.viewpoint.shape in ((3,), (np.count_nonzero(inside), 3)), "one viewpoint, or one for each point")
     _expect(_is_length(found.seed_size), "a positive distance of seeds")
     _expect(0.0 <= found.object_altitude < np.inf, "an altitude of objects that is not negative")

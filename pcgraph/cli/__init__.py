@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from pcgraph import __version__
+from pcgraph.cli.clouds import warning_lines
 from pcgraph.cli.compile import compile_command
 from pcgraph.cli.cut import cut_command
 from pcgraph.cli.info import info_command
@@ -37,11 +38,13 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _pcgraph(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
     """Point clouds as supervoxels, an adjacency graph and a segmentation tree."""
+    context.with_resource(warning_lines())
 
 
 def main() -> None:

@@ -187,6 +187,22 @@ def refusals() -> Iterator[None]:
         raise typer.Exit(1) from None
 
 
+@contextmanager
+def warning_lines() -> Iterator[None]:
+    """Warnings about files as one line on stderr each, without the place in the code."""
+    usual = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if category is UserWarning:
+            typer.echo(f"pcgraph: warning: {one_line(message)}.", err=True)
+        else:
+            usual(message, category, *where, **more)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
 def sentence(error: Exception) -> str:
     """Message of an error as one sentence on one line."""
     message = said(error) if isinstance(error, OSError) else str(error)

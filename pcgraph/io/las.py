@@ -169,6 +169,10 @@ def _check_length(content: bytes) -> None:
     available, needed = len(content) - start, n_points * size
     if available < 0:
         raise CloudReadError(f"the LAS header promises points from byte {start} on, but the file has {len(content)}")
+    n_further = struct.unpack_from("<I", content, 243)[0] if minor >= 4 and len(content) >= 255 else 0
+    has_waveforms = minor == 3
+    if not point_format & 0xC0 and not n_points and available >= size > 0 and not (n_further or has_waveforms):
+        raise CloudReadError(f"the LAS header promises no points, but {available} bytes follow: its writer did not end")
     if not point_format & 0xC0 and available < needed:
         raise CloudReadError(
             f"the LAS header promises {n_points} points ({needed} bytes), but only {available} bytes follow"

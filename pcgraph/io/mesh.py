@@ -187,6 +187,9 @@ def _parts(file: CloudFile, kind: str) -> list[_Part]:
     try:
         if kind in ("glb", "gltf"):
             _check_accessors(file.content)
+            buffers = _gltf_scene(file.content).get("buffers", [])
+            if file.path is None and not all(one.get("uri", "data:").startswith("data:") for one in buffers):
+                raise CloudReadError("a glTF file is read with the files beside it that it names: give its path")
         with np.errstate(all="ignore"):
             scene = trimesh.load_scene(
                 BytesIO(file.content), file_type=kind, resolver=resolver, process=False, skip_materials=True

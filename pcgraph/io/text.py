@@ -89,8 +89,8 @@ _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+(,[0-9]+([eE][-+]?[0-9]+)?)?")
 _UNIT = re.compile(r"\s*[\[(][^\])]*[\])]$")
 _MISSING = ("NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None")
 """Words for a missing number in tables of R, pandas, spreadsheets, databases and Python; they are read as NaN."""
-_TRUTHS = {"True": "1", "TRUE": "1", "False": "0", "FALSE": "0"}
-"""Truth values in tables of pandas, R and spreadsheets, and the numbers as which they are read."""
+_TRUTHS = {"True": "1", "TRUE": "1", "true": "1", "False": "0", "FALSE": "0", "false": "0"}
+"""Truth values in tables of pandas, R, Polars and spreadsheets, and the numbers as which they are read."""
 _OF_NUMBERS = b"0123456789.+- \t,;\r\n"
 """Bytes of which most rows consist. A text without them is short, and so is quickly searched for other words."""
 _IS_NAN = re.compile(rf"(?<![^\s,;])[-+]?(?:{'|'.join(_MISSING)}|{NAN_OF_WINDOWS})(?![^\s,;])")
@@ -422,6 +422,7 @@ def open_table(content: bytes, is_named: bool = False) -> TextTable:
         number, line = above[0] if above else (1, "")
         raise CloudReadError(f"expected rows of numbers, but line {number} and all others have none: {line[:80]!r}")
     _refuse_words(above)
+    _refuse_missing(promised)
     return TextTable(lines, names, [], iter(()))
 
 
@@ -477,6 +478,11 @@ def _refuse_words(above: list[tuple[int, str]]) -> None:
             )
 
 
+def _refuse_missing(left: int | None) -> None:
+    if left:
+        raise CloudReadError(f"the count above the points says that there are {left} more than the file has")
+
+
 def _rows(stream: Iterator[str], dialect: Dialect, promised: int | None, lines: TextLines) -> Iterator[str]:
     """The rows in a stream of lines, of all blocks if the text has blocks with counts of points."""
     left = promised
@@ -491,8 +497,7 @@ def _rows(stream: Iterator[str], dialect: Dialect, promised: int | None, lines: 
         if left is not None:
             left -= 1
         yield dialect.row(line)
-    if left:
-        raise CloudReadError(f"the count above the points says that there are {left} more than the file has")
+    _refuse_missing(left)
 
 
 def read_text(file: CloudFile, is_pts: bool = False, usual: tuple[str, ...] | None = None) -> Cloud:

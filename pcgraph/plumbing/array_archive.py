@@ -214,7 +214,8 @@ def _value(archive: Archive, path: str, kind: type[Any]) -> Any:
     stored = archive.values.get(path)
     if kind is float and stored in ("inf", "-inf", "nan"):
         return float(stored)
-    if not (type(stored) is kind or (kind is float and type(stored) is int)):
+    is_number = kind is float and type(stored) is int and abs(stored) < 1 << 63  # more is no float to a kernel
+    if not (type(stored) is kind or is_number):
         raise DamagedError(f"expected {path} as {kind.__name__}, got {stored!r:.80}")
     return stored
 

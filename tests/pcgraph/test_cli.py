@@ -8,6 +8,7 @@ import json
 import subprocess
 import sys
 import tomllib
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -455,6 +456,11 @@ def test_warnings_are_a_line_on_stderr(tmp_path):
     assert done.exit_code == 0
     assert "pcgraph: warning: expected far fewer objects than supervoxels" in done.stderr
     assert "cli.py" not in done.stderr
+    np.savez(tmp_path / "c.npz", points=points[:50], name=np.full(50, "a"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        done = run(tmp_path / "c.npz", "--out", tmp_path / "d.ply")
+    assert done.stderr.splitlines()[0] == "pcgraph: warning: left out what holds no numbers: the array 'name'."
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")

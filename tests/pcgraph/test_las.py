@@ -329,12 +329,10 @@ def test_more_points_than_there_are(suffix, count):
         read_las(bytes(content))
 
 
-def test_fewer_points_than_there_are_and_none():
+def test_fewer_points_than_there_are():
     content = bytearray(encode_las(mixed_cloud(), ".las"))
     struct.pack_into("<Q", content, POINT_COUNT_AT, 7)
     assert read_las(bytes(content)).points.shape == (7, 3)
-    struct.pack_into("<Q", content, POINT_COUNT_AT, 0)
-    assert read_las(bytes(content)).points.shape == (0, 3)
 
 
 def test_records_that_would_never_end():
@@ -429,3 +427,12 @@ def test_copc_files_are_only_read():
     assert decode_cloud(content, "a.copc.laz").points.tolist() == [[1.0, 1.0, 1.0]] * 2
     with pytest.raises(CloudWriteError, match=r"files ending in \.copc\.laz are only read"):
         encode_cloud(Cloud(np.ones((2, 3))), "a.copc.laz")
+
+
+def test_files_whose_writer_did_not_come_to_the_count_are_refused():
+    content = bytearray(encode_las(Cloud(np.ones((2, 3))), ".las"))
+    content[107:111] = bytes(4)
+    content[POINT_COUNT_AT : POINT_COUNT_AT + 8] = bytes(8)
+    with pytest.raises(CloudReadError, match="promises no points, but 60 bytes follow: its writer did not end"):
+        read_las(bytes(content))
+    assert len(read_las(encode_las(Cloud(np.ones((0, 3))), ".las")).points) == 0

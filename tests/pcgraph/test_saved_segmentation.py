@@ -469,6 +469,8 @@ DAMAGE: list[tuple[Mutation, str]] = [
     (set_value("linkage/cost", "os"), "no BoundaryCost"),
     (set_value("next_object", 0), "objects below the next one"),
     (set_value("next_object", True), "next_object as int"),
+    (set_value("next_object", 1 << 31), "objects in 31 bits"),
+    (set_value("linkage/gap", 1 << 63), "linkage/gap as float"),
     (set_value("seed_size", -1), "distance of seeds"),
     (set_value("object_altitude", "inf"), "altitude of objects"),
     (set_value("further", 1), "further"),

@@ -203,6 +203,7 @@ def test_files_without_points() -> None:
             "expected numbers only .* but line 2 has 'tree': leave out columns of words",
         ),
         ("x,y,z,t\n" + "1,2,3,2020-01-01\n" * 5000, "line 2 has '2020-01-01'"),
+        ("1\n# cut off, as the count promises a row\n", "there are 1 more than the file has"),
         ("3\n1.00 2.00 3.00\n4 5 6\n", "there are 1 more than the file has"),
         ("1\n1 2 3\n4 5 6\n", "line 3 has one point more than the count"),
         ("1000000000\n1 2 3\n", "line 1 promises 1000000000 points, but the whole file has only 17 bytes"),
@@ -478,6 +479,6 @@ def test_cloudcompare_reads_the_same_points_of_ptx_files(tmp_path: Path) -> None
 
 
 def test_truth_values_and_errors_of_spreadsheets() -> None:
-    cloud = read('x,y,z,ok,v\n1,2,3,True,#N/A\n4,5,6,"FALSE",<NA>\n7,8,9,TRUE,2.5\n')
+    cloud = read('x,y,z,ok,v\n1,2,3,True,#N/A\n4,5,6,"FALSE",<NA>\n7,8,9,true,2.5\n')
     assert cloud.columns["ok"].tolist() == [1, 0, 1]
     assert np.array_equal(cloud.columns["v"], [np.nan, np.nan, 2.5], equal_nan=True)
