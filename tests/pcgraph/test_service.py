@@ -273,7 +273,7 @@ REFUSED: dict[str, tuple[dict[str, Any], int, str]] = {
     "parameter": ({"params": {"name": "a.ply", "voxelsize": 1}}, 422, "'voxelsize'; did you mean voxel_size?"),
     "range": ({"params": {"name": "a.ply", "voxel_size": -1}}, 422, "voxel_size: input should be greater than 0"),
     "linkage": ({"params": {"name": "a.ply", "linkage": "regoin"}}, 422, "got 'regoin'; did you mean region?"),
-    "code": ({"params": {"name": "a.ply", "linkage": "own.py:Mine"}}, 422, "expected one of convexity"),
+    "code": ({"params": {"name": "a.ply", "linkage": "own.py:Mine"}}, 422, "linkage: expected one of"),
     "viewpoint": ({"params": {"name": "a.ply", "viewpoint": [0, 0]}}, 422, "viewpoint: "),
     "no name": ({"content": b"ply"}, 422, "?name=scan.laz"),
     "format": ({"params": {"name": "a.foo"}, "content": b"?"}, 422, "expected a file ending in"),
