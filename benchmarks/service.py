@@ -274,6 +274,14 @@ async def begin_stuck_job(http: httpx.AsyncClient, rng: np.random.Generator) -> 
     return path
 
 
+async def end_of(http: httpx.AsyncClient, path: str) -> dict[str, Any]:
+    """The job at a path once it is done or has failed, asked for at once: the small store keeps it for a while only."""
+    while True:
+        job: dict[str, Any] = (await http.get(path, params={"wait": LIMITS["max-seconds"]})).json()
+        if job.get("state") not in ("queued", "running"):
+            return job
+
+
 async def recovered(http: httpx.AsyncClient, pid: int, killed: int) -> bool:
     """Whether all workers are ready again, within some seconds, and none is the killed one."""
     for _ in range(RECOVERY_SECONDS):
@@ -292,6 +300,7 @@ async def load(address: str, pid: int, known: list[Known], arguments: argparse.N
     limits = httpx.Limits(max_connections=None)
     async with httpx.AsyncClient(base_url=address, timeout=120.0, limits=limits) as http:
         stuck = await begin_stuck_job(http, np.random.default_rng(arguments.seed))
+        ended = asyncio.create_task(end_of(http, stuck))
         begin = time.monotonic()
         until = begin + arguments.seconds
         watching = asyncio.create_task(watch_memory(pid, samples))
@@ -300,7 +309,7 @@ async def load(address: str, pid: int, known: list[Known], arguments: argparse.N
         await asyncio.gather(*(client.run(until) for client in clients))
         end = time.monotonic()
         watching.cancel()
-        job = (await http.get(stuck, params={"wait": LIMITS["max-seconds"]})).json()
+        job = await ended
         if (job.get("problem") or {}).get("status") != 504:
             tally.wrong[f"stuck: {json.dumps(job)[:300]}"] += 1
         if not await recovered(http, pid, await kill):

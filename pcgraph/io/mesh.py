@@ -45,8 +45,9 @@ def read_mesh(file: CloudFile, kind: str) -> Cloud:
     """Cloud of the vertices of a mesh file, with their colours and normals if the file has them.
 
     The vertices of all meshes of a scene are in the scene's frame. An STL file repeats a vertex in each triangle; equal
-    ones are merged. An OBJ file repeats a vertex that has several normals; these stay. Textures and materials are not
-    read. `sample_surface` makes points between the vertices.
+    ones are merged. An OBJ file repeats a vertex that has several normals or materials; these stay, and the vertices of
+    one material come after those of another. Textures and materials are not read. `sample_surface` makes points between
+    the vertices.
 
     Parameters
     ----------
@@ -63,15 +64,15 @@ def read_mesh(file: CloudFile, kind: str) -> Cloud:
     -----
     UserWarning
         The mesh has faces, but too few vertices to describe its surface. Or trimesh does not read something: colours
-        and normals of OFF files, normals of OBJ files without faces, normals of points in glTF files, and attributes of
-        glTF files with names of an application.
+        and normals of OFF files, normals of OBJ files without faces, vertices of OBJ files that no face has, normals of
+        points in glTF files, and attributes of glTF files with names of an application.
     """
     parts = _parts(file, kind)
-    left_out = _left_out(file.content, kind, any(len(part.faces) for part in parts))
-    if left_out:
-        warnings.warn(f"left out what the mesh file has besides: {', '.join(left_out)[:200]}", stacklevel=2)
     points = np.concatenate([part.points for part in parts])
     n_faces = sum(len(part.faces) for part in parts)
+    left_out = _left_out(file.content, kind, len(points), n_faces)
+    if left_out:
+        warnings.warn(f"left out what the mesh file has besides: {', '.join(left_out)[:200]}", stacklevel=2)
     colors = _together([part.colors for part in parts])
     normals = _together([part.normals for part in parts])
     if kind == "stl":
@@ -242,14 +243,18 @@ def _gltf_scene(content: bytes) -> dict[str, Any]:
     return scene
 
 
-def _left_out(content: bytes, kind: str, has_faces: bool) -> list[str]:
+def _left_out(content: bytes, kind: str, n_points: int, n_faces: int) -> list[str]:
     """Names of the data of its vertices that a file has and trimesh did not read."""
     if kind == "off":
         word = re.search(rb"(?m)^\s*(\w*)OFF\b", content)
         letters = word[1] if word else b""
         return [name for letter, name in ((b"C", "colors"), (b"N", "normals")) if letter in letters]
     if kind == "obj":
-        return ["normals"] if not has_faces and b"\nvn " in b"\n" + content else []
+        lines = b"\n" + content
+        if not n_faces:
+            return ["normals"] if b"\nvn " in lines else []
+        n_missing = lines.count(b"\nv ") - n_points  # or more, as vertices with several normals are repeated
+        return [f"{n_missing} vertices of no face"] if n_missing > 0 else []
     if kind != "gltf":
         return []
     names = set()

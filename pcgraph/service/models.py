@@ -244,7 +244,8 @@ class ObjectsModel(BaseModel):
         description="Normal and centroid of the plane, metres; null if there is no horizontal plane."
     )
     objects: list[dict[str, Any]] = Field(
-        description="Each with its count of points, standing box, free box and shape, the largest first."
+        description="Each with the labels of which it consists, its count of points, standing box, free box and shape; "
+        "the largest first."
     )
 
 

@@ -209,7 +209,8 @@ def write_objects(stage: Stage, segmentation_id: str, saved: str) -> dict[str, A
         plane = int(level[0])
         support = {"normal": planes.normals[plane].tolist(), "centroid": planes.centroids[plane].tolist()}
     found = objects_on(result, planes, points=cloud.points)
-    return _write_json(saved, "objects.json", {"support": support, "objects": [one.to_dict() for one in found]})
+    objects = [{"labels": np.unique(result.objects[one.supervoxels]).tolist(), **one.to_dict()} for one in found]
+    return _write_json(saved, "objects.json", {"support": support, "objects": objects})
 
 
 def write_tree(stage: Stage, segmentation_id: str, saved: str) -> dict[str, Any]:

@@ -130,7 +130,7 @@ class Viewer {
 
   summarise() {
     const { count, unmeasured, far, step, tree, columnsLeftOut } = this.cloud;
-    const said = [`${counted(count, "point")}, placed to ${metres(Math.max(...step.filter((s) => s !== 1), 0) / 2)}.`];
+    const said = [`${counted(count, "point")}, placed to ${metres(Math.hypot(...step.filter((s) => s !== 1)) / 2)}.`];
     if (unmeasured) said.push(`${counted(unmeasured, "point")} without a measurement.`);
     if (far) said.push(`${counted(far, "point")} far outside not shown.`);
     if (columnsLeftOut) said.push(`${counted(columnsLeftOut, "further column")} not in this page.`);

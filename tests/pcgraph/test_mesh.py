@@ -191,10 +191,15 @@ def test_what_trimesh_leaves_out_is_told(kind, content, names):
     assert len(read(content.replace(b"CNOFF", b"OFF").replace(b"vn", b"#"), kind).points) == 1  # warnings are errors
 
 
+def test_vertices_of_no_face_that_are_left_out():
+    with pytest.warns(UserWarning, match="left out what the mesh file has besides: 1 vertices of no face"):
+        assert len(read(TRIANGLE + b"v 7 7 7\nf 1 2 3\n", "obj").points) == 3
+
+
 def test_attributes_of_gltf_files_that_are_left_out():
     primitives = [{"mode": 0, "attributes": {"POSITION": 0, "NORMAL": 1, "_RING": 2}}, {"attributes": {"NORMAL": 1}}]
     scene = json.dumps({"meshes": [{"primitives": primitives}]}).encode()
-    assert _left_out(scene, "gltf", has_faces=True) == ["NORMAL", "_RING"]
+    assert _left_out(scene, "gltf", 0, 0) == ["NORMAL", "_RING"]
 
 
 @pytest.mark.parametrize("content", [b"glTF\1\0\0\0" + bytes(16), b'{"accessors": {"one": {"count": 3}}}'])

@@ -186,6 +186,7 @@ def test_answers_are_those_of_pcgraph(service, scene, tmp_path):
     assert {box.pop("segment"): box for box in boxes} == expected
     objects = client.get(job["links"]["objects"]).json()
     assert objects["support"]["normal"] == pytest.approx([0, 0, 1], abs=1e-3)
+    assert sorted(label for one in objects["objects"] for label in one["labels"]) == [1, 2]  # the table is 0
     assert [one["height"] for one in objects["objects"]] == pytest.approx([0.3, 0.25], abs=0.03)
     assert client.get(job["links"]["tree"]).json() == right.tree.to_dict()
     view = client.get(job["links"]["view"])
