@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from synthetic import all_bytes
+from tiers import to_validate
 
 import rangesim
 from rangesim import AmcwToF, DirectToF, Scene, StructuredLight, transport
@@ -75,6 +76,7 @@ def script(*names: str, handler: str = "") -> list[str]:
     return [sys.executable, "-c", SCRIPT.format(cases=cases, handler=handler)]
 
 
+@pytest.mark.validation
 def test_ctrl_c_ends_a_pass_without_progress_within_two_seconds() -> None:
     with subprocess.Popen(script(*LONG), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -94,7 +96,7 @@ def test_ctrl_c_ends_a_pass_without_progress_within_two_seconds() -> None:
             process.kill()
 
 
-@pytest.mark.parametrize(("handler", "expected"), [("", -signal.SIGTERM), (RAISES, 7)])
+@pytest.mark.parametrize(("handler", "expected"), [("", -signal.SIGTERM), *to_validate((RAISES, 7))])
 def test_sigterm_ends_a_pass_by_default_and_by_a_handler_that_raises(handler: str, expected: int) -> None:
     line = script("many samples", handler=handler)
     with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as process:

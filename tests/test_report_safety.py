@@ -116,6 +116,7 @@ def test_the_policy_stops_what_escaping_let_through(page: Page, tmp_path: Path) 
     page.wait_for("violations.some((v) => v.startsWith('form-action'))")
 
 
+@pytest.mark.validation
 def test_a_hash_in_the_address_chooses_colours_and_nothing_else(page: Page) -> None:
     for state in ("color=constructor", "color=__proto__", "color=%22]&altitude=x", "color=cause&altitude=-1"):
         page.open(small_result() / "report.html", state)

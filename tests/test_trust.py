@@ -207,9 +207,8 @@ def test_signals_end_a_command_in_one_line_at_any_moment(tmp_path: Path, package
 @pytest.mark.parametrize(
     ("package", "number"),
     [
-        ("rangesim", signal.SIGINT),
         ("pcgraph", signal.SIGTERM),
-        *to_validate(("rangesim", signal.SIGTERM), ("pcgraph", signal.SIGINT)),
+        *to_validate(("rangesim", signal.SIGINT), ("rangesim", signal.SIGTERM), ("pcgraph", signal.SIGINT)),
     ],
 )
 def test_a_signal_after_the_last_line_is_one_line_too_or_comes_too_late(

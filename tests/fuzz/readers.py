@@ -130,6 +130,7 @@ def _vertices(path: Path, arguments: Arguments) -> Any:
 
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "read the .* vertices of the mesh")
+        warnings.filterwarnings("ignore", "left out what the mesh file has besides")
         return _cloud(path, arguments)
 
 
