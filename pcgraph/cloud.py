@@ -70,7 +70,34 @@ class Cloud(ShortRepr):
 
     def finite(self) -> Cloud:
         """The points with finite coordinates as a list, in their order, with their colours, columns and so on."""
-        seen = np.isfinite(self.points).all(axis=-1)
+        return self.select(np.isfinite(self.points).all(axis=-1))
+
+    def select(self, chosen: NDArray[np.bool_]) -> Cloud:
+        """Some of the points as a list, in their order, with their colours, columns and so on.
+
+        Parameters
+        ----------
+        chosen : the points' leading shape, bool
+
+        Raises
+        ------
+        ValueError
+            There is not one truth value for each point.
+
+        Examples
+        --------
+        >>> import numpy as np, pcgraph
+        >>> classes = np.array([2, 7, 2], np.uint8)
+        >>> cloud = pcgraph.Cloud(np.eye(3), columns={"classification": classes})
+        >>> cloud.select(cloud.columns["classification"] != 7).points.tolist()  # without the noise of LAS files
+        [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+        """
+        seen = np.asarray(chosen)
+        if seen.dtype != np.bool_ or seen.shape != self.points.shape[:-1]:
+            raise ValueError(
+                f"expected one truth value for each point, bool of shape {self.points.shape[:-1]}, "
+                f"got {seen.dtype} of shape {seen.shape}"
+            )
         return Cloud(
             self.points[seen],
             None if self.colors is None else self.colors[seen],

@@ -372,3 +372,18 @@ def test_archives_that_lie_are_refused(monkeypatch):
     monkeypatch.setattr(npz, "MAX_BYTES", 4 * 12 * 3 - 1)
     with pytest.raises(pcgraph.CloudReadError, match="at most 143 bytes in all, decompressed"):
         decode_cloud(whole, "a.npz")
+
+
+def test_some_points_keep_all_that_is_theirs():
+    image = np.arange(18.0).reshape(2, 3, 3)
+    cloud = pcgraph.Cloud(
+        image, image.astype(np.uint8), -image, np.arange(6, dtype=np.int32).reshape(2, 3), image + 1.0, {"ring": image}
+    )
+    chosen = np.array([[True, False, False], [False, True, True]])
+    part = cloud.select(chosen)
+    for name in ("points", "colors", "normals", "labels", "viewpoint"):
+        assert np.array_equal(getattr(part, name), getattr(cloud, name)[chosen])
+    assert np.array_equal(part.columns["ring"], image[chosen])
+    for wrong in ([0, 4], chosen[0], chosen.astype(int)):
+        with pytest.raises(ValueError, match="expected one truth value for each point"):
+            cloud.select(wrong)
