@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import re
 import struct
+import warnings
 from collections.abc import Callable
 from io import BytesIO
 from itertools import chain
@@ -45,6 +46,8 @@ _WHITE_RATIO = 257
 _DESCRIPTION = ("pcgraph", 1)
 """User ID and record ID of the variable length record that holds the description of the columns. The user ID is ours,
 so that any record ID is free."""
+_PROJECTION = "LASF_Projection"
+"""User of the variable length records that hold a coordinate reference system, from the standard."""
 _MAX_VLR_BYTES = 65535
 """Largest size of the data of a variable length record, bytes, because the format counts them in 16 bits."""
 _MAX_EXTRA_FIELDS = _MAX_VLR_BYTES // 192
@@ -94,11 +97,16 @@ def read_las(content: bytes) -> Cloud:
     ------
     CloudReadError
         The header is damaged, the file is shorter than the header says, or a library is missing.
+
+    Warns
+    -----
+    UserWarning
+        The file has a coordinate reference system.
     """
     _check_length(content)
     laspy = _laspy(CloudReadError, "reading", compressed=bool(content[104] & 0xC0))
     try:
-        points, fields, standard, text = _unpacked(laspy, content)
+        points, fields, standard, text, is_georeferenced = _unpacked(laspy, content)
     except CloudReadError:
         raise
     except MemoryError:
@@ -107,6 +115,11 @@ def read_las(content: bytes) -> Cloud:
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         raise CloudReadError(f"the LAS file is damaged: {library_reason(error)}") from None
+    if is_georeferenced:
+        warnings.warn(
+            "left out the coordinate reference system of the LAS file: assign it again to files that are written",
+            stacklevel=2,
+        )
     own = described(text)
     if own is not None:  # dimensions of the point format that the written cloud did not have
         for name in standard.intersection(fields) - {*map(str, own["columns"].values()), *COLOR_NAMES}:
@@ -127,12 +140,15 @@ class _Unpacked(NamedTuple):
         Names of the dimensions of the point format.
     description : bytes, or None
         The record that `flatten` made, if the file has one.
+    is_georeferenced : bool
+        Whether the file has a coordinate reference system.
     """
 
     points: NDArray[np.floating]
     fields: Arrays
     standard: set[str]
     description: bytes | None
+    is_georeferenced: bool
 
 
 def _unpacked(laspy: ModuleType, content: bytes) -> _Unpacked:
@@ -144,6 +160,7 @@ def _unpacked(laspy: ModuleType, content: bytes) -> _Unpacked:
         dimensions = [name for name in header.point_format.dimension_names if name not in ("X", "Y", "Z")]
         standard = set(header.point_format.standard_dimension_names)
         records = header.vlrs.get_by_id(_DESCRIPTION[0], (_DESCRIPTION[1],))
+        is_georeferenced = any(record.user_id == _PROJECTION for record in header.vlrs)
         empty = laspy.ScaleAwarePointRecord.zeros(0, header=header)
         points, columns = [], []
         for piece in chain([empty], reader.chunk_iterator(_PIECE)):
@@ -153,7 +170,8 @@ def _unpacked(laspy: ModuleType, content: bytes) -> _Unpacked:
     if n_found != header.point_count:
         raise CloudReadError(f"the LAS header promises {header.point_count} points, but {n_found} follow")
     fields: Arrays = {name: np.concatenate([piece.pop(name) for piece in columns]) for name in dimensions}
-    return _Unpacked(np.concatenate(points), fields, standard, records[0].record_data_bytes() if records else None)
+    text = records[0].record_data_bytes() if records else None
+    return _Unpacked(np.concatenate(points), fields, standard, text, is_georeferenced)
 
 
 def _check_length(content: bytes) -> None:

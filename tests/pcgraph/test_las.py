@@ -436,3 +436,12 @@ def test_files_whose_writer_did_not_come_to_the_count_are_refused():
     with pytest.raises(CloudReadError, match="promises no points, but 60 bytes follow: its writer did not end"):
         read_las(bytes(content))
     assert len(read_las(encode_las(Cloud(np.ones((0, 3))), ".las")).points) == 0
+
+
+def test_a_reference_system_that_is_left_out_is_told():
+    header = header_of("1.4", 6)
+    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr('PROJCS["ETRS89 / UTM zone 32N"]'))
+    content = las_bytes(header, laspy.ScaleAwarePointRecord.zeros(3, header=header))
+    with pytest.warns(UserWarning, match="left out the coordinate reference system of the LAS file"):
+        cloud = read_las(content)
+    assert len(cloud.points) == 3
