@@ -233,6 +233,22 @@ class Segmentation:
         is_below[self.tree.leaves_of(node)] = True
         return np.flatnonzero(self.on_points(is_below))
 
+    def summary(self) -> dict[str, Any]:
+        """Counts, sizes in metres and the acquisition, as plain values for JSON.
+
+        ``segmented`` and ``outliers`` count points; ``objects`` counts those of the last scan.
+        """
+        return {
+            "segmented": int(np.count_nonzero(self.supervoxels >= 0)),
+            "outliers": int(np.count_nonzero(self.outliers)),
+            "acquisition": self.acquisition.in_words,
+            "voxel_size": self.voxel_size,
+            "seed_size": self.seed_size,
+            "supervoxels": self.tree.n_leaves,
+            "edges": len(self.graph.edges),
+            "objects": len(np.unique(self.labels[self.labels >= 0])),
+        }
+
     def with_objects(self, n: int | None = None, altitude: float | None = None, min_size: int = 1) -> Segmentation:
         """The same segmentation with another cut of its tree as its objects; parameters as for `SegmentationTree.cut`.
 

@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -25,6 +25,19 @@ PIPE = "-"
 """Argument that stands for stdin or stdout."""
 SAVED = ".segmentation.npz"
 """Suffix of the files of saved segmentations."""
+
+FormatOption = Annotated[
+    str | None, typer.Option("--from", help="Format of the input, such as ply. Default: by its name.")
+]
+ColumnsOption = Annotated[
+    str | None, typer.Option(help="Names of the columns of a text without a header: x,y,z,intensity.")
+]
+LevelsOption = Annotated[
+    str | None, typer.Option(help="Numbers of segments, such as 10,50,200: a column level_10 and so on for each.")
+]
+ColorizeOption = Annotated[
+    bool, typer.Option("--colorize", help="Colour the points by object; their own colours go to original_red etc.")
+]
 
 
 def read_input(name: str, file_format: str | None = None, columns: str | None = None) -> Cloud:
@@ -210,24 +223,8 @@ def sentence(error: Exception) -> str:
     return f"{one_line(message).rstrip('.')}."
 
 
-def result_record(result: Segmentation) -> dict[str, Any]:
-    """Counts, sizes and the acquisition of a segmentation as plain values for JSON."""
-    import numpy as np
-
-    return {
-        "segmented": int((result.supervoxels >= 0).sum()),
-        "outliers": int(result.outliers.sum()),
-        "acquisition": result.acquisition.in_words,
-        "voxel_size": result.voxel_size,
-        "seed_size": result.seed_size,
-        "supervoxels": result.graph.n_nodes,
-        "edges": len(result.graph.edges),
-        "objects": len(np.unique(result.labels[result.labels >= 0])),
-    }
-
-
 def print_result(record: dict[str, Any], n_points: int) -> None:
-    """Print the rows of a `result_record`."""
+    """Print the rows of a `Segmentation.summary`."""
     print_row("points", f"{record['segmented']} of {n_points} segmented, {record['outliers']} outliers")
     print_row("acquisition", record["acquisition"])
     print_row("voxel size", f"{record['voxel_size']:.3g} m")

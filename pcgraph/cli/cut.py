@@ -9,7 +9,17 @@ from typing import Annotated
 
 import typer
 
-from pcgraph.cli.clouds import SAVED, check_outputs, numbers, object_records, read_saved, refusals, write_results
+from pcgraph.cli.clouds import (
+    SAVED,
+    ColorizeOption,
+    LevelsOption,
+    check_outputs,
+    numbers,
+    object_records,
+    read_saved,
+    refusals,
+    write_results,
+)
 from pcgraph.errors import one_line
 
 
@@ -23,12 +33,8 @@ def cut_command(
         float | None, typer.Option(help="Altitude of the cut, in the linkage's unit. Default: as it was saved.")
     ] = None,
     min_size: Annotated[int, typer.Option(help="Points that every segment has at least.")] = 1,
-    levels: Annotated[
-        str | None, typer.Option(help="Numbers of segments, such as 10,50,200: a column level_10 and so on for each.")
-    ] = None,
-    colorize: Annotated[
-        bool, typer.Option("--colorize", help="Colour the points by object; their own colours go to original_red etc.")
-    ] = False,
+    levels: LevelsOption = None,
+    colorize: ColorizeOption = False,
     boxes: Annotated[bool, typer.Option("--boxes", help="Print each object with its box as a line of JSON.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an output that exists.")] = False,
 ) -> None:

@@ -12,12 +12,13 @@ import typer
 
 from pcgraph.cli.clouds import (
     PIPE,
+    ColumnsOption,
+    FormatOption,
     has_cloud,
     is_saved,
     print_result,
     print_row,
     read_input,
-    result_record,
     sentence,
 )
 from pcgraph.errors import PcgraphError, one_line
@@ -33,12 +34,8 @@ def info_command(
     files: Annotated[
         list[str], typer.Argument(metavar="FILE...", help="Point clouds or saved segmentations; - is stdin.")
     ],
-    from_format: Annotated[
-        str | None, typer.Option("--from", help="Format of the input, such as ply. Default: by its name.")
-    ] = None,
-    columns: Annotated[
-        str | None, typer.Option(help="Names of the columns of a text without a header: x,y,z,intensity.")
-    ] = None,
+    from_format: FormatOption = None,
+    columns: ColumnsOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one line of JSON for each file.")] = False,
 ) -> None:
     """Print the content of files: points, extent, spacing, and columns with their types and ranges.
@@ -68,7 +65,7 @@ def _record(name: str, file_format: str | None, columns: str | None) -> dict[str
     from pcgraph.saved_segmentation import load_segmentation
 
     result = load_segmentation(name)
-    saved = {"segmentation": {"points": result.labels.size, **result_record(result)}}
+    saved = {"segmentation": {"points": result.labels.size, **result.summary()}}
     return saved if not has_cloud(Path(name)) else {**_cloud_record(read_input(name)), **saved}
 
 

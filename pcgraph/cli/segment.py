@@ -15,6 +15,10 @@ import typer
 
 from pcgraph.cli.clouds import (
     PIPE,
+    ColorizeOption,
+    ColumnsOption,
+    FormatOption,
+    LevelsOption,
     check_outputs,
     numbers,
     object_records,
@@ -23,7 +27,6 @@ from pcgraph.cli.clouds import (
     print_row,
     read_input,
     refusals,
-    result_record,
     segmented,
     sentence,
     write_results,
@@ -45,22 +48,14 @@ def segment_command(
         Path | None,
         typer.Option(help="One file, a folder, or - for stdout. Default: two files in the current folder."),
     ] = None,
-    from_format: Annotated[
-        str | None, typer.Option("--from", help="Format of the input, such as ply. Default: by its name.")
-    ] = None,
+    from_format: FormatOption = None,
     to_format: Annotated[
         str | None,
         typer.Option("--to", help="Suffix of the labelled cloud, such as laz. Default: as the input, or ply."),
     ] = None,
-    columns: Annotated[
-        str | None, typer.Option(help="Names of the columns of a text without a header: x,y,z,intensity.")
-    ] = None,
-    levels: Annotated[
-        str | None, typer.Option(help="Numbers of segments, such as 10,50,200: a column level_10 and so on for each.")
-    ] = None,
-    colorize: Annotated[
-        bool, typer.Option("--colorize", help="Colour the points by object; their own colours go to original_red etc.")
-    ] = False,
+    columns: ColumnsOption = None,
+    levels: LevelsOption = None,
+    colorize: ColorizeOption = False,
     boxes: Annotated[
         bool, typer.Option("--boxes", help="Also print each object with its oriented box, as JSON.")
     ] = False,
@@ -214,7 +209,7 @@ def _summary(name: str, cloud: Cloud, result: Segmentation, written: list[Path],
     return {
         "cloud": name,
         "points": math.prod(cloud.points.shape[:-1]),
-        **result_record(result),
+        **result.summary(),
         "seconds": round(seconds, 3),
         "written": [str(path) for path in written],
     }

@@ -93,14 +93,7 @@ def segment_upload(
     result.save(saved, cloud)
     return {
         "points": n_points,
-        "segmented": int(np.count_nonzero(result.supervoxels >= 0)),
-        "outliers": int(np.count_nonzero(result.outliers)),
-        "acquisition": result.acquisition.in_words,
-        "voxel_size": result.voxel_size,
-        "seed_size": result.seed_size,
-        "supervoxels": result.tree.n_leaves,
-        "edges": len(result.graph.edges),
-        "objects": len(np.unique(result.objects)),
+        **result.summary(),
         "object_altitude": result.object_altitude,
         "seconds": round(time.perf_counter() - start, 3),
         "warnings": [str(warning.message) for warning in caught if issubclass(warning.category, CloudWarning)],
