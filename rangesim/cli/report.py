@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from rangesim.cli.own_sensors import OwnSensors, load_own_sensors
 from rangesim.errors import one_line
 
 
@@ -15,14 +16,7 @@ def report_command(
     result: Annotated[
         Path, typer.Argument(help="A directory that `rangesim run` or `rangesim scan` wrote.", show_default=False)
     ],
-    sensor: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="A sensor of your own that the result contains, as FILE.py:NAME. The file is run. Repeat the option "
-            "for several sensors.",
-            show_default=False,
-        ),
-    ] = None,
+    sensor: OwnSensors = None,
 ) -> None:
     """Write report.html again from the files of a result or of a scan.
 
@@ -35,10 +29,8 @@ def report_command(
     from rangesim.report.scan_page import render_scan_page
     from rangesim.results.experiment_results import RESULT, load_result, read_settings
     from rangesim.results.scan_results import SCAN, load_scan
-    from rangesim.sensors import sensor_of
 
-    for name in sensor or ():
-        sensor_of(name)  # from then on the sensor's class is known by its type_name
+    load_own_sensors(sensor)
     if (result / SCAN.sidecar).is_file():
         kind, render = SCAN, lambda: render_scan_page(load_scan(result))
     else:

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from rangesim.cli.own_sensors import OwnSensors, load_own_sensors
 from rangesim.errors import RangesimError, one_line
 
 
@@ -22,14 +23,7 @@ def view_command(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a page that exists.")] = False,
     open_page: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
-    sensor: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="A sensor of your own that the result contains, as FILE.py:NAME. The file is run. Repeat the option "
-            "for several sensors.",
-            show_default=False,
-        ),
-    ] = None,
+    sensor: OwnSensors = None,
 ) -> None:
     """Write one HTML page with the clouds of a result or of a scan, which opens without a network.
 
@@ -43,10 +37,8 @@ def view_command(
     from rangesim.report.clouds_page import render_clouds_page, render_scan_clouds_page
     from rangesim.results.experiment_results import load_result, read_settings
     from rangesim.results.scan_results import SCAN, load_scan
-    from rangesim.sensors import sensor_of
 
-    for name in sensor or ():
-        sensor_of(name)  # from then on the sensor's class is known by its type_name
+    load_own_sensors(sensor)
     target = Path(f"{result.absolute().name}.html") if out is None else out
     if target.exists() and not (overwrite and target.is_file()):
         raise RangesimError(f"{target} exists: add --overwrite, or choose another --out.")
