@@ -26,6 +26,7 @@ import numpy as np
 
 import rangesim
 from rangesim import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
+from rangesim.codes import GrayPhase
 from rangesim.instrument.instrument import Instrument
 from rangesim.motion import Motion, PoseTrack, Timing, transport_moving
 
@@ -36,7 +37,7 @@ PROJECTOR = (256, 160)
 SENSORS: dict[str, Sensor] = {
     "gray": StructuredLight(*PROJECTOR, code="gray", axes=("columns", "rows")),
     "gray-phase": StructuredLight(*PROJECTOR, axes=("columns",)),
-    "fringes-both": StructuredLight(*PROJECTOR, axes=("columns", "rows"), period_px=20.0, steps=5),
+    "fringes-both": StructuredLight(*PROJECTOR, GrayPhase(20.0, 5), axes=("columns", "rows")),
     "amcw": AmcwToF(),
     "amcw-square": AmcwToF((30e6, 50e6), waveform="square"),
     "direct": DirectToF(),

@@ -25,13 +25,14 @@ from finite_aperture import Lamp, finite_aperture
 from reference_scenes import GLASS, MATTE, Guide
 
 from rangesim import Intrinsics, Rig, Scene, Signals, StructuredLight, decode, expose, load_scene, look_at, transport
+from rangesim.codes import GrayPhase
 from rangesim.environment.backend import select_variant
 from rangesim.response import Fringes
 
 BOARD_M, PERIOD_PX, MAX_DEPTH = 0.6, 16.0, 12
 BALL_M, BALL_RADIUS_M, SHELL_M = 0.5, 0.05, 0.0015
 LAMP_RADIUS_M = 0.004
-SENSOR = StructuredLight(code="gray-phase", period_px=PERIOD_PX)
+SENSOR = StructuredLight(code=GrayPhase(PERIOD_PX))
 
 
 class Case(NamedTuple):

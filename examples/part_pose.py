@@ -24,7 +24,6 @@ import rangesim
 from rangesim import StructuredLight
 from rangesim.calibration import Checkerboard
 from rangesim.geometry import find_camera_pose, icp, register
-from rangesim.sensors.structured_light import WHITE
 
 BOXES_M = np.array(
     [
@@ -121,7 +120,7 @@ def main() -> None:
     capture = rangesim.expose(signals, sensor, sensor.default_detector)
     true = np.linalg.inv(rig.T_world_camera) @ T_world_part
 
-    view = LABEL.find(capture.frames[WHITE])
+    view = LABEL.find(capture.sensor.white_image(capture.frames))
     T = label_pose()
     on_part = LABEL.points[view.indices] @ T[:3, :3].T + T[:3, 3]
     by_label = find_camera_pose(on_part, view.pixels, rig.camera, noise_px=0.3)
@@ -145,7 +144,14 @@ def main() -> None:
     for name, found in poses.items():
         degrees, off_mm = errors(found, true, model)
         print(f"{name:30s}{degrees:10.3f} °{off_mm:13.3f} mm")
-    draw(args.out, capture.frames[WHITE], rig.camera, poses["label, then ICP of the scan"], scan[near], true)
+    draw(
+        args.out,
+        capture.sensor.white_image(capture.frames),
+        rig.camera,
+        poses["label, then ICP of the scan"],
+        scan[near],
+        true,
+    )
     print(args.out)
 
 

@@ -32,7 +32,6 @@ from rangesim.environment.backend import select_variant
 from rangesim.fusion.mesh_error import distances_to
 from rangesim.multiview import StructureFromMotion, Tracks, structure_from_motion
 from rangesim.scene.triangles import true_surfaces
-from rangesim.sensors.structured_light import WHITE
 from rangesim.triangle_mesh import TriangleMesh
 
 RATIO = 0.75
@@ -97,7 +96,7 @@ def scanned(world: rangesim.Scene, rig: rangesim.Rig, sensor: StructuredLight, T
     signals = rangesim.transport(world, replace(rig, T_world_camera=T), [sensor], spp=16, seed=seed)
     capture = rangesim.expose(signals, sensor, sensor.default_detector, seed=seed)
     image = rangesim.decode(capture)
-    white = capture.frames[WHITE].astype(np.float64)
+    white = capture.sensor.white_image(capture.frames).astype(np.float64)
     # equal light everywhere in the picture: the lamp is nearer here and farther there
     even = white / cv2.GaussianBlur(white, (0, 0), 0.05 * white.shape[1])
     grey = np.clip(110 * even, 0, 255).astype(np.uint8)

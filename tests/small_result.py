@@ -21,7 +21,7 @@ from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = ROOT / "scenes"
 SENSORS = {
-    "lines": StructuredLight(256, 160, period_px=16),
+    "lines": StructuredLight(256, 160),
     "amcw": AmcwToF(),
     "histogram": DirectToF(bins=64, bin_s=400e-12),
     "ideal": IdealToF(),

@@ -19,6 +19,7 @@ from synthetic import plane_signals, stereo_rig
 from rangesim import save_capture
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
+from rangesim.codes import GrayPhase
 from rangesim.electronics.detector import Detector, PhotoDetector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import FileFormatError
@@ -42,7 +43,7 @@ def small_capture(detector: PhotoDetector | None = None, sensor: Sensor = SMALL)
         (SMALL, None),
         (SMALL, Detector()),
         (SMALL, Detector(bits=8)),
-        (StructuredLight(8, 4, axes=("columns", "rows"), period_px=4.0), Detector(bits=16)),
+        (StructuredLight(8, 4, GrayPhase(4.0), ("columns", "rows")), Detector(bits=16)),
         (AmcwToF(waveform="square"), Detector.time_of_flight()),
         (DirectToF(bins=20, bin_s=1e-9), SpadDetector(pile_up=True)),
         (IdealToF(), None),

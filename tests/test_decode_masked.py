@@ -13,6 +13,7 @@ from synthetic import plane_signals, stereo_rig
 from rangesim import save_range_image
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
+from rangesim.codes import GrayPhase
 from rangesim.decoding import decode
 from rangesim.decoding.status import Status
 from rangesim.files.image_files import write_grey
@@ -24,7 +25,7 @@ from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight
 SENSORS = [
     StructuredLight(code="gray", axes=("columns", "rows")),
     StructuredLight(code="gray"),
-    StructuredLight(period_px=11.0, steps=5),
+    StructuredLight(code=GrayPhase(11.0, 5)),
     AmcwToF(),
     DirectToF(),
     IdealToF(),

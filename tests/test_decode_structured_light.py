@@ -14,6 +14,7 @@ from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
+from rangesim.codes import GrayPhase
 from rangesim.decoding import decode
 from rangesim.decoding.phase_shift import phase_of
 from rangesim.decoding.status import Status
@@ -48,7 +49,7 @@ def test_gray_patterns_decode_to_their_own_coordinates(width: int, height: int, 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(20, 300), st.floats(4, 40), st.integers(3, 7))
 def test_phase_patterns_decode_to_their_own_coordinates(width: int, period: float, steps: int) -> None:
-    sensor = StructuredLight(width, 4, "gray-phase", BOTH, period_px=period, steps=steps)
+    sensor = StructuredLight(width, 4, GrayPhase(period, steps), BOTH)
     image = decode(Capture(sensor.patterns(), sensor))
     assert (image.status == Status.OK).all()
     assert image.projector_column is not None
@@ -105,9 +106,9 @@ def test_code_beyond_the_projector_and_contradiction_of_code_and_phase_are_code_
     frames[0:2, 0, 0] = [255, 0]  # 100000 in Gray code is 63
     assert decode(Capture(frames, sensor)).status[0, 0] == Status.CODE_ERROR
 
-    sensor = StructuredLight(256, 2, "gray-phase", period_px=32)
+    sensor = StructuredLight(256, 2, GrayPhase(32.0))
     frames = capture_of_patterns(sensor).frames.copy()
-    run = slice(len(frames) - 2 - sensor.steps, len(frames) - 2)
+    run = slice(len(frames) - 2 - sensor.code.steps, len(frames) - 2)
     frames[run, :, 100] = frames[run, :, 100 + 19]
     status = decode(Capture(frames, sensor)).status
     assert (status[:, 100] == Status.CODE_ERROR).all()
@@ -129,15 +130,15 @@ def test_dark_and_saturated_pixels_say_so() -> None:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_noise_of_phase_shift_is_that_of_theory(seed: int) -> None:
     """sigma_u = P / (2 pi) sqrt(2 / N) sigma_I / B, with sigma_I from EMVA 1288 at the mean of the fringes."""
-    rig, sensor = stereo_rig(), StructuredLight(period_px=32, steps=4)
+    rig, sensor = stereo_rig(), StructuredLight(code=GrayPhase(32.0))
     signals = plane_signals(rig, sensor, ambient=0.02)
     capture = expose(signals, sensor, Detector(), seed=seed)
     image = decode(capture)
-    phase = phase_of(capture.frames[-2 - sensor.steps : -2])
+    phase = phase_of(capture.frames[-2 - sensor.code.steps : -2])
     noise = capture.noise(phase.mean)
     assert noise is not None
     assert image.projector_column is not None
-    sigma = sensor.period_px / (2 * np.pi) * np.sqrt(2 / sensor.steps) * noise / phase.modulation
+    sigma = sensor.code.period_px / (2 * np.pi) * np.sqrt(2 / sensor.code.steps) * noise / phase.modulation
     inside = image.valid
     normalised = (image.projector_column - signals.truth.projector_uv[..., 0])[inside] / sigma[inside]
     assert abs(normalised.std() - 1) < 0.1

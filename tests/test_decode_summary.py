@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from code_frames import run_of
 from synthetic import plane_signals, stereo_rig
 from typer.testing import CliRunner
 
@@ -41,7 +42,7 @@ def decoded(capture: Capture, directory: Path, *options: str) -> tuple[str, dict
     assert isinstance(sensor, StructuredLight)
     save_capture(capture, directory / "images")
     (directory / "images" / "capture.json").unlink()
-    own = ["--projector", f"{sensor.projector_width}x{sensor.projector_height}", "--code", sensor.code]
+    own = ["--projector", f"{sensor.projector_width}x{sensor.projector_height}", "--code", sensor.code.type_name]
     own += ["--axes", ",".join(sensor.axes), "--out", str(directory / "out")]
     answer = CliRunner().invoke(app, ["decode", str(directory / "images"), *own, *options])
     assert answer.exit_code == 0, answer.output
@@ -103,7 +104,7 @@ def test_rows_shown_first_are_the_cause(size: tuple[int, int], tmp_path: Path) -
     capture = replace(capture, detector=None, rig=None)
     _, info = decoded(capture, tmp_path / "right", "--bits", "12")
     assert info["likely_cause"] is None
-    columns, rows = (run.span for run in sensor.layout())
+    columns, rows = run_of(sensor, "columns"), run_of(sensor, "rows")
     frames = np.concatenate([capture.frames[rows], capture.frames[columns], capture.frames[-2:]])
     text, info = decoded(replace(capture, frames=frames), tmp_path / "wrong", "--bits", "12")
     assert "rows may have been shown first" in str(info["likely_cause"])

@@ -9,28 +9,29 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from code_frames import run_of
 from synthetic import plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
+from rangesim.codes import GrayPhase
 from rangesim.decoding import decode
 from rangesim.electronics.detector import Detector
 from rangesim.errors import RangesimWarning
-from rangesim.response import GrayBits
 from rangesim.rig import translation
 from rangesim.sensors import StructuredLight
 
 SENSORS = [
     StructuredLight(),
-    StructuredLight(steps=3),
-    StructuredLight(axes=("columns", "rows"), period_px=20.0),
-    StructuredLight(period_px=37.0, steps=6),
+    StructuredLight(code=GrayPhase(steps=3)),
+    StructuredLight(code=GrayPhase(20.0), axes=("columns", "rows")),
+    StructuredLight(code=GrayPhase(37.0, 6)),
 ]
 
 
 def fringes(sensor: StructuredLight) -> list[slice]:
     """Where the frames of the fringes stand, per axis."""
-    return [run.span for run in sensor.layout()][1::2]
+    return [run_of(sensor, f"{axis}_phase") for axis in sensor.axes]
 
 
 def capture_of(sensor: StructuredLight, detector: Detector | None = None, exposure_s: float = 1e-3) -> Capture:
@@ -43,14 +44,14 @@ def with_fringes(capture: Capture, change: str, amount: float = 0.0) -> Capture:
     sensor = capture.sensor
     assert isinstance(sensor, StructuredLight)
     frames = capture.frames.copy()
-    steps = 2 * np.pi * np.arange(sensor.steps) / sensor.steps
+    steps = 2 * np.pi * np.arange(sensor.code.steps) / sensor.code.steps
     for run in fringes(sensor):
         shown = frames[run].astype(np.float64)
         mean = shown.mean(axis=0)
-        vector = 2 / sensor.steps * np.tensordot(np.exp(1j * steps), shown, axes=1)
+        vector = 2 / sensor.code.steps * np.tensordot(np.exp(1j * steps), shown, axes=1)
         if change == "reversed":
             vector = vector.conj()
-        vector = vector * np.exp(-2j * np.pi * amount / sensor.period_px)
+        vector = vector * np.exp(-2j * np.pi * amount / sensor.code.period_px)
         frames[run] = [mean + (vector * np.exp(-1j * s)).real for s in steps]
     return replace(capture, frames=frames)
 
@@ -73,7 +74,7 @@ def test_fringes_in_the_other_direction_are_named(sensor: StructuredLight) -> No
 @pytest.mark.parametrize("quarters", [-1, 1])
 def test_a_start_at_sine_is_named_with_its_pixels(sensor: StructuredLight, quarters: int) -> None:
     sensor = replace(sensor, axes=("columns",))
-    later = quarters * sensor.period_px / 4
+    later = quarters * sensor.code.period_px / 4
     with pytest.warns(RangesimWarning, match="contradict the Gray code") as caught:
         decode(with_fringes(capture_of(sensor), "later", later))
     found = re.search(
@@ -88,7 +89,7 @@ def test_a_start_at_sine_is_named_with_its_pixels(sensor: StructuredLight, quart
 @pytest.mark.parametrize("steps", [3, 4, 5])
 @pytest.mark.parametrize("exposure_s", [None, 4e-4])
 def test_a_start_half_a_pixel_off_is_named(later: float, steps: int, exposure_s: float | None) -> None:
-    sensor = StructuredLight(steps=steps)
+    sensor = StructuredLight(code=GrayPhase(steps=steps))
     capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
     with pytest.warns(
         RangesimWarning, match=rf"start 0\.[456] projector pixels too {'late' if later > 0 else 'early'}"
@@ -100,7 +101,7 @@ def test_a_start_half_a_pixel_off_is_named(later: float, steps: int, exposure_s:
 @pytest.mark.parametrize("steps", [3, 4, 6])
 @pytest.mark.parametrize("exposure_s", [None, 4e-4, 1e-4])
 def test_a_black_frame_and_a_repeated_one_are_named(frame: int, steps: int, exposure_s: float | None) -> None:
-    sensor = StructuredLight(steps=steps)
+    sensor = StructuredLight(code=GrayPhase(steps=steps))
     capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
     run, (black, repeated) = fringes(sensor)[0], capture.frames[None].repeat(2, axis=0)
     black[run.start + frame] = black[-1]
@@ -117,7 +118,7 @@ def test_a_black_frame_and_a_repeated_one_are_named(frame: int, steps: int, expo
 @pytest.mark.parametrize("exposure_s", [None, 4e-4])
 def test_a_gamma_is_named_with_the_mean_it_makes(gamma: float, steps: int, exposure_s: float | None) -> None:
     """The mean of ((1 + cos x) / 2)^gamma is G(gamma + 1/2) / (sqrt(pi) G(gamma + 1))."""
-    sensor = StructuredLight(steps=steps)
+    sensor = StructuredLight(code=GrayPhase(steps=steps))
     capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
     frames, run = capture.frames.copy(), fringes(sensor)[0]
     black = frames[-1].astype(np.float64)
@@ -137,8 +138,8 @@ def as_plain_binary(capture: Capture) -> Capture:
     sensor = capture.sensor
     assert isinstance(sensor, StructuredLight)
     frames = capture.frames.copy()
-    runs = [run.span for run in sensor.layout() if isinstance(run.response, GrayBits)]
-    for run in runs:
+    for axis in sensor.axes:
+        run = run_of(sensor, f"{axis}_bit")
         pairs = frames[run].reshape(-1, 2, *frames.shape[1:])
         shown = np.logical_xor.accumulate(pairs[:, 0] > pairs[:, 1], axis=0)
         pairs[:, 0], pairs[:, 1] = (np.where(s, pairs.max(axis=1), pairs.min(axis=1)) for s in (shown, ~shown))
@@ -220,7 +221,7 @@ def test_fringes_finer_than_the_pixels_of_the_camera_are_named_with_what_is_left
     period_px: float, block: int, steps: int
 ) -> None:
     """A pixel as wide as `block` projector pixels leaves |sin x / x|, x = pi block / period, of the fringes."""
-    sensor = StructuredLight(block * 60, 400, axes=("columns",), period_px=period_px, steps=steps)
+    sensor = StructuredLight(block * 60, 400, GrayPhase(period_px, steps))
     seen = sensor.patterns().reshape(sensor.n_frames, 400, 60, block).mean(axis=-1)
     noise = np.random.default_rng(1).normal(size=seen.shape)
     with pytest.warns(RangesimWarning, match="too fine for the camera, or out of focus") as caught:

@@ -10,6 +10,7 @@ import pytest
 from synthetic import plane_signals, stereo_rig
 
 from rangesim.capture.exposure import expose
+from rangesim.codes import GrayPhase
 from rangesim.decoding import decode
 from rangesim.decoding.path_length import PathLengths
 from rangesim.decoding.triangulation import ProjectorCoordinates
@@ -39,7 +40,7 @@ def test_coordinates_and_then_the_rig_are_the_range_image(sensor: Sensor) -> Non
     ("sensor", "detector", "exposure_s", "ambient"),
     [
         (BOTH, Detector(), 1e-4, 0.02),
-        (StructuredLight(steps=3, period_px=20.0), Detector(), 2e-4, 0.0),
+        (StructuredLight(code=GrayPhase(20.0, 3)), Detector(), 2e-4, 0.0),
         (AmcwToF(), Detector.time_of_flight(), 1e-3, 0.02),
         (AmcwToF((30e6,)), Detector.time_of_flight(), 4e-4, 0.1),
         (AmcwToF(waveform="square"), Detector.time_of_flight(), 1e-3, 0.02),

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from code_frames import run_of
 from synthetic import plane_signals, stereo_rig
 
 from rangesim.capture import Capture
@@ -32,7 +33,7 @@ def reordered(capture: Capture, order: Callable[[np.ndarray], np.ndarray], axis:
     """The capture with the frames of an axis as `order` returns them, of (bits, 2, h, w), most significant first."""
     sensor, frames = capture.sensor, capture.frames.copy()
     assert isinstance(sensor, StructuredLight)
-    run = next(r.span for r in sensor.layout() if r.axis == axis)
+    run = run_of(sensor, f"{axis}_bit")
     pairs = frames[run].reshape(-1, 2, *frames.shape[1:])
     frames[run] = order(pairs).reshape(-1, *frames.shape[1:])
     return replace(capture, frames=frames)

@@ -41,11 +41,11 @@ def test_gray_stripes_out_of_focus_are_the_convolved_stripes(bit: int, periods: 
     """Brute force: the stripes' spectrum times that of the Gaussian, 65536 samples per period."""
     period = 4 * 2**bit
     x = (np.arange(65536) + 0.5) / 65536 * period
-    sharp = GrayBits(0, bit + 1, bit).weights(path(x, 0 * x, None), MATH)[0]
+    sharp = GrayBits(0, 1, 1 << bit).weights(path(x, 0 * x, None), MATH)[0]
     f = np.fft.rfftfreq(len(x), period / len(x))
     sigma = periods * period
     expected = np.fft.irfft(np.fft.rfft(sharp) * np.exp(-2 * (np.pi * sigma * f) ** 2), len(x))
-    blurred = GrayBits(0, bit + 1, bit).weights(path(x + 3 * period, 0 * x, sigma), MATH)[0]
+    blurred = GrayBits(0, 1, 1 << bit).weights(path(x + 3 * period, 0 * x, sigma), MATH)[0]
     np.testing.assert_allclose(blurred, expected, atol=5e-4)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from rangesim import Intrinsics, Scene, Sensor, load_scene, look_at
+from rangesim.codes import GrayPhase
 from rangesim.electronics.detector import Detector
 from rangesim.errors import RangesimWarning
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
@@ -113,7 +114,7 @@ def test_a_pass_is_shared_where_emitter_wavelength_and_camera_agree(plane: Scene
 
 def test_instruments_of_different_sizes_stand_in_one_result(tmp_path: Path) -> None:
     instruments = (
-        Instrument("lines", StructuredLight(64, 40, period_px=8.0), width=48),
+        Instrument("lines", StructuredLight(64, 40, GrayPhase(8.0)), width=48),
         Instrument("tof", AmcwToF(), camera=CAMERA),
     )
     experiment = Experiment("plane", instruments=instruments, width=32, height=24, spp=4)

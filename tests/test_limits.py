@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from rangesim.codes import GrayPhase
 from rangesim.experiment import Experiment
 from rangesim.motion import Timing
 from rangesim.response import Images
@@ -22,7 +23,7 @@ from rangesim.settings import limits
 ROOT = Path(__file__).resolve().parent.parent
 
 TOO_LARGE: dict[str, tuple[str, Callable[[], Any]]] = {
-    "steps": ("steps", lambda: StructuredLight(steps=10**30)),
+    "steps": ("steps", lambda: GrayPhase(steps=10**30)),
     "bins": ("bins", lambda: DirectToF(bins=10**9)),
     "fine bins": ("bins", lambda: DirectToF(bins=60_000, pulse_fwhm_s=1e-10)),
     "projector": ("projector", lambda: StructuredLight(projector_width=10**6)),

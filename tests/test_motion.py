@@ -19,6 +19,7 @@ from tiers import to_validate
 import rangesim
 from rangesim import AmcwToF, DirectToF, IdealToF, Intrinsics, Rig, Scene, Sensor, Signals, StructuredLight, transport
 from rangesim.causes import Cause
+from rangesim.codes import GrayPhase
 from rangesim.decoding.phase_shift import phase_of, tap_phase
 from rangesim.experiment import experiment_from_dict, experiment_to_dict
 from rangesim.motion import ConstantTwist, Motion, MovingSignals, PoseTrack, Timing, transport_moving
@@ -290,7 +291,7 @@ def test_fringes_one_after_another_of_a_plane_that_recedes(plane: Scene) -> None
     baseline, speed, period, size = 0.2, 0.1, 0.01, (256, 160)
     projector = Intrinsics.from_fov(*size, 70)
     rig = straight_rig(plane, baseline, projector)
-    sensor = StructuredLight(*size, period_px=32)
+    sensor = StructuredLight(*size, GrayPhase(32.0))
     motion = Motion({"wall": ConstantTwist((0.0, speed, 0.0))})
     steps = [i for i, name in enumerate(sensor.frame_names()) if "phase" in name]
 
@@ -302,8 +303,8 @@ def test_fringes_one_after_another_of_a_plane_that_recedes(plane: Scene) -> None
     z = 1 + speed * period * np.mean(steps)
     x = rig.camera.normalise(rig.camera.pixel_centres())[..., 0]
     u = projector.cx + projector.fx * (x - baseline / z)
-    phase = 2 * np.pi / sensor.period_px * u
-    drift = 2 * np.pi / sensor.period_px * projector.fx * baseline / z**2 * speed * period
+    phase = 2 * np.pi / sensor.code.period_px * u
+    drift = 2 * np.pi / sensor.code.period_px * projector.fx * baseline / z**2 * speed * period
     lit = (u > 1) & (u < size[0] - 1)
     measured = wrapped(2 * np.pi * (phase_of(one_by_one).normalised - phase_of(at_once).normalised))[lit]
     expected = phase_error(phase, np.full_like(phase, drift), 2 * speed * period / z, 1.0)[lit]

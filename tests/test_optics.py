@@ -355,7 +355,7 @@ def test_fringes_lose_the_contrast_that_the_formula_says(plane: rangesim.Scene, 
 @pytest.mark.validation
 def test_the_modulation_that_a_camera_measures_falls_with_depth(plane: rangesim.Scene) -> None:
     """A camera close to the projector and turned away sees the plane at many depths z of the projector."""
-    sensor = StructuredLight(320, 200, steps=4)
+    sensor = StructuredLight(320, 200)
     turn = look_at((0.05, 0, 0), (0.9, 0, 1.0), (0, -1, 0))  # 42 degrees: the plane recedes along the projector's x
     rig = before_plane(plane, 96, 72, projector=Intrinsics.from_fov(320, 200, 60), T_camera_projector=turn)
     rig = dataclasses.replace(rig, projector_lens=Lens(0.05, focus_m=0.7))
@@ -402,7 +402,7 @@ def test_prefiltered_patterns_are_the_mean_over_the_projector_s_lens(matte: rang
     """
     focus, aperture, n = 0.6, 8e-3, 37
     rig = matte.rig(width=64, height=48, projector_size=(320, 200))
-    fringes, gray = Fringes(0, 16.0), GrayBits(0, 9, 3)
+    fringes, gray = Fringes(0, 16.0), GrayBits(0, 6, 8)
     total: dict[Any, Any] = {fringes: 0.0, gray: 0.0}
     for i in range(n):  # Vogel's spiral fills the disc evenly
         radius, angle = aperture * np.sqrt((i + 0.5) / n), i * 2.399963229728653

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
@@ -33,16 +34,16 @@ from rangesim import (
 )
 from rangesim.calibration import Checkerboard, default_rig, render_set
 from rangesim.causes import Cause
+from rangesim.codes import AxisCode, AxisFrames, CodeThresholds, GrayCode, GrayPhase, GrayThresholds
+from rangesim.codes.phase_refinement import refine_by_phase
 from rangesim.decoding.coordinates import Coordinates
-from rangesim.decoding.gray import GrayThresholds
 from rangesim.errors import FileFormatError
 from rangesim.experiment import experiment_from_dict, load_experiment
 from rangesim.instrument.instrument import Instrument
-from rangesim.response import Response
+from rangesim.response import DenseResponse, Response
 from rangesim.rig.calibration_files import load_calibration
 from rangesim.sensor import Background
 from rangesim.sensors import AmcwDecoder, StructuredLightDecoder, presets, sensor_from_dict, sensor_of
-from rangesim.sensors.coded_frames import CodedFrames, FringeFrames
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 GATED = f"{EXAMPLES / 'own_sensor.py'}:GatedCamera"
@@ -159,48 +160,67 @@ def test_options_of_bare_images_that_a_sensor_lacks_are_refused(tmp_path: Path) 
     (tmp_path / "images").mkdir()
     for options, message in (
         (("--code", "amcw", "--projector", "64x64"), "expected a sensor whose code has the size of a projector"),
-        (("--sensor", FRINGES, "--period", 8), "unknown key 'period_px' (did you mean 'periods'?)"),
+        (("--sensor", FRINGES, "--set", "period_px=8"), "unknown setting 'period_px' (did you mean 'periods'?)"),
         (("--sensor", FRINGES, "--code", "gray"), "expected either --sensor or --code"),
         (("--code", "amcw"), "expected 12 images for amcw-tof"),
     ):
         assert message in command("decode", tmp_path / "images", *options, "--out", tmp_path / "out", fails=True)
 
 
-# ---- Runs of frames from outside ------------------------------------------------------------------------------------
-
-
-class FineFringes(FringeFrames):
-    """A second run of fringes on an axis."""
-
-    def names(self) -> list[str]:
-        return [f"{self.axis}_fine{step}" for step in range(self.steps)]
+# ---- Codes from outside ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class TwoPeriods(StructuredLight):
+class TwoPeriods(GrayPhase):
     """Gray code and fringes of two periods, the second a quarter of the first."""
 
     type_name: ClassVar[str] = "two-periods"
 
-    def layout(self) -> tuple[CodedFrames, ...]:
-        runs = super().layout()
-        fine = FineFringes(self.axes[0], self.size(self.axes[0]), runs[-1].span.stop, self.period_px / 4, 3)
-        return (*runs, fine)
+    @property
+    def fine(self) -> GrayPhase:
+        return GrayPhase(self.period_px / 4, 3)
+
+    def names(self, size: int) -> list[str]:
+        return [*super().names(size), "fine0", "fine1", "fine2"]
+
+    def patterns(self, size: int) -> np.ndarray:
+        return np.concatenate([super().patterns(size), self.fine.patterns(size)[-3:]])
+
+    def responses(self, axis: int, size: int) -> tuple[DenseResponse, ...]:
+        return (*super().responses(axis, size), self.fine.responses(axis, size)[-1])
+
+    def frames(self, size: int, channels: Sequence[np.ndarray], white: np.ndarray) -> Iterator[np.ndarray]:
+        yield from super().frames(size, channels[:-1], white)
+        yield from list(self.fine.frames(size, [channels[0], channels[-1]], white))[-3:]
+
+    def decode(self, seen: AxisFrames, thresholds: CodeThresholds) -> AxisCode:
+        coarse, swing = super().decode(seen, thresholds), 0 * seen.contrast.values
+        fine = seen.starting_with("fine")
+        return refine_by_phase(fine, coarse, self.fine.period_px, self.convention, swing, thresholds.phase)
+
+    def contradiction(self, seen: AxisFrames, code: AxisCode) -> str | None:
+        assert code.coarse is not None
+        return super().contradiction(seen, code.coarse)
 
 
-def test_a_layout_of_other_runs_is_framed_named_and_decoded() -> None:
-    """By the decoder of the package, for a run decodes itself."""
-    sensor = TwoPeriods()
+def test_a_code_from_outside_is_framed_named_and_decoded() -> None:
+    sensor = StructuredLight(code=TwoPeriods())
     assert sensor.frame_names()[-5:] == ["columns_fine0", "columns_fine1", "columns_fine2", "white", "black"]
     signals = plane_signals(stereo_rig(), sensor, StructuredLight())
     exact = sensor.default_decoder.coordinates(expose(signals, sensor))
-    assert np.nanmax(np.abs(exact.column - signals.truth.projector_uv[..., 0])) < 1e-3  # type: ignore[attr-defined]
-    scatter = {}
+    assert np.nanmax(np.abs(exact.column - signals.truth.projector_uv[..., 0])) < 1e-3  # type: ignore[operator]
+    scatter = []
     for one in (sensor, StructuredLight()):
         seen = one.default_decoder.coordinates(expose(signals, one, Detector(), 2e-4, seed=1))
         assert seen.valid.mean() > 0.9
-        scatter[one.type_name] = np.nanstd(seen.column - exact.column)  # type: ignore[attr-defined]
-    assert scatter["two-periods"] < 0.5 * scatter["structured-light"]
+        scatter.append(np.nanstd(seen.column - exact.column))  # type: ignore[operator]
+    assert scatter[0] < 0.5 * scatter[1]
+
+
+def test_a_file_may_name_a_code_instead_of_a_sensor(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text("from rangesim.codes import GrayCode\nCoarse = GrayCode(cell_px=4)\n")
+    assert sensor_of(f"{tmp_path}/own.py:Coarse") == StructuredLight(code=GrayCode(4))
+    assert sensor_of(f"{tmp_path}/own.py:GrayCode") == StructuredLight(code="gray")
 
 
 # ---- The two examples are right -------------------------------------------------------------------------------------
@@ -304,8 +324,8 @@ def test_a_decoder_that_looks_at_neighbours_sees_whole_images() -> None:
         ("1 / 0", "fails: ZeroDivisionError"),
         ("import no_such_module", "fails: ModuleNotFoundError"),
         ("import sys\nsys.exit(0)", "fails: SystemExit: 0"),
-        ("class Thing: pass", "expected Thing to be a sensor or a class of sensors, got <class"),
-        ("", "expected Thing to be a sensor or a class of sensors, got None"),
+        ("class Thing: pass", "expected Thing to be a sensor, a code or a class of them, got <class"),
+        ("", "expected Thing to be a sensor, a code or a class of them, got None"),
         ("from rangesim import Sensor\nclass Thing(Sensor): pass", "Thing: TypeError: Can't instantiate abstract"),
         (f"{TWIN}\nclass Thing(AmcwToF): pass", "fails: TypeError: expected Thing to have a type_name of its own"),
         (f"{TWIN}\nclass Thing(AmcwToF): type_name = 'direct-tof'", "of its own; 'direct-tof' is taken"),

@@ -14,10 +14,9 @@ from rangesim.cli.images import (
     ALL_AXES,
     BitsOption,
     CodeOption,
-    PeriodOption,
     ProjectorOption,
     SensorOption,
-    StepsOption,
+    SetOption,
     load_frames,
     sensor_of_images,
 )
@@ -65,8 +64,7 @@ def calibrate_command(
     sensor: SensorOption = None,
     code: CodeOption = None,
     projector: ProjectorOption = None,
-    period: PeriodOption = None,
-    steps: StepsOption = None,
+    set_: SetOption = None,
     bits: BitsOption = None,
 ) -> None:
     """Calibrate camera and projector from coded light, along columns and rows, on a board in two or more poses.
@@ -110,7 +108,7 @@ def calibrate_command(
     if sensor is not None and code is not None:
         raise ValueError("expected either --sensor or --code, got both.")
     axes = ALL_AXES if sensor is None or projector is not None else None
-    taken_with = sensor_of_images(sensor, code, projector, axes, period, steps)
+    taken_with = sensor_of_images(sensor, code, projector, axes, set_)
     loaded = [load_frames(path, taken_with, bits) for path in captures]
     if several := [path for path, one in zip(captures, loaded, strict=True) if len(one.captures) > 1]:
         raise ValueError(f"expected captures of one camera, got those of several in {several[0]}.")

@@ -13,10 +13,9 @@ from rangesim.cli.images import (
     AxesOption,
     BitsOption,
     CodeOption,
-    PeriodOption,
     ProjectorOption,
     SensorOption,
-    StepsOption,
+    SetOption,
     load_frames,
     sensor_of_images,
 )
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from rangesim.capture import Capture
     from rangesim.decoding.range_image import RangeImage
 
-ONLY_BARE_IMAGES = ("code", "projector", "axes", "period", "steps", "bits")
+ONLY_BARE_IMAGES = ("code", "projector", "axes", "set_", "bits")
 """Options that bare images need. A capture with a sidecar refuses them, because the sidecar says the same."""
 
 TOF_SUFFIX = ".npz"
@@ -43,8 +42,7 @@ def decode_command(
     code: CodeOption = None,
     projector: ProjectorOption = None,
     axes: AxesOption = None,
-    period: PeriodOption = None,
-    steps: StepsOption = None,
+    set_: SetOption = None,
     code_step: Annotated[int, typer.Option(help="Projector pixels per Gray cell when an .xml was calibrated.")] = 1,
     unit: Annotated[
         float | None,
@@ -86,7 +84,7 @@ def decode_command(
 
     _refuse_what_would_be_ignored(context, capture, calibration)
     announce_linked_output(out, check_directory(out, DECODED, inputs=[capture]))
-    taken_with = sensor_of_images(sensor, code, projector, axes, period, steps)
+    taken_with = sensor_of_images(sensor, code, projector, axes, set_)
     loaded = load_frames(capture, taken_with, bits)
     if taken_with is not None and type(loaded.sensor) is not type(taken_with):
         raise ValueError(f"expected --sensor to name the sensor of {capture}, {loaded.sensor.type_name}.")
@@ -128,7 +126,7 @@ def _from_command_line(context: typer.Context, name: str) -> bool:
 
 def _options(names: tuple[str, ...], given: set[str]) -> str:
     """The names that are among `given`, written as on the command line."""
-    return ", ".join(f"--{name.replace('_', '-')}" for name in names if name in given)
+    return ", ".join(f"--{name.rstrip('_').replace('_', '-')}" for name in names if name in given)
 
 
 def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: float | None) -> Capture:

@@ -8,9 +8,10 @@ the sensor has.
 from __future__ import annotations
 
 import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -46,15 +47,14 @@ AxesOption = Annotated[
         show_default=f"{ALL_AXES}, or those of --sensor",
     ),
 ]
-PeriodOption = Annotated[
-    float | None,
+SetOption = Annotated[
+    list[str] | None,
     typer.Option(
-        "--period", help="For bare images with fringes: their period, projector pixels.", show_default="the sensor's"
+        "--set",
+        help="A setting of the sensor that took bare images, or of its code, as name=value: period_px=18, "
+        "convention.start=sin. Repeat the option for several.",
+        show_default=False,
     ),
-]
-StepsOption = Annotated[
-    int | None,
-    typer.Option("--steps", help="For bare images with fringes: phase steps per axis.", show_default="the sensor's"),
 ]
 BitsOption = Annotated[
     int | None, typer.Option("--bits", help="For bare images: bits of a value, if fewer than the file's, such as 12.")
@@ -62,14 +62,14 @@ BitsOption = Annotated[
 
 
 def sensor_of_images(
-    own: str | None, code: str | None, projector: str | None, axes: str | None, period: float | None, steps: int | None
+    own: str | None, code: str | None, projector: str | None, axes: str | None, given: list[str] | None
 ) -> Sensor | None:
     """The sensor that the options name; None if they name no sensor, or one whose projector has no known size.
 
     Parameters
     ----------
     own : value of --sensor, FILE.py:NAME. code : value of --code, a preset; None: `IMAGES_PRESET`.
-    projector, axes, period, steps : values of these options; None: not given.
+    projector, axes : values of these options; None: not given. given : values of --set.
 
     Raises
     ------
@@ -78,7 +78,6 @@ def sensor_of_images(
     """
     from rangesim.sensors import sensor_of
     from rangesim.sensors.registry import IMAGES_PRESET
-    from rangesim.settings.config import from_dict, to_dict
 
     if own is not None:
         sensor = _own_sensor(own)
@@ -89,10 +88,61 @@ def sensor_of_images(
     size = sensor.default_emitter.size if projector is None else _size(projector)
     if size is not None and (projector is not None or axes is not None):
         sensor = sensor.for_projector(*size, None if axes is None else [axis.strip() for axis in axes.split(",")])
-    given = {name: value for name, value in (("period_px", period), ("steps", steps)) if value is not None}
-    if not given:
-        return sensor
-    return from_dict(type(sensor), {**to_dict(sensor), **given}, sensor.type_name)
+    return with_settings(sensor, given or [])
+
+
+def with_settings(sensor: Sensor, given: list[str]) -> Sensor:
+    """The sensor with other settings.
+
+    Parameters
+    ----------
+    given : settings as name=value. A name is that of a field of the sensor, or of a field of its code, with or without
+        the name before it: `code.period_px` or `period_px`. A value is written as in TOML; text needs no quotes.
+
+    Raises
+    ------
+    ValueError
+        A setting without =, or that the sensor does not have or refuses.
+    """
+    from rangesim.settings.config import from_dict, nearest, shown, to_dict
+
+    table = to_dict(sensor)
+    for setting in given:
+        name, is_there, text = setting.partition("=")
+        if not is_there:
+            raise ValueError(f"expected --set as name=value, got {shown(setting)}.")
+        places = _places(table, name.strip())
+        if not places:
+            known = [path for path in _paths(table) if not path.endswith("type")]
+            raise ValueError(f"{sensor.type_name}: unknown setting {shown(name)}{nearest(name, known)}.")
+        if len(places) > 1:
+            raise ValueError(f"expected --set with one of {', '.join(places)}, got {shown(name)}.")
+        *outer, last = places[0].split(".")
+        inner = table
+        for key in outer:
+            inner = inner[key]
+        inner[last] = _toml_value(text.strip())
+    return from_dict(type(sensor), table, sensor.type_name) if given else sensor
+
+
+def _places(table: dict[str, Any], name: str) -> list[str]:
+    """Paths of the settings that a name may mean: the whole path if there is one, else all paths that end with it."""
+    paths = _paths(table)
+    return [name] if name in paths else [path for path in paths if path.endswith(f".{name}")]
+
+
+def _paths(table: dict[str, Any]) -> list[str]:
+    """Dotted paths of all settings in a table of tables."""
+    inner = [f"{key}.{path}" for key, value in table.items() if isinstance(value, dict) for path in _paths(value)]
+    return [*table, *inner]
+
+
+def _toml_value(text: str) -> Any:
+    """The value that a text stands for in TOML; the text itself if it is no TOML."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
 
 
 def _own_sensor(name: str) -> Sensor:

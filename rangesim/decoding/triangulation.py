@@ -8,8 +8,8 @@ from typing import Annotated
 
 import numpy as np
 
-from rangesim.decoding.axis_code import MIN_PIXELS
 from rangesim.decoding.coordinates import Coordinates
+from rangesim.decoding.pixel_samples import MIN_PIXELS
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status

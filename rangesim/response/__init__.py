@@ -2,7 +2,7 @@
 """Responses: the weights with which sensors count light paths. `rangesim.response.response` has the interface."""
 
 from rangesim.response.path_lengths import SPEED_OF_LIGHT, FirstReturn, LengthSplit, Phasor, TransientHistogram
-from rangesim.response.patterns import Dots, Fringes, GrayBits, Images
+from rangesim.response.patterns import Dots, Fringes, GrayBits, Images, Stripes
 from rangesim.response.pulse import Pulse
 from rangesim.response.response import (
     CAUSTIC,
@@ -41,5 +41,6 @@ __all__ = [
     "Pulse",
     "Response",
     "SparseResponse",
+    "Stripes",
     "TransientHistogram",
 ]

@@ -87,17 +87,27 @@ class BlurredImage:
 
     Parameters
     ----------
-    pattern : (height, width) float32; each pixel is a uniform square.
+    pattern : (height, width) float32; each pixel is a uniform square. Or (width,), stripes that `along` reads.
     """
 
     def __init__(self, pattern: np.ndarray) -> None:
         sharp = np.pad(np.asarray(pattern, dtype=np.float32), 1)  # blurred light also falls just outside the pattern
-        self.height, self.width = sharp.shape
+        self.height, self.width = sharp.shape if sharp.ndim == 2 else (1, sharp.size)
         variances = [MAX_READ_SIGMA_PX**2 * (VARIANCE_RATIO**k - 1) for k in range(COPIES)]
         self.copies = np.stack([_smooth(sharp, variance) for variance in variances]).ravel()
 
     def at(self, u: Any, v: Any, sigma: Any, m: Math) -> Any:
         """Value of the pattern at pixel coordinates (u, v), blurred with the standard deviation `sigma`, pixels."""
+        read = m.select(sigma < MAX_READ_SIGMA_PX, sigma, MAX_READ_SIGMA_PX)
+        return self._read(_taps(u + 1, self.width, read, m), _taps(v + 1, self.height, read, m), sigma, m)
+
+    def along(self, x: Any, sigma: Any, m: Math) -> Any:
+        """Value of stripes at the pixel coordinate x, blurred with the standard deviation `sigma`, pixels."""
+        read = m.select(sigma < MAX_READ_SIGMA_PX, sigma, MAX_READ_SIGMA_PX)
+        return self._read(_taps(x + 1, self.width, read, m), [(0, 1.0)], sigma, m)
+
+    def _read(self, columns: list[tuple[Any, Any]], rows: list[tuple[Any, Any]], sigma: Any, m: Math) -> Any:
+        """Sum of the pixels with their weights, in the copies whose blur is nearest to `sigma`."""
         variance = sigma * sigma * (1 / MAX_READ_SIGMA_PX**2)
         copy, base = 0.0 * variance, 1.0 + 0.0 * variance  # index and relative variance of the copy with less blur
         for k in range(1, COPIES - 1):
@@ -105,10 +115,8 @@ class BlurredImage:
             copy, base = m.select(beyond, float(k), copy), m.select(beyond, VARIANCE_RATIO**k, base)
         fraction = m.select(variance < VARIANCE_RATIO ** (COPIES - 1), variance / base, VARIANCE_RATIO) - 1
         fraction = m.select(fraction > 0, fraction * (1 / (VARIANCE_RATIO - 1)), 0.0)
-        sigma = m.select(sigma < MAX_READ_SIGMA_PX, sigma, MAX_READ_SIGMA_PX)
-        columns, rows = _taps(u + 1, self.width, sigma, m), _taps(v + 1, self.height, sigma, m)
         copies, offset = m.array(self.copies), m.unsigned(copy) * (self.height * self.width)
-        total = 0.0 * u
+        total = 0.0 * sigma
         for row, row_weight in rows:
             for column, weight in columns:
                 index = offset + row * self.width + column
@@ -144,6 +152,6 @@ def _smooth(image: np.ndarray, variance: float) -> np.ndarray:
     reach = int(np.ceil(5 * np.sqrt(variance))) + 8
     response = np.exp(-2 * np.pi**2 * variance * np.fft.rfftfreq(2 * reach) ** 2)
     kernel = np.fft.fftshift(np.fft.irfft(response))[1:]
-    for axis in (0, 1):
+    for axis in range(image.ndim):
         image = correlate1d(image, kernel / kernel.sum(), axis=axis, mode="constant")
     return image

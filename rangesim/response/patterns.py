@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Responses to the projector pixel that light left: Gray code, fringes, dots, images."""
+"""Responses to the projector pixel that light left: Gray code, fringes, stripes, dots, images."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Annotated, Any, ClassVar
 
@@ -38,12 +38,7 @@ class GrayBits(DenseResponse):
     ----------
     axis : 0 for columns (u), 1 for rows (v).
     bits : number of bits of the code.
-    shift : number of the finest bits to leave out.
-
-    Raises
-    ------
-    ValueError
-        A value out of its bounds, or no bit left.
+    cell_px : projector pixels per cell of the code.
 
     Examples
     --------
@@ -57,26 +52,24 @@ class GrayBits(DenseResponse):
 
     axis: Axis
     bits: Annotated[int, Bounds("a number of bits", 1, 32)]
-    shift: Annotated[int, Bounds("a number of bits", 0, 31)] = 0
+    cell_px: Annotated[int, whole(1, "projector")] = 1
 
     type_name: ClassVar[str] = "GrayBits"
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.shift >= self.bits:
-            raise ValueError(f"expected shift to leave at least one of {self.bits} bits, got {self.shift}.")
 
     @property
     def channels(self) -> int:  # type: ignore[override]
-        return self.bits - self.shift
+        return self.bits
 
     def weights(self, path: LightPath, m: Math) -> list[Any]:
+        bits = reversed(range(self.bits))
         if path.blur_px is not None:
-            bits = reversed(range(self.shift, self.bits))
-            return [blurred_stripes(path[self.axis], 4.0 * 2**b, path.blur_px, m) for b in bits]
-        coordinate = m.unsigned(path[self.axis])
-        gray = coordinate ^ (coordinate >> 1)
-        return [m.select((gray >> b) & 1 == 1, 1.0, 0.0) for b in reversed(range(self.shift, self.bits))]
+            return [blurred_stripes(path[self.axis], 4.0 * self.cell_px * 2**b, path.blur_px, m) for b in bits]
+        cell = m.unsigned(path[self.axis] * (1 / self.cell_px))
+        gray = cell ^ (cell >> 1)
+        return [m.select((gray >> b) & 1 == 1, 1.0, 0.0) for b in bits]
 
 
 @dataclass(frozen=True)
@@ -218,8 +211,103 @@ def image_of(response: DenseResponse, width: int, height: int) -> np.ndarray:
     return np.stack([np.broadcast_to(w, x.shape) for w in weights]).astype(np.float32)
 
 
+class _Tabulated(DenseResponse):
+    """A response with tables of weights. Two with the same pixels are equal, also after pickling, so sensors that show
+    them share their channels."""
+
+    patterns: np.ndarray
+
+    def _keep(self, n_dims: int, shape: str) -> None:
+        """Copy the patterns, read-only; ValueError if they are no array of finite numbers with these dimensions."""
+        values = self.patterns
+        is_array = isinstance(values, np.ndarray) and values.dtype.kind in "fiub"
+        if not is_array or values.ndim != n_dims or not values.size:
+            raise ValueError(f"expected patterns to be an array {shape} of numbers, got {shown(values)}.")
+        limits.check("frames", len(values), "patterns")
+        with np.errstate(over="ignore"):
+            kept = np.array(values, dtype=np.float32, order="C")
+        if not np.isfinite(kept).all():
+            raise ValueError("expected patterns to be finite, got NaN or infinite pixels.")
+        kept.setflags(write=False)
+        object.__setattr__(self, "patterns", kept)
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and self._digest == other._digest  # type: ignore[attr-defined]
+
+    def __hash__(self) -> int:
+        return hash(self._digest)
+
+    def __reduce__(self) -> tuple[type[_Tabulated], tuple[Any, ...]]:
+        """The class and its fields, for pickle: the blurred copies are made anew instead of stored."""
+        return type(self), tuple(getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
+
+    @cached_property
+    def _digest(self) -> str:
+        """SHA-256 of the shape, the pixels and all else. It is the same in every process; `hash` of bytes is not."""
+        others = [getattr(self, field.name) for field in fields(self) if field.name != "patterns"]  # type: ignore[arg-type]
+        digest = hashlib.sha256(repr((self.patterns.shape, *others)).encode())
+        digest.update(self.patterns.data)
+        return digest.hexdigest()
+
+    @property
+    def channels(self) -> int:  # type: ignore[override]
+        return len(self.patterns)
+
+    @cached_property
+    def _blurred(self) -> list[BlurredImage]:
+        return [BlurredImage(pattern) for pattern in self.patterns]
+
+
 @dataclass(frozen=True, eq=False)
-class Images(DenseResponse):
+class Stripes(_Tabulated):
+    """Arbitrary stripes along the projector's columns or rows, one channel per pattern.
+
+    Two stacks with the same pixels are equal. If the projector is out of focus, they are read from blurred copies.
+
+    Parameters
+    ----------
+    axis : 0 for columns (u), 1 for rows (v).
+    patterns : (k, size) float32, fraction of full power for each of the `size` pixels along the axis, each uniform. The
+        array is copied, and the copy is read-only.
+
+    Raises
+    ------
+    ValueError
+        `patterns` is no such array, has no pixels, or has pixels that are not finite.
+
+    Examples
+    --------
+    >>> from rangesim.response import LightPath, NumpyMath
+    >>> ramp = Stripes(0, np.array([[0.0, 0.5, 1.0]]))
+    >>> path = LightPath(u=np.array([0.2, 1.5, 3.0]), v=0.0, path_length_m=1.0, is_first=True)
+    >>> ramp.weights(path, NumpyMath())
+    [array([0. , 0.5, 1. ], dtype=float32)]
+    """
+
+    axis: Axis
+    patterns: np.ndarray
+
+    type_name: ClassVar[str] = "Stripes"
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        self._keep(2, "(k, size)")
+
+    def check(self, width: int, height: int) -> None:
+        size = (width, height)[self.axis]
+        if self.patterns.shape[1] != size:
+            raise ValueError(f"expected patterns of {size} pixels for the projector, got {self.patterns.shape[1]}.")
+
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        x, size = path[self.axis], self.patterns.shape[1]
+        if path.blur_px is not None:
+            return [image.along(x, path.blur_px, m) for image in self._blurred]
+        index = m.unsigned(m.select(x < size, x, size - 1.0))
+        return [m.lookup(pattern, index) for pattern in self.patterns]
+
+
+@dataclass(frozen=True, eq=False)
+class Images(_Tabulated):
     """Arbitrary patterns, read at the projector pixel that the light left.
 
     Two stacks with the same pixels are equal, also after pickling, so sensors that show them share their channels. If
@@ -250,37 +338,7 @@ class Images(DenseResponse):
     type_name: ClassVar[str] = "Images"
 
     def __post_init__(self) -> None:
-        values = self.patterns
-        if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiub" or values.ndim != 3 or not values.size:
-            raise ValueError(f"expected patterns to be an array (k, height, width) of numbers, got {shown(values)}.")
-        limits.check("frames", len(values), "patterns")
-        with np.errstate(over="ignore"):
-            kept = np.array(values, dtype=np.float32, order="C")
-        if not np.isfinite(kept).all():
-            raise ValueError("expected patterns to be finite, got NaN or infinite pixels.")
-        kept.setflags(write=False)
-        object.__setattr__(self, "patterns", kept)
-
-    def __eq__(self, other: object) -> bool:
-        return type(other) is type(self) and self._digest == other._digest  # type: ignore[attr-defined]
-
-    def __hash__(self) -> int:
-        return hash(self._digest)
-
-    def __reduce__(self) -> tuple[type[Images], tuple[np.ndarray]]:
-        """The class and its patterns, for pickle: the blurred copies are made anew instead of stored."""
-        return type(self), (self.patterns,)
-
-    @cached_property
-    def _digest(self) -> str:
-        """SHA-256 of the shape and the pixels. It is the same in every process; `hash` of bytes is not."""
-        digest = hashlib.sha256(repr(self.patterns.shape).encode())
-        digest.update(self.patterns.data)
-        return digest.hexdigest()
-
-    @property
-    def channels(self) -> int:  # type: ignore[override]
-        return len(self.patterns)
+        self._keep(3, "(k, height, width)")
 
     def check(self, width: int, height: int) -> None:
         if self.patterns.shape[1:] != (height, width):
@@ -297,7 +355,3 @@ class Images(DenseResponse):
         row = m.unsigned(m.select(path.v < height, path.v, height - 1.0))
         index = row * width + column
         return [m.lookup(pattern.ravel(), index) for pattern in self.patterns]
-
-    @cached_property
-    def _blurred(self) -> list[BlurredImage]:
-        return [BlurredImage(pattern) for pattern in self.patterns]

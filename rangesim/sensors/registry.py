@@ -11,8 +11,10 @@ from types import ModuleType
 from typing import Any
 
 from pcgraph.plumbing.python_files import module_of_file
+from rangesim.codes import Code
 from rangesim.errors import FileFormatError
 from rangesim.sensor import Decoder, Sensor
+from rangesim.sensors.structured_light import StructuredLight
 from rangesim.settings.config import Named, brief, from_dict, nearest, shown, to_dict
 
 IMAGES_PRESET = "gray"
@@ -51,7 +53,7 @@ def _presets_of(kind: type[Sensor]) -> dict[str, Sensor]:
 
 
 def sensor_of(name: str, files_in: Path | None = Path()) -> Sensor:
-    """The sensor that a name stands for: a preset, or FILE.py:NAME, a sensor or a class of sensors in a Python file.
+    """The sensor that a name stands for: a preset, or FILE.py:NAME for a sensor, a code or a class in a Python file.
 
     Loading a file runs it, so only name files that you trust. Its classes are known from then on, in captures and
     results too. A file that has changed is loaded again.
@@ -66,12 +68,12 @@ def sensor_of(name: str, files_in: Path | None = Path()) -> Sensor:
     ValueError
         No such preset; the message names the nearest one.
     FileFormatError
-        The file is missing or fails, or NAME is no sensor.
+        The file is missing or fails, or NAME is no sensor and no code.
 
     Examples
     --------
     >>> sensor_of("gray").code
-    'gray'
+    GrayCode(cell_px=1)
     >>> sensor_of("grey", files_in=None)
     Traceback (most recent call last):
     ValueError: expected a sensor out of ..., got 'grey' (did you mean 'gray'?).
@@ -167,14 +169,18 @@ def _sensor_in(path: Path, attribute: str) -> Sensor:
     """The sensor of that name in a Python file. If the name is a class, its sensor with the default settings."""
     found = getattr(_module(path), attribute, None)
     try:
-        if isinstance(found, type) and issubclass(found, Sensor):
+        if isinstance(found, type) and issubclass(found, (Sensor, Code)):
             found = found()
+        if isinstance(found, Code):
+            found = StructuredLight(code=found)
         if isinstance(found, Sensor):
             check_sensor(found)
             return found
     except Exception as error:  # a file of a user may raise anything
         raise FileFormatError(f"{path}: {attribute}: {type(error).__name__}: {brief(error)}") from error
-    raise FileFormatError(f"{path}: expected {attribute} to be a sensor or a class of sensors, got {shown(found)}.")
+    raise FileFormatError(
+        f"{path}: expected {attribute} to be a sensor, a code or a class of them, got {shown(found)}."
+    )
 
 
 def _module(path: Path) -> ModuleType:

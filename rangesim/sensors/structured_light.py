@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Temporally coded structured light: Gray code, alone or with N-step phase shift; and its decoder."""
+"""Temporally coded structured light: a projector that shows the patterns of a code in turn; and its decoder."""
 
 from __future__ import annotations
 
@@ -10,26 +10,37 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.decoding.axis_code import AxisCode, AxisFrames
-from rangesim.decoding.gray import GrayThresholds, direct_contrast
+from rangesim.codes import (
+    AXES,
+    AxisCode,
+    AxisFrames,
+    Code,
+    CodeThresholds,
+    Contrast,
+    GrayPhase,
+    GrayThresholds,
+)
+from rangesim.codes.code import stripes
+from rangesim.codes.contrast import direct_contrast
+from rangesim.codes.frame_order import in_order
 from rangesim.decoding.phase_shift import PhaseThresholds
 from rangesim.decoding.range_image import MIN_MEASURED, RangeImage
 from rangesim.decoding.status import Status
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
 from rangesim.decoding.working_range import WorkingRange
 from rangesim.errors import warn
-from rangesim.response import DenseResponse, LightPath, NumpyMath
+from rangesim.response import DenseResponse
 from rangesim.rig import Rig
 from rangesim.sensor import Background, Decoder, Emitter, Sensor, of_type
-from rangesim.sensors.coded_frames import CodedFrames, CodeThresholds, FringeFrames, GrayFrames
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, check_fields, whole
+from rangesim.settings.config import has_defaults, nearest, shown
 
-WHITE = -2
-"""Index of the frame under constant light at full power: the last but one, as in OpenCV's order."""
+WHITE = "white"
+"""Name of the frame under constant light at full power."""
 
-BLACK = -1
-"""Index of the frame without light of the projector: the last one, as in OpenCV."""
+BLACK = "black"
+"""Name of the frame without light of the projector."""
 
 MIN_CONTRAST = 0.02
 """Least difference by which black is brighter than white, as a fraction of full scale, at a pixel that counts as a sign
@@ -44,24 +55,19 @@ useless for depth: depth is then at least four times as uncertain as with the ot
 class StructuredLight(Sensor):
     """A projector that shows a stack of patterns, and a camera that takes one frame of each.
 
-    Frames, in OpenCV's order: for each axis the Gray bits, most significant first, each followed by its inverse;
-    then, with `code="gray-phase"`, the `steps` fringe patterns of that axis; at the end white and black.
+    Frames, unless `order` says otherwise: for each axis those of the code, then white and black, as in OpenCV's order.
 
     Parameters
     ----------
     projector_width, projector_height : int, pixels of the projector.
-    code : "gray" decodes to whole projector pixels, "gray-phase" [2]_ to fractions of a pixel. Phase shift in N steps
-        finds the place within a period, Gray code finds the period. The Gray bits go to half a period or finer, so that
-        a bit error at a stripe edge cannot become a period error.
-    axes : "columns" suffices to triangulate. Columns and rows give the full correspondence (calibration, checks).
-    period_px : float, period of the fringes in projector pixels.
-    steps : int >= 3, number of phase shifts.
-
-    References
-    ----------
-    - OpenCV, structured_light module, GrayCodePattern.
-    - Sansoni, Carocci, Rodella: "Three-dimensional vision based on a combination of gray-code and
-      phase-shift light projection", Applied Optics 38 (1999).
+    code : a `rangesim.codes.Code`, or the name of one: "gray" decodes to whole projector pixels, "gray-phase" to
+        fractions of a pixel; see docs/codes.md for all.
+    axes : "columns" suffices to triangulate. Columns and rows give the full correspondence (calibration, checks). The
+        axis that is named first is shown first.
+    order : entries that say which frames are shown in which order, such as ("white", "black", "*"), see
+        `rangesim.codes.frame_order.in_order`; none: all of them.
+    projector_gamma : float; a projector shows a pattern of the value p with the power p ** projector_gamma. 1 is
+        linear, as codes expect; uncorrected video projectors have about 2.2.
 
     Examples
     --------
@@ -70,54 +76,74 @@ class StructuredLight(Sensor):
     ['columns_bit2', 'columns_bit2_inverse', 'columns_bit1', 'columns_bit1_inverse']
     >>> sensor.patterns()[:, 0].astype(int)[0]  # a row of the coarsest bit
     array([0, 0, 0, 0, 1, 1, 1, 1])
+    >>> StructuredLight(4, 4, "gray", order=("white", "black", "*")).frame_names()[:3]
+    ['white', 'black', 'columns_bit1']
     """
 
     projector_width: Annotated[int, whole(2, "projector")] = 1280
     projector_height: Annotated[int, whole(2, "projector")] = 800
-    code: Literal["gray", "gray-phase"] = "gray-phase"
+    code: Code = field(default_factory=GrayPhase)
     axes: tuple[Literal["columns", "rows"], ...] = ("columns",)
-    period_px: Annotated[float, Bounds("projector pixels", 2, 1e6)] = 16.0
-    steps: Annotated[int, whole(3, "steps")] = 4
+    order: tuple[str, ...] = ()
+    projector_gamma: Annotated[float, Bounds("an exponent", 0.1, 10)] = 1.0
 
     type_name: ClassVar[str] = "structured-light"
     triangulates: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        if isinstance(self.code, str):
+            if self.code not in Code.known:
+                raise ValueError(
+                    f"expected code to be one of {', '.join(Code.known)}, got {shown(self.code)}"
+                    f"{nearest(self.code, Code.known)}."
+                )
+            object.__setattr__(self, "code", Code.known[self.code]())
         check_fields(self)
-        if not self.axes or list(self.axes) != sorted(set(self.axes)):
-            raise ValueError(f"expected axes to be columns, rows or both in that order, got {self.axes!r}.")
+        if not self.axes or len(set(self.axes)) < len(self.axes):
+            raise ValueError(f"expected axes to be columns, rows or both, got {self.axes!r}.")
         limits.check("pixels", self.projector_width * self.projector_height, "pixels of a projector")
+        for axis in self.axes:
+            self.code.check(self.size(axis))
+        if self.order:
+            in_view = set(self.frame_names())
+            for axis in self.axes:
+                names = self.code.names(self.size(axis))
+                self.code.check_shown(self.size(axis), [name for name in names if f"{axis}_{name}" in in_view])
 
     def size(self, axis: str) -> int:
         """Projector pixels along `axis`."""
         return self.projector_width if axis == "columns" else self.projector_height
 
-    def layout(self) -> tuple[CodedFrames, ...]:
-        """The runs of coded frames before white and black, in order.
+    def _all_names(self) -> list[str]:
+        """Names of all frames that the code knows, in its own order."""
+        coded = [f"{axis}_{name}" for axis in self.axes for name in self.code.names(self.size(axis))]
+        return [*coded, WHITE, BLACK]
 
-        A subclass may return runs of other kinds; these decide on the frames, their names and their decoding.
-        """
-        runs: list[CodedFrames] = []
-        start = 0
-        for axis in self.axes:
-            bits = int(np.ceil(np.log2(self.size(axis))))
-            shift = 0 if self.code == "gray" else max(0, min(bits - 1, int(np.floor(np.log2(self.period_px / 2)))))
-            runs.append(GrayFrames(axis, self.size(axis), start, bits, shift))
-            start = runs[-1].span.stop
-            if self.code == "gray-phase":
-                runs.append(FringeFrames(axis, self.size(axis), start, self.period_px, self.steps))
-                start = runs[-1].span.stop
-        return tuple(runs)
+    def frame_names(self) -> list[str]:
+        return in_order(self._all_names(), self.order)
 
     def responses(self) -> tuple[DenseResponse, ...]:
-        return tuple(run.response for run in self.layout())
+        return tuple(response for axis in self.axes for response in self._responses(axis))
+
+    def _responses(self, axis: str) -> tuple[DenseResponse, ...]:
+        if self.projector_gamma == 1:
+            return self.code.responses(AXES.index(axis), self.size(axis))
+        return (stripes(self.code, AXES.index(axis), self.size(axis), self.projector_gamma),)
 
     def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
-        result = np.empty((self.n_frames, *white.shape), dtype=np.float32)
-        for run, values in zip(self.layout(), channels, strict=True):
-            run.frames(values, white, ambient, result[run.span])
-        np.add(white, ambient, out=result[WHITE], casting="same_kind")
-        np.add(np.zeros_like(white), ambient, out=result[BLACK], casting="same_kind")
+        places = {name: i for i, name in enumerate(self.frame_names())}
+        result = np.empty((len(places), *white.shape), dtype=np.float32)
+        remaining = list(channels)
+        for axis in self.axes:
+            size, n = self.size(axis), len(self._responses(axis))
+            own, remaining = remaining[:n], remaining[n:]
+            lit = self.code.frames(size, own, white) if self.projector_gamma == 1 else iter(own[0])
+            for name, radiance in zip(self.code.names(size), lit, strict=True):
+                if (place := places.get(f"{axis}_{name}")) is not None:
+                    np.add(radiance, ambient, out=result[place], casting="same_kind")
+        for name, radiance in ((WHITE, white), (BLACK, np.zeros_like(white))):
+            if name in places:
+                np.add(radiance, ambient, out=result[places[name]], casting="same_kind")
         return result
 
     def check(self, width: int, height: int) -> None:
@@ -127,12 +153,10 @@ class StructuredLight(Sensor):
                 f"the sensor codes, got {width} x {height}."
             )
 
-    def frame_names(self) -> list[str]:
-        return [*(name for run in self.layout() for name in run.names()), "white", "black"]
-
     def white_image(self, frames: np.ndarray) -> np.ndarray:
-        """(h, w), the white frame."""
-        return np.asarray(frames[WHITE])
+        """(h, w), the white frame; where none was shown, the mean of the frames."""
+        names = self.frame_names()
+        return np.asarray(frames[names.index(WHITE)]) if WHITE in names else super().white_image(frames)
 
     def for_projector(self, width: int, height: int, axes: Sequence[str] | None = None) -> StructuredLight:
         coded = self.axes if axes is None else tuple(axes)
@@ -148,39 +172,56 @@ class StructuredLight(Sensor):
 
     @classmethod
     def presets(cls) -> dict[str, Sensor]:
-        return {"gray": cls(code="gray"), "gray-phase": cls()}
+        """One for each code that has defaults, by its name."""
+        return {name: cls(code=kind()) for name, kind in Code.known.items() if has_defaults(kind)}
 
     @property
     def title(self) -> str:
-        return "Structured light" if self.code == "gray-phase" else "Structured light (Gray code)"
+        return self.code.title or f"Structured light ({self.code.type_name} code)"
 
     @property
     def details(self) -> str:
-        fringes = f" and {self.steps}-step fringes of {self.period_px:g} px" if self.code == "gray-phase" else ""
         size = f"{self.projector_width} × {self.projector_height}"
-        return f"Gray code{fringes} along {' and '.join(self.axes)}, projector {size}"
+        return f"{self.code.details} along {' and '.join(self.axes)}, projector {size}"
 
     def representative_frames(self, frames: np.ndarray) -> list[int]:
-        """White, a frame of middle fineness, and a fringe or the finest frame."""
-        runs = self.layout()
-        is_coarse = [all(before.axis != run.axis for before in runs[:i]) for i, run in enumerate(runs)]
-        coarse = [i for run, first in zip(runs, is_coarse, strict=True) if first for i in run.distinct]
-        fine = [run.start for run, first in zip(runs, is_coarse, strict=True) if not first]
-        return [len(frames) + WHITE, coarse[len(coarse) // 2], *(fine[:1] or coarse[-1:])]
+        """White, and two frames of the first axis: a coarse and a fine one."""
+        shown, axis = self.frame_names(), self.axes[0]
+        wanted = [WHITE, *(f"{axis}_{name}" for name in self.code.representative(self.size(axis)))]
+        return [shown.index(name) for name in wanted if name in shown]
 
     def patterns(self) -> np.ndarray:
-        """(k, projector_height, projector_width) float32 in 0..1: the patterns as shown, at pixel centres."""
-        size = 4 * self.n_frames * self.projector_width * self.projector_height
-        limits.check("bytes", size, f"bytes of {self.n_frames} patterns")
-        x, y = np.meshgrid(np.arange(self.projector_width) + 0.5, np.arange(self.projector_height) + 0.5)
-        path = LightPath(x, y, 0 * x, True)
-        weights = [np.stack(r.weights(path, NumpyMath())) for r in self.responses()]  # type: ignore[arg-type]
-        return self.frames(weights, np.ones_like(x), np.zeros_like(x))
+        """(k, projector_height, projector_width) float32 in 0..1: the patterns as asked for, before any gamma, at pixel
+        centres, in the order in which they are shown."""
+        limits.check(
+            "bytes",
+            4 * self.n_frames * self.projector_width * self.projector_height,
+            f"bytes of {self.n_frames} patterns",
+        )
+        shape = self.projector_height, self.projector_width
+        made = {WHITE: np.ones((1, 1), dtype=np.float32), BLACK: np.zeros((1, 1), dtype=np.float32)}
+        for axis in self.axes:
+            for name, values in zip(self.code.names(self.size(axis)), self.code.patterns(self.size(axis)), strict=True):
+                made[f"{axis}_{name}"] = values[None, :] if axis == "columns" else values[:, None]
+        return np.stack([np.broadcast_to(made[name], shape) for name in self.frame_names()])
+
+    def coded_frames(self, frames: np.ndarray, axis: str) -> tuple[list[str], np.ndarray]:
+        """Names of the shown frames of an axis in the order of the code, without the axis, and the frames.
+
+        Parameters
+        ----------
+        frames : (k, h, w), all frames of a capture.
+        """
+        places = {name: i for i, name in enumerate(self.frame_names())}
+        names = [name for name in self.code.names(self.size(axis)) if f"{axis}_{name}" in places]
+        at = [places[f"{axis}_{name}"] for name in names]
+        is_run = at == list(range(at[0], at[0] + len(at)))  # a slice is a view, and copies nothing
+        return names, frames[at[0] : at[-1] + 1] if is_run else frames[at]
 
 
 @dataclass(frozen=True)
 class StructuredLightDecoder(Decoder):
-    """Decodes Gray code, with or without phase shift, to projector coordinates, and triangulates them.
+    """Decodes the frames of a code to projector coordinates, and triangulates them.
 
     Without a rig, only the projector coordinates are decoded: z is NaN everywhere, `status` is that of the code.
 
@@ -214,19 +255,19 @@ class StructuredLightDecoder(Decoder):
         `RangesimWarning` if frames and code contradict each other as a whole.
         """
         sensor = of_type(capture.sensor, StructuredLight)
-        contrast = direct_contrast(capture, capture.frames[WHITE], capture.frames[BLACK], self.gray)
+        contrast = self._contrast(capture, sensor)
         codes: dict[str, AxisCode] = {}
-        contradictions: dict[str, str | None] = {}
-        for run in sensor.layout():
-            axis, coarse = run.axis, codes.get(run.axis)
-            seen = AxisFrames(capture, axis, run.names(), capture.frames[run.span], contrast)
-            codes[axis] = run.decode(seen, coarse, self._thresholds)
-            contradictions[axis] = contradictions.get(axis) or run.contradiction(seen, coarse, codes[axis])
-        for contradiction in filter(None, contradictions.values()):
-            warn(contradiction)
-        for axis, code in codes.items():
-            outside = (code.coordinate < -0.5) | (code.coordinate > sensor.size(axis) + 0.5)
+        contradictions: list[str] = []
+        for axis in sensor.axes:
+            seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
+            code = sensor.code.decode(seen, self._thresholds)
+            outside = (code.coordinate < -0.5) | (code.coordinate > seen.size + 0.5)
             code.status[outside & (code.status == Status.OK)] = Status.CODE_ERROR
+            codes[axis] = code
+            if contradiction := sensor.code.contradiction(seen, code):
+                contradictions.append(contradiction)
+        for contradiction in contradictions:
+            warn(contradiction)
         coordinate = {axis: code.coordinate for axis, code in codes.items()}
         sigma_px = {axis: code.sigma_px for axis, code in codes.items()}
         return ProjectorCoordinates(
@@ -234,27 +275,42 @@ class StructuredLightDecoder(Decoder):
             row=coordinate.get("rows"),
             column_sigma_px=sigma_px.get("columns"),
             row_sigma_px=sigma_px.get("rows"),
-            status=_first_failure([code.status for code in codes.values()]),
+            status=_first_failure([codes[axis].status for axis in AXES if axis in codes]),
             confidence=contrast.values / np.float32(capture.full_scale),
             intensity=contrast.white.astype(np.float32) - np.float32(capture.black_level),
             limits=self.triangulation,
-            is_doubted=any(contradictions.values()),
+            is_doubted=bool(contradictions),
         )
+
+    def _contrast(self, capture: Capture, sensor: StructuredLight) -> Contrast:
+        """Contrast of white and black, each as captured, or estimated by the code if it was not shown."""
+        shown, frames = sensor.frame_names(), capture.frames
+        if WHITE in shown and BLACK in shown:
+            return direct_contrast(capture, frames[shown.index(WHITE)], frames[shown.index(BLACK)], self.gray)
+        code = sensor.code
+        estimates = [code.white_and_black(sensor.size(a), *sensor.coded_frames(frames, a)) for a in sensor.axes]
+        white, black = np.max([w for w, _ in estimates], axis=0), np.min([b for _, b in estimates], axis=0)
+        if WHITE in shown:
+            white = frames[shown.index(WHITE)]
+        if BLACK in shown:
+            black = frames[shown.index(BLACK)]
+        return direct_contrast(capture, white, black, self.gray)._replace(is_measured=False)
 
     @property
     def _thresholds(self) -> CodeThresholds:
         return CodeThresholds(self.gray, self.phase)
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        runs = of_type(sensor, StructuredLight).layout()
-        return np.asarray(np.maximum.reduce([run.least_signal(self._thresholds, background) for run in runs]))
+        shown = of_type(sensor, StructuredLight)
+        each = [shown.code.least_signal(shown.size(axis), self._thresholds, background) for axis in shown.axes]
+        return np.asarray(np.maximum.reduce(each))
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
         if _rows_come_first(image):
             return "columns change along the image's height and rows along its width: rows may have been shown first"
         if float(image.valid.mean()) >= MIN_MEASURED:
             return None
-        contrast = capture.frames[WHITE].astype(np.float32) - capture.frames[BLACK].astype(np.float32)
+        contrast = self._contrast(capture, of_type(capture.sensor, StructuredLight)).values
         clear = MIN_CONTRAST * capture.full_scale
         inverted = float((contrast < -clear).mean())
         if inverted > float((contrast > clear).mean()):

@@ -145,6 +145,11 @@ def nearest(name: str, valid: typing.Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
+def has_defaults(cls: type[Any]) -> bool:
+    """Whether an instance of a dataclass can be made without naming a setting."""
+    return not any(f.init and _required(f) for f in dataclasses.fields(cls))
+
+
 def _required(field: dataclasses.Field[Any]) -> bool:
     return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
 
@@ -249,8 +254,8 @@ def _value(hint: Any, value: Any, where: str) -> Any:
         )
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return from_dict(hint, value, where)
-    if isinstance(hint, type) and issubclass(hint, Named) and isinstance(value, Mapping):
-        return from_dict(hint, value, where)
+    if isinstance(hint, type) and issubclass(hint, Named) and isinstance(value, (Mapping, str)):
+        return from_dict(hint, {"type": value} if isinstance(value, str) else value, where)
     if get_origin(hint) is tuple and dataclasses.is_dataclass(get_args(hint)[0]):
         return tuple(from_dict(get_args(hint)[0], v, f"{where}[{i}]") for i, v in enumerate(value))
     if hint is np.ndarray or get_origin(hint) is np.ndarray:

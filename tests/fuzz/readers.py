@@ -413,8 +413,7 @@ name = "gray"
 type = "structured-light"
 projector_width = 32
 projector_height = 24
-code = "gray-phase"
-period_px = 8.0
+code = { type = "gray-phase", period_px = 8.0 }
 steps = 4
 [[instrument]]
 name = "amcw"
@@ -508,12 +507,10 @@ _OF_DECODE = (
         f"--bits {10**30}",
         "--code x",
     ),
-    "--period nan",
-    "--period inf",
-    "--period 1e-300",
-    f"--steps {10**30}",
-    "--steps 1000000000",
-    "--steps 0",
+    *(f"--code gray-phase --set period_px={text}" for text in ("nan", "inf", "1e-300", "[1]", "{a=1}", "'")),
+    *(f"--code gray-phase --set steps={text}" for text in (10**30, 1000000000, 0)),
+    "--set =",
+    "--set type=x",
 )
 _OF_SEGMENT = (
     *_nonsense(

@@ -56,13 +56,14 @@ def directory(folder: Path, under: str) -> dict[str, bytes]:
 @cache
 def result_files() -> dict[str, bytes]:
     """Files of a small result, under `result/`: structured light and an ideal ranger before a plane."""
+    from rangesim.codes import GrayPhase
     from rangesim.experiment import Experiment
     from rangesim.instrument.instrument import Instrument
     from rangesim.pipeline.experiment_run import run
     from rangesim.sensors import AmcwToF, IdealToF, StructuredLight
 
     instruments = (
-        Instrument("lines", StructuredLight(32, 24, period_px=8)),
+        Instrument("lines", StructuredLight(32, 24, GrayPhase(8.0))),
         Instrument("amcw", AmcwToF()),
         Instrument("ideal", IdealToF()),
     )

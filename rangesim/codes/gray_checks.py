@@ -1,23 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gray code with inverse patterns: frames to projector coordinates, and checks of what is read as Gray code."""
+"""Checks of what is read as Gray code: pairs that do not add up, another code, another order of the frames.
+
+A single pixel may be wrong for many reasons, so the checks look at many pixels at once: a capture that is read wrongly
+contradicts itself nearly everywhere. Each check returns one sentence with the likely cause, or None.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from rangesim.capture import Capture, bright_level
-from rangesim.decoding.axis_code import MIN_PIXELS, AxisCode, AxisFrames, Contrast, evenly_spread
-from rangesim.decoding.row_bands import bands
+from rangesim.codes.axis_code import AxisCode, AxisFrames
+from rangesim.codes.gray_bits import binary_of_gray
+from rangesim.decoding.pixel_samples import MIN_PIXELS, evenly_spread
 from rangesim.decoding.status import Status
-from rangesim.sensor import Threshold
-from rangesim.settings.bounds import check_fields
-
-CELL_SIGMA = 12**-0.5
-"""Standard deviation of a place that is known to lie in a cell, in cells: that of an even distribution."""
 
 MAX_UNPAIRED_FRACTION = 0.2
 """Largest fraction of the pixels at which the sum of a pattern and its inverse may differ from white + black. If two
@@ -55,135 +53,6 @@ MIN_ALONE_FRACTION = 0.3
 scene other bits change too."""
 
 
-@dataclass(frozen=True)
-class GrayThresholds:
-    """Least differences between frames that a decoder accepts.
-
-    If the detector is known, they are multiples of the noise. In digital captures of an unknown detector they are
-    fractions of full scale, as in OpenCV. In noise-free captures they are fractions of the brightness.
-
-    Parameters
-    ----------
-    contrast_sigmas, bit_sigmas : float, least white - black and least pattern - inverse, in standard deviations of the
-        difference.
-    contrast_of_scale, bit_of_scale : float, the same as fractions of full scale, for digital captures of unknown
-        detectors.
-    relative_contrast : float, least white - black of noise-free captures, as a fraction of white - black at the bright
-        pixels.
-    relative_bit : float, least pattern - inverse as a fraction of the pixel's white - black, unless the detector is
-        unknown. Pixels in shadow see the patterns only by interreflection, and their fine stripes are fainter than that
-        at every exposure.
-
-    Examples
-    --------
-    >>> GrayThresholds(contrast_sigmas=8.0).contrast_sigmas
-    8.0
-    """
-
-    contrast_sigmas: Threshold = 5.0
-    bit_sigmas: Threshold = 3.0
-    contrast_of_scale: Threshold = 40 / 255
-    bit_of_scale: Threshold = 5 / 255
-    relative_contrast: Threshold = 1e-4
-    relative_bit: Threshold = 0.1
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-
-
-def direct_contrast(capture: Capture, white: np.ndarray, black: np.ndarray, thresholds: GrayThresholds) -> Contrast:
-    """Contrast of the white and the black frame (h, w) of a capture."""
-    bright, dark = white.astype(np.float32), black.astype(np.float32)
-    contrast = bright - dark
-    noise = _difference_noise(capture, bright, dark)
-    if noise is not None:
-        least: np.ndarray | float = thresholds.contrast_sigmas * noise
-    elif capture.is_digital:
-        least = thresholds.contrast_of_scale * capture.full_scale
-    else:
-        least = thresholds.relative_contrast * bright_level(contrast)
-    return Contrast(white, black, contrast, np.asarray(contrast > least))
-
-
-def decode_gray(seen: AxisFrames, shift: int, size: int, thresholds: GrayThresholds) -> AxisCode:
-    """Projector coordinate of each pixel from Gray bits.
-
-    A bit is the sign of pattern - inverse; it is uncertain where the noise is larger than the difference. A pixel on
-    the edge of a stripe has one uncertain bit, which does no harm if a flip of it leads to a neighbouring cell: the
-    function then returns the edge between the two cells. It refuses all other pixels with uncertain bits.
-
-    Parameters
-    ----------
-    seen : frames (2 b, h, w), each pattern followed by its inverse, most significant bit first.
-    shift : int, number of the finest bits that are left out. size : int, projector pixels along the axis.
-    """
-    capture, contrast, cell = seen.capture, seen.contrast, 1 << shift
-    coordinate = np.empty(contrast.values.shape, dtype=np.float32)
-    status = np.zeros(contrast.values.shape, dtype=np.uint8)
-    for rows in bands(len(status)):
-        code, uncertain = _classify(capture, seen.frames[:, rows], contrast.values[rows], thresholds)
-        low, high = binary_of_gray(code), binary_of_gray(code ^ uncertain)
-        on_edge = (uncertain & (uncertain - 1) == 0) & (np.abs(low - high) <= 1)
-        coordinate[rows] = (0.5 * (low + high) + 0.5) * cell
-        status[rows][coordinate[rows] >= size + cell / 2] = Status.CODE_ERROR
-        failed = ~contrast.is_enough[rows] | ~on_edge
-        status[rows][failed] = Status.LOW_SIGNAL
-        status[rows][failed & capture.saturated(capture.frames[:, rows])] = Status.SATURATED
-    sigma_px = np.broadcast_to(np.float32(CELL_SIGMA * cell), status.shape)
-    return AxisCode(coordinate, status, cell, sigma_px)
-
-
-def _classify(
-    capture: Capture, frames: np.ndarray, contrast: np.ndarray, thresholds: GrayThresholds
-) -> tuple[np.ndarray, np.ndarray]:
-    """(h, w) int32 each: the code, and the set of its bits that are uncertain."""
-    code = np.zeros(contrast.shape, dtype=np.int32)
-    uncertain = np.zeros_like(code)
-    for pattern, inverse in zip(frames[0::2], frames[1::2], strict=True):
-        pattern, inverse = pattern.astype(np.float32), inverse.astype(np.float32)
-        difference = pattern - inverse
-        code = (code << 1) | (difference > 0)
-        least = _least_bit(capture, pattern, inverse, contrast, thresholds)
-        uncertain = (uncertain << 1) | (np.abs(difference) < least)
-    return code, uncertain
-
-
-def _least_bit(
-    capture: Capture, pattern: np.ndarray, inverse: np.ndarray, contrast: np.ndarray, thresholds: GrayThresholds
-) -> np.ndarray | float:
-    """Least |pattern - inverse| of a certain bit, in the capture's units."""
-    noise = _difference_noise(capture, pattern, inverse)
-    if noise is not None:
-        return np.maximum(thresholds.bit_sigmas * noise, thresholds.relative_bit * contrast)
-    if capture.is_digital:
-        return thresholds.bit_of_scale * capture.full_scale
-    return thresholds.relative_bit * contrast
-
-
-def _difference_noise(capture: Capture, a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
-    """(h, w) standard deviation of a - b; None if the detector is unknown or the capture is noise-free."""
-    noise_a, noise_b = capture.noise(a), capture.noise(b)
-    return None if noise_a is None or noise_b is None else np.sqrt(noise_a**2 + noise_b**2)
-
-
-def binary_of_gray(gray: np.ndarray) -> np.ndarray:
-    """Numbers whose Gray codes are `gray` (integers of up to 32 bits): the running exclusive or from the top bit.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> binary_of_gray(np.array([0b000, 0b001, 0b011, 0b010, 0b110]))
-    array([0, 1, 2, 3, 4])
-    """
-    result = gray.copy()
-    for step in (16, 8, 4, 2, 1):
-        result ^= result >> step
-    return result
-
-
-# ---- Frames that contradict Gray code --------------------------------------------------------------------------------
-
-
 def pair_contradiction(seen: AxisFrames) -> str | None:
     """A sentence if patterns and inverses do not add up to white + black; None if they do.
 
@@ -195,6 +64,8 @@ def pair_contradiction(seen: AxisFrames) -> str | None:
     seen : frames (2 b, h, w), each pattern followed by its inverse.
     """
     contrast = seen.contrast
+    if not contrast.is_measured:
+        return None
     white, black, values = contrast.white.ravel(), contrast.black.ravel(), contrast.values.ravel()
     usable = contrast.is_enough & ~seen.capture.saturated(contrast.white[None])
     used = evenly_spread(np.flatnonzero(usable))
@@ -210,7 +81,7 @@ def pair_contradiction(seen: AxisFrames) -> str | None:
     if not unpaired:
         return None
     worst = max(unpaired, key=fractions.__getitem__)
-    pattern_name, inverse_name = seen.names[2 * worst : 2 * worst + 2]
+    pattern_name, inverse_name = map(seen.shown_name, seen.names[2 * worst : 2 * worst + 2])
     return (
         f"{len(unpaired)} of {len(fractions)} pairs of pattern and inverse along {seen.axis} contradict white and "
         f"black: frames {pattern_name} and {inverse_name} do not add up to their sum at {100 * fractions[worst]:.0f} % "
@@ -243,7 +114,7 @@ def binary_contradiction(seen: AxisFrames, gray: AxisCode) -> str | None:
     if len(as_gray) < MIN_STEPS or as_gray.mean() < as_binary.mean() + MAX_FARTHER_OCTAVES:
         return None
     few = words[:, :: 1 + words.shape[1] // MAX_PAIRS]
-    orders = [np.log2(_apart(reorder(few), 0)).mean() for _, reorder in _other_orders(seen.names[-2::-2])]
+    orders = [np.log2(_apart(reorder(few), 0)).mean() for _, reorder in _other_orders(_bit_names(seen))]
     if min(orders) < np.log2(np.abs(few[1] - few[0])).mean():
         return None
     return (
@@ -270,7 +141,7 @@ def order_contradiction(seen: AxisFrames, gray: AxisCode) -> str | None:
     for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         both = usable[here] & usable[there]
         pairs.append(np.stack([word[here][both], word[there][both]]))
-    bits = seen.names[-2::-2]  # least significant first
+    bits = _bit_names(seen)
     few = [words[:, :: 1 + words.shape[1] // MAX_PAIRS] for words in pairs]
     across = max(few, key=lambda words: np.count_nonzero(words[0] != words[1]))
     step = _coarse_step(across, len(bits))
@@ -280,6 +151,11 @@ def order_contradiction(seen: AxisFrames, gray: AxisCode) -> str | None:
     if text is None:
         return None
     return f"the bits along {seen.axis} contradict Gray code, where neighbouring pixels see neighbouring cells: {text}."
+
+
+def _bit_names(seen: AxisFrames) -> list[str]:
+    """Names of the patterns without their inverses, least significant first."""
+    return [seen.shown_name(name) for name in seen.names[-2::-2]]
 
 
 def _that_differ(pairs: list[np.ndarray]) -> np.ndarray:

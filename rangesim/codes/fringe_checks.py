@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fringes of structured light: their phase refines a Gray code, and contradicts it where the frames are wrong."""
+"""Checks of fringes: they contradict the Gray code that they refine, or white and black, where the frames are wrong."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rangesim.decoding.axis_code import MIN_PIXELS, AxisCode, AxisFrames, evenly_spread
-from rangesim.decoding.phase_shift import PhaseThresholds, modulation_is_weak, phase_of, phase_sigma
-from rangesim.decoding.row_bands import bands
+from rangesim.codes.axis_code import AxisCode, AxisFrames
+from rangesim.codes.fringes import FringeConvention
+from rangesim.decoding.phase_shift import phase_of
+from rangesim.decoding.pixel_samples import MIN_PIXELS, evenly_spread
 from rangesim.decoding.status import Status
 from rangesim.robust_scale import sigma_from_median
 
@@ -57,44 +58,9 @@ MEDIAN_ERROR = 1.253
 """Ratio of the standard error of a median to that of a mean, for normally distributed values: sqrt(pi / 2)."""
 
 
-def refine_by_phase(
-    seen: AxisFrames, gray: AxisCode, period_px: float, least_swing: np.ndarray, thresholds: PhaseThresholds
-) -> AxisCode:
-    """Sub-pixel coordinate: of all places with the phase of the fringes, the one nearest to the Gray coordinate.
-
-    Gray cells are half a period at most, so the right place lies at most a quarter of a period off the centre of its
-    cell. An eighth of a period more is allowed for noise and for camera pixels across the edge of a cell. If the place
-    lies farther off, code and phase contradict each other (`CODE_ERROR`).
-
-    Parameters
-    ----------
-    seen : frames (N, h, w), the fringes of the axis. gray : code of the same axis.
-    period_px : float, projector pixels.
-    least_swing : (h, w) float, least difference between the brightest and the darkest fringe, in the capture's units.
-    """
-    capture, frames = seen.capture, seen.frames
-    coordinate, status = np.empty_like(gray.coordinate), gray.status.copy()
-    sigma_px = None if capture.noise(frames[0, :1]) is None else np.empty_like(gray.coordinate)
-    for rows in bands(len(status)):
-        phase, whole, refused = phase_of(frames[:, rows]), gray.coordinate[rows], status[rows]
-        sigma = phase_sigma(capture, phase, len(frames))
-        periods = np.rint(whole / np.float32(period_px) - phase.normalised)
-        coordinate[rows] = (periods + phase.normalised) * np.float32(period_px)
-        ok = refused == Status.OK
-        contradiction = np.abs(coordinate[rows] - whole) > gray.cell_px / 2 + period_px / 8
-        washed_out = 2 * phase.modulation < least_swing[rows]  # like fringes that are seen by interreflection alone
-        refused[ok & contradiction] = Status.CODE_ERROR
-        refused[ok & (modulation_is_weak(capture, phase, sigma, thresholds) | washed_out)] = Status.LOW_SIGNAL
-        refused[ok & capture.saturated(frames[:, rows])] = Status.SATURATED
-        if sigma_px is not None and sigma is not None:
-            np.multiply(sigma, period_px / (2 * np.pi), out=sigma_px[rows], casting="same_kind")
-    return AxisCode(coordinate, status, gray.cell_px, sigma_px)
-
-
-# ---- Fringes that contradict the Gray code, or white and black -------------------------------------------------------
-
-
-def fringe_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, period_px: float) -> str | None:
+def fringe_contradiction(
+    seen: AxisFrames, gray: AxisCode, refined: AxisCode, period_px: float, convention: FringeConvention
+) -> str | None:
     """A sentence if the fringes contradict the Gray code as a whole; None if they agree.
 
     The differences between the place that the phase tells and the centre of its Gray cell must lie around zero, and
@@ -103,14 +69,16 @@ def fringe_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, pe
     Parameters
     ----------
     seen : frames (N, h, w), the fringes of the axis. gray, refined : the code before and after `refine_by_phase`.
-    period_px : float, projector pixels.
+    period_px : float, projector pixels. convention : FringeConvention of the fringes.
     """
     frames, axis = seen.frames, seen.axis
     used = _comparable(gray, refined)
     if len(used) < MIN_PIXELS:
         return None
     phase = phase_of(frames.reshape(len(frames), -1)[:, used])
-    off = _wrapped(phase.normalised - gray.coordinate.ravel()[used] / np.float32(period_px))
+    off = _wrapped(
+        convention.place_turns(phase.normalised, period_px) - gray.coordinate.ravel()[used] / np.float32(period_px)
+    )
     half = gray.cell_px / (2 * period_px)
     far = float((np.abs(off) > half + FAR_TURNS).mean())
     edge = half + OUTSIDE_TURNS
@@ -128,7 +96,7 @@ def fringe_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, pe
             f"{text} and reach {100 * swing:.0f} % of white - black: a period of {period_px:g} projector pixels is too "
             "fine for the camera, or out of focus; take a longer one."
         )
-    if far > MAX_FAR_FRACTION and _direction(gray, refined, frames) < 0:
+    if far > MAX_FAR_FRACTION and convention.sign * _direction(gray, refined, frames) < 0:
         return f"{text}: they seem to be shifted in the opposite direction, so check the order of their frames."
     if resultant > MIN_CONCENTRATION * np.sinc(2 * half):
         return (
@@ -150,6 +118,8 @@ def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> 
     seen : frames (N, h, w), the fringes of the axis. gray, refined : the code before and after `refine_by_phase`.
     """
     white, black, axis = seen.contrast.white, seen.contrast.black, seen.axis
+    if not seen.contrast.is_measured:
+        return None
     used = evenly_spread(np.flatnonzero(_inside_cell(gray, refined) & ~seen.capture.saturated(white[None])))
     if len(used) < MIN_PIXELS:
         return None
@@ -164,7 +134,7 @@ def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> 
     if np.sqrt((off**2).mean()) < MAX_LEVEL_ERROR + 3 * np.sqrt((noise**2).mean()):
         return None
     if len(np.unique(gray.coordinate.ravel()[used])) >= MIN_CELLS and (
-        fault := _odd_frame(values, members, seen.names)
+        fault := _odd_frame(values, members, [seen.shown_name(name) for name in seen.names])
     ):
         return f"the fringes along {axis} contradict white and black: {fault}."
     mean = 100 * float(np.median(values.mean(axis=0)))
