@@ -1,0 +1,6 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Conventions of real captures, found from their frames: order, missing frames, start and direction of fringes."""
+
+from rangesim.conventions.detection import Convention, detect_convention
+
+__all__ = ["Convention", "detect_convention"]
