@@ -414,7 +414,6 @@ type = "structured-light"
 projector_width = 32
 projector_height = 24
 code = { type = "gray-phase", period_px = 8.0 }
-steps = 4
 [[instrument]]
 name = "amcw"
 baseline_m = 0.03
@@ -501,7 +500,7 @@ _OF_DECODE = (
         "--projector -8x8",
         "--axes columns,columns",
         "--axes ,",
-        "--axes rows,columns",
+        "--axes rows,rows",
         "--bits 0",
         "--bits 99",
         f"--bits {10**30}",
