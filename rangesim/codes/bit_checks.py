@@ -39,7 +39,7 @@ MAX_OUTSIDE_FRACTION = 0.2
 """Largest fraction of the pixels at which a frame may be brighter than white or darker than black. If a frame of bits
 is taken for one of the two, half of the pixels are."""
 
-MIN_OUTSIDE = 0.25
+MIN_OUTSIDE = 0.5
 """Least distance from the range between black and white that counts, as a fraction of the range of the frames. If a
 frame of stripes is taken for white or black, it is 1 where the two differ."""
 
@@ -145,7 +145,7 @@ def other_code_contradiction(seen: AxisFrames, code: AxisCode, words: Words, oth
 
     Neighbouring pixels see neighbouring cells. If the words of one code are read as those of another, the cells of
     neighbours lie farther apart. If the frames are in another order, they may lie farther apart too, but they lie
-    nearest when read in that order: then the result is None.
+    clearly nearer when read in that order: then the result is None.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def other_code_contradiction(seen: AxisFrames, code: AxisCode, words: Words, oth
     if own < _octaves(both, nearest) + MAX_FARTHER_OCTAVES:
         return None
     orders = [_octaves(reorder(both), words) for _, reorder in _other_orders(seen, words)]
-    if min(orders) < _octaves(both, nearest):
+    if min(orders) + MAX_FARTHER_OCTAVES < _octaves(both, nearest):
         return None
     return (
         f"the bits along {seen.axis} contradict {words.noun}: neighbouring pixels lie {2**own:.1f} cells apart as "
@@ -186,7 +186,7 @@ def order_contradiction(seen: AxisFrames, code: AxisCode, words: Words) -> str |
     step = _coarse_step(across, words)
     # This looks at all pairs, because the coarsest bits change at a line or two of the image.
     text = None
-    if step is not None and _changes_one_bit(words):
+    if step is not None and words.change_one_bit:
         names = [seen.shown_name(bit.name) for bit in reversed(bit_frames(seen.names, words.bits))]
         text = _repeated_bit(_that_differ(pairs) >> step, names[step:])
     text = text or _better_order(across, _that_differ(few), seen, words)
@@ -214,12 +214,6 @@ def _octaves(both: np.ndarray, words: Words) -> float:
     return float(np.log2(_apart(both, 0, words)).mean())
 
 
-def _changes_one_bit(words: Words) -> bool:
-    """Whether words of neighbouring cells differ in one bit, as in Gray code."""
-    changed = words.of_cell[1:] ^ words.of_cell[:-1]
-    return not (changed & (changed - 1)).any()
-
-
 def _that_differ(pairs: list[np.ndarray]) -> np.ndarray:
     """(2, m) words of all pairs (2, n) whose two words differ."""
     words = np.concatenate(pairs, axis=1)
@@ -236,9 +230,11 @@ def _better_order(across: np.ndarray, differing: np.ndarray, seen: AxisFrames, w
     seen : frames of the bits. words : those of the code.
     """
     best, text = 0.0, None
+    unresolved = _coarse_step(across, words) or 0
     for fault, reorder in _other_orders(seen, words):
         step = _coarse_step(reorder(across), words)
-        if step is None:
+        changed = np.bitwise_xor(reorder(words.of_cell), words.of_cell)
+        if step is None or changed.max() >> unresolved == 0:  # bits that the camera does not resolve tell no order
             continue
         before, after = (np.maximum(_apart(both, step, words), 0.5) for both in (differing, reorder(differing)))
         octaves = np.log2(before / after)

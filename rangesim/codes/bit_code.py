@@ -26,7 +26,8 @@ class BitCode(Code):
     """A code that gives each cell of `cell_px` projector pixels a word of bits.
 
     The frames are the bits of the word, most significant first, each followed by its inverse. A bit may be shown
-    without its inverse, or its inverse alone, see `rangesim.codes.bits.decode_bits`. Subclasses are frozen dataclasses
+    without its inverse, or its inverse alone, see `rangesim.codes.bits.decode_bits`. White and black may then be absent
+    only if the words of neighbouring cells differ in one bit, as in Gray code. Subclasses are frozen dataclasses
     with a field `cell_px`.
 
     Examples
@@ -74,6 +75,12 @@ class BitCode(Code):
             raise ValueError(
                 f"expected an order with each bit of {self.type_name} code or its inverse: {', '.join(missing)} is "
                 "missing ('*_bit*[0-9]' stands for all bits, without inverses)."
+            )
+        is_alone = any(bit.pattern is None or bit.inverse is None for bit in every)
+        if is_alone and not {"white", "black"} <= set(shown) and not self.words(size).change_one_bit:
+            raise ValueError(
+                f"expected an order with white and black, or with all inverses, for {self.type_name} code: several of "
+                "its bits change at one edge, and none tells there what full light and no light look like."
             )
 
     def responses(self, axis: int, size: int) -> tuple[DenseResponse, ...]:

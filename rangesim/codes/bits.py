@@ -44,6 +44,12 @@ class Words(NamedTuple):
         """Number of bits of a word."""
         return len(self.of_cell).bit_length() - 1
 
+    @property
+    def change_one_bit(self) -> bool:
+        """Whether the words of neighbouring cells differ in one bit, as in Gray code."""
+        changed = self.of_cell[1:] ^ self.of_cell[:-1]
+        return not (changed & (changed - 1)).any()
+
 
 class BitFrames(NamedTuple):
     """The frames of one bit.
@@ -79,7 +85,8 @@ def decode_bits(seen: AxisFrames, words: Words, cell_px: int, thresholds: GrayTh
 
     If white or black was not captured either, it is estimated from the frames. Such an estimate is wrong at cells that
     are dark in all frames, or lit in all. Blur from the next cell can look like a bit there, so cells next to these are
-    refused, too, unless two frames show each level.
+    refused, too, unless two frames show each level. It is right elsewhere, because in a code whose neighbouring cells
+    differ in one bit all other bits are certain.
 
     Parameters
     ----------
@@ -97,6 +104,8 @@ def decode_bits(seen: AxisFrames, words: Words, cell_px: int, thresholds: GrayTh
         on_edge = (uncertain & (uncertain - 1) == 0) & (np.abs(low - high) <= 1)
         coordinate[rows] = (0.5 * (low + high) + 0.5) * cell_px
         status[rows][coordinate[rows] >= seen.size + cell_px / 2] = Status.CODE_ERROR
+        if seen.size % cell_px:
+            _in_projector(coordinate[rows], seen.size, cell_px)
         failed = ~contrast.is_enough[rows] | ~on_edge
         if not contrast.is_measured:
             failed |= _is_guessed(capture.frames[:, rows], _rows_of(contrast, rows), shown, words, low)
@@ -104,6 +113,13 @@ def decode_bits(seen: AxisFrames, words: Words, cell_px: int, thresholds: GrayTh
         status[rows][failed & capture.saturated(capture.frames[:, rows])] = Status.SATURATED
     sigma_px = np.broadcast_to(np.float32(CELL_SIGMA * cell_px), status.shape)
     return AxisCode(coordinate, status, cell_px, sigma_px)
+
+
+def _in_projector(coordinate: np.ndarray, size: int, cell_px: int) -> None:
+    """Move coordinates of a last cell that is cut off to the centre of what is left of it, and its edge to the end."""
+    start = size - size % cell_px
+    coordinate[coordinate == start + cell_px / 2] = (start + size) / 2
+    coordinate[coordinate == start + cell_px] = size
 
 
 def _rows_of(contrast: Contrast, rows: slice) -> Contrast:

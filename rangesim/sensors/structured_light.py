@@ -107,8 +107,8 @@ class StructuredLight(Sensor):
         if self.order:
             in_view = set(self.frame_names())
             for axis in self.axes:
-                names = self.code.names(self.size(axis))
-                self.code.check_shown(self.size(axis), [name for name in names if f"{axis}_{name}" in in_view])
+                coded = [name for name in self.code.names(self.size(axis)) if f"{axis}_{name}" in in_view]
+                self.code.check_shown(self.size(axis), [*coded, *(name for name in (WHITE, BLACK) if name in in_view)])
 
     def size(self, axis: str) -> int:
         """Projector pixels along `axis`."""
