@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rangesim.capture import Capture
-from rangesim.codes import BinaryCode, BitCode, GrayCode, GrayPhase, XorCode
+from rangesim.codes import BinaryCode, BitCode, EnsembleCode, GrayCode, GrayPhase, MaxMinStripeCode, XorCode
 from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
@@ -19,7 +19,7 @@ from rangesim.electronics.detector import Detector
 from rangesim.errors import RangesimWarning
 from rangesim.sensors import StructuredLight
 
-CODES: list[BitCode] = [GrayCode(), BinaryCode(), XorCode(0), XorCode(1)]
+CODES: list[BitCode] = [GrayCode(), BinaryCode(), XorCode(0), XorCode(1), MaxMinStripeCode()]
 ONE_BIT: list[BitCode] = [code for code in CODES if code.words(64).change_one_bit]
 PLAIN, INVERSES = "*_bit*[0-9]", "*_inverse"
 
@@ -73,7 +73,7 @@ def test_every_column_comes_back(code: BitCode, width: int, cell_px: int, order:
 def test_without_white_or_black_only_cells_next_to_a_constant_word_are_refused(
     code: BitCode, width: int, cell_px: int, order: tuple[str, ...]
 ) -> None:
-    """A cell that is dark in all frames, or lit in all, has no contrast; blur of its neighbours must not look like it."""
+    """A cell that is dark in all frames, or lit in all, has no contrast; blur of its neighbours is no bit."""
     code = replace(code, cell_px=cell_px)  # type: ignore[call-arg]
     if code.bits(width) < 3:
         return
@@ -168,7 +168,94 @@ def test_noise_reads_no_wrong_cell(order: tuple[str, ...]) -> None:
         assert level < 1000 or read.mean() > 0.98
 
 
-# ---- Contradictions ----------------------------------------------------------------------------------------------------
+# ---- Words -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bits", range(1, 17))
+@pytest.mark.parametrize("code", CODES, ids=lambda code: code.noun)
+def test_each_cell_has_a_word_of_its_own(code: BitCode, bits: int) -> None:
+    words = code.words_of_cells(bits)
+    np.testing.assert_array_equal(np.sort(words), np.arange(1 << bits))
+
+
+def stripe_widths(pattern: np.ndarray) -> np.ndarray:
+    """Widths in cells of the stripes of a pattern, without the two at the ends."""
+    return np.diff(np.flatnonzero(np.diff(pattern)))
+
+
+@pytest.mark.parametrize(
+    ("bits", "narrowest"), [(2, 2), (3, 2), (5, 4), (6, 4), (7, 5), (8, 6), (9, 6), (10, 8), (11, 8), (13, 9), (15, 11)]
+)
+def test_stripes_of_the_max_min_stripe_code_are_wide_and_change_one_by_one(bits: int, narrowest: int) -> None:
+    """8 cells with 10 bits, as in Gupta 2011; also across the end of the cycle, so that any part of it is as good."""
+    words = MaxMinStripeCode().words_of_cells(bits)
+    cyclic = np.concatenate([words, words, words[:1]])
+    changed = cyclic[1:] ^ cyclic[:-1]
+    assert not (changed & (changed - 1)).any()
+    assert min(stripe_widths((cyclic >> k) & 1).min() for k in range(bits)) == narrowest
+
+
+@pytest.mark.parametrize("base_bit", [0, 1])
+def test_stripes_of_xor_codes_are_no_wider_than_their_base(base_bit: int) -> None:
+    """The last Gray pattern as base (XOR-02) leaves stripes of two cells at most, the one before (XOR-04) of four."""
+    patterns = XorCode(base_bit).patterns(1024)[::2]
+    assert max(stripe_widths(pattern).max() for pattern in patterns) == 2 << base_bit
+    base = GrayCode().patterns(1024)[::2][9 - base_bit]
+    np.testing.assert_array_equal(patterns[9 - base_bit], base)
+    others = np.delete(np.arange(10), 9 - base_bit)
+    np.testing.assert_array_equal(np.abs(patterns[others] - base), GrayCode().patterns(1024)[::2][others])
+
+
+# ---- The ensemble ----------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(4, 300), st.integers(1, 4), st.sampled_from([(), ("white", "black", PLAIN)]))
+def test_an_ensemble_reads_every_column(width: int, cell_px: int, order: tuple[str, ...]) -> None:
+    if width <= 2 * cell_px:
+        return
+    sensor = StructuredLight(width, 2, EnsembleCode(cell_px), order=order)
+    image = decode(seen_flat(sensor))
+    assert (image.status == Status.OK).all()
+    np.testing.assert_array_equal(column(image)[0], centres(width, cell_px))
+
+
+def test_an_ensemble_takes_what_two_codes_say_and_refuses_two_opinions() -> None:
+    """Columns 20 and up: one code elsewhere, two codes elsewhere but apart, and two codes elsewhere together."""
+    sensor = StructuredLight(256, 2, EnsembleCode())
+    capture = seen_flat(sensor)
+    frames = capture.frames.copy()
+    code = sensor.code
+    assert isinstance(code, EnsembleCode)
+    at = {}
+    for prefix in code.members:
+        places = [i for i, name in enumerate(sensor.frame_names()) if name.startswith(f"columns_{prefix}")]
+        at[prefix] = slice(places[0], places[-1] + 1)
+    for x, moves in (
+        (20, {"gray_": 150}),
+        (40, {"gray_": 150, "stripe_": 90}),
+        (60, {"gray_": 150, "stripe_": 150}),
+        (80, {"gray_": 150, "stripe_": 90, "xor02_": 200}),
+    ):
+        for prefix, there in moves.items():
+            frames[at[prefix], :, x] = capture.frames[at[prefix], :, there]
+    image = decode(replace(capture, frames=frames))
+    np.testing.assert_array_equal(column(image)[0, [20, 40]], [20.5, 40.5])
+    assert (image.status[:, [60, 80]] == Status.CODE_ERROR).all()
+    assert (np.delete(image.status, [60, 80], axis=1) == Status.OK).all()
+
+
+def test_an_ensemble_names_the_frames_of_its_members() -> None:
+    sensor = StructuredLight(512, 32, EnsembleCode())
+    capture = seen_flat(sensor, px=0.7)
+    names, frames = sensor.frame_names(), capture.frames.copy()
+    a, b = (names.index(f"columns_gray_bit{k}") for k in (6, 3))
+    frames[[a, a + 1, b, b + 1]] = frames[[b, b + 1, a, a + 1]]
+    with pytest.warns(RangesimWarning, match="columns_gray_bit6 and columns_gray_bit3, each with its inverse"):
+        decode(replace(capture, frames=frames))
+
+
+# ---- Contradictions --------------------------------------------------------------------------------------------------
 
 
 def read_as(capture: Capture, code: BitCode) -> str:

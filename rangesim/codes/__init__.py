@@ -8,9 +8,11 @@ from rangesim.codes.axis_code import AxisCode, AxisFrames, Contrast
 from rangesim.codes.binary import BinaryCode
 from rangesim.codes.bit_code import BitCode
 from rangesim.codes.code import AXES, Code, CodeThresholds
+from rangesim.codes.ensemble import EnsembleCode
 from rangesim.codes.fringes import FringeConvention
 from rangesim.codes.gray import GrayCode
 from rangesim.codes.gray_phase import GrayPhase
+from rangesim.codes.max_min_stripe import MaxMinStripeCode
 from rangesim.codes.thresholds import GrayThresholds
 from rangesim.codes.xor import XorCode
 
@@ -23,9 +25,11 @@ __all__ = [
     "Code",
     "CodeThresholds",
     "Contrast",
+    "EnsembleCode",
     "FringeConvention",
     "GrayCode",
     "GrayPhase",
     "GrayThresholds",
+    "MaxMinStripeCode",
     "XorCode",
 ]
