@@ -17,7 +17,17 @@ from synthetic import plane_signals, stereo_rig
 
 import rangesim
 from rangesim import decode, explain, expose
-from rangesim.codes import FringeConvention, GrayCode, GrayPhase, GrayThresholds
+from rangesim.codes import (
+    BinaryCode,
+    EnsembleCode,
+    FringeConvention,
+    GrayCode,
+    GrayPhase,
+    GrayThresholds,
+    MaxMinStripeCode,
+    XorCode,
+)
+from rangesim.codes.ensemble import EnsembleAxisCode
 from rangesim.decoding.disparities import Disparities, ImageNoise
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
@@ -196,6 +206,10 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (StructuredLight(64, 48, code="gray"), use_sensor),
     (StructuredLight(64, 48), use_sensor),
     (GrayCode(2), lambda code: use_sensor(StructuredLight(64, 48, code))),
+    *(
+        (code, lambda code: use_sensor(StructuredLight(64, 48, code)))
+        for code in (BinaryCode(2), XorCode(), MaxMinStripeCode(2), EnsembleCode(2))
+    ),
     (GrayPhase(), lambda code: use_sensor(StructuredLight(64, 48, code))),
     (FringeConvention(), lambda c: use_sensor(StructuredLight(64, 48, GrayPhase(convention=c)))),
     (AmcwToF(), use_sensor),
@@ -325,9 +339,9 @@ MODULES = (
         "decoding.disparities",
     ),
     "geometry.dense_stereo",
-    *("codes.thresholds", "codes.fringes", "codes.gray", "codes.gray_phase"),
+    *("codes.binary", "codes.xor", "codes.max_min_stripe", "codes.ensemble"),
 )
-RESULTS = {Disparities, ProjectorCoordinates, Phase}
+RESULTS = {Disparities, EnsembleAxisCode, ProjectorCoordinates, Phase}
 
 
 def test_every_setting_has_a_case() -> None:

@@ -5,21 +5,31 @@ A code follows one axis of the projector. `rangesim.StructuredLight` shows it al
 """
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames, Contrast
+from rangesim.codes.binary import BinaryCode
+from rangesim.codes.bit_code import BitCode
 from rangesim.codes.code import AXES, Code, CodeThresholds
+from rangesim.codes.ensemble import EnsembleCode
 from rangesim.codes.fringes import FringeConvention
 from rangesim.codes.gray import GrayCode
 from rangesim.codes.gray_phase import GrayPhase
+from rangesim.codes.max_min_stripe import MaxMinStripeCode
 from rangesim.codes.thresholds import GrayThresholds
+from rangesim.codes.xor import XorCode
 
 __all__ = [
     "AXES",
     "AxisCode",
     "AxisFrames",
+    "BinaryCode",
+    "BitCode",
     "Code",
     "CodeThresholds",
     "Contrast",
+    "EnsembleCode",
     "FringeConvention",
     "GrayCode",
     "GrayPhase",
     "GrayThresholds",
+    "MaxMinStripeCode",
+    "XorCode",
 ]

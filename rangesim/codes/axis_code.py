@@ -16,15 +16,20 @@ class Contrast(NamedTuple):
 
     white, black : (h, w), in the type and the units of the capture. values : (h, w) float32, white - black.
     is_enough : (h, w) bool, where `values` is above the threshold.
-    is_measured : whether the capture has a white and a black frame. If not, both are estimated from the code's frames,
-        so that they cannot contradict these.
+    has_white, has_black : whether the capture has such a frame. If not, it is estimated from the code's frames.
     """
 
     white: np.ndarray
     black: np.ndarray
     values: np.ndarray
     is_enough: np.ndarray
-    is_measured: bool = True
+    has_white: bool = True
+    has_black: bool = True
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether both were captured. If not, they cannot contradict the code's frames."""
+        return self.has_white and self.has_black
 
 
 class AxisFrames(NamedTuple):
@@ -34,6 +39,7 @@ class AxisFrames(NamedTuple):
     names : (n,) one name per frame, as the code names them: without the axis, in the order of the code. Frames that
         were not shown are missing.
     frames : (n, h, w), in the type and the units of the capture. contrast : Contrast of the same capture.
+    prefix : what the names of these frames start with in the capture, between the axis and the name.
     """
 
     capture: Capture
@@ -42,6 +48,7 @@ class AxisFrames(NamedTuple):
     names: list[str]
     frames: np.ndarray
     contrast: Contrast
+    prefix: str = ""
 
     def starting_with(self, prefix: str) -> AxisFrames:
         """Only the frames whose names start with `prefix`."""
@@ -50,9 +57,14 @@ class AxisFrames(NamedTuple):
         is_run = len(kept) == run.stop - (run.start or 0)  # a slice is a view, and copies nothing
         return self._replace(names=[self.names[i] for i in kept], frames=self.frames[run if is_run else kept])
 
+    def of_member(self, prefix: str) -> AxisFrames:
+        """Frames of one of several codes, whose names start with `prefix`, with the names that this code gives."""
+        own = self.starting_with(prefix)
+        return own._replace(names=[name.removeprefix(prefix) for name in own.names], prefix=self.prefix + prefix)
+
     def shown_name(self, name: str) -> str:
         """Name of a frame in the capture, with the axis: as in messages and in names of files."""
-        return f"{self.axis}_{name}"
+        return f"{self.axis}_{self.prefix}{name}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,7 +69,12 @@ class Code(Named, ABC):
         """Raise ValueError if the code cannot tell `size` projector pixels from each other."""
 
     def check_shown(self, size: int, shown: Sequence[str]) -> None:
-        """Raise ValueError if the frames of the names `shown` do not suffice to decode; by default all are needed."""
+        """Raise ValueError if the frames of the names `shown` do not suffice to decode; by default all are needed.
+
+        Parameters
+        ----------
+        size : int, projector pixels along the axis. shown : names as in `names`, and "white" and "black" if shown.
+        """
         if missing := [name for name in self.names(size) if name not in shown]:
             raise ValueError(f"expected an order with all frames of {self.type_name}: {', '.join(missing)} is missing.")
 

@@ -69,6 +69,10 @@ class GrayPhase(Code):
         fringes = [self.convention.pattern(x, self.period_px, step, self.steps) for step in range(self.steps)]
         return np.concatenate([self.gray(size).patterns(size), np.array(fringes, dtype=np.float32)])
 
+    def check_shown(self, size: int, shown: Sequence[str]) -> None:
+        self.gray(size).check_shown(size, shown)
+        super().check_shown(size, [*self.gray(size).names(size), *shown])
+
     def responses(self, axis: int, size: int) -> tuple[DenseResponse, ...]:
         return (*self.gray(size).responses(axis, size), Fringes(axis, self.period_px))
 

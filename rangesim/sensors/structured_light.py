@@ -76,8 +76,8 @@ class StructuredLight(Sensor):
     ['columns_bit2', 'columns_bit2_inverse', 'columns_bit1', 'columns_bit1_inverse']
     >>> sensor.patterns()[:, 0].astype(int)[0]  # a row of the coarsest bit
     array([0, 0, 0, 0, 1, 1, 1, 1])
-    >>> StructuredLight(4, 4, "gray", order=("white", "black", "*")).frame_names()[:3]
-    ['white', 'black', 'columns_bit1']
+    >>> StructuredLight(8, 4, "gray", order=("white", "black", "*_bit?")).frame_names()  # no inverses
+    ['white', 'black', 'columns_bit2', 'columns_bit1', 'columns_bit0']
     """
 
     projector_width: Annotated[int, whole(2, "projector")] = 1280
@@ -107,8 +107,8 @@ class StructuredLight(Sensor):
         if self.order:
             in_view = set(self.frame_names())
             for axis in self.axes:
-                names = self.code.names(self.size(axis))
-                self.code.check_shown(self.size(axis), [name for name in names if f"{axis}_{name}" in in_view])
+                coded = [name for name in self.code.names(self.size(axis)) if f"{axis}_{name}" in in_view]
+                self.code.check_shown(self.size(axis), [*coded, *(name for name in (WHITE, BLACK) if name in in_view)])
 
     def size(self, axis: str) -> int:
         """Projector pixels along `axis`."""
@@ -294,7 +294,9 @@ class StructuredLightDecoder(Decoder):
             white = frames[shown.index(WHITE)]
         if BLACK in shown:
             black = frames[shown.index(BLACK)]
-        return direct_contrast(capture, white, black, self.gray)._replace(is_measured=False)
+        return direct_contrast(capture, white, black, self.gray)._replace(
+            has_white=WHITE in shown, has_black=BLACK in shown
+        )
 
     @property
     def _thresholds(self) -> CodeThresholds:

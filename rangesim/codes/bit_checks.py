@@ -1,0 +1,316 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of bits: frames that do not add up to white and black, another code, another order of the frames.
+
+A single pixel may be wrong for many reasons, so the checks look at many pixels at once: a capture that is read wrongly
+contradicts itself nearly everywhere. Each check returns one sentence with the likely cause, or None.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+
+import numpy as np
+
+from rangesim.capture import bright_level
+from rangesim.codes.axis_code import AxisCode, AxisFrames
+from rangesim.codes.bits import Words, bit_frames
+from rangesim.decoding.pixel_samples import MIN_PIXELS, evenly_spread
+from rangesim.decoding.status import Status
+
+MAX_UNPAIRED_FRACTION = 0.2
+"""Largest fraction of the pixels at which the sum of a pattern and its inverse may differ from white + black. If two
+patterns are no pair, it differs at half of the pixels."""
+
+MIN_UNPAIRED = 0.75
+"""Least difference between white + black and the sum of a pattern and its inverse that counts, as a fraction of white -
+black. Where both are lit or both are dark, the difference is 1; a gamma makes a difference of 0.56 at most."""
+
+MAX_PAIRS = 50_000
+"""Largest number of pairs of neighbouring pixels, across and also down the image, on which other orders of the frames
+are tried, so that the time is bounded, which grows with the number of orders. With far fewer, too few of them would lie
+in different cells (see `MIN_STEPS`)."""
+
+MIN_STEPS = 100
+"""Least number of pairs of neighbouring pixels in different cells from which a check of the order draws a
+conclusion."""
+
+MAX_OUTSIDE_FRACTION = 0.2
+"""Largest fraction of the pixels at which a frame may be brighter than white or darker than black. If a frame of bits
+is taken for one of the two, half of the pixels are."""
+
+MIN_OUTSIDE = 0.5
+"""Least distance from the range between black and white that counts, as a fraction of the range of the frames. If a
+frame of stripes is taken for white or black, it is 1 where the two differ."""
+
+MIN_RANGE = 0.25
+"""Least range of the frames at a pixel that is checked, as a fraction of the range at the bright pixels. Light from
+other surfaces makes a smaller range in the shadow."""
+
+MAX_FARTHER_OCTAVES = 0.3
+"""Largest mean distance by which neighbours may lie farther apart when read as the code than when read as another one,
+in powers of two. For plain binary numbers that are read as Gray code, this distance is about 1. For the right code
+whose neighbours lie one cell apart, it is at most 0, because they cannot lie nearer."""
+
+MAX_NEARER_FRACTION = 0.8
+"""Largest fraction of neighbours that another order of the frames may bring nearer to each other, because the right
+order brings nearly all of them nearer. Only neighbours count whose distance the other order halves or doubles. With a
+larger value, noise at some pixels would hide a wrong order."""
+
+MIN_REPEATED_FRACTION = 0.9
+"""Least fraction of the changes of one bit, from pixel to pixel, at which another bit changes too if both bits come
+from the same frame. In Gray code that the camera sees sharply, no two bits change together."""
+
+MIN_ALONE_FRACTION = 0.3
+"""Least fraction of these changes at which no third bit changes, if both bits are the same frame. At a step of the
+scene other bits change too."""
+
+
+def pair_contradiction(seen: AxisFrames, words: Words) -> str | None:
+    """A sentence if patterns and inverses do not add up to white + black; None if they do.
+
+    A pair adds up to white + black at any blur and any interreflection, because light adds up. Two frames that are no
+    pair do so at half of the pixels only.
+
+    Parameters
+    ----------
+    seen : frames (k, h, w) of the bits. words : those of the code.
+    """
+    contrast = seen.contrast
+    pairs = [
+        (bit.pattern, bit.inverse)
+        for bit in bit_frames(seen.names, words.bits)
+        if bit.pattern is not None and bit.inverse is not None
+    ]
+    if not contrast.is_measured or not pairs:
+        return None
+    white, black, values = contrast.white.ravel(), contrast.black.ravel(), contrast.values.ravel()
+    usable = contrast.is_enough & ~seen.capture.saturated(contrast.white[None])
+    used = evenly_spread(np.flatnonzero(usable))
+    if len(used) < MIN_PIXELS:
+        return None
+    used = used[values[used] >= np.median(values[used])]
+    total = white[used].astype(np.float64) + black[used]
+    fractions = []
+    for places in pairs:
+        pattern, inverse = (seen.frames[i].ravel()[used].astype(np.float64) for i in places)
+        fractions.append(float((np.abs(pattern + inverse - total) > MIN_UNPAIRED * values[used]).mean()))
+    unpaired = [k for k, fraction in enumerate(fractions) if fraction > MAX_UNPAIRED_FRACTION]
+    if not unpaired:
+        return None
+    worst = max(unpaired, key=fractions.__getitem__)
+    pattern_name, inverse_name = (seen.shown_name(seen.names[i]) for i in pairs[worst])
+    return (
+        f"{len(unpaired)} of {len(fractions)} pairs of pattern and inverse along {seen.axis} contradict white and "
+        f"black: frames {pattern_name} and {inverse_name} do not add up to their sum at {100 * fractions[worst]:.0f} % "
+        "of the pixels: check the order of the frames, that none is missing or there twice, and that all have one "
+        "exposure."
+    )
+
+
+def level_contradiction(seen: AxisFrames, words: Words) -> str | None:
+    """A sentence if frames without inverse are brighter than white or darker than black; None if they are not.
+
+    Parameters
+    ----------
+    seen : frames (k, h, w) of the bits. words : those of the code.
+    """
+    contrast = seen.contrast
+    shown = bit_frames(seen.names, words.bits)
+    if all(bit.pattern is not None and bit.inverse is not None for bit in shown):
+        return None  # pairs tell more, see `pair_contradiction`
+    if not (contrast.has_white or contrast.has_black):
+        return None
+    brightest, darkest = (f.astype(np.float32).ravel() for f in (seen.frames.max(axis=0), seen.frames.min(axis=0)))
+    swing = brightest - darkest
+    used = evenly_spread(np.flatnonzero(swing > MIN_RANGE * bright_level(swing)))
+    if len(used) < MIN_PIXELS:
+        return None
+    least = MIN_OUTSIDE * swing[used]
+    for has_level, level, excess, words_of_it in (
+        (contrast.has_white, "white", brightest[used] - contrast.white.ravel()[used], "brighter than white"),
+        (contrast.has_black, "black", contrast.black.ravel()[used] - darkest[used], "darker than black"),
+    ):
+        outside = float((excess > least).mean())
+        if has_level and outside > MAX_OUTSIDE_FRACTION:
+            return (
+                f"the bits along {seen.axis} contradict {level}: one of them is {words_of_it} at {100 * outside:.0f} % "
+                "of the pixels: check the order of the frames, and that all have one exposure."
+            )
+    return None
+
+
+def other_code_contradiction(seen: AxisFrames, code: AxisCode, words: Words, others: Sequence[Words]) -> str | None:
+    """A sentence if the patterns look like another code; None if they look like the code that they are read as.
+
+    Neighbouring pixels see neighbouring cells. If the words of one code are read as those of another, the cells of
+    neighbours lie farther apart. If the frames are in another order, they may lie farther apart too, but they lie
+    clearly nearer when read in that order: then the result is None.
+
+    Parameters
+    ----------
+    seen : frames (k, h, w) of the bits. code : what they decode to. words : those of the code. others : those of other
+        codes with as many bits.
+    """
+    pairs = [seen_words[:, seen_words[0] != seen_words[1]] for seen_words in _neighbours(code, words)]
+    both = np.concatenate(pairs, axis=1)
+    if both.shape[1] < MIN_STEPS:
+        return None
+    both = both[:, :: 1 + both.shape[1] // (2 * MAX_PAIRS)]
+    own = _octaves(both, words)
+    nearest = min(others, key=lambda other: _octaves(both, other), default=words)
+    if own < _octaves(both, nearest) + MAX_FARTHER_OCTAVES:
+        return None
+    orders = [_octaves(reorder(both), words) for _, reorder in _other_orders(seen, words)]
+    if min(orders) + MAX_FARTHER_OCTAVES < _octaves(both, nearest):
+        return None
+    return (
+        f"the bits along {seen.axis} contradict {words.noun}: neighbouring pixels lie {2**own:.1f} cells apart as "
+        f"{words.noun}, and {2 ** _octaves(both, nearest):.1f} as {nearest.noun}: check which code was shown."
+    )
+
+
+def order_contradiction(seen: AxisFrames, code: AxisCode, words: Words) -> str | None:
+    """A sentence if the bits seem to be in another order, inverted or repeated; None if not.
+
+    Neighbouring pixels see neighbouring cells. The function tries other orders. Each changes the distance of some
+    neighbours; if an order brings nearly all of these nearer to each other, the frames were in that order.
+
+    Parameters
+    ----------
+    seen : frames (k, h, w) of the bits. code : what they decode to. words : those of the code.
+    """
+    pairs = _neighbours(code, words)
+    few = [part[:, :: 1 + part.shape[1] // MAX_PAIRS] for part in pairs]
+    across = max(few, key=lambda part: np.count_nonzero(part[0] != part[1]))
+    step = _coarse_step(across, words)
+    # This looks at all pairs, because the coarsest bits change at a line or two of the image.
+    text = None
+    if step is not None and words.change_one_bit:
+        names = [seen.shown_name(bit.name) for bit in reversed(bit_frames(seen.names, words.bits))]
+        text = _repeated_bit(_that_differ(pairs) >> step, names[step:])
+    text = text or _better_order(across, _that_differ(few), seen, words)
+    if text is None:
+        return None
+    return (
+        f"the bits along {seen.axis} contradict {words.noun}, where neighbouring pixels see neighbouring cells: {text}."
+    )
+
+
+def _neighbours(code: AxisCode, words: Words) -> list[np.ndarray]:
+    """(2, n) int each: words of neighbouring pixels, across and down the image, both inside a cell."""
+    cell = code.coordinate / np.float32(code.cell_px)
+    usable = (cell % 1 == 0.5) & (code.status != Status.LOW_SIGNAL) & (code.status != Status.SATURATED)
+    word = words.of_cell[cell.astype(np.int32)]  # the bits as shown
+    pairs = []
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        both = usable[here] & usable[there]
+        pairs.append(np.stack([word[here][both], word[there][both]]))
+    return pairs
+
+
+def _octaves(both: np.ndarray, words: Words) -> float:
+    """Mean distance of neighbours with words (2, n) that differ, in cells, as a power of two."""
+    return float(np.log2(_apart(both, 0, words)).mean())
+
+
+def _that_differ(pairs: list[np.ndarray]) -> np.ndarray:
+    """(2, m) words of all pairs (2, n) whose two words differ."""
+    words = np.concatenate(pairs, axis=1)
+    return np.asarray(words[:, words[0] != words[1]])
+
+
+def _better_order(across: np.ndarray, differing: np.ndarray, seen: AxisFrames, words: Words) -> str | None:
+    """The fault of the frames whose correction brings neighbours nearest together; None if no correction does.
+
+    Parameters
+    ----------
+    across : (2, n) int, words of neighbours in the direction in which the code changes more.
+    differing : (2, m) int, words of the neighbours in both directions whose words differ.
+    seen : frames of the bits. words : those of the code.
+    """
+    best, text = 0.0, None
+    unresolved = _coarse_step(across, words) or 0
+    for fault, reorder in _other_orders(seen, words):
+        step = _coarse_step(reorder(across), words)
+        changed = np.bitwise_xor(reorder(words.of_cell), words.of_cell)
+        if step is None or changed.max() >> unresolved == 0:  # bits that the camera does not resolve tell no order
+            continue
+        before, after = (np.maximum(_apart(both, step, words), 0.5) for both in (differing, reorder(differing)))
+        octaves = np.log2(before / after)
+        moved, nearer, gain = np.abs(octaves) >= 1, octaves >= 1, float(octaves.sum())
+        if moved.sum() >= MIN_STEPS and nearer.sum() > MAX_NEARER_FRACTION * moved.sum() and gain > best:
+            best, text = gain, fault
+    return text
+
+
+def _coarse_step(both: np.ndarray, words: Words) -> int | None:
+    """Least number of finest bits to leave out so that half of the neighbours with words (2, n) see the same cell.
+
+    Bits that are finer than the camera's pixels do not show neighbours. None if fewer than three bits would be left.
+    """
+    first, second = words.cell_of[both]
+    for step in range(words.bits - 2):
+        if np.count_nonzero(first >> step == second >> step) >= 0.5 * len(first):
+            return step
+    return None
+
+
+def _apart(both: np.ndarray, step: int, words: Words) -> np.ndarray:
+    """(n,) int, distance of the neighbours with words (2, n), in cells as large as 2^step of the finest ones."""
+    first, second = words.cell_of[both]
+    return np.asarray(np.abs((second >> step) - (first >> step)))
+
+
+def _other_orders(seen: AxisFrames, words: Words) -> Iterator[tuple[str, Callable[[np.ndarray], np.ndarray]]]:
+    """Faults that the order of the frames may have, each with the function that corrects words for it."""
+    n = words.bits
+    shown = list(reversed(bit_frames(seen.names, n)))
+    is_pair = [bit.pattern is not None and bit.inverse is not None for bit in shown]
+    names = [seen.shown_name(bit.name if bit.pattern is not None else f"{bit.name}_inverse") for bit in shown]
+    if all(is_pair):
+        yield "every inverse seems to stand before its pattern", partial(np.bitwise_xor, (1 << n) - 1)
+    else:
+        lone = sum(1 << i for i in range(n) if not is_pair[i])
+        yield "frames without their inverse seem to be inverted", partial(np.bitwise_xor, lone)
+    yield "the least significant bit seems to come first", partial(_reversed, n)
+    for i in range(n):
+        fault = f"{names[i]} and its inverse seem to be exchanged" if is_pair[i] else f"{names[i]} seems to be inverted"
+        yield f"frame {fault}", partial(np.bitwise_xor, 1 << i)
+        for j in range(i):
+            each = ", each with its inverse," if is_pair[i] and is_pair[j] else ""
+            yield f"frames {names[i]} and {names[j]}{each} seem to be exchanged", partial(_exchanged, i, j)
+
+
+def _reversed(n_bits: int, words: np.ndarray) -> np.ndarray:
+    """Words of `n_bits` bits, with the bits in reverse order."""
+    result = np.zeros_like(words)
+    for k in range(n_bits):
+        result |= ((words >> k) & 1) << (n_bits - 1 - k)
+    return result
+
+
+def _exchanged(i: int, j: int, words: np.ndarray) -> np.ndarray:
+    """Words with bits i and j exchanged."""
+    differ = ((words >> i) ^ (words >> j)) & 1
+    return np.asarray(words ^ (differ << i) ^ (differ << j))
+
+
+def _repeated_bit(words: np.ndarray, bits: list[str]) -> str | None:
+    """A clause that names two bits which always change together; None if no two do.
+
+    Parameters
+    ----------
+    words : (2, m) int, words of neighbours that differ. bits : (b,) names of the patterns, least significant
+        first."""
+    changed = words[0] ^ words[1]
+    counts = [int(np.count_nonzero(changed & (1 << i))) for i in range(len(bits))]
+    for i in range(len(bits)):
+        for j in range(i):
+            two = (1 << i) | (1 << j)
+            both = int(np.count_nonzero((changed & two) == two))
+            if both < MIN_STEPS or both < MIN_REPEATED_FRACTION * max(counts[i], counts[j]):
+                continue
+            if np.count_nonzero(changed == two) > MIN_ALONE_FRACTION * both:
+                return f"frames {bits[i]} and {bits[j]} seem to be one pattern shown twice"
+    return None

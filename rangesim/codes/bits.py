@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bits of a code, with or without inverse patterns, to words, to numbers of cells, and to projector coordinates."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rangesim.capture import Capture
+from rangesim.codes.axis_code import AxisCode, AxisFrames, Contrast
+from rangesim.codes.contrast import difference_noise
+from rangesim.codes.thresholds import GrayThresholds
+from rangesim.decoding.row_bands import bands
+from rangesim.decoding.status import Status
+
+CELL_SIGMA = 12**-0.5
+"""Standard deviation of a place that is known to lie in a cell, in cells: that of an even distribution."""
+
+LONE_NOISE = 3**0.5
+"""Ratio of the noise of 2 pattern - (white + black) to that of pattern - inverse, at equal noise of all frames."""
+
+
+class Words(NamedTuple):
+    """The words that a code gives to its cells.
+
+    noun : what the words are, in running text. of_cell : (2^b,) int32, word of each cell. cell_of : (2^b,) int32, cell
+    of each word.
+    """
+
+    noun: str
+    of_cell: np.ndarray
+    cell_of: np.ndarray
+
+    @classmethod
+    def of(cls, noun: str, of_cell: np.ndarray) -> Words:
+        """Words from those of all cells (2^b,), each word once."""
+        cell_of = np.empty(len(of_cell), dtype=np.int32)
+        cell_of[of_cell] = np.arange(len(of_cell), dtype=np.int32)
+        return cls(noun, of_cell.astype(np.int32), cell_of)
+
+    @property
+    def bits(self) -> int:
+        """Number of bits of a word."""
+        return len(self.of_cell).bit_length() - 1
+
+    @property
+    def change_one_bit(self) -> bool:
+        """Whether the words of neighbouring cells differ in one bit, as in Gray code."""
+        changed = self.of_cell[1:] ^ self.of_cell[:-1]
+        return not (changed & (changed - 1)).any()
+
+
+class BitFrames(NamedTuple):
+    """The frames of one bit.
+
+    name : of the bit. pattern, inverse : indices of its frames; None where the frame was not shown.
+    """
+
+    name: str
+    pattern: int | None
+    inverse: int | None
+
+
+def bit_frames(names: list[str], bits: int) -> list[BitFrames]:
+    """The frames of each bit, most significant first.
+
+    Examples
+    --------
+    >>> bit_frames(["bit1", "bit0", "bit0_inverse"], 2)
+    [BitFrames(name='bit1', pattern=0, inverse=None), BitFrames(name='bit0', pattern=1, inverse=2)]
+    """
+    at = {name: i for i, name in enumerate(names)}
+    every = (f"bit{k}" for k in reversed(range(bits)))
+    return [BitFrames(name, at.get(name), at.get(f"{name}_inverse")) for name in every]
+
+
+def decode_bits(seen: AxisFrames, words: Words, cell_px: int, thresholds: GrayThresholds) -> AxisCode:
+    """Projector coordinate of each pixel from the bits of its cell.
+
+    A bit is the sign of pattern - inverse. Where only one of the two was shown, white + black - pattern stands for the
+    inverse, because light adds up. A bit is uncertain where the noise is larger than the difference. A pixel on the
+    edge of a stripe has one uncertain bit, which does no harm if a flip of it leads to a neighbouring cell: the
+    function then returns the edge between the two cells. It refuses all other pixels with uncertain bits.
+
+    If white or black was not captured either, it is estimated from the frames. Such an estimate is wrong at cells that
+    are dark in all frames, or lit in all. Blur from the next cell can look like a bit there, so cells next to these are
+    refused, too, unless two frames show each level. It is right elsewhere, because in a code whose neighbouring cells
+    differ in one bit all other bits are certain.
+
+    Parameters
+    ----------
+    seen : frames (k, h, w) of the bits, named "bit3" and "bit3_inverse"; each bit has one of them or both.
+    words : those of the code.
+    cell_px : int, projector pixels per cell of the code.
+    """
+    capture, contrast = seen.capture, seen.contrast
+    shown = bit_frames(seen.names, words.bits)
+    coordinate = np.empty(contrast.values.shape, dtype=np.float32)
+    status = np.zeros(contrast.values.shape, dtype=np.uint8)
+    for rows in bands(len(status)):
+        word, uncertain = _classify(capture, seen.frames[:, rows], _rows_of(contrast, rows), shown, thresholds)
+        low, high = words.cell_of[word], words.cell_of[word ^ uncertain]
+        on_edge = (uncertain & (uncertain - 1) == 0) & (np.abs(low - high) <= 1)
+        coordinate[rows] = (0.5 * (low + high) + 0.5) * cell_px
+        status[rows][coordinate[rows] >= seen.size + cell_px / 2] = Status.CODE_ERROR
+        if seen.size % cell_px:
+            _in_projector(coordinate[rows], seen.size, cell_px)
+        failed = ~contrast.is_enough[rows] | ~on_edge
+        if not contrast.is_measured:
+            failed |= _is_guessed(capture.frames[:, rows], _rows_of(contrast, rows), shown, words, low)
+        status[rows][failed] = Status.LOW_SIGNAL
+        status[rows][failed & capture.saturated(capture.frames[:, rows])] = Status.SATURATED
+    sigma_px = np.broadcast_to(np.float32(CELL_SIGMA * cell_px), status.shape)
+    return AxisCode(coordinate, status, cell_px, sigma_px)
+
+
+def _in_projector(coordinate: np.ndarray, size: int, cell_px: int) -> None:
+    """Move coordinates of a last cell that is cut off to the centre of what is left of it, and its edge to the end."""
+    start = size - size % cell_px
+    coordinate[coordinate == start + cell_px / 2] = (start + size) / 2
+    coordinate[coordinate == start + cell_px] = size
+
+
+def _rows_of(contrast: Contrast, rows: slice) -> Contrast:
+    """Contrast of some rows of the image."""
+    return contrast._replace(
+        white=contrast.white[rows],
+        black=contrast.black[rows],
+        values=contrast.values[rows],
+        is_enough=contrast.is_enough[rows],
+    )
+
+
+def _classify(
+    capture: Capture, frames: np.ndarray, contrast: Contrast, shown: list[BitFrames], thresholds: GrayThresholds
+) -> tuple[np.ndarray, np.ndarray]:
+    """(h, w) int32 each: the word, and the set of its bits that are uncertain."""
+    word = np.zeros(contrast.values.shape, dtype=np.int32)
+    uncertain = np.zeros_like(word)
+    levels = None
+    for bit in shown:
+        if bit.pattern is not None and bit.inverse is not None:
+            pattern, inverse = (frames[i].astype(np.float32) for i in (bit.pattern, bit.inverse))
+            difference = pattern - inverse
+            least = _least_bit(capture, difference_noise(capture, pattern, inverse), 1.0, contrast, thresholds)
+            is_uncertain = np.abs(difference) < least
+        else:
+            levels = levels or _Levels.of(capture, contrast)
+            alone = frames[bit.pattern if bit.inverse is None else bit.inverse]
+            difference, is_uncertain = levels.compare(capture, alone, contrast, thresholds)
+            if bit.pattern is None:
+                difference = -difference
+        word = (word << 1) | (difference > 0)
+        uncertain = (uncertain << 1) | is_uncertain
+    return word, uncertain
+
+
+class _Levels(NamedTuple):
+    """White and black as references of frames without inverse.
+
+    total : (h, w) float32, white + black. variance : (h, w), of its noise; None: unknown. is_clipped : (h, w) bool,
+    whether white is; None: nowhere.
+    """
+
+    total: np.ndarray
+    variance: np.ndarray | None
+    is_clipped: np.ndarray | None
+
+    @classmethod
+    def of(cls, capture: Capture, contrast: Contrast) -> _Levels:
+        white, black = contrast.white.astype(np.float32), contrast.black.astype(np.float32)
+        noise = difference_noise(capture, white, black)
+        is_clipped = capture.saturated(contrast.white[None])
+        return cls(white + black, None if noise is None else noise**2, is_clipped if is_clipped.any() else None)
+
+    def compare(
+        self, capture: Capture, frame: np.ndarray, contrast: Contrast, thresholds: GrayThresholds
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(h, w) each: 2 frame - (white + black), and whether its sign is uncertain.
+
+        Where white is clipped, the middle of white and black is too low. A frame above it that is not clipped itself
+        may be dark, so its bit is uncertain.
+        """
+        value = frame.astype(np.float32)
+        difference = 2 * value - self.total
+        noise, frame_noise = None, capture.noise(value)
+        if frame_noise is not None and self.variance is not None:
+            noise = np.sqrt(4 * frame_noise**2 + self.variance)
+        uncertain = np.abs(difference) < _least_bit(capture, noise, LONE_NOISE, contrast, thresholds)
+        if self.is_clipped is not None:
+            uncertain |= self.is_clipped & (difference > 0) & ~capture.saturated(frame[None])
+        return difference, uncertain
+
+
+def _least_bit(
+    capture: Capture, noise: np.ndarray | None, relative_noise: float, contrast: Contrast, thresholds: GrayThresholds
+) -> np.ndarray | float:
+    """Least difference of a certain bit, in the capture's units.
+
+    Parameters
+    ----------
+    noise : (h, w) standard deviation of the difference; None: unknown.
+    relative_noise : ratio of this standard deviation to that of pattern - inverse, where it is unknown.
+    """
+    if noise is not None:
+        return np.maximum(thresholds.bit_sigmas * noise, thresholds.relative_bit * contrast.values)
+    if capture.is_digital:
+        return relative_noise * thresholds.bit_of_scale * capture.full_scale
+    return thresholds.relative_bit * contrast.values
+
+
+def _is_guessed(
+    frames: np.ndarray, contrast: Contrast, shown: list[BitFrames], words: Words, cell: np.ndarray
+) -> np.ndarray:
+    """(h, w) bool, pixels next to a cell that is dark in all frames or lit in all, whose levels one frame shows only.
+
+    Parameters
+    ----------
+    frames : (k, h, w), all of the capture. cell : (h, w) int, number of the cell that was read.
+    """
+    guessed = np.zeros(cell.shape, dtype=bool)
+    inverted = sum(1 << k for k, bit in enumerate(reversed(shown)) if bit.pattern is None)
+    if any(bit.pattern is not None and bit.inverse is not None for bit in shown):
+        return guessed  # a pair shows both levels everywhere
+    all_lit = len(words.of_cell) - 1 - inverted
+    for has_level, constant, sign in ((contrast.has_white, inverted, 1), (contrast.has_black, all_lit, -1)):
+        if not has_level:
+            y, x = np.nonzero(np.abs(cell - words.cell_of[constant]) <= 1)
+            twice_middle = contrast.white[y, x].astype(np.float32) + contrast.black[y, x]
+            beyond = sign * (2 * frames[:, y, x].astype(np.float32) - twice_middle) > 0
+            guessed[y, x] |= np.count_nonzero(beyond, axis=0) < 2
+    return guessed
+
+
+def binary_of_gray(gray: np.ndarray) -> np.ndarray:
+    """Numbers whose Gray codes are `gray` (integers of up to 32 bits): the running exclusive or from the top bit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> binary_of_gray(np.array([0b000, 0b001, 0b011, 0b010, 0b110]))
+    array([0, 1, 2, 3, 4])
+    """
+    result = gray.copy()
+    for step in (16, 8, 4, 2, 1):
+        result ^= result >> step
+    return result
