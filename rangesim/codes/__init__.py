@@ -9,6 +9,7 @@ from rangesim.codes.code import AXES, Code, CodeThresholds
 from rangesim.codes.fringes import FringeConvention
 from rangesim.codes.gray import GrayCode
 from rangesim.codes.gray_phase import GrayPhase
+from rangesim.codes.micro_phase_shifting import MicroPhaseShifting
 from rangesim.codes.thresholds import GrayThresholds
 
 __all__ = [
@@ -22,4 +23,5 @@ __all__ = [
     "GrayCode",
     "GrayPhase",
     "GrayThresholds",
+    "MicroPhaseShifting",
 ]
