@@ -17,7 +17,14 @@ from synthetic import plane_signals, stereo_rig
 
 import rangesim
 from rangesim import decode, explain, expose
-from rangesim.codes import FringeConvention, GrayCode, GrayPhase, GrayThresholds
+from rangesim.codes import (
+    FringeConvention,
+    GrayCode,
+    GrayPhase,
+    GrayThresholds,
+    MicroPhaseShifting,
+    ModulatedPhaseShifting,
+)
 from rangesim.decoding.disparities import Disparities, ImageNoise
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
@@ -197,6 +204,8 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (StructuredLight(64, 48), use_sensor),
     (GrayCode(2), lambda code: use_sensor(StructuredLight(64, 48, code))),
     (GrayPhase(), lambda code: use_sensor(StructuredLight(64, 48, code))),
+    (MicroPhaseShifting(), lambda code: use_sensor(StructuredLight(64, 48, code))),
+    (ModulatedPhaseShifting(), lambda code: use_sensor(StructuredLight(64, 48, code))),
     (FringeConvention(), lambda c: use_sensor(StructuredLight(64, 48, GrayPhase(convention=c)))),
     (AmcwToF(), use_sensor),
     (AmcwToF(waveform="square"), use_sensor),
@@ -326,6 +335,7 @@ MODULES = (
     ),
     "geometry.dense_stereo",
     *("codes.thresholds", "codes.fringes", "codes.gray", "codes.gray_phase"),
+    *("codes.micro_phase_shifting", "codes.modulated_phase_shifting"),
 )
 RESULTS = {Disparities, ProjectorCoordinates, Phase}
 

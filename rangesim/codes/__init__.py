@@ -10,6 +10,7 @@ from rangesim.codes.fringes import FringeConvention
 from rangesim.codes.gray import GrayCode
 from rangesim.codes.gray_phase import GrayPhase
 from rangesim.codes.micro_phase_shifting import MicroPhaseShifting
+from rangesim.codes.modulated_phase_shifting import ModulatedPhaseShifting
 from rangesim.codes.thresholds import GrayThresholds
 
 __all__ = [
@@ -24,4 +25,5 @@ __all__ = [
     "GrayPhase",
     "GrayThresholds",
     "MicroPhaseShifting",
+    "ModulatedPhaseShifting",
 ]

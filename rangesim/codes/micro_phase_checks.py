@@ -40,6 +40,9 @@ MAX_HARMONIC = 0.06
 """Largest amplitude of the second harmonic of the fringes, as a fraction of the first. A projector's gamma g makes it
 (g - 1) / (g + 2): 0.06 is a gamma of 1.2, and moves phases by 0.06 radians."""
 
+GAMMAS = (0.45, 1.4, 1.8, 2.2, 2.6)
+"""Exponents of a projector that are tried on images that fit to no place."""
+
 
 def period_contradiction(seen: AxisFrames, code: MicroPhaseShifting) -> str | None:
     """A sentence if the images contradict the periods as a whole, with the likely cause; None if they agree."""
@@ -63,9 +66,15 @@ def period_contradiction(seen: AxisFrames, code: MicroPhaseShifting) -> str | No
     for fault, other_frames, other_code, other_periods in _faults(frames, code, periods, names):
         if _misfits(other_frames, other_code, other_periods, seen.size) <= MAX_MENDED_FRACTION:
             return f"{text}: {fault}."
+    curved = {
+        gamma: float(1 - code.match(frames, periods, code.table_of(seen.size, gamma)).fits.mean()) for gamma in GAMMAS
+    }
+    gamma = min(curved, key=lambda gamma: curved[gamma])
+    if curved[gamma] <= MAX_MENDED_FRACTION:
+        return f"{text}: the fringes seem to have a gamma of about {gamma:.1f}: projector and camera must be linear."
     return (
         f"{text}: check periods_px, which are the periods in projector pixels (the name of a set is not them), the "
-        "size of the projector, and the order of the images."
+        "size of the projector, and the order of the images. Noise does the same: take more light."
     )
 
 
