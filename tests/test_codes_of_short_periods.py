@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Micro and modulated phase shifting: identity, noise law, light between surfaces, named faults, and its authors' captures."""
+"""Micro and modulated phase shifting: identity, noise law, light between surfaces, named faults, real captures."""
 
 from __future__ import annotations
 
