@@ -13,6 +13,8 @@ from rangesim.codes.fringes import FringeConvention
 from rangesim.codes.gray import GrayCode
 from rangesim.codes.gray_phase import GrayPhase
 from rangesim.codes.max_min_stripe import MaxMinStripeCode
+from rangesim.codes.micro_phase_shifting import MicroPhaseShifting
+from rangesim.codes.modulated_phase_shifting import ModulatedPhaseShifting
 from rangesim.codes.thresholds import GrayThresholds
 from rangesim.codes.xor import XorCode
 
@@ -31,5 +33,7 @@ __all__ = [
     "GrayPhase",
     "GrayThresholds",
     "MaxMinStripeCode",
+    "MicroPhaseShifting",
+    "ModulatedPhaseShifting",
     "XorCode",
 ]
