@@ -9,6 +9,9 @@ from rangesim.codes.code import AXES, Code, CodeThresholds
 from rangesim.codes.fringes import FringeConvention
 from rangesim.codes.gray import GrayCode
 from rangesim.codes.gray_phase import GrayPhase
+from rangesim.codes.image_stack import ImageStack
+from rangesim.codes.line_sweep import LineSweep
+from rangesim.codes.ramp import RampCode
 from rangesim.codes.thresholds import GrayThresholds
 
 __all__ = [
@@ -22,4 +25,7 @@ __all__ = [
     "GrayCode",
     "GrayPhase",
     "GrayThresholds",
+    "ImageStack",
+    "LineSweep",
+    "RampCode",
 ]
