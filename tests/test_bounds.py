@@ -17,7 +17,16 @@ from synthetic import plane_signals, stereo_rig
 
 import rangesim
 from rangesim import decode, explain, expose
-from rangesim.codes import FringeConvention, GrayCode, GrayPhase, GrayThresholds
+from rangesim.codes import (
+    DeBruijnStripes,
+    FringeConvention,
+    GrayCode,
+    GrayPhase,
+    GrayThresholds,
+    ImageStack,
+    LineSweep,
+    RampCode,
+)
 from rangesim.decoding.disparities import Disparities, ImageNoise
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
@@ -58,6 +67,7 @@ from rangesim.sensors import (
     StereoDecoder,
     StructuredLight,
     StructuredLightDecoder,
+    ZnccDecoder,
 )
 from rangesim.signals import SignalSet
 
@@ -98,6 +108,7 @@ def use_sensor(sensor: Any) -> None:
         sensor = dataclasses.replace(sensor, bins=2000)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "the fringes along .* contradict white and black", RangesimWarning)  # a gamma
+        warnings.filterwarnings("ignore", "the stripes along .* contradict", RangesimWarning)  # finer than the camera
         expose_and_decode(sensor, rig)
     assert len(sensor.frame_names()) == sensor.n_frames
 
@@ -116,6 +127,7 @@ def use_response(response: Any) -> None:
 def use_decoder(decoder: Decoder) -> None:
     sensor = {
         StructuredLightDecoder: StructuredLight(axes=("columns", "rows")),
+        ZnccDecoder: StructuredLight(axes=("columns", "rows")),
         AmcwDecoder: AmcwToF(waveform="square"),
         DirectToFDecoder: DirectToF(bins=32),
         IdealToFDecoder: IdealToF(),
@@ -197,6 +209,10 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (StructuredLight(64, 48), use_sensor),
     (GrayCode(2), lambda code: use_sensor(StructuredLight(64, 48, code))),
     (GrayPhase(), lambda code: use_sensor(StructuredLight(64, 48, code))),
+    (DeBruijnStripes(), lambda code: use_sensor(StructuredLight(64, 48, code))),
+    (ImageStack(), lambda code: use_sensor(StructuredLight(64, 48, code))),
+    (LineSweep(), lambda code: use_sensor(StructuredLight(64, 48, code))),
+    (RampCode(), lambda code: use_sensor(StructuredLight(64, 48, code))),
     (FringeConvention(), lambda c: use_sensor(StructuredLight(64, 48, GrayPhase(convention=c)))),
     (AmcwToF(), use_sensor),
     (AmcwToF(waveform="square"), use_sensor),
@@ -204,6 +220,7 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (DirectToF(pulse_fwhm_s=400e-12), use_sensor),
     (IdealToF(), use_sensor),
     (StructuredLightDecoder(), use_decoder),
+    (ZnccDecoder(), use_decoder),
     (STEREO, use_sensor),
     (DOTS, use_sensor),
     (ReferencePatternDecoder(disparities=8), use_decoder),
@@ -314,8 +331,13 @@ MODULES = (
         "sensors.ideal_tof",
         "sensors.active_stereo",
         "sensors.reference_pattern",
+        "sensors.zncc",
     ),
     *(
+        "codes.de_bruijn",
+        "codes.image_stack",
+        "codes.line_sweep",
+        "codes.ramp",
         "codes.thresholds",
         "codes.fringes",
         "codes.gray",

@@ -6,6 +6,7 @@ A code follows one axis of the projector. `rangesim.StructuredLight` shows it al
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames, Contrast
 from rangesim.codes.code import AXES, Code, CodeThresholds
+from rangesim.codes.de_bruijn import DeBruijnStripes
 from rangesim.codes.fringes import FringeConvention
 from rangesim.codes.gray import GrayCode
 from rangesim.codes.gray_phase import GrayPhase
@@ -21,6 +22,7 @@ __all__ = [
     "Code",
     "CodeThresholds",
     "Contrast",
+    "DeBruijnStripes",
     "FringeConvention",
     "GrayCode",
     "GrayPhase",

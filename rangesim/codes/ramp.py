@@ -76,9 +76,9 @@ class RampCode(Code):
         ratio = (ramp - reverse) / contrast  # -1 to 1
         coordinate = (0.5 * seen.size * (1 + ratio)).astype(np.float32)
         status = np.zeros(ratio.shape, dtype=np.uint8)
-        noises = [capture.noise(image) for image in (ramp, reverse, white, black)]
+        noises = [noise for image in (ramp, reverse, white, black) if (noise := capture.noise(image)) is not None]
         sigma_px, allowed = None, thresholds.gray.relative_bit * contrast
-        if all(noise is not None for noise in noises):
+        if noises:
             of_ramp, of_reverse, of_white, of_black = (np.square(noise) for noise in noises)
             if has_both:
                 variance = of_ramp + of_reverse + ratio**2 * (of_white + of_black)
