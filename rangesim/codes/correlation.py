@@ -28,13 +28,13 @@ memory that decoding takes does not depend on the size of the image."""
 SAME_VALUE = 1e-6
 """Largest difference of two values of patterns, 0 to 1, that are shown alike. It allows for rounding of float32."""
 
-MIN_EXPLAINED = 0.5
-"""Least fraction of a pixel's variance over the frames that its column must explain. A pixel that sees two places
-equally well gets half of its variance from each."""
+MAX_UNEXPLAINED = 1e-3
+"""Largest fraction of the variance, on median or on average over the pixels, that the columns may leave unexplained
+before causes are tried. Rounding to 8 bits leaves 1e-5."""
 
-MAX_UNEXPLAINED = 0.02
-"""Largest fraction of the variance, on median over the pixels, that the columns may leave unexplained beside the noise
-before other causes are tried. Rounding to 8 bits leaves 1e-5."""
+MIN_WRONG = 0.5
+"""Least such fraction, beside that of the noise, at which the patterns count as wrong altogether, although no single
+fault explains it."""
 
 MIN_GAIN = 0.5
 """Largest ratio of the unexplained variance with a fault undone to that without, at which the fault is named. Undoing
@@ -72,9 +72,10 @@ def decode_by_correlation(seen: AxisFrames, patterns: np.ndarray, thresholds: Gr
     count as two more patterns if they were captured.
 
     A pixel is refused if it lies nearer to the middle between its column and another one than the thresholds allow
-    (`LOW_SIGNAL` if noise may have moved it there, `CODE_ERROR` if not). It is also refused if its column explains less
-    than half of its variance (`CODE_ERROR`). The thresholds of Gray bits apply: of a pattern and its inverse,
-    |pattern - inverse| is sqrt(2) times the distance from the middle between the two values of the bit.
+    (`LOW_SIGNAL` if noise may have moved it there, `CODE_ERROR` if not). It is also refused (`CODE_ERROR`) if it lies
+    farther from its column than half the way to the other one, beside the noise: then it may see several places. The
+    thresholds of Gray bits apply: of a pattern and its inverse, |pattern - inverse| is sqrt(2) times the distance from
+    the middle between the two values of the bit.
 
     Parameters
     ----------
@@ -96,12 +97,16 @@ def decode_by_correlation(seen: AxisFrames, patterns: np.ndarray, thresholds: Gr
         difference = found.length**2 * (explained - found.second**2)
         from_middle = np.where(found.apart > 0, difference / (2 * found.apart), 0.0)
     from_middle = np.where(found.second > 0, from_middle, np.inf)
-    is_ambiguous = ~(from_middle > 0.5 * thresholds.relative_bit * found.apart) | ~(explained >= MIN_EXPLAINED)
     least: np.ndarray | float = 0.0
     if sigma is not None:
         least = thresholds.bit_sigmas * sigma
     elif capture.is_digital:
         least = thresholds.bit_of_scale * capture.full_scale / np.sqrt(2)
+    noise = least / max(thresholds.bit_sigmas, 1.0)
+    left = max(len(frames) - 2, 1)  # gain and offset are fitted
+    of_noise = (left + thresholds.bit_sigmas * np.sqrt(2 * left)) * noise**2
+    is_ambiguous = ~(from_middle > 0.5 * thresholds.relative_bit * found.apart)
+    is_ambiguous |= ~(found.length**2 * (1 - explained) <= 0.25 * found.apart**2 + of_noise)
     status = np.zeros(explained.shape, dtype=np.uint8)
     status[is_ambiguous] = Status.CODE_ERROR
     status[from_middle < least] = Status.LOW_SIGNAL
@@ -260,26 +265,26 @@ def correlation_contradiction(seen: AxisFrames, patterns: np.ndarray) -> str | N
         return None
     used = clear[np.linspace(0, len(clear) - 1, SAMPLES).astype(int)]
     values = frames.reshape(len(frames), -1)[:, used].astype(np.float32)
-    sigma = seen.capture.noise(values.mean(axis=0))
-    variance = values.var(axis=0, dtype=np.float64)
-    noise = 0.0 if sigma is None else float(np.median(sigma**2 / np.maximum(variance, 1e-30)))
 
-    def unexplained(of: np.ndarray, by: np.ndarray) -> float:
+    def unexplained(of: np.ndarray, by: np.ndarray) -> np.ndarray:
+        """(2,), median and mean over the pixels: faults show at all pixels, or at those that see two frames."""
         try:
             columns = columns_of(np.ascontiguousarray(by, dtype=np.float32).tobytes(), *by.shape)
         except ValueError:
-            return 1.0
-        return max(float(np.median(1 - match(of, columns).correlation ** 2)) - noise, 0.0)
+            return np.ones(2)
+        left = 1 - match(of, columns).correlation ** 2
+        return np.array([np.median(left), np.mean(left)], dtype=np.float64)
 
     left = unexplained(values, shown)
-    if left <= MAX_UNEXPLAINED:
+    if left.max() <= MAX_UNEXPLAINED:
         return None
+    counts = np.maximum(left, MAX_UNEXPLAINED)
     names = [*(seen.shown_name(name) for name in seen.names), "white", "black"][: len(frames)]
     text = (
-        f"the frames along {seen.axis} contradict their patterns: no column explains {100 * left:.0f} % of the "
+        f"the frames along {seen.axis} contradict their patterns: no column explains {100 * left[1]:.1g} % of the "
         "variance of a pixel over the frames"
     )
-    faults: list[tuple[float, str]] = []
+    faults: list[tuple[np.ndarray, str]] = []
     suspects = np.sort(_worst_frames(values, shown))
     for n, i in enumerate(suspects):
         for j in suspects[:n]:
@@ -293,9 +298,12 @@ def correlation_contradiction(seen: AxisFrames, patterns: np.ndarray) -> str | N
                 f"a gamma of about {gamma:.1f} explains it: make projector and camera linear",
             )
         )
-    least, fault = min(faults)
-    if least < MIN_GAIN * left:
+    ratio, fault = min((float((remains / counts).min()), fault) for remains, fault in faults)
+    if ratio < MIN_GAIN:
         return f"{text}; {fault}."
-    if left > MIN_EXPLAINED:
+    sigma = seen.capture.noise(values.mean(axis=0))
+    variance = values.var(axis=0, dtype=np.float64)
+    noise = 0.0 if sigma is None else float(np.median(sigma**2 / np.maximum(variance, 1e-30)))
+    if left[0] - noise > MIN_WRONG:
         return f"{text}: check that these are the patterns that were shown, in this order."
     return None

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -101,7 +102,7 @@ def match_best(scores, best, values, columns, matches):  # type: ignore[no-untyp
                     break
                 top, here = top + step, there
         cell, fraction, explained = top, 0.0, max(here, 0.0) ** 2
-        turn = 0.0
+        turn = lone_turn = math.inf
         for first in (top - 1, top):
             if first < 0 or first + 1 >= n:
                 continue
@@ -110,13 +111,15 @@ def match_best(scores, best, values, columns, matches):  # type: ignore[no-untyp
             determinant = pp * qq - pq * pq
             if determinant < LEAST_TURN * pp * qq:
                 continue
-            turn = max(turn, determinant / max(0.25 * (pp + 2 * pq + qq), TINY))  # at the middle of the two
+            here_turn = determinant / max(0.25 * (pp + 2 * pq + qq), TINY)  # at the middle of the two
+            lone_turn = min(lone_turn, here_turn)
             of_p, of_q = yp * qq - yq * pq, yq * pp - yp * pq
             if of_p < 0 or of_q < 0 or of_p + of_q <= 0:
                 continue
             by_both = (of_p * yp + of_q * yq) / determinant
             if by_both >= explained:
-                cell, fraction, explained = first, of_q / (of_p + of_q), by_both
+                cell, fraction, explained, turn = first, of_q / (of_p + of_q), by_both, here_turn
+        turn = turn if turn < math.inf else min(lone_turn, 1 / TINY)
         after = min(cell + 1, n - 1)
         length = 0.0
         for k in range(frames):

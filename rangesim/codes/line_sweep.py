@@ -29,7 +29,8 @@ MIN_WIDTH = 0.7
 frame in a wrong place."""
 
 MIN_FRACTION = 1e-3
-"""Least fraction of the peak that counts for the frames beside it, so that logarithms stay finite."""
+"""Least fraction of the peak that counts for the frames beside it, and of full scale that counts for the peak, so that
+logarithms stay finite."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ class LineSweep(Code):
             peak = np.clip(seen.frames[:, rows].argmax(axis=0), 1, len(seen.frames) - 2)
             beside = [_at(seen.frames[:, rows], peak + side) for side in (-1, 0, 1)]
             before, top, after = (value - black for value in beside)
-            least = MIN_FRACTION * np.maximum(top, np.float32(1e-20))
+            least = MIN_FRACTION * np.maximum(top, np.float32(MIN_FRACTION * capture.full_scale))
             a, b, c = (np.log(np.maximum(value, least)) for value in (before, top, after))
             bend = np.minimum(a - 2 * b + c, np.float32(-1e-6))
             coordinate[rows] = self.step_px * (peak - 1 + 0.5 * (a - c) / bend)

@@ -22,6 +22,10 @@ MAX_SUM_ERROR = 0.03
 """Largest distance of ramp + reverse from white + black, on median over the pixels, as a fraction of white - black. A
 gamma of 2.2 makes 0.5 in the middle of the ramp and 0 at its ends."""
 
+MAX_OUTSIDE = 0.1
+"""Largest distance of a ramp beyond white or black, as a fraction of white - black, and largest fraction of pixels with
+more, if a gamma is the cause: a gamma leaves black and white where they are."""
+
 GAMMAS = np.arange(0.4, 3.21, 0.1)
 """Exponents of projectors that are tried where the ramps do not add up to white and black."""
 
@@ -83,7 +87,9 @@ class RampCode(Code):
             if has_both:
                 variance = of_ramp + of_reverse + ratio**2 * (of_white + of_black)
             else:
-                variance = 4 * of_ramp + (1 - ratio) ** 2 * of_black + (1 + ratio) ** 2 * of_white
+                side = 1 if RAMP in shown else -1
+                of_shown = of_ramp if RAMP in shown else of_reverse
+                variance = 4 * of_shown + (1 - side * ratio) ** 2 * of_black + (1 + side * ratio) ** 2 * of_white
             sigma_px = (0.5 * seen.size * np.sqrt(variance) / contrast).astype(np.float32)
             of_sum = np.sqrt(of_ramp + of_reverse + of_white + of_black)
             allowed = np.maximum(allowed, thresholds.gray.bit_sigmas * of_sum)
@@ -108,11 +114,14 @@ class RampCode(Code):
         off = float(np.median(np.abs(ramp + reverse - 1)))
         if off <= allowed:
             return None
+        outside = float(
+            ((np.minimum(ramp, reverse) < -MAX_OUTSIDE) | (np.maximum(ramp, reverse) > 1 + MAX_OUTSIDE)).mean()
+        )
         ramp, reverse = np.clip(ramp, 0, 1), np.clip(reverse, 0, 1)
         left = [float(np.median(np.abs(ramp ** (1 / gamma) + reverse ** (1 / gamma) - 1))) for gamma in GAMMAS]
         best = int(np.argmin(left))
         cause = "check the order of the frames, and that nothing moved and all have one exposure"
-        if left[best] < 0.5 * off:
+        if left[best] < 0.5 * off and outside < MAX_OUTSIDE:
             cause = f"a gamma of about {GAMMAS[best]:.1f} explains it: make projector and camera linear"
         return (
             f"the ramps along {seen.axis} contradict white and black: on median they miss their sum by "

@@ -67,9 +67,15 @@ def decode_lines(  # type: ignore[no-untyped-def]
                 if (before > 0) == (after > 0):
                     continue
                 for x in range(last[i], first[i + 1]):
-                    here, there = values[c, y, x], values[c, y, x + 1]
-                    if (here > 0) != (there > 0):
-                        total += x + 0.5 + here / (here - there)
+                    if (values[c, y, x] > 0) != (values[c, y, x + 1] > 0):
+                        # The area under the step: exact where pixels average over their width, whatever that is.
+                        place = x - 1.0
+                        for k in range(x - 1, x + 3):
+                            value = values[c, y, k] if first[i] <= k <= last[i + 1] else (1.0 if k <= x else -1.0)
+                            if first[i] <= k <= last[i + 1] and before <= 0:
+                                value = -value
+                            place += 0.5 * (1.0 + min(max(value, -1.0), 1.0))
+                        total += place
                         found += 1
                         break
             if found:
@@ -99,5 +105,8 @@ def decode_lines(  # type: ignore[no-untyped-def]
                 place = stripe_px * stripe[i] + (x + 0.5 - low) * scale
                 if not has_low:
                     place = stripe_px * (stripe[i] + 1) - (high - x - 0.5) * scale
-                coordinate[y, x] = min(max(place, stripe_px * stripe[i]), stripe_px * (stripe[i] + 1))
-                is_known[y, x] = True
+                # A run with one edge may go on into a stripe of the same colour on another surface.
+                beyond = max(stripe_px * stripe[i] - place, place - stripe_px * (stripe[i] + 1))
+                if (has_low and has_high) or beyond <= 0.5 * scale:
+                    coordinate[y, x] = min(max(place, stripe_px * stripe[i]), stripe_px * (stripe[i] + 1))
+                    is_known[y, x] = True
