@@ -8,13 +8,17 @@ from rangesim.codes.axis_code import AxisCode, AxisFrames, Contrast
 from rangesim.codes.binary import BinaryCode
 from rangesim.codes.bit_code import BitCode
 from rangesim.codes.code import AXES, Code, CodeThresholds
+from rangesim.codes.de_bruijn import DeBruijnStripes
 from rangesim.codes.ensemble import EnsembleCode
 from rangesim.codes.fringes import FringeConvention
 from rangesim.codes.gray import GrayCode
 from rangesim.codes.gray_phase import GrayPhase
+from rangesim.codes.image_stack import ImageStack
+from rangesim.codes.line_sweep import LineSweep
 from rangesim.codes.max_min_stripe import MaxMinStripeCode
 from rangesim.codes.micro_phase_shifting import MicroPhaseShifting
 from rangesim.codes.modulated_phase_shifting import ModulatedPhaseShifting
+from rangesim.codes.ramp import RampCode
 from rangesim.codes.thresholds import GrayThresholds
 from rangesim.codes.xor import XorCode
 
@@ -27,13 +31,17 @@ __all__ = [
     "Code",
     "CodeThresholds",
     "Contrast",
+    "DeBruijnStripes",
     "EnsembleCode",
     "FringeConvention",
     "GrayCode",
     "GrayPhase",
     "GrayThresholds",
+    "ImageStack",
+    "LineSweep",
     "MaxMinStripeCode",
     "MicroPhaseShifting",
     "ModulatedPhaseShifting",
+    "RampCode",
     "XorCode",
 ]

@@ -9,6 +9,7 @@ from rangesim.sensors.ideal_tof import IdealToF, IdealToFDecoder
 from rangesim.sensors.reference_pattern import ReferencePatternDecoder, ReferencePatternStereo
 from rangesim.sensors.registry import check_sensor, is_file_name, presets, sensor_from_dict, sensor_of
 from rangesim.sensors.structured_light import StructuredLight, StructuredLightDecoder
+from rangesim.sensors.zncc import ZnccDecoder
 
 __all__ = [
     "ActiveStereo",
@@ -26,6 +27,7 @@ __all__ = [
     "StereoDecoder",
     "StructuredLight",
     "StructuredLightDecoder",
+    "ZnccDecoder",
     "check_sensor",
     "is_file_name",
     "presets",

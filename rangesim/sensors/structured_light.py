@@ -255,7 +255,7 @@ class StructuredLightDecoder(Decoder):
         `RangesimWarning` if frames and code contradict each other as a whole.
         """
         sensor = of_type(capture.sensor, StructuredLight)
-        contrast = self._contrast(capture, sensor)
+        contrast = self.contrast(capture, sensor)
         codes: dict[str, AxisCode] = {}
         contradictions: list[str] = []
         for axis in sensor.axes:
@@ -275,14 +275,14 @@ class StructuredLightDecoder(Decoder):
             row=coordinate.get("rows"),
             column_sigma_px=sigma_px.get("columns"),
             row_sigma_px=sigma_px.get("rows"),
-            status=_first_failure([codes[axis].status for axis in AXES if axis in codes]),
+            status=first_failure([codes[axis].status for axis in AXES if axis in codes]),
             confidence=contrast.values / np.float32(capture.full_scale),
             intensity=contrast.white.astype(np.float32) - np.float32(capture.black_level),
             limits=self.triangulation,
             is_doubted=bool(contradictions),
         )
 
-    def _contrast(self, capture: Capture, sensor: StructuredLight) -> Contrast:
+    def contrast(self, capture: Capture, sensor: StructuredLight) -> Contrast:
         """Contrast of white and black, each as captured, or estimated by the code if it was not shown."""
         shown, frames = sensor.frame_names(), capture.frames
         if WHITE in shown and BLACK in shown:
@@ -312,7 +312,7 @@ class StructuredLightDecoder(Decoder):
             return "columns change along the image's height and rows along its width: rows may have been shown first"
         if float(image.valid.mean()) >= MIN_MEASURED:
             return None
-        contrast = self._contrast(capture, of_type(capture.sensor, StructuredLight)).values
+        contrast = self.contrast(capture, of_type(capture.sensor, StructuredLight)).values
         clear = MIN_CONTRAST * capture.full_scale
         inverted = float((contrast < -clear).mean())
         if inverted > float((contrast > clear).mean()):
@@ -326,7 +326,7 @@ class StructuredLightDecoder(Decoder):
         return None
 
 
-def _first_failure(statuses: list[np.ndarray]) -> np.ndarray:
+def first_failure(statuses: list[np.ndarray]) -> np.ndarray:
     """(h, w) uint8, per pixel the first status that is not OK."""
     result = statuses[0].copy()
     for status in statuses[1:]:
