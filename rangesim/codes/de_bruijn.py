@@ -60,7 +60,7 @@ class DeBruijnStripes(Code):
 
     A grey camera takes one image for each of the three colour channels; they suffice for a whole projector. A row of
     stripes is only accepted if one place of the sequence has all of them, so a surface must show 5 to 9 stripes side by
-    side (`window`). The edges between stripes are found to a fraction of a camera pixel, and the places between two
+    side (`StripeSequence.window`). The edges between stripes are found to a fraction of a camera pixel, and the places between two
     edges by linear interpolation: without noise they are exact on planes seen in parallel, and off by about c / 8 times
     the square of the stripe's width where the coordinate bends with the second derivative c.
 
