@@ -98,6 +98,28 @@ def test_a_rendered_plane_is_compared_and_explained(plane: Scene) -> None:
     assert (causes[8:-8, 8:-8] == Cause.LOW_SIGNAL).mean() > 0.9
 
 
+def test_a_video_projector_may_show_the_dots() -> None:
+    """What it shows is the pattern of the sensor up to a factor, for a projector of any size."""
+    sensor = ReferencePatternStereo().for_projector(320, 200, ("columns", "rows"))
+    assert sensor.default_emitter.size == (320, 200)
+    (image,) = sensor.patterns()
+    assert image.shape == (200, 320)
+    assert image.max() == 1
+    shown = replace(sensor, pattern=Images(image[None]))
+    rig = Rig(
+        Intrinsics.from_fov(120, 90, 50),
+        Intrinsics.from_fov(320, 200, 60),
+        T_camera_projector=translation(0.075, 0, 0),
+    )
+    capture, depth = dots_on_plane(rig, sensor, (0.0, 0.0, 1.0), 1.0)
+    for decoded_as in (sensor, shown):
+        found = decode(replace(capture, sensor=decoded_as)).z
+        assert np.isfinite(found).mean() > 0.7
+        assert np.nanmedian(np.abs(found - depth)) < 0.01
+    with pytest.raises(ValueError, match="expected patterns of shape"):
+        shown.for_projector(640, 480)
+
+
 def test_what_cannot_be_decoded_is_refused() -> None:
     capture, _ = dots_on_plane(rig_of(), SENSOR, (0, 0, 1), 1.0)
     with pytest.raises(ValueError, match="expected a capture with a rig: the reference image depends on"):

@@ -59,10 +59,10 @@ class DeBruijnStripes(Code):
     """Stripes in six colours; neighbours differ, and any few stripes in a row occur once in the sequence.
 
     A grey camera takes one image for each of the three colour channels; they suffice for a whole projector. A row of
-    stripes is only accepted if one place of the sequence has all of them, so a surface must show 5 to 9 stripes side by
-    side (`window`). The edges between stripes are found to a fraction of a camera pixel, and the places between two
-    edges by linear interpolation: without noise they are exact on planes seen in parallel, and off by about c / 8 times
-    the square of the stripe's width where the coordinate bends with the second derivative c.
+    stripes is only accepted if one place of the sequence has all of them, so a surface must show 5 to 9 of them side by
+    side, see `StripeSequence`. The edges between stripes are found to a fraction of a camera pixel, and the places
+    between two edges by linear interpolation: without noise they are exact on planes seen in parallel, and off by about
+    c / 8 times the square of the stripe's width where the coordinate bends with the second derivative c.
 
     Parameters
     ----------

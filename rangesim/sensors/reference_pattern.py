@@ -11,7 +11,7 @@ cameras serves: the projector takes the place of the second camera.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Annotated, ClassVar
 
@@ -23,6 +23,7 @@ from rangesim.decoding.working_range import WorkingRange
 from rangesim.geometry.dense_stereo import DenseMatching
 from rangesim.geometry.stereo import rectify
 from rangesim.response import DenseResponse, Dots, LightPath, NumpyMath, Response
+from rangesim.response.patterns import image_of
 from rangesim.rig import Intrinsics, Rig
 from rangesim.sensor import Background, Decoder, Emitter, FrameContent, Sensor, of_type
 from rangesim.sensors.active_stereo import Disparity, described, least_light, pattern_of, quantised, size_of
@@ -70,6 +71,29 @@ class ReferencePatternStereo(Sensor):
 
     def frame_names(self) -> list[str]:
         return ["infrared"]
+
+    def patterns(self) -> np.ndarray:
+        """(1, height, width) float32 in 0..1: the pattern at the centres of the projector's pixels, its brightest is 1;
+        for a video projector in the place of a laser."""
+        pattern = pattern_of(self.pattern)
+        size = size_of(pattern)
+        assert pattern is not None
+        assert size is not None
+        image = image_of(pattern, *size)
+        return np.asarray(image / max(float(image.max()), float(np.finfo(np.float32).tiny)))
+
+    def for_projector(self, width: int, height: int, axes: Sequence[str] | None = None) -> ReferencePatternStereo:
+        """This sensor with dots for a projector of another size. `axes` mean nothing to dots.
+
+        Raises
+        ------
+        ValueError
+            The pattern is an image of another size.
+        """
+        if isinstance(self.pattern, Dots):
+            return replace(self, pattern=replace(self.pattern, width=width, height=height))
+        self.check(width, height)
+        return self
 
     @property
     def default_emitter(self) -> Emitter:
