@@ -20,6 +20,7 @@ from rangesim.decoding.status import Status
 from rangesim.decoding.triangulation import ProjectorCoordinates
 from rangesim.electronics.detector import Detector
 from rangesim.errors import RangesimWarning
+from rangesim.response import LightPath, NumpyMath
 from rangesim.results.captures import import_capture
 from rangesim.sensors import StructuredLight, StructuredLightDecoder
 
@@ -74,6 +75,39 @@ def test_all_columns_come_back(code: Code, size: int, convention: FringeConventi
 def test_periods_of_an_own_choice_come_back(refinement: str) -> None:
     code = MicroPhaseShifting((18.3, 21.7, 16.1, 24.9, 19.0), refinement=refinement)  # type: ignore[arg-type]
     assert np.abs(errors(coordinates(capture_of(code, 333)))).max() < 0.005
+
+
+@pytest.mark.parametrize("refinement", ["first-period", "all-periods"])
+@pytest.mark.parametrize("period_px", [16.0, 12.0, 8.0])
+def test_places_between_the_centres_of_pixels_come_back(refinement: str, period_px: float) -> None:
+    code = MicroPhaseShifting(period_px=period_px, refinement=refinement)  # type: ignore[arg-type]
+    x = np.random.default_rng(0).uniform(0, 640, 2000)
+    shifts = [(period, step) for f, period in enumerate(code.periods(640)) for step in range(1 if f else 3)]
+    frames = [code.convention.pattern(x, period, step, 3) for period, step in shifts]
+    seen = coordinates(Capture(np.array(frames, dtype=np.float32)[:, None], sensor_of(code, 640)))
+    assert seen.column is not None
+    assert (seen.status == Status.OK).all()
+    assert np.abs(seen.column - x).max() < 0.005
+
+
+def test_places_between_the_centres_of_pixels_come_back_by_modulation() -> None:
+    code = ModulatedPhaseShifting()
+    x = np.random.default_rng(0).uniform(0, 640, 2000)
+    frames = code.patterns_at(x, 640).astype(np.float32)[:, None]
+    seen = coordinates(Capture(frames, sensor_of(code, 640)))
+    assert seen.column is not None
+    assert (seen.status == Status.OK).all()
+    assert np.abs(seen.column - x).max() < 0.005
+
+
+@pytest.mark.parametrize("code", CODES, ids=NAMES)
+def test_responses_are_the_patterns(code: Code) -> None:
+    """Light of every projector pixel, by the code's own responses, makes the frames that the patterns make."""
+    x = np.arange(200) + 0.5
+    path = LightPath(u=x, v=np.zeros_like(x), path_length_m=1.0, is_first=True)
+    channels = [np.array(r.weights(path, NumpyMath()))[:, None] for r in code.responses(0, 200)]
+    frames = np.array([*code.frames(200, channels, np.ones((1, 200)))])[:, 0]
+    np.testing.assert_allclose(frames, code.patterns(200), atol=1e-5)
 
 
 @pytest.mark.parametrize("code", CODES, ids=NAMES)

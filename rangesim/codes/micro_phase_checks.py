@@ -131,7 +131,10 @@ def _harmonic(frames: np.ndarray, code: MicroPhaseShifting, periods: Sequence[fl
     match = code.match(frames, periods, period_table(periods, code.convention, seen.size, np.ones(len(periods))))
     omega, start = angles(periods, code.convention)
     fits = match.fits.ravel()
-    theta = omega[1:, None] * (match.column.ravel()[fits] + 0.5) - start[1:, None]
+    place = match.place.ravel()[fits]
+    if not place.size or np.ptp(place) < max(periods):
+        return None  # a part of a fringe does not tell its shape
+    theta = omega[1:, None] * place - start[1:, None]
     shown = np.stack([np.ones_like(theta), np.cos(theta), np.cos(2 * theta)]).reshape(3, -1).T
     _, first, second = np.linalg.lstsq(shown, match.units[fits, 2:].T.ravel().astype(np.float64), rcond=None)[0]
     harmonic = second / first

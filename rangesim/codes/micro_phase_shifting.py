@@ -27,6 +27,16 @@ from rangesim.settings.bounds import Bounds, check_fields, whole
 FRINGE_VISIBILITY = 0.5
 """Amplitude of a fringe as a fraction of the light at full power: fringes go from 0 to 1."""
 
+MIN_PERIOD_PX = 6.0
+"""Least period in projector pixels. The search looks at the centres of pixels; with shorter periods, places between
+them fit to no centre."""
+
+OUTSIDE_CURVATURE = 0.25
+"""Largest distance of the first period's place from the best column at which it is kept, in projector pixels, as a
+fraction of the square of the angle in radians by which the shortest fringe advances in a pixel. Near the edge between
+two columns either may fit best, because a cosine is no straight line: without noise, the place is 0.03 pixels outside
+with periods of about 16 pixels, half of this limit."""
+
 SHIFTS = 3
 """Number of shifts of the first period, the least that tells offset, amplitude and phase."""
 
@@ -104,8 +114,8 @@ class MicroPhaseShifting(Code):
     array([1., 0.], dtype=float32)
     """
 
-    periods_px: tuple[Annotated[float, Bounds("projector pixels", 2, 1e6)], ...] = ()
-    period_px: Annotated[float, Bounds("projector pixels", 2, 1e6)] = 16.0
+    periods_px: tuple[Annotated[float, Bounds("projector pixels", MIN_PERIOD_PX, 1e6)], ...] = ()
+    period_px: Annotated[float, Bounds("projector pixels", MIN_PERIOD_PX, 1e6)] = 16.0
     n_periods: Annotated[int, whole(2, "frames")] = 8
     convention: FringeConvention = field(default_factory=lambda: FringeConvention(direction="backward", origin_px=0.5))
     refinement: Literal["first-period", "all-periods"] = "first-period"
@@ -181,8 +191,7 @@ class MicroPhaseShifting(Code):
             if fits_all:
                 coordinate[rows], spread = self._fitted(match, periods, contrast)
             else:
-                # The phase tells the place within the column that all images found, and never another column.
-                coordinate[rows] = np.clip(match.place, match.column, match.column + 1)
+                coordinate[rows] = _within_column(match, OUTSIDE_CURVATURE * (2 * math.pi / min(periods)) ** 2)
                 spread = np.array(periods[0] / (2 * math.pi) * math.sqrt(2 / SHIFTS), dtype=np.float32)
             refused[~match.fits] = Status.CODE_ERROR
             washed_out = 2 * match.phase.modulation < thresholds.gray.relative_bit * seen.contrast.values[rows]
@@ -255,6 +264,14 @@ class MicroPhaseShifting(Code):
             measured = (shown[1:] * match.units[fits, 2:].T).sum(axis=1) / (shown[1:] ** 2).sum(axis=1)
             contrast[1:] = np.clip(measured, MIN_PERIOD_CONTRAST, 1 / MIN_PERIOD_CONTRAST)
         return contrast
+
+
+def _within_column(match: PeriodMatch, margin_px: float) -> np.ndarray:
+    """(h, w) place of the first period's phase; where it lies outside the column that all images found, that column's
+    nearer edge, because the phase tells a fraction of a column and never another column. A place that is less than
+    `margin_px` outside is kept."""
+    clipped = np.clip(match.place, match.column, match.column + 1)
+    return np.where(np.abs(match.place - clipped) <= margin_px, match.place, clipped)
 
 
 def angles(periods: Sequence[float], convention: FringeConvention) -> tuple[np.ndarray, np.ndarray]:
