@@ -194,7 +194,7 @@ def noise_free_capture(
     unfiltered = 1.0 if ambient is None else ambient.scale
 
     def radiance(one: Signals) -> np.ndarray:
-        return _through_lens(one.frames(sensor, unfiltered, sampling_errors), one.rig)
+        return _through_lens(sensor.at_pixels(one.frames(sensor, unfiltered, sampling_errors)), one.rig)
 
     return capture_of_frames(signals, sensor, radiance, ambient)
 
@@ -243,7 +243,7 @@ def _mean_radiance(
     sampling_errors : factor on the draw of the sampling error that is added to the signals; 0: none is added.
     """
     lit = signals.frames(sensor, detector.ambient_fraction(sensor.gate, ambient), sampling_errors)
-    return _through_lens(lit, signals.rig)
+    return _through_lens(sensor.at_pixels(lit), signals.rig)
 
 
 def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:
