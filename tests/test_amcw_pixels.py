@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels of modulated cameras: how taps share light, harmonics, fixed patterns, and two paths, against closed forms."""
+"""Pixels of modulated cameras: how taps share light, harmonics, fixed patterns, stray light and two paths,
+against closed forms."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ from rangesim.decoding.two_paths import separate
 from rangesim.electronics.detector import Detector
 from rangesim.motion.timing import Timing
 from rangesim.response import SPEED_OF_LIGHT, Correlation, Phasor
-from rangesim.sensors import AmcwDecoder, AmcwToF
+from rangesim.rig import Intrinsics
+from rangesim.sensor import Sensor
+from rangesim.sensors import AmcwDecoder, AmcwToF, DirectToF, StructuredLight
 
 SHARING = [(3, 3), (4, 4), (4, 2), (4, 1), (6, 6), (6, 3), (6, 2), (8, 2), (5, 5)]
 """Number of taps, and of those that share an exposure."""
@@ -194,6 +197,30 @@ def test_the_fixed_pattern_is_a_delay_of_each_pixel(taps: int) -> None:
     light = [expose(signals, s).frames.sum(axis=0) for s in (sensor, even)]
     np.testing.assert_allclose(*light, rtol=1e-6)
     assert not np.array_equal(again, decode(expose(signals, replace(sensor, pixel_seed=8))).range_m)
+
+
+@pytest.mark.parametrize("sensor", [AmcwToF((20e6, 80e6)), DirectToF(bins=64, bin_s=400e-12), StructuredLight(64, 48)])
+def test_stray_light_spreads_the_mean_of_the_image_and_loses_no_light(sensor: Sensor) -> None:
+    rig = stereo_rig(48, 36, baseline_m=0.02, projector=Intrinsics.from_fov(64, 48, 60))
+    clean = signals_of_depth(rig, np.tile(np.linspace(0.5, 3.0, 48), (36, 1)), [sensor], ambient=0.01)
+    veiled = replace(clean, rig=replace(rig, camera_lens=replace(rig.camera_lens, stray_light=0.1)))
+    frames, seen = expose(clean, sensor).frames, expose(veiled, sensor).frames
+    np.testing.assert_allclose(seen.mean(axis=(1, 2)), frames.mean(axis=(1, 2)), rtol=1e-5)
+    np.testing.assert_allclose(seen, 0.9 * frames + 0.1 * frames.mean(axis=(1, 2), keepdims=True), rtol=1e-5)
+
+
+def test_stray_light_adds_the_mean_phasor_of_the_image() -> None:
+    sensor, rig = AmcwToF((20e6,)), stereo_rig(48, 36, baseline_m=0.0)
+    clean = signals_of_depth(rig, np.tile(np.linspace(0.5, 3.0, 48), (36, 1)), [sensor])
+    veiled = replace(clean, rig=replace(rig, camera_lens=replace(rig.camera_lens, stray_light=0.05)))
+    x, y = next(iter(clean.channels.values()))
+    z = (x + 1j * y).astype(np.complex128)
+    turns = np.angle(0.95 * z + 0.05 * z.mean()) / (2 * np.pi) % 1
+    seen = decode(expose(veiled, sensor)).range_m
+    np.testing.assert_allclose(seen, turns * SPEED_OF_LIGHT / 40e6, atol=1e-4)
+    assert np.nanmedian(np.abs(seen - clean.truth.range_m)) > 0.01
+    with pytest.raises(ValueError, match="expected a projector_lens without stray_light"):
+        replace(rig, projector_lens=replace(rig.projector_lens, stray_light=0.05))
 
 
 PATHS = np.random.default_rng(3).uniform([0.02, 0.06, 0.05], [0.4, 0.45, 0.9], (500, 3))

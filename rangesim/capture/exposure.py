@@ -247,11 +247,19 @@ def _mean_radiance(
 
 
 def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:
-    """Frames (k, h, w) behind the camera's lens, which darkens the corners if it vignettes, and for smaller pixels."""
-    if rig.camera.is_pinhole and not rig.camera_lens.vignetting:
-        return frames
-    fraction = rig.camera_illumination
-    return frames if (fraction == 1).all() else frames * fraction
+    """Frames (k, h, w) behind the camera's lens, which darkens the corners if it vignettes, and for smaller pixels.
+
+    The lens scatters stray light over each frame alike, so no light is lost: it has the phase, the code and the path
+    length of the image's mean.
+    """
+    if not (rig.camera.is_pinhole and not rig.camera_lens.vignetting):
+        fraction = rig.camera_illumination
+        frames = frames if (fraction == 1).all() else frames * fraction
+    if rig.camera_lens.stray_light:
+        stray = rig.camera_lens.stray_light
+        mean = frames.mean(axis=(1, 2), dtype=np.float64, keepdims=True)
+        frames = ((1 - stray) * frames + stray * mean).astype(np.float32)
+    return frames
 
 
 def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetector, rig: Rig) -> float:
