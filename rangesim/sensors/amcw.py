@@ -16,9 +16,16 @@ from rangesim.decoding.phase_shift import Phase, PhaseThresholds, modulation_is_
 from rangesim.decoding.phase_unwrapping import unwrap
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
+from rangesim.decoding.tap_checks import (
+    chosen,
+    direction_contradiction,
+    frequency_contradiction,
+    order_contradiction,
+)
 from rangesim.decoding.two_paths import nearest_length, order_of_ratios, separate, turns_sigma
 from rangesim.decoding.working_range import WorkingRange
 from rangesim.electronics.detector import Detector
+from rangesim.errors import warn
 from rangesim.response import SPEED_OF_LIGHT, Correlation, Phasor, Response
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, of_type
 from rangesim.settings import limits
@@ -355,6 +362,8 @@ class AmcwDecoder(Decoder):
                 _separate(sensor, phases, sigmas, length[rows], None if sigma_m is None else sigma_m[rows])
             amplitude[rows] = np.mean([p.modulation for p in phases], axis=0)
             mean[rows] = np.mean([p.mean for p in phases], axis=0)
+        if found := self._contradiction(sensor, capture.frames, status, length, amplitude):
+            warn(found)
         return PathLengths(
             length_m=length,
             sigma_m=sigma_m,
@@ -362,6 +371,24 @@ class AmcwDecoder(Decoder):
             confidence=2 * amplitude / capture.full_scale,
             intensity=mean - capture.black_level,
         )
+
+    def _contradiction(
+        self, sensor: AmcwToF, frames: np.ndarray, status: np.ndarray, length_m: np.ndarray, modulation: np.ndarray
+    ) -> str | None:
+        """A sentence if the taps contradict each other as a whole, see `rangesim.decoding.tap_checks`."""
+        at = chosen(np.isin(status, [Status.OK, Status.UNWRAPPING_FAILED]))
+        if at is None:
+            return None
+        taps = frames.reshape(len(frames), -1)[:, at].astype(np.float32)
+        groups = np.split(taps, len(sensor.modulation_hz))
+        if found := order_contradiction(groups):
+            return found
+        phases = [self._phase(sensor, group) for group in groups]
+        weights = [_weight(*read) for read in zip(phases, [None] * len(phases), sensor.modulation_hz, strict=True)]
+        if found := frequency_contradiction(phases, sensor.modulation_hz, weights, sensor.searched_m):
+            return found
+        at = at[status.ravel()[at] == Status.OK]
+        return direction_contradiction(length_m.ravel()[at], modulation.ravel()[at], 2 * sensor.unambiguous_range_m)
 
     def _phase(self, sensor: AmcwToF, taps: np.ndarray) -> Phase:
         """Phase of the taps (N, h, w) of one frequency."""
