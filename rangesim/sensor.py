@@ -369,6 +369,13 @@ class Decoder(Named, ABC):
         """Light and dark current in the frame that decides about a reading, on average over the patterns."""
         return FrameContent()
 
+    def undetectable(self, sensor: Sensor) -> str | None:
+        """A clause on wrong readings of which nothing in a capture tells; None if there are none.
+
+        `rangesim decode` shows it for real captures.
+        """
+        return None
+
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
         """A clause with a likely mistake in how the capture was taken, judged by `image`; None if none is known.
 

@@ -13,8 +13,10 @@ from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.electronics.detector import Detector
+from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import RangesimWarning
-from rangesim.sensors import AmcwDecoder, AmcwToF
+from rangesim.response import SPEED_OF_LIGHT
+from rangesim.sensors import AmcwDecoder, AmcwToF, DirectToF, DirectToFDecoder
 
 SENSORS = [AmcwToF((20e6,)), AmcwToF(), AmcwToF((80e6, 16e6, 120e6), taps=3), AmcwToF((20e6, 60e6), taps=6)]
 
@@ -88,3 +90,45 @@ def test_wrong_frequencies_are_told() -> None:
     taken = capture_of(AmcwToF((80e6, 16e6, 120e6)))
     with pytest.warns(RangesimWarning, match="agree on no path length.*: check modulation_hz"):
         decode(Capture(taken.frames, AmcwToF((70e6, 20e6, 110e6))))
+
+
+def test_doubts_travel_with_the_range_image() -> None:
+    taken = sorted_taps(capture_of(SENSORS[0]), [0, 2, 1, 3])
+    with pytest.warns(RangesimWarning, match="not in the order"):
+        image = decode(taken)
+    assert len(image.doubts) == 1
+    assert decode(capture_of(SENSORS[0])).doubts == ()
+
+
+def test_what_no_frame_tells_is_stated() -> None:
+    """A wall beyond the range of one frequency is read too near, with status OK."""
+    assert AmcwDecoder().undetectable(AmcwToF((20e6,))) == (
+        "surfaces beyond 7.495 m would be read too near by that or a multiple of it, and no frame tells"
+    )
+    assert str(DirectToFDecoder().undetectable(DirectToF())).startswith("surfaces beyond 3.837 m")
+    assert DirectToFDecoder().undetectable(DirectToF(laser="single-shot")) is None
+
+
+def test_noise_at_the_ends_of_the_range_is_refused() -> None:
+    """Near the end of the range of one frequency, noise makes the farthest surface the nearest."""
+    sensor, detector, rng = AmcwToF((20e6,)), Detector.time_of_flight(), np.random.default_rng(0)
+    range_m = rng.uniform(0.05, 1.0, 20_000) * sensor.unambiguous_range_m
+    phi = 2 * np.pi * 20e6 * 2 * range_m / SPEED_OF_LIGHT
+    mean = np.stack([500 * (1 + 0.8 * np.cos(phi - k * np.pi / 2)) / 4 for k in range(4)])
+    electrons = rng.poisson(mean) + detector.read_noise_e * rng.standard_normal(mean.shape)
+    frames = np.clip(np.rint(electrons * detector.gain_dn_e + detector.offset_dn), 0, 4095).astype(np.uint16)
+    image = decode(Capture(frames.reshape(4, 100, 200), sensor, None, detector, 1e-3))
+    error = np.abs(image.range_m.ravel() - range_m)
+    assert image.valid.mean() > 0.7
+    assert (error[image.valid.ravel()] > 1.0).mean() < 1e-3
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize("pulse_fwhm_s", [0.3e-9, 1e-9])
+@pytest.mark.parametrize("dark_counts_hz", [1e4, 3e4, 1e5, 1e6])
+def test_dark_histograms_keep_no_peak(pulse_fwhm_s: float, dark_counts_hz: float) -> None:
+    """Before, 0.7 to 1.3 % of the pixels without any light had a reading at 0.1 counts a bin."""
+    sensor = DirectToF(pulse_fwhm_s=pulse_fwhm_s)
+    nothing = signals_of_depth(stereo_rig(160, 120), np.full((120, 160), np.nan), [sensor])
+    detector = SpadDetector(dark_counts_hz=dark_counts_hz, bits=16)
+    assert decode(expose(nothing, sensor, detector, exposure_s=1e-3)).valid.mean() < 1e-4

@@ -30,6 +30,7 @@ from rangesim.geometry.dense_stereo import DenseMatching
 from rangesim.motion import ConstantTwist, Motion, PoseTrack, Timing
 from rangesim.presets import instrument
 from rangesim.response import (
+    Correlation,
     Dots,
     FirstReturn,
     Fringes,
@@ -200,6 +201,8 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (FringeConvention(), lambda c: use_sensor(StructuredLight(64, 48, GrayPhase(convention=c)))),
     (AmcwToF(), use_sensor),
     (AmcwToF(waveform="square"), use_sensor),
+    (AmcwToF((20e6, 80e6), taps_per_exposure=2, contrasts=(0.8, 0.6), pixel_delay_s=1e-10), use_sensor),
+    (Correlation((0.05, 0.1), (0.0, 0.5)), lambda c: use_sensor(AmcwToF(correlation=c))),
     (DirectToF(), use_sensor),
     (DirectToF(pulse_fwhm_s=400e-12), use_sensor),
     (IdealToF(), use_sensor),
@@ -325,6 +328,7 @@ MODULES = (
         "decoding.disparities",
     ),
     "geometry.dense_stereo",
+    "response.correlation",
     *("codes.thresholds", "codes.fringes", "codes.gray", "codes.gray_phase"),
 )
 RESULTS = {Disparities, ProjectorCoordinates, Phase}

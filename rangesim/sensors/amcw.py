@@ -55,6 +55,10 @@ any detector distinguishes from noise. With a larger value, the causes would say
 noise-free capture has a reading."""
 
 
+END_SIGMAS = 3.0
+"""Distance of a path length from the ends of the unambiguous range, in standard deviations, below which the reading is
+refused, because the other end is as likely. Noise reaches it in one of 700 pixels whose surface lies at an end."""
+
 Contrast = Annotated[float, Bounds("a positive fraction", 1e-3, 1)]
 """Demodulation contrast: modulation of the taps as a fraction of their mean, for light of one path."""
 
@@ -358,18 +362,22 @@ class AmcwDecoder(Decoder):
             length[rows] = unwrapped.length_m
             if sigma_m is not None:
                 sigma_m[rows] = RADIAN_M / np.sqrt(unwrapped.weight)
+                at_end = _is_at_end(length[rows], sigma_m[rows], sensor) & (status[rows] == Status.OK)
+                status[rows][at_end] = Status.UNWRAPPING_FAILED
             if self.two_paths:
                 _separate(sensor, phases, sigmas, length[rows], None if sigma_m is None else sigma_m[rows])
             amplitude[rows] = np.mean([p.modulation for p in phases], axis=0)
             mean[rows] = np.mean([p.mean for p in phases], axis=0)
-        if found := self._contradiction(sensor, capture.frames, status, length, amplitude):
-            warn(found)
+        doubt = self._contradiction(sensor, capture.frames, status, length, amplitude)
+        if doubt:
+            warn(doubt)
         return PathLengths(
             length_m=length,
             sigma_m=sigma_m,
             status=status,
             confidence=2 * amplitude / capture.full_scale,
             intensity=mean - capture.black_level,
+            doubts=(doubt,) if doubt else (),
         )
 
     def _contradiction(
@@ -399,6 +407,10 @@ class AmcwDecoder(Decoder):
         if sensor.correlation is None or not self.correct_wiggling:
             return phase
         return replace(phase, normalised=sensor.correlation.corrected(sensor.taps, phase.normalised))
+
+    def undetectable(self, sensor: Sensor) -> str | None:
+        range_m = of_type(sensor, AmcwToF).unambiguous_range_m
+        return f"surfaces beyond {range_m:.4g} m would be read too near by that or a multiple of it, and no frame tells"
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         visibility = min(of_type(sensor, AmcwToF).contrast_of_each) * of_type(sensor, AmcwToF).tap_fraction
@@ -466,6 +478,15 @@ def delay_taps(taps: np.ndarray, angle: np.ndarray, out: np.ndarray) -> None:
     more_cosine, more_sine = cosine * turned[0] - sine * turned[1], sine * turned[0] + cosine * turned[1]
     for tap, result, t in zip(taps, out, theta, strict=True):
         result[:] = tap + math.cos(t) * more_cosine + math.sin(t) * more_sine
+
+
+def _is_at_end(length_m: np.ndarray, sigma_m: np.ndarray, sensor: AmcwToF) -> np.ndarray:
+    """(h, w) bool, where noise may have moved a path length (h, w), metres, across the end of the range to its start,
+    or back: it is nearer to one of them than `END_SIGMAS`."""
+    period_m = 2 * sensor.unambiguous_range_m
+    if period_m > sensor.searched_m:
+        return np.zeros(length_m.shape, dtype=bool)
+    return np.asarray(np.minimum(length_m, period_m - length_m) < END_SIGMAS * sigma_m)
 
 
 def _separate(

@@ -455,6 +455,13 @@ class DirectToFDecoder(Decoder):
             returns=None if is_one else returns,
         )
 
+    def undetectable(self, sensor: Sensor) -> str | None:
+        direct = of_type(sensor, DirectToF)
+        if direct.laser != "periodic":
+            return None
+        range_m = direct.period_s * SPEED_OF_LIGHT / 2
+        return f"surfaces beyond {range_m:.4g} m would be read too near by that or a multiple of it, and no frame tells"
+
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         if background.noise_variance is None:
             return background.floor(self.relative_peak)
