@@ -389,7 +389,8 @@ def range_ambiguity() -> Case:
     sensor, slow, detector = AmcwToF((80e6,)), AmcwToF((20e6,)), Detector.time_of_flight()
     signals = transport(scene, scene.rig(0.001, **SIZE), [sensor, slow], spp=64, max_depth=2)
     healed = right(measure(signals, slow, None)[1], signals)
-    return case(signals, sensor, detector, lambda c, i: [(healed, Cause.RANGE_AMBIGUITY), (True, Cause.DEPTH_EDGE)])
+    with pytest.warns(RangesimWarning, match="that no surface is beyond 1.874 m"):
+        return case(signals, sensor, detector, lambda c, i: [(healed, Cause.RANGE_AMBIGUITY), (True, Cause.DEPTH_EDGE)])
 
 
 def resolution() -> Case:

@@ -34,8 +34,8 @@ MAX_MISFIT = 0.04
 multipath in a corner 0.01. Wrong frequencies, orders and directions made 0.045 to 0.16 in tests."""
 
 MIN_SPREAD = 0.3
-"""Least spread of the light times the square of its path, in powers of e, for a doubt of its direction: albedos and
-slopes of one surface differ by less."""
+"""Least spread of the light, and of the light times the square of its path, in powers of e, for a doubt of its
+direction: albedos and slopes of one surface differ by less."""
 
 MAX_FREQUENCIES = 4
 """Largest number of frequencies whose other orders are tried; more have more than 24."""
@@ -178,12 +178,12 @@ def direction_contradiction(length_m: np.ndarray, modulation: np.ndarray, period
     if np.count_nonzero(inside) < MIN_PIXELS:
         return None
     light, length = np.log(modulation[inside]), length_m[inside]
-    stated, mirrored = (_spread(light + 2 * np.log(x)) for x in (length, period_m - length))
-    rises = float(np.corrcoef(light, np.log(length))[0, 1]) > 0 if length.std() > 0 and light.std() > 0 else False
-    if rises and stated > MIN_SPREAD and stated > CLEARER * mirrored:
+    unexplained, stated, mirrored = (_spread(light + 2 * np.log(x)) for x in (1.0, length, period_m - length))
+    if min(stated, unexplained) > max(MIN_SPREAD, CLEARER * mirrored):
         return (
-            "pixels are brighter where the path is longer, and as light falls with the distance if the taps run the "
-            "other way: the ranges may be mirrored; check the order of the frames."
+            "pixels are brighter where the path is longer, and light falls with the distance if the taps run the other "
+            "way, so the ranges may be mirrored: check the order of the frames, and that no surface is beyond "
+            f"{period_m / 2:.4g} m."
         )
     return None
 

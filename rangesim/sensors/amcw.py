@@ -467,7 +467,7 @@ def delay_taps(taps: np.ndarray, angle: np.ndarray, out: np.ndarray) -> None:
     >>> theta = np.deg2rad([0, 90, 180, 270])[:, None, None]
     >>> out = np.empty((4, 1, 1), np.float32)
     >>> delay_taps(5 + 2 * np.cos(0.3 - theta), np.full((1, 1), 0.2), out)
-    >>> np.abs(out - (5 + 2 * np.cos(0.5 - theta))).max() < 1e-6
+    >>> bool(np.abs(out - (5 + 2 * np.cos(0.5 - theta))).max() < 1e-6)
     True
     """
     n = len(taps)
