@@ -71,7 +71,7 @@ OUTCOME_COLORS = np.array(
         (60, 12, 252),  # occluded: a blue, as geometry
         (0, 0, 12),  # no texture: black
         (252, 72, 78),  # cover glass: a red, as other light
-        (84, 6, 30),  # stray light: a red, as other light
+        (236, 32, 192),  # stray light: a magenta, as other light
         (203, 206, 210),  # nothing there
     ],
     dtype=np.uint8,
