@@ -5,11 +5,13 @@ against closed forms."""
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from synthetic import plane_signals, signals_of_depth, stereo_rig
 
+from rangesim import load_scene, transport
 from rangesim.calibration.time_of_flight import triangle_harmonics, wiggling
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
@@ -24,6 +26,7 @@ from rangesim.rig import Intrinsics
 from rangesim.sensor import Sensor
 from rangesim.sensors import AmcwDecoder, AmcwToF, DirectToF, StructuredLight
 
+SCENES = Path(__file__).resolve().parent.parent / "scenes"
 SHARING = [(3, 3), (4, 4), (4, 2), (4, 1), (6, 6), (6, 3), (6, 2), (8, 2), (5, 5)]
 """Number of taps, and of those that share an exposure."""
 
@@ -290,3 +293,25 @@ def test_pixels_of_little_light_are_refused_with_every_kind_of_pixel() -> None:
         signals = plane_signals(stereo_rig(32, 24, baseline_m=0.0), sensor)
         assert (decode(expose(signals, sensor, detector, 1e-8)).status == Status.LOW_SIGNAL).mean() > 0.95
         assert (decode(expose(signals, sensor, detector, 1.0)).status == Status.SATURATED).mean() > 0.9
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize(
+    ("frequencies", "exposure_s", "most"),
+    [((20e6, 40e6, 60e6), None, 0.4), ((40e6, 80e6, 120e6), None, 0.5), ((40e6, 80e6, 120e6), 5e-3, 0.6)],
+)
+def test_two_paths_take_most_of_the_error_out_of_a_corner(
+    frequencies: tuple[float, ...], exposure_s: float | None, most: float
+) -> None:
+    """The table of docs/decoding.md; in weak light the reading stays as it is."""
+    scene, sensor = load_scene(SCENES / "corner.xml"), AmcwToF(frequencies)
+    signals = transport(scene, scene.rig(baseline_m=0.03, width=160, height=120), [sensor], spp=64)
+    errors = []
+    for time_s in (exposure_s, 1e-4):
+        capture = expose(signals, sensor, Detector.time_of_flight() if time_s else None, time_s)
+        images = [decode(capture, AmcwDecoder(two_paths=two)) for two in (False, True)]
+        errors.append([float(np.nanmedian(np.abs(i.range_m - signals.truth.range_m))) for i in images])
+    (plain, corrected), weak = errors
+    assert plain > 0.02
+    assert corrected < most * plain
+    assert weak[1] == pytest.approx(weak[0], rel=0.05)
