@@ -124,6 +124,28 @@ class Sensor(Named, ABC):
         """
         return 1
 
+    def exposure_of_frames(self, single_tap: bool = False) -> np.ndarray:
+        """(k,) int, index of the exposure that fills each frame; exposures follow each other from 0.
+
+        A sensor overrides it if the frames of an exposure are not consecutive.
+
+        Parameters
+        ----------
+        single_tap : see `frames_per_exposure`.
+        """
+        return np.arange(self.n_frames) // self.frames_per_exposure(single_tap)
+
+    def at_pixels(self, frames: np.ndarray) -> np.ndarray:
+        """(k, h, w) float32, W/m2/sr, frames with the fixed errors of each pixel; by default there are none.
+
+        It is called once, with the frames of the whole image.
+
+        Parameters
+        ----------
+        frames : (k, h, w) float32, W/m2/sr, frames of equal pixels.
+        """
+        return frames
+
     # ---- Emitter, detector, decoder ----------------------------------------------------------------------------------
 
     @property
@@ -346,6 +368,13 @@ class Decoder(Named, ABC):
     def content(self, sensor: Sensor) -> FrameContent:
         """Light and dark current in the frame that decides about a reading, on average over the patterns."""
         return FrameContent()
+
+    def undetectable(self, sensor: Sensor) -> str | None:
+        """A clause on wrong readings of which nothing in a capture tells; None if there are none.
+
+        `rangesim decode` shows it for real captures.
+        """
+        return None
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
         """A clause with a likely mistake in how the capture was taken, judged by `image`; None if none is known.

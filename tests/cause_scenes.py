@@ -311,6 +311,21 @@ def cover_glass() -> Case:
     return case(signals, sensor, detector, lambda c, i: [(healed, Cause.COVER_GLASS)])
 
 
+def stray_light() -> Case:
+    """An AMCW camera whose lens scatters 5 % of the light, a board at 0.5 m before a wall at 1.6 m; healed by a clean
+    lens."""
+    scene = room(near=board(-0.2, 0, 0.5, 0.2), wall=board(0, 0, 1.6, 2))
+    sensor, detector = AmcwToF(), Detector.time_of_flight()
+    clean = scene.rig(1e-6, **SIZE)
+    signals = transport(scene, clean, [sensor], spp=64, max_depth=2)
+    veiled = replace(signals, rig=replace(clean, camera_lens=replace(clean.camera_lens, stray_light=0.05)))
+    exposure_s = measure(signals, sensor, detector)[0].exposure_s
+    healed = right(measure(signals, sensor, detector, exposure_s)[1], signals)
+    return timed_case(
+        veiled, sensor, detector, exposure_s, [(healed, Cause.STRAY_LIGHT), (np.ones_like(healed), Cause.DEPTH_EDGE)]
+    )
+
+
 def occluded() -> Case:
     """Active stereo on a wall, whose left border the second camera does not see; the other pixels are right, but for
     windows that the border cuts."""
@@ -374,7 +389,8 @@ def range_ambiguity() -> Case:
     sensor, slow, detector = AmcwToF((80e6,)), AmcwToF((20e6,)), Detector.time_of_flight()
     signals = transport(scene, scene.rig(0.001, **SIZE), [sensor, slow], spp=64, max_depth=2)
     healed = right(measure(signals, slow, None)[1], signals)
-    return case(signals, sensor, detector, lambda c, i: [(healed, Cause.RANGE_AMBIGUITY), (True, Cause.DEPTH_EDGE)])
+    with pytest.warns(RangesimWarning, match="that no surface is beyond 1.874 m"):
+        return case(signals, sensor, detector, lambda c, i: [(healed, Cause.RANGE_AMBIGUITY), (True, Cause.DEPTH_EDGE)])
 
 
 def resolution() -> Case:

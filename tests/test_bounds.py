@@ -32,6 +32,7 @@ from rangesim.geometry.dense_stereo import DenseMatching
 from rangesim.motion import ConstantTwist, Motion, PoseTrack, Timing
 from rangesim.presets import instrument
 from rangesim.response import (
+    Correlation,
     Dots,
     FirstReturn,
     Fringes,
@@ -209,6 +210,8 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (FringeConvention(), lambda c: use_sensor(StructuredLight(64, 48, GrayPhase(convention=c)))),
     (AmcwToF(), use_sensor),
     (AmcwToF(waveform="square"), use_sensor),
+    (AmcwToF((20e6, 80e6), taps_per_exposure=2, contrasts=(0.8, 0.6), pixel_delay_s=1e-10), use_sensor),
+    (Correlation((0.05, 0.1), (0.0, 0.5)), lambda c: use_sensor(AmcwToF(correlation=c))),
     (DirectToF(), use_sensor),
     (DirectToF(pulse_fwhm_s=400e-12), use_sensor),
     (IdealToF(), use_sensor),
@@ -332,6 +335,7 @@ MODULES = (
         "decoding.disparities",
     ),
     "geometry.dense_stereo",
+    "response.correlation",
     *(f"codes.{module.name}" for module in pkgutil.iter_modules(rangesim.codes.__path__)),
 )
 RESULTS = {Disparities, ProjectorCoordinates, Phase, *AxisCode.__subclasses__(), AxisCode}

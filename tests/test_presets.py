@@ -48,9 +48,9 @@ from rangesim.settings.config import to_dict
 NAMES = presets.names()
 UNUSED = ("pixel_pitch_m", "min_exposure_s", "max_exposure_s", "ambient_transmission")
 """Settings of detectors on which nothing depends if the exposure is stated and the light's spectrum is known."""
-OFF = {"projector_gamma": 1, "spads": 1, "coincidence": 1, "dead_time_s": 0, "afterpulsing": 0}
+OFF = {"projector_gamma": 1, "spads": 1, "coincidence": 1, "dead_time_s": 0, "afterpulsing": 0, "pixel_delay_s": 0}
 """Effects that a device without them need not mention, by the values that switch them off."""
-WITH_THESE = ("coincidence_window_s", "afterpulse_decay_s")
+WITH_THESE = ("coincidence_window_s", "afterpulse_decay_s", "pixel_seed")
 """Settings of such effects."""
 
 

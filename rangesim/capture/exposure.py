@@ -194,7 +194,7 @@ def noise_free_capture(
     unfiltered = 1.0 if ambient is None else ambient.scale
 
     def radiance(one: Signals) -> np.ndarray:
-        return _through_lens(one.frames(sensor, unfiltered, sampling_errors), one.rig)
+        return _through_lens(sensor.at_pixels(one.frames(sensor, unfiltered, sampling_errors)), one.rig)
 
     return capture_of_frames(signals, sensor, radiance, ambient)
 
@@ -243,15 +243,23 @@ def _mean_radiance(
     sampling_errors : factor on the draw of the sampling error that is added to the signals; 0: none is added.
     """
     lit = signals.frames(sensor, detector.ambient_fraction(sensor.gate, ambient), sampling_errors)
-    return _through_lens(lit, signals.rig)
+    return _through_lens(sensor.at_pixels(lit), signals.rig)
 
 
 def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:
-    """Frames (k, h, w) behind the camera's lens, which darkens the corners if it vignettes, and for smaller pixels."""
-    if rig.camera.is_pinhole and not rig.camera_lens.vignetting:
-        return frames
-    fraction = rig.camera_illumination
-    return frames if (fraction == 1).all() else frames * fraction
+    """Frames (k, h, w) behind the camera's lens, which darkens the corners if it vignettes, and for smaller pixels.
+
+    The lens scatters stray light over each frame alike, so no light is lost: it has the phase, the code and the path
+    length of the image's mean.
+    """
+    if not (rig.camera.is_pinhole and not rig.camera_lens.vignetting):
+        fraction = rig.camera_illumination
+        frames = frames if (fraction == 1).all() else frames * fraction
+    if rig.camera_lens.stray_light:
+        stray = rig.camera_lens.stray_light
+        mean = frames.mean(axis=(1, 2), dtype=np.float64, keepdims=True)
+        frames = ((1 - stray) * frames + stray * mean).astype(np.float32)
+    return frames
 
 
 def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetector, rig: Rig) -> float:

@@ -44,6 +44,7 @@ class Cause(IntEnum):
     OCCLUDED = 15
     NO_TEXTURE = 16
     COVER_GLASS = 17
+    STRAY_LIGHT = 18
 
 
 DEFINITIONS = {
@@ -65,6 +66,7 @@ DEFINITIONS = {
     Cause.OCCLUDED: "The second camera of a pair does not see the point: something is in between, or it lies outside.",
     Cause.NO_TEXTURE: "The surface shows no texture by which the images of two cameras could be matched.",
     Cause.COVER_GLASS: "Light off the window of the device disturbed the reading, or hid a surface close before it.",
+    Cause.STRAY_LIGHT: "Light of the rest of the image, which the camera's lens scatters, disturbed the reading.",
 }
 """Meaning of each cause, in one sentence, which the tables of docs/causes.md and of reports show."""
 
@@ -87,6 +89,7 @@ TITLES = {
     Cause.OCCLUDED: "occluded from a camera",
     Cause.NO_TEXTURE: "no texture",
     Cause.COVER_GLASS: "cover glass",
+    Cause.STRAY_LIGHT: "stray light",
 }
 """Name of each cause in tables and legends."""
 

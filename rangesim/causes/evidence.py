@@ -146,6 +146,14 @@ class Evidence:
         return np.asarray(self.optical & (healed | (self.image.status == Status.OUT_OF_RANGE)))
 
     @cached_property
+    def veiled(self) -> np.ndarray:
+        """Whether stray light of the camera's lens is to blame: the reading without noise fails, or keeps half of its
+        error, but not the one without what the lens adds."""
+        if not self.signals.rig.camera_lens.stray_light:
+            return np.zeros(self.true_m.shape, dtype=bool)
+        return np.asarray(~self.optical & self._wrong(self._of_failed_pixels(self.readings.noise_free)))
+
+    @cached_property
     def piled_up(self) -> np.ndarray:
         """Whether more than `MAX_PULSES_HIT` of the pulses brought a photon, or the decoder found that the pulses ran
         out although no counter is full."""

@@ -122,6 +122,7 @@ def rules(e: Evidence) -> list[Rule]:
         # ---- The distance itself
         (e.beyond_range, Cause.RANGE_AMBIGUITY),
         (e.off_glass, Cause.COVER_GLASS),
+        (e.veiled, Cause.STRAY_LIGHT),
         (e.optical & e.textureless, Cause.NO_TEXTURE),
         (e.optical & e.coarse, Cause.RESOLUTION),
         # ---- The pixel covers more than one distance

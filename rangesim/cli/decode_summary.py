@@ -68,6 +68,8 @@ def summary(decoded: Decoded, out: Path) -> str:
         parts[0] += f", {name} from {reading_m.min():.3f} to {reading_m.max():.3f} m"
     if others := ", ".join(f"{100 * fraction:.1f} % {name}" for name, fraction in fractions.items() if fraction):
         parts.append(others)
+    if image.valid.any() and (clause := (image.decoder or decoded.sensor.default_decoder).undetectable(decoded.sensor)):
+        parts.append(clause)
     if image.camera is None:
         parts.append("without --calibration there is no depth")
     if decoded.likely_cause:

@@ -15,7 +15,7 @@ import numpy as np
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.code import Code, CodeThresholds
-from rangesim.codes.correlation import check_columns, correlation_contradiction, decode_by_correlation
+from rangesim.codes.zncc_matching import check_columns, correlation_contradiction, decode_by_correlation
 from rangesim.errors import FileFormatError
 from rangesim.settings import limits
 from rangesim.settings.bounds import check_fields

@@ -11,7 +11,7 @@ import numpy as np
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.code import Code, CodeThresholds
-from rangesim.codes.correlation import correlation_contradiction
+from rangesim.codes.zncc_matching import correlation_contradiction
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.settings import limits

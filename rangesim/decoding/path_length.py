@@ -118,6 +118,7 @@ class PathLengths(Coordinates):
     sigma_m : (h, w) float32, metres, standard deviation of `length_m` that the noise of the frames causes; NaN where
         `status` is not OK. None: not known, as for noise-free captures and unknown detectors.
     returns : LengthReturns, all returns of each pixel, of which `length_m` is one; None: they were not looked for.
+    doubts : sentences with which the decoder has warned that the capture contradicts itself.
 
     Examples
     --------
@@ -133,6 +134,7 @@ class PathLengths(Coordinates):
     length_m: np.ndarray
     sigma_m: np.ndarray | None = None
     returns: LengthReturns | None = None
+    doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -161,7 +163,7 @@ class PathLengths(Coordinates):
             status[rows][(status[rows] == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
             ok = status[rows] == Status.OK
             z_m[rows], range_m[rows] = np.where(ok, z, np.nan), np.where(ok, along_ray, np.nan)
-        image = self._image(rig, z_m, range_m, status)
+        image = replace(self._image(rig, z_m, range_m, status), doubts=self.doubts)
         return image if self.returns is None else replace(image, returns=self.returns.ranges(rig))
 
 

@@ -85,14 +85,20 @@ class ReferenceReadings:
 
     @cached_property
     def emitter_alone(self) -> np.ndarray:
-        """Depths in the emitter's light alone: without noise, ambient light and the vignetting of the lens.
+        """Depths in the emitter's light alone: without noise, ambient light, and the vignetting and stray light of the
+        lens.
 
         A sensor that reads no light of the emitter is read in ambient light.
         """
         if not self.capture.sensor.reads_emitter:
             return self.noise_free
         moves = self.signals.motion_m is not None
-        if not (moves or self.signals.energy.ambient.any() or self.signals.rig.camera_lens.vignetting):
+        lens = self.signals.rig.camera_lens
+        if not (moves or self.signals.energy.ambient.any() or lens.vignetting or lens.stray_light):
             return self.noise_free
         sensor = self.capture.sensor
-        return self.read([capture_of_frames(self.signals, sensor, lambda one: one.frames(sensor, 0.0))])[0]
+
+        def frames_of(one: Signals) -> np.ndarray:
+            return sensor.at_pixels(one.frames(sensor, 0.0))
+
+        return self.read([capture_of_frames(self.signals, sensor, frames_of)])[0]

@@ -67,8 +67,9 @@ class Timing:
         is a pass of its own, rendered at the time of its middle line. For a camera whose rays have times: of columns
         or rows that are measured about the same time, if objects move; motion of the rig needs no bands there.
     single_tap : bool, whether an AMCW camera takes its taps one after another. This sets the times of the taps, not
-        their signal: a tap has the light that `AmcwToF` gives it, a quarter of an exposure. A real pixel with a single
-        tap collects half of the light of an exposure, which is twice as much.
+        their signal: a tap has the light that `AmcwToF` gives it, by default a quarter of an exposure.
+        `AmcwToF(taps_per_exposure=1)` has the same times, and the light of a real pixel with a single tap, half of an
+        exposure.
     start_s : float, seconds, middle of the first exposure.
     exposure_s : float >= 0, seconds, over which the moments of `exposure_samples` are spread. 0: the motion within an
         exposure is neglected.
@@ -105,11 +106,11 @@ class Timing:
 
     def exposure_of_frames(self, sensor: Sensor) -> np.ndarray:
         """Index of the exposure of each frame of a sensor: (k,) int64."""
-        return np.arange(sensor.n_frames) // sensor.frames_per_exposure(self.single_tap)
+        return sensor.exposure_of_frames(self.single_tap)
 
     def exposure_times_s(self, sensor: Sensor) -> Array:
         """Middle of each exposure, in line 0: (e,) float64, seconds."""
-        exposures = int(self.exposure_of_frames(sensor)[-1]) + 1
+        exposures = int(self.exposure_of_frames(sensor).max()) + 1
         bands = self.bands if self.line_period_s else 1
         passes = exposures * bands * self.exposure_samples
         limits.check("passes", passes, f"passes for {exposures} exposures in {bands} bands")

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Responses: the weights with which sensors count light paths. `rangesim.response.response` has the interface."""
 
+from rangesim.response.correlation import Correlation
 from rangesim.response.path_lengths import SPEED_OF_LIGHT, FirstReturn, LengthSplit, Phasor, TransientHistogram
 from rangesim.response.patterns import Dots, Fringes, GrayBits, Images, Stripes
 from rangesim.response.pulse import Pulse
@@ -27,6 +28,7 @@ __all__ = [
     "MULTIPATH",
     "SPECULAR",
     "SPEED_OF_LIGHT",
+    "Correlation",
     "DenseResponse",
     "Dots",
     "FirstReturn",

@@ -17,7 +17,7 @@ from rangesim.rig.cover_glass import CoverGlass
 from rangesim.rig.intrinsics import Intrinsics
 from rangesim.rig.poses import SAME_PLACE, Array, is_same_pose, pose
 from rangesim.rig.zones import Zones
-from rangesim.settings.bounds import Exponent, Metres, Watts, Wavelength, check_fields
+from rangesim.settings.bounds import Exponent, Fraction, Metres, Watts, Wavelength, check_fields
 from rangesim.settings.config import from_dict, shown, to_dict
 
 
@@ -33,15 +33,20 @@ class Lens:
     vignetting : exponent n >= 0 of the relative illumination cos^n of the angle to the optical axis: 4 is the natural
         law, 0 an even image. The light that a projector loses by vignetting is missing from its power.
 
+    stray_light : fraction of the image's light that a camera's lens scatters evenly over the image, its veiling glare:
+        a pixel gets (1 - fraction) of its own light, and the fraction of the mean over all pixels. 0.01 to 0.05 are
+        common (ISO 9358). It does not concern projectors.
+
     Examples
     --------
     >>> Lens(aperture_radius_m=2e-3, focus_m=0.8, vignetting=4)
-    Lens(aperture_radius_m=0.002, focus_m=0.8, vignetting=4)
+    Lens(aperture_radius_m=0.002, focus_m=0.8, vignetting=4, stray_light=0.0)
     """
 
     aperture_radius_m: Metres
     focus_m: Metres | None = None
     vignetting: Exponent = 0.0
+    stray_light: Fraction = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -115,11 +120,13 @@ class Rig:
             raise ValueError(f"expected camera as a Camera, such as Intrinsics, got {shown(self.camera)}.")
         if not isinstance(self.projector, (Intrinsics, Beam)):
             raise ValueError(f"expected projector as Intrinsics or Beam, got {shown(self.projector)}.")
-        if not self.camera.traced.is_pinhole and (self.camera_lens.focus_m is not None or self.camera_lens.vignetting):
+        if not self.camera.traced.is_pinhole and self.camera_lens != Lens(self.camera_lens.aperture_radius_m):
             raise ValueError(
-                f"expected a camera_lens without focus_m and vignetting for a {type(self.camera).__name__}: only a "
-                "pinhole camera has them."
+                "expected a camera_lens without focus_m, vignetting and stray_light for a "
+                f"{type(self.camera).__name__}: only a pinhole camera has them."
             )
+        if self.projector_lens.stray_light:
+            raise ValueError("expected a projector_lens without stray_light: it is that of a camera's image.")
         if isinstance(self.projector, Beam):
             self._check_beam(self.projector)
 

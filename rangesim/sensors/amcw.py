@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -16,12 +16,20 @@ from rangesim.decoding.phase_shift import Phase, PhaseThresholds, modulation_is_
 from rangesim.decoding.phase_unwrapping import unwrap
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
+from rangesim.decoding.tap_checks import (
+    chosen,
+    direction_contradiction,
+    frequency_contradiction,
+    order_contradiction,
+)
+from rangesim.decoding.two_paths import nearest_length, order_of_ratios, separate, turns_sigma
 from rangesim.decoding.working_range import WorkingRange
 from rangesim.electronics.detector import Detector
-from rangesim.response import SPEED_OF_LIGHT, Phasor, Response
+from rangesim.errors import warn
+from rangesim.response import SPEED_OF_LIGHT, Correlation, Phasor, Response
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, of_type
 from rangesim.settings import limits
-from rangesim.settings.bounds import HERTZ, Bounds, Hertz, check_fields, check_number
+from rangesim.settings.bounds import HERTZ, Bounds, Hertz, Pause, check_fields, check_number
 
 MAX_RANGE_M = 100.0
 """Largest range, metres, that phase unwrapping searches, even if the frequencies are unambiguous farther out, because
@@ -47,17 +55,26 @@ any detector distinguishes from noise. With a larger value, the causes would say
 noise-free capture has a reading."""
 
 
+END_SIGMAS = 3.0
+"""Distance of a path length from the ends of the unambiguous range, in standard deviations, below which the reading is
+refused, because the other end is as likely. Noise reaches it in one of 700 pixels whose surface lies at an end."""
+
+Contrast = Annotated[float, Bounds("a positive fraction", 1e-3, 1)]
+"""Demodulation contrast: modulation of the taps as a fraction of their mean, for light of one path."""
+
+
 @dataclass(frozen=True)
 class AmcwToF(Sensor):
     """Amplitude-modulated continuous wave camera with evenly spaced taps, by default four (0, 90, 180, 270 degrees).
 
-    The N taps of a pixel share the light of one exposure. The mean of tap theta is (A + contrast * B cos(phi -
-    theta)) / N with phi = 2 pi f l / c over the path length l (there and back); A is the white and the ambient light.
-    So the taps add up to A. A pixel with two taps, which takes two exposures, collects as much in each tap as this one
-    with twice the `exposure_s`. Frames: frequency by frequency, `taps` each.
+    By default the N taps of a pixel share the light of one exposure. The mean of tap theta is (A + contrast * B cos(phi
+    - theta)) / N with phi = 2 pi f l / c over the path length l (there and back); A is the white and the ambient light.
+    So the taps add up to A. Frames: frequency by frequency, `taps` each, by their phase.
 
-    A pixel of a Kinect v2 takes N exposures, and delivers the difference of two opposite taps for each. Such a
-    difference has the modulation and the shot noise of one of N taps that share an exposure as long as all N together.
+    A pixel with fewer charge stores takes several exposures, see `taps_per_exposure`. Then each tap collects 1 / (taps
+    of an exposure) of A, and the standard deviation of the phase by shot noise is sqrt(2 / (exposures A)) / contrast,
+    with A in electrons of one exposure: light that is collected for as long gives the same noise with any pixel, but
+    for the read noise.
 
     Parameters
     ----------
@@ -66,6 +83,16 @@ class AmcwToF(Sensor):
     waveform : "sine", or "square" for a square source against a square reference. The correlation is then a triangle,
         and a decoder that takes it for a sine has a periodic error, the "wiggling". It needs four taps.
     taps : number of taps of each frequency, at 0, 360 / taps, ... degrees of its phase. Kinect v2 has 3.
+    taps_per_exposure : number of taps that share the light of one exposure; it divides `taps`. The taps of an exposure
+        are evenly spaced, for example 0 and 180 degrees of the two-tap pixels of Melexis and EPC. None: all of them
+        share it. 1: a pixel that stores the charge of one half of the period and drains that of the other.
+    contrasts : demodulation contrast of each frequency, which takes the place of `contrast`; (): the same for all. It
+        falls with the frequency, for example from 0.87 at 200 MHz to 0.78 at 320 MHz (Bamji et al., ISSCC 2018).
+    correlation : Correlation, the measured one of source and reference; None: a sine, or what `waveform` says. Of the
+        harmonics whose order is a multiple of `taps_per_exposure`, nothing is left, because the taps divide the light.
+    pixel_delay_s : seconds, standard deviation of the delay of a pixel's reference, a fixed pattern. A pixel reads
+        surfaces too far by delay * c / 2, at all frequencies.
+    pixel_seed : seed of that pattern, the number of the device.
 
     Examples
     --------
@@ -77,9 +104,14 @@ class AmcwToF(Sensor):
     """
 
     modulation_hz: tuple[Hertz, ...] = (20e6, 80e6, 100e6)
-    contrast: Annotated[float, Bounds("a positive fraction", 1e-3, 1)] = 0.8
+    contrast: Contrast = 0.8
     waveform: Literal["sine", "square"] = "sine"
     taps: Annotated[int, Bounds("a number of taps", 3, MAX_TAPS)] = len(TAPS_DEG)
+    taps_per_exposure: Annotated[int, Bounds("a number of taps", 1, MAX_TAPS)] | None = None
+    contrasts: tuple[Contrast, ...] = ()
+    correlation: Correlation | None = None
+    pixel_delay_s: Pause = 0.0
+    pixel_seed: Annotated[int, Bounds("a seed", 0, 2**32 - 1)] = 0
 
     type_name: ClassVar[str] = "amcw-tof"
 
@@ -92,8 +124,53 @@ class AmcwToF(Sensor):
             raise ValueError("expected modulation_hz to hold at least one frequency in hertz, got none.")
         if self.waveform == "square" and self.taps != len(TAPS_DEG):
             raise ValueError(f"expected {len(TAPS_DEG)} taps for a square waveform, got {self.taps}.")
+        if self.taps % self.sharing:
+            raise ValueError(
+                f"expected taps_per_exposure to divide the {self.taps} taps evenly, got {self.taps_per_exposure}."
+            )
+        if self.contrasts and len(self.contrasts) != len(self.modulation_hz):
+            raise ValueError(
+                f"expected contrasts of {len(self.modulation_hz)} frequencies as modulation_hz, or none, "
+                f"got {len(self.contrasts)}."
+            )
+        if self.waveform == "square" and (self.correlation is not None or self.pixel_delay_s):
+            raise ValueError("expected a sine waveform with a correlation or a pixel_delay_s, got a square one.")
+        self._check_correlation()
         limits.check("frequencies", len(self.modulation_hz), "frequencies in modulation_hz")
         limits.check("wraps", self.wraps, "wraps of the highest frequency before all frequencies repeat")
+
+    def _check_correlation(self) -> None:
+        """Raise ValueError if a tap would collect less than no light, or if phases would not grow with the range."""
+        if self.correlation is None:
+            return
+        turns = np.arange(1024) / 1024
+        most = float(np.abs(self.correlation.values(turns)).max() * max(self.contrast_of_each))
+        if most > 1 + 1e-9:
+            raise ValueError(
+                f"expected a contrast times correlation of at most 1, because taps collect no negative light, "
+                f"got {most:g}."
+            )
+        if not (np.diff(self.correlation.read_by(self.taps, turns)) > 0).all():
+            raise ValueError(
+                f"expected a correlation whose phase, read by {self.taps} taps, grows with the path length; the "
+                "amplitudes of its harmonics are too large."
+            )
+
+    @property
+    def sharing(self) -> int:
+        """Number of taps that share the light of an exposure."""
+        return self.taps if self.taps_per_exposure is None else self.taps_per_exposure
+
+    @property
+    def contrast_of_each(self) -> tuple[float, ...]:
+        """Demodulation contrast of each frequency."""
+        return self.contrasts or (self.contrast,) * len(self.modulation_hz)
+
+    @property
+    def _orders(self) -> tuple[int, ...]:
+        """Orders of the harmonics that reach the taps, the first one included."""
+        others = self.correlation.orders if self.correlation is not None else ()
+        return (1, *(k for k in others if self.sharing == 1 or k % self.sharing))
 
     @property
     def shortest_period_m(self) -> float:
@@ -117,26 +194,61 @@ class AmcwToF(Sensor):
         return max(1, int(np.ceil(self.searched_m * max(self.modulation_hz) / SPEED_OF_LIGHT - 1e-6)))
 
     def responses(self) -> tuple[Response, ...]:
-        return tuple(Phasor(f, self.waveform == "square") for f in self.modulation_hz)
+        return tuple(Phasor(f * k, self.waveform == "square") for f in self.modulation_hz for k in self._orders)
 
     def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         offset = white + ambient
         result = np.empty((self.n_frames, *offset.shape), dtype=np.float32)
-        correlations = (tap for phasor in channels for tap in tap_correlations(phasor, self.contrast, self.taps))
-        for frame, correlation in zip(result, correlations, strict=True):
+        for frame, correlation in zip(result, self._correlations(channels), strict=True):
             np.multiply(self.tap_fraction, offset + correlation, out=frame, casting="same_kind")
+        return result
+
+    def _correlations(self, channels: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
+        """Correlations (h, w) of all frames, W/m2/sr."""
+        n = len(self._orders)
+        for i, contrast in enumerate(self.contrast_of_each):
+            phasors = channels[n * i : n * (i + 1)]
+            if self.correlation is None or n == 1:
+                yield from tap_correlations(phasors[0], contrast, self.taps)
+                continue
+            for k in range(self.taps):
+                yield sum(
+                    _projected(phasor, contrast * self.correlation.coefficient(order), order * k / self.taps)
+                    for phasor, order in zip(phasors, self._orders, strict=True)
+                )  # type: ignore[misc]
+
+    def at_pixels(self, frames: np.ndarray) -> np.ndarray:
+        if not self.pixel_delay_s:
+            return frames
+        rng = np.random.default_rng(self.pixel_seed)
+        delay_s = self.pixel_delay_s * rng.standard_normal(frames.shape[1:])
+        result = np.empty_like(frames)
+        for group, out, f in zip(
+            np.split(frames, len(self.modulation_hz)),
+            np.split(result, len(self.modulation_hz)),
+            self.modulation_hz,
+            strict=True,
+        ):
+            delay_taps(group, 2 * np.pi * f * delay_s, out)
         return result
 
     @property
     def tap_fraction(self) -> float:
         """Fraction of an exposure's light that each tap collects on average.
 
-        All are equal, because the taps divide the light and lose none.
+        The taps of an exposure divide its light and lose none. A pixel with a single tap drains the other half.
         """
-        return 1 / self.taps
+        return 1 / max(self.sharing, 2)
 
     def frames_per_exposure(self, single_tap: bool = False) -> int:
-        return 1 if single_tap else self.taps
+        return 1 if single_tap else self.sharing
+
+    def exposure_of_frames(self, single_tap: bool = False) -> np.ndarray:
+        frame = np.arange(self.n_frames)
+        if single_tap:
+            return frame
+        exposures = self.taps // self.sharing
+        return np.asarray(frame // self.taps * exposures + frame % self.taps % exposures)
 
     def frame_names(self) -> list[str]:
         return [f"{f / 1e6:g}MHz_{360 * k / self.taps:.4g}deg" for f in self.modulation_hz for k in range(self.taps)]
@@ -170,7 +282,9 @@ class AmcwToF(Sensor):
     @property
     def details(self) -> str:
         megahertz = ", ".join(f"{f / 1e6:g}" for f in self.modulation_hz)
-        return f"{megahertz} MHz, {self.taps} taps, {self.waveform} wave"
+        wave = f"{self.waveform} wave" if self.correlation is None else "measured correlation"
+        exposures = self.taps // self.sharing
+        return f"{megahertz} MHz, {self.taps} taps{f' in {exposures} exposures' * (exposures > 1)}, {wave}"
 
     def representative_frames(self, frames: np.ndarray) -> list[int]:
         """Indices of a tap of the first frequency, and of two taps of the last one."""
@@ -185,12 +299,15 @@ class AmcwDecoder(Decoder):
     Parameters
     ----------
     phase : PhaseThresholds.
-    correct_wiggling : bool; for a square waveform, True inverts the triangle correlation exactly (what a calibrated
-        camera does with a look-up table), False uses the sine formula and shows the raw wiggling error, up to 0.011
-        periods. Multipath adds triangles of different phase, for which neither is exact.
+    correct_wiggling : bool; for a square waveform or a measured correlation, True inverts it exactly (what a calibrated
+        camera does with a look-up table), False uses the sine formula and shows the raw wiggling error, of a square
+        waveform up to 0.011 periods. Multipath adds light of different phase, for which neither is exact.
     max_residual : float, turns; a phase that is farther from the phase of the common path length contradicts it.
     max_ambiguity : float, largest misfit of the best wrap counts as a fraction of that of the second best. Above it,
         the choice between the two is a guess.
+    two_paths : bool, whether light of a second path is separated from that of the stronger one, see
+        `rangesim.decoding.two_paths`. It needs the frequencies f, 2 f and 3 f, and pays in noise where it finds a
+        second path; elsewhere the reading stays as it is.
     working_range : WorkingRange, outside which readings are refused; None: all are kept.
 
     Examples
@@ -203,6 +320,7 @@ class AmcwDecoder(Decoder):
     correct_wiggling: bool = True
     max_residual: Annotated[float, Bounds("0 or positive", 0, 1)] = 0.1
     max_ambiguity: Annotated[float, Bounds("0 or positive", 0, 1)] = 0.5
+    two_paths: bool = False
     working_range: WorkingRange | None = None
 
     type_name: ClassVar[str] = "amcw-tof"
@@ -211,20 +329,28 @@ class AmcwDecoder(Decoder):
     def __post_init__(self) -> None:
         check_fields(self)
 
+    def check(self, sensor: Sensor) -> None:
+        super().check(sensor)
+        amcw = of_type(sensor, AmcwToF)
+        if self.two_paths and (amcw.waveform != "sine" or order_of_ratios(amcw.modulation_hz) is None):
+            raise ValueError(
+                f"expected sine waves of three frequencies f, 2 f and 3 f to separate two paths, got {amcw.details}."
+            )
+
     def coordinates(self, capture: Capture) -> PathLengths:
-        """Path lengths of an `AmcwToF` capture; their standard deviations are those of sine waves."""
+        """Path lengths of an `AmcwToF` capture; their standard deviations are those of sine waves.
+
+        `RangesimWarning` if the taps contradict each other as a whole.
+        """
+        self.check(capture.sensor)
         sensor = of_type(capture.sensor, AmcwToF)
-        exact_square = sensor.waveform == "square" and self.correct_wiggling
         groups = np.split(capture.frames, len(sensor.modulation_hz))
         shape = capture.frames.shape[1:]
         status, length = np.zeros(shape, dtype=np.uint8), np.empty(shape)
         amplitude, mean = np.empty((2, *shape), dtype=np.float32)
         sigma_m = None if capture.noise(capture.frames[0, :1]) is None else np.empty(shape, dtype=np.float32)
         for rows in bands(len(status)):
-            if sensor.taps == len(TAPS_DEG):
-                phases = [tap_phase(taps[:, rows], exact_square) for taps in groups]
-            else:
-                phases = [phase_of(taps[:, rows]) for taps in groups]
+            phases = [self._phase(sensor, taps[:, rows]) for taps in groups]
             sigmas = [phase_sigma(capture, phase, sensor.taps) for phase in phases]
             weights = [_weight(*read) for read in zip(phases, sigmas, sensor.modulation_hz, strict=True)]
             unwrapped = unwrap([p.normalised for p in phases], sensor.modulation_hz, weights, sensor.searched_m)
@@ -236,18 +362,58 @@ class AmcwDecoder(Decoder):
             length[rows] = unwrapped.length_m
             if sigma_m is not None:
                 sigma_m[rows] = RADIAN_M / np.sqrt(unwrapped.weight)
+                at_end = _is_at_end(length[rows], sigma_m[rows], sensor) & (status[rows] == Status.OK)
+                status[rows][at_end] = Status.UNWRAPPING_FAILED
+            if self.two_paths:
+                _separate(sensor, phases, sigmas, length[rows], None if sigma_m is None else sigma_m[rows])
             amplitude[rows] = np.mean([p.modulation for p in phases], axis=0)
             mean[rows] = np.mean([p.mean for p in phases], axis=0)
+        doubt = self._contradiction(sensor, capture.frames, status, length, amplitude)
+        if doubt:
+            warn(doubt)
         return PathLengths(
             length_m=length,
             sigma_m=sigma_m,
             status=status,
             confidence=2 * amplitude / capture.full_scale,
             intensity=mean - capture.black_level,
+            doubts=(doubt,) if doubt else (),
         )
 
+    def _contradiction(
+        self, sensor: AmcwToF, frames: np.ndarray, status: np.ndarray, length_m: np.ndarray, modulation: np.ndarray
+    ) -> str | None:
+        """A sentence if the taps contradict each other as a whole, see `rangesim.decoding.tap_checks`."""
+        at = chosen(np.isin(status, [Status.OK, Status.UNWRAPPING_FAILED]))
+        if at is None:
+            return None
+        taps = frames.reshape(len(frames), -1)[:, at].astype(np.float32)
+        groups = np.split(taps, len(sensor.modulation_hz))
+        if found := order_contradiction(groups):
+            return found
+        phases = [self._phase(sensor, group) for group in groups]
+        weights = [_weight(*read) for read in zip(phases, [None] * len(phases), sensor.modulation_hz, strict=True)]
+        if found := frequency_contradiction(phases, sensor.modulation_hz, weights, sensor.searched_m):
+            return found
+        at = at[status.ravel()[at] == Status.OK]
+        return direction_contradiction(length_m.ravel()[at], modulation.ravel()[at], 2 * sensor.unambiguous_range_m)
+
+    def _phase(self, sensor: AmcwToF, taps: np.ndarray) -> Phase:
+        """Phase of the taps (N, h, w) of one frequency."""
+        if sensor.taps == len(TAPS_DEG):
+            phase = tap_phase(taps, sensor.waveform == "square" and self.correct_wiggling)
+        else:
+            phase = phase_of(taps)
+        if sensor.correlation is None or not self.correct_wiggling:
+            return phase
+        return replace(phase, normalised=sensor.correlation.corrected(sensor.taps, phase.normalised))
+
+    def undetectable(self, sensor: Sensor) -> str | None:
+        range_m = of_type(sensor, AmcwToF).unambiguous_range_m
+        return f"surfaces beyond {range_m:.4g} m would be read too near by that or a multiple of it, and no frame tells"
+
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        visibility = of_type(sensor, AmcwToF).contrast * of_type(sensor, AmcwToF).tap_fraction
+        visibility = min(of_type(sensor, AmcwToF).contrast_of_each) * of_type(sensor, AmcwToF).tap_fraction
         least = self.phase.least_signal(of_type(sensor, AmcwToF).taps, visibility, self.content(sensor), background)
         if background.noise_variance is None:
             least = np.maximum(least, background.floor(RELATIVE_SIGNAL))
@@ -278,6 +444,73 @@ def tap_correlations(phasor: np.ndarray, contrast: float, taps: int) -> Iterator
     for k in range(taps):
         theta = 2 * math.pi * k / taps
         yield np.float32(contrast * math.cos(theta)) * phasor[0] + np.float32(contrast * math.sin(theta)) * phasor[1]
+
+
+def _projected(phasor: np.ndarray, coefficient: complex, turns: float) -> np.ndarray:
+    """(h, w) float32, the real part of `coefficient` times a phasor (2, h, w) that is turned back by `turns`."""
+    c = coefficient * np.exp(-2j * math.pi * turns)
+    return np.asarray(np.float32(c.real) * phasor[0] - np.float32(c.imag) * phasor[1])
+
+
+def delay_taps(taps: np.ndarray, angle: np.ndarray, out: np.ndarray) -> None:
+    """Write taps whose phase is later by an angle to `out`.
+
+    It turns the first harmonic of the taps, which is all of a sine; of other harmonics, it also turns the part that the
+    taps cannot tell from the first one.
+
+    Parameters
+    ----------
+    taps : (N, h, w) float, evenly spaced. angle : (h, w) float, radians. out : (N, h, w) float32.
+
+    Examples
+    --------
+    >>> theta = np.deg2rad([0, 90, 180, 270])[:, None, None]
+    >>> out = np.empty((4, 1, 1), np.float32)
+    >>> delay_taps(5 + 2 * np.cos(0.3 - theta), np.full((1, 1), 0.2), out)
+    >>> bool(np.abs(out - (5 + 2 * np.cos(0.5 - theta))).max() < 1e-6)
+    True
+    """
+    n = len(taps)
+    theta = 2 * math.pi * np.arange(n) / n
+    cosine = np.tensordot(np.cos(theta), taps, axes=1) * (2 / n)
+    sine = np.tensordot(np.sin(theta), taps, axes=1) * (2 / n)
+    turned = np.cos(angle) - 1, np.sin(angle)
+    more_cosine, more_sine = cosine * turned[0] - sine * turned[1], sine * turned[0] + cosine * turned[1]
+    for tap, result, t in zip(taps, out, theta, strict=True):
+        result[:] = tap + math.cos(t) * more_cosine + math.sin(t) * more_sine
+
+
+def _is_at_end(length_m: np.ndarray, sigma_m: np.ndarray, sensor: AmcwToF) -> np.ndarray:
+    """(h, w) bool, where noise may have moved a path length (h, w), metres, across the end of the range to its start,
+    or back: it is nearer to one of them than `END_SIGMAS`."""
+    period_m = 2 * sensor.unambiguous_range_m
+    if period_m > sensor.searched_m:
+        return np.zeros(length_m.shape, dtype=bool)
+    return np.asarray(np.minimum(length_m, period_m - length_m) < END_SIGMAS * sigma_m)
+
+
+def _separate(
+    sensor: AmcwToF,
+    phases: list[Phase],
+    sigmas: list[np.ndarray | None],
+    length_m: np.ndarray,
+    sigma_m: np.ndarray | None,
+) -> None:
+    """Replace path lengths (h, w), metres, and their standard deviations where light of two paths is found."""
+    order = order_of_ratios(sensor.modulation_hz)
+    assert order is not None  # `AmcwDecoder.check`
+    phasors, noise = [], []
+    for i in order:
+        phase, sigma, contrast = phases[i], sigmas[i], sensor.contrast_of_each[i]
+        light = phase.modulation.astype(np.float64) / contrast
+        phasors.append(light * np.exp(2j * np.pi * phase.normalised.astype(np.float64)))
+        noise.append(light * sigma if sigma is not None else np.zeros(light.shape))
+    found = separate(phasors, None if sigma_m is None else noise)
+    slowest_hz = sensor.modulation_hz[order[0]]
+    length_m[found.found] = nearest_length(found.turns, length_m, slowest_hz)[found.found]
+    if sigma_m is not None:
+        turns = turns_sigma(phasors, noise, found.turns)
+        sigma_m[found.found] = (SPEED_OF_LIGHT / slowest_hz * turns)[found.found]
 
 
 def _weight(phase: Phase, sigma: np.ndarray | None, modulation_hz: float) -> np.ndarray:

@@ -287,8 +287,8 @@ class DirectToFDecoder(Decoder):
 
     Parameters
     ----------
-    peak_sigmas, min_counts : float, least height of a peak over the background, in standard deviations of the counts in
-        its window, and in counts.
+    peak_sigmas, min_counts : float, least height of a peak over the background: s standard deviations of the counts in
+        its window and s^2 / 4 counts, because small counts stray farther upwards, and so many counts.
     relative_peak : float, least peak as a fraction of the bright peaks of the image, for noise-free captures.
     reading : return that the range image holds: "strongest", "first" (nearest) or "last" (farthest).
     max_returns : int from 1 to 16, largest number of returns of a pixel; the strongest ones are found. "first" and
@@ -455,16 +455,26 @@ class DirectToFDecoder(Decoder):
             returns=None if is_one else returns,
         )
 
+    def undetectable(self, sensor: Sensor) -> str | None:
+        direct = of_type(sensor, DirectToF)
+        if direct.laser != "periodic":
+            return None
+        range_m = direct.period_s * SPEED_OF_LIGHT / 2
+        return f"surfaces beyond {range_m:.4g} m would be read too near by that or a multiple of it, and no frame tells"
+
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         if background.noise_variance is None:
             return background.floor(self.relative_peak)
         window, bins = _window_bins(of_type(sensor, DirectToF)), of_type(sensor, DirectToF).bins
-        least = self._least_counts(window * (background.dark + background.ambient / bins))
-        return least + 0.25 * self.peak_sigmas**2 if self._fits_pulses(of_type(sensor, DirectToF)) else least
+        return self._least_counts(window * (background.dark + background.ambient / bins))
 
     def _least_counts(self, background: np.ndarray) -> np.ndarray:
-        """(...) float64, counts, least height of a peak over the counts (...) of background in its window."""
-        return np.asarray(np.maximum(self.min_counts, self.peak_sigmas * np.sqrt(background)))
+        """(...) float64, counts, least height of a peak over the counts (...) of background in its window.
+
+        A quarter of the square of the standard deviations is added to them, see `ReturnRules`.
+        """
+        sigmas = self.peak_sigmas
+        return np.asarray(np.maximum(self.min_counts, sigmas * np.sqrt(background) + 0.25 * sigmas**2))
 
     def content(self, sensor: Sensor) -> FrameContent:
         """Light and dark counts in the window of a peak."""

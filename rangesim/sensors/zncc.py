@@ -10,7 +10,7 @@ import numpy as np
 
 from rangesim.capture import Capture
 from rangesim.codes import AXES, AxisFrames, Code, CodeThresholds, GrayThresholds
-from rangesim.codes.correlation import CorrelatedCode, check_columns, correlation_contradiction, decode_by_correlation
+from rangesim.codes.zncc_matching import CorrelatedCode, check_columns, correlation_contradiction, decode_by_correlation
 from rangesim.decoding.phase_shift import PhaseThresholds
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits

@@ -10,12 +10,12 @@ Examples
 >>> from rangesim.rig import Lens
 >>> table = to_dict(Lens(aperture_radius_m=2e-3))
 >>> table
-{'aperture_radius_m': 0.002, 'focus_m': None, 'vignetting': 0.0}
+{'aperture_radius_m': 0.002, 'focus_m': None, 'vignetting': 0.0, 'stray_light': 0.0}
 >>> from_dict(Lens, table) == Lens(aperture_radius_m=2e-3)
 True
 >>> from_dict(Lens, {"aperture_radius_m": 2e-3, "focus": 1.0})
 Traceback (most recent call last):
-ValueError: Lens: unknown key 'focus' (did you mean 'focus_m'?); valid are aperture_radius_m, focus_m, vignetting.
+ValueError: Lens: unknown key 'focus' (did you mean 'focus_m'?); valid are aperture_radius_m, ...
 """
 
 from __future__ import annotations
