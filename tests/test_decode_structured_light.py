@@ -192,7 +192,7 @@ def test_points_behind_and_off_the_epipolar_line_are_refused() -> None:
     single = StructuredLight(code="gray")
     capture = expose(plane_signals(rig, single), single)
     mirrored = dataclasses.replace(capture, frames=capture.frames[:, :, ::-1].copy())
-    with pytest.warns(RangesimWarning, match="meet behind camera or projector"):
+    with pytest.warns(RangesimWarning, match="no image is mirrored"):
         status = decode(mirrored).status
     assert (status == Status.OUT_OF_RANGE).any()
 

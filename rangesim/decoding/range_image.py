@@ -47,6 +47,7 @@ class RangeImage(ShortRepr):
     decoder : Decoder that made it; None: not known.
     returns : Returns, all returns of each pixel, of which `range_m` is one (the decoder's `reading`); None: the decoder
         looked for one alone.
+    doubts : sentences in which the decoder says what in the capture contradicts itself, each with its likely cause.
 
     Examples
     --------
@@ -73,6 +74,7 @@ class RangeImage(ShortRepr):
     sampling_sigma_m: np.ndarray | None = None
     decoder: Decoder | None = None
     returns: Returns | None = None
+    doubts: tuple[str, ...] = ()
 
     @property
     def valid(self) -> np.ndarray:
