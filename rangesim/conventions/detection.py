@@ -1,13 +1,75 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The convention of a stack of frames: the settings of its sensor with which the frames agree best."""
+"""The convention of a stack of frames: the settings of its sensor with which the frames agree best.
+
+Many orders of the same frames are in use. Cheap tests leave a few of them: which frames are brightest and darkest
+everywhere, which add up to the same sum, and along which side of the image and how finely each changes. Those that are
+left are decoded on some of the pixels; in the right order, neighbouring pixels see neighbouring places.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from rangesim.sensors import StructuredLight
+from rangesim.capture import Capture, bright_level
+from rangesim.capture.capture import DTYPES
+from rangesim.codes import AXES, AxisCode, AxisFrames
+from rangesim.conventions.fringe_conventions import measured_fringes
+from rangesim.conventions.layouts import (
+    ENDS,
+    INVERSE,
+    INVERSES,
+    Layout,
+    kinds,
+    layouts,
+    refined_kinds,
+    variations,
+    with_layout,
+)
+from rangesim.decoding.orientation import is_mirrored
+from rangesim.decoding.pixel_samples import MIN_PIXELS
+from rangesim.decoding.status import Status
+from rangesim.sensors import StructuredLight, StructuredLightDecoder
+from rangesim.settings.config import shown
+
+MAX_SAMPLE = 20_000
+"""Largest number of pixels on which orders are tried: about a fifteenth of an image of 640 x 480. Orders differ by bits,
+which a few hundred pixels tell."""
+
+MIN_SWING = 0.1
+"""Least swing of a pixel in all frames that is looked at, as a fraction of that of the bright pixels. Pixels that swing
+less may be in shadow."""
+
+MAX_END_ERROR = 0.2
+"""Largest distance of a white or black frame from a pixel's brightest or darkest value, as a fraction of its swing. It
+allows for noise; a pattern differs by the whole swing where it is dark."""
+
+MIN_END_FRACTION = 0.9
+"""Least fraction of the pixels at which a white or black frame is the brightest or darkest. A pattern is at half of
+them, and at more only if few of its stripes are in view."""
+
+MAX_PAIR_ERROR = 0.25
+"""Largest mean difference between the sum of a pattern and its inverse and that of the brightest and the darkest value,
+as a fraction of the swing. It is 0 for a pair that is in focus and 0.5 for two frames that are no pair."""
+
+MAX_LIKENESS_LOSS = 0.15
+"""Largest loss against the best order, in the cosine between the fineness of the frames and that of the patterns, at
+which an order is still tried. An exchange of two axes, or of coarse and fine, loses 0.5 and more."""
+
+MAX_TRIED = 12
+"""Largest number of orders that are decoded, so that the time is bounded. After the cheap tests, two to eight are left
+in all captures that were tried."""
+
+MIN_GAIN_BITS = 0.7
+"""Least gain of another order over the given one, in bits (see `_agreement_bits`), at which the order is changed. Two
+orders that are equally right differ by less than 0.1 bits, a wrong one and the right one by more than 1."""
+
+MIN_BITS = 0.7
+"""Least agreement of neighbours in bits at which frames count as decoded in an order. In a wrong order it is near 0, in
+the right one above 1 if more than four cells are in view."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +84,24 @@ class Convention:
     findings: tuple[str, ...] = ()
 
 
+class _Sample(NamedTuple):
+    """Some of the pixels of a stack of frames.
+
+    frames : (k, h, w), pixels on a grid, of the type of the capture. is_lit : (h, w) bool, where they swing.
+    high, low : (h, w) float32, the brightest and the darkest value of each pixel.
+    across, down : (k,) mean change of each frame from a pixel to the next, along and down the image at full resolution.
+    """
+
+    frames: np.ndarray
+    is_lit: np.ndarray
+    high: np.ndarray
+    low: np.ndarray
+    across: np.ndarray
+    down: np.ndarray
+
+
 def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention:
-    """The settings of a sensor with which frames agree best; its code is not changed.
+    """The settings of a sensor with which frames agree best; its code is not changed but for where its fringes start.
 
     Parameters
     ----------
@@ -34,11 +112,249 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
     Raises
     ------
     ValueError
-        No convention of the sensor's code has as many frames.
+        No convention of the sensor's code has as many frames, or none with as many decodes these.
+
+    Examples
+    --------
+    >>> sensor = StructuredLight(64, 48, code="gray")
+    >>> shown = sensor.patterns()  # as a camera sees them that looks straight at the screen
+    >>> detect_convention(np.concatenate([shown[-2:], shown[:-2]]), sensor)
+    Convention(sensor=StructuredLight(...), findings=('white and black come first.',))
     """
-    if len(frames) != sensor.n_frames:
-        raise ValueError(
-            f"expected {sensor.n_frames} images for {sensor.type_name} ({sensor.frame_names()[0]} ... "
-            f"{sensor.frame_names()[-1]}), got {len(frames)}."
+    frames = frames if frames.dtype.name in DTYPES else frames.astype(np.float32)
+    is_given = len(frames) == sensor.n_frames
+    orders = list(_orders(len(frames), sensor))
+    if not is_given and not orders:
+        raise ValueError(_wrong_number(len(frames), sensor))
+    sample = _sampled(frames)
+    found = sensor
+    layout: Layout | None = None
+    if np.count_nonzero(sample.is_lit) >= MIN_PIXELS:
+        layout = _best_layout(sample, sensor, orders, is_given)
+        if layout is not None:
+            found = with_layout(sensor, layout)
+        found = _upright(sample, sensor, found)
+    elif not is_given:
+        raise ValueError(f"{_wrong_number(len(frames), sensor)[:-1]}; and they are too dark to tell which are missing.")
+    findings = [] if layout is None else list(_differences(layout, sensor, found))
+    if layout is None and found.axes != sensor.axes:
+        findings.append(f"{found.axes[0]} were shown before {found.axes[1]}.")
+    if found.order != sensor.order and found.order:
+        findings[-1] = (
+            f"{findings[-1][:-1]} (order = {shown(list(found.order))})."
+            if len(str(found.order)) < 200
+            else findings[-1]
         )
-    return Convention(sensor)
+    code, said = measured_fringes(sample.frames, found)
+    return Convention(replace(found, code=code), (*findings, *said))
+
+
+def _wrong_number(n: int, sensor: StructuredLight) -> str:
+    """The sentence that says that no order of the code has that many frames."""
+    names = sensor.frame_names()
+    return f"expected {len(names)} images for {sensor.type_name} ({names[0]} ... {names[-1]}), got {n}."
+
+
+def _orders(n: int, sensor: StructuredLight) -> Iterator[tuple[Layout, StructuredLight]]:
+    """Layouts of n frames from which the code can be decoded, each with its sensor."""
+    for layout in layouts(sensor, n):
+        try:
+            yield layout, with_layout(sensor, layout)
+        except ValueError:
+            continue
+
+
+def _sampled(frames: np.ndarray) -> _Sample:
+    """Pixels on a grid over the image, and how much each frame changes from pixel to pixel."""
+    n_pixels = frames[0].size
+    stride = max(1, int(np.ceil(np.sqrt(n_pixels / MAX_SAMPLE))))
+    few = np.ascontiguousarray(frames[:, ::stride, ::stride])
+    high, low = few.max(axis=0).astype(np.float32), few.min(axis=0).astype(np.float32)
+    swing = high - low
+    is_lit = swing > MIN_SWING * bright_level(swing)
+    skip = stride * stride
+    across, down = frames[:, ::skip], frames[:, :, ::skip]
+    return _Sample(
+        few,
+        is_lit,
+        high,
+        low,
+        np.array([np.abs(np.diff(frame.astype(np.float32), axis=1)).mean() for frame in across]),
+        np.array([np.abs(np.diff(frame.astype(np.float32), axis=0)).mean() for frame in down]),
+    )
+
+
+# ---- Order of the frames ---------------------------------------------------------------------------------------------
+
+
+def _best_layout(
+    sample: _Sample, sensor: StructuredLight, orders: Sequence[tuple[Layout, StructuredLight]], is_given: bool
+) -> Layout | None:
+    """The layout in which the frames decode best; None if it is the given one.
+
+    Raises
+    ------
+    ValueError
+        The given order has another number of frames, and no other order decodes them.
+    """
+    given = sensor.frame_names() if is_given else None
+    possible = []
+    for layout, candidate in orders:
+        names = candidate.frame_names()
+        if names != given and _ends_fit(sample, names) and _pairs_fit(sample, names):
+            likeness = _likeness(sample, candidate, names)
+            is_part = len(layout.axes) < len(sensor.axes)
+            is_exchanged = len(layout.axes) == 2 and layout.axes != sensor.axes  # `_upright` decides that
+            if not is_exchanged and (likeness > 0 or not is_part):
+                possible.append((abs(likeness), layout, candidate))
+    best = max((likeness for likeness, _, _ in possible), default=0.0)
+    tried = [(layout, c) for likeness, layout, c in possible if likeness >= best - MAX_LIKENESS_LOSS][:MAX_TRIED]
+    scores = [_agreement_bits(sample, candidate) for _, candidate in tried]
+    at = int(np.argmax(scores)) if scores else None
+    if is_given:
+        least = max(MIN_BITS, _agreement_bits(sample, sensor) + MIN_GAIN_BITS)
+        return None if at is None or scores[at] < least else tried[at][0]
+    if at is None or scores[at] < MIN_BITS:
+        raise ValueError(
+            f"{_wrong_number(len(sample.frames), sensor)[:-1]}; and in no order that misses some of them do "
+            "neighbouring pixels see neighbouring places."
+        )
+    return tried[at][0]
+
+
+def _ends_fit(sample: _Sample, names: Sequence[str]) -> bool:
+    """Whether the frames that would be white and black are the brightest and the darkest nearly everywhere."""
+    lit, swing = sample.is_lit, sample.high - sample.low
+    for name, limit in (("white", sample.high), ("black", sample.low)):
+        if name in names:
+            off = np.abs(sample.frames[list(names).index(name)] - limit)[lit]
+            if (off <= MAX_END_ERROR * swing[lit]).mean() < MIN_END_FRACTION:
+                return False
+    return True
+
+
+def _pairs_fit(sample: _Sample, names: Sequence[str]) -> bool:
+    """Whether the frames that would be a pattern and its inverse add up to the same sum."""
+    places = {name: i for i, name in enumerate(names)}
+    lit = sample.is_lit
+    total, swing = (sample.high + sample.low)[lit], float((sample.high - sample.low)[lit].mean())
+    errors = [
+        float(np.abs(sample.frames[i][lit].astype(np.float32) + sample.frames[j][lit] - total).mean()) / swing
+        for name, i in places.items()
+        if (j := places.get(name + INVERSE)) is not None
+    ]
+    return not errors or float(np.median(errors)) < MAX_PAIR_ERROR
+
+
+def _likeness(sample: _Sample, candidate: StructuredLight, names: Sequence[str]) -> float:
+    """Cosine between how finely the frames change, and how finely the patterns do; negative if along the other side.
+
+    Both count as positive for columns, which change across an upright image, and negative for rows.
+    """
+    seen = np.log(np.maximum(sample.across, 1e-6) / np.maximum(sample.down, 1e-6))
+    expected = np.zeros(len(names))
+    for axis in candidate.axes:
+        size = candidate.size(axis)
+        fineness = dict(
+            zip(candidate.code.names(size), np.log1p(variations(candidate.code.patterns(size))), strict=True)
+        )
+        sign = 1 if axis == AXES[0] else -1
+        for i, name in enumerate(names):
+            if name.startswith(f"{axis}_"):
+                expected[i] = sign * fineness[name.removeprefix(f"{axis}_")]
+    length = float(np.linalg.norm(seen) * np.linalg.norm(expected))
+    return float(seen @ expected) / length if length else 0.0
+
+
+def _agreement_bits(sample: _Sample, candidate: StructuredLight) -> float:
+    """How much nearer to each other neighbouring pixels see the projector than any two pixels do, in powers of two.
+
+    It is the mean over all pairs of neighbours and over the axes. A pair that is not decoded counts as none.
+    """
+    total = 0.0
+    for code in _decoded(sample.frames, candidate).values():
+        total += max(_nearness(sample, c) for c in (code, code.coarse) if c is not None) / len(candidate.axes)
+    return total
+
+
+def _decoded(frames: np.ndarray, sensor: StructuredLight) -> dict[str, AxisCode]:
+    """The codes of all axes."""
+    capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
+    contrast = decoder.contrast(capture, sensor)
+    codes = {}
+    for axis in sensor.axes:
+        seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
+        codes[axis] = sensor.code.decode(seen, decoder.thresholds)
+    return codes
+
+
+def _nearness(sample: _Sample, code: AxisCode) -> float:
+    """Mean of log2 of the distance of any two pixels minus that of neighbours, in cells; see `_agreement_bits`."""
+    ok = code.status == Status.OK
+    here, there, n = [], [], 0
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        n += np.count_nonzero(sample.is_lit[a] & sample.is_lit[b])
+        both = ok[a] & ok[b] & sample.is_lit[a] & sample.is_lit[b]
+        here.append(code.coordinate[a][both])
+        there.append(code.coordinate[b][both])
+    first, second = np.concatenate(here) / code.cell_px, np.concatenate(there) / code.cell_px
+    if not n or not len(first):
+        return 0.0
+    any_other = np.random.default_rng(0).permutation(second)
+    return float((np.log2(1 + np.abs(first - any_other)) - np.log2(1 + np.abs(first - second))).sum() / n)
+
+
+def _upright(sample: _Sample, sensor: StructuredLight, found: StructuredLight) -> StructuredLight:
+    """The sensor with its axes exchanged if rows come first: if the image is mirrored as given and upright exchanged.
+
+    A camera that was turned by 90 degrees sees rows change across its image, too, but its image is not mirrored.
+    """
+    if len(found.axes) < 2 or _likeness(sample, found, found.frame_names()) >= 0:
+        return found
+    codes = _decoded(sample.frames, found)
+    places = []
+    for axis in AXES:
+        code = codes[axis].coarse or codes[axis]
+        places.append(np.where(code.status == Status.OK, code.coordinate, np.float32(np.nan)))
+    if not is_mirrored(*places):
+        return found
+    axes = found.axes[::-1]
+    other = {f"{a}_": f"{b}_" for a, b in zip(found.axes, axes, strict=True)}
+    order = tuple(next((entry.replace(a, b) for a, b in other.items() if a in entry), entry) for entry in found.order)
+    try:
+        exchanged = replace(found, axes=axes, order=order)
+    except ValueError:
+        return found
+    return exchanged if exchanged.n_frames == found.n_frames else found
+
+
+def _differences(layout: Layout, sensor: StructuredLight, found: StructuredLight) -> Iterator[str]:
+    """Sentences on what of an order differs from that of the sensor."""
+    before = _described(sensor)
+    if found.axes != sensor.axes:
+        if len(found.axes) < len(sensor.axes):
+            yield f"only {found.axes[0]} were shown."
+        else:
+            yield f"{found.axes[0]} were shown before {found.axes[1]}."
+    if before is None or layout.ends != before.ends:
+        yield f"{ENDS[layout.ends]}."
+    if before is None or layout.inverses != before.inverses:
+        yield f"{INVERSES[layout.inverses]}."
+    if layout.is_reversed and not (before and before.is_reversed):
+        yield f"the finest {refined_kinds(sensor)[0]}s come first."
+    if layout.blocks != (before.blocks if before else tuple(range(len(layout.blocks)))):
+        yield f"{kinds(sensor)[layout.blocks[0]]} images come before {kinds(sensor)[layout.blocks[1]]} images."
+    if layout.is_by_block and not (before and before.is_by_block):
+        yield f"all {kinds(sensor)[layout.blocks[0]]} images of both axes come before the others."
+    if layout.is_interleaved and not (before and before.is_interleaved):
+        yield "columns and rows take turns."
+
+
+def _described(sensor: StructuredLight) -> Layout | None:
+    """The layout of a sensor's own order; None if it is no usual one."""
+    names = sensor.frame_names()
+    blocks = tuple(range(len(kinds(sensor))))
+    plain = Layout(sensor.axes, blocks=blocks)
+    if plain.names(sensor) == names:
+        return plain
+    return next((layout for layout in layouts(sensor, len(names)) if layout.names(sensor) == names), None)

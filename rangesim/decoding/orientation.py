@@ -43,7 +43,7 @@ def orientation_contradiction(column: np.ndarray | None, row: np.ndarray | None,
     rig : Rig that took the capture; None: not calibrated.
     """
     slopes = {name: _slopes(c) for name, c in (("columns", column), ("rows", row)) if c is not None}
-    if len(slopes) == 2 and _is_mirrored(slopes["columns"], slopes["rows"]):
+    if len(slopes) == 2 and _is_turned_over(slopes["columns"], slopes["rows"]):
         if _along(slopes["columns"]) == "height" and _along(slopes["rows"]) == "width":
             return (
                 "columns change along the image's height and rows along its width: rows may have been shown first, or "
@@ -72,6 +72,16 @@ def orientation_contradiction(column: np.ndarray | None, row: np.ndarray | None,
     return None
 
 
+def is_mirrored(column: np.ndarray, row: np.ndarray) -> bool:
+    """Whether the map from camera pixels to projector pixels turns nearly all areas over.
+
+    Parameters
+    ----------
+    column, row : (h, w) float32, projector pixels, NaN where not decoded.
+    """
+    return _is_turned_over(_slopes(column), _slopes(row))
+
+
 def changes_along(coordinate: np.ndarray) -> str | None:
     """Side of the image along which a coordinate changes twice as much as along the other; None if there is none.
 
@@ -94,7 +104,7 @@ def _slopes(coordinate: np.ndarray) -> np.ndarray:
     return np.stack([across[strides], down[strides]])
 
 
-def _is_mirrored(column: np.ndarray, row: np.ndarray) -> bool:
+def _is_turned_over(column: np.ndarray, row: np.ndarray) -> bool:
     """Whether nearly all areas are turned over, by the slopes (2, n, m) of both axes."""
     area = column[0] * row[1] - column[1] * row[0]
     clear = np.abs(area) >= MIN_AREA_PX2  # False for NaN

@@ -28,9 +28,12 @@ MAX_BEHIND_FRACTION = 0.2
 because interreflection makes only a few rays do so, but a mirrored image or an inverted calibration most of them."""
 
 MIN_IN_FRONT_FRACTION = 0.8
-"""Least fraction of the decoded pixels that must fit the inverse of the calibration's pose, and must not fit the given
-pose, for the pose to count as inverted. The right pose fits all but stray light and, where nothing is mistaken, an
-inverted one fits few."""
+"""Least fraction of the decoded pixels that must fit the inverse of the calibration's pose, for the pose to count as
+inverted. The right pose fits all but stray light."""
+
+MAX_FITTING_FRACTION = 0.5
+"""Largest fraction of the decoded pixels that may fit the pose as given, if it is inverted. Of devices that are turned
+to each other by 9 degrees, a third fit the inverted pose by chance."""
 
 MAX_TRIED = 5000
 """Largest number of pixels on which the inverse of the pose is tried. They tell a fraction to 0.7 %."""
@@ -162,7 +165,7 @@ class ProjectorCoordinates(Coordinates):
             found = triangulate_coordinates(directions, replace(rig, T_camera_projector=pose), column, row)
             fits = np.isfinite(found.z) & (found.epipolar_px <= self.limits.epipolar_tolerance_px)
             fractions.append(float(fits.mean()))
-            if fractions[0] > 1 - MIN_IN_FRONT_FRACTION:
+            if fractions[0] > MAX_FITTING_FRACTION:
                 return None
         before, after = fractions
         if after < MIN_IN_FRONT_FRACTION:

@@ -269,12 +269,12 @@ class StructuredLightDecoder(Decoder):
         `DoubtWarning` if frames and code contradict each other as a whole, or if two frames are the same.
         """
         sensor = of_type(capture.sensor, StructuredLight)
-        contrast = self._contrast(capture, sensor)
+        contrast = self.contrast(capture, sensor)
         codes: dict[str, AxisCode] = {}
         contradictions: list[str] = []
         for axis in sensor.axes:
             seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
-            code = sensor.code.decode(seen, self._thresholds)
+            code = sensor.code.decode(seen, self.thresholds)
             outside = (code.coordinate < -0.5) | (code.coordinate > seen.size + 0.5)
             code.status[outside & (code.status == Status.OK)] = Status.CODE_ERROR
             codes[axis] = code
@@ -299,7 +299,7 @@ class StructuredLightDecoder(Decoder):
             doubts=tuple(contradictions),
         )
 
-    def _contrast(self, capture: Capture, sensor: StructuredLight) -> Contrast:
+    def contrast(self, capture: Capture, sensor: StructuredLight) -> Contrast:
         """Contrast of white and black, each as captured, or estimated by the code if it was not shown."""
         shown, frames = sensor.frame_names(), capture.frames
         if WHITE in shown and BLACK in shown:
@@ -314,12 +314,13 @@ class StructuredLightDecoder(Decoder):
         return direct_contrast(capture, white, black, self.gray)._replace(is_measured=False)
 
     @property
-    def _thresholds(self) -> CodeThresholds:
+    def thresholds(self) -> CodeThresholds:
+        """Thresholds that the decoders of codes take."""
         return CodeThresholds(self.gray, self.phase)
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         shown = of_type(sensor, StructuredLight)
-        each = [shown.code.least_signal(shown.size(axis), self._thresholds, background) for axis in shown.axes]
+        each = [shown.code.least_signal(shown.size(axis), self.thresholds, background) for axis in shown.axes]
         return np.asarray(np.maximum.reduce(each))
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
@@ -332,7 +333,7 @@ class StructuredLightDecoder(Decoder):
             )
         if float(image.valid.mean()) >= MIN_MEASURED:
             return None
-        contrast = self._contrast(capture, of_type(capture.sensor, StructuredLight)).values
+        contrast = self.contrast(capture, of_type(capture.sensor, StructuredLight)).values
         clear = MIN_CONTRAST * capture.full_scale
         inverted = float((contrast < -clear).mean())
         if inverted > float((contrast > clear).mean()):
