@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.capture.capture import DTYPES
 from rangesim.codes import AXES, AxisCode, AxisFrames
 from rangesim.conventions.fringe_conventions import measured_fringes
 from rangesim.conventions.layouts import (
@@ -33,11 +32,10 @@ from rangesim.decoding.orientation import is_mirrored
 from rangesim.decoding.pixel_samples import MIN_PIXELS
 from rangesim.decoding.status import Status
 from rangesim.sensors import StructuredLight, StructuredLightDecoder
-from rangesim.settings.config import shown
 
 MAX_SAMPLE = 20_000
-"""Largest number of pixels on which orders are tried: about a fifteenth of an image of 640 x 480. Orders differ by bits,
-which a few hundred pixels tell."""
+"""Largest number of pixels on which orders are tried: about a fifteenth of an image of 640 x 480. A few hundred pixels
+tell orders from each other."""
 
 MIN_SWING = 0.1
 """Least swing of a pixel in all frames that is looked at, as a fraction of that of the bright pixels. Pixels that swing
@@ -87,7 +85,7 @@ class Convention:
 class _Sample(NamedTuple):
     """Some of the pixels of a stack of frames.
 
-    frames : (k, h, w), pixels on a grid, of the type of the capture. is_lit : (h, w) bool, where they swing.
+    frames : (k, h, w) float32, pixels on a grid. is_lit : (h, w) bool, where they swing.
     high, low : (h, w) float32, the brightest and the darkest value of each pixel.
     across, down : (k,) mean change of each frame from a pixel to the next, along and down the image at full resolution.
     """
@@ -121,9 +119,8 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
     >>> detect_convention(np.concatenate([shown[-2:], shown[:-2]]), sensor)
     Convention(sensor=StructuredLight(...), findings=('white and black come first.',))
     """
-    frames = frames if frames.dtype.name in DTYPES else frames.astype(np.float32)
     is_given = len(frames) == sensor.n_frames
-    orders = list(_orders(len(frames), sensor))
+    orders = list(layouts(sensor, len(frames)))
     if not is_given and not orders:
         raise ValueError(_wrong_number(len(frames), sensor))
     sample = _sampled(frames)
@@ -140,11 +137,7 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
     if layout is None and found.axes != sensor.axes:
         findings.append(f"{found.axes[0]} were shown before {found.axes[1]}.")
     if found.order != sensor.order and found.order:
-        findings[-1] = (
-            f"{findings[-1][:-1]} (order = {shown(list(found.order))})."
-            if len(str(found.order)) < 200
-            else findings[-1]
-        )
+        findings.append(f"this is the order {', '.join(found.order)}.")
     code, said = measured_fringes(sample.frames, found)
     return Convention(replace(found, code=code), (*findings, *said))
 
@@ -155,21 +148,12 @@ def _wrong_number(n: int, sensor: StructuredLight) -> str:
     return f"expected {len(names)} images for {sensor.type_name} ({names[0]} ... {names[-1]}), got {n}."
 
 
-def _orders(n: int, sensor: StructuredLight) -> Iterator[tuple[Layout, StructuredLight]]:
-    """Layouts of n frames from which the code can be decoded, each with its sensor."""
-    for layout in layouts(sensor, n):
-        try:
-            yield layout, with_layout(sensor, layout)
-        except ValueError:
-            continue
-
-
 def _sampled(frames: np.ndarray) -> _Sample:
     """Pixels on a grid over the image, and how much each frame changes from pixel to pixel."""
     n_pixels = frames[0].size
     stride = max(1, int(np.ceil(np.sqrt(n_pixels / MAX_SAMPLE))))
-    few = np.ascontiguousarray(frames[:, ::stride, ::stride])
-    high, low = few.max(axis=0).astype(np.float32), few.min(axis=0).astype(np.float32)
+    few = frames[:, ::stride, ::stride].astype(np.float32)  # not digital, so that thresholds are relative
+    high, low = few.max(axis=0), few.min(axis=0)
     swing = high - low
     is_lit = swing > MIN_SWING * bright_level(swing)
     skip = stride * stride
@@ -187,9 +171,7 @@ def _sampled(frames: np.ndarray) -> _Sample:
 # ---- Order of the frames ---------------------------------------------------------------------------------------------
 
 
-def _best_layout(
-    sample: _Sample, sensor: StructuredLight, orders: Sequence[tuple[Layout, StructuredLight]], is_given: bool
-) -> Layout | None:
+def _best_layout(sample: _Sample, sensor: StructuredLight, orders: Sequence[Layout], is_given: bool) -> Layout | None:
     """The layout in which the frames decode best; None if it is the given one.
 
     Raises
@@ -198,39 +180,48 @@ def _best_layout(
         The given order has another number of frames, and no other order decodes them.
     """
     given = sensor.frame_names() if is_given else None
+    fineness, ends = _fineness(sensor), {ends: _ends_fit(sample, ends) for ends in ENDS}
     possible = []
-    for layout, candidate in orders:
-        names = candidate.frame_names()
-        if names != given and _ends_fit(sample, names) and _pairs_fit(sample, names):
-            likeness = _likeness(sample, candidate, names)
-            is_part = len(layout.axes) < len(sensor.axes)
-            is_exchanged = len(layout.axes) == 2 and layout.axes != sensor.axes  # `_upright` decides that
-            if not is_exchanged and (likeness > 0 or not is_part):
-                possible.append((abs(likeness), layout, candidate))
-    best = max((likeness for likeness, _, _ in possible), default=0.0)
-    tried = [(layout, c) for likeness, layout, c in possible if likeness >= best - MAX_LIKENESS_LOSS][:MAX_TRIED]
-    scores = [_agreement_bits(sample, candidate) for _, candidate in tried]
-    at = int(np.argmax(scores)) if scores else None
+    for layout in orders:
+        is_exchanged = len(layout.axes) == 2 and layout.axes != sensor.axes  # `_upright` decides that
+        if is_exchanged or not ends[layout.ends]:
+            continue
+        names = layout.names(sensor)
+        likeness = _likeness(sample, fineness, names)
+        if names != given and (likeness > 0 or len(layout.axes) == len(sensor.axes)) and _pairs_fit(sample, names):
+            possible.append((abs(likeness), layout))
+    best = max((likeness for likeness, _ in possible), default=0.0)
+    scores: list[tuple[float, Layout]] = []
+    for likeness, layout in possible:
+        if likeness >= best - MAX_LIKENESS_LOSS and len(scores) < MAX_TRIED:
+            try:
+                scores.append((_agreement_bits(sample, with_layout(sensor, layout)), layout))
+            except ValueError:  # the code needs frames that are missing in this layout
+                continue
+    score, layout = max(scores, key=lambda found: found[0], default=(0.0, Layout(sensor.axes)))
     if is_given:
-        least = max(MIN_BITS, _agreement_bits(sample, sensor) + MIN_GAIN_BITS)
-        return None if at is None or scores[at] < least else tried[at][0]
-    if at is None or scores[at] < MIN_BITS:
+        return layout if score > max(MIN_BITS, _agreement_bits(sample, sensor) + MIN_GAIN_BITS) else None
+    if score < MIN_BITS:
         raise ValueError(
             f"{_wrong_number(len(sample.frames), sensor)[:-1]}; and in no order that misses some of them do "
             "neighbouring pixels see neighbouring places."
         )
-    return tried[at][0]
+    return layout
 
 
-def _ends_fit(sample: _Sample, names: Sequence[str]) -> bool:
-    """Whether the frames that would be white and black are the brightest and the darkest nearly everywhere."""
-    lit, swing = sample.is_lit, sample.high - sample.low
-    for name, limit in (("white", sample.high), ("black", sample.low)):
-        if name in names:
-            off = np.abs(sample.frames[list(names).index(name)] - limit)[lit]
-            if (off <= MAX_END_ERROR * swing[lit]).mean() < MIN_END_FRACTION:
-                return False
-    return True
+def _ends_fit(sample: _Sample, ends: tuple[tuple[str, ...], tuple[str, ...]]) -> bool:
+    """Whether the frames that would be white and black are the brightest and the darkest nearly everywhere.
+
+    Parameters
+    ----------
+    ends : names of the first and of the last frames.
+    """
+    lit, limits = sample.is_lit, {"white": sample.high, "black": sample.low}
+    largest = MAX_END_ERROR * (sample.high - sample.low)[lit]
+    places = [*enumerate(ends[0]), *((i - len(ends[1]), name) for i, name in enumerate(ends[1]))]
+    return all(
+        (np.abs(sample.frames[i] - limits[name])[lit] <= largest).mean() >= MIN_END_FRACTION for i, name in places
+    )
 
 
 def _pairs_fit(sample: _Sample, names: Sequence[str]) -> bool:
@@ -239,29 +230,30 @@ def _pairs_fit(sample: _Sample, names: Sequence[str]) -> bool:
     lit = sample.is_lit
     total, swing = (sample.high + sample.low)[lit], float((sample.high - sample.low)[lit].mean())
     errors = [
-        float(np.abs(sample.frames[i][lit].astype(np.float32) + sample.frames[j][lit] - total).mean()) / swing
+        float(np.abs(sample.frames[i][lit] + sample.frames[j][lit] - total).mean()) / swing
         for name, i in places.items()
         if (j := places.get(name + INVERSE)) is not None
     ]
     return not errors or float(np.median(errors)) < MAX_PAIR_ERROR
 
 
-def _likeness(sample: _Sample, candidate: StructuredLight, names: Sequence[str]) -> float:
+def _fineness(sensor: StructuredLight) -> dict[str, float]:
+    """Logarithm of how often each pattern changes, positive for columns and negative for rows, by the frame's name."""
+    result: dict[str, float] = {}
+    for axis, sign in zip(AXES, (1, -1), strict=True):
+        size = sensor.size(axis)
+        changes = np.log1p(variations(sensor.code.patterns(size)))
+        result |= {f"{axis}_{name}": sign * x for name, x in zip(sensor.code.names(size), changes, strict=True)}
+    return result
+
+
+def _likeness(sample: _Sample, fineness: dict[str, float], names: Sequence[str]) -> float:
     """Cosine between how finely the frames change, and how finely the patterns do; negative if along the other side.
 
-    Both count as positive for columns, which change across an upright image, and negative for rows.
+    Both count as positive for what changes across the image, and negative for what changes down the image.
     """
     seen = np.log(np.maximum(sample.across, 1e-6) / np.maximum(sample.down, 1e-6))
-    expected = np.zeros(len(names))
-    for axis in candidate.axes:
-        size = candidate.size(axis)
-        fineness = dict(
-            zip(candidate.code.names(size), np.log1p(variations(candidate.code.patterns(size))), strict=True)
-        )
-        sign = 1 if axis == AXES[0] else -1
-        for i, name in enumerate(names):
-            if name.startswith(f"{axis}_"):
-                expected[i] = sign * fineness[name.removeprefix(f"{axis}_")]
+    expected = np.array([fineness.get(name, 0.0) for name in names])  # 0 for white and black
     length = float(np.linalg.norm(seen) * np.linalg.norm(expected))
     return float(seen @ expected) / length if length else 0.0
 
@@ -281,7 +273,7 @@ def _decoded(frames: np.ndarray, sensor: StructuredLight) -> dict[str, AxisCode]
     """The codes of all axes."""
     capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
     contrast = decoder.contrast(capture, sensor)
-    codes = {}
+    codes: dict[str, AxisCode] = {}
     for axis in sensor.axes:
         seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
         codes[axis] = sensor.code.decode(seen, decoder.thresholds)
@@ -293,7 +285,7 @@ def _nearness(sample: _Sample, code: AxisCode) -> float:
     ok = code.status == Status.OK
     here, there, n = [], [], 0
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        n += np.count_nonzero(sample.is_lit[a] & sample.is_lit[b])
+        n += int(np.count_nonzero(sample.is_lit[a] & sample.is_lit[b]))
         both = ok[a] & ok[b] & sample.is_lit[a] & sample.is_lit[b]
         here.append(code.coordinate[a][both])
         there.append(code.coordinate[b][both])
@@ -309,7 +301,7 @@ def _upright(sample: _Sample, sensor: StructuredLight, found: StructuredLight) -
 
     A camera that was turned by 90 degrees sees rows change across its image, too, but its image is not mirrored.
     """
-    if len(found.axes) < 2 or _likeness(sample, found, found.frame_names()) >= 0:
+    if len(found.axes) < 2 or _likeness(sample, _fineness(found), found.frame_names()) >= 0:
         return found
     codes = _decoded(sample.frames, found)
     places = []

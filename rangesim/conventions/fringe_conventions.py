@@ -143,7 +143,7 @@ def _differences(found: FringeConvention, given: FringeConvention) -> Iterator[s
         yield f"the fringes start as {found.start} (convention.start = {found.start})."
     if found.direction != given.direction:
         way = "larger" if found.direction == "forward" else "smaller"
-        yield f"each fringe image is the one before, moved towards {way} pixels (convention.direction = {found.direction})."
+        yield f"the fringes move towards {way} pixels (convention.direction = {found.direction})."
     if found.origin_px != given.origin_px:
         place = {0.0: "at the edge", 0.5: "at the centre"}[found.origin_px]
         yield f"phase 0 of the fringes lies {place} of the first pixel (convention.origin_px = {found.origin_px:g})."

@@ -130,12 +130,11 @@ def layouts(sensor: StructuredLight, n: int) -> Iterator[Layout]:
     """
     has_inverses = any(name.endswith(INVERSE) for name in sensor.code.names(sensor.size(sensor.axes[0])))
     n_kinds = len(kinds(sensor))
-    subsets = list(permutations(sensor.axes))
+    subsets: list[tuple[str, ...]] = list(permutations(sensor.axes))
     if len(sensor.axes) == 2:
         subsets += [(axis,) for axis in AXES]
-    orders = (
-        list(permutations(range(n_kinds))) if n_kinds <= 2 else [tuple(range(n_kinds)), tuple(range(n_kinds))[::-1]]
-    )
+    own = tuple(range(n_kinds))
+    orders = dict.fromkeys((own, own[::-1]))
     counts: dict[tuple[object, ...], int] = {}
     for axes, inverses, ends, is_reversed, blocks, (is_by_block, is_interleaved) in product(
         subsets,

@@ -109,7 +109,7 @@ def _is_turned_over(column: np.ndarray, row: np.ndarray) -> bool:
     area = column[0] * row[1] - column[1] * row[0]
     clear = np.abs(area) >= MIN_AREA_PX2  # False for NaN
     n = np.count_nonzero(clear)
-    return n >= MIN_PIXELS and np.count_nonzero(clear & (area < 0)) > MIN_MIRRORED_FRACTION * n
+    return bool(n >= MIN_PIXELS and np.count_nonzero(clear & (area < 0)) > MIN_MIRRORED_FRACTION * n)
 
 
 def _along(slopes: np.ndarray) -> str | None:
