@@ -37,6 +37,10 @@ MAX_SAMPLE = 20_000
 """Largest number of pixels on which orders are tried: about a fifteenth of an image of 640 x 480. A few hundred pixels
 tell orders from each other."""
 
+TILE = 16
+"""Side of a tile of the sample in pixels. Pixels within a tile are true neighbours, whose fringes are not a period
+apart; one pair in sixteen lies across the edge of a tile, which loses as much in every order."""
+
 MIN_SWING = 0.1
 """Least swing of a pixel in all frames that is looked at, as a fraction of that of the bright pixels. Pixels that swing
 less may be in shadow."""
@@ -61,13 +65,25 @@ MAX_TRIED = 12
 """Largest number of orders that are decoded, so that the time is bounded. After the cheap tests, two to eight are left
 in all captures that were tried."""
 
-MIN_GAIN_BITS = 0.7
+MIN_GAIN_BITS = 0.4
 """Least gain of another order over the given one, in bits (see `_agreement_bits`), at which the order is changed. Two
-orders that are equally right differ by less than 0.1 bits, a wrong one and the right one by more than 1."""
+orders that are equally right differ by less than 0.1 bits, a wrong one and the right one by about 1."""
 
 MIN_BITS = 0.7
 """Least agreement of neighbours in bits at which frames count as decoded in an order. In a wrong order it is near 0, in
 the right one above 1 if more than four cells are in view."""
+
+
+MIN_STEP = 0.5
+"""Least distance of two pixels that see different cells, in cells: a pixel on the edge of two cells is half a cell off
+both."""
+
+MAX_LOSS_BITS = 0.2
+"""Largest loss against the best order, in bits, at which a more usual order is taken. Two orders that are equally right
+differ by less than 0.1 bits."""
+
+MAX_ENTRIES = 6
+"""Largest number of entries of an order that a finding repeats, so that it stays readable."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +101,8 @@ class Convention:
 class _Sample(NamedTuple):
     """Some of the pixels of a stack of frames.
 
-    frames : (k, h, w) float32, pixels on a grid. is_lit : (h, w) bool, where they swing.
+    frames : (k, h, w) float32, pixels of tiles that are spread over the image; tiles stand side by side.
+    is_lit : (h, w) bool, where they swing.
     high, low : (h, w) float32, the brightest and the darkest value of each pixel.
     across, down : (k,) mean change of each frame from a pixel to the next, along and down the image at full resolution.
     """
@@ -136,7 +153,7 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
     findings = [] if layout is None else list(_differences(layout, sensor, found))
     if layout is None and found.axes != sensor.axes:
         findings.append(f"{found.axes[0]} were shown before {found.axes[1]}.")
-    if found.order != sensor.order and found.order:
+    if found.order != sensor.order and 0 < len(found.order) <= MAX_ENTRIES:
         findings.append(f"this is the order {', '.join(found.order)}.")
     code, said = measured_fringes(sample.frames, found)
     return Convention(replace(found, code=code), (*findings, *said))
@@ -150,9 +167,9 @@ def _wrong_number(n: int, sensor: StructuredLight) -> str:
 
 def _sampled(frames: np.ndarray) -> _Sample:
     """Pixels on a grid over the image, and how much each frame changes from pixel to pixel."""
-    n_pixels = frames[0].size
-    stride = max(1, int(np.ceil(np.sqrt(n_pixels / MAX_SAMPLE))))
-    few = frames[:, ::stride, ::stride].astype(np.float32)  # not digital, so that thresholds are relative
+    stride = max(1, int(np.ceil(np.sqrt(frames[0].size / MAX_SAMPLE))))
+    y, x = (np.flatnonzero(np.arange(n) // TILE % stride == 0) for n in frames.shape[1:])
+    few = frames[:, y][:, :, x].astype(np.float32)  # not digital, so that thresholds are relative
     high, low = few.max(axis=0), few.min(axis=0)
     swing = high - low
     is_lit = swing > MIN_SWING * bright_level(swing)
@@ -198,7 +215,8 @@ def _best_layout(sample: _Sample, sensor: StructuredLight, orders: Sequence[Layo
                 scores.append((_agreement_bits(sample, with_layout(sensor, layout)), layout))
             except ValueError:  # the code needs frames that are missing in this layout
                 continue
-    score, layout = max(scores, key=lambda found: found[0], default=(0.0, Layout(sensor.axes)))
+    highest = max((score for score, _ in scores), default=0.0)
+    score, layout = next((found for found in scores if found[0] >= highest - MAX_LOSS_BITS), (0.0, Layout(sensor.axes)))
     if is_given:
         return layout if score > max(MIN_BITS, _agreement_bits(sample, sensor) + MIN_GAIN_BITS) else None
     if score < MIN_BITS:
@@ -261,7 +279,8 @@ def _likeness(sample: _Sample, fineness: dict[str, float], names: Sequence[str])
 def _agreement_bits(sample: _Sample, candidate: StructuredLight) -> float:
     """How much nearer to each other neighbouring pixels see the projector than any two pixels do, in powers of two.
 
-    It is the mean over all pairs of neighbours and over the axes. A pair that is not decoded counts as none.
+    It is the mean over all pairs of neighbours that see different cells, times the fraction of the pairs that are
+    decoded, and the mean over the axes.
     """
     total = 0.0
     for code in _decoded(sample.frames, candidate).values():
@@ -281,7 +300,10 @@ def _decoded(frames: np.ndarray, sensor: StructuredLight) -> dict[str, AxisCode]
 
 
 def _nearness(sample: _Sample, code: AxisCode) -> float:
-    """Mean of log2 of the distance of any two pixels minus that of neighbours, in cells; see `_agreement_bits`."""
+    """Mean of log2 of the distance of any two pixels minus that of neighbours, in cells; see `_agreement_bits`.
+
+    Neighbours that see the same cell would agree in every order.
+    """
     ok = code.status == Status.OK
     here, there, n = [], [], 0
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
@@ -290,10 +312,12 @@ def _nearness(sample: _Sample, code: AxisCode) -> float:
         here.append(code.coordinate[a][both])
         there.append(code.coordinate[b][both])
     first, second = np.concatenate(here) / code.cell_px, np.concatenate(there) / code.cell_px
-    if not n or not len(first):
+    differ = np.abs(first - second) >= MIN_STEP
+    if np.count_nonzero(differ) < MIN_PIXELS:
         return 0.0
     any_other = np.random.default_rng(0).permutation(second)
-    return float((np.log2(1 + np.abs(first - any_other)) - np.log2(1 + np.abs(first - second))).sum() / n)
+    octaves = np.log2(np.maximum(np.abs(first - any_other), MIN_STEP)).mean()
+    return float((octaves - np.log2(np.abs(first - second)[differ]).mean()) * len(first) / n)
 
 
 def _upright(sample: _Sample, sensor: StructuredLight, found: StructuredLight) -> StructuredLight:

@@ -24,6 +24,10 @@ MIN_CONCENTRATION = 0.8
 """Least length of the mean vector of phase minus place, as a fraction of that of an even distribution over a Gray cell,
 at which fringes count as following the code. For fringes in the other direction it is near 0."""
 
+MIN_AGREEMENT = 0.5
+"""Least agreement of the directions of phases and cells, from -1 to 1, at which fringes count as running that way. It
+is near 1 or -1 if a step from pixel to pixel is below half a period."""
+
 MAX_REST_PX = 0.2
 """Largest distance of the measured start from one of the usual ones, in projector pixels, at which it counts as that
 one. Usual ones are half a pixel apart; sound captures measure theirs to 0.1 pixels."""
@@ -37,13 +41,16 @@ EDGE_TURNS = 0.005
 
 
 class _Offsets(NamedTuple):
-    """Phases of some pixels, and their Gray cells. phase, cell : (n,) turns. half_turns : half a cell, in turns.
+    """Phases of some pixels, and their Gray cells.
 
-    period_px : projector pixels.
+    phase, cell : (n,) turns. agreement : 1 if the phases grow from pixel to pixel as their cells do, -1 if the other
+    way, 0 if there are no neighbours in neighbouring cells. half_turns : half a cell, in turns. period_px : projector
+    pixels.
     """
 
     phase: np.ndarray
     cell: np.ndarray
+    agreement: float
     half_turns: float
     period_px: float
 
@@ -93,10 +100,11 @@ def _all_offsets(frames: np.ndarray, sensor: StructuredLight, period_px: float) 
         inside = (gray.coordinate / gray.cell_px) % 1 == 0.5
         is_strong = (code.status == Status.OK) | (code.status == Status.CODE_ERROR)
         used = inside & is_strong & (gray.status == Status.OK)
-        phase = phase_of(fringes.frames[:, used])
+        phase = phase_of(fringes.frames).normalised
         yield _Offsets(
-            phase.normalised,
+            phase[used],
             gray.coordinate[used] / np.float32(period_px),
+            _agreement(phase, gray.coordinate / np.float32(gray.cell_px), used),
             gray.cell_px / (2 * period_px),
             period_px,
         )
@@ -107,7 +115,9 @@ def _measured(offsets: _Offsets, given: FringeConvention) -> FringeConvention | 
     if len(offsets.phase) < MIN_PIXELS:
         return None
     expected = float(np.sinc(2 * offsets.half_turns))
-    for direction in (given.direction, "backward" if given.direction == "forward" else "forward"):
+    for direction, sign in (("forward", 1), ("backward", -1)):
+        if sign * offsets.agreement < MIN_AGREEMENT:
+            continue
         here = replace(given, direction=direction)  # type: ignore[arg-type]
         vector = np.exp(2j * np.pi * offsets.off(here).astype(np.float64)).mean()
         if abs(vector) < MIN_CONCENTRATION * expected:
@@ -116,10 +126,23 @@ def _measured(offsets: _Offsets, given: FringeConvention) -> FringeConvention | 
         best = min(_usual(here), key=lambda c: abs(_rest_px(c, here, off_px, offsets.period_px)))
         if abs(_rest_px(best, here, off_px, offsets.period_px)) > MAX_REST_PX:
             return None
-        if best == given or offsets.outside(best) > MAX_OUTSIDE_RATIO * offsets.outside(given):
+        is_turned = direction != given.direction  # its mirror image in each cell may leave no phase outside
+        if not is_turned and (best == given or offsets.outside(best) > MAX_OUTSIDE_RATIO * offsets.outside(given)):
             return given
         return best
     return None
+
+
+def _agreement(phase: np.ndarray, cell: np.ndarray, used: np.ndarray) -> float:
+    """Mean of the signs of the changes of phase (h, w) in turns, between neighbours in neighbouring Gray cells."""
+    total, n = 0.0, 0
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        step = cell[there] - cell[here]
+        both = used[here] & used[there] & (np.abs(step) == 1)
+        turn = (phase[there] - phase[here])[both]
+        total += float((np.sign(turn - np.rint(turn)) * step[both]).sum())
+        n += int(np.count_nonzero(both))
+    return total / max(n, 1)
 
 
 def _usual(given: FringeConvention) -> Iterator[FringeConvention]:

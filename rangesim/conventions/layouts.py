@@ -167,7 +167,8 @@ def with_layout(sensor: StructuredLight, layout: Layout) -> StructuredLight:
     plain = replace(sensor, axes=layout.axes, order=())  # type: ignore[arg-type]
     if plain.frame_names() == names:
         return plain
-    for order in ((*first, "*", *last), (*first, "*"), (*first, *names[len(first) : len(names) - len(last)], *last)):
+    by_axis = tuple(f"{axis}_*" for axis in layout.axes)
+    for order in ((*first, "*"), (*first, *by_axis, *last)):
         shown = _with_order(plain, order, names)
         if shown is not None:
             return shown
