@@ -53,7 +53,16 @@ def likely_cause(image: RangeImage, capture: Capture) -> str | None:
                 f"the brightest value is {brightest} of {capture.full_scale:.0f}: give --bits "
                 f"{max(brightest.bit_length(), 1)} if the camera has no more, or expose longer"
             )
-    if float((image.status == Status.CODE_ERROR).mean()) > float(image.valid.mean()):
+    measured = float(image.valid.mean())
+    if (clipped := float((image.status == Status.SATURATED).mean())) > measured:
+        return f"{100 * clipped:.0f} % of the pixels are as bright as the camera can tell: expose shorter"
+    if capture.is_digital and float((image.status == Status.LOW_SIGNAL).mean()) > measured:
+        swing = float(np.median(np.ptp(capture.frames, axis=0)))
+        return (
+            f"half of the pixels change by {swing:.0f} of {capture.full_scale:.0f} or less in all images: expose "
+            "longer, keep other light away, and check that the patterns were shown"
+        )
+    if float((image.status == Status.CODE_ERROR).mean()) > measured:
         return "codes miss their epipolar line or each other: check --calibration, --code-step and the patterns' order"
     return None
 

@@ -156,7 +156,10 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
     if found.order != sensor.order and 0 < len(found.order) <= MAX_ENTRIES:
         findings.append(f"this is the order {', '.join(found.order)}.")
     code, said = measured_fringes(sample.frames, found)
-    return Convention(replace(found, code=code), (*findings, *said))
+    found = replace(found, code=code)
+    if not is_given and _contradict(sample.frames, found):
+        findings.append("the images contradict this order, too: check that none is missing or there twice.")
+    return Convention(found, (*findings, *said))
 
 
 def _wrong_number(n: int, sensor: StructuredLight) -> str:
@@ -200,12 +203,11 @@ def _best_layout(sample: _Sample, sensor: StructuredLight, orders: Sequence[Layo
     fineness, ends = _fineness(sensor), {ends: _ends_fit(sample, ends) for ends in ENDS}
     possible = []
     for layout in orders:
-        is_exchanged = len(layout.axes) == 2 and layout.axes != sensor.axes  # `_upright` decides that
-        if is_exchanged or not ends[layout.ends]:
+        if not ends[layout.ends]:
             continue
         names = layout.names(sensor)
-        likeness = _likeness(sample, fineness, names)
-        if names != given and (likeness > 0 or len(layout.axes) == len(sensor.axes)) and _pairs_fit(sample, names):
+        likeness = _likeness(sample, fineness, names)  # negative: the camera would be turned by 90 degrees
+        if names != given and (likeness > 0 or layout.axes == sensor.axes) and _pairs_fit(sample, names):
             possible.append((abs(likeness), layout))
     best = max((likeness for likeness, _ in possible), default=0.0)
     scores: list[tuple[float, Layout]] = []
@@ -297,6 +299,17 @@ def _decoded(frames: np.ndarray, sensor: StructuredLight) -> dict[str, AxisCode]
         seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
         codes[axis] = sensor.code.decode(seen, decoder.thresholds)
     return codes
+
+
+def _contradict(frames: np.ndarray, sensor: StructuredLight) -> bool:
+    """Whether frames (k, h, w) contradict the sensor's code as a whole."""
+    capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
+    contrast = decoder.contrast(capture, sensor)
+    for axis, code in _decoded(frames, sensor).items():
+        seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
+        if sensor.code.contradiction(seen, code):
+            return True
+    return False
 
 
 def _nearness(sample: _Sample, code: AxisCode) -> float:

@@ -84,7 +84,21 @@ def measured_fringes(frames: np.ndarray, sensor: StructuredLight) -> tuple[Code,
         return code, ()
     convention = found.pop()
     assert convention is not None
-    return replace(code, convention=convention), tuple(_differences(convention, given))  # type: ignore[type-var]
+    other: Code = replace(code, convention=convention)  # type: ignore[type-var]
+    if len(_contradictions(frames, replace(sensor, code=other))) >= max(1, len(_contradictions(frames, sensor))):
+        return code, ()  # something else is wrong
+    return other, tuple(_differences(convention, given))
+
+
+def _contradictions(frames: np.ndarray, sensor: StructuredLight) -> list[str]:
+    """What of the frames (k, h, w) contradicts the sensor's code as a whole."""
+    capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
+    contrast = decoder.contrast(capture, sensor)
+    found = []
+    for axis in sensor.axes:
+        seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
+        found.append(sensor.code.contradiction(seen, sensor.code.decode(seen, decoder.thresholds)))
+    return [text for text in found if text]
 
 
 def _all_offsets(frames: np.ndarray, sensor: StructuredLight, period_px: float) -> Iterator[_Offsets]:

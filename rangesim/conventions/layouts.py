@@ -115,7 +115,7 @@ def refined_kinds(sensor: StructuredLight) -> list[str]:
     for name, total in zip(sensor.code.names(size), variations(sensor.code.patterns(size)), strict=True):
         if not name.endswith(INVERSE):
             variation.setdefault(kind_of(name), []).append(float(total))
-    return [kind for kind, totals in variation.items() if len(totals) > 1 and (np.diff(totals) > 0).all()]
+    return [kind for kind, totals in variation.items() if (np.diff(totals) >= 0).all() and totals[-1] > totals[0]]
 
 
 def variations(patterns: np.ndarray) -> np.ndarray:

@@ -31,9 +31,13 @@ MIN_IN_FRONT_FRACTION = 0.8
 """Least fraction of the decoded pixels that must fit the inverse of the calibration's pose, for the pose to count as
 inverted. The right pose fits all but stray light."""
 
-MAX_FITTING_FRACTION = 0.5
+MAX_FITTING_FRACTION = 0.7
 """Largest fraction of the decoded pixels that may fit the pose as given, if it is inverted. Of devices that are turned
-to each other by 9 degrees, a third fit the inverted pose by chance."""
+to each other by 9 degrees, a third to a half fit the inverted pose by chance."""
+
+MAX_OFF_LINE_FRACTION = 0.3
+"""Largest fraction of the decoded pixels that may miss their epipolar line. Interreflection and noise move a tenth off
+at most; a calibration of another rig, or one that has changed, moves most of them."""
 
 MAX_TRIED = 5000
 """Largest number of pixels on which the inverse of the pose is tried. They tell a fraction to 0.7 %."""
@@ -141,12 +145,33 @@ class ProjectorCoordinates(Coordinates):
                 status[rows][y, x], z[rows][y, x] = outcome, depth
                 range_m[rows][y, x] = depth * np.linalg.norm(directions, axis=-1)
             if not (self.doubts or doubt):
-                doubt = self._pose_contradiction(rig) or behind_contradiction(np.concatenate(behind_px))
+                doubt = (
+                    self._pose_contradiction(rig)
+                    or behind_contradiction(np.concatenate(behind_px))
+                    or self._line_contradiction(status)
+                )
         if doubt:
             warn(doubt, DoubtWarning)
         image = self._image(rig, z, range_m, status)
         doubts = (*self.doubts, doubt) if doubt else self.doubts
         return replace(image, projector_column=column, projector_row=row, doubts=doubts)
+
+    def _line_contradiction(self, status: np.ndarray) -> str | None:
+        """A sentence if many decoded pixels miss their epipolar line; None if not.
+
+        Parameters
+        ----------
+        status : (h, w) uint8, that of the range image.
+        """
+        n = np.count_nonzero(self.valid)
+        off = np.count_nonzero(self.valid & (status == Status.CODE_ERROR))
+        if n < MIN_PIXELS or off <= MAX_OFF_LINE_FRACTION * n:
+            return None
+        return (
+            f"{100 * off / n:.0f} % of the decoded pixels miss their epipolar line by more than "
+            f"{self.limits.epipolar_tolerance_px:g} projector pixels, so the depth of the others is doubtful: check "
+            "the calibration, its code step, and that camera and projector have not moved since."
+        )
 
     def _pose_contradiction(self, rig: Rig) -> str | None:
         """A sentence if the decoded pixels fit the inverse of T_camera_projector, but not itself; None if not.
