@@ -16,7 +16,7 @@ import numpy as np
 
 from rangesim.capture import Capture, bright_level
 from rangesim.codes import AXES, AxisCode, AxisFrames
-from rangesim.conventions.fringe_conventions import measured_fringes
+from rangesim.conventions.fringe_conventions import contradictions, measured_fringes
 from rangesim.conventions.layouts import (
     ENDS,
     INVERSE,
@@ -155,9 +155,9 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
         findings.append(f"{found.axes[0]} were shown before {found.axes[1]}.")
     if found.order != sensor.order and 0 < len(found.order) <= MAX_ENTRIES:
         findings.append(f"this is the order {', '.join(found.order)}.")
-    code, said = measured_fringes(sample.frames, found)
+    code, said = measured_fringes(frames, sample.frames, found)
     found = replace(found, code=code)
-    if not is_given and _contradict(sample.frames, found):
+    if not is_given and contradictions(frames, found):
         findings.append("the images contradict this order, too: check that none is missing or there twice.")
     return Convention(found, (*findings, *said))
 
@@ -282,12 +282,12 @@ def _agreement_bits(sample: _Sample, candidate: StructuredLight) -> float:
     """How much nearer to each other neighbouring pixels see the projector than any two pixels do, in powers of two.
 
     It is the mean over all pairs of neighbours that see different cells, times the fraction of the pairs that are
-    decoded, and the mean over the axes.
+    decoded; of two axes, that of the worse one.
     """
-    total = 0.0
-    for code in _decoded(sample.frames, candidate).values():
-        total += max(_nearness(sample, c) for c in (code, code.coarse) if c is not None) / len(candidate.axes)
-    return total
+    return min(
+        max(_nearness(sample, c) for c in (code, code.coarse) if c is not None)
+        for code in _decoded(sample.frames, candidate).values()
+    )
 
 
 def _decoded(frames: np.ndarray, sensor: StructuredLight) -> dict[str, AxisCode]:
@@ -299,17 +299,6 @@ def _decoded(frames: np.ndarray, sensor: StructuredLight) -> dict[str, AxisCode]
         seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
         codes[axis] = sensor.code.decode(seen, decoder.thresholds)
     return codes
-
-
-def _contradict(frames: np.ndarray, sensor: StructuredLight) -> bool:
-    """Whether frames (k, h, w) contradict the sensor's code as a whole."""
-    capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
-    contrast = decoder.contrast(capture, sensor)
-    for axis, code in _decoded(frames, sensor).items():
-        seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
-        if sensor.code.contradiction(seen, code):
-            return True
-    return False
 
 
 def _nearness(sample: _Sample, code: AxisCode) -> float:

@@ -24,6 +24,10 @@ MIN_CONCENTRATION = 0.8
 """Least length of the mean vector of phase minus place, as a fraction of that of an even distribution over a Gray cell,
 at which fringes count as following the code. For fringes in the other direction it is near 0."""
 
+MAX_SIDE = 480
+"""Largest side in pixels of the part of the image in which contradictions are looked for, so that the time is bounded.
+They compare neighbours, so the part has all its pixels."""
+
 MIN_AGREEMENT = 0.5
 """Least agreement of the directions of phases and cells, from -1 to 1, at which fringes count as running that way. It
 is near 1 or -1 if a step from pixel to pixel is below half a period."""
@@ -64,7 +68,7 @@ class _Offsets(NamedTuple):
         return float((np.abs(self.off(convention)) > self.half_turns + EDGE_TURNS).mean())
 
 
-def measured_fringes(frames: np.ndarray, sensor: StructuredLight) -> tuple[Code, tuple[str, ...]]:
+def measured_fringes(frames: np.ndarray, sample: np.ndarray, sensor: StructuredLight) -> tuple[Code, tuple[str, ...]]:
     """The sensor's code with the convention that its fringes follow, and sentences on what differs from its own.
 
     A code without fringes over a Gray code is returned as it is, and so is one whose fringes start nowhere usual: its
@@ -72,26 +76,29 @@ def measured_fringes(frames: np.ndarray, sensor: StructuredLight) -> tuple[Code,
 
     Parameters
     ----------
-    frames : (k, h, w), all frames of the sensor in its order, at some or all pixels.
+    frames : (k, h, w), all frames of the sensor in its order. sample : (k, i, j), some of their pixels.
     """
     code = sensor.code
     given = getattr(code, "convention", None) if "convention" in {f.name for f in fields(code)} else None  # type: ignore[arg-type]
     period_px = getattr(code, "period_px", None)
     if not isinstance(given, FringeConvention) or not isinstance(period_px, float):
         return code, ()
-    found = {_measured(offsets, given) for offsets in _all_offsets(frames, sensor, period_px)}
+    found = {_measured(offsets, given) for offsets in _all_offsets(sample, sensor, period_px)}
     if len(found) != 1 or None in found or found == {given}:
         return code, ()
     convention = found.pop()
     assert convention is not None
     other: Code = replace(code, convention=convention)  # type: ignore[type-var]
-    if len(_contradictions(frames, replace(sensor, code=other))) >= max(1, len(_contradictions(frames, sensor))):
+    still = contradictions(frames, replace(sensor, code=other))
+    if still and len(still) >= len(contradictions(frames, sensor)):
         return code, ()  # something else is wrong
     return other, tuple(_differences(convention, given))
 
 
-def _contradictions(frames: np.ndarray, sensor: StructuredLight) -> list[str]:
-    """What of the frames (k, h, w) contradicts the sensor's code as a whole."""
+def contradictions(frames: np.ndarray, sensor: StructuredLight) -> list[str]:
+    """Sentences on what contradicts the sensor's code as a whole, in the middle of frames (k, h, w)."""
+    y, x = (slice(max(0, (size - MAX_SIDE) // 2), (size + MAX_SIDE) // 2) for size in frames.shape[1:])
+    frames = frames[:, y, x].astype(np.float32)
     capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
     contrast = decoder.contrast(capture, sensor)
     found = []
