@@ -254,3 +254,11 @@ def test_fringes_finer_than_the_pixels_of_the_camera_are_named_with_what_is_left
     assert found is not None
     assert int(found[1]) == pytest.approx(100 * abs(np.sinc(block / period_px)), abs=2)
     assert int(found[2]) == period_px
+
+
+@pytest.mark.parametrize("code", ["gray", "gray-phase"])
+def test_codes_beyond_the_projector_are_told(code: str) -> None:
+    shown = StructuredLight(640, 48, code=code)  # type: ignore[arg-type]
+    frames = np.rint(20 + 200 * shown.patterns()).astype(np.uint8)
+    text = doubt(Capture(frames, replace(shown, projector_width=600)))
+    assert re.search(r"[67] % of the codes along columns lie beyond the projector's 600 pixels", text)

@@ -16,7 +16,7 @@ import numpy as np
 
 from rangesim.capture import Capture, bright_level
 from rangesim.codes import AXES, AxisCode, AxisFrames
-from rangesim.conventions.fringe_conventions import contradictions, measured_fringes
+from rangesim.conventions.fringe_conventions import contradictions, measured_fringes, middle_of
 from rangesim.conventions.layouts import (
     ENDS,
     INVERSE,
@@ -147,7 +147,7 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
         layout = _best_layout(sample, sensor, orders, is_given)
         if layout is not None:
             found = with_layout(sensor, layout)
-        found = _upright(sample, sensor, found)
+        found = _upright(frames, sample, found)
     elif not is_given:
         raise ValueError(f"{_wrong_number(len(frames), sensor)[:-1]}; and they are too dark to tell which are missing.")
     findings = [] if layout is None else list(_differences(layout, sensor, found))
@@ -322,14 +322,14 @@ def _nearness(sample: _Sample, code: AxisCode) -> float:
     return float((octaves - np.log2(np.abs(first - second)[differ]).mean()) * len(first) / n)
 
 
-def _upright(sample: _Sample, sensor: StructuredLight, found: StructuredLight) -> StructuredLight:
+def _upright(frames: np.ndarray, sample: _Sample, found: StructuredLight) -> StructuredLight:
     """The sensor with its axes exchanged if rows come first: if the image is mirrored as given and upright exchanged.
 
     A camera that was turned by 90 degrees sees rows change across its image, too, but its image is not mirrored.
     """
     if len(found.axes) < 2 or _likeness(sample, _fineness(found), found.frame_names()) >= 0:
         return found
-    codes = _decoded(sample.frames, found)
+    codes = _decoded(middle_of(frames), found)  # slopes are measured over several pixels, which tiles cut off
     places = []
     for axis in AXES:
         code = codes[axis].coarse or codes[axis]

@@ -95,10 +95,15 @@ def measured_fringes(frames: np.ndarray, sample: np.ndarray, sensor: StructuredL
     return other, tuple(_differences(convention, given))
 
 
+def middle_of(frames: np.ndarray) -> np.ndarray:
+    """(k, i, j) float32, all pixels in the middle of frames (k, h, w)."""
+    y, x = (slice(max(0, (size - MAX_SIDE) // 2), (size + MAX_SIDE) // 2) for size in frames.shape[1:])
+    return frames[:, y, x].astype(np.float32)
+
+
 def contradictions(frames: np.ndarray, sensor: StructuredLight) -> list[str]:
     """Sentences on what contradicts the sensor's code as a whole, in the middle of frames (k, h, w)."""
-    y, x = (slice(max(0, (size - MAX_SIDE) // 2), (size + MAX_SIDE) // 2) for size in frames.shape[1:])
-    frames = frames[:, y, x].astype(np.float32)
+    frames = middle_of(frames)
     capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
     contrast = decoder.contrast(capture, sensor)
     found = []
