@@ -15,6 +15,7 @@ from pcgraph.errors import one_line, visible, without_long_words
 
 __all__ = [
     "AlignmentWarning",
+    "DoubtWarning",
     "EnvironmentProblem",
     "FileFormatError",
     "RangesimError",
@@ -73,13 +74,17 @@ class AlignmentWarning(RangesimWarning):
     """The poses of some views are not confirmed by the data."""
 
 
+class DoubtWarning(RangesimWarning):
+    """A capture contradicts itself. `RangeImage.doubts` holds the same sentence."""
+
+
 class SamplingWarning(RangesimWarning):
     """The sampling error of the light transport is not small compared with the detector's noise."""
 
 
-def warn(message: str) -> None:
-    """Issue a `RangesimWarning` of one sentence; the command line prints it on a line of its own."""
-    warnings.warn(sentence(message), RangesimWarning, stacklevel=3)
+def warn(message: str, kind: type[RangesimWarning] = RangesimWarning) -> None:
+    """Issue a warning of one sentence; the command line prints it on a line of its own."""
+    warnings.warn(sentence(message), kind, stacklevel=3)
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -78,6 +79,7 @@ def decode_command(
     """
     from rangesim.cli.decode_summary import likely_cause, status_fractions, summary
     from rangesim.decoding import decode
+    from rangesim.errors import DoubtWarning
     from rangesim.files.atomic_directories import check_directory
     from rangesim.report.figures import map_pictures
     from rangesim.results.decoded_captures import DECODED, Decoded, save_decoded
@@ -95,10 +97,12 @@ def decode_command(
         image = _calibrated_tof(first, calibration)
     else:
         first = _calibrated(first, calibration, code_step, unit) if calibration else first
-        image = decode(first if calibration else loaded)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DoubtWarning)  # the summary tells the doubts
+            image = decode(first if calibration else loaded)
     decoded = Decoded(image, first.sensor, first.rig, status_fractions(image), likely_cause(image, first))
     save_decoded(decoded, out, map_pictures(image))
-    typer.echo(summary(decoded, out))
+    typer.echo(summary(decoded, out, is_given=calibration is not None))
 
 
 def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibration: Path | None) -> None:

@@ -53,13 +53,36 @@ def likely_cause(image: RangeImage, capture: Capture) -> str | None:
                 f"the brightest value is {brightest} of {capture.full_scale:.0f}: give --bits "
                 f"{max(brightest.bit_length(), 1)} if the camera has no more, or expose longer"
             )
-    if float((image.status == Status.CODE_ERROR).mean()) > float(image.valid.mean()):
+    measured = float(image.valid.mean())
+    if (clipped := float((image.status == Status.SATURATED).mean())) > measured:
+        return f"{100 * clipped:.0f} % of the pixels are as bright as the camera can tell: expose shorter"
+    if capture.is_digital and float((image.status == Status.LOW_SIGNAL).mean()) > measured:
+        swing = float(np.median(np.ptp(capture.frames, axis=0)))
+        return (
+            f"half of the pixels change by {swing:.0f} of {capture.full_scale:.0f} or less in all images: expose "
+            "longer, keep other light away, and check that the patterns were shown"
+        )
+    if float((image.status == Status.CODE_ERROR).mean()) > measured:
         return "codes miss their epipolar line or each other: check --calibration, --code-step and the patterns' order"
     return None
 
 
-def summary(decoded: Decoded, out: Path) -> str:
-    """One line on the result: fractions of all statuses that pixels have, depths, and the likely cause."""
+def unchecked(image: RangeImage) -> str | None:
+    """A clause that says what the data cannot tell of a calibration; None if both axes are coded or there is no code.
+
+    Columns and rows together must meet the epipolar line. One axis alone gives a depth for every calibration.
+    """
+    one = [c is not None for c in (image.projector_column, image.projector_row)]
+    if image.camera is None or sum(one) != 1:
+        return None
+    return f"{'columns' if one[0] else 'rows'} alone do not check the calibration: show both axes once to check it"
+
+
+def summary(decoded: Decoded, out: Path, is_given: bool = False) -> str:
+    """One line on the result: fractions of all statuses that pixels have, depths, doubts, and the likely cause.
+
+    is_given : whether the user gave a calibration for the capture, so that it may be one of another rig.
+    """
     image, fractions = decoded.image, dict(decoded.status)
     measured = fractions.pop(STATUS_NAMES[Status.OK])
     parts = [f"{100 * measured:.1f} % of the pixels {'decoded' if image.camera is None else 'measured'}"]
@@ -72,6 +95,9 @@ def summary(decoded: Decoded, out: Path) -> str:
         parts.append(clause)
     if image.camera is None:
         parts.append("without --calibration there is no depth")
+    parts += [doubt.removesuffix(".") for doubt in image.doubts]
     if decoded.likely_cause:
         parts.append(decoded.likely_cause)
+    if is_given and (clause := unchecked(image)):
+        parts.append(clause)
     return f"{one_line(out)}: {'; '.join(parts)}."

@@ -19,7 +19,7 @@ from rangesim.decoding.pixel_samples import MIN_PIXELS
 from rangesim.decoding.status import Status
 
 if TYPE_CHECKING:
-    from rangesim.codes.zncc_matching_kernels import Columns, Matches
+    from rangesim.codes.zncc_kernels import Columns, Matches
 
 BLOCK_BYTES = 16 << 20
 """Bytes of the correlations of a block of pixels with all columns. They then stay in the processor's cache, and the
@@ -146,7 +146,7 @@ def match(frames: np.ndarray, columns: Columns) -> Matches:
     frames : (K, m) of any number type. columns : of the K patterns.
     """
     from pcgraph.parallel import in_blocks
-    from rangesim.codes.zncc_matching_kernels import Matches, match_best, match_second
+    from rangesim.codes.zncc_kernels import Matches, match_best, match_second
 
     pixels, n = frames.shape[1], len(columns.vectors)
     matches = Matches(np.zeros(pixels, np.int64), *(np.zeros(pixels, np.float32) for _ in range(7)))
@@ -178,7 +178,7 @@ def columns_of(patterns: bytes, n_frames: int, size: int) -> Columns:
         Two places look alike, or a place looks the same in all frames.
     """
     from pcgraph.parallel import in_blocks
-    from rangesim.codes.zncc_matching_kernels import Columns, find_lobes
+    from rangesim.codes.zncc_kernels import Columns, find_lobes
 
     values = np.frombuffer(patterns, dtype=np.float32).reshape(n_frames, size).astype(np.float64).T
     changes = np.flatnonzero(np.abs(np.diff(values, axis=0)).max(axis=1) > SAME_VALUE) + 1

@@ -1,13 +1,89 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The convention of a stack of frames: the settings of its sensor with which the frames agree best."""
+"""The convention of a stack of frames: the settings of its sensor with which the frames agree best.
+
+Many orders of the same frames are in use. Cheap tests leave a few of them: which frames are brightest and darkest
+everywhere, which add up to the same sum, and along which side of the image and how finely each changes. Those that are
+left are decoded on some of the pixels; in the right order, neighbouring pixels see neighbouring places.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from rangesim.sensors import StructuredLight
+from rangesim.capture import Capture, bright_level
+from rangesim.codes import AXES, AxisCode, AxisFrames
+from rangesim.conventions.fringe_conventions import contradictions, measured_fringes, middle_of
+from rangesim.conventions.layouts import (
+    ENDS,
+    INVERSE,
+    INVERSES,
+    Layout,
+    kinds,
+    layouts,
+    refined_kinds,
+    variations,
+    with_layout,
+)
+from rangesim.decoding.orientation import is_mirrored
+from rangesim.decoding.pixel_samples import MIN_PIXELS
+from rangesim.decoding.status import Status
+from rangesim.sensors import StructuredLight, StructuredLightDecoder
+
+MAX_SAMPLE = 20_000
+"""Largest number of pixels on which orders are tried: about a fifteenth of an image of 640 x 480. A few hundred pixels
+tell orders from each other."""
+
+TILE = 16
+"""Side of a tile of the sample in pixels. Pixels within a tile are true neighbours, whose fringes are not a period
+apart; one pair in sixteen lies across the edge of a tile, which loses as much in every order."""
+
+MIN_SWING = 0.1
+"""Least swing of a pixel in all frames that is looked at, as a fraction of that of the bright pixels. Pixels that swing
+less may be in shadow."""
+
+MAX_END_ERROR = 0.2
+"""Largest distance of a white or black frame from a pixel's brightest or darkest value, as a fraction of its swing. It
+allows for noise; a pattern differs by the whole swing where it is dark."""
+
+MIN_END_FRACTION = 0.9
+"""Least fraction of the pixels at which a white or black frame is the brightest or darkest. A pattern is at half of
+them, and at more only if few of its stripes are in view."""
+
+MAX_PAIR_ERROR = 0.25
+"""Largest mean difference between the sum of a pattern and its inverse and that of the brightest and the darkest value,
+as a fraction of the swing. It is 0 for a pair that is in focus and 0.5 for two frames that are no pair."""
+
+MAX_LIKENESS_LOSS = 0.15
+"""Largest loss against the best order, in the cosine between the fineness of the frames and that of the patterns, at
+which an order is still tried. An exchange of two axes, or of coarse and fine, loses 0.5 and more."""
+
+MAX_TRIED = 12
+"""Largest number of orders that are decoded, so that the time is bounded. After the cheap tests, two to eight are left
+in all captures that were tried."""
+
+MIN_GAIN_BITS = 0.4
+"""Least gain of another order over the given one, in bits (see `_agreement_bits`), at which the order is changed. Two
+orders that are equally right differ by less than 0.1 bits, a wrong one and the right one by about 1."""
+
+MIN_BITS = 0.7
+"""Least agreement of neighbours in bits at which frames count as decoded in an order. In a wrong order it is near 0, in
+the right one above 1 if more than four cells are in view."""
+
+
+MIN_STEP = 0.5
+"""Least distance of two pixels that see different cells, in cells: a pixel on the edge of two cells is half a cell off
+both."""
+
+MAX_LOSS_BITS = 0.2
+"""Largest loss against the best order, in bits, at which a more usual order is taken. Two orders that are equally right
+differ by less than 0.1 bits."""
+
+MAX_ENTRIES = 6
+"""Largest number of entries of an order that a finding repeats, so that it stays readable."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +98,25 @@ class Convention:
     findings: tuple[str, ...] = ()
 
 
+class _Sample(NamedTuple):
+    """Some of the pixels of a stack of frames.
+
+    frames : (k, h, w) float32, pixels of tiles that are spread over the image; tiles stand side by side.
+    is_lit : (h, w) bool, where they swing.
+    high, low : (h, w) float32, the brightest and the darkest value of each pixel.
+    across, down : (k,) mean change of each frame from a pixel to the next, along and down the image at full resolution.
+    """
+
+    frames: np.ndarray
+    is_lit: np.ndarray
+    high: np.ndarray
+    low: np.ndarray
+    across: np.ndarray
+    down: np.ndarray
+
+
 def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention:
-    """The settings of a sensor with which frames agree best; its code is not changed.
+    """The settings of a sensor with which frames agree best; its code is not changed but for where its fringes start.
 
     Parameters
     ----------
@@ -34,11 +127,252 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
     Raises
     ------
     ValueError
-        No convention of the sensor's code has as many frames.
+        No convention of the sensor's code has as many frames, or none with as many decodes these.
+
+    Examples
+    --------
+    >>> sensor = StructuredLight(64, 48, code="gray")
+    >>> shown = sensor.patterns()  # as a camera sees them that looks straight at the screen
+    >>> detect_convention(np.concatenate([shown[-2:], shown[:-2]]), sensor)
+    Convention(sensor=StructuredLight(...), findings=('white and black come first.',))
     """
-    if len(frames) != sensor.n_frames:
+    is_given = len(frames) == sensor.n_frames
+    orders = list(layouts(sensor, len(frames)))
+    if not is_given and not orders:
+        raise ValueError(_wrong_number(len(frames), sensor))
+    sample = _sampled(frames)
+    found = sensor
+    layout: Layout | None = None
+    if np.count_nonzero(sample.is_lit) >= MIN_PIXELS:
+        layout = _best_layout(sample, sensor, orders, is_given)
+        if layout is not None:
+            found = with_layout(sensor, layout)
+        found = _upright(frames, sample, found)
+    elif not is_given:
+        raise ValueError(f"{_wrong_number(len(frames), sensor)[:-1]}; and they are too dark to tell which are missing.")
+    findings = [] if layout is None else list(_differences(layout, sensor, found))
+    if layout is None and found.axes != sensor.axes:
+        findings.append(f"{found.axes[0]} were shown before {found.axes[1]}.")
+    if found.order != sensor.order and 0 < len(found.order) <= MAX_ENTRIES:
+        findings.append(f"this is the order {', '.join(found.order)}.")
+    code, said = measured_fringes(frames, sample.frames, found)
+    found = replace(found, code=code)
+    if not is_given and contradictions(frames, found):
+        findings.append("the images contradict this order, too: check that none is missing or there twice.")
+    return Convention(found, (*findings, *said))
+
+
+def _wrong_number(n: int, sensor: StructuredLight) -> str:
+    """The sentence that says that no order of the code has that many frames."""
+    names = sensor.frame_names()
+    return f"expected {len(names)} images for {sensor.type_name} ({names[0]} ... {names[-1]}), got {n}."
+
+
+def _sampled(frames: np.ndarray) -> _Sample:
+    """Pixels on a grid over the image, and how much each frame changes from pixel to pixel."""
+    stride = max(1, int(np.ceil(np.sqrt(frames[0].size / MAX_SAMPLE))))
+    y, x = (np.flatnonzero(np.arange(n) // TILE % stride == 0) for n in frames.shape[1:])
+    few = frames[:, y][:, :, x].astype(np.float32)  # not digital, so that thresholds are relative
+    high, low = few.max(axis=0), few.min(axis=0)
+    swing = high - low
+    is_lit = swing > MIN_SWING * bright_level(swing)
+    skip = stride * stride
+    across, down = frames[:, ::skip], frames[:, :, ::skip]
+    return _Sample(
+        few,
+        is_lit,
+        high,
+        low,
+        np.array([np.abs(np.diff(frame.astype(np.float32), axis=1)).mean() for frame in across]),
+        np.array([np.abs(np.diff(frame.astype(np.float32), axis=0)).mean() for frame in down]),
+    )
+
+
+# ---- Order of the frames ---------------------------------------------------------------------------------------------
+
+
+def _best_layout(sample: _Sample, sensor: StructuredLight, orders: Sequence[Layout], is_given: bool) -> Layout | None:
+    """The layout in which the frames decode best; None if it is the given one.
+
+    Raises
+    ------
+    ValueError
+        The given order has another number of frames, and no other order decodes them.
+    """
+    given = sensor.frame_names() if is_given else None
+    fineness, ends = _fineness(sensor), {ends: _ends_fit(sample, ends) for ends in ENDS}
+    possible = []
+    for layout in orders:
+        if not ends[layout.ends]:
+            continue
+        names = layout.names(sensor)
+        likeness = _likeness(sample, fineness, names)  # negative: the camera would be turned by 90 degrees
+        if names != given and (likeness > 0 or layout.axes == sensor.axes) and _pairs_fit(sample, names):
+            possible.append((abs(likeness), layout))
+    best = max((likeness for likeness, _ in possible), default=0.0)
+    scores: list[tuple[float, Layout]] = []
+    for likeness, layout in possible:
+        if likeness >= best - MAX_LIKENESS_LOSS and len(scores) < MAX_TRIED:
+            try:
+                scores.append((_agreement_bits(sample, with_layout(sensor, layout)), layout))
+            except ValueError:  # the code needs frames that are missing in this layout
+                continue
+    highest = max((score for score, _ in scores), default=0.0)
+    score, layout = next((found for found in scores if found[0] >= highest - MAX_LOSS_BITS), (0.0, Layout(sensor.axes)))
+    if is_given:
+        return layout if score > max(MIN_BITS, _agreement_bits(sample, sensor) + MIN_GAIN_BITS) else None
+    if score < MIN_BITS:
         raise ValueError(
-            f"expected {sensor.n_frames} images for {sensor.type_name} ({sensor.frame_names()[0]} ... "
-            f"{sensor.frame_names()[-1]}), got {len(frames)}."
+            f"{_wrong_number(len(sample.frames), sensor)[:-1]}; and in no order that misses some of them do "
+            "neighbouring pixels see neighbouring places."
         )
-    return Convention(sensor)
+    return layout
+
+
+def _ends_fit(sample: _Sample, ends: tuple[tuple[str, ...], tuple[str, ...]]) -> bool:
+    """Whether the frames that would be white and black are the brightest and the darkest nearly everywhere.
+
+    Parameters
+    ----------
+    ends : names of the first and of the last frames.
+    """
+    lit, limits = sample.is_lit, {"white": sample.high, "black": sample.low}
+    largest = MAX_END_ERROR * (sample.high - sample.low)[lit]
+    places = [*enumerate(ends[0]), *((i - len(ends[1]), name) for i, name in enumerate(ends[1]))]
+    return all(
+        (np.abs(sample.frames[i] - limits[name])[lit] <= largest).mean() >= MIN_END_FRACTION for i, name in places
+    )
+
+
+def _pairs_fit(sample: _Sample, names: Sequence[str]) -> bool:
+    """Whether the frames that would be a pattern and its inverse add up to the same sum."""
+    places = {name: i for i, name in enumerate(names)}
+    lit = sample.is_lit
+    total, swing = (sample.high + sample.low)[lit], float((sample.high - sample.low)[lit].mean())
+    errors = [
+        float(np.abs(sample.frames[i][lit] + sample.frames[j][lit] - total).mean()) / swing
+        for name, i in places.items()
+        if (j := places.get(name + INVERSE)) is not None
+    ]
+    return not errors or float(np.median(errors)) < MAX_PAIR_ERROR
+
+
+def _fineness(sensor: StructuredLight) -> dict[str, float]:
+    """Logarithm of how often each pattern changes, positive for columns and negative for rows, by the frame's name."""
+    result: dict[str, float] = {}
+    for axis, sign in zip(AXES, (1, -1), strict=True):
+        size = sensor.size(axis)
+        changes = np.log1p(variations(sensor.code.patterns(size)))
+        result |= {f"{axis}_{name}": sign * x for name, x in zip(sensor.code.names(size), changes, strict=True)}
+    return result
+
+
+def _likeness(sample: _Sample, fineness: dict[str, float], names: Sequence[str]) -> float:
+    """Cosine between how finely the frames change, and how finely the patterns do; negative if along the other side.
+
+    Both count as positive for what changes across the image, and negative for what changes down the image.
+    """
+    seen = np.log(np.maximum(sample.across, 1e-6) / np.maximum(sample.down, 1e-6))
+    expected = np.array([fineness.get(name, 0.0) for name in names])  # 0 for white and black
+    length = float(np.linalg.norm(seen) * np.linalg.norm(expected))
+    return float(seen @ expected) / length if length else 0.0
+
+
+def _agreement_bits(sample: _Sample, candidate: StructuredLight) -> float:
+    """How much nearer to each other neighbouring pixels see the projector than any two pixels do, in powers of two.
+
+    It is the mean over all pairs of neighbours that see different cells, times the fraction of the pairs that are
+    decoded; of two axes, that of the worse one.
+    """
+    return min(
+        max(_nearness(sample, c) for c in (code, code.coarse) if c is not None)
+        for code in _decoded(sample.frames, candidate).values()
+    )
+
+
+def _decoded(frames: np.ndarray, sensor: StructuredLight) -> dict[str, AxisCode]:
+    """The codes of all axes."""
+    capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
+    contrast = decoder.contrast(capture, sensor)
+    codes: dict[str, AxisCode] = {}
+    for axis in sensor.axes:
+        seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
+        codes[axis] = sensor.code.decode(seen, decoder.thresholds)
+    return codes
+
+
+def _nearness(sample: _Sample, code: AxisCode) -> float:
+    """Mean of log2 of the distance of any two pixels minus that of neighbours, in cells; see `_agreement_bits`.
+
+    Neighbours that see the same cell would agree in every order.
+    """
+    ok = code.status == Status.OK
+    here, there, n = [], [], 0
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        n += int(np.count_nonzero(sample.is_lit[a] & sample.is_lit[b]))
+        both = ok[a] & ok[b] & sample.is_lit[a] & sample.is_lit[b]
+        here.append(code.coordinate[a][both])
+        there.append(code.coordinate[b][both])
+    first, second = np.concatenate(here) / code.cell_px, np.concatenate(there) / code.cell_px
+    differ = np.abs(first - second) >= MIN_STEP
+    if np.count_nonzero(differ) < MIN_PIXELS:
+        return 0.0
+    any_other = np.random.default_rng(0).permutation(second)
+    octaves = np.log2(np.maximum(np.abs(first - any_other), MIN_STEP)).mean()
+    return float((octaves - np.log2(np.abs(first - second)[differ]).mean()) * len(first) / n)
+
+
+def _upright(frames: np.ndarray, sample: _Sample, found: StructuredLight) -> StructuredLight:
+    """The sensor with its axes exchanged if rows come first: if the image is mirrored as given and upright exchanged.
+
+    A camera that was turned by 90 degrees sees rows change across its image, too, but its image is not mirrored.
+    """
+    if len(found.axes) < 2 or _likeness(sample, _fineness(found), found.frame_names()) >= 0:
+        return found
+    codes = _decoded(middle_of(frames), found)  # slopes are measured over several pixels, which tiles cut off
+    places = []
+    for axis in AXES:
+        code = codes[axis].coarse or codes[axis]
+        places.append(np.where(code.status == Status.OK, code.coordinate, np.float32(np.nan)))
+    if not is_mirrored(*places):
+        return found
+    axes = found.axes[::-1]
+    other = {f"{a}_": f"{b}_" for a, b in zip(found.axes, axes, strict=True)}
+    order = tuple(next((entry.replace(a, b) for a, b in other.items() if a in entry), entry) for entry in found.order)
+    try:
+        exchanged = replace(found, axes=axes, order=order)
+    except ValueError:
+        return found
+    return exchanged if exchanged.n_frames == found.n_frames else found
+
+
+def _differences(layout: Layout, sensor: StructuredLight, found: StructuredLight) -> Iterator[str]:
+    """Sentences on what of an order differs from that of the sensor."""
+    before = _described(sensor)
+    if found.axes != sensor.axes:
+        if len(found.axes) < len(sensor.axes):
+            yield f"only {found.axes[0]} were shown."
+        else:
+            yield f"{found.axes[0]} were shown before {found.axes[1]}."
+    if before is None or layout.ends != before.ends:
+        yield f"{ENDS[layout.ends]}."
+    if before is None or layout.inverses != before.inverses:
+        yield f"{INVERSES[layout.inverses]}."
+    if layout.is_reversed and not (before and before.is_reversed):
+        yield f"the finest {refined_kinds(sensor)[0]}s come first."
+    if layout.blocks != (before.blocks if before else tuple(range(len(layout.blocks)))):
+        yield f"{kinds(sensor)[layout.blocks[0]]} images come before {kinds(sensor)[layout.blocks[1]]} images."
+    if layout.is_by_block and not (before and before.is_by_block):
+        yield f"all {kinds(sensor)[layout.blocks[0]]} images of both axes come before the others."
+    if layout.is_interleaved and not (before and before.is_interleaved):
+        yield "columns and rows take turns."
+
+
+def _described(sensor: StructuredLight) -> Layout | None:
+    """The layout of a sensor's own order; None if it is no usual one."""
+    names = sensor.frame_names()
+    blocks = tuple(range(len(kinds(sensor))))
+    plain = Layout(sensor.axes, blocks=blocks)
+    if plain.names(sensor) == names:
+        return plain
+    return next((layout for layout in layouts(sensor, len(names)) if layout.names(sensor) == names), None)

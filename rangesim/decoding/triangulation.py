@@ -9,11 +9,12 @@ from typing import Annotated
 import numpy as np
 
 from rangesim.decoding.coordinates import Coordinates
+from rangesim.decoding.orientation import orientation_contradiction
 from rangesim.decoding.pixel_samples import MIN_PIXELS
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
-from rangesim.errors import warn
+from rangesim.errors import DoubtWarning, warn
 from rangesim.geometry.camera_projector import triangulate_coordinates
 from rangesim.rig import Rig
 from rangesim.settings.bounds import Bounds, check_fields
@@ -25,6 +26,21 @@ largest error of a sound Gray code, which decodes to whole pixels. Phase shift i
 MAX_BEHIND_FRACTION = 0.2
 """Largest fraction of the decoded pixels whose rays may meet clearly behind a device before the capture is doubted,
 because interreflection makes only a few rays do so, but a mirrored image or an inverted calibration most of them."""
+
+MIN_IN_FRONT_FRACTION = 0.8
+"""Least fraction of the decoded pixels that must fit the inverse of the calibration's pose, for the pose to count as
+inverted. The right pose fits all but stray light."""
+
+MAX_FITTING_FRACTION = 0.7
+"""Largest fraction of the decoded pixels that may fit the pose as given, if it is inverted. Of devices that are turned
+to each other by 9 degrees, a third to a half fit the inverted pose by chance."""
+
+MAX_OFF_LINE_FRACTION = 0.3
+"""Largest fraction of the decoded pixels that may miss their epipolar line. Interreflection and noise move a tenth off
+at most; a calibration of another rig, or one that has changed, moves most of them."""
+
+MAX_TRIED = 5000
+"""Largest number of pixels on which the inverse of the pose is tried. They tell a fraction to 0.7 %."""
 
 MIN_BEHIND_PX = 10.0
 """Least distance, in projector pixels, of a coordinate from the one that would make the rays parallel, at which they
@@ -66,8 +82,8 @@ class ProjectorCoordinates(Coordinates):
     column_sigma_px, row_sigma_px : (h, w) float32, projector pixels, standard deviations of `column` and `row`; NaN
         where `status` is not OK. None: not known, as for fringes of an unknown detector.
     limits : TriangulationLimits that `range_image` applies.
-    is_doubted : whether the decoder has warned that the capture contradicts its code. Then the cause of rays that meet
-        behind a device is known, and `range_image` does not warn of them.
+    doubts : sentences with which the decoder has warned that the capture contradicts its code. If there are any, the
+        cause of rays that meet behind a device is known, and `range_image` does not warn of them.
 
     Examples
     --------
@@ -87,7 +103,7 @@ class ProjectorCoordinates(Coordinates):
     column_sigma_px: np.ndarray | None = None
     row_sigma_px: np.ndarray | None = None
     limits: TriangulationLimits = field(default_factory=TriangulationLimits)
-    is_doubted: bool = False
+    doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -97,7 +113,9 @@ class ProjectorCoordinates(Coordinates):
     def range_image(self, rig: Rig | None) -> RangeImage:
         """Range image of these coordinates, triangulated.
 
-        It warns (`RangesimWarning`) if many rays meet behind a device.
+        It warns (`DoubtWarning`) if the map from camera to projector pixels contradicts what is known: if the images
+        seem to be mirrored or turned, the pose inverted, or if many rays meet behind a device. It does not if there are
+        `doubts` already.
 
         Parameters
         ----------
@@ -106,6 +124,7 @@ class ProjectorCoordinates(Coordinates):
         column, row, status, decoded = self.column, self.row, self.status.copy(), self.valid
         z = np.full(status.shape, np.nan, dtype=np.float32)
         range_m = z.copy()
+        doubt = None if self.doubts else orientation_contradiction(column, row, rig)
         if rig is not None:
             behind_px = []
             for rows in bands(len(status)):
@@ -125,11 +144,62 @@ class ProjectorCoordinates(Coordinates):
                 depth = np.where(outcome == Status.OK, found.z, np.nan)
                 status[rows][y, x], z[rows][y, x] = outcome, depth
                 range_m[rows][y, x] = depth * np.linalg.norm(directions, axis=-1)
-            contradiction = behind_contradiction(np.concatenate(behind_px))
-            if contradiction and not self.is_doubted:
-                warn(contradiction)
+            if not (self.doubts or doubt):
+                doubt = (
+                    self._pose_contradiction(rig)
+                    or behind_contradiction(np.concatenate(behind_px))
+                    or self._line_contradiction(status)
+                )
+        if doubt:
+            warn(doubt, DoubtWarning)
         image = self._image(rig, z, range_m, status)
-        return replace(image, projector_column=column, projector_row=row)
+        doubts = (*self.doubts, doubt) if doubt else self.doubts
+        return replace(image, projector_column=column, projector_row=row, doubts=doubts)
+
+    def _line_contradiction(self, status: np.ndarray) -> str | None:
+        """A sentence if many decoded pixels miss their epipolar line; None if not.
+
+        Parameters
+        ----------
+        status : (h, w) uint8, that of the range image.
+        """
+        n = np.count_nonzero(self.valid)
+        off = np.count_nonzero(self.valid & (status == Status.CODE_ERROR))
+        if n < MIN_PIXELS or off <= MAX_OFF_LINE_FRACTION * n:
+            return None
+        return (
+            f"{100 * off / n:.0f} % of the decoded pixels miss their epipolar line by more than "
+            f"{self.limits.epipolar_tolerance_px:g} projector pixels, so the depth of the others is doubtful: check "
+            "the calibration, its code step, and that camera and projector have not moved since."
+        )
+
+    def _pose_contradiction(self, rig: Rig) -> str | None:
+        """A sentence if the decoded pixels fit the inverse of T_camera_projector, but not itself; None if not.
+
+        They fit if their rays meet in front of both devices, and within the epipolar tolerance.
+        """
+        y, x = np.nonzero(self.valid)
+        few = slice(None, None, 1 + len(y) // MAX_TRIED)
+        y, x = y[few], x[few]
+        if len(y) < MIN_PIXELS:
+            return None
+        directions = rig.pinhole.directions(np.stack([x + 0.5, y + 0.5], axis=-1))
+        column, row = (None if c is None else c[y, x] for c in (self.column, self.row))
+        fractions = []
+        for pose in (rig.T_camera_projector, np.linalg.inv(rig.T_camera_projector)):
+            found = triangulate_coordinates(directions, replace(rig, T_camera_projector=pose), column, row)
+            fits = np.isfinite(found.z) & (found.epipolar_px <= self.limits.epipolar_tolerance_px)
+            fractions.append(float(fits.mean()))
+            if fractions[0] > MAX_FITTING_FRACTION:
+                return None
+        before, after = fractions
+        if after < MIN_IN_FRONT_FRACTION:
+            return None
+        return (
+            f"{100 * before:.0f} % of the decoded pixels fit T_camera_projector as given, and "
+            f"{100 * after:.0f} % its inverse: the calibration's pose seems to be inverted, that of the camera in "
+            "the projector's frame."
+        )
 
 
 def behind_contradiction(behind_px: np.ndarray) -> str | None:

@@ -2,7 +2,8 @@
 """Writes and reads a decoded capture: the directory that `rangesim decode` writes.
 
 DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.atomic_directories`
-    decoded.json         sensor, rig, fraction of the pixels by status, likely cause if few pixels have a reading
+    decoded.json         sensor, rig, fraction of the pixels by status, likely cause if few pixels have a reading, and
+                         doubts: sentences on what in the capture contradicts itself
     range.npz            range image
     cloud.ply            points, metres, camera coordinates; missing if there are none
     depth.png ...        pictures of the maps
@@ -34,7 +35,7 @@ DECODED = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
 
 
 class DecodedRecord(Record, frozen=True, kw_only=True):
-    """The contents of `decoded.json`; the fields are those of `Decoded`."""
+    """The contents of `decoded.json`; the fields are those of `Decoded`, and the doubts of its range image."""
 
     format: Literal["rangesim-decoded"] = "rangesim-decoded"
     format_version: Literal[1] = 1
@@ -43,6 +44,7 @@ class DecodedRecord(Record, frozen=True, kw_only=True):
     rangesim: str
     status: dict[str, Fraction]
     likely_cause: str | None
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,6 +83,7 @@ def save_decoded(decoded: Decoded, directory: str | Path, pictures: Mapping[str,
         rangesim=__version__,
         status=decoded.status,
         likely_cause=decoded.likely_cause,
+        doubts=decoded.image.doubts,
     )
     image = decoded.image
     with new_directory(directory, DECODED) as folder:

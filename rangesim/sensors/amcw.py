@@ -25,7 +25,7 @@ from rangesim.decoding.tap_checks import (
 from rangesim.decoding.two_paths import nearest_length, order_of_ratios, separate, turns_sigma
 from rangesim.decoding.working_range import WorkingRange
 from rangesim.electronics.detector import Detector
-from rangesim.errors import warn
+from rangesim.errors import DoubtWarning, warn
 from rangesim.response import SPEED_OF_LIGHT, Correlation, Phasor, Response
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, of_type
 from rangesim.settings import limits
@@ -370,7 +370,7 @@ class AmcwDecoder(Decoder):
             mean[rows] = np.mean([p.mean for p in phases], axis=0)
         doubt = self._contradiction(sensor, capture.frames, status, length, amplitude)
         if doubt:
-            warn(doubt)
+            warn(doubt, DoubtWarning)
         return PathLengths(
             length_m=length,
             sigma_m=sigma_m,

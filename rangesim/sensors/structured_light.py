@@ -23,12 +23,14 @@ from rangesim.codes import (
 from rangesim.codes.code import stripes
 from rangesim.codes.contrast import direct_contrast
 from rangesim.codes.frame_order import in_order
+from rangesim.decoding.orientation import changes_along, orientation_contradiction
 from rangesim.decoding.phase_shift import PhaseThresholds
+from rangesim.decoding.pixel_samples import MIN_PIXELS
 from rangesim.decoding.range_image import MIN_MEASURED, RangeImage
 from rangesim.decoding.status import Status
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
 from rangesim.decoding.working_range import WorkingRange
-from rangesim.errors import warn
+from rangesim.errors import DoubtWarning, warn
 from rangesim.response import DenseResponse
 from rangesim.rig import Rig
 from rangesim.sensor import Background, Decoder, Emitter, Sensor, of_type
@@ -45,6 +47,18 @@ BLACK = "black"
 MIN_CONTRAST = 0.02
 """Least difference by which black is brighter than white, as a fraction of full scale, at a pixel that counts as a sign
 that the two frames are exchanged. Noise alone makes black a little brighter in half of the dark pixels."""
+
+MAX_COMPARED = 20_000
+"""Number of pixels, at most, by which frames are first compared with each other; frames that agree at these are then
+compared at all pixels."""
+
+MAX_UNIFORM_FRACTION = 0.98
+"""Largest fraction of the pixels at which a frame may be as dark as the darkest frame, or as bright as the brightest,
+and still count as a pattern."""
+
+MAX_BEYOND_FRACTION = 0.02
+"""Largest fraction of the codes that may lie beyond the projector. Errors of single pixels put fewer there, and a
+projector that is a twentieth larger than stated more."""
 
 MAX_ACROSS = 0.25
 """Largest ratio of the baseline across the stripes of an axis to the baseline along them, at which the axis counts as
@@ -252,7 +266,7 @@ class StructuredLightDecoder(Decoder):
     def coordinates(self, capture: Capture) -> ProjectorCoordinates:
         """Projector coordinates of a `StructuredLight` capture.
 
-        `RangesimWarning` if frames and code contradict each other as a whole.
+        `DoubtWarning` if frames and code contradict each other as a whole, or if two frames are the same.
         """
         sensor = of_type(capture.sensor, StructuredLight)
         contrast = self.contrast(capture, sensor)
@@ -260,14 +274,17 @@ class StructuredLightDecoder(Decoder):
         contradictions: list[str] = []
         for axis in sensor.axes:
             seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
-            code = sensor.code.decode(seen, self._thresholds)
+            code = sensor.code.decode(seen, self.thresholds)
             outside = (code.coordinate < -0.5) | (code.coordinate > seen.size + 0.5)
             code.status[outside & (code.status == Status.OK)] = Status.CODE_ERROR
             codes[axis] = code
             if contradiction := sensor.code.contradiction(seen, code):
                 contradictions.append(contradiction)
+        if not contradictions:  # they name the cause better than what follows
+            doubt = _orientation(codes) or _beyond_projector(sensor, codes) or _repeated_frames(capture)
+            contradictions += [doubt] if doubt else []
         for contradiction in contradictions:
-            warn(contradiction)
+            warn(contradiction, DoubtWarning)
         coordinate = {axis: code.coordinate for axis, code in codes.items()}
         sigma_px = {axis: code.sigma_px for axis, code in codes.items()}
         return ProjectorCoordinates(
@@ -279,7 +296,7 @@ class StructuredLightDecoder(Decoder):
             confidence=contrast.values / np.float32(capture.full_scale),
             intensity=contrast.white.astype(np.float32) - np.float32(capture.black_level),
             limits=self.triangulation,
-            is_doubted=bool(contradictions),
+            doubts=tuple(contradictions),
         )
 
     def contrast(self, capture: Capture, sensor: StructuredLight) -> Contrast:
@@ -299,17 +316,23 @@ class StructuredLightDecoder(Decoder):
         )
 
     @property
-    def _thresholds(self) -> CodeThresholds:
+    def thresholds(self) -> CodeThresholds:
+        """Thresholds that the decoders of codes take."""
         return CodeThresholds(self.gray, self.phase)
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         shown = of_type(sensor, StructuredLight)
-        each = [shown.code.least_signal(shown.size(axis), self._thresholds, background) for axis in shown.axes]
+        each = [shown.code.least_signal(shown.size(axis), self.thresholds, background) for axis in shown.axes]
         return np.asarray(np.maximum.reduce(each))
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
-        if _rows_come_first(image):
-            return "columns change along the image's height and rows along its width: rows may have been shown first"
+        if image.camera is None and (axis := _another_axis(image)):
+            other = "rows" if axis == "columns" else "columns"
+            along = "height" if axis == "columns" else "width"
+            return (
+                f"{axis} change along the image's {along}: {other} may have been shown, or the camera was turned by 90 "
+                "degrees"
+            )
         if float(image.valid.mean()) >= MIN_MEASURED:
             return None
         contrast = self.contrast(capture, of_type(capture.sensor, StructuredLight)).values
@@ -324,6 +347,53 @@ class StructuredLightDecoder(Decoder):
             other = "rows" if axis == "columns" else "columns"
             return f"{axis} tell no depth here, because camera and projector stand apart along them: code {other}"
         return None
+
+
+def _repeated_frames(capture: Capture) -> str | None:
+    """A sentence if two frames of a digital capture are the same to the last digit, and neither is black or white.
+
+    The noise of a camera makes two images of the same pattern differ. Of patterns that lie outside the view, noise-free
+    images are all black or all white, so the frames must change from pixel to pixel as no other frames do.
+    """
+    if not capture.is_digital or capture.frames[0].size < MIN_PIXELS:
+        return None
+    frames, names = capture.frames, capture.sensor.frame_names()
+    few = frames.reshape(len(frames), -1)[:, :: 1 + frames[0].size // MAX_COMPARED]
+    low, high = few.min(axis=0), few.max(axis=0)
+    seen: dict[bytes, int] = {}
+    for i, values in enumerate(few):
+        j = seen.setdefault(values.tobytes(), i)
+        is_dark, is_bright = (float((values == edge).mean()) > MAX_UNIFORM_FRACTION for edge in (low, high))
+        if j < i and not is_dark and not is_bright and np.array_equal(frames[i], frames[j]):
+            return (
+                f"frames {names[j]} and {names[i]} are the same image to the last digit, which no camera takes twice: "
+                "check that no file is there twice or in place of another."
+            )
+    return None
+
+
+def _orientation(codes: dict[str, AxisCode]) -> str | None:
+    """A sentence if the codes of both axes are those of a mirrored image; None if not."""
+    if len(codes) < 2:
+        return None
+    ok = first_failure([code.status for code in codes.values()]) == Status.OK
+    column, row = (np.where(ok, codes[axis].coordinate, np.float32(np.nan)) for axis in AXES)
+    return orientation_contradiction(column, row, None)
+
+
+def _beyond_projector(sensor: StructuredLight, codes: dict[str, AxisCode]) -> str | None:
+    """A sentence if many pixels have a code beyond the last pixel of the projector; None if not."""
+    for axis, code in codes.items():
+        size, is_error = sensor.size(axis), code.status == Status.CODE_ERROR
+        beyond = is_error & (code.coordinate > size + 0.5)
+        n, read = np.count_nonzero(beyond), np.count_nonzero(is_error | (code.status == Status.OK))
+        if read >= MIN_PIXELS and n > MAX_BEYOND_FRACTION * read:
+            furthest = float(np.percentile(code.coordinate[beyond], 99))
+            return (
+                f"{100 * n / read:.0f} % of the codes along {axis} lie beyond the projector's {size} pixels, up to "
+                f"{furthest:.0f}: check the size of the projector, the order of the frames and their code."
+            )
+    return None
 
 
 def first_failure(statuses: list[np.ndarray]) -> np.ndarray:
@@ -347,17 +417,9 @@ def _axis_along_baseline(image: RangeImage, axes: Sequence[str], rig: Rig | None
     return axes[0] if across < MAX_ACROSS * along else None
 
 
-def _rows_come_first(image: RangeImage) -> bool:
-    """Whether columns change down the image and rows across it, each twice as much as the other way."""
-    if image.projector_column is None or image.projector_row is None:
-        return False
-    column, row = (_changes(c) for c in (image.projector_column, image.projector_row))
-    return column[1] > 2 * column[0] and row[0] > 2 * row[1]
-
-
-def _changes(coordinate: np.ndarray) -> tuple[float, float]:
-    """Mean size of the change to the next pixel across and down; 0 where no neighbours were decoded."""
-    steps = (np.abs(np.diff(coordinate, axis=axis)) for axis in (1, 0))
-    known = (s[np.isfinite(s)] for s in steps)
-    across, down = (float(k.mean()) if k.size else 0.0 for k in known)
-    return across, down
+def _another_axis(image: RangeImage) -> str | None:
+    """The only coded axis, if it changes along the image as the other axis does for an upright camera; else None."""
+    column, row = image.projector_column, image.projector_row
+    if column is not None and row is None and changes_along(column) == "height":
+        return "columns"
+    return "rows" if row is not None and column is None and changes_along(row) == "width" else None

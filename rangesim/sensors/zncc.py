@@ -15,7 +15,7 @@ from rangesim.decoding.phase_shift import PhaseThresholds
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
 from rangesim.decoding.working_range import WorkingRange
-from rangesim.errors import warn
+from rangesim.errors import DoubtWarning, warn
 from rangesim.sensor import Background, Decoder, Sensor, of_type
 from rangesim.sensors.structured_light import StructuredLight, StructuredLightDecoder, first_failure
 from rangesim.settings.bounds import check_fields
@@ -68,7 +68,7 @@ class ZnccDecoder(Decoder):
     def coordinates(self, capture: Capture) -> ProjectorCoordinates:
         """Projector coordinates of a `StructuredLight` capture.
 
-        `RangesimWarning` if no column of the patterns explains most of the pixels.
+        `DoubtWarning` if no column of the patterns explains most of the pixels.
 
         Raises
         ------
@@ -86,7 +86,7 @@ class ZnccDecoder(Decoder):
             if contradiction := correlation_contradiction(seen, patterns):
                 contradictions.append(contradiction)
         for contradiction in contradictions:
-            warn(contradiction)
+            warn(contradiction, DoubtWarning)
         codes = {axis: one.code for axis, one in found.items()}
         coordinate = {axis: code.coordinate for axis, code in codes.items()}
         sigma_px = {axis: code.sigma_px for axis, code in codes.items()}
@@ -99,7 +99,7 @@ class ZnccDecoder(Decoder):
             confidence=np.minimum.reduce([one.distance for one in found.values()]),
             intensity=contrast.white.astype(np.float32) - np.float32(capture.black_level),
             limits=self.triangulation,
-            is_doubted=bool(contradictions),
+            doubts=tuple(contradictions),
         )
 
     @property
