@@ -51,7 +51,7 @@ def read_storage(path: str | Path) -> dict[str, Any]:
         check_xml(path)
         if path.stat().st_size > MAX_CHARACTERS:
             raise _too_large(path)
-        data = _of_element(ET.parse(path).getroot())
+        data = _of_element(ET.parse(path).getroot()) or {}
     else:
         text = read_text(path)
         if len(text) > MAX_CHARACTERS:

@@ -90,8 +90,10 @@ class PatternSet:
         return [f"{i:03d}_{name}.png" for i, name in enumerate(names)]
 
 
-def save_patterns(patterns: PatternSet, directory: str | Path) -> None:
-    """Write the images of a pattern set and `patterns.json`. They appear when all of them are complete.
+def save_patterns(patterns: PatternSet, directory: str | Path) -> int:
+    """Write the images of a pattern set and `patterns.json`, and return how many images these are.
+
+    The files appear when all of them are complete.
 
     Raises
     ------
@@ -113,6 +115,7 @@ def save_patterns(patterns: PatternSet, directory: str | Path) -> None:
         for name, image in zip(names, images, strict=True):
             write_grey(folder / name, image)
         write_record(folder / SIDECAR, record)
+    return len(images)
 
 
 def load_patterns(path: str | Path) -> PatternSet:

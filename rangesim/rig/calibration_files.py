@@ -160,6 +160,13 @@ class StoredCalibration:
             return self.own.projector.width, self.own.projector.height
         return None if self.projector is None else self.projector.size
 
+    @property
+    def camera_size(self) -> tuple[int, int] | None:
+        """(width, height) of the camera's images in pixels; None: the file does not state it."""
+        if self.own is not None:
+            return self.own.camera.width, self.own.camera.height
+        return None if self.camera is None else self.camera.size
+
     def rig(self, camera_size: tuple[int, int] | None = None, projector_size: tuple[int, int] | None = None) -> Rig:
         """The rig. `camera_size` and `projector_size`, (width, height), serve where the file states none.
 
@@ -212,7 +219,8 @@ def read_calibration(path: str | Path, code_step: int = 1, unit_m: float | None 
         raise FileFormatError(f"{path} does not exist; expected a calibration file ({', '.join(SUFFIXES)}).")
     data = read_storage(path)
     entries = dict(_entries(data))
-    is_own = path.suffix.lower() == ".json" and _find(entries, CAMERA.matrix) is None
+    foreign = (CAMERA.matrix, PROJECTOR.matrix, ROTATION, TRANSLATION)
+    is_own = path.suffix.lower() == ".json" and not any(_find(entries, aliases) for aliases in foreign)
     if code_step != 1 and PROCAM_ROTATION not in entries:
         raise ValueError("expected --code-step only with --calibration FILE.xml of procam-calibration.")
     if is_own:
@@ -448,7 +456,7 @@ def _size(entries: dict[str, Any], names: DeviceNames) -> tuple[int, int] | None
 
 def _whole(name: str, number: float) -> int:
     if number % 1 != 0 or number < 1:
-        raise ValueError(f"expected {name} to hold whole numbers, the width and height in pixels, got {number:g}.")
+        raise ValueError(f"expected {name} to hold whole numbers of at least 1, the size in pixels, got {number:g}.")
     return int(number)
 
 
