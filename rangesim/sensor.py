@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple,
 import numpy as np
 
 from rangesim.electronics.detector import Detector, Gate, PhotoDetector
-from rangesim.response import DenseResponse, Response
-from rangesim.response.patterns import image_of
+from rangesim.response import Response
 from rangesim.settings.bounds import Bounds
 from rangesim.settings.config import Named
 
@@ -182,18 +181,14 @@ class Sensor(Named, ABC):
         raise ValueError(f"expected a sensor whose code has the size of a projector, got {self.type_name}.")
 
     def patterns(self) -> np.ndarray:
-        """(k, height, width) float32 in 0..1: the images that the projector shows; by default those of the responses.
+        """(k, height, width) float32 in 0..1: the images that the projector shows. A sensor with some overrides this.
 
         Raises
         ------
         ValueError
-            The sensor's emitter shows no images.
+            The sensor's emitter shows no images, or they are not known.
         """
-        size, shown = self.default_emitter.size, self.responses()
-        if size is None or not shown or not all(isinstance(response, DenseResponse) for response in shown):
-            raise ValueError(f"expected a sensor whose projector shows images, got {self.type_name}.")
-        images = np.concatenate([image_of(response, *size) for response in shown])  # type: ignore[arg-type]
-        return np.asarray(images / max(float(images.max()), np.finfo(np.float32).tiny), dtype=np.float32)
+        raise ValueError(f"expected a sensor that knows the images of its projector, got {self.type_name}.")
 
     def check(self, width: int, height: int) -> None:
         """Raise ValueError if this sensor does not fit a projector of that many pixels."""

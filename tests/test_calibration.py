@@ -716,7 +716,7 @@ def test_a_matrix_of_another_size_than_stated_is_refused(rendered, tmp_path, suf
     }.items():
         for value in values:
             wrong = {k: v for k, v in {**right, key: value}.items() if v is not None}
-            with pytest.raises(FileFormatError, match="camera_matrix|camera's matrix"):
+            with pytest.raises(FileFormatError, match=r"camera_matrix|camera's matrix"):
                 load_calibration(written(wrong))
 
 

@@ -409,9 +409,7 @@ def _coefficients(name: str, values: np.ndarray) -> tuple[float, ...]:
     """Up to five coefficients of distortion; further ones must be 0, because the lens model does not have them."""
     if len(values) not in COEFFICIENT_COUNTS:
         counts = " or ".join(map(str, COEFFICIENT_COUNTS))
-        raise ValueError(
-            f"expected one of {counts} numbers in {name!r}, the coefficients of OpenCV, got {len(values)}."
-        )
+        raise ValueError(f"expected {counts} coefficients of OpenCV in {name!r}, got {len(values)}.")
     if np.any(values[5:]):
         raise ValueError(
             f"expected {name!r} with the coefficients k1, k2, p1, p2, k3 alone, got {values.tolist()}; calibrate again "

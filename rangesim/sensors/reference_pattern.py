@@ -25,7 +25,15 @@ from rangesim.geometry.stereo import rectify
 from rangesim.response import DenseResponse, Dots, LightPath, NumpyMath, Response
 from rangesim.rig import Intrinsics, Rig
 from rangesim.sensor import Background, Decoder, Emitter, FrameContent, Sensor, of_type
-from rangesim.sensors.active_stereo import Disparity, described, least_light, pattern_of, quantised, size_of
+from rangesim.sensors.active_stereo import (
+    Disparity,
+    described,
+    least_light,
+    pattern_of,
+    quantised,
+    shown_image,
+    size_of,
+)
 from rangesim.settings.bounds import Bounds, Metres, check_fields
 
 SAMPLES = 4
@@ -67,6 +75,9 @@ class ReferencePatternStereo(Sensor):
 
     def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         return np.asarray(channels[0] + ambient, dtype=np.float32)
+
+    def patterns(self) -> np.ndarray:
+        return shown_image(pattern_of(self.pattern))
 
     def frame_names(self) -> list[str]:
         return ["infrared"]
