@@ -202,6 +202,16 @@ class Sensor(Named, ABC):
         """
         raise ValueError(f"expected a sensor whose code has the size of a projector, got {self.type_name}.")
 
+    def patterns(self) -> np.ndarray:
+        """(k, height, width) float32 in 0..1: the images that the projector shows. A sensor with some overrides this.
+
+        Raises
+        ------
+        ValueError
+            The sensor's emitter shows no images, or they are not known.
+        """
+        raise ValueError(f"expected a sensor that knows the images of its projector, got {self.type_name}.")
+
     def check(self, width: int, height: int) -> None:
         """Raise ValueError if this sensor does not fit a projector of that many pixels."""
         for response in self.responses():

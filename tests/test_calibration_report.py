@@ -166,11 +166,11 @@ def test_what_somebody_changed_since_is_theirs(tmp_path: Path, name: str):
 
 
 def test_a_calibration_corrected_by_hand_is_read_and_kept(tmp_path: Path):
-    from rangesim.calibration.opencv_files import load_opencv, save_opencv
+    from rangesim.calibration.opencv_files import save_opencv
     from rangesim.rig.calibration_files import load_calibration, save_calibration
 
     rig = default_rig()
-    for name, save, load in (("a.json", save_calibration, load_calibration), ("a.yml", save_opencv, load_opencv)):
+    for name, save, load in (("a.json", save_calibration, load_calibration), ("a.yml", save_opencv, load_calibration)):
         save(rig, tmp_path / name)
         text = (tmp_path / name).read_text()
         width = str(rig.camera.width)

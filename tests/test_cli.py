@@ -226,7 +226,7 @@ def _write_bad_files(folder: Path) -> None:
         (["decode", "gap", "--axes", "rows", "--bits", "12"], "how it was taken: leave out --axes, --bits"),
         (
             ["decode", "empty", "--projector", "64x64", "--unit", "1"],
-            "--calibration FILE.xml or FILE.yml with",
+            "--calibration FILE.xml, FILE.yml or FILE.json with",
         ),
         (["decode", "crop"], "expected 120 x 90 uint16 .* got 60 x 60"),
     ],

@@ -380,7 +380,7 @@ def test_a_calibration_with_a_number_that_is_none_is_refused(tmp_path: Path, nam
     ("changed", "message"),
     [
         ({"img_shape": "1e6 1e6"}, "at most 100000000 pixels"),
-        ({"img_shape": "0 640"}, "height to be a whole number of at least 1"),
+        ({"img_shape": "0 640"}, "whole numbers of at least 1"),
         ({"img_shape": "480.5 640"}, "whole numbers"),
         ({"roration": "0 0 0 0 0 0 0 0 0"}, "expected"),
         ({"cam_int": "0 0 0 0 0 0 0 0 1"}, "fx to be positive"),

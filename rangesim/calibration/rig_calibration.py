@@ -30,6 +30,7 @@ from rangesim.geometry.projective_plane import map_points
 from rangesim.geometry.reprojection import LENS, POSE
 from rangesim.rig import Rig
 from rangesim.robust_scale import sigma_from_median
+from rangesim.sensor import Decoder
 
 MIN_AROUND = 24
 """Least number of decoded pixels around a corner for a homography. A homography has 8 parameters, and each pixel gives
@@ -164,7 +165,12 @@ def _surrounds(offsets: Array) -> bool:
 
 
 def calibrate_rig(
-    board: Board, captures: Sequence[Capture], *, coefficients: int = 5, names: Sequence[str] | None = None
+    board: Board,
+    captures: Sequence[Capture],
+    *,
+    coefficients: int = 5,
+    names: Sequence[str] | None = None,
+    decoder: Decoder | None = None,
 ) -> RigCalibration:
     """Calibration of a camera and a projector from coded light on a board, each capture with the board in another pose.
 
@@ -180,6 +186,7 @@ def calibrate_rig(
     captures : two or more Captures of one sensor that codes columns and rows of a projector.
     coefficients : int, number of free coefficients of distortion, of k1, k2, p1, p2, k3 in this order; 0 for pinholes.
     names : names of the captures, for messages; None: their numbers.
+    decoder : Decoder of the captures; None: that of their sensor.
 
     Raises
     ------
@@ -193,7 +200,7 @@ def calibrate_rig(
     views, projector_views = [], []
     for name, capture in zip(names, captures, strict=True):
         try:
-            view, seen = _views(board, capture)
+            view, seen = _views(board, capture, decoder or capture.sensor.default_decoder)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
         if capture.frames.shape != captures[0].frames.shape or capture.sensor != captures[0].sensor:
@@ -260,12 +267,12 @@ def _rms(residuals: tuple[Array, ...]) -> float:
     return float(np.sqrt(np.square(np.concatenate(residuals)).sum(axis=1).mean()))
 
 
-def _views(board: Board, capture: Capture) -> tuple[BoardView, BoardView]:
+def _views(board: Board, capture: Capture, decoder: Decoder) -> tuple[BoardView, BoardView]:
     """The board as the camera sees it, and as the projector would see it."""
     if capture.sensor.default_emitter.size is None:
         raise ValueError(f"expected a capture of a sensor with a projector, got one of {capture.sensor.type_name}.")
     view = board.find(capture.sensor.white_image(capture.frames))
-    decoded = capture.sensor.default_decoder.coordinates(capture)
+    decoded = decoder.coordinates(capture)
     grid = np.full((board.rows, board.columns, 2), np.nan)
     grid[view.indices // board.columns, view.indices % board.columns] = view.pixels
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]

@@ -18,6 +18,7 @@ from rangesim import __version__
 from rangesim.cli.calibrate import calibrate_command
 from rangesim.cli.compare import compare_command
 from rangesim.cli.decode import decode_command
+from rangesim.cli.patterns import patterns_command
 from rangesim.cli.presets import presets_command
 from rangesim.cli.report import report_command
 from rangesim.cli.run import run_command
@@ -34,6 +35,7 @@ app.command("run")(run_command)
 app.command("scan")(scan_command)
 app.command("decode")(decode_command)
 app.command("calibrate")(calibrate_command)
+app.command("patterns")(patterns_command)
 app.command("compare")(compare_command)
 app.command("report")(report_command)
 app.command("view")(view_command)

@@ -13,12 +13,18 @@ from rangesim.cli.decode import TOF_SUFFIX
 from rangesim.cli.images import (
     ALL_AXES,
     BitsOption,
+    ChannelOption,
     CodeOption,
+    ImageOptions,
+    ImagesOption,
+    MirrorOption,
+    OrderOption,
+    PatternsOption,
     ProjectorOption,
+    RotateOption,
     SensorOption,
     SetOption,
     load_frames,
-    sensor_of_images,
 )
 from rangesim.errors import one_line
 
@@ -63,8 +69,14 @@ def calibrate_command(
     ] = 5,
     sensor: SensorOption = None,
     code: CodeOption = None,
+    patterns: PatternsOption = None,
     projector: ProjectorOption = None,
+    images: ImagesOption = None,
+    order: OrderOption = None,
     set_: SetOption = None,
+    rotate: RotateOption = 0,
+    mirror: MirrorOption = False,
+    channel: ChannelOption = None,
     bits: BitsOption = None,
 ) -> None:
     """Calibrate camera and projector from coded light, along columns and rows, on a board in two or more poses.
@@ -105,14 +117,12 @@ def calibrate_command(
     if any(path.is_file() for path in captures):
         _camera_alone(target, captures, out, coefficients, projector, report)
         return
-    if sensor is not None and code is not None:
-        raise ValueError("expected either --sensor or --code, got both.")
+    options = ImageOptions(sensor, code, projector, None, order, set_, images, rotate, mirror, channel, bits, patterns)
     axes = ALL_AXES if sensor is None or projector is not None else None
-    taken_with = sensor_of_images(sensor, code, projector, axes, set_)
-    loaded = [load_frames(path, taken_with, bits) for path in captures]
-    if several := [path for path, one in zip(captures, loaded, strict=True) if len(one.captures) > 1]:
+    loaded = [load_frames(path, options, axes) for path in captures]
+    if several := [path for path, one in zip(captures, loaded, strict=True) if len(one.captured.captures) > 1]:
         raise ValueError(f"expected captures of one camera, got those of several in {several[0]}.")
-    taken = [one.reference for one in loaded]
+    taken, decoder = [one.captured.reference for one in loaded], loaded[0].decoder
     of_tof = any(capture.sensor.default_emitter.size is None for capture in taken)  # its light shows no pattern
     if of_tof != (out.suffix.lower() == TOF_SUFFIX):
         raise ValueError(
@@ -122,16 +132,19 @@ def calibrate_command(
     if of_tof:
         if report is not None:
             raise ValueError("expected --report only for a camera and a projector; time of flight has no page yet.")
+        if decoder is not None:
+            raise ValueError("expected --set with settings of the sensor alone to calibrate time of flight.")
         _time_of_flight(target, taken, [str(path) for path in captures], out)
         return
-    found = calibrate_rig(target, taken, coefficients=coefficients, names=[str(path) for path in captures])
+    names = [str(path) for path in captures]
+    found = calibrate_rig(target, taken, coefficients=coefficients, names=names, decoder=decoder)
     check_places(out, report)  # again, because the calibration may take minutes
     (save_calibration if out.suffix.lower() == ".json" else save_opencv)(found.rig, out)
+    for finding in dict.fromkeys(finding for one in loaded for finding in one.findings):
+        typer.echo(one_line(finding))
     typer.echo(_table(found, captures))
     if report is not None:
-        page = render_calibration(
-            found, [str(path) for path in captures], [c.sensor.white_image(c.frames) for c in taken]
-        )
+        page = render_calibration(found, names, [c.sensor.white_image(c.frames) for c in taken])
         write_file(report, page.encode(), FileFormatError, make_parents=True)
         typer.echo(f"{one_line(report)}: written.")
     typer.echo(f"{one_line(out)}: written.")

@@ -13,59 +13,76 @@ import typer
 from rangesim.cli.images import (
     AxesOption,
     BitsOption,
+    ChannelOption,
     CodeOption,
+    ImageOptions,
+    ImagesOption,
+    MirrorOption,
+    OrderOption,
+    PatternsOption,
     ProjectorOption,
+    RotateOption,
     SensorOption,
     SetOption,
     load_frames,
-    sensor_of_images,
 )
 from rangesim.cli.progress import announce_linked_output
+from rangesim.errors import one_line
 
 if TYPE_CHECKING:
     from rangesim.capture import Capture
     from rangesim.decoding.range_image import RangeImage
-
-ONLY_BARE_IMAGES = ("code", "projector", "axes", "set_", "bits")
-"""Options that bare images need. A capture with a sidecar refuses them, because the sidecar says the same."""
+    from rangesim.rig.calibration_files import StoredCalibration
 
 TOF_SUFFIX = ".npz"
 """Suffix of the calibrations that `rangesim calibrate` writes for time-of-flight cameras."""
 
 
 def decode_command(
-    context: typer.Context,
     capture: Annotated[
-        Path, typer.Argument(help="A capture that rangesim wrote, or a folder of images.", show_default=False)
+        Path,
+        typer.Argument(
+            help="A capture that rangesim wrote, a folder of images, or a file with all frames (.npy, .npz, .json).",
+            show_default=False,
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Directory for the maps and the cloud.")] = ...,  # type: ignore[assignment]
     sensor: SensorOption = None,
     code: CodeOption = None,
+    patterns: PatternsOption = None,
     projector: ProjectorOption = None,
     axes: AxesOption = None,
+    images: ImagesOption = None,
+    order: OrderOption = None,
     set_: SetOption = None,
-    code_step: Annotated[int, typer.Option(help="Projector pixels per Gray cell when an .xml was calibrated.")] = 1,
-    unit: Annotated[
-        float | None,
-        typer.Option(
-            help="Metres per unit of length of a calibration, .xml or .yml. Default: 1 for OpenCV's files with "
-            "camera_matrix, 0.001 for those of procam-calibration."
-        ),
-    ] = None,
+    rotate: RotateOption = 0,
+    mirror: MirrorOption = False,
+    channel: ChannelOption = None,
     bits: BitsOption = None,
     calibration: Annotated[
         Path | None,
         typer.Option(
-            help="Calibration: what rangesim calibrate wrote (.json, .yml, .xml; time of flight: .npz), or .xml of "
-            "procam-calibration."
+            help="Calibration: OpenCV's K, D, R and T of camera and projector by any usual names (.xml, .yml, .json), "
+            "or what rangesim calibrate wrote (time of flight: .npz)."
         ),
     ] = None,
+    unit: Annotated[
+        float | None,
+        typer.Option(
+            help="Metres per unit of length of T in the calibration, 0.001 for millimetres.",
+            show_default="the file's, or a guess that is printed",
+        ),
+    ] = None,
+    code_step: Annotated[
+        int, typer.Option(help="Projector pixels per Gray cell in a calibration by procam-calibration.")
+    ] = 1,
 ) -> None:
     """Decode a capture to maps, and with a calibration to a point cloud, without scene and renderer.
 
-    The command reads bare images in the order of their names, which must be the order of the sensor's frames. The
-    default is OpenCV's order: for each axis the patterns from the coarsest to the finest, each followed by its
-    inverse; then white and black.
+    The command reads bare images in the order of their names, or as --images says. They show the frames of the code in
+    its own order, or as --order says. A patterns.json in the folder says all that at once. The default is OpenCV's
+    order: for each axis the patterns from the coarsest to the finest, each followed by its inverse; then white and
+    black.
 
     The command writes range.npz and pictures of the maps, and with a calibration also cloud.ply, in metres.
 
@@ -73,9 +90,13 @@ def decode_command(
 
       rangesim decode out/tabletop/gray-phase/capture --out out/decoded
 
-      rangesim decode out/gated/gated-camera/capture --sensor examples/own_sensor.py:GatedCamera --out out/decoded
+      rangesim decode photographs --patterns patterns/patterns.json --calibration stereo.yml --out out/scan
 
       rangesim decode images --projector 1024x768 --calibration board.xml --code-step 2 --out out/board
+
+      rangesim decode scan --code gray --projector 1280x800 --order 'white,black,columns_bit?' --out out/scan
+
+      rangesim decode taps.npy --sensor amcw --set 'modulation_hz=[60e6]' --out out/taps
     """
     from rangesim.cli.decode_summary import likely_cause, status_fractions, summary
     from rangesim.decoding import decode
@@ -84,75 +105,62 @@ def decode_command(
     from rangesim.report.figures import map_pictures
     from rangesim.results.decoded_captures import DECODED, Decoded, save_decoded
 
-    _refuse_what_would_be_ignored(context, capture, calibration)
+    options = ImageOptions(sensor, code, projector, axes, order, set_, images, rotate, mirror, channel, bits, patterns)
+    stored = _stored(calibration, code_step, unit)
     announce_linked_output(out, check_directory(out, DECODED, inputs=[capture]))
-    taken_with = sensor_of_images(sensor, code, projector, axes, set_)
-    loaded = load_frames(capture, taken_with, bits)
-    if taken_with is not None and type(loaded.sensor) is not type(taken_with):
-        raise ValueError(f"expected --sensor to name the sensor of {capture}, {loaded.sensor.type_name}.")
-    first = loaded.reference
-    if calibration and len(loaded.captures) > 1:
-        raise ValueError(f"expected no --calibration: {capture} holds the rigs of its {len(loaded.captures)} cameras.")
-    if calibration and calibration.suffix.lower() == TOF_SUFFIX:
-        image = _calibrated_tof(first, calibration)
-    else:
-        first = _calibrated(first, calibration, code_step, unit) if calibration else first
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DoubtWarning)  # the summary tells the doubts
-            image = decode(first if calibration else loaded)
-    decoded = Decoded(image, first.sensor, first.rig, status_fractions(image), likely_cause(image, first))
+    camera_size = None if stored is None else stored.camera_size
+    loaded = load_frames(
+        capture, options, camera_size=camera_size, projector_size=None if stored is None else stored.projector_size
+    )
+    first, findings = loaded.captured.reference, loaded.findings
+    if calibration and len(loaded.captured.captures) > 1:
+        raise ValueError(
+            f"expected no --calibration: {capture} holds the rigs of its {len(loaded.captured.captures)} cameras."
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtWarning)  # the summary tells the doubts
+        if calibration is None:
+            image = decode(loaded.captured, loaded.decoder)
+        elif stored is None:
+            if loaded.decoder is not None:
+                raise ValueError(f"expected no --set of the decoder with {calibration}, which holds its settings.")
+            image = _calibrated_tof(first, calibration)
+        else:
+            first, findings = _calibrated(first, stored, calibration), (*findings, *stored.findings)
+            image = decode(first, loaded.decoder)
+    cause = likely_cause(image, first)
+    decoded = Decoded(image, first.sensor, first.rig, status_fractions(image), cause, findings)
     save_decoded(decoded, out, map_pictures(image))
+    for finding in findings:
+        typer.echo(one_line(finding))
     typer.echo(summary(decoded, out, is_given=calibration is not None))
 
 
-def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibration: Path | None) -> None:
-    """Raise ValueError if an option was given that would have no effect on this input."""
-    from rangesim.calibration.opencv_files import SUFFIXES
-    from rangesim.results.captures import SIDECAR
+def _stored(calibration: Path | None, code_step: int, unit_m: float | None) -> StoredCalibration | None:
+    """What a calibration file holds; None without a file, and for one of a time-of-flight camera."""
+    from rangesim.rig.calibration_files import read_calibration
 
-    given = {name for name in context.params if _from_command_line(context, name)}
-    if (capture / SIDECAR).is_file() and (surplus := _options(ONLY_BARE_IMAGES, given)):
-        raise ValueError(f"{capture} is a capture whose {SIDECAR} says how it was taken: leave out {surplus}.")
-    if {"sensor", "code"} <= given:
-        raise ValueError("expected either --sensor or --code, got both.")
-    suffix = "" if calibration is None else calibration.suffix.lower()
-    if "code_step" in given and (calibration is None or suffix != ".xml" or _is_opencv(calibration)):
-        raise ValueError("expected --code-step only with --calibration FILE.xml of procam-calibration.")
-    if "unit" in given and suffix not in SUFFIXES:
-        raise ValueError("expected --calibration FILE.xml or FILE.yml with --unit; other files are in metres.")
+    if calibration is None or calibration.suffix.lower() == TOF_SUFFIX:
+        if code_step != 1:
+            raise ValueError("expected --code-step only with --calibration FILE.xml of procam-calibration.")
+        if unit_m is not None:
+            raise ValueError("expected --calibration FILE.xml, FILE.yml or FILE.json with --unit.")
+        return None
+    return read_calibration(calibration, code_step, unit_m)
 
 
-def _from_command_line(context: typer.Context, name: str) -> bool:
-    """Whether the user gave an option, so that its value is not the default."""
-    source = context.get_parameter_source(name)
-    return source is not None and source.name == "COMMANDLINE"
-
-
-def _options(names: tuple[str, ...], given: set[str]) -> str:
-    """The names that are among `given`, written as on the command line."""
-    return ", ".join(f"--{name.rstrip('_').replace('_', '-')}" for name in names if name in given)
-
-
-def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: float | None) -> Capture:
+def _calibrated(capture: Capture, stored: StoredCalibration, calibration: Path) -> Capture:
     """The capture with the rig of a calibration file."""
-    from rangesim.rig.calibration_files import load_calibration
-
-    if _is_opencv(calibration):
-        from rangesim.calibration.opencv_files import load_opencv
-
-        return replace(capture, rig=load_opencv(calibration, 1.0 if unit_m is None else unit_m))
-    size = capture.sensor.default_emitter.size
-    return replace(capture, rig=load_calibration(calibration, size, code_step, 1e-3 if unit_m is None else unit_m))
-
-
-def _is_opencv(calibration: Path) -> bool:
-    """Whether a file is one that `rangesim calibrate` writes for OpenCV; another .xml is procam-calibration's."""
-    from pcgraph.plumbing.plain_files import read_file
     from rangesim.errors import FileFormatError
 
-    if calibration.suffix.lower() in (".yml", ".yaml"):
-        return True
-    return calibration.suffix.lower() == ".xml" and b"camera_matrix" in read_file(calibration, FileFormatError)
+    size = capture.sensor.default_emitter.size
+    height, width = capture.frames.shape[1:]
+    try:
+        if size is None and not capture.sensor.triangulates:
+            return replace(capture, rig=stored.rig_of_camera((width, height)))
+        return replace(capture, rig=stored.rig((width, height), size))
+    except ValueError as error:
+        raise FileFormatError(f"{calibration}: {error}") from error
 
 
 def _calibrated_tof(capture: Capture, calibration: Path) -> RangeImage:

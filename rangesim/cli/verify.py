@@ -14,7 +14,9 @@ from rangesim.errors import one_line
 def verify_command(
     directory: Annotated[
         Path,
-        typer.Argument(help="A directory that rangesim wrote: a result, a scan, a capture, or a decoded capture."),
+        typer.Argument(
+            help="A directory that rangesim wrote: a result, a scan, a capture, a decoded capture, or a pattern set."
+        ),
     ],
 ) -> None:
     """Compare the size and SHA-256 of every file in a directory with its manifest.
@@ -31,9 +33,10 @@ def verify_command(
     from rangesim.results.captures import CAPTURE
     from rangesim.results.decoded_captures import DECODED
     from rangesim.results.experiment_results import RESULT
+    from rangesim.results.pattern_sets import PATTERNS
     from rangesim.results.scan_results import SCAN
 
-    kinds = (RESULT, SCAN, CAPTURE, DECODED)
+    kinds = (RESULT, SCAN, CAPTURE, DECODED, PATTERNS)
     kind = next((k for k in kinds if (directory / k.sidecar).is_file()), None)
     if kind is None:
         raise FileFormatError(

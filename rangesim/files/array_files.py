@@ -122,6 +122,31 @@ def read_arrays(
         raise FileFormatError(f"{path} cannot be read as .npz: {brief(error)}.") from error
 
 
+def read_array(path: str | Path, check: Check | None = None) -> np.ndarray:
+    """The array of a .npy file; as `read_arrays`, which reads .npz files, it unpickles nothing.
+
+    Raises
+    ------
+    FileFormatError
+        The file is missing, broken or too large, or holds objects.
+    """
+    path = Path(path)
+    check_file(path, FileFormatError)
+    try:
+        limits.check("bytes", path.stat().st_size, f"bytes in {path}", FileFormatError)
+        with path.open("rb") as file:
+            shape, fortran_order, dtype = _header(file, str(path))
+            if check is not None:
+                check("", str(path), shape, dtype)
+            size = math.prod(shape) * dtype.itemsize
+            if size != path.stat().st_size - file.tell():
+                raise FileFormatError(f"{path}: expected {size} bytes as its header says, got another number.")
+            values = np.frombuffer(file.read(size), dtype=dtype)
+    except (OSError, MemoryError, ValueError, OverflowError) as error:
+        raise FileFormatError(f"{path} cannot be read as .npy: {brief(error)}.") from error
+    return values.reshape(shape, order="F" if fortran_order else "C")
+
+
 def _members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
     entries = archive.infolist()
     if len(entries) > MAX_ARRAYS:

@@ -10,7 +10,7 @@ import struct
 import sys
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,12 @@ from rangesim.settings.config import brief
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".exr")
 """Suffixes of the files that `read_grey` reads."""
+CHANNELS = {"grey": "", "red": "R", "green": "G", "blue": "B"}
+"""Channels that can be read of a colour image, each with its name in files; "grey" is their luma (ITU-R BT.601)."""
+LUMA = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in grey, by ITU-R BT.601."""
+GREY_MODES = ("1", "L", "LA", "La", "I", "F", "I;16", "I;16L", "I;16B", "I;16N")
+"""Modes of Pillow's images without colours."""
 _BROKEN = (
     *(OSError, ValueError, SyntaxError, RuntimeError, LookupError, TypeError, EOFError, ArithmeticError, MemoryError),
     *(struct.error, zlib.error),
@@ -73,18 +79,21 @@ def write_grey(path: Path, image: np.ndarray) -> None:
     Image.fromarray(np.ascontiguousarray(image)).save(path, compress_level=1, compress_type=PNG_STRATEGY)
 
 
-def read_grey(path: Path) -> np.ndarray:
-    """The image in a file as (h, w) uint8, uint16 or float32. Colours become grey by their luma (ITU-R BT.601).
+def read_grey(path: Path, channel: str = "grey") -> np.ndarray:
+    """The image in a file as (h, w) uint8, uint16 or float32.
+
+    channel : of a colour image, one of `CHANNELS`. Luma holds three tenths of red, so a red laser is nearly black in
+        it.
 
     Raises
     ------
     FileFormatError
-        The file cannot be read, or its pixels are of another type.
+        The file cannot be read, its pixels are of another type, or it has no colours where one is asked for.
     """
     check_file(path, FileFormatError)
     try:
         with _quiet():
-            return _read_exr(path) if path.suffix.lower() == ".exr" else _read_raster(path)
+            return _read_exr(path, channel) if path.suffix.lower() == ".exr" else _read_raster(path, channel)
     except FileFormatError:
         raise
     except _BROKEN as error:
@@ -125,11 +134,14 @@ def check_pixels(path: Path) -> None:
         raise FileFormatError(f"{path} cannot be read as an image: {brief(error)}.") from error
 
 
-def read_stack(paths: list[Path], size: tuple[int, int] | None = None) -> np.ndarray:
+def read_stack(
+    paths: list[Path], size: tuple[int, int] | None = None, read: Callable[[Path], np.ndarray] = read_grey
+) -> np.ndarray:
     """The images in several files as one array (k, h, w), uint8, uint16 or float32.
 
     size : (w, h) that the images must have, pixels; None: that of the first. It is checked before memory is allocated
         for all images.
+    read : function that reads one file.
 
     Raises
     ------
@@ -140,7 +152,7 @@ def read_stack(paths: list[Path], size: tuple[int, int] | None = None) -> np.nda
     for i, path in enumerate(paths):
         if not os.path.lexists(path):  # unlike Path.exists, accepts impossible names
             raise FileFormatError(f"frame {path} is missing.")
-        image = read_grey(path)
+        image = read(path)
         if first is None:
             first = image
             if size is not None and image.shape != size[::-1]:
@@ -228,7 +240,11 @@ def _open_exr(path: Path) -> None:
     limits.check("bytes", size, f"bytes in {path}, decompressed", FileFormatError)
 
 
-def _read_exr(path: Path) -> np.ndarray:
+def _no_colours(path: Path, channel: str) -> FileFormatError:
+    return FileFormatError(f"{path} is grey and has no channel {channel}: leave out --channel.")
+
+
+def _read_exr(path: Path, channel: str) -> np.ndarray:
     import OpenEXR
 
     _open_exr(path)
@@ -237,10 +253,14 @@ def _read_exr(path: Path) -> np.ndarray:
     if not file.parts:
         raise FileFormatError(f"{path} cannot be read as an image: its pixels are damaged or missing.")
     channels = {name: c.pixels for name, c in file.channels().items()}
+    if channel != "grey":
+        if CHANNELS[channel] not in channels:
+            raise _no_colours(path, channel)
+        return np.asarray(channels[CHANNELS[channel]], dtype=np.float32)
     if "Y" in channels:
         return np.asarray(channels["Y"], dtype=np.float32)
     r, g, b = (np.asarray(channels[c], dtype=np.float32) for c in "RGB")
-    return np.asarray(0.299 * r + 0.587 * g + 0.114 * b, dtype=np.float32)
+    return np.asarray(LUMA[0] * r + LUMA[1] * g + LUMA[2] * b, dtype=np.float32)
 
 
 @contextmanager
@@ -275,7 +295,7 @@ def _open_raster(path: Path) -> Iterator[Any]:
     raise _OtherFormatError(f"it is none of {', '.join(p.format for p in plugins)} or OpenEXR")
 
 
-def _read_raster(path: Path) -> np.ndarray:
+def _read_raster(path: Path, channel: str) -> np.ndarray:
     with _open_raster(path) as image:
         if image.format == "TIFF" and (pages := _pages_of_one_size(image)) > 1:
             raise FileFormatError(
@@ -283,6 +303,10 @@ def _read_raster(path: Path) -> np.ndarray:
             )
         if image.format == "PNG" and _is_deep_colour_png(path):
             raise FileFormatError(f"{path} is a colour PNG of 16 bits, which is not supported; convert it to grey.")
+        if channel != "grey":
+            if image.mode in GREY_MODES:
+                raise _no_colours(path, channel)
+            return np.asarray(image.convert("RGB").getchannel(CHANNELS[channel]), dtype=np.uint8)
         if image.mode in ("I;16", "I;16L", "I;16B", "I;16N", "I"):
             values = np.asarray(image)
             if values.size and (values.min() < 0 or values.max() > 65535):

@@ -7,6 +7,7 @@
 | a scan | `scan_results.ScanResult` | `write_scan` | `load_scan` |
 | a decoded capture | `decoded_captures.Decoded` | `save_decoded` | `load_decoded` |
 | a capture | `rangesim.capture.Capture` | `save_capture` | `load_capture`, `import_capture` |
+| a pattern set | `pattern_sets.PatternSet` | `save_patterns` | `load_patterns` |
 | a range image | `rangesim.decoding.range_image.RangeImage` | `save_range_image` | `load_range_image` |
 | signals | `rangesim.signals.StillSignals` | `save_signals` | `load_signals` |
 """

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,8 +14,18 @@ from rangesim import __version__
 from rangesim.capture import DTYPES, Capture, Captured, together
 from rangesim.electronics.ambient import Ambient
 from rangesim.electronics.detector import PhotoDetector
-from rangesim.errors import FileFormatError
+from rangesim.errors import FileFormatError, warn
 from rangesim.files.atomic_directories import DirectoryKind, new_directory, sidecar_of, write_manifest
+from rangesim.files.frame_files import (
+    CameraView,
+    Digital,
+    NumberFormat,
+    as_counts,
+    as_digital,
+    find_frames,
+    read_frames,
+    read_frames_file,
+)
 from rangesim.files.image_files import SUFFIXES, read_stack, write_grey
 from rangesim.files.schema import write_json
 from rangesim.files.text_files import read_json
@@ -155,20 +165,89 @@ def _read_capture(sidecar: Path) -> tuple[Capture, list[str]]:
         raise FileFormatError(f"{sidecar}: {str(error).removeprefix(f'{sidecar}: ')}") from error
 
 
-def import_capture(
-    folder: str | Path, sensor: Sensor, rig: Rig | None = None, detector: PhotoDetector | None = None
-) -> Capture:
-    """A real capture from a folder with one image per frame.
+class ImportedFrames(NamedTuple):
+    """Frames (k, h, w) of a real camera, in a type that a Capture takes.
 
-    The images are read in the order of their names; numbers in the names are compared by value, so 2 precedes 10.
+    names : names of the frames, if a list of the images states them. findings : sentences on what was assumed.
+    """
+
+    frames: np.ndarray
+    names: list[str] | None = None
+    findings: tuple[str, ...] = ()
+
+
+def import_frames(
+    place: str | Path,
+    sensor: Sensor,
+    images: str | None = None,
+    view: CameraView | None = None,
+    number: NumberFormat | None = None,
+    shape: tuple[int, int] | None = None,
+) -> ImportedFrames:
+    """The frames of a real camera; how many there are is not checked.
 
     Parameters
     ----------
-    folder : folder with as many images as the sensor has frames: PNG, TIFF, JPEG, BMP or EXR of 8 or 16 bits. Colour
-        images are converted to grey.
+    place : folder of images or arrays, see `find_frames`; or a file with all frames, see `read_frames_file`.
+    sensor : Sensor that took them. Histograms of a sensor that counts photons stay as they are; other numbers are
+        stretched to all bits of their type, see `as_digital`.
+    images : which of the files, or which array of the file. view : CameraView. number : NumberFormat.
+    shape : (h, w) of the camera, for pixels that an array holds in a row; None: not known.
+
+    Raises
+    ------
+    FileFormatError
+        There is no such place, or a file is broken; or the numbers are not of that format.
+    """
+    place, number = Path(place), number or NumberFormat()
+    names: list[str] | None = None
+    if place.is_file():
+        values = read_frames_file(place, sensor.n_frames, images, view, shape or (1, -1))
+    else:
+        files = find_frames(place, images)
+        names = files.names
+        if not files.paths:
+            raise FileFormatError(f"{place}: expected {sensor.n_frames} images for {sensor.type_name}, got 0.")
+        values = read_frames(files, view)
+        if values.dtype == np.float32 and number.bits is None and files.paths[0].suffix.lower() in SUFFIXES:
+            return ImportedFrames(values, names)  # floating-point images hold radiance
+    try:
+        if sensor.gate is None:
+            return ImportedFrames(*_with_names(as_digital(values, number), names))
+        if number != NumberFormat():
+            raise ValueError("expected no --bits for histograms, which hold counts of photons.")
+        return ImportedFrames(*_with_names(as_counts(values), names))
+    except ValueError as error:
+        raise FileFormatError(f"{place}: {error}") from error
+
+
+def _with_names(digital: Digital, names: list[str] | None) -> tuple[np.ndarray, list[str] | None, tuple[str, ...]]:
+    return digital.frames, names, digital.findings
+
+
+def import_capture(
+    folder: str | Path,
+    sensor: Sensor,
+    rig: Rig | None = None,
+    detector: PhotoDetector | None = None,
+    *,
+    images: str | None = None,
+    view: CameraView | None = None,
+    number: NumberFormat | None = None,
+) -> Capture:
+    """A real capture from a folder with one image per frame, or from a file with all frames.
+
+    The images are read in the order of their names; numbers in the names are compared by value, so 2 precedes 10. A
+    `RangesimWarning` says what is assumed of the camera's numbers.
+
+    Parameters
+    ----------
+    folder : folder with as many images as the sensor has frames: PNG, TIFF, JPEG, BMP or EXR of 8 or 16 bits, or arrays
+        (.npy). Colour images are converted to grey. Or a file with all frames, .npy, .npz or .json.
     sensor : Sensor, whose `frame_names()` are in the order of the images.
     rig : Rig; None: not calibrated.
     detector : PhotoDetector; None: not known.
+    images, view, number : as for `import_frames`.
 
     Raises
     ------
@@ -183,20 +262,24 @@ def import_capture(
     >>> rig = load_calibration("rig.json")  # doctest: +SKIP
     >>> image = decode(import_capture("photographs", sensor, rig))  # doctest: +SKIP
     """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise FileFormatError(f"{folder} is no folder of images.")
-    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural)
-    if len(paths) != sensor.n_frames:
-        raise FileFormatError(
-            f"{folder}: expected {sensor.n_frames} images for {sensor.type_name} "
-            f"({sensor.frame_names()[0]} ... {sensor.frame_names()[-1]}), got {len(paths)}."
-        )
-    frames = read_stack(paths)
+    imported = import_frames(folder, sensor, images, view, number)
+    check_count(folder, imported.frames, sensor)
+    for finding in imported.findings:
+        warn(f"{folder}: {finding}")
     try:
-        return Capture(frames, sensor, rig, detector)
+        return Capture(imported.frames, sensor, rig, detector)
     except ValueError as error:
         raise FileFormatError(f"{folder}: {error}") from error
+
+
+def check_count(place: str | Path, frames: np.ndarray, sensor: Sensor) -> None:
+    """Raise FileFormatError unless there are as many frames (k, h, w) as the sensor has."""
+    if len(frames) != sensor.n_frames:
+        names = sensor.frame_names()
+        raise FileFormatError(
+            f"{place}: expected {sensor.n_frames} images for {sensor.type_name} ({names[0]} ... {names[-1]}), got "
+            f"{len(frames)}."
+        )
 
 
 def _file_names(capture: Capture) -> list[str]:
@@ -239,8 +322,3 @@ def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor, size: 
     if frames.dtype.name != stored:
         raise ValueError(f"expected frames of type {stored}, got {frames.dtype.name}.")
     return frames.astype(dtype, copy=False)
-
-
-def _natural(path: Path) -> list[tuple[int, int | str]]:
-    """Key that sorts the names of files so that image2 comes before image10."""
-    return [(0, int(s)) if s.isdigit() else (1, s) for s in re.split(r"(\d+)", path.name.lower())]

@@ -2,7 +2,8 @@
 """Writes and reads a decoded capture: the directory that `rangesim decode` writes.
 
 DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.atomic_directories`
-    decoded.json         sensor, rig, fraction of the pixels by status, likely cause if few pixels have a reading, and
+    decoded.json         sensor, rig, fraction of the pixels by status, likely cause if few pixels have a reading;
+                         findings: what the frames told of themselves, and what was assumed;
                          doubts: sentences on what in the capture contradicts itself
     range.npz            range image
     cloud.ply            points, metres, camera coordinates; missing if there are none
@@ -45,6 +46,7 @@ class DecodedRecord(Record, frozen=True, kw_only=True):
     status: dict[str, Fraction]
     likely_cause: str | None
     doubts: tuple[str, ...] = ()
+    findings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,6 +58,7 @@ class Decoded(ShortRepr):
     rig : Rig; None: not calibrated.
     status : fraction of the pixels with each status, by the status's name.
     likely_cause : clause that says why few pixels have a reading; None if no cause is likely.
+    findings : sentences on what the frames told of how they were taken, and on what was assumed.
     """
 
     image: RangeImage
@@ -63,6 +66,7 @@ class Decoded(ShortRepr):
     rig: Rig | None
     status: dict[str, float]
     likely_cause: str | None
+    findings: tuple[str, ...] = ()
 
 
 def save_decoded(decoded: Decoded, directory: str | Path, pictures: Mapping[str, bytes]) -> None:
@@ -84,6 +88,7 @@ def save_decoded(decoded: Decoded, directory: str | Path, pictures: Mapping[str,
         status=decoded.status,
         likely_cause=decoded.likely_cause,
         doubts=decoded.image.doubts,
+        findings=decoded.findings,
     )
     image = decoded.image
     with new_directory(directory, DECODED) as folder:
@@ -110,4 +115,6 @@ def load_decoded(directory: str | Path) -> Decoded:
         rig = None if record.rig is None else Rig.from_dict(record.rig)
     except (ValueError, TypeError) as error:
         raise FileFormatError(f"{folder / SIDECAR}: {error}") from error
-    return Decoded(load_range_image(folder / "range.npz"), sensor, rig, record.status, record.likely_cause)
+    return Decoded(
+        load_range_image(folder / "range.npz"), sensor, rig, record.status, record.likely_cause, record.findings
+    )

@@ -54,6 +54,21 @@ def size_of(pattern: DenseResponse | None) -> tuple[int, int] | None:
     return (pattern.width, pattern.height) if isinstance(pattern, Dots) else None
 
 
+def shown_image(pattern: DenseResponse | None) -> np.ndarray:
+    """(1, height, width) float32 in 0..1, a pattern at the centres of the projector's pixels, its brightest dot at 1.
+
+    Raises
+    ------
+    ValueError
+        There is no pattern.
+    """
+    size = size_of(pattern)
+    if pattern is None or size is None:
+        raise ValueError("expected a sensor with a pattern, got passive stereo, whose emitter is off.")
+    image = image_of(pattern, *size)[:1]
+    return np.asarray(image / max(float(image.max()), np.finfo(np.float32).tiny), dtype=np.float32)
+
+
 @lru_cache(maxsize=16)  # a report asks for each pixel's budget several times
 def texture_of(pattern: DenseResponse | None) -> float:
     """Mean square of the change of a pattern from one projector pixel to the next, per square of its mean; 0 if there
@@ -102,6 +117,9 @@ class ActiveStereo(Sensor):
     def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         light = channels[0] if len(channels) else np.zeros_like(ambient)[None]
         return np.asarray(light + ambient, dtype=np.float32)
+
+    def patterns(self) -> np.ndarray:
+        return shown_image(pattern_of(self.pattern))
 
     def frame_names(self) -> list[str]:
         return ["infrared"]

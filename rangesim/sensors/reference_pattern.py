@@ -26,7 +26,15 @@ from rangesim.response import DenseResponse, Dots, LightPath, NumpyMath, Respons
 from rangesim.response.patterns import image_of
 from rangesim.rig import Intrinsics, Rig
 from rangesim.sensor import Background, Decoder, Emitter, FrameContent, Sensor, of_type
-from rangesim.sensors.active_stereo import Disparity, described, least_light, pattern_of, quantised, size_of
+from rangesim.sensors.active_stereo import (
+    Disparity,
+    described,
+    least_light,
+    pattern_of,
+    quantised,
+    shown_image,
+    size_of,
+)
 from rangesim.settings.bounds import Bounds, Metres, check_fields
 
 SAMPLES = 4
@@ -68,6 +76,9 @@ class ReferencePatternStereo(Sensor):
 
     def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         return np.asarray(channels[0] + ambient, dtype=np.float32)
+
+    def patterns(self) -> np.ndarray:
+        return shown_image(pattern_of(self.pattern))
 
     def frame_names(self) -> list[str]:
         return ["infrared"]

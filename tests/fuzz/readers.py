@@ -205,9 +205,23 @@ def _calibration(path: Path, _: Arguments) -> Any:
 
 
 def _opencv_rig(path: Path, _: Arguments) -> Any:
-    from rangesim.calibration.opencv_files import load_opencv
+    import rangesim
 
-    return load_opencv(path)
+    return rangesim.load_calibration(path, (32, 24), camera_size=(32, 24))
+
+
+def _patterns(path: Path, _: Arguments) -> Any:
+    from rangesim.results.pattern_sets import load_patterns
+
+    return load_patterns(path)
+
+
+def _frames_file(path: Path, _: Arguments) -> Any:
+    import rangesim
+    from rangesim.errors import without_warnings
+
+    with without_warnings():
+        return rangesim.import_capture(path, rangesim.AmcwToF((60e6,)))
 
 
 def _tof_calibration(path: Path, _: Arguments) -> Any:
@@ -462,6 +476,7 @@ _CLOUD = ("CloudReadError",)
 _IMAGES = {"png": "png", "tif": "tiff", "bmp": "bmp", "jpg": "jpeg", "pgm": "pgm"}
 _RUN = "run {entry} --out {out} --width 16 --height 12 --spp 1 --photons 1000"
 _DECODE = "decode {entry} --out {out} --code gray --projector 8x8 --axes columns,rows --bits 8"
+_TURNED = "decode {entry} --out {out} --projector 8x8 --images *.png --order * --rotate 180 --channel grey --mirror"
 _OF_RUN = (
     *_nonsense(
         "--width 1000000000",
@@ -505,11 +520,33 @@ _OF_DECODE = (
         "--bits 99",
         f"--bits {10**30}",
         "--code x",
+        "--order x",
+        "--order ,",
+        "--images none*",
+        "--images ,",
+        "--images none.txt",
+        "--rotate 45",
+        f"--rotate {10**30}",
+        "--channel x",
+        "--channel red",
+        "--patterns none.json",
+        "--sensor x",
+        "--bits s0",
+        "--bits s33",
     ),
     *(f"--code gray-phase --set period_px={text}" for text in ("nan", "inf", "1e-300", "[1]", "{a=1}", "'")),
     *(f"--code gray-phase --set steps={text}" for text in (10**30, 1000000000, 0)),
     "--set =",
     "--set type=x",
+    "--set decoder.type=x",
+    "--set contrast_of_scale=nan",
+    "--set decoder={}",
+    "--bits s8",
+    "--rotate 90",
+    "--images *.png",
+    "--order *",
+    f"--order {'*' * 5000}",
+    "--axes rows,columns",
 )
 _OF_SEGMENT = (
     *_nonsense(
@@ -621,6 +658,11 @@ READERS = {
             "calibration-xml", _calibration, seeds.opencv_files, by_hand=(hostile.opencv_calibrations,),
             check=_rig_is_finite,
         ),
+        Reader("patterns", _patterns, seeds.pattern_sets, ("*.json",), (_sidecar_trees,), share=0.3),
+        *(
+            Reader(f"frames-{suffix}", _frames_file, partial(seeds.frames_files, suffix), share=0.5)
+            for suffix in ("npy", "json")
+        ),
         Reader("opencv-rig", _opencv_rig, seeds.opencv_rig_files, share=0.3, check=_rig_is_finite),
         Reader("tof-calibration", _tof_calibration, seeds.tof_calibrations, by_hand=(hostile.npz_files,), share=0.3),
         Reader("ouster", _ouster, seeds.lidar_recordings, ("*.pcap", "*.json"), (_sidecar_trees,), check=_is_sweep),
@@ -662,7 +704,7 @@ READERS = {
             (_settings_to_run,), share=0.05, command="rangesim", may_write=("out*",),
         ),
         Reader(
-            "options-decode", _rangesim, _with_arguments(_bare_images, _DECODE), share=0.2, command="rangesim",
+            "options-decode", _rangesim, _with_arguments(_bare_images, _DECODE, _TURNED), share=0.2, command="rangesim",
             by_hand=(_options(*_OF_DECODE),), names_file=False, may_write=("*",), mutates_arguments=True,
         ),
         Reader(

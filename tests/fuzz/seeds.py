@@ -244,6 +244,34 @@ def opencv_rig_files() -> Seeds:
     return {name: of_file(name, written(name, lambda path: save_opencv(rig, path))) for name in ("rig.yml", "rig.xml")}
 
 
+def pattern_sets() -> Seeds:
+    """The sidecars of pattern sets."""
+    from rangesim.results.pattern_sets import SIDECAR, PatternSet, save_patterns
+    from rangesim.sensors import StructuredLight
+
+    def sidecar(sensor: StructuredLight) -> bytes:
+        with tempfile.TemporaryDirectory() as folder:
+            save_patterns(PatternSet(sensor, 2.2), f"{folder}/p")
+            return (Path(folder) / "p" / SIDECAR).read_bytes()
+
+    sensors = {"gray": StructuredLight(8, 8, "gray"), "phase": StructuredLight(32, 24, order=("white", "*"))}
+    return {name: of_file(SIDECAR, sidecar(sensor)) for name, sensor in sensors.items()}
+
+
+def frames_files(suffix: str) -> Seeds:
+    """Taps of a time-of-flight camera in one file."""
+    rng, seeds = np.random.default_rng(6), {}
+    for dtype in ("int16", "uint16", "float64"):
+        frames = (1000 * rng.random((4, 6, 8))).astype(dtype)
+        if suffix == "json":
+            seeds[dtype] = of_file("taps.json", json.dumps(frames.tolist()).encode())
+        else:
+            stream = io.BytesIO()
+            np.save(stream, frames)
+            seeds[dtype] = of_file("taps.npy", stream.getvalue())
+    return seeds
+
+
 def tof_calibrations() -> Seeds:
     """The calibration of a time-of-flight camera."""
     import numpy as np
