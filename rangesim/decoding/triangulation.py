@@ -167,6 +167,8 @@ class ProjectorCoordinates(Coordinates):
         off = np.count_nonzero(self.valid & (status == Status.CODE_ERROR))
         if n < MIN_PIXELS or off <= MAX_OFF_LINE_FRACTION * n:
             return None
+        if self.limits.epipolar_tolerance_px < COORDINATE_ERROR_PX:
+            return None  # sound codes miss it, too
         return (
             f"{100 * off / n:.0f} % of the decoded pixels miss their epipolar line by more than "
             f"{self.limits.epipolar_tolerance_px:g} projector pixels, so the depth of the others is doubtful: check "

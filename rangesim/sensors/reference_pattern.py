@@ -23,7 +23,6 @@ from rangesim.decoding.working_range import WorkingRange
 from rangesim.geometry.dense_stereo import DenseMatching
 from rangesim.geometry.stereo import rectify
 from rangesim.response import DenseResponse, Dots, LightPath, NumpyMath, Response
-from rangesim.response.patterns import image_of
 from rangesim.rig import Intrinsics, Rig
 from rangesim.sensor import Background, Decoder, Emitter, FrameContent, Sensor, of_type
 from rangesim.sensors.active_stereo import (
@@ -78,20 +77,11 @@ class ReferencePatternStereo(Sensor):
         return np.asarray(channels[0] + ambient, dtype=np.float32)
 
     def patterns(self) -> np.ndarray:
+        """(1, height, width) float32 in 0..1, the dots as a video projector in the place of the laser shows them."""
         return shown_image(pattern_of(self.pattern))
 
     def frame_names(self) -> list[str]:
         return ["infrared"]
-
-    def patterns(self) -> np.ndarray:
-        """(1, height, width) float32 in 0..1: the pattern at the centres of the projector's pixels, its brightest is 1;
-        for a video projector in the place of a laser."""
-        pattern = pattern_of(self.pattern)
-        size = size_of(pattern)
-        assert pattern is not None
-        assert size is not None
-        image = image_of(pattern, *size)
-        return np.asarray(image / max(float(image.max()), float(np.finfo(np.float32).tiny)))
 
     def for_projector(self, width: int, height: int, axes: Sequence[str] | None = None) -> ReferencePatternStereo:
         """This sensor with dots for a projector of another size. `axes` mean nothing to dots.

@@ -385,7 +385,7 @@ def _beyond_projector(sensor: StructuredLight, codes: dict[str, AxisCode]) -> st
     """A sentence if many pixels have a code beyond the last pixel of the projector; None if not."""
     for axis, code in codes.items():
         size, is_error = sensor.size(axis), code.status == Status.CODE_ERROR
-        beyond = is_error & (code.coordinate > size + 0.5)
+        beyond = is_error & (code.coordinate > size + max(0.5, code.cell_px / 2))  # the last cell may stand out
         n, read = np.count_nonzero(beyond), np.count_nonzero(is_error | (code.status == Status.OK))
         if read >= MIN_PIXELS and n > MAX_BEYOND_FRACTION * read:
             furthest = float(np.percentile(code.coordinate[beyond], 99))
