@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,9 +28,9 @@ MIN_UNPAIRED = 0.75
 black. Where both are lit or both are dark, the difference is 1; a gamma makes a difference of 0.56 at most."""
 
 MAX_PAIRS = 50_000
-"""Largest number of pairs of neighbouring pixels, across and also down the image, on which other orders of the frames
-are tried, so that the time is bounded, which grows with the number of orders. With far fewer, too few of them would lie
-in different cells (see `MIN_STEPS`)."""
+"""Largest number of different pairs of words on which other orders of the frames are tried. It bounds the time, which
+grows with the number of orders. Only images of noise have as many pairs. With far fewer, too few of them would lie in
+different cells (see `MIN_STEPS`)."""
 
 MIN_STEPS = 100
 """Least number of pairs of neighbouring pixels in different cells from which a check of the order draws a
@@ -152,21 +153,20 @@ def other_code_contradiction(seen: AxisFrames, code: AxisCode, words: Words, oth
     seen : frames (k, h, w) of the bits. code : what they decode to. words : those of the code. others : those of other
         codes with as many bits.
     """
-    pairs = [seen_words[:, seen_words[0] != seen_words[1]] for seen_words in _neighbours(code, words)]
-    both = np.concatenate(pairs, axis=1)
-    if both.shape[1] < MIN_STEPS:
+    both = _Neighbours.together([part.that_differ() for part in _neighbours(code, words)])
+    if both.counts.sum() < MIN_STEPS:
         return None
-    both = both[:, :: 1 + both.shape[1] // (2 * MAX_PAIRS)]
-    own = _octaves(both, words)
-    nearest = min(others, key=lambda other: _octaves(both, other), default=words)
-    if own < _octaves(both, nearest) + MAX_FARTHER_OCTAVES:
+    both = both.few()
+    own = both.octaves(words)
+    nearest = min(others, key=both.octaves, default=words)
+    if own < both.octaves(nearest) + MAX_FARTHER_OCTAVES:
         return None
-    orders = [_octaves(reorder(both), words) for _, reorder in _other_orders(seen, words)]
-    if min(orders) + MAX_FARTHER_OCTAVES < _octaves(both, nearest):
+    orders = [both.reordered(reorder).octaves(words) for _, reorder in _other_orders(seen, words)]
+    if min(orders) + MAX_FARTHER_OCTAVES < both.octaves(nearest):
         return None
     return (
         f"the bits along {seen.axis} contradict {words.noun}: neighbouring pixels lie {2**own:.1f} cells apart as "
-        f"{words.noun}, and {2 ** _octaves(both, nearest):.1f} as {nearest.noun}: check which code was shown."
+        f"{words.noun}, and {2 ** both.octaves(nearest):.1f} as {nearest.noun}: check which code was shown."
     )
 
 
@@ -181,15 +181,15 @@ def order_contradiction(seen: AxisFrames, code: AxisCode, words: Words) -> str |
     seen : frames (k, h, w) of the bits. code : what they decode to. words : those of the code.
     """
     pairs = _neighbours(code, words)
-    few = [part[:, :: 1 + part.shape[1] // MAX_PAIRS] for part in pairs]
-    across = max(few, key=lambda part: np.count_nonzero(part[0] != part[1]))
-    step = _coarse_step(across, words)
+    across = max(pairs, key=lambda part: part.that_differ().counts.sum())
+    differing = _Neighbours.together([part.that_differ() for part in pairs])
+    step = across.coarse_step(words)
     # This looks at all pairs, because the coarsest bits change at a line or two of the image.
     text = None
     if step is not None and words.change_one_bit:
         names = [seen.shown_name(bit.name) for bit in reversed(bit_frames(seen.names, words.bits))]
-        text = _repeated_bit(_that_differ(pairs) >> step, names[step:])
-    text = text or _better_order(across, _that_differ(few), seen, words)
+        text = _repeated_bit(differing, step, names)
+    text = text or _better_order(across.few(), differing.few(), seen, words)
     if text is None:
         return None
     return (
@@ -197,69 +197,100 @@ def order_contradiction(seen: AxisFrames, code: AxisCode, words: Words) -> str |
     )
 
 
-def _neighbours(code: AxisCode, words: Words) -> list[np.ndarray]:
-    """(2, n) int each: words of neighbouring pixels, across and down the image, both inside a cell."""
+class _Neighbours(NamedTuple):
+    """Pairs of words that neighbouring pixels see, and how many pixels see each pair.
+
+    words : (2, n) int32. counts : (n,) int.
+    """
+
+    words: np.ndarray
+    counts: np.ndarray
+
+    @classmethod
+    def of(cls, here: np.ndarray, there: np.ndarray, bits: int) -> _Neighbours:
+        """Pairs of the words here (m,) and there (m,) of `bits` bits, each pair once."""
+        both = np.left_shift(here, bits, dtype=np.int32 if 2 * bits < 32 else np.int64) | there
+        pairs, counts = np.unique(both, return_counts=True)
+        return cls(np.stack([pairs >> bits, pairs & ((1 << bits) - 1)]), counts)
+
+    @classmethod
+    def together(cls, parts: Sequence[_Neighbours]) -> _Neighbours:
+        """The pairs of several parts."""
+        return cls(np.concatenate([p.words for p in parts], axis=1), np.concatenate([p.counts for p in parts]))
+
+    def that_differ(self) -> _Neighbours:
+        """Only the pairs whose two words differ."""
+        differ = self.words[0] != self.words[1]
+        return _Neighbours(self.words[:, differ], self.counts[differ])
+
+    def few(self) -> _Neighbours:
+        """At most `MAX_PAIRS` of the pairs, evenly spread."""
+        step = 1 + len(self.counts) // MAX_PAIRS
+        return _Neighbours(self.words[:, ::step], self.counts[::step])
+
+    def reordered(self, reorder: Callable[[np.ndarray], np.ndarray]) -> _Neighbours:
+        """The pairs as they are if `reorder` corrects the words."""
+        return self._replace(words=reorder(self.words))
+
+    def apart(self, step: int, words: Words) -> np.ndarray:
+        """(n,) int, distance of the two cells of each pair, in cells as large as 2^step of the finest ones."""
+        first, second = words.cell_of[self.words]
+        return np.asarray(np.abs((second >> step) - (first >> step)))
+
+    def octaves(self, words: Words) -> float:
+        """Mean distance of pairs that differ, in cells, as a power of two."""
+        return float(np.average(np.log2(self.apart(0, words)), weights=self.counts))
+
+    def coarse_step(self, words: Words) -> int | None:
+        """Least number of finest bits to leave out so that half of the neighbours see the same cell.
+
+        Bits that are finer than the camera's pixels do not show neighbours. None if fewer than three bits would be
+        left.
+        """
+        first, second = words.cell_of[self.words]
+        for step in range(words.bits - 2):
+            if self.counts[first >> step == second >> step].sum() >= 0.5 * self.counts.sum():
+                return step
+        return None
+
+
+def _neighbours(code: AxisCode, words: Words) -> list[_Neighbours]:
+    """Neighbouring pixels across and down the image, both inside a cell."""
     cell = code.coordinate / np.float32(code.cell_px)
     usable = (cell % 1 == 0.5) & (code.status != Status.LOW_SIGNAL) & (code.status != Status.SATURATED)
     word = words.of_cell[cell.astype(np.int32)]  # the bits as shown
     pairs = []
     for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         both = usable[here] & usable[there]
-        pairs.append(np.stack([word[here][both], word[there][both]]))
+        pairs.append(_Neighbours.of(word[here][both], word[there][both], words.bits))
     return pairs
 
 
-def _octaves(both: np.ndarray, words: Words) -> float:
-    """Mean distance of neighbours with words (2, n) that differ, in cells, as a power of two."""
-    return float(np.log2(_apart(both, 0, words)).mean())
-
-
-def _that_differ(pairs: list[np.ndarray]) -> np.ndarray:
-    """(2, m) words of all pairs (2, n) whose two words differ."""
-    words = np.concatenate(pairs, axis=1)
-    return np.asarray(words[:, words[0] != words[1]])
-
-
-def _better_order(across: np.ndarray, differing: np.ndarray, seen: AxisFrames, words: Words) -> str | None:
+def _better_order(across: _Neighbours, differing: _Neighbours, seen: AxisFrames, words: Words) -> str | None:
     """The fault of the frames whose correction brings neighbours nearest together; None if no correction does.
 
     Parameters
     ----------
-    across : (2, n) int, words of neighbours in the direction in which the code changes more.
-    differing : (2, m) int, words of the neighbours in both directions whose words differ.
+    across : neighbours in the direction in which the code changes more.
+    differing : neighbours in both directions whose words differ.
     seen : frames of the bits. words : those of the code.
     """
     best, text = 0.0, None
-    unresolved = _coarse_step(across, words) or 0
+    unresolved = across.coarse_step(words) or 0
     for fault, reorder in _other_orders(seen, words):
-        step = _coarse_step(reorder(across), words)
         changed = np.bitwise_xor(reorder(words.of_cell), words.of_cell)
-        if step is None or changed.max() >> unresolved == 0:  # bits that the camera does not resolve tell no order
+        if changed.max() >> unresolved == 0:  # bits that the camera does not resolve tell no order
             continue
-        before, after = (np.maximum(_apart(both, step, words), 0.5) for both in (differing, reorder(differing)))
-        octaves = np.log2(before / after)
-        moved, nearer, gain = np.abs(octaves) >= 1, octaves >= 1, float(octaves.sum())
-        if moved.sum() >= MIN_STEPS and nearer.sum() > MAX_NEARER_FRACTION * moved.sum() and gain > best:
+        step = across.reordered(reorder).coarse_step(words)
+        if step is None:
+            continue
+        before, after = (np.maximum(p.apart(step, words), 0.5) for p in (differing, differing.reordered(reorder)))
+        octaves, counts = np.log2(before / after), differing.counts
+        moved, nearer = counts[np.abs(octaves) >= 1].sum(), counts[octaves >= 1].sum()
+        gain = float(octaves @ counts)
+        if moved >= MIN_STEPS and nearer > MAX_NEARER_FRACTION * moved and gain > best:
             best, text = gain, fault
     return text
-
-
-def _coarse_step(both: np.ndarray, words: Words) -> int | None:
-    """Least number of finest bits to leave out so that half of the neighbours with words (2, n) see the same cell.
-
-    Bits that are finer than the camera's pixels do not show neighbours. None if fewer than three bits would be left.
-    """
-    first, second = words.cell_of[both]
-    for step in range(words.bits - 2):
-        if np.count_nonzero(first >> step == second >> step) >= 0.5 * len(first):
-            return step
-    return None
-
-
-def _apart(both: np.ndarray, step: int, words: Words) -> np.ndarray:
-    """(n,) int, distance of the neighbours with words (2, n), in cells as large as 2^step of the finest ones."""
-    first, second = words.cell_of[both]
-    return np.asarray(np.abs((second >> step) - (first >> step)))
 
 
 def _other_orders(seen: AxisFrames, words: Words) -> Iterator[tuple[str, Callable[[np.ndarray], np.ndarray]]]:
@@ -296,21 +327,22 @@ def _exchanged(i: int, j: int, words: np.ndarray) -> np.ndarray:
     return np.asarray(words ^ (differ << i) ^ (differ << j))
 
 
-def _repeated_bit(words: np.ndarray, bits: list[str]) -> str | None:
+def _repeated_bit(differing: _Neighbours, step: int, names: list[str]) -> str | None:
     """A clause that names two bits which always change together; None if no two do.
 
     Parameters
     ----------
-    words : (2, m) int, words of neighbours that differ. bits : (b,) names of the patterns, least significant
-        first."""
-    changed = words[0] ^ words[1]
-    counts = [int(np.count_nonzero(changed & (1 << i))) for i in range(len(bits))]
+    differing : neighbours whose words differ. step : number of finest bits that the camera does not resolve.
+    names : (b,) of the patterns, least significant first.
+    """
+    changed, bits = (differing.words[0] ^ differing.words[1]) >> step, names[step:]
+    counts = [int(differing.counts[changed & (1 << i) != 0].sum()) for i in range(len(bits))]
     for i in range(len(bits)):
         for j in range(i):
             two = (1 << i) | (1 << j)
-            both = int(np.count_nonzero((changed & two) == two))
+            both = int(differing.counts[(changed & two) == two].sum())
             if both < MIN_STEPS or both < MIN_REPEATED_FRACTION * max(counts[i], counts[j]):
                 continue
-            if np.count_nonzero(changed == two) > MIN_ALONE_FRACTION * both:
+            if differing.counts[changed == two].sum() > MIN_ALONE_FRACTION * both:
                 return f"frames {bits[i]} and {bits[j]} seem to be one pattern shown twice"
     return None
