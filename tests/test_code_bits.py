@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -331,3 +332,41 @@ def test_a_bit_that_is_taken_for_white_or_black_is_named() -> None:
     other = replace(sensor, order=("black", PLAIN, "white"))
     with pytest.warns(RangesimWarning, match="contradict (white|black): one of them is"):
         decode(replace(seen_flat(sensor), sensor=other))
+
+
+# ---- Interreflection -------------------------------------------------------------------------------------------------
+
+
+def corner(patterns: np.ndarray, indirect: float, width_px: float) -> np.ndarray:
+    """(k, 2, width) what a camera sees of a groove of two walls, one for each half of the projector's columns.
+
+    A point sees its own column, and the facing wall at the mirrored column, blurred: the opposite wall's light arrives
+    from a wide area. `indirect` is the ratio of that light to the direct light, under full power.
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    facing = gaussian_filter1d(patterns[:, 0, ::-1].astype(np.float64), width_px, axis=1, mode="nearest")
+    seen = patterns[:, 0] + indirect * facing
+    return np.repeat(seen[:, None], 2, axis=1)
+
+
+@pytest.mark.parametrize("order", [(), ("white", "black", PLAIN)])
+@pytest.mark.parametrize("indirect", [1.5, 3.0])
+def test_xor_codes_read_a_corner_that_gray_code_reads_wrongly(indirect: float, order: tuple[str, ...]) -> None:
+    """Light from the facing wall is stronger than direct light, so that a coarse pattern looks like its inverse.
+
+    Gupta 2011: fine patterns do not, because the facing wall is half lit in each of them.
+    """
+    right, wrong = {}, {}
+    for code in (GrayCode(), XorCode(0), XorCode(1)):
+        sensor = StructuredLight(512, 2, code, order=order)
+        frames = corner(sensor.patterns(), indirect, 24.0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RangesimWarning)
+            image = decode(Capture(frames.astype(np.float32), sensor))
+        off = np.abs(column(image)[0] - (np.arange(512) + 0.5))
+        right[code.noun], wrong[code.noun] = (off <= 1).mean(), (off > 1).mean()
+    assert wrong["Gray code"] > 0.8
+    for noun in ("XOR-02 code", "XOR-04 code"):
+        assert right[noun] > 0.9
+        assert wrong[noun] < 0.02

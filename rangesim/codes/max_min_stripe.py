@@ -60,7 +60,7 @@ _LONG_MERGER = _Merger(5, 9)
 class MaxMinStripeCode(BitCode):
     """Gray code in which each bit changes about equally often, and no stripe is narrow.
 
-    With 10 bits, the narrowest stripe has 8 cells (2 in the common Gray code) and the widest 25 instead of 1024. So
+    With 10 bits, the narrowest stripe has 8 cells (2 in the common Gray code) and the widest 24 instead of 512. So
     neither blur nor light that travels far inside the scene takes away the contrast of single patterns.
 
     Parameters
