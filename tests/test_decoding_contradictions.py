@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +19,9 @@ from rangesim.capture.exposure import expose
 from rangesim.codes import GrayPhase
 from rangesim.decoding import decode
 from rangesim.electronics.detector import Detector
-from rangesim.errors import RangesimWarning
+from rangesim.errors import DoubtWarning, RangesimWarning
+from rangesim.results.decoded_captures import Decoded, load_decoded, save_decoded
+from rangesim.results.range_images import load_range_image, save_range_image
 from rangesim.rig import translation
 from rangesim.sensors import StructuredLight
 
@@ -262,3 +266,16 @@ def test_codes_beyond_the_projector_are_told(code: str) -> None:
     frames = np.rint(20 + 200 * shown.patterns()).astype(np.uint8)
     text = doubt(Capture(frames, replace(shown, projector_width=600)))
     assert re.search(r"[67] % of the codes along columns lie beyond the projector's 600 pixels", text)
+
+
+def test_doubts_are_kept_in_files(tmp_path: Path) -> None:
+    capture = expose(plane_signals(stereo_rig(), sensor := StructuredLight(axes=("columns", "rows"))), sensor)
+    mirrored = replace(capture, frames=capture.frames[:, :, ::-1].copy(), rig=None)
+    with pytest.warns(DoubtWarning):
+        image = decode(mirrored)
+    save_range_image(image, tmp_path / "range.npz")
+    assert load_range_image(tmp_path / "range.npz").doubts == image.doubts
+    save_decoded(Decoded(image, sensor, None, {}, None), tmp_path / "out", {})
+    assert load_decoded(tmp_path / "out").image.doubts == image.doubts
+    record = json.loads((tmp_path / "out" / "decoded.json").read_text(encoding="utf-8"))
+    assert record["doubts"] == list(image.doubts)
