@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -11,8 +11,11 @@ from rangesim.capture import Capture
 from rangesim.codes.axis_code import AxisCode, AxisFrames, Contrast
 from rangesim.codes.contrast import difference_noise
 from rangesim.codes.thresholds import GrayThresholds
-from rangesim.decoding.row_bands import bands
+from rangesim.decoding.row_bands import in_bands
 from rangesim.decoding.status import Status
+
+if TYPE_CHECKING:
+    from rangesim.codes.bit_kernels import LeastDifference
 
 CELL_SIGMA = 12**-0.5
 """Standard deviation of a place that is known to lie in a cell, in cells: that of an even distribution."""
@@ -98,8 +101,10 @@ def decode_bits(seen: AxisFrames, words: Words, cell_px: int, thresholds: GrayTh
     shown = bit_frames(seen.names, words.bits)
     coordinate = np.empty(contrast.values.shape, dtype=np.float32)
     status = np.zeros(contrast.values.shape, dtype=np.uint8)
-    for rows in bands(len(status)):
-        word, uncertain = _classify(capture, seen.frames[:, rows], _rows_of(contrast, rows), shown, thresholds)
+    least = _least_difference(capture, thresholds)
+
+    def decode_rows(rows: slice) -> None:
+        word, uncertain = _classify(capture, seen.frames[:, rows], _rows_of(contrast, rows), shown, thresholds, least)
         low, high = words.cell_of[word], words.cell_of[word ^ uncertain]
         on_edge = (uncertain & (uncertain - 1) == 0) & (np.abs(low - high) <= 1)
         coordinate[rows] = (0.5 * (low + high) + 0.5) * cell_px
@@ -110,7 +115,10 @@ def decode_bits(seen: AxisFrames, words: Words, cell_px: int, thresholds: GrayTh
         if not contrast.is_measured:
             failed |= _is_guessed(capture.frames[:, rows], _rows_of(contrast, rows), shown, words, low)
         status[rows][failed] = Status.LOW_SIGNAL
-        status[rows][failed & capture.saturated(capture.frames[:, rows])] = Status.SATURATED
+        if failed.any():
+            status[rows][failed & capture.saturated(capture.frames[:, rows])] = Status.SATURATED
+
+    in_bands(decode_rows, len(status))
     sigma_px = np.broadcast_to(np.float32(CELL_SIGMA * cell_px), status.shape)
     return AxisCode(coordinate, status, cell_px, sigma_px)
 
@@ -132,25 +140,41 @@ def _rows_of(contrast: Contrast, rows: slice) -> Contrast:
     )
 
 
+def _least_difference(capture: Capture, thresholds: GrayThresholds) -> LeastDifference:
+    """Least |pattern - inverse| of a certain bit."""
+    from rangesim.codes.bit_kernels import LeastDifference
+
+    noise = capture.noise(np.arange(1 + capture.detector.max_dn)) if capture.detector else None
+    floor, relative = np.float32(0), np.float32(thresholds.relative_bit)
+    if noise is None and capture.is_digital:
+        floor, relative = np.float32(thresholds.bit_of_scale * capture.full_scale), np.float32(0)
+    variance = np.zeros(0, dtype=np.float32) if noise is None else np.asarray(noise**2, dtype=np.float32)
+    return LeastDifference(floor, relative, np.float32(thresholds.bit_sigmas), variance)
+
+
 def _classify(
-    capture: Capture, frames: np.ndarray, contrast: Contrast, shown: list[BitFrames], thresholds: GrayThresholds
+    capture: Capture,
+    frames: np.ndarray,
+    contrast: Contrast,
+    shown: list[BitFrames],
+    thresholds: GrayThresholds,
+    least: LeastDifference,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(h, w) int32 each: the word, and the set of its bits that are uncertain."""
+    from rangesim.codes.bit_kernels import append_bit
+
     word = np.zeros(contrast.values.shape, dtype=np.int32)
     uncertain = np.zeros_like(word)
     levels = None
     for bit in shown:
         if bit.pattern is not None and bit.inverse is not None:
-            pattern, inverse = (frames[i].astype(np.float32) for i in (bit.pattern, bit.inverse))
-            difference = pattern - inverse
-            least = _least_bit(capture, difference_noise(capture, pattern, inverse), 1.0, contrast, thresholds)
-            is_uncertain = np.abs(difference) < least
-        else:
-            levels = levels or _Levels.of(capture, contrast)
-            alone = frames[bit.pattern if bit.inverse is None else bit.inverse]
-            difference, is_uncertain = levels.compare(capture, alone, contrast, thresholds)
-            if bit.pattern is None:
-                difference = -difference
+            append_bit(frames[bit.pattern], frames[bit.inverse], contrast.values, least, word, uncertain)
+            continue
+        levels = levels or _Levels.of(capture, contrast)
+        alone = frames[bit.pattern if bit.inverse is None else bit.inverse]
+        difference, is_uncertain = levels.compare(capture, alone, contrast, thresholds)
+        if bit.pattern is None:
+            difference = -difference
         word = (word << 1) | (difference > 0)
         uncertain = (uncertain << 1) | is_uncertain
     return word, uncertain
@@ -187,26 +211,25 @@ class _Levels(NamedTuple):
         noise, frame_noise = None, capture.noise(value)
         if frame_noise is not None and self.variance is not None:
             noise = np.sqrt(4 * frame_noise**2 + self.variance)
-        uncertain = np.abs(difference) < _least_bit(capture, noise, LONE_NOISE, contrast, thresholds)
+        uncertain = np.abs(difference) < _least_lone_bit(capture, noise, contrast, thresholds)
         if self.is_clipped is not None:
             uncertain |= self.is_clipped & (difference > 0) & ~capture.saturated(frame[None])
         return difference, uncertain
 
 
-def _least_bit(
-    capture: Capture, noise: np.ndarray | None, relative_noise: float, contrast: Contrast, thresholds: GrayThresholds
+def _least_lone_bit(
+    capture: Capture, noise: np.ndarray | None, contrast: Contrast, thresholds: GrayThresholds
 ) -> np.ndarray | float:
-    """Least difference of a certain bit, in the capture's units.
+    """Least |2 pattern - (white + black)| of a certain bit, in the capture's units.
 
     Parameters
     ----------
     noise : (h, w) standard deviation of the difference; None: unknown.
-    relative_noise : ratio of this standard deviation to that of pattern - inverse, where it is unknown.
     """
     if noise is not None:
         return np.maximum(thresholds.bit_sigmas * noise, thresholds.relative_bit * contrast.values)
     if capture.is_digital:
-        return relative_noise * thresholds.bit_of_scale * capture.full_scale
+        return LONE_NOISE * thresholds.bit_of_scale * capture.full_scale
     return thresholds.relative_bit * contrast.values
 
 
