@@ -28,9 +28,9 @@ MIN_UNPAIRED = 0.75
 black. Where both are lit or both are dark, the difference is 1; a gamma makes a difference of 0.56 at most."""
 
 MAX_PAIRS = 50_000
-"""Largest number of different pairs of words on which other orders of the frames are tried. It bounds the time, which
-grows with the number of orders. Only images of noise have as many pairs. With far fewer, too few of them would lie in
-different cells (see `MIN_STEPS`)."""
+"""Largest number of pairs of neighbouring pixels, across and also down the image, on which other orders of the frames
+are tried, so that the time is bounded, which grows with the number of orders. With far fewer, too few of them would lie
+in different cells (see `MIN_STEPS`)."""
 
 MIN_STEPS = 100
 """Least number of pairs of neighbouring pixels in different cells from which a check of the order draws a
@@ -141,7 +141,9 @@ def level_contradiction(seen: AxisFrames, words: Words) -> str | None:
     return None
 
 
-def other_code_contradiction(seen: AxisFrames, code: AxisCode, words: Words, others: Sequence[Words]) -> str | None:
+def other_code_contradiction(
+    seen: AxisFrames, neighbours: list[np.ndarray], words: Words, others: Sequence[Words]
+) -> str | None:
     """A sentence if the patterns look like another code; None if they look like the code that they are read as.
 
     Neighbouring pixels see neighbouring cells. If the words of one code are read as those of another, the cells of
@@ -150,27 +152,28 @@ def other_code_contradiction(seen: AxisFrames, code: AxisCode, words: Words, oth
 
     Parameters
     ----------
-    seen : frames (k, h, w) of the bits. code : what they decode to. words : those of the code. others : those of other
-        codes with as many bits.
+    seen : frames (k, h, w) of the bits. neighbours : what `neighbours_of` returns. words : those of the code.
+    others : those of other codes with as many bits.
     """
-    both = _Neighbours.together([part.that_differ() for part in _neighbours(code, words)])
-    if both.counts.sum() < MIN_STEPS:
+    keys = np.concatenate([_that_differ(part) for part in neighbours])
+    if len(keys) < MIN_STEPS:
         return None
-    both = both.few()
-    own = both.octaves(words)
-    nearest = min(others, key=both.octaves, default=words)
-    if own < both.octaves(nearest) + MAX_FARTHER_OCTAVES:
+    both = Pairs.of(keys[:: 1 + len(keys) // (2 * MAX_PAIRS)])
+    own = _octaves(both, words.cell_of)
+    nearest = min(others, key=lambda other: _octaves(both, other.cell_of), default=words)
+    least = _octaves(both, nearest.cell_of)
+    if own < least + MAX_FARTHER_OCTAVES:
         return None
-    orders = [both.reordered(reorder).octaves(words) for _, reorder in _other_orders(seen, words)]
-    if min(orders) + MAX_FARTHER_OCTAVES < both.octaves(nearest):
+    orders = [_octaves(both, cell_of) for _, cell_of in _other_orders(seen, words)]
+    if min(orders) + MAX_FARTHER_OCTAVES < least:
         return None
     return (
         f"the bits along {seen.axis} contradict {words.noun}: neighbouring pixels lie {2**own:.1f} cells apart as "
-        f"{words.noun}, and {2 ** both.octaves(nearest):.1f} as {nearest.noun}: check which code was shown."
+        f"{words.noun}, and {2**least:.1f} as {nearest.noun}: check which code was shown."
     )
 
 
-def order_contradiction(seen: AxisFrames, code: AxisCode, words: Words) -> str | None:
+def order_contradiction(seen: AxisFrames, neighbours: list[np.ndarray], words: Words) -> str | None:
     """A sentence if the bits seem to be in another order, inverted or repeated; None if not.
 
     Neighbouring pixels see neighbouring cells. The function tries other orders. Each changes the distance of some
@@ -178,18 +181,21 @@ def order_contradiction(seen: AxisFrames, code: AxisCode, words: Words) -> str |
 
     Parameters
     ----------
-    seen : frames (k, h, w) of the bits. code : what they decode to. words : those of the code.
+    seen : frames (k, h, w) of the bits. neighbours : what `neighbours_of` returns. words : those of the code.
     """
-    pairs = _neighbours(code, words)
-    across = max(pairs, key=lambda part: part.that_differ().counts.sum())
-    differing = _Neighbours.together([part.that_differ() for part in pairs])
-    step = across.coarse_step(words)
+    from rangesim.codes.bit_kernels import coarse_step
+
+    few = [part[:: 1 + len(part) // MAX_PAIRS] for part in neighbours]
+    across = Pairs.of(max(few, key=lambda part: len(_that_differ(part))))
+    step = coarse_step(across, words.cell_of, words.bits)
     # This looks at all pairs, because the coarsest bits change at a line or two of the image.
     text = None
-    if step is not None and words.change_one_bit:
+    if step >= 0 and words.change_one_bit:
         names = [seen.shown_name(bit.name) for bit in reversed(bit_frames(seen.names, words.bits))]
-        text = _repeated_bit(differing, step, names)
-    text = text or _better_order(across.few(), differing.few(), seen, words)
+        every = Pairs.of(np.concatenate([_that_differ(part) for part in neighbours]))
+        text = _repeated_bit((every.first ^ every.second) >> step, every.counts, names[step:])
+    differing = Pairs.of(np.concatenate([_that_differ(part) for part in few]))
+    text = text or _better_order(across, differing, seen, words)
     if text is None:
         return None
     return (
@@ -197,103 +203,84 @@ def order_contradiction(seen: AxisFrames, code: AxisCode, words: Words) -> str |
     )
 
 
-class _Neighbours(NamedTuple):
-    """Pairs of words that neighbouring pixels see, and how many pixels see each pair.
+class Pairs(NamedTuple):
+    """Words of neighbouring pixels; equal pairs are counted, because most are equal to others.
 
-    words : (2, n) int32. counts : (n,) int.
+    first, second : (n,) int32, words of the two pixels. counts : (n,) int64, number of such pairs.
     """
 
-    words: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
     counts: np.ndarray
 
     @classmethod
-    def of(cls, here: np.ndarray, there: np.ndarray, bits: int) -> _Neighbours:
-        """Pairs of the words here (m,) and there (m,) of `bits` bits, each pair once."""
-        both = np.left_shift(here, bits, dtype=np.int32 if 2 * bits < 32 else np.int64) | there
-        pairs, counts = np.unique(both, return_counts=True)
-        return cls(np.stack([pairs >> bits, pairs & ((1 << bits) - 1)]), counts)
-
-    @classmethod
-    def together(cls, parts: Sequence[_Neighbours]) -> _Neighbours:
-        """The pairs of several parts."""
-        return cls(np.concatenate([p.words for p in parts], axis=1), np.concatenate([p.counts for p in parts]))
-
-    def that_differ(self) -> _Neighbours:
-        """Only the pairs whose two words differ."""
-        differ = self.words[0] != self.words[1]
-        return _Neighbours(self.words[:, differ], self.counts[differ])
-
-    def few(self) -> _Neighbours:
-        """At most `MAX_PAIRS` of the pairs, evenly spread."""
-        step = 1 + len(self.counts) // MAX_PAIRS
-        return _Neighbours(self.words[:, ::step], self.counts[::step])
-
-    def reordered(self, reorder: Callable[[np.ndarray], np.ndarray]) -> _Neighbours:
-        """The pairs as they are if `reorder` corrects the words."""
-        return self._replace(words=reorder(self.words))
-
-    def apart(self, step: int, words: Words) -> np.ndarray:
-        """(n,) int, distance of the two cells of each pair, in cells as large as 2^step of the finest ones."""
-        first, second = words.cell_of[self.words]
-        return np.asarray(np.abs((second >> step) - (first >> step)))
-
-    def octaves(self, words: Words) -> float:
-        """Mean distance of pairs that differ, in cells, as a power of two."""
-        return float(np.average(np.log2(self.apart(0, words)), weights=self.counts))
-
-    def coarse_step(self, words: Words) -> int | None:
-        """Least number of finest bits to leave out so that half of the neighbours see the same cell.
-
-        Bits that are finer than the camera's pixels do not show neighbours. None if fewer than three bits would be
-        left.
-        """
-        first, second = words.cell_of[self.words]
-        for step in range(words.bits - 2):
-            if self.counts[first >> step == second >> step].sum() >= 0.5 * self.counts.sum():
-                return step
-        return None
+    def of(cls, keys: np.ndarray) -> Pairs:
+        """Pairs of keys (m,) int64, as `neighbours_of` returns them."""
+        distinct, counts = np.unique(keys, return_counts=True)
+        return cls((distinct >> 32).astype(np.int32), distinct.astype(np.int32), counts.astype(np.int64))
 
 
-def _neighbours(code: AxisCode, words: Words) -> list[_Neighbours]:
-    """Neighbouring pixels across and down the image, both inside a cell."""
+def neighbours_of(code: AxisCode, words: Words) -> list[np.ndarray]:
+    """Words of neighbouring pixels, across and down the image, both inside a cell: (n,) int64 keys each.
+
+    A key has the word of the one pixel in its upper 32 bits, and that of the other in its lower ones.
+
+    Parameters
+    ----------
+    code : what the frames decode to. words : those of the code.
+    """
+    from rangesim.codes.bit_kernels import neighbour_keys
+
     cell = code.coordinate / np.float32(code.cell_px)
-    usable = (cell % 1 == 0.5) & (code.status != Status.LOW_SIGNAL) & (code.status != Status.SATURATED)
-    word = words.of_cell[cell.astype(np.int32)]  # the bits as shown
-    pairs = []
-    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        both = usable[here] & usable[there]
-        pairs.append(_Neighbours.of(word[here][both], word[there][both], words.bits))
-    return pairs
+    number = np.floor(cell)
+    usable = (cell - number == 0.5) & (code.status != Status.LOW_SIGNAL) & (code.status != Status.SATURATED)
+    word = np.where(usable, words.of_cell[number.astype(np.int32)], np.int32(-1))  # the bits as shown
+    return [neighbour_keys(word, 0, 1), neighbour_keys(word, 1, 0)]
 
 
-def _better_order(across: _Neighbours, differing: _Neighbours, seen: AxisFrames, words: Words) -> str | None:
+def _that_differ(keys: np.ndarray) -> np.ndarray:
+    """Those of the keys (n,) whose two words differ."""
+    return np.asarray(keys[keys >> 32 != keys & 0xFFFFFFFF])
+
+
+def _octaves(both: Pairs, cell_of: np.ndarray) -> float:
+    """Mean distance of neighbours with words that differ, in cells, as a power of two; cell_of : (2^b,), of words."""
+    apart = np.abs(cell_of[both.second] - cell_of[both.first])
+    return float(np.average(np.log2(apart), weights=both.counts))
+
+
+def _better_order(across: Pairs, differing: Pairs, seen: AxisFrames, words: Words) -> str | None:
     """The fault of the frames whose correction brings neighbours nearest together; None if no correction does.
 
     Parameters
     ----------
-    across : neighbours in the direction in which the code changes more.
-    differing : neighbours in both directions whose words differ.
+    across : words of neighbours in the direction in which the code changes more.
+    differing : words of the neighbours in both directions whose words differ.
     seen : frames of the bits. words : those of the code.
     """
+    from rangesim.codes.bit_kernels import coarse_step, octaves_nearer
+
     best, text = 0.0, None
-    unresolved = across.coarse_step(words) or 0
-    for fault, reorder in _other_orders(seen, words):
-        changed = np.bitwise_xor(reorder(words.of_cell), words.of_cell)
-        if changed.max() >> unresolved == 0:  # bits that the camera does not resolve tell no order
+    unresolved = max(coarse_step(across, words.cell_of, words.bits), 0)
+    for fault, cell_of in _other_orders(seen, words):
+        step = coarse_step(across, cell_of, words.bits)
+        changed = np.bitwise_xor(words.of_cell[cell_of], np.arange(len(cell_of)))
+        if step < 0 or changed.max() >> unresolved == 0:  # bits that the camera does not resolve tell no order
             continue
-        step = across.reordered(reorder).coarse_step(words)
-        if step is None:
-            continue
-        before, after = (np.maximum(p.apart(step, words), 0.5) for p in (differing, differing.reordered(reorder)))
-        octaves, counts = np.log2(before / after), differing.counts
-        moved, nearer = counts[np.abs(octaves) >= 1].sum(), counts[octaves >= 1].sum()
-        gain = float(octaves @ counts)
+        moved, nearer, gain = octaves_nearer(differing, words.cell_of, cell_of, step)
         if moved >= MIN_STEPS and nearer > MAX_NEARER_FRACTION * moved and gain > best:
             best, text = gain, fault
     return text
 
 
-def _other_orders(seen: AxisFrames, words: Words) -> Iterator[tuple[str, Callable[[np.ndarray], np.ndarray]]]:
+def _other_orders(seen: AxisFrames, words: Words) -> Iterator[tuple[str, np.ndarray]]:
+    """Faults that the order of the frames may have, each with the cells (2^b,) int32 of words that it corrects."""
+    every = np.arange(len(words.cell_of), dtype=np.int32)
+    for fault, corrected in _corrections(seen, words):
+        yield fault, words.cell_of[corrected(every)]
+
+
+def _corrections(seen: AxisFrames, words: Words) -> Iterator[tuple[str, Callable[[np.ndarray], np.ndarray]]]:
     """Faults that the order of the frames may have, each with the function that corrects words for it."""
     n = words.bits
     shown = list(reversed(bit_frames(seen.names, n)))
@@ -327,22 +314,21 @@ def _exchanged(i: int, j: int, words: np.ndarray) -> np.ndarray:
     return np.asarray(words ^ (differ << i) ^ (differ << j))
 
 
-def _repeated_bit(differing: _Neighbours, step: int, names: list[str]) -> str | None:
+def _repeated_bit(changed: np.ndarray, weights: np.ndarray, bits: list[str]) -> str | None:
     """A clause that names two bits which always change together; None if no two do.
 
     Parameters
     ----------
-    differing : neighbours whose words differ. step : number of finest bits that the camera does not resolve.
-    names : (b,) of the patterns, least significant first.
+    changed : (n,) int, bits in which the words of neighbours differ. weights : (n,) int, number of such neighbours.
+    bits : (b,) names of the patterns, least significant first.
     """
-    changed, bits = (differing.words[0] ^ differing.words[1]) >> step, names[step:]
-    counts = [int(differing.counts[changed & (1 << i) != 0].sum()) for i in range(len(bits))]
+    counts = [int(weights[changed & (1 << i) > 0].sum()) for i in range(len(bits))]
     for i in range(len(bits)):
         for j in range(i):
             two = (1 << i) | (1 << j)
-            both = int(differing.counts[(changed & two) == two].sum())
+            both = int(weights[(changed & two) == two].sum())
             if both < MIN_STEPS or both < MIN_REPEATED_FRACTION * max(counts[i], counts[j]):
                 continue
-            if differing.counts[changed == two].sum() > MIN_ALONE_FRACTION * both:
+            if weights[changed == two].sum() > MIN_ALONE_FRACTION * both:
                 return f"frames {bits[i]} and {bits[j]} seem to be one pattern shown twice"
     return None

@@ -12,6 +12,7 @@ import numpy as np
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.bit_checks import (
     level_contradiction,
+    neighbours_of,
     order_contradiction,
     other_code_contradiction,
     pair_contradiction,
@@ -96,11 +97,11 @@ class BitCode(Code):
 
     def contradiction(self, seen: AxisFrames, code: AxisCode) -> str | None:
         words = self.words(seen.size)
-        return (
-            pair_contradiction(seen, words)
-            or level_contradiction(seen, words)
-            or other_code_contradiction(seen, code, words, _other_words(words))
-            or order_contradiction(seen, code, words)
+        if found := pair_contradiction(seen, words) or level_contradiction(seen, words):
+            return found
+        neighbours = neighbours_of(code, words)
+        return other_code_contradiction(seen, neighbours, words, _other_words(words)) or order_contradiction(
+            seen, neighbours, words
         )
 
     @property

@@ -52,3 +52,65 @@ def append_bit(pattern, inverse, contrast, least, code, uncertain):  # type: ign
 def _at(table, number):  # type: ignore[no-untyped-def]
     """Entry of a table for a digital number; beyond its ends, the entry at the end."""
     return table[min(np.uint32(number), np.uint32(len(table) - 1))]
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def neighbour_keys(word, down, across):  # type: ignore[no-untyped-def]
+    """(n,) int64, words of each pixel and of the neighbour `down` rows and `across` columns on, as one number each.
+
+    The first word stands in the upper 32 bits. Pairs of which a pixel has no word are left out.
+
+    word : (h, w) int32, -1 where there is none.
+    """
+    keys = np.empty(word.size, np.int64)
+    n = 0
+    for row in range(len(word) - down):
+        for column in range(word.shape[1] - across):
+            first, second = word[row, column], word[row + down, column + across]
+            keys[n] = (np.int64(first) << 32) | np.int64(second)
+            n += first >= 0 and second >= 0
+    return keys[:n]
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def coarse_step(pairs, cell_of, bits):  # type: ignore[no-untyped-def]
+    """Least number of finest bits to leave out so that half of the pairs see the same cell; -1 if below three are left.
+
+    pairs : `rangesim.codes.bit_checks.Pairs`. cell_of : (2^bits,) int32, cell of each word.
+    """
+    same = np.zeros(bits + 1, np.int64)
+    for i in range(len(pairs.counts)):
+        differing, length = cell_of[pairs.first[i]] ^ cell_of[pairs.second[i]], 0
+        while differing:
+            differing >>= 1
+            length += 1
+        same[length] += pairs.counts[i]
+    total, found = pairs.counts.sum(), 0
+    for step in range(bits - 2):
+        found += same[step]
+        if found >= 0.5 * total:
+            return step
+    return -1
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def octaves_nearer(pairs, before, after, step):  # type: ignore[no-untyped-def]
+    """How much nearer pairs lie by one table of cells than by another: three sums over the pairs.
+
+    They are the number of pairs whose distance is halved or doubled at least, the number of those whose distance is
+    halved, and the sum of all changes, in powers of two.
+
+    pairs : `rangesim.codes.bit_checks.Pairs`. before, after : (2^b,) int32, cell of each word.
+    step : number of finest bits that are left out.
+    """
+    moved = nearer = 0
+    gain = 0.0
+    for i in range(len(pairs.counts)):
+        first, second = pairs.first[i], pairs.second[i]
+        old = max(abs((before[second] >> step) - (before[first] >> step)), 0.5)
+        new = max(abs((after[second] >> step) - (after[first] >> step)), 0.5)
+        if old != new:
+            moved += pairs.counts[i] * (old >= 2 * new or new >= 2 * old)
+            nearer += pairs.counts[i] * (old >= 2 * new)
+            gain += pairs.counts[i] * math.log2(old / new)
+    return moved, nearer, gain
