@@ -44,7 +44,8 @@ def main() -> None:
 
     result = {}
     for name in args.sensors:
-        result[name] = times(presets()[name], plane(args.width, args.height, name), args.repeats)
+        sensor = presets()[name]
+        result[name] = times(sensor, plane(args.width, args.height, sensor, BASELINE_M[name]), args.repeats)
         print(name, result[name], flush=True)
     print(json.dumps(result))
 
@@ -67,11 +68,10 @@ def fastest(call: Callable[[], T], repeats: int) -> tuple[T, float]:
     return value, round(min(seconds), 4)
 
 
-def plane(width: int, height: int, name: str) -> Signals:
-    """Signals of a tilted matte plane for the sensor of that name: direct light alone."""
-    sensor = presets()[name]
+def plane(width: int, height: int, sensor: Sensor, baseline_m: float) -> Signals:
+    """Signals of a tilted matte plane for a sensor: direct light alone."""
     camera, projector = Intrinsics.from_fov(width, height, 45), Intrinsics.from_fov(1280, 800, 70)
-    rig = Rig(camera=camera, projector=projector, T_camera_projector=translation(BASELINE_M[name], 0.0, 0.0))
+    rig = Rig(camera=camera, projector=projector, T_camera_projector=translation(baseline_m, 0.0, 0.0))
     rays = camera.directions(camera.pixel_centres())
     z = DISTANCE_M * NORMAL[2] / (rays @ np.asarray(NORMAL))
     points = rays * z[..., None]
