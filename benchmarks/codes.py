@@ -278,19 +278,19 @@ def document(table: str, number: int) -> str:
     camera, projector = (f"{width} x {height}" for width, height in (CAMERA, PROJECTOR))
     return f"""# Codes in difficult scenes
 
-{number} codes of structured light in eight scenes ([what the codes are](codes.md)). All frames of a code together are exposed
-for {1e3 * TOTAL_S:g} ms, so that a code of few frames exposes each of them longer. The camera has {camera} pixels, the
-projector {projector}; columns alone, the defaults of each code, white and black included.
+{number} codes of structured light in eight scenes ([what the codes are](codes.md)). All frames of a code together are
+exposed for {1e3 * TOTAL_S:g} ms, so that a code of few frames exposes each of them longer. The camera has {camera}
+pixels, the projector {projector}; columns alone, the defaults of each code, white and black included.
 `python benchmarks/codes.py --out docs/codes_table.md` makes this page.
 
-A cell has three numbers: the completeness (percentage of the lit pixels that have a reading), the median error in projector
-pixels, and the percentage of the readings that err by more than one projector pixel although their status is OK. `!` means
-that the decoder says that the frames contradict the code.
+A cell has three numbers: the completeness (percentage of the lit pixels that have a reading), the median error in
+projector pixels, and the percentage of the readings that err by more than one projector pixel although their status
+is OK. `!` means that the decoder says that the frames contradict the code.
 
 {table}
 
-- *corner*: two white walls (albedo 0.9) at 75 degrees. The projector lights one of them at a grazing angle, so that it gets
-  more light from the other wall than from the projector.
+- *corner*: two white walls (albedo 0.9) at 75 degrees. The projector lights one of them at a grazing angle, so that
+  it gets more light from the other wall than from the projector.
 - *defocus*: the projector's blur has a standard deviation of about 1.7 projector pixels.
 - *low albedo*: all reflectances of *matte* times 0.03. *ambient*: strong constant light from everywhere.
 - *gamma 2.2*: the projector shows the patterns with that gamma, and the decoder is not told.

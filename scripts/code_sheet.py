@@ -28,6 +28,8 @@ ACROSS = 3
 """Number of panels side by side."""
 MARGIN, TITLE = 16, 24
 """Pixels around a panel, and of the line above it."""
+LINE = 150
+"""Grey level of the lines around the frames, 0 to 255; it is neither that of a pattern nor that of the paper."""
 
 
 def main() -> None:
@@ -46,17 +48,18 @@ def main() -> None:
 
 def panel(code: Code) -> Image.Image:
     """The frames of a code, with its name above them."""
-    drawn = Image.new("L", (SCALE * COLUMNS, TITLE + HEIGHT), 255)
+    drawn = Image.new("L", (SCALE * COLUMNS + 2, TITLE + HEIGHT + 1), 255)
     names = code.names(COLUMNS)
-    title = f"{code.type_name}: {len(names)} frames"
-    ImageDraw.Draw(drawn).text((0, 0), title, fill=0, font=ImageFont.load_default(size=16))
+    ink = ImageDraw.Draw(drawn)
+    ink.text((0, 0), f"{code.type_name}: {len(names)} frames", fill=0, font=ImageFont.load_default(size=16))
+    ink.rectangle((0, TITLE - 1, drawn.width, drawn.height), fill=LINE)
     frames = StructuredLight(COLUMNS, 8, code=code).patterns()[: len(names)]
     for number, frame in enumerate(np.uint8(np.rint(255 * np.clip(frames, 0, 1)))):
         top, end = (round(TITLE + HEIGHT * n / len(frames)) for n in (number, number + 1))
-        gap = int(end - top > 5)  # a line between strips that are thick enough
+        gap = int(end - top > 5)  # lines between strips that are thick enough
         if end > top:
             strip = Image.fromarray(frame).resize((SCALE * COLUMNS, end - top - gap), Image.Resampling.NEAREST)
-            drawn.paste(strip, (0, top))
+            drawn.paste(strip, (1, top))
     return drawn
 
 
