@@ -71,8 +71,8 @@ DETECTOR = Detector(full_well_e=200_000, bits=16)
 WRONG_PX = 1.0
 """Error above which a reading is wrong, projector pixels. Gray code errs by half a pixel at most by itself."""
 MOMENTS = 24
-"""Number of moments at which the moving scene is rendered; a frame takes the nearest. The rig moves by a fourteenth of
-a camera pixel from one to the next."""
+"""Number of moments at which the moving scene is rendered; a frame takes the nearest. From one to the next, the rig
+moves by 1.25 mm, and what a pixel sees by less than a tenth of a projector pixel."""
 IDENTITY_SIZES = (1280, 1000, 333)
 """Columns of the projectors on which encoding and decoding is tried."""
 
@@ -82,8 +82,8 @@ class Case:
     """A scene with what is done to it.
 
     scene : function that returns it. baseline_m : metres. lens : Lens of the projector; None: all is in focus.
-    gamma : of the projector. moved_m : way of the rig, sideways, in the whole acquisition, metres. max_depth : as for
-    `transport`.
+    gamma : of the projector. moved_m : way of the rig towards the scene in the whole acquisition, metres.
+    max_depth : as for `transport`.
     """
 
     scene: Callable[[], Scene]
@@ -147,7 +147,7 @@ CASES = {
     "ambient": Case(lambda: matte(1.0, '<emitter type="constant"><spectrum name="radiance" value="150"/></emitter>')),
     "gamma 2.2": Case(matte, gamma=2.2),
     "glass, mirror": Case(lambda: load_scene(SCENES / "tabletop.xml")),
-    "moving": Case(matte, moved_m=0.01),
+    "moving": Case(matte, moved_m=0.03),
 }
 
 
@@ -223,9 +223,9 @@ def scores_of(case_name: str, codes: dict[str, Code], spp: int, moments: int) ->
 
 
 def moved(rig: Rig, way_m: float) -> Rig:
-    """The rig, moved sideways."""
+    """The rig, moved along the axis of its camera."""
     step = np.eye(4)
-    step[0, 3] = way_m
+    step[2, 3] = way_m
     return replace(rig, T_world_camera=rig.T_world_camera @ step)
 
 
@@ -295,7 +295,7 @@ is OK. `!` means that the decoder says that the frames contradict the code.
 - *low albedo*: all reflectances of *matte* times 0.03. *ambient*: strong constant light from everywhere.
 - *gamma 2.2*: the projector shows the patterns with that gamma, and the decoder is not told.
 - *glass, mirror*: the scene `tabletop`.
-- *moving*: the rig moves sideways by 10 mm (1.7 camera pixels) in the whole acquisition.
+- *moving*: the rig moves 30 mm towards the scene in the whole acquisition, about 1.4 projector pixels.
 """
 
 
