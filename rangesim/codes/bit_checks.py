@@ -28,9 +28,9 @@ MIN_UNPAIRED = 0.75
 black. Where both are lit or both are dark, the difference is 1; a gamma makes a difference of 0.56 at most."""
 
 MAX_PAIRS = 50_000
-"""Largest number of different pairs of words on which other orders of the frames are tried. It bounds the time, which
-grows with the number of orders. Only images of noise have as many pairs. With far fewer, too few of them would lie in
-different cells (see `MIN_STEPS`)."""
+"""Largest number of pairs of neighbouring pixels, across and also down the image, on which other orders of the frames
+are tried, so that the time is bounded, which grows with the number of orders. With far fewer, too few of them would lie
+in different cells (see `MIN_STEPS`)."""
 
 MIN_STEPS = 100
 """Least number of pairs of neighbouring pixels in different cells from which a check of the order draws a

@@ -95,7 +95,8 @@ class ImageStack(Code):
         check_columns(patterns, has_white_and_black=True)
 
     def check_shown(self, size: int, shown: Sequence[str]) -> None:
-        check_columns(self._of(size, shown), has_white_and_black=True)
+        coded = [name for name in self.names(size) if name in shown]
+        check_columns(self._of(size, coded), has_white_and_black={"white", "black"} <= set(shown))
 
     def _of(self, size: int, names: Sequence[str]) -> np.ndarray:
         """Patterns (n, size) of these names."""

@@ -212,12 +212,21 @@ class StructuredLight(Sensor):
             4 * self.n_frames * self.projector_width * self.projector_height,
             f"bytes of {self.n_frames} patterns",
         )
-        shape = self.projector_height, self.projector_width
+        shape, made = (self.projector_height, self.projector_width), self._values()
+        return np.stack([np.broadcast_to(made[name], shape) for name in self.frame_names()])
+
+    def _values(self) -> dict[str, np.ndarray]:
+        """Pattern of each frame by its name: (1, width), (height, 1) or (1, 1) float32, without its equal pixels."""
         made = {WHITE: np.ones((1, 1), dtype=np.float32), BLACK: np.zeros((1, 1), dtype=np.float32)}
         for axis in self.axes:
             for name, values in zip(self.code.names(self.size(axis)), self.code.patterns(self.size(axis)), strict=True):
                 made[f"{axis}_{name}"] = values[None, :] if axis == "columns" else values[:, None]
-        return np.stack([np.broadcast_to(made[name], shape) for name in self.frame_names()])
+        return made
+
+    def shows_the_same(self, one: str, other: str) -> bool:
+        """Whether two frames, given by their names, have equal patterns."""
+        made = self._values()
+        return np.array_equal(made[one], made[other])
 
     def coded_frames(self, frames: np.ndarray, axis: str) -> tuple[list[str], np.ndarray]:
         """Names of the shown frames of an axis in the order of the code, without the axis, and the frames.
@@ -357,14 +366,17 @@ def _repeated_frames(capture: Capture) -> str | None:
     """
     if not capture.is_digital or capture.frames[0].size < MIN_PIXELS:
         return None
-    frames, names = capture.frames, capture.sensor.frame_names()
+    sensor = of_type(capture.sensor, StructuredLight)
+    frames, names = capture.frames, sensor.frame_names()
     few = frames.reshape(len(frames), -1)[:, :: 1 + frames[0].size // MAX_COMPARED]
     low, high = few.min(axis=0), few.max(axis=0)
     seen: dict[bytes, int] = {}
     for i, values in enumerate(few):
         j = seen.setdefault(values.tobytes(), i)
         is_dark, is_bright = (float((values == edge).mean()) > MAX_UNIFORM_FRACTION for edge in (low, high))
-        if j < i and not is_dark and not is_bright and np.array_equal(frames[i], frames[j]):
+        if j == i or is_dark or is_bright or not np.array_equal(frames[i], frames[j]):
+            continue
+        if not sensor.shows_the_same(names[i], names[j]):
             return (
                 f"frames {names[j]} and {names[i]} are the same image to the last digit, which no camera takes twice: "
                 "check that no file is there twice or in place of another."
