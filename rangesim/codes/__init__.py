@@ -9,6 +9,8 @@ from rangesim.codes.code import AXES, Code, CodeThresholds
 from rangesim.codes.fringes import FringeConvention
 from rangesim.codes.gray import GrayCode
 from rangesim.codes.gray_phase import GrayPhase
+from rangesim.codes.multi_frequency import Heterodyne, MultiFrequency, NumberTheoretic
+from rangesim.codes.n_step import PhaseShift
 from rangesim.codes.thresholds import GrayThresholds
 
 __all__ = [
@@ -22,4 +24,8 @@ __all__ = [
     "GrayCode",
     "GrayPhase",
     "GrayThresholds",
+    "Heterodyne",
+    "MultiFrequency",
+    "NumberTheoretic",
+    "PhaseShift",
 ]
