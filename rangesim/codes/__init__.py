@@ -18,6 +18,8 @@ from rangesim.codes.line_sweep import LineSweep
 from rangesim.codes.max_min_stripe import MaxMinStripeCode
 from rangesim.codes.micro_phase_shifting import MicroPhaseShifting
 from rangesim.codes.modulated_phase_shifting import ModulatedPhaseShifting
+from rangesim.codes.multi_frequency import Heterodyne, MultiFrequency, NumberTheoretic
+from rangesim.codes.n_step import PhaseShift
 from rangesim.codes.ramp import RampCode
 from rangesim.codes.thresholds import GrayThresholds
 from rangesim.codes.xor import XorCode
@@ -37,11 +39,15 @@ __all__ = [
     "GrayCode",
     "GrayPhase",
     "GrayThresholds",
+    "Heterodyne",
     "ImageStack",
     "LineSweep",
     "MaxMinStripeCode",
     "MicroPhaseShifting",
     "ModulatedPhaseShifting",
+    "MultiFrequency",
+    "NumberTheoretic",
+    "PhaseShift",
     "RampCode",
     "XorCode",
 ]

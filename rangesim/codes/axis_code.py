@@ -77,6 +77,7 @@ class AxisCode:
     cell_px : float, projector pixels: size of the cell to which the frames tell a place that is not sub-pixel.
     sigma_px : (h, w) float32, standard deviation of `coordinate`, projector pixels; None: not known.
     coarse : AxisCode that was refined to this one, such as Gray code by fringes; None: there is none.
+    gamma : float, exponent of the response that the fringes show, and for which their phases were corrected; 1: linear.
     """
 
     coordinate: np.ndarray
@@ -84,3 +85,4 @@ class AxisCode:
     cell_px: float
     sigma_px: np.ndarray | None = None
     coarse: AxisCode | None = None
+    gamma: float = 1.0

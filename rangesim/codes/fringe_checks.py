@@ -3,12 +3,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations, permutations
+from typing import Literal
+
 import numpy as np
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames
-from rangesim.codes.fringes import FringeConvention
-from rangesim.decoding.phase_shift import phase_of
-from rangesim.decoding.pixel_samples import MIN_PIXELS, evenly_spread
+from rangesim.codes.fringe_gamma import MAX_SAMPLES, FringeGamma
+from rangesim.codes.fringe_stack import FringeStack
+from rangesim.codes.fringes import STARTS, FringeConvention
+from rangesim.decoding.phase_shift import Phase, phase_of
+from rangesim.decoding.pixel_samples import MAX_PIXELS, MIN_PIXELS, evenly_spread
 from rangesim.decoding.status import Status
 from rangesim.robust_scale import sigma_from_median
 
@@ -54,6 +61,22 @@ MIN_SWING = 0.35
 """Least swing of fringes that the camera resolves, as a fraction of white - black. In focus the swing is 1. Out of
 focus it is still above this value if the period is wider than a few pixels of the camera."""
 
+MAX_SINUSOID_ERROR = 0.08
+"""Largest systematic difference of four or more fringes from a sinusoid, as a fraction of their swing. Two exchanged
+frames of 16 differ by 0.09; a camera that is 5 % off linear by less than 0.05."""
+
+MIN_AGREEING = 0.8
+"""Least fraction of the pixels that agree after a correction, at which the correction is named: as many as may disagree
+without a word otherwise."""
+
+MIN_ORIGIN_PX = 0.15
+"""Least difference of the start of fringes that is told, in projector pixels, below a third of that of a pixel's edge
+and its centre."""
+
+MIN_DIRECTION = 0.5
+"""Least agreement of phase and Gray code from pixel to pixel that tells the direction of the fringes: three of four
+pairs of neighbours. By chance it is 0."""
+
 MEDIAN_ERROR = 1.253
 """Ratio of the standard error of a median to that of a mean, for normally distributed values: sqrt(pi / 2)."""
 
@@ -96,7 +119,7 @@ def fringe_contradiction(
             f"{text} and reach {100 * swing:.0f} % of white - black: a period of {period_px:g} projector pixels is too "
             "fine for the camera, or out of focus; take a longer one."
         )
-    if far > MAX_FAR_FRACTION and convention.sign * _direction(gray, refined, frames) < 0:
+    if far > MAX_FAR_FRACTION and convention.sign * _direction(_inside_cell(gray, refined), gray, frames) < 0:
         return f"{text}: they seem to be shifted in the opposite direction, so check the order of their frames."
     if resultant > MIN_CONCENTRATION * np.sinc(2 * half):
         return (
@@ -111,31 +134,36 @@ def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> 
     """A sentence if the fringes contradict white and black as a whole; None if they agree.
 
     Light adds up, also the light of interreflection. So the mean of the fringes is the middle between white and black
-    at every phase. A frame that is missing or there twice moves this mean at some phases, a gamma at all phases.
+    at every phase, or what the gamma of `refined` makes of it. A frame that is missing or there twice moves this mean
+    at some phases, a gamma at all phases.
 
     Parameters
     ----------
     seen : frames (N, h, w), the fringes of the axis. gray, refined : the code before and after `refine_by_phase`.
     """
+    inside = _inside_cell(gray, refined)
+    in_many_cells = len(np.unique(gray.coordinate[inside][:: 1 + inside.size // MAX_PIXELS])) >= MIN_CELLS
+    return _level_fault(seen, inside, refined.gamma, in_many_cells)
+
+
+def _level_fault(seen: AxisFrames, usable: np.ndarray, gamma: float, in_many_cells: bool) -> str | None:
+    """As `level_contradiction`, from the pixels `usable` (h, w), which lie `in_many_cells` or fringes or not."""
     white, black, axis = seen.contrast.white, seen.contrast.black, seen.axis
     if not seen.contrast.is_measured:
         return None
-    used = evenly_spread(np.flatnonzero(_inside_cell(gray, refined) & ~seen.capture.saturated(white[None])))
+    used = evenly_spread(np.flatnonzero(usable & ~seen.capture.saturated(white[None])))
     if len(used) < MIN_PIXELS:
         return None
     dark = black.ravel()[used].astype(np.float64)
     values = (seen.frames.reshape(len(seen.frames), -1)[:, used] - dark) / (white.ravel()[used] - dark)
     phase = phase_of(values)
-    bins = np.minimum((phase.normalised * PHASE_BINS).astype(int), PHASE_BINS - 1)
-    members = [m for m in (np.flatnonzero(bins == b) for b in range(PHASE_BINS)) if len(m) >= MIN_PIXELS / 10]
+    members = _by_phase(phase.normalised)
     if not members:
         return None
-    off, noise = _medians(values.mean(axis=0) - 0.5, members)
+    off, noise = _medians(values.mean(axis=0) - _expected(phase, len(values), gamma).mean(axis=0), members)
     if np.sqrt((off**2).mean()) < MAX_LEVEL_ERROR + 3 * np.sqrt((noise**2).mean()):
         return None
-    if len(np.unique(gray.coordinate.ravel()[used])) >= MIN_CELLS and (
-        fault := _odd_frame(values, members, [seen.shown_name(name) for name in seen.names])
-    ):
+    if in_many_cells and (fault := _odd_frame(values, members, [seen.shown_name(name) for name in seen.names])):
         return f"the fringes along {axis} contradict white and black: {fault}."
     mean = 100 * float(np.median(values.mean(axis=0)))
     return (
@@ -143,6 +171,213 @@ def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> 
         "to white, expected 50 % at every phase: check that projector and camera are linear (no gamma, automatic "
         "exposure, no clipping) and that no frame is missing or repeated."
     )
+
+
+def stack_contradiction(seen: AxisFrames, code: AxisCode, stack: FringeStack) -> str | None:
+    """A sentence if the fringes of a stack contradict white and black, a sinusoid, or each other; None if they agree.
+
+    Parameters
+    ----------
+    seen : frames (n, h, w), those of the stack. code : what `FringeStack.decode` or `refine_by_phase` made of them.
+    """
+    usable = ((code.status == Status.OK) | (code.status == Status.CODE_ERROR)) & seen.contrast.is_enough
+    for i in range(len(stack.steps)):
+        one = stack.frames_of(seen, i)
+        if code.coarse is None and (text := _level_fault(one, usable, code.gamma, True)):
+            return text
+        if text := _sinusoid_fault(one, usable, stack.gamma(seen, i, usable, code.coarse is not None)):
+            return text
+    return _agreement_fault(seen, code, stack, usable) if code.coarse is None else None
+
+
+def _sinusoid_fault(seen: AxisFrames, usable: np.ndarray, gamma: FringeGamma) -> str | None:
+    """A sentence if no sinusoid of any gamma explains the fringes of one period; None if one does."""
+    if not gamma.is_explained and len(seen.frames) == 3:
+        return (
+            f"the fringes along {seen.axis} are no sinusoids ({seen.shown_name(seen.names[0])} and next), and no gamma "
+            "explains their shape: check that projector and camera are linear and that no frame is repeated."
+        )
+    used = evenly_spread(np.flatnonzero(usable))
+    used = used[:: 1 + len(used) // MAX_SAMPLES]
+    if len(used) < MIN_PIXELS or len(seen.frames) == 3:
+        return None
+    frames = seen.frames.reshape(len(seen.frames), -1)[:, used].astype(np.float64)
+    if _misfit(frames, gamma) < MAX_SINUSOID_ERROR:
+        return None
+    names, steps = [seen.shown_name(name) for name in seen.names], len(frames)
+    least, pairs = 0.5 * _misfit(frames, gamma), []
+    for i, j in combinations(range(steps), 2):
+        order = list(range(steps))
+        order[i], order[j] = j, i
+        if _misfit(frames[order], FringeGamma()) < least:
+            pairs.append(f"{names[i]} and {names[j]}")
+    # With four steps, to exchange the first two is to exchange the last two, and to turn the direction.
+    fault = f"frames {', or '.join(pairs)} seem to be exchanged" if pairs else ""
+    modulation = phase_of(frames).modulation
+    for i in range(steps):
+        for j in range(i):
+            if np.median(np.abs(frames[i] - frames[j]) / modulation) < 0.1 * np.sin(np.pi * (i - j) / steps):
+                fault = f"frame {names[i]} repeats {names[j]}"
+    fault = fault or "check the number of steps, the order of the frames, and that none is missing or repeated"
+    return f"the fringes along {seen.axis} are no sinusoids shifted in {steps} equal steps: {fault}."
+
+
+def _misfit(frames: np.ndarray, gamma: FringeGamma) -> float:
+    """Systematic difference of fringes (N, n) from a sinusoid, beyond noise, as a fraction of their swing."""
+    phase = phase_of(frames)
+    true = gamma.corrected(phase, len(frames))
+    model = _expected(true, len(frames), gamma.gamma)
+    modulation = np.maximum(phase.modulation, 1e-12)
+    scale = modulation / np.maximum(phase_of(model).modulation, 1e-12)
+    swing = np.sqrt(2) * np.maximum(frames.std(axis=0), 1e-12)  # the modulation, if the fringes are sinusoids
+    rest = (frames - frames.mean(axis=0) - scale * (model - model.mean(axis=0))) / swing
+    members = _by_phase(phase.normalised)
+    if not members:
+        return 0.0
+    found = [_medians(values, members) for values in rest]
+    excess = np.mean([off**2 - 9 * noise**2 for off, noise in found])
+    return float(np.sqrt(max(excess, 0.0)))
+
+
+def _agreement_fault(seen: AxisFrames, code: AxisCode, stack: FringeStack, usable: np.ndarray) -> str | None:
+    """A sentence if the phases of several periods do not agree on places of the axis; None if they do."""
+    used = evenly_spread(np.flatnonzero(usable))
+    used = used[:: 1 + len(used) // MAX_SAMPLES]
+    if len(stack.steps) == 1 or len(used) < MIN_PIXELS:
+        return None
+    refused = float((code.status.ravel()[used] == Status.CODE_ERROR).mean())
+    if refused <= MAX_FAR_FRACTION:
+        return None
+    frames = seen.frames.reshape(len(seen.frames), -1)[:, used]
+    phases = [phase_of(stack.of_period(frames, i)).normalised for i in range(len(stack.steps))]
+    text = f"the fringes along {seen.axis} contradict each other at {100 * refused:.0f} % of the pixels"
+    places = [stack.convention.place_turns(t, p) for t, p in zip(phases, stack.periods_px, strict=True)]
+    for fault, other in _other_places(stack, phases, places):
+        if float(stack.agrees(other, seen.size).mean()) > MIN_AGREEING:
+            return f"{text}: {fault}."
+    return f"{text}: check the periods ({', '.join(f'{p:g}' for p in stack.periods_px)} pixels) and their order."
+
+
+def _other_places(
+    stack: FringeStack, phases: list[np.ndarray], places: list[np.ndarray]
+) -> Iterator[tuple[str, list[np.ndarray]]]:
+    """Faults that fringes may have, each with the places in turns that would be right if it were corrected."""
+    count, convention = len(places), stack.convention
+    if len(set(stack.steps)) == 1:
+        for order in permutations(range(count)):
+            if order != tuple(range(count)) and count <= 4:
+                shown = ", ".join(f"{stack.periods_px[k]:g}" for k in order)
+                pairs = zip([phases[order.index(k)] for k in range(count)], stack.periods_px, strict=True)
+                moved = [convention.place_turns(t, p) for t, p in pairs]
+                yield f"their periods seem to be shown in the order {shown} pixels", moved
+    other = replace(convention, direction="backward" if convention.sign > 0 else "forward")
+    flipped = [other.place_turns(t, p) for t, p in zip(phases, stack.periods_px, strict=True)]
+    yield "they seem to be shifted in the opposite direction, so check the order of their frames", flipped
+    for i, period in enumerate(stack.periods_px):
+        name = f"those of {period:g} pixels seem"
+        turned = [*places[:i], flipped[i], *places[i + 1 :]]
+        yield f"{name} to be shifted in the opposite direction, so check the order of their frames", turned
+        for turns in sorted({k / stack.steps[i] for k in range(1, stack.steps[i])} | {0.25, 0.5, 0.75}):
+            for there, fault in ((places[i], "start elsewhere"), (flipped[i], "run the other way and start elsewhere")):
+                elsewhere = [*places[:i], (there + np.float32(turns)) % 1, *places[i + 1 :]]
+                yield f"{name} to {fault}, so check the order of their frames", elsewhere
+
+
+def measured_convention(
+    seen: AxisFrames, gray: AxisCode, period_px: float, given: FringeConvention
+) -> FringeConvention | None:
+    """The convention with which fringes agree best with the Gray code of the same axis; None if none does.
+
+    The places that the phases tell must lie within their Gray cells. Their mean difference, as an angle, tells where
+    the fringes start, for each of the two directions. `given` is returned if it fits within its uncertainty; else the
+    nearest of the known starts at a pixel's edge or centre; else one whose `origin_px` is what was measured.
+
+    Parameters
+    ----------
+    seen : frames (N, h, w), the fringes of the axis, with their contrast. gray : code of the axis.
+    period_px : float, projector pixels. given : FringeConvention that the user stated.
+    """
+    fit = _offset(seen, gray, period_px)
+    if fit is None:
+        return None
+    sign, turns, error = fit
+    tolerance = max(3 * error, MIN_ORIGIN_PX / period_px)
+    direction: Literal["forward", "backward"] = "forward" if sign > 0 else "backward"
+
+    def away(convention: FringeConvention) -> float:
+        return abs(float(_wrapped(np.asarray(turns - convention.shift_turns(0, 1, period_px)))))
+
+    if given.direction == direction and away(given) <= tolerance:
+        return given
+    known = [FringeConvention(start, direction, x) for start in STARTS for x in (0.0, 0.5)]  # type: ignore[arg-type]
+    nearest = min(known, key=away)
+    if away(nearest) <= tolerance:
+        return nearest
+    at_start = replace(nearest, origin_px=0.0)
+    rest = float(_wrapped(np.asarray(turns - at_start.shift_turns(0, 1, period_px)))) * period_px
+    return replace(at_start, origin_px=round(rest, 3))
+
+
+def convention_fit(seen: AxisFrames, gray: AxisCode, period_px: float, convention: FringeConvention) -> float:
+    """Fraction of pixels, 0 to 1, whose place by a convention lies in their Gray cell or a 32nd of a period beyond.
+
+    By chance it is the cell and a 16th of a period, over the period. Parameters as for `measured_convention`.
+    """
+    used = _gray_pixels(seen, gray)
+    if not len(used):
+        return 0.0
+    phase = phase_of(seen.frames.reshape(len(seen.frames), -1)[:, used])
+    place = convention.place_turns(phase.normalised, period_px)
+    off = _wrapped(place - gray.coordinate.ravel()[used] / np.float32(period_px))
+    return float((np.abs(off) <= gray.cell_px / (2 * period_px) + FAR_TURNS / 4).mean())
+
+
+def _offset(seen: AxisFrames, gray: AxisCode, period_px: float) -> tuple[int, float, float] | None:
+    """Direction of fringes (1 or -1), their shift in turns, and its standard error; None if Gray code tells none.
+
+    With place = direction * phase + shift, in turns, the shift is the mean of gray / period - direction * phase.
+    """
+    used = _gray_pixels(seen, gray)
+    if len(used) < MIN_PIXELS:
+        return None
+    phase = phase_of(seen.frames.reshape(len(seen.frames), -1)[:, used])
+    within = gray.coordinate.ravel()[used] / np.float32(period_px)
+    mask = np.zeros(gray.status.size, dtype=bool)
+    mask[used] = True
+    # Cells of half a period lie alike for both directions, so that neighbouring pixels must tell.
+    direction = _direction(mask.reshape(gray.status.shape), gray, seen.frames)
+    if abs(direction) < MIN_DIRECTION:
+        return None
+    sign = 1 if direction > 0 else -1
+    off = within - sign * phase.normalised
+    turns, resultant = _circular_mean(off)
+    if resultant < MIN_CONCENTRATION * float(np.sinc(gray.cell_px / period_px)):
+        return None
+    _, cell, counts = np.unique(gray.coordinate.ravel()[used], return_inverse=True, return_counts=True)
+    of_cells = np.bincount(cell, weights=_wrapped(off - turns)) / counts  # a cell that is seen in part has another mean
+    return sign, turns, float(of_cells.std() / len(counts) ** 0.5)
+
+
+def _gray_pixels(seen: AxisFrames, gray: AxisCode) -> np.ndarray:
+    """(n,) int, flat indices of pixels within a Gray cell, not on an edge, whose fringes swing enough to compare."""
+    inside = ((gray.coordinate / gray.cell_px) % 1 == 0.5) & (gray.status == Status.OK)
+    inside &= ~seen.capture.saturated(seen.frames)
+    used = evenly_spread(np.flatnonzero(inside))
+    swing = 2 * phase_of(seen.frames.reshape(len(seen.frames), -1)[:, used]).modulation
+    return np.asarray(used[swing > 0.5 * MIN_SWING * seen.contrast.values.ravel()[used]])
+
+
+def _expected(phase: Phase, steps: int, gamma: float) -> np.ndarray:
+    """(N, n) values from 0 to 1 of fringes of these phases, with a gamma."""
+    shifts = np.arange(steps)[:, None] / steps
+    turns = phase.normalised.astype(np.float64)[None]
+    return np.asarray((0.5 + 0.5 * np.cos(2 * np.pi * (turns - shifts))) ** gamma)
+
+
+def _by_phase(normalised: np.ndarray) -> list[np.ndarray]:
+    """Indices of the pixels in each part of the period that holds enough of them."""
+    bins = np.minimum((normalised * PHASE_BINS).astype(int), PHASE_BINS - 1)
+    return [m for m in (np.flatnonzero(bins == b) for b in range(PHASE_BINS)) if len(m) >= MIN_PIXELS / 10]
 
 
 def _odd_frame(values: np.ndarray, members: list[np.ndarray], names: list[str]) -> str | None:
@@ -184,12 +419,12 @@ def _inside_cell(gray: AxisCode, refined: AxisCode) -> np.ndarray:
     return np.asarray(inside & is_strong & (gray.status == Status.OK))
 
 
-def _direction(gray: AxisCode, refined: AxisCode, frames: np.ndarray) -> float:
+def _direction(usable: np.ndarray, gray: AxisCode, frames: np.ndarray) -> float:
     """Agreement of phase and Gray code from pixel to pixel: 1 if both grow the same way, -1 if the opposite way.
 
-    It is 0 if there are no neighbours in neighbouring cells.
+    It is 0 if no pixels `usable` (h, w) bool are neighbours in neighbouring cells.
     """
-    usable, cell = _inside_cell(gray, refined), gray.coordinate / gray.cell_px
+    cell = gray.coordinate / gray.cell_px
     agreement, pairs = 0.0, 0
     for here, there in (
         (np.s_[..., :, :-1], np.s_[..., :, 1:]),

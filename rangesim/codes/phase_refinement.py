@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames
+from rangesim.codes.fringe_gamma import gamma_of
 from rangesim.codes.fringes import FringeConvention
 from rangesim.decoding.phase_shift import PhaseThresholds, modulation_is_weak, phase_of, phase_sigma
 from rangesim.decoding.row_bands import bands
@@ -22,9 +23,10 @@ def refine_by_phase(
 ) -> AxisCode:
     """Sub-pixel coordinate: of all places with the phase of the fringes, the one nearest to the Gray coordinate.
 
-    Gray cells are half a period at most, so the right place lies at most a quarter of a period off the centre of its
-    cell. An eighth of a period more is allowed for noise and for camera pixels across the edge of a cell. If the place
-    lies farther off, code and phase contradict each other (`CODE_ERROR`).
+    The right place lies at most half a cell off the centre of its cell. An eighth of a period more is allowed for noise
+    and for camera pixels across the edge of a cell. If the place lies farther off, code and phase contradict each other
+    (`CODE_ERROR`). If the cells are larger than half a period, so is a place that may belong to two cycles: one whose
+    next cycle lies within that range, too. The phases are corrected for the gamma that the fringes show.
 
     Parameters
     ----------
@@ -35,18 +37,24 @@ def refine_by_phase(
     capture, frames = seen.capture, seen.frames
     coordinate, status = np.empty_like(gray.coordinate), gray.status.copy()
     sigma_px = None if capture.noise(frames[0, :1]) is None else np.empty_like(gray.coordinate)
+    saturated = capture.saturated(frames)
+    gamma = gamma_of(seen, (status == Status.OK) & ~saturated, seen.contrast.values)
+    reach = gray.cell_px / 2 + period_px / 8
+    if gray.cell_px <= period_px:  # coarser cells are those of a place that fringes have refined before
+        reach = min(reach, period_px - reach)  # a place that is farther off has a second cycle within the range
     for rows in bands(len(status)):
-        phase, whole, refused = phase_of(frames[:, rows]), gray.coordinate[rows], status[rows]
+        phase = gamma.corrected(phase_of(frames[:, rows]), len(frames))
+        whole, refused = gray.coordinate[rows], status[rows]
         sigma = phase_sigma(capture, phase, len(frames))
         place = convention.place_turns(phase.normalised, period_px)
         periods = np.rint(whole / np.float32(period_px) - place)
         coordinate[rows] = (periods + place) * np.float32(period_px)
         ok = refused == Status.OK
-        contradiction = np.abs(coordinate[rows] - whole) > gray.cell_px / 2 + period_px / 8
+        contradiction = np.abs(coordinate[rows] - whole) > reach
         washed_out = 2 * phase.modulation < least_swing[rows]  # like fringes that are seen by interreflection alone
         refused[ok & contradiction] = Status.CODE_ERROR
         refused[ok & (modulation_is_weak(capture, phase, sigma, thresholds) | washed_out)] = Status.LOW_SIGNAL
-        refused[ok & capture.saturated(frames[:, rows])] = Status.SATURATED
+        refused[ok & saturated[rows]] = Status.SATURATED
         if sigma_px is not None and sigma is not None:
             np.multiply(sigma, period_px / (2 * np.pi), out=sigma_px[rows], casting="same_kind")
-    return AxisCode(coordinate, status, gray.cell_px, sigma_px, coarse=gray)
+    return AxisCode(coordinate, status, gray.cell_px, sigma_px, gray, gamma.gamma)

@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stacks of fringes of one or several periods: their patterns, and the place on which all their phases agree.
+
+References
+----------
+- Huntley, Saldner: "Temporal phase-unwrapping algorithm for automated interferogram analysis", Applied Optics 32
+  (1993): the coarsest period covers all, and each finer one is unwrapped by those before.
+- Reich, Ritter, Thesing: "White light heterodyne principle for 3D-measurement", Proc. SPIE 3100 (1997): the beat of
+  similar periods covers all.
+- Gushov, Solodkin: "Automatic processing of fringe patterns in integer interferometers", Optics and Lasers in
+  Engineering 14 (1991): periods without a common divisor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rangesim.codes.axis_code import AxisCode, AxisFrames
+from rangesim.codes.fringe_gamma import FringeGamma, gamma_of
+from rangesim.codes.fringe_kernels import agree, mean_place
+from rangesim.codes.fringes import FringeConvention
+from rangesim.decoding.phase_shift import PhaseThresholds, modulation_is_weak, phase_of, phase_sigma
+from rangesim.decoding.row_bands import bands
+from rangesim.decoding.status import Status
+from rangesim.response import Fringes
+
+MAX_MISFIT_TURNS = 1 / 8
+"""Largest distance of any phase from the place that was found, in turns. It is four standard deviations of the noisiest
+phase that is accepted (`PhaseThresholds.max_sigma_rad`, 0.2)."""
+
+WIDEST_TURNS = 1 / 4
+"""Distance from the coarsest phase, in turns, up to which candidates are searched: twice the largest misfit, so that
+the second best is known where the best is accepted."""
+
+MAX_AMBIGUITY = 0.25
+"""Largest cost of the best place as a fraction of that of the second best. At 1/4 the best place is half as far from
+the phases as the second; noise would have to move the phases by two thirds of the way between both to deceive, and at
+half of it the pixel counts as ambiguous."""
+
+MIN_APART_TURNS = 0.005
+"""Least distance of any two places of the axis in the space of the phases, in turns. A camera of 8 bits tells a phase
+of full contrast to 0.0005 turns; closer places could not be told apart even then."""
+
+MIN_PRECISION = 0.1
+"""Least precision (inverse variance) of a period, as a fraction of the finest one's, at which its phase is averaged
+into the place. What is less would gain less than 5 % of the standard deviation, and brings the errors of a coarse
+phase in."""
+
+
+@dataclass(frozen=True)
+class FringeStack:
+    """Fringes of one or several periods, shown one period after the other.
+
+    periods_px : (K,) float, projector pixels, in the order in which they are shown. steps : (K,) int, phase shifts of
+        each period. convention : FringeConvention of all of them.
+    """
+
+    periods_px: tuple[float, ...]
+    steps: tuple[int, ...]
+    convention: FringeConvention
+
+    def names(self) -> list[str]:
+        """One name per frame: phase0, ... of a single period, period0_phase0, ... of several."""
+        if len(self.steps) == 1:
+            return [f"phase{s}" for s in range(self.steps[0])]
+        return [f"period{i}_phase{s}" for i, steps in enumerate(self.steps) for s in range(steps)]
+
+    def patterns(self, size: int) -> np.ndarray:
+        """(n, size) float32, at the centres of the projector's pixels."""
+        x, pairs = np.arange(size) + 0.5, zip(self.periods_px, self.steps, strict=True)
+        shown = [self.convention.pattern(x, period, s, steps) for period, steps in pairs for s in range(steps)]
+        return np.array(shown, dtype=np.float32)
+
+    def responses(self, axis: int) -> tuple[Fringes, ...]:
+        """One per period, with the channels cosine and sine."""
+        return tuple(Fringes(axis, period) for period in self.periods_px)
+
+    def frames(self, channels: Sequence[np.ndarray], white: np.ndarray) -> Iterator[np.ndarray]:
+        """Radiance (h, w) of each frame, from the channels (2, h, w) of each period."""
+        for period, steps, (cosine, sine) in zip(self.periods_px, self.steps, channels, strict=True):
+            for step in range(steps):
+                shift = 2 * math.pi * self.convention.shift_turns(step, steps, period)
+                yield 0.5 * (white + math.cos(shift) * cosine + math.sin(shift) * sine)
+
+    def of_period(self, frames: np.ndarray, i: int) -> np.ndarray:
+        """The frames (N, ...) of period i, a view."""
+        start = sum(self.steps[:i])
+        return frames[start : start + self.steps[i]]
+
+    def frames_of(self, seen: AxisFrames, i: int) -> AxisFrames:
+        """The frames of period i of those that `names` lists."""
+        start = sum(self.steps[:i])
+        run = slice(start, start + self.steps[i])
+        return seen._replace(names=seen.names[run], frames=seen.frames[run])
+
+    def gamma(self, seen: AxisFrames, i: int, usable: np.ndarray, has_bits: bool) -> FringeGamma:
+        """What the fringes of period i tell of the response, from the pixels `usable` (h, w) bool.
+
+        `has_bits` tells whether the capture has other frames of the axis, from which white - black is estimated well.
+        """
+        scale: np.ndarray | None = None
+        if seen.contrast.is_measured or has_bits:
+            scale = seen.contrast.values
+        elif len(self.steps) > 1:  # the means of the other periods change with other phases
+            others = [k for k in range(len(self.steps)) if k != i]
+            scale = np.mean([self.of_period(seen.frames, k).mean(axis=0, dtype=np.float32) for k in others], axis=0)
+        return gamma_of(self.frames_of(seen, i), usable, scale)
+
+    def apart(self, size: int) -> tuple[float, float]:
+        """Least distance of two places in the space of the phases, in turns, and their distance in projector pixels.
+
+        Only places that lie more than half of the finest period apart count; those nearer are told by its phase.
+        """
+        periods = np.array(self.periods_px)
+        base = float(periods.min())
+        cycles = np.arange(1, math.floor(size / base + 1e-9) + 1)
+        steps = np.concatenate([cycles * base + shift for shift in np.linspace(-0.25, 0.25, 51) * base])
+        steps = steps[(steps > base / 2) & (steps < size * (1 - 1e-6))]
+        if not len(steps):
+            return 0.5, float(size)
+        turns = steps[:, None] / periods
+        distance = np.sqrt(((turns - np.rint(turns)) ** 2).sum(axis=1))
+        nearest = int(np.argmin(distance))
+        return float(distance[nearest]), float(steps[nearest])
+
+    def check(self, size: int) -> None:
+        """Raise ValueError if the phases do not tell `size` projector pixels apart."""
+        distance, repeat = self.apart(size)
+        if distance < MIN_APART_TURNS:
+            periods = ", ".join(f"{p:g}" for p in self.periods_px)
+            what = "a period" if len(self.periods_px) == 1 else "periods"
+            raise ValueError(
+                f"expected {what} that tell{'s' if len(self.periods_px) == 1 else ''} {size} projector pixels apart, "
+                f"got {periods}, whose phases repeat after {repeat:.4g} pixels: add a period of at least {size} "
+                "(multi-frequency), or Gray code (gray-phase)."
+            )
+
+    def agrees(self, places: list[np.ndarray], size: int) -> np.ndarray:
+        """(n,) bool, where the places within the periods, K of (n,) turns in the order of the stack, agree on one."""
+        order = np.argsort(self.periods_px, kind="stable")
+        periods = np.array(self.periods_px)[order]
+        turns = np.stack([places[i] for i in order]).astype(np.float32)
+        weights = np.broadcast_to((1 / periods**2)[:, None], turns.shape).astype(np.float32)
+        low, high = np.zeros_like(turns[0]), np.full_like(turns[0], size)
+        place, misfit, ambiguity = np.empty((3, turns.shape[1]), dtype=np.float32)
+        agree(turns, weights, periods, low, high, WIDEST_TURNS, place, misfit, ambiguity)
+        return (misfit <= MAX_MISFIT_TURNS) & (ambiguity <= MAX_AMBIGUITY)
+
+    def decode(
+        self,
+        seen: AxisFrames,
+        low: np.ndarray | float,
+        high: np.ndarray | float,
+        least_swing: np.ndarray | float,
+        thresholds: PhaseThresholds,
+        coarse: AxisCode | None = None,
+    ) -> AxisCode:
+        """The place between `low` and `high` on which all phases agree; `CODE_ERROR` where they do not, or on several.
+
+        Parameters
+        ----------
+        seen : frames (n, h, w), those of `names`. low, high : (h, w) or float, projector pixels.
+        least_swing : (h, w) or float, least difference between the brightest and the darkest fringe, in the capture's
+            units. coarse : AxisCode that tells `low` and `high`; pixels that it refuses stay refused.
+        """
+        capture, frames = seen.capture, seen.frames
+        shape = frames.shape[1:]
+        status = np.zeros(shape, dtype=np.uint8) if coarse is None else coarse.status.copy()
+        coordinate = np.empty(shape, dtype=np.float32)
+        sigma_px = None if capture.noise(frames[0, :1]) is None else np.empty(shape, dtype=np.float32)
+        saturated = capture.saturated(frames)
+        usable = (status == Status.OK) & seen.contrast.is_enough & ~saturated
+        gammas = [self.gamma(seen, i, usable, coarse is not None) for i in range(len(self.steps))]
+        order = np.argsort(self.periods_px, kind="stable")
+        periods = np.array(self.periods_px)[order]
+        precision = np.array(self.steps)[order] / periods**2
+        kept = np.flatnonzero(precision >= MIN_PRECISION * precision[0])
+        lows, highs, swings = (np.broadcast_to(np.float32(x), shape) for x in (low, high, least_swing))
+        for rows in bands(shape[0]):
+            refused = status[rows]
+            places, weights = np.empty((2, len(order), *refused.shape), dtype=np.float32)
+            variance = np.zeros(refused.shape, dtype=np.float32)
+            weak = np.zeros(refused.shape, dtype=bool)
+            for k, i in enumerate(order):
+                steps, period = self.steps[i], self.periods_px[i]
+                phase = gammas[i].corrected(phase_of(self.of_period(frames, i)[:, rows]), steps)
+                sigma = phase_sigma(capture, phase, steps)
+                weak |= modulation_is_weak(capture, phase, sigma, thresholds)
+                weak |= 2 * phase.modulation < swings[rows]
+                places[k] = self.convention.place_turns(phase.normalised, period)
+                weights[k] = steps * (phase.modulation / period) ** 2
+                if sigma is not None and k == 0:
+                    variance = (sigma * np.float32(period / (2 * math.pi))) ** 2
+            flat, inverse = places.reshape(len(order), -1), weights.reshape(len(order), -1)
+            margin = np.minimum(3 * np.sqrt(variance).ravel(), np.float32(periods[0]))  # infinite without any swing
+            place, misfit, ambiguity = np.empty((3, refused.size), dtype=np.float32)
+            # The noise may put a place beyond an end of the axis: then the other end is as likely.
+            start, end = lows[rows].ravel() - margin, highs[rows].ravel() + margin
+            agree(flat, inverse, periods, start, end, WIDEST_TURNS, place, misfit, ambiguity)
+            precise = inverse[0] > 0
+            if len(kept) > 1:
+                mean_place(flat[kept], inverse[kept], periods[kept], place)
+            coordinate[rows] = place.reshape(refused.shape)
+            disagrees = (misfit > MAX_MISFIT_TURNS) | (ambiguity > MAX_AMBIGUITY) | ~precise
+            ok = refused == Status.OK
+            refused[ok & disagrees.reshape(refused.shape)] = Status.CODE_ERROR
+            refused[ok & weak] = Status.LOW_SIGNAL
+            refused[ok & saturated[rows]] = Status.SATURATED
+            if sigma_px is not None:
+                gain = inverse[0] / np.maximum(inverse[kept].sum(axis=0), np.float32(1e-30))
+                sigma_px[rows] = np.sqrt(variance * gain.reshape(refused.shape))
+        cell_px = float(periods[0]) if coarse is None else coarse.cell_px
+        gamma = float(np.median([g.gamma for g in gammas]))
+        return AxisCode(coordinate, status, cell_px, sigma_px, coarse, gamma)

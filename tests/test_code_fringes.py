@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Phase shift, several periods, and Gray cells of any size: every column decodes to itself, or is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from synthetic import plane_signals, stereo_rig
+
+from rangesim.capture import Capture
+from rangesim.capture.exposure import expose
+from rangesim.codes import (
+    AxisFrames,
+    Code,
+    CodeThresholds,
+    FringeConvention,
+    GrayPhase,
+    GrayThresholds,
+    Heterodyne,
+    MultiFrequency,
+    NumberTheoretic,
+    PhaseShift,
+)
+from rangesim.codes.contrast import direct_contrast
+from rangesim.codes.fringe_checks import convention_fit, measured_convention
+from rangesim.decoding import decode
+from rangesim.decoding.phase_shift import PhaseThresholds
+from rangesim.decoding.status import Status
+from rangesim.electronics.detector import Detector
+from rangesim.errors import RangesimWarning
+from rangesim.rig import Intrinsics
+from rangesim.sensors import StructuredLight, StructuredLightDecoder
+
+
+def seen_flat(code: Code, size: int, order: tuple[str, ...] = (), **settings: float) -> tuple[np.ndarray, np.ndarray]:
+    """Column and status of a camera that sees each projector pixel with one of its own."""
+    sensor = StructuredLight(size, 8, code, order=order)
+    seen = StructuredLightDecoder().coordinates(Capture(sensor.patterns(), sensor))
+    assert seen.column is not None
+    return seen.column, seen.status
+
+
+CODES = [
+    PhaseShift(),
+    PhaseShift(steps=3),
+    PhaseShift(steps=16),
+    PhaseShift(2000.0, 5),
+    MultiFrequency(),
+    MultiFrequency(steps=3),
+    MultiFrequency((18.0, 150.0, 2000.0), steps_each=(5, 3, 4)),
+    Heterodyne(),
+    Heterodyne(steps=3),
+    NumberTheoretic(),
+    NumberTheoretic((40.0, 41.0)),
+    GrayPhase(cell_px=7),
+    GrayPhase(20.0, 3, cell_px=10),
+    GrayPhase(200 / 3, 3, cell_px=100, further_periods_px=(100.0,)),
+]
+
+
+@pytest.mark.parametrize("code", CODES, ids=repr)
+@pytest.mark.parametrize("size", [64, 333, 1280])
+@pytest.mark.parametrize("order", [(), ("columns_*",)])
+def test_every_column_decodes_to_itself(code: Code, size: int, order: tuple[str, ...]) -> None:
+    column, status = seen_flat(code, size, order)
+    assert (status == Status.OK).all()
+    np.testing.assert_allclose(column, np.broadcast_to(np.arange(size) + 0.5, column.shape), atol=0.02)
+
+
+@pytest.mark.parametrize("start", ["cos", "sin", "-cos", "-sin", "cos-120", "cos+120"])
+@pytest.mark.parametrize("direction", ["forward", "backward"])
+@pytest.mark.parametrize("origin_px", [0.0, 0.5, -3.2])
+def test_every_convention_decodes(start: str, direction: str, origin_px: float) -> None:
+    convention = FringeConvention(start, direction, origin_px)  # type: ignore[arg-type]
+    for code in (PhaseShift(steps=3), MultiFrequency(), Heterodyne(), GrayPhase(convention=convention)):
+        column, status = seen_flat(replace(code, convention=convention), 150)  # type: ignore[type-var]
+        assert (status == Status.OK).all()
+        np.testing.assert_allclose(column[0], np.arange(150) + 0.5, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("code", "repeat"),
+    [(PhaseShift(500.0), "500"), (MultiFrequency((200 / 3, 100.0)), "200"), (NumberTheoretic((12.0, 15.0)), "60")],
+)
+def test_periods_that_repeat_within_the_axis_are_refused(code: Code, repeat: str) -> None:
+    with pytest.raises(ValueError, match=f"phases repeat after {repeat} pixels: add a period of at least 640"):
+        code.check(640)
+
+
+def test_cells_that_fringes_repeat_in_are_refused() -> None:
+    with pytest.raises(ValueError, match="expected cell_px to be at most the period"):
+        GrayPhase(16.0, cell_px=20).check(640)
+    with pytest.raises(ValueError, match="phases repeat after 40 pixels"):
+        GrayPhase(10.0, cell_px=50, further_periods_px=(40.0,)).check(640)
+
+
+def test_cells_as_large_as_a_period_are_never_read_a_period_off() -> None:
+    """A wrong bit at the edge of a cell is corrected or refused."""
+    sensor = StructuredLight(640, 8, GrayPhase(16.0, cell_px=16))
+    frames = np.roll(sensor.patterns(), 0)
+    shown = [i for i, name in enumerate(sensor.frame_names()) if "bit" in name]
+    frames[shown] = np.roll(frames[shown], 1, axis=2)  # the bits come from the neighbouring pixel
+    seen = StructuredLightDecoder().coordinates(Capture(frames, sensor))
+    assert seen.column is not None
+    off = np.abs(seen.column - (np.arange(640) + 0.5))[:, 1:]
+    ok = seen.status[:, 1:] == Status.OK
+    assert off[ok].max() < 0.02
+    assert ok.mean() > 0.7
+
+
+# ---- Noise ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("steps", [3, 4, 8])
+@pytest.mark.parametrize("kind", [PhaseShift, MultiFrequency, Heterodyne])
+def test_the_noise_of_a_place_follows_its_law(kind: type[Code], steps: int) -> None:
+    """sigma_u = P / (2 pi) sqrt(2 / N) sigma_I / B of the finest period."""
+    code = kind(steps=steps)  # type: ignore[call-arg]
+    size = 320
+    sensor = StructuredLight(size, 48, code)
+    rig = stereo_rig(160, 120, projector=Intrinsics.from_fov(size, 48, 60))
+    clean = expose(plane_signals(rig, sensor), sensor)
+    noisy = expose(plane_signals(rig, sensor), sensor, Detector())
+    decoder = StructuredLightDecoder()
+    expected, seen = decoder.coordinates(clean), decoder.coordinates(noisy)
+    assert expected.column is not None
+    assert seen.column is not None
+    assert seen.column_sigma_px is not None
+    ok = (expected.status == Status.OK) & (seen.status == Status.OK)
+    assert ok.mean() > 0.2
+    pull = (seen.column - expected.column)[ok] / seen.column_sigma_px[ok]
+    assert np.abs(pull).max() < 8  # none is a cycle off
+    assert float(np.sqrt(np.mean(pull**2))) == pytest.approx(1, abs=0.12)
+    if kind is PhaseShift:
+        modulation = 0.5 * (seen.confidence * noisy.full_scale)[ok]
+        noise = noisy.noise(noisy.frames[:steps].mean(axis=0).astype(np.float32))
+        assert noise is not None
+        law = size / (2 * math.pi) * math.sqrt(2 / steps) * noise[ok] / modulation
+        np.testing.assert_allclose(seen.column_sigma_px[ok], law, rtol=0.15)
+
+
+# ---- Gamma ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("gamma", [1.8, 2.2, 2.6])
+@pytest.mark.parametrize("steps", [3, 4, 5])
+@pytest.mark.parametrize("code", [GrayPhase(), MultiFrequency((16.0, 160.0, 1280.0)), Heterodyne()], ids=repr)
+@pytest.mark.parametrize("order", [(), ("columns_*",)])
+def test_a_gamma_is_measured_and_corrected(code: Code, steps: int, gamma: float, order: tuple[str, ...]) -> None:
+    code = replace(code, steps=steps)  # type: ignore[type-var]
+    sensor = StructuredLight(1280, 8, code, order=order)
+    fringes = [i for i, name in enumerate(sensor.frame_names()) if "phase" in name]
+    x = np.linspace(1, 1279, 4001)
+    frames = np.empty((sensor.n_frames, 4, len(x)), dtype=np.float32)
+    at = np.minimum(x.astype(int), 1279)
+    frames[:] = sensor.patterns()[:, :1, at]
+    stack = code.stack if isinstance(code, GrayPhase) else code.stack(1280)  # type: ignore[attr-defined]
+    shown = [
+        stack.convention.pattern(x, p, s, n)
+        for p, n in zip(stack.periods_px, stack.steps, strict=True)
+        for s in range(n)
+    ]
+    frames[fringes] = np.array(shown)[:, None] ** gamma
+    seen = StructuredLightDecoder().coordinates(Capture(0.1 + frames, sensor))
+    assert seen.column is not None
+    ok = seen.status == Status.OK
+    assert ok.mean() > 0.98
+    off = (seen.column - x)[ok]
+    assert float(np.sqrt(np.mean(off**2))) < 0.05
+    assert not seen.is_doubted
+
+
+def test_a_gamma_of_the_projector_is_corrected_in_a_rendered_capture() -> None:
+    linear = StructuredLight(code=GrayPhase(steps=3))
+    truth = decode(expose(plane_signals(stereo_rig(), linear), linear))
+    sensor = replace(linear, projector_gamma=2.2)
+    image = decode(expose(plane_signals(stereo_rig(), sensor), sensor))
+    assert truth.projector_column is not None
+    assert image.projector_column is not None
+    both = truth.valid & image.valid
+    assert both.mean() > 0.95 * truth.valid.mean()
+    off = (image.projector_column - truth.projector_column)[both]
+    assert float(np.sqrt(np.mean(off**2))) < 0.4  # a table shows uniform pixels: 0.29 px are their width
+
+
+# ---- Frames that contradict themselves ------------------------------------------------------------------------------
+
+
+def warned(code: Code, change: str, order: tuple[str, ...] = ("columns_*",)) -> str:
+    sensor = StructuredLight(640, 8, code, order=order)
+    frames = sensor.patterns()
+    if change == "swapped":
+        frames[[0, 1]] = frames[[1, 0]]
+    elif change == "repeated":
+        frames[1] = frames[0]
+    with pytest.warns(RangesimWarning) as caught:
+        StructuredLightDecoder().coordinates(Capture(0.1 + frames, sensor))
+    return str(caught[0].message)
+
+
+def test_exchanged_and_repeated_fringes_are_named_without_white_and_black() -> None:
+    assert "columns_period0_phase0 and columns_period0_phase1, or" in warned(MultiFrequency(), "swapped")
+    assert "period0_phase1 repeats columns_period0_phase0" in warned(MultiFrequency(), "repeated")
+    assert "columns_phase1 repeats columns_phase0" in warned(PhaseShift(), "repeated")
+    text = warned(MultiFrequency(steps=3), "swapped")
+    assert "contradict each other" in text
+    assert "those of 640 pixels seem to run the other way" in text
+
+
+def test_periods_in_another_order_and_other_periods_are_named() -> None:
+    sensor = StructuredLight(640, 8, MultiFrequency((640.0, 100.0, 16.0)))
+    capture = Capture(0.1 + sensor.patterns(), sensor)
+    other = replace(sensor, code=MultiFrequency((16.0, 100.0, 640.0)))
+    with pytest.warns(RangesimWarning, match=r"shown in the order 640, 100, 16 pixels"):
+        StructuredLightDecoder().coordinates(replace(capture, sensor=other))
+    other = replace(sensor, code=MultiFrequency((640.0, 100.0, 17.0)))
+    with pytest.warns(RangesimWarning, match=r"check the periods \(640, 100, 17 pixels\)"):
+        StructuredLightDecoder().coordinates(replace(capture, sensor=other))
+
+
+# ---- Conventions ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("start", ["cos", "sin", "-cos", "-sin"])
+@pytest.mark.parametrize("direction", ["forward", "backward"])
+@pytest.mark.parametrize("origin_px", [0.0, 0.5, 2.7])
+def test_the_convention_is_measured_from_the_frames(start: str, direction: str, origin_px: float) -> None:
+    shown = FringeConvention(start, direction, origin_px)  # type: ignore[arg-type]
+    sensor = StructuredLight(640, 8, GrayPhase(convention=shown))
+    capture = Capture(0.1 + sensor.patterns(), sensor)
+    axis = AxisFrames(
+        capture,
+        "columns",
+        640,
+        *sensor.coded_frames(capture.frames, "columns"),
+        direct_contrast(capture, capture.frames[-2], capture.frames[-1], GrayThresholds()),
+    )
+    gray = sensor.code.decode(axis, CodeThresholds(GrayThresholds(), PhaseThresholds())).coarse
+    assert gray is not None
+    fringes = axis.starting_with("phase")
+    found = measured_convention(fringes, gray, 16.0, FringeConvention())
+    assert found is not None
+    assert found.direction == direction
+    off = found.shift_turns(0, 1, 16.0) - shown.shift_turns(0, 1, 16.0)
+    assert 16 * abs(off - round(off)) < 0.15
+    assert measured_convention(fringes, gray, 16.0, shown) == shown
+    assert measured_convention(fringes, gray, 23.0, shown) is None
+    assert convention_fit(fringes, gray, 16.0, found) > 0.99
+    assert convention_fit(fringes, gray, 16.0, replace(shown, origin_px=origin_px + 8)) < 0.3
+
+
+# ---- Real captures --------------------------------------------------------------------------------------------------
+
+CAPTURES = Path(__file__).resolve().parents[1] / "shared" / "data" / "captures"
+if not CAPTURES.is_dir():
+    CAPTURES = Path("/work/shared/data/captures")
+
+
+def images(folder: str, pattern: str) -> np.ndarray:
+    files = sorted((CAPTURES / folder).glob(pattern))
+    if not files:
+        pytest.skip(f"{CAPTURES / folder} is not there")
+    return np.stack([np.asarray(Image.open(file)) for file in files])
+
+
+@pytest.mark.validation
+def test_slstudio_2x3_agrees_with_its_formula() -> None:
+    """Its cue of one period chooses one of 16 cycles; columns are counted there from the first pixel's centre."""
+    frames = images("slstudio_skull_2x3", "frameSeq_*.png")
+    code = MultiFrequency((114.0, 1824.0), 3, convention=FringeConvention(origin_px=0.5))
+    sensor = StructuredLight(1824, 1140, code, order=("columns_*",))
+    seen = StructuredLightDecoder().coordinates(Capture(frames, sensor))
+    a, b, c, d, e, f = frames.astype(np.float64)
+    fine, cue = (np.arctan2(3**0.5 * (q - r), 2 * p - q - r) / (2 * np.pi) % 1 for p, q, r in ((a, b, c), (d, e, f)))
+    column = (np.rint(16 * cue - fine) + fine) * 114 + 0.5
+    ok = seen.status == Status.OK
+    assert ok.mean() > 0.19
+    assert seen.column is not None
+    off = np.abs(seen.column - column)[ok]
+    assert (off < 0.01).mean() > 0.9999  # the rest lies at the ends of the axis, where the formula leaves it
+    assert not seen.is_doubted
+
+
+@pytest.mark.validation
+def test_kamino410_decodes_with_two_periods_in_cells_of_100_pixels() -> None:
+    """Both periods have their own phase, so their places agree only with the right convention."""
+    frames = images("kamino410_object1", "pat*.png")
+    code = GrayPhase(200 / 3, 3, FringeConvention("cos-120", "backward", 0.5), 100, (100.0,))
+    order = (
+        *(f"{axis}_period{i}_*" for axis in ("columns", "rows") for i in (0, 1)),
+        *("columns_bit*", "rows_bit*", "white", "black"),
+    )
+    sensor = StructuredLight(1920, 1080, code, ("columns", "rows"), order)
+    seen = StructuredLightDecoder().coordinates(Capture(frames, sensor))
+    assert not seen.is_doubted
+    white = frames[30].astype(int) - frames[31] > 40
+    assert (seen.status == Status.OK).mean() > 0.54
+    assert (seen.status == Status.OK)[white].mean() > 0.98
+    assert (seen.status == Status.CODE_ERROR).mean() < 0.002
