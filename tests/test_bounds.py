@@ -20,6 +20,7 @@ from synthetic import plane_signals, stereo_rig
 import rangesim
 from rangesim import decode, explain, expose
 from rangesim.codes import AxisCode, Code, FringeConvention, GrayPhase, GrayThresholds
+from rangesim.codes.fringe_gamma import FringeGamma
 from rangesim.decoding.disparities import Disparities, ImageNoise
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
@@ -338,7 +339,7 @@ MODULES = (
     "response.correlation",
     *(f"codes.{module.name}" for module in pkgutil.iter_modules(rangesim.codes.__path__)),
 )
-RESULTS = {Disparities, ProjectorCoordinates, Phase, *AxisCode.__subclasses__(), AxisCode}
+RESULTS = {Disparities, ProjectorCoordinates, Phase, FringeGamma, AxisCode, *AxisCode.__subclasses__()}
 
 
 def test_every_setting_has_a_case() -> None:

@@ -172,7 +172,7 @@ def test_a_gamma_is_measured_and_corrected(code: Code, steps: int, gamma: float,
     assert ok.mean() > 0.98
     off = (seen.column - x)[ok]
     assert float(np.sqrt(np.mean(off**2))) < 0.05
-    assert not seen.is_doubted
+    assert not seen.doubts
 
 
 def test_a_gamma_of_the_projector_is_corrected_in_a_rendered_capture() -> None:
@@ -283,7 +283,7 @@ def test_slstudio_2x3_agrees_with_its_formula() -> None:
     assert seen.column is not None
     off = np.abs(seen.column - column)[ok]
     assert (off < 0.01).mean() > 0.9999  # the rest lies at the ends of the axis, where the formula leaves it
-    assert not seen.is_doubted
+    assert not seen.doubts
 
 
 @pytest.mark.validation
@@ -297,7 +297,7 @@ def test_kamino410_decodes_with_two_periods_in_cells_of_100_pixels() -> None:
     )
     sensor = StructuredLight(1920, 1080, code, ("columns", "rows"), order)
     seen = StructuredLightDecoder().coordinates(Capture(frames, sensor))
-    assert not seen.is_doubted
+    assert not seen.doubts
     white = frames[30].astype(int) - frames[31] > 40
     assert (seen.status == Status.OK).mean() > 0.54
     assert (seen.status == Status.OK)[white].mean() > 0.98
