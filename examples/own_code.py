@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A structured-light code of your own, in one file: fringes of several periods, with their decoder.
+"""A structured-light code of your own, in one file: triangles instead of sinusoids.
 
-The frames are fringes alone, without Gray code. The coarsest period covers the projector, and each finer one is
-unwrapped by the one before (temporal phase unwrapping: Huntley and Saldner, Applied Optics 32, 1993). Every command
-takes it:
+Each period is shown as four triangle waves, shifted by quarters of the period. The two differences of opposite patterns
+tell the place within the period: they are linear in it, so no arctangent is needed (Jia, Kofman, English: "Two-step
+triangular-pattern phase-shifting method for three-dimensional object-shape measurement", Optical Engineering 46, 2007).
+Two periods, of which the coarse one covers the projector, tell the place. Every command takes the code:
 
-    rangesim run tabletop --sensor examples/own_code.py:MultiFrequency --sensor gray-phase --out out/fringes
-    rangesim calibrate pose_*/ --sensor examples/own_code.py:MultiFrequency --projector 1280x800 --points 9x6
+    rangesim run tabletop --sensor examples/own_code.py:TriangleWaves --sensor phase-shift --out out/triangles
+    rangesim calibrate pose_*/ --sensor examples/own_code.py:TriangleWaves --projector 1280x800 --points 9x6
         --spacing 0.025 --out rig.json
-    rangesim decode images --sensor examples/own_code.py:MultiFrequency --projector 1280x800 --axes columns,rows
+    rangesim decode images --sensor examples/own_code.py:TriangleWaves --projector 1280x800 --axes columns,rows
         --calibration rig.json --out out/decoded
 
 Usage: python examples/own_code.py
@@ -16,135 +17,83 @@ Usage: python examples/own_code.py
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from rangesim import Capture, Decoder, Sensor, Status, compare, decode, expose, load_scene, transport
-from rangesim.decoding.phase_shift import PhaseThresholds, modulation_is_weak, phase_of, phase_sigma
-from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
-from rangesim.response import Fringes
-from rangesim.sensor import Background, Emitter, FrameContent, of_type
+from rangesim import Status, StructuredLight, compare, decode, expose, load_scene, transport
+from rangesim.codes import AxisCode, AxisFrames, Code, CodeThresholds
+from rangesim.sensor import Background, FrameContent
+
+SHIFTS = 4
+"""Patterns of each period, shifted by quarters of it."""
 
 
 @dataclass(frozen=True)
-class MultiFrequency(Sensor):
-    """Fringes of several periods. Frames: axis by axis, period by period, coarse to fine, `steps` phase shifts each.
+class TriangleWaves(Code):
+    """Triangle waves of two periods: one as long as the axis, and one `ratio` times finer.
 
     Parameters
     ----------
-    width, height : int, pixels of the projector.
-    ratio : float, ratio of each period to the next finer one. periods : int, number of periods.
-    steps : int >= 3, number of phase shifts.
-    axes : "columns" suffices to triangulate; calibration needs "rows" as well.
+    ratio : int, ratio of the two periods.
     """
 
-    width: int = 1280
-    height: int = 800
-    ratio: float = 8.0
-    periods: int = 3
-    steps: int = 4
-    axes: tuple[str, ...] = ("columns",)
+    ratio: int = 16
 
-    type_name: ClassVar[str] = "multi-frequency"
+    type_name: ClassVar[str] = "triangle-waves"
+    title: ClassVar[str] = "Structured light (triangle waves)"
 
-    def periods_px(self, axis: str) -> list[float]:
-        """Periods along an axis, projector pixels, coarse to fine."""
-        size = self.width if axis == "columns" else self.height
-        return [size / self.ratio**i for i in range(self.periods)]
+    def names(self, size: int) -> list[str]:
+        return [f"{period}{shift}" for period in ("coarse", "fine") for shift in range(SHIFTS)]
 
-    def responses(self) -> tuple[Fringes, ...]:
-        return tuple(Fringes(int(axis == "rows"), period) for axis in self.axes for period in self.periods_px(axis))
+    def patterns(self, size: int) -> np.ndarray:
+        turns = np.outer((1, self.ratio), (np.arange(size) + 0.5) / size)
+        shifted = turns[:, None] - np.arange(SHIFTS)[:, None] / SHIFTS
+        return (np.abs(2 * (shifted % 1) - 1)).reshape(-1, size).astype(np.float32)
 
-    def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
-        shifts = 2 * np.pi * np.arange(self.steps) / self.steps
-        shown = [0.5 * (white + np.cos(s) * cosine + np.sin(s) * sine) for cosine, sine in channels for s in shifts]
-        return (np.stack(shown) + ambient).astype(np.float32)
+    def decode(self, seen: AxisFrames, thresholds: CodeThresholds) -> AxisCode:
+        coarse, fine = (np.asarray(f, np.float32) for f in (seen.frames[:SHIFTS], seen.frames[SHIFTS:]))
+        status = np.full(coarse.shape[1:], Status.OK, dtype=np.uint8)
+        turn = place(fine)
+        coordinate = (np.rint(place(coarse) * self.ratio - turn) + turn) * seen.size / self.ratio
+        status[(coordinate < 0) | (coordinate > seen.size)] = Status.CODE_ERROR
+        sigma_px = None
+        for period_px, waves in ((seen.size, coarse), (seen.size / self.ratio, fine)):
+            noise = seen.capture.noise(waves.mean(axis=0))
+            if noise is not None:  # a quarter of the period is as long as the swing of a difference of two frames
+                sigma_px = np.sqrt(2) * noise * (period_px / SHIFTS) / np.maximum(swing(waves), 1e-9)
+                weak = sigma_px > thresholds.phase.max_sigma_rad / (2 * np.pi) * period_px
+            elif seen.capture.is_digital:
+                weak = swing(waves) < 2 * thresholds.phase.modulation_of_scale * seen.capture.full_scale
+            else:
+                weak = swing(waves) <= thresholds.phase.relative_modulation * waves.mean(axis=0)
+            status[weak] = Status.LOW_SIGNAL
+        status[seen.capture.saturated(seen.frames)] = Status.SATURATED
+        return AxisCode(coordinate.astype(np.float32), status, seen.size / self.ratio, sigma_px)
 
-    def frame_names(self) -> list[str]:
-        return [f"{axis}{i}_phase{s}" for axis in self.axes for i in range(self.periods) for s in range(self.steps)]
-
-    def for_projector(self, width: int, height: int, axes: Sequence[str] | None = None) -> MultiFrequency:
-        return replace(self, width=width, height=height, axes=self.axes if axes is None else tuple(axes))
-
-    def check(self, width: int, height: int) -> None:
-        if (width, height) != (self.width, self.height):
-            raise ValueError(f"expected a projector of {self.width} x {self.height} pixels, got {width} x {height}.")
-
-    @property
-    def default_emitter(self) -> Emitter:
-        return Emitter((self.width, self.height))
-
-    @property
-    def default_decoder(self) -> TemporalUnwrapping:
-        return TemporalUnwrapping()
-
-    @property
-    def title(self) -> str:
-        return "Structured light (fringes of several periods)"
+    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
+        return thresholds.phase.least_signal(SHIFTS, 1 / np.pi, FrameContent(), background)
 
     @property
     def details(self) -> str:
-        return f"{self.steps}-step fringes of {', '.join(f'{p:g}' for p in self.periods_px(self.axes[0]))} px"
-
-    def representative_frames(self, frames: np.ndarray) -> list[int]:
-        return [i * self.steps for i in range(self.periods)][:3]
+        return f"{SHIFTS} triangle waves of two periods, ratio {self.ratio}"
 
 
-@dataclass(frozen=True)
-class TemporalUnwrapping(Decoder):
-    """Decodes a place from the coarsest phase, and refines it by each finer one.
+def place(waves: np.ndarray) -> np.ndarray:
+    """(h, w) place within the period, in turns, 0 to 1, of four triangle waves (4, h, w)."""
+    first, second = waves[0] - waves[2], waves[1] - waves[3]
+    quarter = second / np.maximum(np.abs(first) + np.abs(second), 1e-20)
+    return np.asarray(0.25 * np.where(first >= 0, quarter, 2 - quarter) % 1)
 
-    Parameters
-    ----------
-    phase : PhaseThresholds of every period. triangulation : TriangulationLimits.
-    """
 
-    phase: PhaseThresholds = field(default_factory=PhaseThresholds)
-    triangulation: TriangulationLimits = field(default_factory=TriangulationLimits)
-
-    type_name: ClassVar[str] = "temporal-unwrapping"
-    reads: ClassVar[type[Sensor]] = MultiFrequency
-
-    def coordinates(self, capture: Capture) -> ProjectorCoordinates:
-        sensor = of_type(capture.sensor, MultiFrequency)
-        status = np.full(capture.frames.shape[1:], Status.OK, dtype=np.uint8)
-        coordinate: dict[str, np.ndarray] = {}
-        sigma_px: dict[str, np.ndarray] = {}
-        for axis, frames in zip(sensor.axes, np.split(capture.frames, len(sensor.axes)), strict=True):
-            periods_px = sensor.periods_px(axis)
-            phases = [phase_of(shifted) for shifted in np.split(frames, sensor.periods)]
-            place = phases[0].normalised * periods_px[0]
-            for phase, period_px in zip(phases[1:], periods_px[1:], strict=True):
-                place = (np.rint(place / period_px - phase.normalised) + phase.normalised) * period_px
-            status[(place < 0) | (place > periods_px[0])] = Status.CODE_ERROR
-            for phase in phases:
-                sigma = phase_sigma(capture, phase, sensor.steps)  # after the loop, that of the finest period
-                status[modulation_is_weak(capture, phase, sigma, self.phase)] = Status.LOW_SIGNAL
-            coordinate[axis] = place
-            if sigma is not None:
-                sigma_px[axis] = sigma * periods_px[-1] / (2 * np.pi)
-        status[capture.saturated(capture.frames)] = Status.SATURATED
-        return ProjectorCoordinates(
-            column=coordinate.get("columns"),
-            row=coordinate.get("rows"),
-            column_sigma_px=sigma_px.get("columns"),
-            row_sigma_px=sigma_px.get("rows"),
-            status=status,
-            confidence=2 * phases[-1].modulation / capture.full_scale,
-            intensity=phases[-1].mean - np.float32(capture.black_level),
-            limits=self.triangulation,
-        )
-
-    def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        least = self.phase.least_signal(of_type(sensor, MultiFrequency).steps, 0.5, FrameContent(), background)
-        return np.maximum(least, background.floor(0.0))
+def swing(waves: np.ndarray) -> np.ndarray:
+    """(h, w) difference between the top and the bottom of the waves (4, h, w)."""
+    return np.asarray(np.abs(waves[0] - waves[2]) + np.abs(waves[1] - waves[3]))
 
 
 def main() -> None:
-    sensor = MultiFrequency()
+    sensor = StructuredLight(code=TriangleWaves())
     scene = load_scene("matte")
     size, baseline_m = sensor.default_emitter
     signals = transport(scene, scene.rig(baseline_m, size, width=320, height=240), [sensor], spp=16)

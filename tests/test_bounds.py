@@ -17,7 +17,16 @@ from synthetic import plane_signals, stereo_rig
 
 import rangesim
 from rangesim import decode, explain, expose
-from rangesim.codes import FringeConvention, GrayCode, GrayPhase, GrayThresholds
+from rangesim.codes import (
+    FringeConvention,
+    GrayCode,
+    GrayPhase,
+    GrayThresholds,
+    Heterodyne,
+    MultiFrequency,
+    NumberTheoretic,
+    PhaseShift,
+)
 from rangesim.decoding.disparities import Disparities, ImageNoise
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
@@ -197,6 +206,10 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (StructuredLight(64, 48), use_sensor),
     (GrayCode(2), lambda code: use_sensor(StructuredLight(64, 48, code))),
     (GrayPhase(), lambda code: use_sensor(StructuredLight(64, 48, code))),
+    (PhaseShift(), lambda code: use_sensor(StructuredLight(64, 48, code))),
+    (MultiFrequency(), lambda code: use_sensor(StructuredLight(64, 48, code))),
+    (Heterodyne(), lambda code: use_sensor(StructuredLight(64, 48, code))),
+    (NumberTheoretic(), lambda code: use_sensor(StructuredLight(64, 48, code))),
     (FringeConvention(), lambda c: use_sensor(StructuredLight(64, 48, GrayPhase(convention=c)))),
     (AmcwToF(), use_sensor),
     (AmcwToF(waveform="square"), use_sensor),
@@ -325,7 +338,7 @@ MODULES = (
         "decoding.disparities",
     ),
     "geometry.dense_stereo",
-    *("codes.thresholds", "codes.fringes", "codes.gray", "codes.gray_phase"),
+    *("codes.thresholds", "codes.fringes", "codes.gray", "codes.gray_phase", "codes.multi_frequency", "codes.n_step"),
 )
 RESULTS = {Disparities, ProjectorCoordinates, Phase}
 

@@ -5,23 +5,31 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from synthetic import plane_signals, stereo_rig
 
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
 from rangesim.codes import (
+    AxisFrames,
     Code,
+    CodeThresholds,
     FringeConvention,
     GrayPhase,
+    GrayThresholds,
     Heterodyne,
     MultiFrequency,
     NumberTheoretic,
     PhaseShift,
 )
+from rangesim.codes.contrast import direct_contrast
+from rangesim.codes.fringe_checks import convention_fit, measured_convention
 from rangesim.decoding import decode
+from rangesim.decoding.phase_shift import PhaseThresholds
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.errors import RangesimWarning
@@ -111,7 +119,7 @@ def test_cells_as_large_as_a_period_are_never_read_a_period_off() -> None:
 @pytest.mark.parametrize("steps", [3, 4, 8])
 @pytest.mark.parametrize("kind", [PhaseShift, MultiFrequency, Heterodyne])
 def test_the_noise_of_a_place_follows_its_law(kind: type[Code], steps: int) -> None:
-    """sigma_u = P / (2 pi) sqrt(2 / N) sigma_I / B of the finest period; of three similar ones, a third of the variance."""
+    """sigma_u = P / (2 pi) sqrt(2 / N) sigma_I / B of the finest period."""
     code = kind(steps=steps)  # type: ignore[call-arg]
     size = 320
     sensor = StructuredLight(size, 48, code)
@@ -124,14 +132,12 @@ def test_the_noise_of_a_place_follows_its_law(kind: type[Code], steps: int) -> N
     assert seen.column is not None
     assert seen.column_sigma_px is not None
     ok = (expected.status == Status.OK) & (seen.status == Status.OK)
-    assert ok.mean() > 0.4
+    assert ok.mean() > 0.2
     pull = (seen.column - expected.column)[ok] / seen.column_sigma_px[ok]
     assert np.abs(pull).max() < 8  # none is a cycle off
     assert float(np.sqrt(np.mean(pull**2))) == pytest.approx(1, abs=0.12)
     if kind is PhaseShift:
         modulation = 0.5 * (seen.confidence * noisy.full_scale)[ok]
-        place = clean.frames[:steps].mean(axis=0)
-        del place
         noise = noisy.noise(noisy.frames[:steps].mean(axis=0).astype(np.float32))
         assert noise is not None
         law = size / (2 * math.pi) * math.sqrt(2 / steps) * noise[ok] / modulation
@@ -198,12 +204,12 @@ def warned(code: Code, change: str, order: tuple[str, ...] = ("columns_*",)) -> 
 
 
 def test_exchanged_and_repeated_fringes_are_named_without_white_and_black() -> None:
-    assert "period0_phase0 and columns_period0_phase1 seem to be exchanged" in warned(MultiFrequency(), "swapped")
+    assert "columns_period0_phase0 and columns_period0_phase1, or" in warned(MultiFrequency(), "swapped")
     assert "period0_phase1 repeats columns_period0_phase0" in warned(MultiFrequency(), "repeated")
     assert "columns_phase1 repeats columns_phase0" in warned(PhaseShift(), "repeated")
     text = warned(MultiFrequency(steps=3), "swapped")
     assert "contradict each other" in text
-    assert "those of 640 pixels seem to be shifted in the opposite direction" in text
+    assert "those of 640 pixels seem to run the other way" in text
 
 
 def test_periods_in_another_order_and_other_periods_are_named() -> None:
@@ -215,3 +221,84 @@ def test_periods_in_another_order_and_other_periods_are_named() -> None:
     other = replace(sensor, code=MultiFrequency((640.0, 100.0, 17.0)))
     with pytest.warns(RangesimWarning, match=r"check the periods \(640, 100, 17 pixels\)"):
         StructuredLightDecoder().coordinates(replace(capture, sensor=other))
+
+
+# ---- Conventions ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("start", ["cos", "sin", "-cos", "-sin"])
+@pytest.mark.parametrize("direction", ["forward", "backward"])
+@pytest.mark.parametrize("origin_px", [0.0, 0.5, 2.7])
+def test_the_convention_is_measured_from_the_frames(start: str, direction: str, origin_px: float) -> None:
+    shown = FringeConvention(start, direction, origin_px)  # type: ignore[arg-type]
+    sensor = StructuredLight(640, 8, GrayPhase(convention=shown))
+    capture = Capture(0.1 + sensor.patterns(), sensor)
+    axis = AxisFrames(
+        capture,
+        "columns",
+        640,
+        *sensor.coded_frames(capture.frames, "columns"),
+        direct_contrast(capture, capture.frames[-2], capture.frames[-1], GrayThresholds()),
+    )
+    gray = sensor.code.decode(axis, CodeThresholds(GrayThresholds(), PhaseThresholds())).coarse
+    assert gray is not None
+    fringes = axis.starting_with("phase")
+    found = measured_convention(fringes, gray, 16.0, FringeConvention())
+    assert found is not None
+    assert found.direction == direction
+    off = found.shift_turns(0, 1, 16.0) - shown.shift_turns(0, 1, 16.0)
+    assert 16 * abs(off - round(off)) < 0.15
+    assert measured_convention(fringes, gray, 16.0, shown) == shown
+    assert measured_convention(fringes, gray, 23.0, shown) is None
+    assert convention_fit(fringes, gray, 16.0, found) > 0.99
+    assert convention_fit(fringes, gray, 16.0, replace(shown, origin_px=origin_px + 8)) < 0.3
+
+
+# ---- Real captures --------------------------------------------------------------------------------------------------
+
+CAPTURES = Path(__file__).resolve().parents[1] / "shared" / "data" / "captures"
+if not CAPTURES.is_dir():
+    CAPTURES = Path("/work/shared/data/captures")
+
+
+def images(folder: str, pattern: str) -> np.ndarray:
+    files = sorted((CAPTURES / folder).glob(pattern))
+    if not files:
+        pytest.skip(f"{CAPTURES / folder} is not there")
+    return np.stack([np.asarray(Image.open(file)) for file in files])
+
+
+@pytest.mark.validation
+def test_slstudio_2x3_agrees_with_its_formula() -> None:
+    """Its cue of one period chooses one of 16 cycles; columns are counted there from the first pixel's centre."""
+    frames = images("slstudio_skull_2x3", "frameSeq_*.png")
+    code = MultiFrequency((114.0, 1824.0), 3, convention=FringeConvention(origin_px=0.5))
+    sensor = StructuredLight(1824, 1140, code, order=("columns_*",))
+    seen = StructuredLightDecoder().coordinates(Capture(frames, sensor))
+    a, b, c, d, e, f = frames.astype(np.float64)
+    fine, cue = (np.arctan2(3**0.5 * (q - r), 2 * p - q - r) / (2 * np.pi) % 1 for p, q, r in ((a, b, c), (d, e, f)))
+    column = (np.rint(16 * cue - fine) + fine) * 114 + 0.5
+    ok = seen.status == Status.OK
+    assert ok.mean() > 0.19
+    assert seen.column is not None
+    off = np.abs(seen.column - column)[ok]
+    assert (off < 0.01).mean() > 0.9999  # the rest lies at the ends of the axis, where the formula leaves it
+    assert not seen.is_doubted
+
+
+@pytest.mark.validation
+def test_kamino410_decodes_with_two_periods_in_cells_of_100_pixels() -> None:
+    """Both periods have their own phase, so their places agree only with the right convention."""
+    frames = images("kamino410_object1", "pat*.png")
+    code = GrayPhase(200 / 3, 3, FringeConvention("cos-120", "backward", 0.5), 100, (100.0,))
+    order = (
+        *(f"{axis}_period{i}_*" for axis in ("columns", "rows") for i in (0, 1)),
+        *("columns_bit*", "rows_bit*", "white", "black"),
+    )
+    sensor = StructuredLight(1920, 1080, code, ("columns", "rows"), order)
+    seen = StructuredLightDecoder().coordinates(Capture(frames, sensor))
+    assert not seen.is_doubted
+    white = frames[30].astype(int) - frames[31] > 40
+    assert (seen.status == Status.OK).mean() > 0.54
+    assert (seen.status == Status.OK)[white].mean() > 0.98
+    assert (seen.status == Status.CODE_ERROR).mean() < 0.002

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import permutations
-from typing import Literal, cast
+from itertools import combinations, permutations
+from typing import Literal
 
 import numpy as np
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames
-from rangesim.codes.fringe_gamma import MAX_SAMPLES, FringeGamma, gamma_of
+from rangesim.codes.fringe_gamma import MAX_SAMPLES, FringeGamma
 from rangesim.codes.fringe_stack import FringeStack
 from rangesim.codes.fringes import STARTS, FringeConvention
 from rangesim.decoding.phase_shift import Phase, phase_of
@@ -62,7 +62,7 @@ MIN_SWING = 0.35
 focus it is still above this value if the period is wider than a few pixels of the camera."""
 
 MAX_SINUSOID_ERROR = 0.08
-"""Largest systematic difference of four or more fringes from a sinusoid, as a fraction of the modulation. Two exchanged
+"""Largest systematic difference of four or more fringes from a sinusoid, as a fraction of their swing. Two exchanged
 frames of 16 differ by 0.09; a camera that is 5 % off linear by less than 0.05."""
 
 MIN_AGREEING = 0.8
@@ -70,11 +70,12 @@ MIN_AGREEING = 0.8
 without a word otherwise."""
 
 MIN_ORIGIN_PX = 0.15
-"""Least difference of the start of fringes that is told, in projector pixels, below a third of that of a pixel's edge and
-its centre."""
+"""Least difference of the start of fringes that is told, in projector pixels, below a third of that of a pixel's edge
+and its centre."""
 
-PARTIAL_CELL = 0.3
-"""Standard deviation of the mean place in a cell that is seen in part, in cells: that of an even distribution."""
+MIN_DIRECTION = 0.5
+"""Least agreement of phase and Gray code from pixel to pixel that tells the direction of the fringes: three of four
+pairs of neighbours. By chance it is 0."""
 
 MEDIAN_ERROR = 1.253
 """Ratio of the standard error of a median to that of a mean, for normally distributed values: sqrt(pi / 2)."""
@@ -118,7 +119,7 @@ def fringe_contradiction(
             f"{text} and reach {100 * swing:.0f} % of white - black: a period of {period_px:g} projector pixels is too "
             "fine for the camera, or out of focus; take a longer one."
         )
-    if far > MAX_FAR_FRACTION and convention.sign * _direction(gray, refined, frames) < 0:
+    if far > MAX_FAR_FRACTION and convention.sign * _direction(_inside_cell(gray, refined), gray, frames) < 0:
         return f"{text}: they seem to be shifted in the opposite direction, so check the order of their frames."
     if resultant > MIN_CONCENTRATION * np.sinc(2 * half):
         return (
@@ -133,8 +134,8 @@ def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> 
     """A sentence if the fringes contradict white and black as a whole; None if they agree.
 
     Light adds up, also the light of interreflection. So the mean of the fringes is the middle between white and black
-    at every phase, or what the gamma of `refined` makes of it. A frame that is missing or there twice moves this mean at
-    some phases, a gamma at all phases.
+    at every phase, or what the gamma of `refined` makes of it. A frame that is missing or there twice moves this mean
+    at some phases, a gamma at all phases.
 
     Parameters
     ----------
@@ -184,14 +185,13 @@ def stack_contradiction(seen: AxisFrames, code: AxisCode, stack: FringeStack) ->
         one = stack.frames_of(seen, i)
         if code.coarse is None and (text := _level_fault(one, usable, code.gamma, True)):
             return text
-        if text := _sinusoid_fault(one, usable):
+        if text := _sinusoid_fault(one, usable, stack.gamma(seen, i, usable, code.coarse is not None)):
             return text
     return _agreement_fault(seen, code, stack, usable) if code.coarse is None else None
 
 
-def _sinusoid_fault(seen: AxisFrames, usable: np.ndarray) -> str | None:
-    """A sentence if no sinusoid, also of any gamma, explains the fringes of one period, four or more; None if one does."""
-    gamma = gamma_of(seen, usable)
+def _sinusoid_fault(seen: AxisFrames, usable: np.ndarray, gamma: FringeGamma) -> str | None:
+    """A sentence if no sinusoid of any gamma explains the fringes of one period; None if one does."""
     if not gamma.is_explained and len(seen.frames) == 3:
         return (
             f"the fringes along {seen.axis} are no sinusoids ({seen.shown_name(seen.names[0])} and next), and no gamma "
@@ -205,13 +205,14 @@ def _sinusoid_fault(seen: AxisFrames, usable: np.ndarray) -> str | None:
     if _misfit(frames, gamma) < MAX_SINUSOID_ERROR:
         return None
     names, steps = [seen.shown_name(name) for name in seen.names], len(frames)
-    best, fault = 0.5 * _misfit(frames, gamma), ""
-    for i in range(steps):
-        for j in range(i):
-            order = list(range(steps))
-            order[i], order[j] = j, i
-            if (misfit := _misfit(frames[order], FringeGamma())) < best:
-                best, fault = misfit, f"frames {names[j]} and {names[i]} seem to be exchanged"
+    least, pairs = 0.5 * _misfit(frames, gamma), []
+    for i, j in combinations(range(steps), 2):
+        order = list(range(steps))
+        order[i], order[j] = j, i
+        if _misfit(frames[order], FringeGamma()) < least:
+            pairs.append(f"{names[i]} and {names[j]}")
+    # With four steps, to exchange the first two is to exchange the last two, and to turn the direction.
+    fault = f"frames {', or '.join(pairs)} seem to be exchanged" if pairs else ""
     modulation = phase_of(frames).modulation
     for i in range(steps):
         for j in range(i):
@@ -222,13 +223,14 @@ def _sinusoid_fault(seen: AxisFrames, usable: np.ndarray) -> str | None:
 
 
 def _misfit(frames: np.ndarray, gamma: FringeGamma) -> float:
-    """Systematic difference of fringes (N, n) from a sinusoid of their phase, beyond noise, as a fraction of modulation."""
+    """Systematic difference of fringes (N, n) from a sinusoid, beyond noise, as a fraction of their swing."""
     phase = phase_of(frames)
     true = gamma.corrected(phase, len(frames))
     model = _expected(true, len(frames), gamma.gamma)
     modulation = np.maximum(phase.modulation, 1e-12)
     scale = modulation / np.maximum(phase_of(model).modulation, 1e-12)
-    rest = (frames - frames.mean(axis=0) - scale * (model - model.mean(axis=0))) / modulation
+    swing = np.sqrt(2) * np.maximum(frames.std(axis=0), 1e-12)  # the modulation, if the fringes are sinusoids
+    rest = (frames - frames.mean(axis=0) - scale * (model - model.mean(axis=0))) / swing
     members = _by_phase(phase.normalised)
     if not members:
         return 0.0
@@ -273,12 +275,12 @@ def _other_places(
     yield "they seem to be shifted in the opposite direction, so check the order of their frames", flipped
     for i, period in enumerate(stack.periods_px):
         name = f"those of {period:g} pixels seem"
-        one = [*places[:i], flipped[i], *places[i + 1 :]]
-        yield f"{name} to be shifted in the opposite direction, so check the order of their frames", one
+        turned = [*places[:i], flipped[i], *places[i + 1 :]]
+        yield f"{name} to be shifted in the opposite direction, so check the order of their frames", turned
         for turns in sorted({k / stack.steps[i] for k in range(1, stack.steps[i])} | {0.25, 0.5, 0.75}):
-            for there in (places[i], flipped[i]):
-                moved = (there + np.float32(turns)) % 1
-                yield f"{name} to start elsewhere, so check the order of their frames", [*places[:i], moved, *places[i + 1 :]]
+            for there, fault in ((places[i], "start elsewhere"), (flipped[i], "run the other way and start elsewhere")):
+                elsewhere = [*places[:i], (there + np.float32(turns)) % 1, *places[i + 1 :]]
+                yield f"{name} to {fault}, so check the order of their frames", elsewhere
 
 
 def measured_convention(
@@ -300,7 +302,7 @@ def measured_convention(
         return None
     sign, turns, error = fit
     tolerance = max(3 * error, MIN_ORIGIN_PX / period_px)
-    direction = cast(Literal["forward", "backward"], "forward" if sign > 0 else "backward")
+    direction: Literal["forward", "backward"] = "forward" if sign > 0 else "backward"
 
     def away(convention: FringeConvention) -> float:
         return abs(float(_wrapped(np.asarray(turns - convention.shift_turns(0, 1, period_px)))))
@@ -317,9 +319,9 @@ def measured_convention(
 
 
 def convention_fit(seen: AxisFrames, gray: AxisCode, period_px: float, convention: FringeConvention) -> float:
-    """Fraction of pixels, 0 to 1, whose place by a convention lies in their Gray cell or an eighth of a period beyond.
+    """Fraction of pixels, 0 to 1, whose place by a convention lies in their Gray cell or a 32nd of a period beyond.
 
-    By chance it is the cell and a quarter of a period, over the period. Parameters as for `measured_convention`.
+    By chance it is the cell and a 16th of a period, over the period. Parameters as for `measured_convention`.
     """
     used = _gray_pixels(seen, gray)
     if not len(used):
@@ -327,7 +329,7 @@ def convention_fit(seen: AxisFrames, gray: AxisCode, period_px: float, conventio
     phase = phase_of(seen.frames.reshape(len(seen.frames), -1)[:, used])
     place = convention.place_turns(phase.normalised, period_px)
     off = _wrapped(place - gray.coordinate.ravel()[used] / np.float32(period_px))
-    return float((np.abs(off) <= gray.cell_px / (2 * period_px) + FAR_TURNS).mean())
+    return float((np.abs(off) <= gray.cell_px / (2 * period_px) + FAR_TURNS / 4).mean())
 
 
 def _offset(seen: AxisFrames, gray: AxisCode, period_px: float) -> tuple[int, float, float] | None:
@@ -340,14 +342,20 @@ def _offset(seen: AxisFrames, gray: AxisCode, period_px: float) -> tuple[int, fl
         return None
     phase = phase_of(seen.frames.reshape(len(seen.frames), -1)[:, used])
     within = gray.coordinate.ravel()[used] / np.float32(period_px)
-    best = max(((sign, *_circular_mean(within - sign * phase.normalised)) for sign in (1, -1)), key=lambda f: f[2])
-    sign, turns, resultant = best
-    expected = float(np.sinc(gray.cell_px / period_px))
-    if resultant < MIN_CONCENTRATION * expected:
+    mask = np.zeros(gray.status.size, dtype=bool)
+    mask[used] = True
+    # Cells of half a period lie alike for both directions, so that neighbouring pixels must tell.
+    direction = _direction(mask.reshape(gray.status.shape), gray, seen.frames)
+    if abs(direction) < MIN_DIRECTION:
         return None
-    cells = len(np.unique(gray.coordinate.ravel()[used]))
-    # A cell that is seen in part shifts its own mean by a fraction of the cell; the cells are independent.
-    return sign, turns, gray.cell_px / period_px * PARTIAL_CELL / cells**0.5
+    sign = 1 if direction > 0 else -1
+    off = within - sign * phase.normalised
+    turns, resultant = _circular_mean(off)
+    if resultant < MIN_CONCENTRATION * float(np.sinc(gray.cell_px / period_px)):
+        return None
+    _, cell, counts = np.unique(gray.coordinate.ravel()[used], return_inverse=True, return_counts=True)
+    of_cells = np.bincount(cell, weights=_wrapped(off - turns)) / counts  # a cell that is seen in part has another mean
+    return sign, turns, float(of_cells.std() / len(counts) ** 0.5)
 
 
 def _gray_pixels(seen: AxisFrames, gray: AxisCode) -> np.ndarray:
@@ -411,12 +419,12 @@ def _inside_cell(gray: AxisCode, refined: AxisCode) -> np.ndarray:
     return np.asarray(inside & is_strong & (gray.status == Status.OK))
 
 
-def _direction(gray: AxisCode, refined: AxisCode, frames: np.ndarray) -> float:
+def _direction(usable: np.ndarray, gray: AxisCode, frames: np.ndarray) -> float:
     """Agreement of phase and Gray code from pixel to pixel: 1 if both grow the same way, -1 if the opposite way.
 
-    It is 0 if there are no neighbours in neighbouring cells.
+    It is 0 if no pixels `usable` (h, w) bool are neighbours in neighbouring cells.
     """
-    usable, cell = _inside_cell(gray, refined), gray.coordinate / gray.cell_px
+    cell = gray.coordinate / gray.cell_px
     agreement, pairs = 0.0, 0
     for here, there in (
         (np.s_[..., :, :-1], np.s_[..., :, 1:]),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gamma of fringes: the exponent of a response that is not linear, measured from the fringes, and their phases corrected.
+"""Gamma of fringes: the exponent of a response that is not linear, measured from fringes, whose phases it corrects.
 
 A projector with gamma shows a fringe p = 1/2 + 1/2 cos(theta) as p^gamma, which has harmonics of theta. N steps cannot
 tell the harmonics N - 1 and N + 1 from the fringe itself, so the phase ripples N times per period. The same harmonics
@@ -8,8 +8,8 @@ make the modulation ripple (N = 3), or leave a remainder that no sinusoid explai
 References
 ----------
 - Guo, He, Zhang, Chen: "Gamma correction for digital fringe projection profilometry", Applied Optics 43 (2004).
-- Pan, Kemao, Huang, Asundi: "Phase error analysis and compensation for nonsinusoidal waveforms in phase-shifting digital
-  fringe projection profilometry", Optics Letters 34 (2009).
+- Pan, Kemao, Huang, Asundi: "Phase error analysis and compensation for nonsinusoidal waveforms in phase-shifting
+  digital fringe projection profilometry", Optics Letters 34 (2009).
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ GAMMAS = np.arange(8, 81) / 20
 a camera of 2 each."""
 
 RIPPLE_BINS = 16
-"""Number of parts into which one ripple of the phase is divided. A ripple is nearly a sine, which needs a few; with more
-parts, each would hold fewer pixels."""
+"""Number of parts into which one ripple of the phase is divided. A ripple is nearly a sine, which needs a few; with
+more parts, each would hold fewer pixels."""
 
 TABLE_SIZE = 2048
 """Number of phases in a table of corrections. The error of linear interpolation is below 1e-5 turns."""
@@ -77,14 +77,20 @@ class FringeGamma:
         return Phase(place - np.floor(place), phase.modulation, phase.mean)
 
 
-def gamma_of(seen: AxisFrames, usable: np.ndarray) -> FringeGamma:
-    """What the fringes `seen` tell of the response, from the pixels `usable` (h, w) bool."""
+def gamma_of(seen: AxisFrames, usable: np.ndarray, scale: np.ndarray | None) -> FringeGamma:
+    """What the fringes `seen` tell of the response.
+
+    Parameters
+    ----------
+    usable : (h, w) bool, pixels that are neither weak nor saturated. scale : (h, w) brightness that the fringes do not
+        change, such as white - black; None: there is none.
+    """
     used = evenly_spread(np.flatnonzero(usable))
     used = used[:: 1 + len(used) // MAX_SAMPLES]
     if len(used) < MIN_PIXELS:
         return FringeGamma()
-    contrast = seen.contrast.values.ravel()[used] if seen.contrast.is_measured else None
-    return measured_gamma(seen.frames.reshape(len(seen.frames), -1)[:, used], contrast)
+    frames = seen.frames.reshape(len(seen.frames), -1)[:, used]
+    return measured_gamma(frames, None if scale is None else scale.ravel()[used])
 
 
 def measured_gamma(frames: np.ndarray, contrast: np.ndarray | None = None) -> FringeGamma:
@@ -93,7 +99,8 @@ def measured_gamma(frames: np.ndarray, contrast: np.ndarray | None = None) -> Fr
     Parameters
     ----------
     frames : (N, n) of any number type, fringes of pixels that are neither weak nor saturated.
-    contrast : (n,) white - black of these pixels; None: not measured.
+    contrast : (n,) brightness of these pixels that the fringes do not change, such as white - black; None: there is
+        none. Then ambient light makes three steps tell an exponent that is too near to 1.
 
     Examples
     --------
@@ -132,7 +139,7 @@ def measured_gamma(frames: np.ndarray, contrast: np.ndarray | None = None) -> Fr
 
 
 def _refined(best: int, difference: np.ndarray, curves: np.ndarray) -> tuple[float, float]:
-    """The exponent between the steps of `GAMMAS`, by one step of Gauss and Newton, and the change of the curve with it."""
+    """The exponent between the steps of `GAMMAS`, by a step of Gauss and Newton, and the change of the curve."""
     low, high = max(best - 1, 0), min(best + 1, len(GAMMAS) - 1)
     derivative = (curves[high] - curves[low]) / (GAMMAS[high] - GAMMAS[low])
     square = float((derivative**2).mean())
@@ -141,7 +148,7 @@ def _refined(best: int, difference: np.ndarray, curves: np.ndarray) -> tuple[flo
 
 
 def _ripple(frames: np.ndarray, contrast: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Part of the ripple (n,) int that a pixel lies in, and a value (n,) that changes with the part if there is a gamma.
+    """Part of the ripple (n,) int that a pixel lies in, and a value (n,) that a gamma makes change with the part.
 
     For three steps it is the logarithm of the modulation over white - black, or over the mean. For more it is the
     second harmonic in phase with the fringe, as a fraction of the modulation.
@@ -172,7 +179,7 @@ def _curves(steps: int, has_contrast: bool) -> np.ndarray:
 
 
 def _shown(gamma: float, steps: int) -> np.ndarray:
-    """(N, TABLE_SIZE) fringes of one ripple, 1 / N turns, as they are shown with a gamma; all values of a ripple occur."""
+    """(N, TABLE_SIZE) fringes as they are shown with a gamma, of two ripples: 2 / N turns."""
     turns = np.linspace(-0.5, 1.5, TABLE_SIZE) / steps
     shifts = np.arange(steps)[:, None] / steps
     return np.asarray((0.5 + 0.5 * np.cos(2 * np.pi * (turns - shifts))) ** gamma)

@@ -3,8 +3,8 @@
 
 References
 ----------
-- Huntley, Saldner: "Temporal phase-unwrapping algorithm for automated interferogram analysis", Applied Optics 32 (1993):
-  the coarsest period covers all, and each finer one is unwrapped by those before.
+- Huntley, Saldner: "Temporal phase-unwrapping algorithm for automated interferogram analysis", Applied Optics 32
+  (1993): the coarsest period covers all, and each finer one is unwrapped by those before.
 - Reich, Ritter, Thesing: "White light heterodyne principle for 3D-measurement", Proc. SPIE 3100 (1997): the beat of
   similar periods covers all.
 - Gushov, Solodkin: "Automatic processing of fringe patterns in integer interferometers", Optics and Lasers in
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames
-from rangesim.codes.fringe_gamma import gamma_of
+from rangesim.codes.fringe_gamma import FringeGamma, gamma_of
 from rangesim.codes.fringe_kernels import agree, mean_place
 from rangesim.codes.fringes import FringeConvention
 from rangesim.decoding.phase_shift import PhaseThresholds, modulation_is_weak, phase_of, phase_sigma
@@ -33,21 +33,22 @@ MAX_MISFIT_TURNS = 1 / 8
 phase that is accepted (`PhaseThresholds.max_sigma_rad`, 0.2)."""
 
 WIDEST_TURNS = 1 / 4
-"""Distance from the coarsest phase, in turns, up to which candidates are searched: twice the largest misfit, so that the
-second best is known where the best is accepted."""
+"""Distance from the coarsest phase, in turns, up to which candidates are searched: twice the largest misfit, so that
+the second best is known where the best is accepted."""
 
 MAX_AMBIGUITY = 0.25
-"""Largest cost of the best place as a fraction of that of the second best. At 1/4 the best place is half as far from the
-phases as the second; noise would have to move the phases by two thirds of the way between both to deceive, and at half
-of it the pixel counts as ambiguous."""
+"""Largest cost of the best place as a fraction of that of the second best. At 1/4 the best place is half as far from
+the phases as the second; noise would have to move the phases by two thirds of the way between both to deceive, and at
+half of it the pixel counts as ambiguous."""
 
 MIN_APART_TURNS = 0.005
-"""Least distance of any two places of the axis in the space of the phases, in turns. A camera of 8 bits tells a phase of
-full contrast to 0.0005 turns; closer places could not be told apart even then."""
+"""Least distance of any two places of the axis in the space of the phases, in turns. A camera of 8 bits tells a phase
+of full contrast to 0.0005 turns; closer places could not be told apart even then."""
 
 MIN_PRECISION = 0.1
-"""Least precision (inverse variance) of a period, as a fraction of the finest one's, at which its phase is averaged into
-the place. What is less would gain less than 5 % of the standard deviation, and brings the errors of a coarse phase in."""
+"""Least precision (inverse variance) of a period, as a fraction of the finest one's, at which its phase is averaged
+into the place. What is less would gain less than 5 % of the standard deviation, and brings the errors of a coarse
+phase in."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,21 @@ class FringeStack:
         run = slice(start, start + self.steps[i])
         return seen._replace(names=seen.names[run], frames=seen.frames[run])
 
+    def gamma(self, seen: AxisFrames, i: int, usable: np.ndarray, has_bits: bool) -> FringeGamma:
+        """What the fringes of period i tell of the response, from the pixels `usable` (h, w) bool.
+
+        `has_bits` tells whether the capture has other frames of the axis, from which white - black is estimated well.
+        """
+        scale: np.ndarray | None = None
+        if seen.contrast.is_measured or has_bits:
+            scale = seen.contrast.values
+        elif len(self.steps) > 1:  # the means of the other periods change with other phases
+            others = [k for k in range(len(self.steps)) if k != i]
+            scale = np.mean([self.of_period(seen.frames, k).mean(axis=0, dtype=np.float32) for k in others], axis=0)
+        return gamma_of(self.frames_of(seen, i), usable, scale)
+
     def apart(self, size: int) -> tuple[float, float]:
-        """Least distance of two places in the space of the phases, in turns, and how many projector pixels they lie apart.
+        """Least distance of two places in the space of the phases, in turns, and their distance in projector pixels.
 
         Only places that lie more than half of the finest period apart count; those nearer are told by its phase.
         """
@@ -120,8 +134,8 @@ class FringeStack:
             periods = ", ".join(f"{p:g}" for p in self.periods_px)
             what = "a period" if len(self.periods_px) == 1 else "periods"
             raise ValueError(
-                f"expected {what} that tell{'s' if len(self.periods_px) == 1 else ''} {size} projector pixels apart, got "
-                f"{periods}, whose phases repeat after {repeat:.4g} pixels: add a period of at least {size} "
+                f"expected {what} that tell{'s' if len(self.periods_px) == 1 else ''} {size} projector pixels apart, "
+                f"got {periods}, whose phases repeat after {repeat:.4g} pixels: add a period of at least {size} "
                 "(multi-frequency), or Gray code (gray-phase)."
             )
 
@@ -160,7 +174,7 @@ class FringeStack:
         sigma_px = None if capture.noise(frames[0, :1]) is None else np.empty(shape, dtype=np.float32)
         saturated = capture.saturated(frames)
         usable = (status == Status.OK) & seen.contrast.is_enough & ~saturated
-        gammas = [gamma_of(self.frames_of(seen, i), usable) for i in range(len(self.steps))]
+        gammas = [self.gamma(seen, i, usable, coarse is not None) for i in range(len(self.steps))]
         order = np.argsort(self.periods_px, kind="stable")
         periods = np.array(self.periods_px)[order]
         precision = np.array(self.steps)[order] / periods**2
@@ -182,7 +196,7 @@ class FringeStack:
                 if sigma is not None and k == 0:
                     variance = (sigma * np.float32(period / (2 * math.pi))) ** 2
             flat, inverse = places.reshape(len(order), -1), weights.reshape(len(order), -1)
-            margin = 3 * np.sqrt(variance).ravel()
+            margin = np.minimum(3 * np.sqrt(variance).ravel(), np.float32(periods[0]))  # infinite without any swing
             place, misfit, ambiguity = np.empty((3, refused.size), dtype=np.float32)
             # The noise may put a place beyond an end of the axis: then the other end is as likely.
             start, end = lows[rows].ravel() - margin, highs[rows].ravel() + margin

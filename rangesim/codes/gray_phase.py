@@ -22,17 +22,18 @@ from rangesim.sensor import Background, FrameContent
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 GUARD_TURNS = 1 / 8
-"""Distance beyond the edges of a Gray cell, in periods of the fringes, at which a place may still lie: for noise, and for
-camera pixels across the edge of a cell."""
+"""Distance beyond the edges of a Gray cell, in periods of the fringes, at which a place may still lie: for noise, and
+for camera pixels across the edge of a cell."""
 
 
 @dataclass(frozen=True)
 class GrayPhase(Code):
     """Gray code that finds the cycle of sinusoidal fringes, and the fringes, shifted in equal steps.
 
-    By default the cells are half a period or finer, so that a bit error at a stripe's edge cannot become a period error.
-    Cells of up to a period are decoded too, but then places near the edges of a cell that may belong to two cycles are
-    refused (`CODE_ERROR`). Fringes of a second period tell them: their beat with the first is longer than a cell.
+    By default the cells are half a period or finer, so that a bit error at a stripe's edge cannot become a period
+    error. Cells of up to a period are decoded too, but then places near the edges of a cell that may belong to two
+    cycles are refused (`CODE_ERROR`). Fringes of a second period tell them: their beat with the first is longer than a
+    cell.
 
     Parameters
     ----------
@@ -85,8 +86,8 @@ class GrayPhase(Code):
             return
         if not self.further_periods_px and gray.cell_px > self.period_px:
             raise ValueError(
-                f"expected cell_px to be at most the period of {self.period_px:g} pixels, got {gray.cell_px}: the fringes "
-                "repeat within a cell; take smaller cells, or set further_periods_px."
+                f"expected cell_px to be at most the period of {self.period_px:g} pixels, got {gray.cell_px}: the "
+                "fringes repeat within a cell; take smaller cells, or set further_periods_px."
             )
         if self.further_periods_px:
             self.stack.check(min(size, gray.cell_px + math.ceil(self._guard_px())))

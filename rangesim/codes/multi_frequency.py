@@ -35,8 +35,8 @@ class MultiFrequency(Code):
 
     The decoder looks for the place between 0 and the size of the axis on which all phases agree. So it needs to know
     no method: if the coarsest period covers the axis, this is hierarchical unwrapping; if the beats of similar periods
-    do, heterodyne; if periods without a common divisor do, number-theoretic. Each of the three is a code with periods of
-    its own: "multi-frequency", "heterodyne", "number-theoretic".
+    do, heterodyne; if periods without a common divisor do, number-theoretic. Each of the three is a code with periods
+    of its own: "multi-frequency", "heterodyne", "number-theoretic".
 
     Parameters
     ----------
@@ -90,7 +90,8 @@ class MultiFrequency(Code):
         periods = self.periods_px or self.default_periods(size)
         if self.steps_each and len(self.steps_each) != len(periods):
             raise ValueError(
-                f"expected steps_each with one number for each of the {len(periods)} periods, got {len(self.steps_each)}."
+                f"expected steps_each with one number for each of the {len(periods)} periods, "
+                f"got {len(self.steps_each)}."
             )
         self.stack(size).check(size)
 
@@ -137,8 +138,8 @@ class MultiFrequency(Code):
 class Heterodyne(MultiFrequency):
     """Fringes of three similar periods whose beats cover the axis: n, n - 1 and n - sqrt(n) fringes in all.
 
-    The beat of the first two is as long as the axis, and that of the first and the third is sqrt(n) times finer. Settings
-    and decoder are those of `MultiFrequency`.
+    The beat of the first two is as long as the axis, and that of the first and the third is sqrt(n) times finer.
+    Settings and decoder are those of `MultiFrequency`.
 
     References
     ----------

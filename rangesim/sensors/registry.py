@@ -134,7 +134,7 @@ def is_file_name(name: str) -> bool:
 
     Examples
     --------
-    >>> is_file_name("own_code.py:MultiFrequency"), is_file_name("gray")
+    >>> is_file_name("own_code.py:TriangleWaves"), is_file_name("gray")
     (True, False)
     """
     return _SEPARATOR in name
