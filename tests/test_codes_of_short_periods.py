@@ -20,7 +20,6 @@ from rangesim.decoding.status import Status
 from rangesim.decoding.triangulation import ProjectorCoordinates
 from rangesim.electronics.detector import Detector
 from rangesim.errors import RangesimWarning
-from rangesim.response import LightPath, NumpyMath
 from rangesim.results.captures import import_capture
 from rangesim.sensors import StructuredLight, StructuredLightDecoder
 
@@ -98,16 +97,6 @@ def test_places_between_the_centres_of_pixels_come_back_by_modulation() -> None:
     assert seen.column is not None
     assert (seen.status == Status.OK).all()
     assert np.abs(seen.column - x).max() < 0.005
-
-
-@pytest.mark.parametrize("code", CODES, ids=NAMES)
-def test_responses_are_the_patterns(code: Code) -> None:
-    """Light of every projector pixel, by the code's own responses, makes the frames that the patterns make."""
-    x = np.arange(200) + 0.5
-    path = LightPath(u=x, v=np.zeros_like(x), path_length_m=1.0, is_first=True)
-    channels = [np.array(r.weights(path, NumpyMath()))[:, None] for r in code.responses(0, 200)]
-    frames = np.array([*code.frames(200, channels, np.ones((1, 200)))])[:, 0]
-    np.testing.assert_allclose(frames, code.patterns(200), atol=1e-5)
 
 
 @pytest.mark.parametrize("code", CODES, ids=NAMES)
