@@ -213,6 +213,6 @@ class FringeStack:
             if sigma_px is not None:
                 gain = inverse[0] / np.maximum(inverse[kept].sum(axis=0), np.float32(1e-30))
                 sigma_px[rows] = np.sqrt(variance * gain.reshape(refused.shape))
-        cell_px = float(periods[0]) if coarse is None else coarse.cell_px
+        cell_px = 1.0 if coarse is None else coarse.cell_px
         gamma = float(np.median([g.gamma for g in gammas]))
         return AxisCode(coordinate, status, cell_px, sigma_px, coarse, gamma)

@@ -16,7 +16,7 @@ import numpy as np
 
 from rangesim.capture import Capture, bright_level
 from rangesim.codes import AXES, AxisCode, AxisFrames
-from rangesim.conventions.fringe_conventions import contradictions, measured_fringes, middle_of
+from rangesim.conventions.fringe_conventions import measured_fringes, middle_of
 from rangesim.conventions.layouts import (
     ENDS,
     INVERSE,
@@ -157,8 +157,6 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
         findings.append(f"this is the order {', '.join(found.order)}.")
     code, said = measured_fringes(frames, sample.frames, found)
     found = replace(found, code=code)
-    if not is_given and contradictions(frames, found):
-        findings.append("the images contradict this order, too: check that none is missing or there twice.")
     return Convention(found, (*findings, *said))
 
 
