@@ -279,3 +279,13 @@ def test_doubts_are_kept_in_files(tmp_path: Path) -> None:
     assert load_decoded(tmp_path / "out").image.doubts == image.doubts
     record = json.loads((tmp_path / "out" / "decoded.json").read_text(encoding="utf-8"))
     assert record["doubts"] == list(image.doubts)
+
+
+def test_fringes_that_mirror_every_place_within_its_cell_are_named() -> None:
+    """Cells of half a period: with the first and third fringe exchanged, each place lies in its cell, on the other side."""
+    sensor = StructuredLight()
+    capture = capture_of(sensor, Detector())
+    frames, (run,) = capture.frames.copy(), fringes(sensor)
+    frames[[run.start, run.start + 2]] = frames[[run.start + 2, run.start]]
+    with pytest.warns(RangesimWarning, match="every place is mirrored within its cell"):
+        decode(replace(capture, frames=frames))

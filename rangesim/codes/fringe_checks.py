@@ -77,6 +77,11 @@ MIN_DIRECTION = 0.5
 """Least agreement of phase and Gray code from pixel to pixel that tells the direction of the fringes: three of four
 pairs of neighbours. By chance it is 0."""
 
+MIN_BACKWARD = 0.5
+"""Least disagreement of phase and Gray code from pixel to pixel at which fringes count as backward although every place
+lies in its cell. It is 1 if all run backward, -1 if none does, and near 0 if the pixels of the camera are as wide as
+half a period, so that the direction is a guess."""
+
 MEDIAN_ERROR = 1.253
 """Ratio of the standard error of a median to that of a mean, for normally distributed values: sqrt(pi / 2)."""
 
@@ -109,8 +114,14 @@ def fringe_contradiction(
     mean, resultant = _circular_mean(off)
     offset_px = mean * period_px
     one_sided = max(above, below) > MIN_ONE_SIDED_FRACTION + 3 * min(above, below) and abs(offset_px) > MIN_OFFSET_PX
+    backwards = convention.sign * _direction(_inside_cell(gray, refined), gray, frames)
     if far <= MAX_FAR_FRACTION and not one_sided:
-        return None
+        if backwards > -MIN_BACKWARD:
+            return None
+        return (
+            f"the fringes along {axis} contradict the Gray code: from one cell to the next, their phase runs the other "
+            "way, so every place is mirrored within its cell: check the order and the direction of their frames."
+        )
     outside = 100 * float((np.abs(off) > edge).mean())
     text = f"the fringes along {axis} contradict the Gray code at {outside:.0f} % of the pixels"
     swing = float(np.median(2 * phase.modulation / seen.contrast.values.ravel()[used]))
@@ -119,7 +130,7 @@ def fringe_contradiction(
             f"{text} and reach {100 * swing:.0f} % of white - black: a period of {period_px:g} projector pixels is too "
             "fine for the camera, or out of focus; take a longer one."
         )
-    if far > MAX_FAR_FRACTION and convention.sign * _direction(_inside_cell(gray, refined), gray, frames) < 0:
+    if far > MAX_FAR_FRACTION and backwards < 0:
         return f"{text}: they seem to be shifted in the opposite direction, so check the order of their frames."
     if resultant > MIN_CONCENTRATION * np.sinc(2 * half):
         return (
