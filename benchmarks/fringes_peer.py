@@ -26,8 +26,8 @@ from rangesim.sensors import StructuredLightDecoder
 SIZE = 640, 480
 """Pixels of projector and camera."""
 
-PERIODS_IN_AXIS = (1, 8, 64)
-"""Fringes along the axis of each period: 640, 80 and 10 projector pixels."""
+PERIODS_IN_AXIS = (1, 8, 40)
+"""Fringes along the axis of each period: 640, 80 and 16 projector pixels."""
 
 STEPS = 4
 """Phase shifts of each period."""
@@ -49,7 +49,10 @@ def timed(run: Callable[[], Any]) -> tuple[Any, float]:
 def main() -> None:
     width, height = SIZE
     count = len(PERIODS_IN_AXIS)
-    peer = Fringes(X=width, Y=height, axes=(0,), K=count, N=(STEPS,) * count, v=PERIODS_IN_AXIS)
+    peer = Fringes()
+    settings = {"X": width, "Y": height, "axes": (0,), "K": count, "N": (STEPS,) * count, "v": PERIODS_IN_AXIS}
+    for name, value in settings.items():  # each depends on those before
+        setattr(peer, name, value)
     periods = tuple(width / v for v in PERIODS_IN_AXIS)
     code = MultiFrequency(periods, STEPS, convention=FringeConvention("-cos", origin_px=0.5))
     sensor = StructuredLight(width, height, code, order=("columns_*",))
