@@ -155,14 +155,15 @@ def _ripple(frames: np.ndarray, contrast: np.ndarray | None) -> tuple[np.ndarray
     """
     steps = len(frames)
     turns = np.exp(2j * np.pi * np.arange(steps) / steps)
-    first = 2 / steps * np.tensordot(turns, frames, axes=1)
+    first = 2 / steps * (turns.real @ frames + 1j * (turns.imag @ frames))
     modulation = np.maximum(np.abs(first), 1e-30)
     phase = np.angle(first) / (2 * np.pi) * steps
     part = np.minimum(((phase - np.floor(phase)) * RIPPLE_BINS).astype(int), RIPPLE_BINS - 1)
     if steps == 3:
         scale = frames.mean(axis=0) if contrast is None else contrast
         return part, np.log(modulation / np.where(scale > 0, scale, np.nan))
-    second = 2 / steps * np.tensordot(turns**2, frames, axes=1)
+    twice = turns**2
+    second = 2 / steps * (twice.real @ frames + 1j * (twice.imag @ frames))
     return part, (second * first.conj() ** 2).real / modulation**3
 
 

@@ -29,6 +29,7 @@ def agree(places, weights, periods_px, low, high, widest, result, misfit, ambigu
     """
     count, n = places.shape
     base, last = periods_px[0], count - 1
+    rate = 1.0 / periods_px
     for i in range(n):
         turn = places[0, i]
         first = math.ceil(low[i] / base - turn - 1e-6)
@@ -43,14 +44,14 @@ def agree(places, weights, periods_px, low, high, widest, result, misfit, ambigu
         best = np.nan
         for cycle in range(first, end + 1):
             x = (cycle + turn) * base
-            off = x / periods_px[last] - places[last, i]
-            off -= math.floor(off + 0.5)
+            off = x * rate[last] - places[last, i]
+            off -= np.rint(off)
             if abs(off) > widest:
                 continue
             squares = mean = 0.0
             for k in range(1, count):
-                off = x / periods_px[k] - places[k, i]
-                off = (off - math.floor(off + 0.5)) * periods_px[k]
+                off = x * rate[k] - places[k, i]
+                off = (off - np.rint(off)) * periods_px[k]
                 squares += weights[k, i] * off * off
                 mean += weights[k, i] * off
             cost = squares - mean * mean / max(total, 1e-30)
