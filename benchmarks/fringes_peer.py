@@ -33,7 +33,7 @@ STEPS = 4
 """Phase shifts of each period."""
 
 RUNS = 7
-"""Runs of each; their median varies by less than 10 % on an idle machine."""
+"""Runs of each. Medians of theirs varied from 70 to 210 ms with the load of the machine, so run it several times."""
 
 
 def timed(run: Callable[[], Any]) -> tuple[Any, float]:

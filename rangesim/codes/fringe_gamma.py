@@ -33,10 +33,12 @@ RIPPLE_BINS = 16
 more parts, each would hold fewer pixels."""
 
 TABLE_SIZE = 2048
-"""Number of phases in a table of corrections. The error of linear interpolation is below 1e-5 turns."""
+"""Number of phases in a table of corrections. The error is below 1e-6 turns for gammas from 1.8 to
+2.6 and three or four steps (measured)."""
 
 MAX_SAMPLES = 20_000
-"""Largest number of pixels from which the exponent is measured. With 1 % noise its standard error is then 0.001."""
+"""Largest number of pixels from which the exponent is measured. With noise of 1 % of white
+its standard deviation is 0.0012 with three steps and 0.0005 with four (measured at a gamma of 1.5)."""
 
 MIN_CHANGE = 0.02
 """Least difference of the exponent from 1 that is corrected. With three steps it makes a ripple of 0.001 turns, 0.017

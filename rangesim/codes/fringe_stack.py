@@ -43,7 +43,7 @@ half of it the pixel counts as ambiguous."""
 
 MIN_APART_TURNS = 0.005
 """Least distance of any two places of the axis in the space of the phases, in turns. A camera of 8 bits tells a phase
-of full contrast to 0.0005 turns; closer places could not be told apart even then."""
+of full contrast to 0.0004 turns; closer places could not be told apart even then."""
 
 MIN_PRECISION = 0.1
 """Least precision (inverse variance) of a period, as a fraction of the finest one's, at which its phase is averaged
