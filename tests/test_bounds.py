@@ -21,6 +21,7 @@ import rangesim
 from rangesim import decode, explain, expose
 from rangesim.codes import AxisCode, Code, FringeConvention, GrayPhase, GrayThresholds
 from rangesim.codes.fringe_gamma import FringeGamma
+from rangesim.codes.fringe_stack import FringeStack
 from rangesim.decoding.disparities import Disparities, ImageNoise
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
@@ -339,7 +340,7 @@ MODULES = (
     "response.correlation",
     *(f"codes.{module.name}" for module in pkgutil.iter_modules(rangesim.codes.__path__)),
 )
-RESULTS = {Disparities, ProjectorCoordinates, Phase, FringeGamma, AxisCode, *AxisCode.__subclasses__()}
+RESULTS = {Disparities, ProjectorCoordinates, Phase, FringeGamma, FringeStack, AxisCode, *AxisCode.__subclasses__()}
 
 
 def test_every_setting_has_a_case() -> None:

@@ -78,6 +78,10 @@ MIN_DIRECTION = 0.5
 """Least agreement of phase and Gray code from pixel to pixel that tells the direction of the fringes: three of four
 pairs of neighbours. By chance it is 0."""
 
+MIN_CLEAR_TURNS, MAX_CLEAR_TURNS = 0.001, 0.4
+"""Least and largest step of the phase from pixel to pixel, in turns, that shows a direction: above the rounding of the
+phase, and below half a turn by a fifth, because half a turn is the same in both directions."""
+
 MIN_BACKWARD = 0.5
 """Least disagreement of phase and Gray code from pixel to pixel at which fringes count as backward although every place
 lies in its cell. It is 1 if all run backward, -1 if none does, and near 0 if the pixels of the camera are as wide as
@@ -117,7 +121,7 @@ def fringe_contradiction(
     one_sided = max(above, below) > MIN_ONE_SIDED_FRACTION + 3 * min(above, below) and abs(offset_px) > MIN_OFFSET_PX
     backwards = convention.sign * _direction(_inside_cell(gray, refined), gray, frames)
     if far <= MAX_FAR_FRACTION and not one_sided:
-        if backwards > -MIN_BACKWARD:
+        if backwards > -MIN_BACKWARD or not _resolves_cells(gray):
             return None
         return (
             f"the fringes along {axis} contradict the Gray code: from one cell to the next, their phase runs the other "
@@ -447,9 +451,20 @@ def _direction(usable: np.ndarray, gray: AxisCode, frames: np.ndarray) -> float:
         turn = _wrapped(
             phase_of(frames[there][:, y, x]).normalised - phase_of(frames[here][:, y, x]).normalised,
         )
-        agreement += float((np.sign(turn) * (cell[there][y, x] - cell[here][y, x])).sum())
+        is_clear = (np.abs(turn) > MIN_CLEAR_TURNS) & (np.abs(turn) < MAX_CLEAR_TURNS)
+        agreement += float((is_clear * np.sign(turn) * (cell[there][y, x] - cell[here][y, x])).sum())
         pairs += len(y)
     return agreement / max(pairs, 1)
+
+
+def _resolves_cells(gray: AxisCode) -> bool:
+    """Whether most decoded neighbours see the same cell, so that the pixels of the camera are finer than the cells."""
+    ok, same, pairs = gray.status == Status.OK, 0, 0
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        both = ok[here] & ok[there]
+        same += int(np.count_nonzero(both & (gray.coordinate[here] == gray.coordinate[there])))
+        pairs += int(np.count_nonzero(both))
+    return 2 * same > pairs
 
 
 def _wrapped(turns: np.ndarray) -> np.ndarray:
