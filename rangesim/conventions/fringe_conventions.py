@@ -11,6 +11,7 @@ import numpy as np
 
 from rangesim.capture import Capture
 from rangesim.codes import AxisFrames, Code, FringeConvention
+from rangesim.codes.fringe_direction import phase_direction
 from rangesim.codes.fringes import STARTS
 from rangesim.decoding.phase_shift import phase_of
 from rangesim.decoding.pixel_samples import MIN_PIXELS
@@ -24,13 +25,17 @@ MIN_CONCENTRATION = 0.8
 """Least length of the mean vector of phase minus place, as a fraction of that of an even distribution over a Gray cell,
 at which fringes count as following the code. For fringes in the other direction it is near 0."""
 
+MAX_CELL_TURNS = 0.75
+"""Largest Gray cell, in periods of the fringes, that tells where they start. The mean vector of phase minus place over
+a cell has the length sinc(cell / period): 0.3 here, and 0 if the cell is a period, because all phases occur alike."""
+
 MAX_SIDE = 480
 """Largest side in pixels of the part of the image in which contradictions are looked for, so that the time is bounded.
 They compare neighbours, so the part has all its pixels."""
 
 MIN_AGREEMENT = 0.5
 """Least agreement of the directions of phases and cells, from -1 to 1, at which fringes count as running that way. It
-is near 1 or -1 if a step from pixel to pixel is below half a period."""
+is near 1 or -1 if noise is small against the step of the phase from pixel to pixel."""
 
 MAX_REST_PX = 0.2
 """Largest distance of the measured start from one of the usual ones, in projector pixels, at which it counts as that
@@ -48,8 +53,7 @@ class _Offsets(NamedTuple):
     """Phases of some pixels, and their Gray cells.
 
     phase, cell : (n,) turns. agreement : 1 if the phases grow from pixel to pixel as their cells do, -1 if the other
-    way, 0 if there are no neighbours in neighbouring cells. half_turns : half a cell, in turns. period_px : projector
-    pixels.
+    way, 0 if neighbours do not tell. half_turns : half a cell, in turns. period_px : projector pixels.
     """
 
     phase: np.ndarray
@@ -130,7 +134,7 @@ def _all_offsets(frames: np.ndarray, sensor: StructuredLight, period_px: float) 
         yield _Offsets(
             phase[used],
             gray.coordinate[used] / np.float32(period_px),
-            _agreement(phase, gray.coordinate / np.float32(gray.cell_px), used),
+            phase_direction(fringes.frames, gray, used, period_px),
             gray.cell_px / (2 * period_px),
             period_px,
         )
@@ -138,7 +142,7 @@ def _all_offsets(frames: np.ndarray, sensor: StructuredLight, period_px: float) 
 
 def _measured(offsets: _Offsets, given: FringeConvention) -> FringeConvention | None:
     """The convention that the phases of an axis follow, `given` if they agree with it; None if they follow none."""
-    if len(offsets.phase) < MIN_PIXELS:
+    if len(offsets.phase) < MIN_PIXELS or 2 * offsets.half_turns > MAX_CELL_TURNS:
         return None
     expected = float(np.sinc(2 * offsets.half_turns))
     for direction, sign in (("forward", 1), ("backward", -1)):
@@ -157,18 +161,6 @@ def _measured(offsets: _Offsets, given: FringeConvention) -> FringeConvention | 
             return given
         return best
     return None
-
-
-def _agreement(phase: np.ndarray, cell: np.ndarray, used: np.ndarray) -> float:
-    """Mean of the signs of the changes of phase (h, w) in turns, between neighbours in neighbouring Gray cells."""
-    total, n = 0.0, 0
-    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        step = cell[there] - cell[here]
-        both = used[here] & used[there] & (np.abs(step) == 1)
-        turn = (phase[there] - phase[here])[both]
-        total += float((np.sign(turn - np.rint(turn)) * step[both]).sum())
-        n += int(np.count_nonzero(both))
-    return total / max(n, 1)
 
 
 def _usual(given: FringeConvention) -> Iterator[FringeConvention]:

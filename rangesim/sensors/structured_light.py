@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -117,7 +118,7 @@ class StructuredLight(Sensor):
             raise ValueError(f"expected axes to be columns, rows or both, got {self.axes!r}.")
         limits.check("pixels", self.projector_width * self.projector_height, "pixels of a projector")
         for axis in self.axes:
-            self.code.check(self.size(axis))
+            _check_code(self.code, self.size(axis))
         if self.order:
             in_view = set(self.frame_names())
             for axis in self.axes:
@@ -187,7 +188,7 @@ class StructuredLight(Sensor):
     @classmethod
     def presets(cls) -> dict[str, Sensor]:
         """One for each code that has defaults, by its name."""
-        return {name: cls(code=kind()) for name, kind in Code.known.items() if has_defaults(kind)}
+        return {name: _with_defaults(cls, kind) for name, kind in Code.known.items() if has_defaults(kind)}
 
     @property
     def title(self) -> str:
@@ -406,6 +407,18 @@ def _beyond_projector(sensor: StructuredLight, codes: dict[str, AxisCode]) -> st
                 f"{furthest:.0f}: check the size of the projector, the order of the frames and their code."
             )
     return None
+
+
+@lru_cache(maxsize=256)  # each look-up of a sensor by name asks for all presets
+def _with_defaults(cls: type[StructuredLight], kind: type[Code]) -> StructuredLight:
+    """A sensor of that class whose code is of that kind, all with default settings."""
+    return cls(code=kind())
+
+
+@lru_cache(maxsize=256)  # sensors are made anew for each setting that changes, and periods take time to be checked
+def _check_code(code: Code, size: int) -> None:
+    """Raise ValueError if the code cannot tell `size` projector pixels from each other."""
+    code.check(size)
 
 
 def first_failure(statuses: list[np.ndarray]) -> np.ndarray:
