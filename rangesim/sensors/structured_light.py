@@ -188,7 +188,8 @@ class StructuredLight(Sensor):
     @classmethod
     def presets(cls) -> dict[str, Sensor]:
         """One for each code that has defaults, by its name."""
-        return {name: _with_defaults(cls, kind) for name, kind in Code.known.items() if has_defaults(kind)}
+        kinds = {name: kind for name, kind in Code.known.items() if has_defaults(kind)}
+        return {name: _with_defaults(cls, kind) for name, kind in kinds.items()}  # type: ignore[arg-type]  # hashable
 
     @property
     def title(self) -> str:
