@@ -361,8 +361,8 @@ def _outside(sample: _Sample, sensor: StructuredLight) -> float:
     """Fraction of the decoded pixels that see no place of the projector; of two axes, that of the worse one."""
     fractions = []
     for code in _decoded(sample.frames, sensor).values():
-        outside = np.count_nonzero(code.status == Status.CODE_ERROR)
-        fractions.append(outside / max(1, outside + np.count_nonzero(code.status == Status.OK)))
+        outside = int(np.count_nonzero(code.status == Status.CODE_ERROR))
+        fractions.append(outside / max(1, outside + int(np.count_nonzero(code.status == Status.OK))))
     return max(fractions)
 
 
