@@ -45,8 +45,8 @@ class MultiFrequency(FringeCode):
 
     Examples
     --------
-    >>> MultiFrequency().default_periods(1280)
-    (1280.0, 143.1083505599865, 16.0)
+    >>> [round(period, 1) for period in MultiFrequency().default_periods(1280)]
+    [1280.0, 143.1, 16.0]
     >>> MultiFrequency((64.0, 8.0), steps=3).names(64)
     ['period0_phase0', 'period0_phase1', 'period0_phase2', 'period1_phase0', 'period1_phase1', 'period1_phase2']
     """

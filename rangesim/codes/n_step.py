@@ -31,8 +31,8 @@ class PhaseShift(FringeCode):
     --------
     >>> PhaseShift(steps=3).patterns(4).round(2)
     array([[0.85, 0.15, 0.15, 0.85],
-           [0.37, 0.98, 0.63, 0.02],
-           [0.02, 0.63, 0.98, 0.37]], dtype=float32)
+           [0.63, 0.98, 0.37, 0.02],
+           [0.02, 0.37, 0.98, 0.63]], dtype=float32)
     """
 
     period_px: Annotated[float, Bounds("projector pixels", 2, 1e6)] | None = None
