@@ -134,8 +134,8 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
     --------
     >>> sensor = StructuredLight(64, 48, code="gray")
     >>> shown = sensor.patterns()  # as a camera sees them that looks straight at the screen
-    >>> detect_convention(np.concatenate([shown[-2:], shown[:-2]]), sensor)
-    Convention(sensor=StructuredLight(...), findings=('white and black come first.',))
+    >>> detect_convention(np.concatenate([shown[-2:], shown[:-2]]), sensor).findings
+    ('white and black come first.', 'this is the order white, black, *.')
     """
     is_given = len(frames) == sensor.n_frames
     orders = list(layouts(sensor, len(frames)))
