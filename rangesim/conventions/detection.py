@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.codes import AXES, AxisCode, AxisFrames
+from rangesim.codes import AXES, AxisCode
 from rangesim.conventions.fringe_conventions import measured_fringes, middle_of
 from rangesim.conventions.layouts import (
     ENDS,
@@ -290,13 +290,9 @@ def _agreement_bits(sample: _Sample, candidate: StructuredLight) -> float:
 
 def _decoded(frames: np.ndarray, sensor: StructuredLight) -> dict[str, AxisCode]:
     """The codes of all axes."""
-    capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
-    contrast = decoder.contrast(capture, sensor)
-    codes: dict[str, AxisCode] = {}
-    for axis in sensor.axes:
-        seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
-        codes[axis] = sensor.code.decode(seen, decoder.thresholds)
-    return codes
+    decoder = StructuredLightDecoder()
+    axes = decoder.axis_frames(Capture(frames, sensor))
+    return {seen.axis: sensor.code.decode(seen, decoder.thresholds) for seen in axes}
 
 
 def _nearness(sample: _Sample, code: AxisCode) -> float:
