@@ -118,7 +118,7 @@ class StructuredLight(Sensor):
             raise ValueError(f"expected axes to be columns, rows or both, got {self.axes!r}.")
         limits.check("pixels", self.projector_width * self.projector_height, "pixels of a projector")
         for axis in self.axes:
-            _check_code(self.code, self.size(axis))
+            self.code.check(self.size(axis))
         if self.order:
             in_view = set(self.frame_names())
             for axis in self.axes:
@@ -410,12 +410,6 @@ def _beyond_projector(sensor: StructuredLight, codes: dict[str, AxisCode]) -> st
 def _with_defaults(cls: type[StructuredLight], kind: type[Code]) -> StructuredLight:
     """A sensor of that class whose code is of that kind, all with default settings."""
     return cls(code=kind())
-
-
-@lru_cache(maxsize=256)  # sensors are made anew for each setting that changes, and periods take time to be checked
-def _check_code(code: Code, size: int) -> None:
-    """Raise ValueError if the code cannot tell `size` projector pixels from each other."""
-    code.check(size)
 
 
 def joined_axes(
