@@ -342,18 +342,22 @@ class StructuredLightDecoder(Decoder):
             )
         if float(image.valid.mean()) >= MIN_MEASURED:
             return None
-        contrast = self.contrast(capture, of_type(capture.sensor, StructuredLight)).values
-        clear = MIN_CONTRAST * capture.full_scale
-        inverted = float((contrast < -clear).mean())
-        if inverted > float((contrast > clear).mean()):
-            return (
-                f"black is brighter than white at {100 * inverted:.0f} % of the pixels: the last two images are white, "
-                "then black"
-            )
         if axis := _axis_along_baseline(image, of_type(capture.sensor, StructuredLight).axes, capture.rig):
             other = "rows" if axis == "columns" else "columns"
             return f"{axis} tell no depth here, because camera and projector stand apart along them: code {other}"
         return None
+
+
+def _exchanged_ends(capture: Capture, contrast: Contrast) -> str | None:
+    """A sentence if black is brighter than white at most of the pixels where they differ; None if not."""
+    clear = MIN_CONTRAST * capture.full_scale
+    inverted = float((contrast.values < -clear).mean())
+    if not contrast.is_measured or inverted <= float((contrast.values > clear).mean()):
+        return None
+    return (
+        f"black is brighter than white at {100 * inverted:.0f} % of the pixels: the images of white and black seem to "
+        "be exchanged."
+    )
 
 
 def _repeated_frames(capture: Capture) -> str | None:
@@ -420,12 +424,16 @@ def joined_axes(
     triangulation: TriangulationLimits,
     contradictions: list[str],
 ) -> ProjectorCoordinates:
-    """The coordinates along all axes as one result; `DoubtWarning` of each contradiction.
+    """The coordinates along all axes as one result.
+
+    `DoubtWarning` of each contradiction; if there is none, of a black frame that is brighter than white.
 
     Parameters
     ----------
     codes : AxisCode by the name of its axis. contrast : Contrast of the capture. confidence : (h, w) float32.
     """
+    if not contradictions and (exchanged := _exchanged_ends(capture, contrast)):  # a wrong order has other signs, too
+        contradictions = [exchanged]
     for contradiction in contradictions:
         warn(contradiction, DoubtWarning)
     coordinate = {axis: code.coordinate for axis, code in codes.items()}
