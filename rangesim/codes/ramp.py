@@ -65,9 +65,15 @@ class RampCode(Code):
 
     def check_shown(self, size: int, shown: Sequence[str]) -> None:
         if RAMP not in shown and REVERSE not in shown:
-            raise ValueError("expected an order with a ramp or its reverse.")
+            raise ValueError(
+                f"expected an order with {RAMP} or {REVERSE}, got {', '.join(shown) or 'no frames'}: show one of them."
+            )
         if not {"white", "black"} <= set(shown):
-            raise ValueError("expected white and black among the frames: without them, a ramp tells no place.")
+            missing = " and no ".join(level for level in ("white", "black") if level not in shown)
+            raise ValueError(
+                f"expected white and black among the frames, got no {missing}: show them, because a ramp tells no "
+                "place without them."
+            )
 
     def decode(self, seen: AxisFrames, thresholds: CodeThresholds) -> AxisCode:
         capture, contrast = seen.capture, np.maximum(seen.contrast.values, np.float32(1e-30))
