@@ -49,6 +49,11 @@ class BitCode(Code):
     def words_of_cells(self, bits: int) -> np.ndarray:
         """(2^bits,) int, the word of each cell; each word is there once."""
 
+    def base_of(self, bits: int) -> int | None:
+        """Number of the bit with which all others are combined, so that the stripes of all bits have about one width;
+        None: they have many widths."""
+        return None
+
     @classmethod
     def variants(cls) -> tuple[BitCode, ...]:
         """Codes of this kind that a capture may show instead of the one it is read as."""
@@ -118,7 +123,7 @@ class BitCode(Code):
     maxsize=256
 )  # the cells do not depend on the size of a cell, but codes of all kinds are asked in each decode
 def _words(code: BitCode, bits: int) -> Words:
-    return Words.of(code.noun, code.words_of_cells(bits))
+    return Words.of(code.noun, code.words_of_cells(bits), code.base_of(bits))
 
 
 @lru_cache(maxsize=64)  # a sensor is asked for its responses again and again
