@@ -20,6 +20,7 @@ from rangesim.codes.bit_checks import (
 from rangesim.codes.bits import Words, bit_frames, decode_bits
 from rangesim.codes.code import Code, CodeThresholds, stripes
 from rangesim.response import DenseResponse
+from rangesim.sensor import Background, least_signal_for
 from rangesim.settings.config import has_defaults
 
 
@@ -108,6 +109,21 @@ class BitCode(Code):
         return other_code_contradiction(seen, neighbours, words, _other_words(words)) or order_contradiction(
             seen, neighbours, words
         )
+
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
+        """What white - black needs, and what a bit without inverse needs, 2 pattern - (white + black).
+
+        At a lit pixel that difference is the light S, and its variance is 4 (S + n) + (S + n) + n = 5 S + 6 n, with n
+        of a frame without S; so S = t sqrt(5 S + 6 n) for t sigmas, which is 3 sqrt(6) = 7.3 sqrt(n) in weak light.
+        """
+        least = super().least_signal(size, shown, thresholds, background)
+        is_alone = any(bit.pattern is None or bit.inverse is None for bit in bit_frames(list(shown), self.bits(size)))
+        if background.noise_variance is None or not is_alone:
+            return least
+        noise_variance = 6 * (background.ambient + background.noise_variance)
+        return np.maximum(least, least_signal_for(thresholds.gray.bit_sigmas**2, 5.0, noise_variance))
 
     @property
     def details(self) -> str:

@@ -173,7 +173,9 @@ class MicroPhaseShifting(Code):
         phase = phase_of(frames[:SHIFTS])
         return phase.mean + phase.modulation, phase.mean - phase.modulation
 
-    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
         return thresholds.phase.least_signal(SHIFTS, FRINGE_VISIBILITY, FrameContent(), background)
 
     @property

@@ -116,7 +116,9 @@ class MultiFrequency(Code):
     def white_and_black(self, size: int, names: list[str], frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return mean_and_swing(self.stack(size), frames)
 
-    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
         steps = min(self.stack(size).steps)
         return thresholds.phase.least_signal(steps, VISIBILITY, FrameContent(), background)
 

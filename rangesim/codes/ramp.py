@@ -89,13 +89,14 @@ class RampCode(Code):
         sigma_px, allowed = None, thresholds.gray.relative_bit * contrast
         if noises:
             of_ramp, of_reverse, of_white, of_black = (np.square(noise) for noise in noises)
-            if has_both:
-                variance = of_ramp + of_reverse + ratio**2 * (of_white + of_black)
-            else:
-                side = 1 if RAMP in shown else -1
-                of_shown = of_ramp if RAMP in shown else of_reverse
-                variance = 4 * of_shown + (1 - side * ratio) ** 2 * of_black + (1 + side * ratio) ** 2 * of_white
-            sigma_px = (0.5 * seen.size * np.sqrt(variance) / contrast).astype(np.float32)
+            with np.errstate(over="ignore"):  # a pixel without contrast has an infinite deviation
+                if has_both:
+                    variance = of_ramp + of_reverse + ratio**2 * (of_white + of_black)
+                else:
+                    side = 1 if RAMP in shown else -1
+                    of_shown = of_ramp if RAMP in shown else of_reverse
+                    variance = 4 * of_shown + (1 - side * ratio) ** 2 * of_black + (1 + side * ratio) ** 2 * of_white
+                sigma_px = (0.5 * seen.size * np.sqrt(variance) / contrast).astype(np.float32)
             of_sum = np.sqrt(of_ramp + of_reverse + of_white + of_black)
             allowed = np.maximum(allowed, thresholds.gray.bit_sigmas * of_sum)
         elif capture.is_digital:
