@@ -55,6 +55,23 @@ def _at(table, number):  # type: ignore[no-untyped-def]
 
 
 @cached_njit(nogil=True, error_model="numpy")
+def middle_of(values):  # type: ignore[no-untyped-def]
+    """(h, w) float32, median of the values (k, h, w) float32 of each pixel; of an even number, the upper one."""
+    result = np.empty(values.shape[1:], np.float32)
+    sorted_values = np.empty(len(values), np.float32)
+    for row in range(values.shape[1]):
+        for column in range(values.shape[2]):
+            for k in range(len(values)):  # insertion sort, because a word has few bits
+                value, place = values[k, row, column], k
+                while place > 0 and sorted_values[place - 1] > value:
+                    sorted_values[place] = sorted_values[place - 1]
+                    place -= 1
+                sorted_values[place] = value
+            result[row, column] = sorted_values[len(values) // 2]
+    return result
+
+
+@cached_njit(nogil=True, error_model="numpy")
 def neighbour_keys(word, down, across):  # type: ignore[no-untyped-def]
     """(n,) int64, words of each pixel and of the neighbour `down` rows and `across` columns on, as one number each.
 

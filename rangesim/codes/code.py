@@ -135,9 +135,16 @@ class Code(Named, ABC):
         says what differs; by default none. `rangesim.conventions.detect_convention` tries them."""
         yield from ()
 
-    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
         """(h, w) float64, least light of the projector at full power that the thresholds accept, in the background's
-        unit; by default what the difference of white and black needs."""
+        unit; by default what the difference of white and black needs.
+
+        Parameters
+        ----------
+        size, shown : as for `check_shown`.
+        """
         if background.noise_variance is None:
             return background.floor(thresholds.gray.relative_contrast)
         noise_variance = 2 * (background.ambient + background.noise_variance)  # white - black: the noise of two frames

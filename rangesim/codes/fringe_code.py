@@ -62,6 +62,8 @@ class FringeCode(Code):
         modulation = np.max([p.modulation for p in phases], axis=0)
         return mean + modulation, mean - modulation
 
-    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
         steps = min(self.stack(size).steps)
         return thresholds.phase.least_signal(steps, VISIBILITY, FrameContent(), background)

@@ -139,9 +139,11 @@ class GrayPhase(Code):
                 )
         return text or stack_contradiction(fringes, code, self.stack)
 
-    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
         needed = thresholds.phase.least_signal(self.steps, VISIBILITY, FrameContent(), background)
-        return np.maximum(super().least_signal(size, thresholds, background), needed)
+        return np.maximum(self.gray(size).least_signal(size, shown, thresholds, background), needed)
 
     @property
     def details(self) -> str:

@@ -68,7 +68,9 @@ class ImageStack(Code):
         check_fields(self)
         if not self.path:
             if self.digest:
-                raise ValueError("expected no digest without a path.")
+                raise ValueError(
+                    f"expected no digest without a path, got {shown(self.digest)}: give the path, or leave it out."
+                )
             return
         patterns = _patterns_in(self.path)
         found = _digest(patterns)
@@ -91,7 +93,10 @@ class ImageStack(Code):
     def check(self, size: int) -> None:
         patterns = self._stack(size)
         if patterns.shape[1] != size:
-            raise ValueError(f"expected patterns of {size} pixels, got {patterns.shape[1]} in {shown(self.path)}.")
+            raise ValueError(
+                f"expected patterns of {size} pixels, got {patterns.shape[1]} in "
+                f"{shown(self.path)}: make them for this size, or choose the projector that they are for."
+            )
         check_columns(patterns, has_white_and_black=True)
 
     def check_shown(self, size: int, shown: Sequence[str]) -> None:
@@ -155,20 +160,27 @@ def _read(place: Path, files: tuple[tuple[Path, int], ...]) -> np.ndarray:
     if len(files) == 1 and files[0][0] == place:
         patterns = np.load(place, mmap_mode="r", allow_pickle=False)
         if not isinstance(patterns, np.ndarray) or patterns.ndim != 2 or patterns.dtype.kind not in "fiub":
-            raise ValueError("expected an array (n, size) of numbers")
+            raise ValueError(f"expected an array (n, size) of numbers, got {shown(patterns)}")
     else:
         images = [file for file, _ in files if file.suffix.lower() in SUFFIXES]
         if not images:
-            raise ValueError("expected images in the folder")
+            raise ValueError(f"expected images ({', '.join(SUFFIXES)}) in the folder, got {len(files)} other files")
         lines = [_along_axis(read_grey(file), file) for file in images]
-        if len({len(line) for line in lines}) > 1:
-            raise ValueError("expected patterns that all vary along the same axis and have one size")
+        lengths = sorted({len(line) for line in lines})
+        if len(lengths) > 1:
+            raise ValueError(
+                "expected images of one size that all vary along the same axis, got patterns of "
+                f"{lengths[0]} and of {lengths[-1]} pixels"
+            )
         patterns = np.stack(lines)
     limits.check("frames", len(patterns), "patterns")
     limits.check("projector", patterns.shape[1], "pixels of a pattern")
     kept = np.array(patterns, dtype=np.float32, order="C")
-    if not (kept.size and np.isfinite(kept).all() and kept.min() >= 0 and kept.max() <= 1):
-        raise ValueError("expected values from 0 to 1")
+    if not kept.size:
+        raise ValueError(f"expected one pattern or more, got {shown(kept)}")
+    low, high = float(kept.min()), float(kept.max())
+    if not (low >= 0 and high <= 1):  # neither is a NaN
+        raise ValueError(f"expected values from 0 to 1, got {low:g} to {high:g}: divide them by their full scale")
     kept.setflags(write=False)
     return kept
 
@@ -180,7 +192,7 @@ def _along_axis(image: np.ndarray, file: Path) -> np.ndarray:
         values /= np.iinfo(image.dtype).max
     down, across = np.ptp(values, axis=0).max(), np.ptp(values, axis=1).max()
     if min(down, across) > MAX_UNEVEN:
-        raise ValueError(f"expected images that vary along one axis, {file.name} varies along both")
+        raise ValueError(f"expected images that vary along one axis, got {file.name}, which varies along both")
     return np.asarray(values.mean(axis=0) if down <= MAX_UNEVEN else values.mean(axis=1))
 
 

@@ -120,10 +120,14 @@ class StructuredLight(Sensor):
         for axis in self.axes:
             self.code.check(self.size(axis))
         if self.order:
-            in_view = set(self.frame_names())
             for axis in self.axes:
-                coded = [name for name in self.code.names(self.size(axis)) if f"{axis}_{name}" in in_view]
-                self.code.check_shown(self.size(axis), [*coded, *(name for name in (WHITE, BLACK) if name in in_view)])
+                self.code.check_shown(self.size(axis), self.shown_names(axis))
+
+    def shown_names(self, axis: str) -> list[str]:
+        """Names of the frames of an axis that are shown, as the code names them, and white and black if they are."""
+        in_view = set(self.frame_names())
+        coded = [name for name in self.code.names(self.size(axis)) if f"{axis}_{name}" in in_view]
+        return [*coded, *(name for name in (WHITE, BLACK) if name in in_view)]
 
     def size(self, axis: str) -> int:
         """Projector pixels along `axis`."""
@@ -329,7 +333,10 @@ class StructuredLightDecoder(Decoder):
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         shown = of_type(sensor, StructuredLight)
-        each = [shown.code.least_signal(shown.size(axis), self.thresholds, background) for axis in shown.axes]
+        each = [
+            shown.code.least_signal(shown.size(axis), shown.shown_names(axis), self.thresholds, background)
+            for axis in shown.axes
+        ]
         return np.asarray(np.maximum.reduce(each))
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
