@@ -65,7 +65,5 @@ class FringeConvention:
         ----------
         normalised : (...) float32, phase in turns of frames I_s = mean + modulation cos(phase - 2 pi s / N).
         """
-        if self == FringeConvention():
-            return normalised
         place = self.sign * normalised + np.float32(self.shift_turns(0, 1, period_px))
         return np.asarray(place - np.floor(place))
