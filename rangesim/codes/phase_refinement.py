@@ -57,4 +57,4 @@ def refine_by_phase(
         refused[ok & saturated[rows]] = Status.SATURATED
         if sigma_px is not None and sigma is not None:
             np.multiply(sigma, period_px / (2 * np.pi), out=sigma_px[rows], casting="same_kind")
-    return AxisCode(coordinate, status, gray.cell_px, sigma_px, gray, gamma.gamma)
+    return AxisCode(coordinate, status, gray.cell_px, sigma_px, gray, (gamma,))
