@@ -145,7 +145,7 @@ def answer(case: Case, code: str) -> Answer:
     except ValueError as error:
         return Answer("refused", "", str(error))
     cause = likely_cause(image, capture)
-    notes = unchecked(image) if case.is_calibrated else None
+    unknown = unchecked(image) if case.is_calibrated else None
     shares = ", ".join(f"{100 * x:.0f} % {name}" for name, x in status_fractions(image).items() if x >= 0.005)
     wrong = 0.0
     for coordinate, true in ((image.projector_column, uv[..., 0]), (image.projector_row, uv[..., 1])):
@@ -155,11 +155,12 @@ def answer(case: Case, code: str) -> Answer:
             wrong = max(wrong, float(off.mean()) if read.any() else 0.0)
     if case.is_calibrated and image.z.shape == z.shape and image.valid.any():
         wrong = max(wrong, float((np.abs(image.z / z - 1)[image.valid] > TOLERANCE_Z).mean()))
-    said = " ".join([*found.findings, *image.doubts, *(f"{c}." for c in (cause, notes) if c)])
+    said = " ".join([*found.findings, *image.notes, *image.doubts, *(f"{c}." for c in (cause, unknown) if c)])
     is_right = wrong <= MAX_WRONG_FRACTION and image.valid.mean() > 0.5
-    if found.findings and is_right and not image.doubts:
+    is_mended = bool(found.findings or image.notes)
+    if is_mended and is_right and not image.doubts:
         verdict = "mended"
-    elif image.doubts or cause or notes or found.findings:
+    elif image.doubts or cause or unknown or is_mended:
         verdict = "warned"
     else:
         verdict = "right" if is_right else "SILENT"

@@ -79,7 +79,7 @@ def unchecked(image: RangeImage) -> str | None:
 
 
 def summary(decoded: Decoded, out: Path, is_given: bool = False) -> str:
-    """One line on the result: fractions of all statuses that pixels have, depths, doubts, and the likely cause.
+    """One line on the result: fractions of all statuses that pixels have, depths, notes, doubts, and the likely cause.
 
     is_given : whether the user gave a calibration for the capture, so that it may be one of another rig.
     """
@@ -95,7 +95,7 @@ def summary(decoded: Decoded, out: Path, is_given: bool = False) -> str:
         parts.append(clause)
     if image.camera is None:
         parts.append("without --calibration there is no depth")
-    parts += [doubt.removesuffix(".") for doubt in image.doubts]
+    parts += [text.removesuffix(".") for text in (*image.notes, *image.doubts)]
     if decoded.likely_cause:
         parts.append(decoded.likely_cause)
     if is_given and (clause := unchecked(image)):

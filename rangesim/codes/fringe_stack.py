@@ -92,11 +92,20 @@ class FringeStack:
         run = slice(start, start + self.steps[i])
         return seen._replace(names=seen.names[run], frames=seen.frames[run])
 
-    def gamma(self, seen: AxisFrames, i: int, usable: np.ndarray, has_bits: bool) -> FringeGamma:
-        """What the fringes of period i tell of the response, from the pixels `usable` (h, w) bool.
+    def gammas(self, seen: AxisFrames, usable: np.ndarray, has_bits: bool) -> tuple[FringeGamma, ...]:
+        """What the fringes of each period tell of the response, from the pixels `usable` (h, w) bool.
 
-        `has_bits` tells whether the capture has other frames of the axis, from which white - black is estimated well.
+        Blurred fringes have a smaller gamma, so each period has its own. One that does not tell has that of the others,
+        because projector and camera are the same. `has_bits` tells whether the capture has other frames of the axis,
+        from which white - black is estimated well.
         """
+        found = [self._gamma(seen, i, usable, has_bits) for i in range(len(self.steps))]
+        told = [one.gamma for one in found if one.is_told]
+        common = FringeGamma(float(np.median(told))) if told else None
+        return tuple(one if one.is_told else common or one for one in found)
+
+    def _gamma(self, seen: AxisFrames, i: int, usable: np.ndarray, has_bits: bool) -> FringeGamma:
+        """What the fringes of period i alone tell of the response."""
         scale: np.ndarray | None = None
         if seen.contrast.is_measured or has_bits:
             scale = seen.contrast.values
@@ -169,7 +178,7 @@ class FringeStack:
         sigma_px = None if capture.noise(frames[0, :1]) is None else np.empty(shape, dtype=np.float32)
         saturated = capture.saturated(frames)
         usable = (status == Status.OK) & seen.contrast.is_enough & ~saturated
-        gammas = [self.gamma(seen, i, usable, coarse is not None) for i in range(len(self.steps))]
+        gammas = self.gammas(seen, usable, coarse is not None)
         order = np.argsort(self.periods_px, kind="stable")
         periods = np.array(self.periods_px)[order]
         precision = np.array(self.steps)[order] / periods**2
@@ -212,5 +221,4 @@ class FringeStack:
 
         in_bands(decode_rows, shape[0])
         cell_px = 1.0 if coarse is None else coarse.cell_px
-        gamma = float(np.median([g.gamma for g in gammas]))
-        return AxisCode(coordinate, status, cell_px, sigma_px, coarse, gamma)
+        return AxisCode(coordinate, status, cell_px, sigma_px, coarse, gammas)

@@ -134,7 +134,7 @@ class GrayPhase(Code):
         for i, period_px in enumerate(self.stack.periods_px):
             if text is None:
                 one = self.stack.frames_of(fringes, i)
-                text = level_contradiction(one, gray, code) or fringe_contradiction(
+                text = level_contradiction(one, gray, code, code.gammas[i]) or fringe_contradiction(
                     one, gray, code, period_px, self.convention
                 )
         return text or stack_contradiction(fringes, code, self.stack)

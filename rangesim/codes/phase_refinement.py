@@ -60,4 +60,4 @@ def refine_by_phase(
             np.multiply(sigma, period_px / (2 * np.pi), out=sigma_px[rows], casting="same_kind")
 
     in_bands(refine_rows, len(status))
-    return AxisCode(coordinate, status, gray.cell_px, sigma_px, gray, gamma.gamma)
+    return AxisCode(coordinate, status, gray.cell_px, sigma_px, gray, (gamma,))

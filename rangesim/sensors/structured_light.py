@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Annotated, ClassVar, Literal
@@ -393,6 +393,16 @@ def _repeated_frames(capture: Capture) -> str | None:
     return None
 
 
+def _corrections(codes: dict[str, AxisCode]) -> Iterator[str]:
+    """Sentences on what was corrected in the codes of all axes."""
+    gammas = {axis: f"{code.gamma:.3g}" for axis, code in codes.items() if code.gamma != 1}
+    if gammas:
+        yield (
+            f"the fringes along {' and '.join(gammas)} were corrected for a gamma of "
+            f"{' and '.join(dict.fromkeys(gammas.values()))} of projector and camera together."
+        )
+
+
 def _orientation(codes: dict[str, AxisCode]) -> str | None:
     """A sentence if the codes of both axes are those of a mirrored image; None if not."""
     if len(codes) < 2:
@@ -455,6 +465,7 @@ def joined_axes(
         intensity=contrast.white.astype(np.float32) - np.float32(capture.black_level),
         limits=triangulation,
         doubts=tuple(contradictions),
+        notes=tuple(_corrections(codes)),
     )
 
 
