@@ -180,6 +180,14 @@ def _posed(given: Given, change: Callable[[np.ndarray], np.ndarray]) -> Given:
     return replace(given, rig=replace(given.rig, T_camera_projector=change(given.rig.T_camera_projector)))
 
 
+def _shorter_lens(given: Given, factor: float) -> Given:
+    """The calibration of a camera of another size of image: focal length and principal point times a factor."""
+    assert given.rig is not None
+    camera = given.rig.pinhole
+    scaled = {name: factor * getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
+    return replace(given, rig=replace(given.rig, camera=replace(camera, **scaled)))
+
+
 def _millimetres(pose: np.ndarray) -> np.ndarray:
     pose = pose.copy()
     pose[:3, 3] *= 1000
@@ -313,6 +321,7 @@ CASES = [
         is_calibrated=True,
         axes=BOTH,
     ),
+    Case("a calibration at half the size", lambda g: _shorter_lens(g, 0.5), "beside the projector", is_calibrated=True),
     Case("a calibration with one axis", lambda g: g, "alone do not check", is_calibrated=True),
     Case("levels that clip at 40 % of the pixels", _clipped, ""),
     Case("plain binary", _plain_binary, "plain binary"),
