@@ -200,6 +200,21 @@ def test_patterns_say_all_that_decoding_needs(tmp_path: Path) -> None:
         assert f"leave out {option[0]}" in refused("decode", tmp_path / "scan", *sidecar, *option, "--out", "x")
 
 
+def test_photographs_in_another_order_than_patterns_json_states(tmp_path: Path) -> None:
+    run("patterns", "gray", *SIZE, "--axes", "columns", "--out", tmp_path / "patterns")
+    shown = import_capture(tmp_path / "patterns", load_patterns(tmp_path / "patterns").sensor).frames
+    sidecar = ("--patterns", tmp_path / "patterns" / "patterns.json")
+    for name, order, words in (
+        ("first", [-2, -1, *range(len(shown) - 2)], "not as the patterns were written: white and black come first."),
+        ("inverses", [*(i ^ 1 for i in range(len(shown) - 2)), -2, -1], "each inverse stands before its pattern."),
+    ):
+        write_images(tmp_path / name, shown[order])
+        assert words in run("decode", tmp_path / name, *sidecar, "--out", tmp_path / f"out_{name}")
+        with np.load(tmp_path / f"out_{name}" / "range.npz") as maps:
+            column = maps["projector_column"]
+        np.testing.assert_array_equal(column, np.broadcast_to(np.arange(column.shape[1]) + 0.5, column.shape))
+
+
 @pytest.mark.parametrize(("bits", "dtype"), [(8, np.uint8), (5, np.uint8), (10, np.uint16)])
 def test_a_projector_with_that_gamma_shows_the_patterns(bits: int, dtype: type) -> None:
     sensor = StructuredLight(64, 48)

@@ -126,7 +126,8 @@ def decode_command(
                 raise ValueError(f"expected no --set of the decoder with {calibration}, which holds its settings.")
             image = _calibrated_tof(first, calibration)
         else:
-            first, findings = _calibrated(first, stored, calibration), (*findings, *stored.findings)
+            first = _calibrated(first, stored, calibration)
+            findings = (*findings, *stored.findings, *_calibration_doubts(first, calibration))
             image = decode(first, loaded.decoder)
     cause = likely_cause(image, first)
     decoded = Decoded(image, first.sensor, first.rig, status_fractions(image), cause, findings)
@@ -155,12 +156,28 @@ def _calibrated(capture: Capture, stored: StoredCalibration, calibration: Path) 
 
     size = capture.sensor.default_emitter.size
     height, width = capture.frames.shape[1:]
+    if stored.camera_size not in (None, (width, height)):
+        raise FileFormatError(
+            f"{calibration}: expected the calibration of a camera of {width} x {height} pixels, as the images, got "
+            f"{' x '.join(map(str, stored.camera_size or ()))}: calibrate at the size of the images, and check that "
+            "camera and projector are not exchanged in the file."
+        )
     try:
         if size is None and not capture.sensor.triangulates:
             return replace(capture, rig=stored.rig_of_camera((width, height)))
         return replace(capture, rig=stored.rig((width, height), size))
     except ValueError as error:
         raise FileFormatError(f"{calibration}: {error}") from error
+
+
+def _calibration_doubts(capture: Capture, calibration: Path) -> tuple[str, ...]:
+    """Sentences on what is implausible in the calibration of a capture."""
+    from rangesim.rig import Intrinsics
+    from rangesim.rig.calibration_files import principal_point_doubts
+
+    if capture.rig is None or not isinstance(capture.rig.camera, Intrinsics):
+        return ()
+    return tuple(f"{calibration}: {text}" for text in principal_point_doubts(capture.rig))
 
 
 def _calibrated_tof(capture: Capture, calibration: Path) -> RangeImage:

@@ -24,6 +24,10 @@ MAX_BASELINE_M = 10.0
 Few rigs have a baseline of less than 10 mm, and a file in millimetres would give 10 mm as 10 m."""
 
 
+MIN_BASELINE_M = 1e-3
+"""Least baseline in metres of devices that triangulate. A baseline in metres that is stated in millimetres is less."""
+
+
 def status_fractions(image: RangeImage) -> dict[str, float]:
     """Fractions of the pixels, 0 to 1, by the name of their status, for all statuses."""
     counts = np.bincount(image.status.ravel(), minlength=len(Status))
@@ -40,6 +44,11 @@ def likely_cause(image: RangeImage, capture: Capture) -> str | None:
         return (
             f"camera and emitter are {capture.rig.baseline_m:g} m apart: if the calibration is in millimetres, "
             "give --unit 0.001"
+        )
+    if capture.rig is not None and capture.sensor.triangulates and capture.rig.baseline_m < MIN_BASELINE_M:
+        return (
+            f"camera and projector are {1000 * capture.rig.baseline_m:.2g} mm apart: if the calibration is in metres, "
+            "give --unit 1"
         )
     decoder = image.decoder or capture.sensor.default_decoder
     if cause := decoder.likely_cause(capture, image):

@@ -226,9 +226,8 @@ def _imported(
     sensor, frames = _by_name(sensor, imported, options.axes)
     findings = imported.findings
     try:
-        if not is_stated:
-            sensor, found = _as_found(sensor, frames)
-            findings += found
+        sensor, found = _as_found(sensor, frames, is_stated)
+        findings += found
     except ValueError as error:
         raise FileFormatError(
             f"{place}: {error} If some images are no frames, name the others with --images."
@@ -240,12 +239,22 @@ def _imported(
         raise FileFormatError(f"{place}: {error}") from error
 
 
-def _as_found(sensor: Sensor, frames: np.ndarray) -> tuple[Sensor, tuple[str, ...]]:
-    """The sensor with the conventions that the frames tell, and what they told; unchanged if an order is stated."""
-    from rangesim.conventions import detect_convention
+def _as_found(sensor: Sensor, frames: np.ndarray, is_stated: bool) -> tuple[Sensor, tuple[str, ...]]:
+    """The sensor with the conventions that the frames tell, and what they told.
+
+    If --order states the order, nothing is looked for; if a patterns.json does, only whether the images are in another.
+    """
+    from rangesim.conventions import detect_convention, detect_order
     from rangesim.sensors import StructuredLight
 
-    if not isinstance(sensor, StructuredLight) or sensor.order:
+    if not isinstance(sensor, StructuredLight):
+        return sensor, ()
+    if is_stated:
+        if len(frames) != sensor.n_frames:
+            return sensor, ()
+        found = detect_order(frames, sensor)
+        return found.sensor, tuple(f"not as the patterns were written: {text}" for text in found.findings)
+    if sensor.order:
         return sensor, ()
     found = detect_convention(frames, sensor)
     return found.sensor, found.findings

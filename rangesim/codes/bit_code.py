@@ -11,7 +11,10 @@ import numpy as np
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.bit_checks import (
+    frame_contradiction,
     level_contradiction,
+    light_of_bits,
+    lost_contradiction,
     neighbours_of,
     order_contradiction,
     other_code_contradiction,
@@ -104,6 +107,9 @@ class BitCode(Code):
     def contradiction(self, seen: AxisFrames, code: AxisCode) -> str | None:
         words = self.words(seen.size)
         if found := pair_contradiction(seen, words) or level_contradiction(seen, words):
+            return found
+        light = light_of_bits(seen, words, self.cell_px)
+        if found := frame_contradiction(light) or lost_contradiction(light):
             return found
         neighbours = neighbours_of(code, words)
         return other_code_contradiction(seen, neighbours, words, _other_words(words)) or order_contradiction(

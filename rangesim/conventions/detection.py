@@ -152,15 +152,48 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
         found = _upright(frames, sample, found)
     elif not is_given:
         raise ValueError(f"{_wrong_number(len(frames), sensor)[:-1]}; and they are too dark to tell which are missing.")
-    findings = [] if layout is None else list(_differences(layout, sensor, found))
+    findings = _order_findings(layout, sensor, found)
     if layout is None and found.axes != sensor.axes:
-        findings.append(f"{found.axes[0]} were shown before {found.axes[1]}.")
-    if found.order != sensor.order and 0 < len(found.order) <= MAX_ENTRIES:
-        findings.append(f"this is the order {', '.join(found.order)}.")
+        findings.insert(0, f"{found.axes[0]} were shown before {found.axes[1]}.")
     found, said_of_places = _within_projector(sample, found)
     code, said = measured_fringes(frames, sample.frames, found)
     found = replace(found, code=code)
     return Convention(found, (*findings, *said_of_places, *said))
+
+
+def detect_order(frames: np.ndarray, sensor: StructuredLight) -> Convention:
+    """The sensor with another order of its frames, if the frames agree clearly better with that one; else unchanged.
+
+    Parameters
+    ----------
+    frames : (k, h, w) of any number type, as many as the sensor has frames.
+    sensor : StructuredLight with the order and the code in which its patterns were shown.
+
+    Examples
+    --------
+    >>> sensor = StructuredLight(64, 48, code="gray")
+    >>> detect_order(sensor.patterns()[::-1], sensor).findings[0]
+    'black and white come first, black before white.'
+    """
+    sample = _sampled(frames)
+    if np.count_nonzero(sample.is_lit) < MIN_PIXELS:
+        return Convention(sensor)
+    layout = _best_layout(sample, sensor, list(layouts(sensor, len(frames))), is_given=True)
+    if layout is None:
+        return Convention(sensor)
+    found = _upright(frames, sample, with_layout(sensor, layout))
+    return Convention(found, tuple(_order_findings(layout, sensor, found)))
+
+
+def _order_findings(layout: Layout | None, sensor: StructuredLight, found: StructuredLight) -> list[str]:
+    """Sentences on what of an order differs from that of the sensor; none without a layout."""
+    findings = [] if layout is None else list(_differences(layout, sensor, found))
+    if found.order != sensor.order and 0 < len(found.order) <= MAX_ENTRIES:
+        findings.append(f"this is the order {', '.join(found.order)}.")
+    if layout is not None and not findings:
+        names = found.frame_names()
+        findings.append(f"this is the order {', '.join(names[:MAX_ENTRIES])}, ... {names[-1]}.")
+    return findings
 
 
 def _wrong_number(n: int, sensor: StructuredLight) -> str:
