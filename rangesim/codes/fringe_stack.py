@@ -98,7 +98,7 @@ class FringeStack:
         return seen._replace(names=seen.names[run], frames=seen.frames[run])
 
     def gamma(self, seen: AxisFrames, i: int, usable: np.ndarray, has_bits: bool) -> FringeGamma:
-        """What the fringes of period i tell of the response, from the pixels `usable` (h, w) bool.
+        """Response of projector and camera as the fringes of period i show it at the pixels `usable` (h, w) bool.
 
         `has_bits` tells whether the capture has other frames of the axis, from which white - black is estimated well.
         """
