@@ -138,7 +138,7 @@ def decode_command(
 
 
 def _stored(calibration: Path | None, code_step: int, unit_m: float | None) -> StoredCalibration | None:
-    """What a calibration file holds; None without a file, and for one of a time-of-flight camera."""
+    """Contents of a calibration file; None without a file, and for one of a time-of-flight camera."""
     from rangesim.rig.calibration_files import read_calibration
 
     if calibration is None or calibration.suffix.lower() == TOF_SUFFIX:

@@ -131,7 +131,7 @@ class ImageOptions:
     patterns: Path | None = None
 
     def given(self, names: Sequence[str]) -> str:
-        """Those of the named options that were given, as on the command line; "" if none was."""
+        """Names of the options that were given, of `names`, as on the command line; "" if none was."""
         return ", ".join(f"--{name}" for name in names if getattr(self, name))
 
 

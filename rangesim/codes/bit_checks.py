@@ -441,7 +441,7 @@ def neighbours_of(code: AxisCode, words: Words) -> list[np.ndarray]:
 
 
 def _that_differ(keys: np.ndarray) -> np.ndarray:
-    """Those of the keys (n,) whose two words differ."""
+    """The keys, of keys (n,), whose two words differ."""
     return np.asarray(keys[keys >> 32 != keys & 0xFFFFFFFF])
 
 

@@ -47,7 +47,7 @@ class BitCode(Code):
     @property
     @abstractmethod
     def noun(self) -> str:
-        """What the words are, in running text: "Gray code"."""
+        """Name of the words in running text: "Gray code"."""
 
     @abstractmethod
     def words_of_cells(self, bits: int) -> np.ndarray:
@@ -119,10 +119,11 @@ class BitCode(Code):
     def least_signal(
         self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
     ) -> np.ndarray:
-        """What white - black needs, and what a bit without inverse needs, 2 pattern - (white + black).
+        """The light that white - black needs, or that a bit without inverse needs, if that is more.
 
-        At a lit pixel that difference is the light S, and its variance is 4 (S + n) + (S + n) + n = 5 S + 6 n, with n
-        of a frame without S; so S = t sqrt(5 S + 6 n) for t sigmas, which is 3 sqrt(6) = 7.3 sqrt(n) in weak light.
+        Such a bit is the sign of 2 pattern - (white + black). At a lit pixel that difference is the light S, and its
+        variance is 4 (S + n) + (S + n) + n = 5 S + 6 n, with n of a frame without S; so S = t sqrt(5 S + 6 n) for t
+        sigmas, which is 3 sqrt(6) = 7.3 times sqrt(n) in weak light.
         """
         least = super().least_signal(size, shown, thresholds, background)
         is_alone = any(bit.pattern is None or bit.inverse is None for bit in bit_frames(list(shown), self.bits(size)))

@@ -112,7 +112,7 @@ def coarse_step(pairs, cell_of, bits):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy")
 def octaves_nearer(pairs, before, after, step):  # type: ignore[no-untyped-def]
-    """How much nearer pairs lie by one table of cells than by another: three sums over the pairs.
+    """Three sums over pairs that compare their distances by two tables of cells.
 
     They are the number of pairs whose distance is halved or doubled at least, the number of those whose distance is
     halved, and the sum of all changes, in powers of two.

@@ -21,7 +21,8 @@ CELL_SIGMA = 12**-0.5
 """Standard deviation of a place that is known to lie in a cell, in cells: that of an even distribution."""
 
 LONE_NOISE = 3**0.5
-"""Ratio of the noise of 2 pattern - (white + black) to that of pattern - inverse, at equal noise of all frames."""
+"""Ratio of the noise of 2 pattern - (white + black) to that of pattern - inverse, at equal noise of all frames: their
+variances are those of 4 + 1 + 1 frames and of 2."""
 
 
 MIN_EVEN_CONTRAST = 0.5

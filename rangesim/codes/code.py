@@ -41,7 +41,7 @@ class CodeThresholds(NamedTuple):
 
 
 class Code(Named, ABC):
-    """How a stack of patterns codes one axis of a projector. Subclasses are frozen dataclasses.
+    """A stack of patterns that codes one axis of a projector. Subclasses are frozen dataclasses.
 
     Examples
     --------

@@ -40,7 +40,8 @@ MIN_FOUND = 0.5
 found that fit by chance, `MAX_FALSE`."""
 
 MIN_WINDOWS = 50
-"""Least number of windows from which a check draws a conclusion."""
+"""Least number of windows from which a check draws a conclusion. The fraction of them that is found then has a standard
+error of 7 % at most, so that a sound capture does not fall below `MIN_FOUND` by chance."""
 
 
 class StripeSequence(NamedTuple):
@@ -123,9 +124,10 @@ class DeBruijnStripes(Code):
     def least_signal(
         self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
     ) -> np.ndarray:
-        """What white - black needs, and what a channel needs, its difference from their middle.
+        """The light that white - black needs, or that a channel needs, if that is more.
 
-        At a lit pixel it is half the light S, and its variance is taken as that of two frames, S + n and S / 2 + n,
+        The colour of a pixel is the sign of its channels minus the middle of white and black. At a lit pixel that
+        difference is half the light S, and its variance is taken as that of two frames, S + n and S / 2 + n,
         with n of a frame without S; so S / 2 = t sqrt(1.5 S + 2 n) for t sigmas.
         """
         least = super().least_signal(size, shown, thresholds, background)

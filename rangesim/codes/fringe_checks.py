@@ -158,7 +158,10 @@ def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, gam
 
 
 def _level_fault(seen: AxisFrames, usable: np.ndarray, gamma: FringeGamma, in_many_cells: bool) -> str | None:
-    """As `level_contradiction`, from the pixels `usable` (h, w), which lie `in_many_cells` or fringes or not."""
+    """A sentence if the fringes contradict white and black at the pixels `usable` (h, w) bool; None if they do not.
+
+    in_many_cells : whether these pixels lie in many Gray cells or fringes, so that a constant frame shows.
+    """
     white, black, axis = seen.contrast.white, seen.contrast.black, seen.axis
     if not seen.contrast.is_measured:
         return None

@@ -93,7 +93,7 @@ class FringeStack:
         return seen._replace(names=seen.names[run], frames=seen.frames[run])
 
     def gammas(self, seen: AxisFrames, usable: np.ndarray, has_bits: bool) -> tuple[FringeGamma, ...]:
-        """What the fringes of each period tell of the response, from the pixels `usable` (h, w) bool.
+        """Response of projector and camera as the fringes of each period show it at the pixels `usable` (h, w) bool.
 
         Blurred fringes have a smaller gamma, so each period has its own. One that does not tell has that of the others,
         because projector and camera are the same. `has_bits` tells whether the capture has other frames of the axis,
@@ -105,7 +105,7 @@ class FringeStack:
         return tuple(one if one.is_told else common or one for one in found)
 
     def _gamma(self, seen: AxisFrames, i: int, usable: np.ndarray, has_bits: bool) -> FringeGamma:
-        """What the fringes of period i alone tell of the response."""
+        """Response of projector and camera as the fringes of period i alone show it at the pixels `usable`."""
         scale: np.ndarray | None = None
         if seen.contrast.is_measured or has_bits:
             scale = seen.contrast.values

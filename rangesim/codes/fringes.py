@@ -21,7 +21,9 @@ VISIBILITY = 0.5
 
 @dataclass(frozen=True)
 class FringeConvention:
-    """How fringes are numbered: pattern s of N is 1/2 + 1/2 cos(2 pi ((x - origin_px) / P - start -+ s / N)).
+    """Start, direction and origin of fringes.
+
+    Pattern s of N is 1/2 + 1/2 cos(2 pi ((x - origin_px) / P - start -+ s / N)).
 
     Parameters
     ----------

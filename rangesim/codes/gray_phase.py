@@ -22,8 +22,8 @@ from rangesim.sensor import Background, FrameContent
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 GUARD_TURNS = 1 / 8
-"""Distance beyond the edges of a Gray cell, in periods of the fringes, at which a place may still lie: for noise, and
-for camera pixels across the edge of a cell."""
+"""Distance beyond the edges of a Gray cell, in periods of the fringes, at which a place may still lie: for noise, four
+standard deviations of the noisiest phase that is accepted, and for camera pixels across the edge of a cell."""
 
 
 @dataclass(frozen=True)

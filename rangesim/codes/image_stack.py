@@ -27,9 +27,15 @@ MAX_UNEVEN = 2 / 255
 DIGEST_LENGTH = 16
 """Number of hexadecimal digits of a digest: 64 bits, so that two stacks never share one by chance."""
 
-SMOOTH_PATTERNS, SMOOTH_PERIODS, SMOOTH_SEED = 12, 16, 7
-"""The stack without a file: number of patterns, most periods of a pattern over the projector, seed. With these, no two
-places that are no neighbours correlate by more than 0.95."""
+SMOOTH_PATTERNS = 12
+"""Number of patterns of the stack without a file. With it, the periods and the seed below, no two places that are no
+neighbours correlate by more than 0.95."""
+
+MAX_SMOOTH_PERIODS = 16
+"""Number of periods over the projector of the finest of these patterns; see `SMOOTH_PATTERNS`."""
+
+SMOOTH_SEED = 7
+"""Seed of the phases of these patterns; see `SMOOTH_PATTERNS`."""
 
 
 @dataclass(frozen=True)
@@ -121,10 +127,10 @@ class ImageStack(Code):
 
 @lru_cache(maxsize=8)
 def _smooth_patterns(size: int) -> np.ndarray:
-    """(n, size) float32, fringes of 1 to `SMOOTH_PERIODS` periods with random phases; read-only."""
+    """(n, size) float32, fringes of 1 to `MAX_SMOOTH_PERIODS` periods with random phases; read-only."""
     rng = np.random.default_rng(SMOOTH_SEED)
     x = (np.arange(size) + 0.5) / size
-    periods = np.linspace(1, SMOOTH_PERIODS, SMOOTH_PATTERNS)
+    periods = np.linspace(1, MAX_SMOOTH_PERIODS, SMOOTH_PATTERNS)
     phases = rng.random(SMOOTH_PATTERNS)
     patterns = (0.5 + 0.5 * np.cos(2 * np.pi * (periods[:, None] * x + phases[:, None]))).astype(np.float32)
     patterns.setflags(write=False)

@@ -245,7 +245,7 @@ class MicroPhaseShifting(Code):
         return phase, places, units
 
     def table_of(self, size: int, gamma: float) -> PeriodTable:
-        """What the images show at each projector pixel if the projector has that gamma."""
+        """Values of the images at each projector pixel if the projector has that gamma."""
         shown = self.patterns(size)[:, None] ** np.float32(gamma)
         values = self._units(shown, self.periods(size))[2]
         slopes = np.gradient(values, axis=0).astype(np.float32)
@@ -302,7 +302,7 @@ def angles(periods: Sequence[float], convention: FringeConvention) -> tuple[np.n
 def period_table(
     periods: Sequence[float], convention: FringeConvention, size: int, contrast: np.ndarray
 ) -> PeriodTable:
-    """What the images show at each projector pixel, if periods have that contrast (F,) as a fraction of the first."""
+    """Values of the images at each projector pixel, if periods have that contrast (F,) as a fraction of the first."""
     omega, start = angles(periods, convention)
     x = np.arange(size)[:, None] + 0.5
     first, further = omega[:1] * x, omega[1:] * x - start[1:]

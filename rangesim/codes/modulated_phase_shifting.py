@@ -22,10 +22,12 @@ from rangesim.sensor import Background, FrameContent, least_signal_for
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 CARRIER_VISIBILITY = 0.5
-"""Amplitude of the carrier where the long fringes are brightest, as a fraction of the light at full power."""
+"""Amplitude of the carrier where the long fringes are brightest, as a fraction of the light at full power: half of it,
+because the values of a pattern go from 0 to 1."""
 
 MEAN_SQUARE = 3 / 8
-"""Mean square of a long fringe, 1/2 + 1/2 cos: the fraction of the images' information on the carrier that is left."""
+"""Mean square of a long fringe, 1/2 + 1/2 cos, which is 1/4 + 1/8: the fraction of the images' information on the
+carrier that is left."""
 
 MAX_OFF_PERIODS = 0.2
 """Largest distance of the place that longer fringes tell from the nearest place of the next shorter ones, in periods of
@@ -38,7 +40,7 @@ MAX_SIGMA_PERIODS = 1 / 6
 
 
 class Demodulated(NamedTuple):
-    """What the images of a carrier tell at each pixel.
+    """Phases of the carrier and of the long fringes at each pixel.
 
     carrier : Phase of the carrier; its modulation is the amplitude where the long fringes are brightest.
     long : phases of the long fringes, the longest first, in the amplitude of the carrier.
@@ -155,8 +157,11 @@ class ModulatedPhaseShifting(Code):
     def least_signal(
         self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
     ) -> np.ndarray:
-        """What the phase of the carrier needs, and what its period needs: the noise is at most `_max_relative_noise` of
-        the carrier's amplitude, `CARRIER_VISIBILITY` times the light."""
+        """The light that the phase of the carrier needs, or that its period needs, if that is more.
+
+        The period can be told if the noise is at most `_max_relative_noise` of the carrier's amplitude, which is
+        `CARRIER_VISIBILITY` times the light.
+        """
         steps = max(1, round(MEAN_SQUARE * len(self.names(size))))
         least = thresholds.phase.least_signal(steps, CARRIER_VISIBILITY, FrameContent(), background)
         if background.noise_variance is None:

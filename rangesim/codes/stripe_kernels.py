@@ -9,8 +9,11 @@ import numpy as np
 
 from pcgraph.parallel import kernel
 
-UNCERTAIN, DARK = -1, -2
-"""Words of pixels on the edge of a stripe, and of pixels without light."""
+UNCERTAIN = -1
+"""Word of a pixel on the edge of a stripe; words of colours are numbers from 0 on."""
+
+DARK = -2
+"""Word of a pixel without light, across which no stripes are read; see `UNCERTAIN`."""
 
 MAX_STEP_RATIO = 1.2
 """Largest ratio of the widths in the image of a stripe and of the more similar of its two neighbours. Between the edges

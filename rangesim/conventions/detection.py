@@ -90,7 +90,7 @@ MAX_ENTRIES = 6
 
 @dataclass(frozen=True)
 class Convention:
-    """What the frames tell of how they were taken.
+    """Convention in which frames were taken, as they show it.
 
     sensor : StructuredLight with the settings that the frames agree with.
     findings : sentences, one for each setting that differs from those given; none if nothing does.
@@ -320,7 +320,7 @@ def _likeness(sample: _Sample, fineness: dict[str, float], names: Sequence[str])
 
 
 def _agreement_bits(sample: _Sample, candidate: StructuredLight) -> float:
-    """How much nearer to each other neighbouring pixels see the projector than any two pixels do, in powers of two.
+    """Ratio of the distance of any two pixels to that of neighbours, on the projector, in powers of two.
 
     It is the mean over all pairs of neighbours that see different cells, times the fraction of the pairs that are
     decoded; of two axes, that of the worse one.

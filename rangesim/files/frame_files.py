@@ -138,7 +138,7 @@ def _natural(path: Path) -> list[tuple[int, int | str]]:
 
 @dataclass(frozen=True)
 class CameraView:
-    """How images become frames.
+    """Rule by which images become frames.
 
     rotate : degrees clockwise by which the images are turned. mirror : whether left and right are then exchanged.
     channel : one of `CHANNELS`, of images with colours.

@@ -148,7 +148,7 @@ class DeviceCalibration:
 
 @dataclass(frozen=True)
 class StoredCalibration:
-    """What a calibration file holds. The sizes of the images may be missing; `rig` takes them from elsewhere.
+    """Contents of a calibration file. The sizes of the images may be missing; `rig` takes them from elsewhere.
 
     camera, projector : DeviceCalibration; projector None: the file holds a camera alone.
     T_camera_projector : (4, 4) float64, metres; None likewise. own : the Rig of a JSON file of our own, else None.
