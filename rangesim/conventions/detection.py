@@ -80,6 +80,10 @@ MIN_STEP = 0.5
 """Least distance of two pixels that see different cells, in cells: a pixel on the edge of two cells is half a cell off
 both."""
 
+MIN_SUBPIXEL_FRACTION = 0.5
+"""Least fraction of the places that are neither the centre nor the edge of a cell, at which a code counts as sub-pixel:
+of bits none is, of fringes nearly all are."""
+
 MAX_LOSS_BITS = 0.2
 """Largest loss against the best order, in bits, at which a more usual order is taken. Two orders that are equally right
 differ by less than 0.1 bits."""
@@ -339,9 +343,10 @@ def _decoded(frames: np.ndarray, sensor: StructuredLight) -> dict[str, AxisCode]
 
 
 def _nearness(sample: _Sample, code: AxisCode) -> float:
-    """Mean of log2 of the distance of any two pixels minus that of neighbours, in cells; see `_agreement_bits`.
+    """Mean of log2 of the distance of any two pixels minus that of neighbours; see `_agreement_bits`.
 
-    Neighbours that see the same cell would agree in every order.
+    Distances are in cells. Neighbours that see the same cell of a code of bits would agree in every order, so they do
+    not count. A sub-pixel code that refines no such cells tells all places from each other; its cells are pixels.
     """
     ok = code.status == Status.OK
     here, there, n = [], [], 0
@@ -351,12 +356,16 @@ def _nearness(sample: _Sample, code: AxisCode) -> float:
         here.append(code.coordinate[a][both])
         there.append(code.coordinate[b][both])
     first, second = np.concatenate(here) / code.cell_px, np.concatenate(there) / code.cell_px
-    differ = np.abs(first - second) >= MIN_STEP
+    is_subpixel = code.coarse is None and np.count_nonzero(first % MIN_STEP) > MIN_SUBPIXEL_FRACTION * len(first)
+    if is_subpixel:
+        first, second = first * code.cell_px, second * code.cell_px
+    distance = np.abs(first - second)
+    differ = (distance >= MIN_STEP) | is_subpixel
     if np.count_nonzero(differ) < MIN_PIXELS:
         return 0.0
     any_other = np.random.default_rng(0).permutation(second)
     octaves = np.log2(np.maximum(np.abs(first - any_other), MIN_STEP)).mean()
-    return float((octaves - np.log2(np.abs(first - second)[differ]).mean()) * len(first) / n)
+    return float((octaves - np.log2(np.maximum(distance, MIN_STEP)[differ]).mean()) * len(first) / n)
 
 
 def _upright(frames: np.ndarray, sample: _Sample, found: StructuredLight) -> StructuredLight:
