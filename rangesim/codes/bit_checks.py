@@ -168,26 +168,12 @@ def level_contradiction(seen: AxisFrames, words: Words) -> str | None:
     return None
 
 
-def frame_contradiction(light: Light) -> str | None:
-    """A sentence if frames show no bits, or white or black in place of a bit; None if each may show its bit.
-
-    A bit is dark or lit, and between the two only at its edges. It takes both values in a view of more cells than its
-    widest stripe has.
-
-    Parameters
-    ----------
-    light : what `light_of_bits` returns.
-    """
-    if light.lit.shape[1] < MIN_PIXELS:
-        return None
-    return _between_contradiction(light) or _uniform_contradiction(light)
-
-
 class Light(NamedTuple):
     """Light of the bits, most significant first: 0 dark, 1 lit, NaN in shadow.
 
     seen : frames of the bits. words : those of the code. coded : (b, cells) int, bits of the cells of the projector.
     across, down : (b, n, m) float32, along lines across the image and down the image.
+    decoded : (n, m) bool, pixels of `across` with a word of the code.
     """
 
     seen: AxisFrames
@@ -195,6 +181,7 @@ class Light(NamedTuple):
     coded: np.ndarray
     across: np.ndarray
     down: np.ndarray
+    decoded: np.ndarray
 
     @property
     def lit(self) -> np.ndarray:
@@ -202,20 +189,27 @@ class Light(NamedTuple):
         return self.across[:, np.isfinite(self.across[0])]
 
 
-def light_of_bits(seen: AxisFrames, words: Words, cell_px: int) -> Light:
+def light_of_bits(seen: AxisFrames, code: AxisCode, words: Words) -> Light:
     """Light of the bits at some lines of the image.
 
     Parameters
     ----------
-    seen : frames (k, h, w) of the bits. words : those of the code. cell_px : int, projector pixels per cell.
+    seen : frames (k, h, w) of the bits. code : what they decode to. words : those of the code.
     """
+    cell_px = round(code.cell_px)
     coded = (words.of_cell[: -(-seen.size // cell_px)] >> np.arange(words.bits)[::-1, None]) & 1
-    return Light(seen, words, coded, _along_lines(seen, words, is_down=False), _along_lines(seen, words, is_down=True))
+    across, down = _along_lines(seen, words, is_down=False), _along_lines(seen, words, is_down=True)
+    return Light(seen, words, coded, across, down, (code.status == Status.OK)[:: _line_step(seen)])
+
+
+def _line_step(seen: AxisFrames) -> int:
+    """Distance of the lines of the image that are looked at, in pixels."""
+    return 1 + seen.contrast.values.size // MAX_PIXELS
 
 
 def _along_lines(seen: AxisFrames, words: Words, is_down: bool) -> np.ndarray:
     """(b, n, m) float32, light of the bits along lines of the image, across or down."""
-    step = 1 + seen.contrast.values.size // MAX_PIXELS
+    step = _line_step(seen)
 
     def lines(image: np.ndarray) -> np.ndarray:
         return (image.T if is_down else image)[::step].astype(np.float32)
@@ -232,12 +226,21 @@ def _along_lines(seen: AxisFrames, words: Words, is_down: bool) -> np.ndarray:
     return np.stack(result)
 
 
-def _between_contradiction(light: Light) -> str | None:
-    """A sentence if bits of wide stripes lie between dark and lit at many pixels; None if not."""
+def between_contradiction(light: Light) -> str | None:
+    """A sentence if bits of wide stripes lie between dark and lit at many of the decoded pixels; None if not.
+
+    A bit is dark or lit, and between the two only at its edges. Light of interreflection blurs all bits, but such
+    pixels are not decoded.
+
+    Parameters
+    ----------
+    light : what `light_of_bits` returns.
+    """
     n_cells = light.coded.shape[1]
     mean_stripe = n_cells / (1 + np.count_nonzero(np.diff(light.coded), axis=1))
-    wide = light.lit[mean_stripe >= min(MIN_STRIPE_CELLS, n_cells**0.5)]
-    if not len(wide):
+    used = np.isfinite(light.across[0]) & light.decoded
+    wide = light.across[:, used][mean_stripe >= min(MIN_STRIPE_CELLS, n_cells**0.5)]
+    if not len(wide) or wide.shape[1] < MIN_PIXELS:
         return None
     between = float(np.median((np.abs(wide - 0.5) < MAX_FROM_MIDDLE).mean(axis=1)))
     if between <= MAX_BETWEEN_FRACTION:
@@ -248,14 +251,20 @@ def _between_contradiction(light: Light) -> str | None:
     )
 
 
-def _uniform_contradiction(light: Light) -> str | None:
+def uniform_contradiction(light: Light) -> str | None:
     """A sentence if a bit is dark or lit at all pixels, and white or black may stand in its place; None if not.
 
-    It is so where the words are more than the cells of the bit's widest stripe. In Gray code, the widest stripe of the
+    A bit takes both values in a view of more cells than its widest stripe has. In Gray code, the widest stripe of the
     coarsest bit is half of the projector. If the camera sees no more than that, the frame counts as white or black if
     there is no such frame beside it.
+
+    Parameters
+    ----------
+    light : what `light_of_bits` returns.
     """
     seen, words, coded, lit = light.seen, light.words, light.coded, light.lit
+    if lit.shape[1] < MIN_PIXELS:
+        return None
     n_seen = _n_covering(lit > 0.5)
     is_shown = {"white": seen.contrast.has_white, "black": seen.contrast.has_black}
     for i, (bit, values) in enumerate(zip(bit_frames(seen.names, words.bits), lit, strict=True)):
