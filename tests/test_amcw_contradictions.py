@@ -52,6 +52,15 @@ def test_right_taps_are_quiet(sensor: AmcwToF, noise: bool) -> None:
     assert warnings_of(capture_of(sensor, noise)) == []
 
 
+@pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: s.details)
+def test_a_tap_without_any_light_is_named(sensor: AmcwToF) -> None:
+    capture = capture_of(sensor)
+    frames = capture.frames.copy()
+    frames[1] = 0
+    with pytest.warns(RangesimWarning, match=f"^{sensor.frame_names()[1]} is 0 at all pixels"):
+        decode(Capture(frames, sensor))
+
+
 @pytest.mark.parametrize("sensor", SENSORS[:2], ids=lambda s: s.details)
 @pytest.mark.parametrize(
     ("order", "words"), [([0, 2, 1, 3], "taps 1 and 2 .* 3 and 4"), ([0, 1, 3, 2], "taps 1 and 4 .* 2 and 3")]

@@ -202,6 +202,16 @@ def test_patterns_say_all_that_decoding_needs(tmp_path: Path) -> None:
         assert f"leave out {option[0]}" in refused("decode", tmp_path / "scan", *sidecar, *option, "--out", "x")
 
 
+@pytest.mark.parametrize(
+    ("colour", "channel"), [((1.0, 0.1, 0.05), "red"), ((0.0, 0.1, 1.0), "blue"), ((1, 1, 1), None)]
+)
+def test_light_of_one_colour_names_its_channel(colour: tuple[float, ...], channel: str | None, tmp_path: Path) -> None:
+    images = 40 + 0.8 * FLAT[..., None] * np.array(colour)  # in a lit room
+    write_images(tmp_path / "scan", np.rint(images).astype(np.uint8))
+    said = run("decode", tmp_path / "scan", "--projector", "64x48", "--code", "gray", "--out", tmp_path / "out")
+    assert f"give --channel {channel}" in said if channel else "--channel" not in said
+
+
 def test_photographs_in_another_order_than_patterns_json_states(tmp_path: Path) -> None:
     run("patterns", "gray", *SIZE, "--axes", "columns", "--out", tmp_path / "patterns")
     shown = import_capture(tmp_path / "patterns", load_patterns(tmp_path / "patterns").sensor).frames

@@ -53,15 +53,22 @@ def likely_cause(image: RangeImage, capture: Capture) -> str | None:
     decoder = image.decoder or capture.sensor.default_decoder
     if cause := decoder.likely_cause(capture, image):
         return cause
-    if float(image.valid.mean()) >= MIN_MEASURED:
-        return None
-    if capture.is_digital and capture.detector is None:
+    if capture.is_digital and not capture.frames.any():
+        return (
+            f"the brightest value is 0 of {capture.full_scale:.0f}, so nothing was recorded: check that these are the "
+            "frames (--images), and that the camera exposed them"
+        )
+    is_measured = float(image.valid.mean()) >= MIN_MEASURED
+    may_have_fewer_bits = capture.is_digital and capture.detector is None and capture.sensor.gate is None
+    if may_have_fewer_bits and (not is_measured or capture.frames.dtype.itemsize > 1):  # few cameras have 16 bits
         brightest = int(capture.frames.max())
         if brightest < MIN_BRIGHTEST * capture.full_scale:
             return (
                 f"the brightest value is {brightest} of {capture.full_scale:.0f}: give --bits "
                 f"{max(brightest.bit_length(), 1)} if the camera has no more, or expose longer"
             )
+    if is_measured:
+        return None
     measured = float(image.valid.mean())
     if (clipped := float((image.status == Status.SATURATED).mean())) > measured:
         return f"{100 * clipped:.0f} % of the pixels are as bright as the camera can tell: expose shorter"

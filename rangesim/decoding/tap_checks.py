@@ -52,6 +52,20 @@ def chosen(usable: np.ndarray) -> np.ndarray | None:
     return found[:: max(1, len(found) // MAX_PIXELS)] if len(found) >= MIN_PIXELS else None
 
 
+def empty_contradiction(frames: np.ndarray, names: Sequence[str]) -> str | None:
+    """A sentence if some of the taps are 0 at all pixels, and others are not; None if not.
+
+    Parameters
+    ----------
+    frames : (k, h, w), all taps. names : (k,) of the taps.
+    """
+    is_empty = [not frame.any() for frame in frames]
+    if not any(is_empty) or all(is_empty):
+        return None
+    empty = ", ".join(name for name, nothing in zip(names, is_empty, strict=True) if nothing)
+    return f"{empty} is 0 at all pixels, so the ranges are wrong: check that no tap is missing in the capture."
+
+
 def order_contradiction(groups: Sequence[np.ndarray]) -> str | None:
     """A sentence if the taps lie on no cosine; None if they do, or if there are only three, which always do.
 

@@ -19,6 +19,7 @@ from rangesim.decoding.status import Status
 from rangesim.decoding.tap_checks import (
     chosen,
     direction_contradiction,
+    empty_contradiction,
     frequency_contradiction,
     order_contradiction,
 )
@@ -384,6 +385,8 @@ class AmcwDecoder(Decoder):
         self, sensor: AmcwToF, frames: np.ndarray, status: np.ndarray, length_m: np.ndarray, modulation: np.ndarray
     ) -> str | None:
         """A sentence if the taps contradict each other as a whole, see `rangesim.decoding.tap_checks`."""
+        if found := empty_contradiction(frames, sensor.frame_names()):
+            return found
         at = chosen(np.isin(status, [Status.OK, Status.UNWRAPPING_FAILED]))
         if at is None:
             return None
