@@ -46,16 +46,20 @@ def likely_cause(image: RangeImage, capture: Capture) -> str | None:
         return cause
     if float(image.valid.mean()) >= MIN_MEASURED:
         return None
+    measured = float(image.valid.mean())
+    clipped = float((image.status == Status.SATURATED).mean())
+    too_bright = f"{100 * clipped:.0f} % of the pixels are as bright as the camera can tell: expose shorter"
     if capture.is_digital and capture.detector is None:
         brightest = int(capture.frames.max())
+        if brightest == 0:
+            return "the brightest value is 0: all images are black, so expose longer, or check how they were written"
         if brightest < MIN_BRIGHTEST * capture.full_scale:
             return (
-                f"the brightest value is {brightest} of {capture.full_scale:.0f}: give --bits "
-                f"{max(brightest.bit_length(), 1)} if the camera has no more, or expose longer"
+                f"the brightest value is {brightest} of {capture.full_scale:.0f}: give --bits {brightest.bit_length()} "
+                f"if the camera has no more{f'; {too_bright}' if clipped > measured else ', or expose longer'}"
             )
-    measured = float(image.valid.mean())
-    if (clipped := float((image.status == Status.SATURATED).mean())) > measured:
-        return f"{100 * clipped:.0f} % of the pixels are as bright as the camera can tell: expose shorter"
+    if clipped > measured:
+        return too_bright
     if capture.is_digital and float((image.status == Status.LOW_SIGNAL).mean()) > measured:
         swing = float(np.median(np.ptp(capture.frames, axis=0)))
         return (
