@@ -91,7 +91,9 @@ def test_images_that_are_no_frames_are_left_out(tmp_path: Path) -> None:
     assert "expected 64 x 48" not in refused(*options)
     run(*options, "--images", "shot*.png")
     check_flat(tmp_path / "out")
-    assert "expected images that match 'pat*'; it holds a_photograph.png" in refused(*options, "--images", "pat*")
+    assert "expected images that match 'pat*', got a folder with a_photograph.png" in refused(
+        *options, "--images", "pat*"
+    )
 
 
 def test_a_list_says_which_images_and_what_they_show(tmp_path: Path) -> None:
