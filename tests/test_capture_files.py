@@ -180,7 +180,7 @@ def test_real_images_come_in_by_number(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((4, 6), np.uint8)).save(tmp_path / "shot5.png")
     with pytest.raises(FileFormatError, match=r"shot5\.png: expected 5 x 4 uint8"):
         import_capture(tmp_path, SMALL)
-    with pytest.raises(FileFormatError, match="no folder"):
+    with pytest.raises(FileFormatError, match="expected a folder of images, got a path"):
         import_capture(tmp_path / "nowhere", SMALL)
 
 

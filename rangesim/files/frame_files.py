@@ -64,7 +64,7 @@ def find_frames(folder: Path, images: str | None = None) -> FrameFiles:
         There is no such folder or no such image, or the list is broken.
     """
     if not folder.is_dir():
-        got = "a file" if folder.exists() else "no such folder"
+        got = "a file" if folder.exists() else "a path with nothing there"
         raise FileFormatError(f"{folder}: expected a folder of images, got {got}.")
     if images is not None and images.lower().endswith(LIST):
         return _listed(folder, Path(images))
@@ -82,9 +82,11 @@ def find_frames(folder: Path, images: str | None = None) -> FrameFiles:
     for pattern in (part.strip() for part in images.split(",")):
         matching = [path for path in known if fnmatchcase(path.name, pattern)]
         if not matching:
-            few = ", ".join(path.name for path in known[:MAX_LISTED])
+            few = ", ".join(path.name for path in known[:MAX_LISTED]) + (
+                " and others" if len(known) > MAX_LISTED else ""
+            )
+            got = f"a folder with {few}" if known else f"a folder without any ({', '.join((*SUFFIXES, ARRAY))})"
             hint = nearest(pattern, [path.name for path in known])
-            got = f"a folder with {few} ..." if known else f"a folder without any ({', '.join((*SUFFIXES, ARRAY))})"
             raise FileFormatError(f"{folder}: expected images that match {shown(pattern)}{hint}, got {got}.")
         found += [path for path in matching if path not in found]
     return FrameFiles(found)

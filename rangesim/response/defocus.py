@@ -9,7 +9,7 @@ sampled over the lens. The functions are written with `rangesim.response.Math`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -77,10 +77,7 @@ bytes per pixel."""
 
 
 class BlurredImage:
-    """A pattern with Gaussian-blurred copies of it.
-
-    Outside an image it is dark. Stripes go on outside, because their values are fractions of white, which has no blur
-    at the projector's ends; if they were dark outside, all inverses, white - pattern, would be bright there.
+    """A pattern with Gaussian-blurred copies of it; outside the pattern it is dark.
 
     A blur of at most `MAX_READ_SIGMA_PX` is computed while reading, exactly except for the Gaussian's tails beyond the
     neighbouring pixels. A stronger blur is split in two: reading adds MAX_READ_SIGMA_PX, and the copies hold the rest,
@@ -94,8 +91,7 @@ class BlurredImage:
     """
 
     def __init__(self, pattern: np.ndarray) -> None:
-        mode: Literal["constant", "edge"] = "constant" if pattern.ndim == 2 else "edge"
-        sharp = np.pad(np.asarray(pattern, dtype=np.float32), 1, mode=mode)  # blurred light falls just outside, too
+        sharp = np.pad(np.asarray(pattern, dtype=np.float32), 1)  # blurred light also falls just outside the pattern
         self.height, self.width = sharp.shape if sharp.ndim == 2 else (1, sharp.size)
         variances = [MAX_READ_SIGMA_PX**2 * (VARIANCE_RATIO**k - 1) for k in range(COPIES)]
         self.copies = np.stack([_smooth(sharp, variance) for variance in variances]).ravel()
@@ -157,6 +153,5 @@ def _smooth(image: np.ndarray, variance: float) -> np.ndarray:
     response = np.exp(-2 * np.pi**2 * variance * np.fft.rfftfreq(2 * reach) ** 2)
     kernel = np.fft.fftshift(np.fft.irfft(response))[1:]
     for axis in range(image.ndim):
-        mode = "constant" if image.ndim == 2 else "nearest"
-        image = correlate1d(image, kernel / kernel.sum(), axis=axis, mode=mode)
+        image = correlate1d(image, kernel / kernel.sum(), axis=axis, mode="constant")
     return image
