@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.codes import AXES, AxisCode, AxisFrames
+from rangesim.codes import AXES, AxisCode
+from rangesim.codes.code import MAX_LEFT_OUTSIDE, MAX_OUTSIDE_FRACTION
 from rangesim.conventions.fringe_conventions import measured_fringes, middle_of
 from rangesim.conventions.layouts import (
     ENDS,
@@ -32,6 +33,7 @@ from rangesim.decoding.orientation import is_mirrored
 from rangesim.decoding.pixel_samples import MIN_PIXELS
 from rangesim.decoding.status import Status
 from rangesim.sensors import StructuredLight, StructuredLightDecoder
+from rangesim.sensors.structured_light import BLACK, WHITE
 
 MAX_SAMPLE = 20_000
 """Largest number of pixels on which orders are tried: about a fifteenth of an image of 640 x 480. A few hundred pixels
@@ -155,9 +157,10 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
         findings.append(f"{found.axes[0]} were shown before {found.axes[1]}.")
     if found.order != sensor.order and 0 < len(found.order) <= MAX_ENTRIES:
         findings.append(f"this is the order {', '.join(found.order)}.")
+    found, said_of_places = _within_projector(sample, found)
     code, said = measured_fringes(frames, sample.frames, found)
     found = replace(found, code=code)
-    return Convention(found, (*findings, *said))
+    return Convention(found, (*findings, *said_of_places, *said))
 
 
 def _wrong_number(n: int, sensor: StructuredLight) -> str:
@@ -198,7 +201,7 @@ def _best_layout(sample: _Sample, sensor: StructuredLight, orders: Sequence[Layo
         The given order has another number of frames, and no other order decodes them.
     """
     given = sensor.frame_names() if is_given else None
-    fineness, ends = _fineness(sensor), {ends: _ends_fit(sample, ends) for ends in ENDS}
+    fineness, ends = _fineness(sensor), {ends: _ends_fit(sample, _at_ends(*ends)) for ends in ENDS}
     possible = []
     for layout in orders:
         if not ends[layout.ends]:
@@ -217,8 +220,11 @@ def _best_layout(sample: _Sample, sensor: StructuredLight, orders: Sequence[Layo
                 continue
     highest = max((score for score, _ in scores), default=0.0)
     score, layout = next((found for found in scores if found[0] >= highest - MAX_LOSS_BITS), (0.0, Layout(sensor.axes)))
-    if is_given:
-        return layout if score > max(MIN_BITS, _agreement_bits(sample, sensor) + MIN_GAIN_BITS) else None
+    if given is not None:
+        # White and black that are exchanged cost fringes nothing, because their phases tell the place without them.
+        fits = _ends_fit(sample, [(i, name) for i, name in enumerate(given) if name in (WHITE, BLACK)])
+        least = _agreement_bits(sample, sensor) + (MIN_GAIN_BITS if fits else -MAX_LOSS_BITS)
+        return layout if score > max(MIN_BITS, least) else None
     if score < MIN_BITS:
         raise ValueError(
             f"{_wrong_number(len(sample.frames), sensor)[:-1]}; and in no order that misses some of them do "
@@ -227,16 +233,20 @@ def _best_layout(sample: _Sample, sensor: StructuredLight, orders: Sequence[Layo
     return layout
 
 
-def _ends_fit(sample: _Sample, ends: tuple[tuple[str, ...], tuple[str, ...]]) -> bool:
+def _at_ends(first: Sequence[str], last: Sequence[str]) -> list[tuple[int, str]]:
+    """Places of the first and of the last frames, each with the frame's name."""
+    return [*enumerate(first), *((i - len(last), name) for i, name in enumerate(last))]
+
+
+def _ends_fit(sample: _Sample, places: Sequence[tuple[int, str]]) -> bool:
     """Whether the frames that would be white and black are the brightest and the darkest nearly everywhere.
 
     Parameters
     ----------
-    ends : names of the first and of the last frames.
+    places : places of white and black among the frames, each with its name.
     """
-    lit, limits = sample.is_lit, {"white": sample.high, "black": sample.low}
+    lit, limits = sample.is_lit, {WHITE: sample.high, BLACK: sample.low}
     largest = MAX_END_ERROR * (sample.high - sample.low)[lit]
-    places = [*enumerate(ends[0]), *((i - len(ends[1]), name) for i, name in enumerate(ends[1]))]
     return all(
         (np.abs(sample.frames[i] - limits[name])[lit] <= largest).mean() >= MIN_END_FRACTION for i, name in places
     )
@@ -290,13 +300,9 @@ def _agreement_bits(sample: _Sample, candidate: StructuredLight) -> float:
 
 def _decoded(frames: np.ndarray, sensor: StructuredLight) -> dict[str, AxisCode]:
     """The codes of all axes."""
-    capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
-    contrast = decoder.contrast(capture, sensor)
-    codes: dict[str, AxisCode] = {}
-    for axis in sensor.axes:
-        seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
-        codes[axis] = sensor.code.decode(seen, decoder.thresholds)
-    return codes
+    decoder = StructuredLightDecoder()
+    axes = decoder.axis_frames(Capture(frames, sensor))
+    return {seen.axis: sensor.code.decode(seen, decoder.thresholds) for seen in axes}
 
 
 def _nearness(sample: _Sample, code: AxisCode) -> float:
@@ -342,6 +348,26 @@ def _upright(frames: np.ndarray, sample: _Sample, found: StructuredLight) -> Str
     except ValueError:
         return found
     return exchanged if exchanged.n_frames == found.n_frames else found
+
+
+def _within_projector(sample: _Sample, sensor: StructuredLight) -> tuple[StructuredLight, tuple[str, ...]]:
+    """The sensor in a convention of its code in which nearly all places lie in the projector, and what differs."""
+    outside = _outside(sample, sensor)
+    if outside > MAX_OUTSIDE_FRACTION:
+        for code, said in sensor.code.other_conventions():
+            other = replace(sensor, code=code)
+            if _outside(sample, other) < MAX_LEFT_OUTSIDE * outside:
+                return other, (said,)
+    return sensor, ()
+
+
+def _outside(sample: _Sample, sensor: StructuredLight) -> float:
+    """Fraction of the decoded pixels that see no place of the projector; of two axes, that of the worse one."""
+    fractions = []
+    for code in _decoded(sample.frames, sensor).values():
+        outside = int(np.count_nonzero(code.status == Status.CODE_ERROR))
+        fractions.append(outside / max(1, outside + int(np.count_nonzero(code.status == Status.OK))))
+    return max(fractions)
 
 
 def _differences(layout: Layout, sensor: StructuredLight, found: StructuredLight) -> Iterator[str]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.codes import AxisFrames, Code, FringeConvention
+from rangesim.codes import Code, FringeConvention
 from rangesim.codes.fringe_direction import phase_direction
 from rangesim.codes.fringes import STARTS
 from rangesim.decoding.phase_shift import phase_of
@@ -107,22 +107,16 @@ def middle_of(frames: np.ndarray) -> np.ndarray:
 
 def contradictions(frames: np.ndarray, sensor: StructuredLight) -> list[str]:
     """Sentences on what contradicts the sensor's code as a whole, in the middle of frames (k, h, w)."""
-    frames = middle_of(frames)
-    capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
-    contrast = decoder.contrast(capture, sensor)
-    found = []
-    for axis in sensor.axes:
-        seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
-        found.append(sensor.code.contradiction(seen, sensor.code.decode(seen, decoder.thresholds)))
+    decoder = StructuredLightDecoder()
+    axes = decoder.axis_frames(Capture(middle_of(frames), sensor))
+    found = (sensor.code.contradiction(seen, sensor.code.decode(seen, decoder.thresholds)) for seen in axes)
     return [text for text in found if text]
 
 
 def _all_offsets(frames: np.ndarray, sensor: StructuredLight, period_px: float) -> Iterator[_Offsets]:
     """Phases and Gray cells along each axis, where both are clear."""
-    capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
-    contrast = decoder.contrast(capture, sensor)
-    for axis in sensor.axes:
-        seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
+    decoder = StructuredLightDecoder()
+    for seen in decoder.axis_frames(Capture(frames, sensor)):
         code = sensor.code.decode(seen, decoder.thresholds)
         gray, fringes = code.coarse, seen.starting_with("phase")
         if gray is None or not len(fringes.frames):

@@ -118,7 +118,7 @@ class StructuredLight(Sensor):
             raise ValueError(f"expected axes to be columns, rows or both, got {self.axes!r}.")
         limits.check("pixels", self.projector_width * self.projector_height, "pixels of a projector")
         for axis in self.axes:
-            _check_code(self.code, self.size(axis))
+            self.code.check(self.size(axis))
         if self.order:
             in_view = set(self.frame_names())
             for axis in self.axes:
@@ -280,36 +280,31 @@ class StructuredLightDecoder(Decoder):
         `DoubtWarning` if frames and code contradict each other as a whole, or if two frames are the same.
         """
         sensor = of_type(capture.sensor, StructuredLight)
-        contrast = self.contrast(capture, sensor)
         codes: dict[str, AxisCode] = {}
         contradictions: list[str] = []
-        for axis in sensor.axes:
-            seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
+        axes = self.axis_frames(capture)
+        for seen in axes:
             code = sensor.code.decode(seen, self.thresholds)
             outside = (code.coordinate < -0.5) | (code.coordinate > seen.size + 0.5)
             code.status[outside & (code.status == Status.OK)] = Status.CODE_ERROR
-            codes[axis] = code
+            codes[seen.axis] = code
             if contradiction := sensor.code.contradiction(seen, code):
                 contradictions.append(contradiction)
         if not contradictions:  # they name the cause better than what follows
             doubt = _orientation(codes) or _beyond_projector(sensor, codes) or _repeated_frames(capture)
             contradictions += [doubt] if doubt else []
-        for contradiction in contradictions:
-            warn(contradiction, DoubtWarning)
-        coordinate = {axis: code.coordinate for axis, code in codes.items()}
-        sigma_px = {axis: code.sigma_px for axis, code in codes.items()}
-        return ProjectorCoordinates(
-            column=coordinate.get("columns"),
-            row=coordinate.get("rows"),
-            column_sigma_px=sigma_px.get("columns"),
-            row_sigma_px=sigma_px.get("rows"),
-            status=first_failure([codes[axis].status for axis in AXES if axis in codes]),
-            confidence=contrast.values / np.float32(capture.full_scale),
-            intensity=contrast.white.astype(np.float32) - np.float32(capture.black_level),
-            limits=self.triangulation,
-            doubts=tuple(contradictions),
-            notes=tuple(_corrections(codes)),
-        )
+        contrast = axes[0].contrast
+        confidence = contrast.values / np.float32(capture.full_scale)
+        return joined_axes(capture, codes, contrast, confidence, self.triangulation, contradictions)
+
+    def axis_frames(self, capture: Capture) -> list[AxisFrames]:
+        """The frames of each coded axis of a `StructuredLight` capture, in the order of the sensor's axes."""
+        sensor = of_type(capture.sensor, StructuredLight)
+        contrast = self.contrast(capture, sensor)
+        return [
+            AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
+            for axis in sensor.axes
+        ]
 
     def contrast(self, capture: Capture, sensor: StructuredLight) -> Contrast:
         """Contrast of white and black, each as captured, or estimated by the code if it was not shown."""
@@ -347,18 +342,22 @@ class StructuredLightDecoder(Decoder):
             )
         if float(image.valid.mean()) >= MIN_MEASURED:
             return None
-        contrast = self.contrast(capture, of_type(capture.sensor, StructuredLight)).values
-        clear = MIN_CONTRAST * capture.full_scale
-        inverted = float((contrast < -clear).mean())
-        if inverted > float((contrast > clear).mean()):
-            return (
-                f"black is brighter than white at {100 * inverted:.0f} % of the pixels: the last two images are white, "
-                "then black"
-            )
         if axis := _axis_along_baseline(image, of_type(capture.sensor, StructuredLight).axes, capture.rig):
             other = "rows" if axis == "columns" else "columns"
             return f"{axis} tell no depth here, because camera and projector stand apart along them: code {other}"
         return None
+
+
+def _exchanged_ends(capture: Capture, contrast: Contrast) -> str | None:
+    """A sentence if black is brighter than white at most of the pixels where they differ; None if not."""
+    clear = MIN_CONTRAST * capture.full_scale
+    inverted = float((contrast.values < -clear).mean())
+    if not contrast.is_measured or inverted <= float((contrast.values > clear).mean()):
+        return None
+    return (
+        f"black is brighter than white at {100 * inverted:.0f} % of the pixels: the images of white and black seem to "
+        "be exchanged."
+    )
 
 
 def _repeated_frames(capture: Capture) -> str | None:
@@ -401,7 +400,7 @@ def _orientation(codes: dict[str, AxisCode]) -> str | None:
     """A sentence if the codes of both axes are those of a mirrored image; None if not."""
     if len(codes) < 2:
         return None
-    ok = first_failure([code.status for code in codes.values()]) == Status.OK
+    ok = _first_failure([code.status for code in codes.values()]) == Status.OK
     column, row = (np.where(ok, codes[axis].coordinate, np.float32(np.nan)) for axis in AXES)
     return orientation_contradiction(column, row, None)
 
@@ -427,13 +426,43 @@ def _with_defaults(cls: type[StructuredLight], kind: type[Code]) -> StructuredLi
     return cls(code=kind())
 
 
-@lru_cache(maxsize=256)  # sensors are made anew for each setting that changes, and periods take time to be checked
-def _check_code(code: Code, size: int) -> None:
-    """Raise ValueError if the code cannot tell `size` projector pixels from each other."""
-    code.check(size)
+def joined_axes(
+    capture: Capture,
+    codes: dict[str, AxisCode],
+    contrast: Contrast,
+    confidence: np.ndarray,
+    triangulation: TriangulationLimits,
+    contradictions: list[str],
+) -> ProjectorCoordinates:
+    """The coordinates along all axes as one result.
+
+    `DoubtWarning` of each contradiction; if there is none, of a black frame that is brighter than white.
+
+    Parameters
+    ----------
+    codes : AxisCode by the name of its axis. contrast : Contrast of the capture. confidence : (h, w) float32.
+    """
+    if not contradictions and (exchanged := _exchanged_ends(capture, contrast)):  # a wrong order has other signs, too
+        contradictions = [exchanged]
+    for contradiction in contradictions:
+        warn(contradiction, DoubtWarning)
+    coordinate = {axis: code.coordinate for axis, code in codes.items()}
+    sigma_px = {axis: code.sigma_px for axis, code in codes.items()}
+    return ProjectorCoordinates(
+        column=coordinate.get("columns"),
+        row=coordinate.get("rows"),
+        column_sigma_px=sigma_px.get("columns"),
+        row_sigma_px=sigma_px.get("rows"),
+        status=_first_failure([codes[axis].status for axis in AXES if axis in codes]),
+        confidence=confidence,
+        intensity=contrast.white.astype(np.float32) - np.float32(capture.black_level),
+        limits=triangulation,
+        doubts=tuple(contradictions),
+        notes=tuple(_corrections(codes)),
+    )
 
 
-def first_failure(statuses: list[np.ndarray]) -> np.ndarray:
+def _first_failure(statuses: list[np.ndarray]) -> np.ndarray:
     """(h, w) uint8, per pixel the first status that is not OK."""
     result = statuses[0].copy()
     for status in statuses[1:]:
