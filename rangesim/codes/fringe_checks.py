@@ -12,7 +12,7 @@ import numpy as np
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.fringe_direction import phase_direction
 from rangesim.codes.fringe_gamma import MAX_SAMPLES, FringeGamma
-from rangesim.codes.fringe_stack import FringeStack
+from rangesim.codes.fringe_stack import MIN_AGREEING, FringeStack
 from rangesim.codes.fringes import FringeConvention
 from rangesim.decoding.phase_shift import Phase, phase_of
 from rangesim.decoding.pixel_samples import MAX_PIXELS, MIN_PIXELS, evenly_spread
@@ -65,10 +65,6 @@ MAX_SINUSOID_ERROR = 0.08
 """Largest systematic difference of four or more fringes from a sinusoid, as a fraction of their swing. Two exchanged
 neighbours of 16 frames differ by 0.097, of 4 by 0.35; a gamma of 1.2 that is not corrected
 differs by 0.043 (measured)."""
-
-MIN_AGREEING = 0.8
-"""Least fraction of the pixels that agree after a correction, at which the correction is named: as many as may disagree
-without a word otherwise."""
 
 MIN_BACKWARD = 0.5
 """Least disagreement of phase and Gray code from pixel to pixel at which fringes count as backward although every place
