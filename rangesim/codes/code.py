@@ -57,6 +57,9 @@ class Code(Named, ABC):
     """Name on the command line and in files."""
     title: ClassVar[str] = ""
     """Name of a sensor with this code in running text; "": made of `type_name`."""
+    tells_direction: ClassVar[bool] = True
+    """Whether frames that are read in the wrong direction contradict each other. Fringes alone do not: if they move the
+    other way, they agree on mirrored places."""
 
     # ---- Patterns ----------------------------------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ import numpy as np
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.fringe_direction import phase_direction
 from rangesim.codes.fringe_gamma import MAX_SAMPLES, FringeGamma
-from rangesim.codes.fringe_stack import FringeStack
+from rangesim.codes.fringe_stack import MIN_AGREEING, FringeStack
 from rangesim.codes.fringes import FringeConvention
 from rangesim.decoding.phase_shift import Phase, phase_of
 from rangesim.decoding.pixel_samples import MAX_PIXELS, MIN_PIXELS, evenly_spread
@@ -74,10 +74,6 @@ differs by 0.043 (measured)."""
 MAX_SINUSOID_PIXELS = 5000
 """Largest number of pixels whose fringes are compared with a sinusoid. An eighth of them is in one part of the period:
 the standard error of its median is 5 % of the noise, so that noise up to a fifth of the swing hides no fault."""
-
-MIN_AGREEING = 0.8
-"""Least fraction of the pixels that agree after a correction, at which the correction is named: as many as may disagree
-without a word otherwise."""
 
 MIN_BACKWARD = 0.5
 """Least disagreement of phase and Gray code from pixel to pixel at which fringes count as backward although every place

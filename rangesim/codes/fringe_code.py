@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -28,6 +29,8 @@ class FringeCode(Code):
     >>> PhaseShift(steps=3).stack(640).periods_px
     (640.0,)
     """
+
+    tells_direction: ClassVar[bool] = False
 
     @abstractmethod
     def stack(self, size: int) -> FringeStack:

@@ -40,6 +40,10 @@ MIN_APART_TURNS = 0.005
 """Least distance of any two places of the axis in the space of the phases, in turns. A camera of 8 bits tells a phase
 of full contrast to 0.0004 turns; closer places could not be told apart even then."""
 
+MIN_AGREEING = 0.8
+"""Least fraction of the pixels on whose places all phases agree, at which fringes count as read as they were shown.
+Interreflection, noise and edges make up to a fifth disagree."""
+
 MIN_PRECISION = 0.1
 """Least precision (inverse variance) of a period, as a fraction of the finest one's, at which its phase is averaged
 into the place. What is less would gain less than 5 % of the standard deviation, and brings the errors of a coarse
@@ -145,14 +149,34 @@ class FringeStack:
 
     def agrees(self, places: list[np.ndarray], size: int) -> np.ndarray:
         """(n,) bool, where the places within the periods, K of (n,) turns in the order of the stack, agree on one."""
+        return self._agreed(places, size)[1]
+
+    def bias_turns(self, places: list[np.ndarray], size: int) -> float:
+        """How far the phases of the periods lie on average beside the places on which they agree, in turns.
+
+        It is the root mean square over the periods, 1 if the phases agree at few pixels. It is near 0 if all fringes
+        start where they should: noise lies on both sides.
+
+        Parameters
+        ----------
+        places : K of (n,) turns, the place within each period in the order of the stack. size : int, projector pixels.
+        """
+        place, ok = self._agreed(places, size)
+        if ok.mean() <= MIN_AGREEING:
+            return 1.0
+        off = [turns[ok] - place[ok] / period for turns, period in zip(places, self.periods_px, strict=True)]
+        return float(np.sqrt(np.mean([float((o - np.rint(o)).mean()) ** 2 for o in off])))
+
+    def _agreed(self, places: list[np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) float32, projector pixels on which the places within the periods agree best, and where they agree."""
         order = np.argsort(self.periods_px, kind="stable")
         periods = np.array(self.periods_px)[order]
         turns = np.stack([places[i] for i in order]).astype(np.float32)
         weights = np.broadcast_to((1 / periods**2)[:, None], turns.shape).astype(np.float32)
         low, high = np.zeros_like(turns[0]), np.full_like(turns[0], size)
-        agrees = np.empty(turns.shape[1], dtype=bool)
-        agree(turns, weights, periods, low, high, LIMITS, np.empty_like(low), agrees)
-        return agrees
+        place, agrees = np.empty(turns.shape[1], dtype=np.float32), np.empty(turns.shape[1], dtype=bool)
+        agree(turns, weights, periods, low, high, LIMITS, place, agrees)
+        return place, agrees
 
     def decode(
         self,

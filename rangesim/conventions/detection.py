@@ -17,7 +17,7 @@ import numpy as np
 from rangesim.capture import Capture, bright_level
 from rangesim.codes import AXES, AxisCode
 from rangesim.codes.code import MAX_LEFT_OUTSIDE, MAX_OUTSIDE_FRACTION
-from rangesim.conventions.fringe_conventions import measured_fringes, middle_of
+from rangesim.conventions.fringe_conventions import measured_fringes, middle_of, with_own_start
 from rangesim.conventions.layouts import (
     ENDS,
     INVERSE,
@@ -329,6 +329,7 @@ def _agreement_bits(sample: _Sample, candidate: StructuredLight) -> float:
     It is the mean over all pairs of neighbours that see different cells, times the fraction of the pairs that are
     decoded; of two axes, that of the worse one.
     """
+    candidate = with_own_start(sample.frames, candidate)
     return min(
         max(_nearness(sample, c) for c in (code, code.coarse) if c is not None)
         for code in _decoded(sample.frames, candidate).values()

@@ -24,7 +24,7 @@ from rangesim.codes import (
 from rangesim.codes.code import stripes
 from rangesim.codes.contrast import direct_contrast
 from rangesim.codes.frame_order import in_order
-from rangesim.decoding.orientation import changes_along, orientation_contradiction
+from rangesim.decoding.orientation import changes_along, fringe_doubt, orientation_contradiction
 from rangesim.decoding.phase_shift import PhaseThresholds
 from rangesim.decoding.pixel_samples import MIN_PIXELS, equal_frames, same_images
 from rangesim.decoding.range_image import MIN_MEASURED, RangeImage
@@ -339,9 +339,15 @@ class StructuredLightDecoder(Decoder):
                 f"{axis} change along the image's {along}: {other} may have been shown, or the camera was turned by 90 "
                 "degrees"
             )
+        sensor = of_type(capture.sensor, StructuredLight)
+        is_explained = bool(image.doubts) if image.camera is None else not image.doubts  # a calibration tells more
+        if not sensor.code.tells_direction and not is_explained:
+            size = (sensor.projector_width, sensor.projector_height)
+            if doubt := fringe_doubt(image.projector_column, image.projector_row, size):
+                return doubt
         if float(image.valid.mean()) >= MIN_MEASURED:
             return None
-        if axis := _axis_along_baseline(image, of_type(capture.sensor, StructuredLight).axes, capture.rig):
+        if axis := _axis_along_baseline(image, sensor.axes, capture.rig):
             other = "rows" if axis == "columns" else "columns"
             return f"{axis} tell no depth here, because camera and projector stand apart along them: code {other}"
         return None
