@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cleargrasp import LEFT_M, NOISE_Q, aligned, read_scene
 from rebuilt_scene import Rebuilt, front_surface, rebuild, reflectances, scene_dictionary
+from tiers import to_validate
 
 from rangesim import Intrinsics, load_scene, transport
 
@@ -81,7 +82,7 @@ def test_a_surface_goes_on_straight_where_depth_is_missing_at_its_boundary() -> 
     np.testing.assert_allclose(front[mask], 1 / q[mask], atol=1e-5)
 
 
-@pytest.mark.parametrize("glass", ["wall", "thin", "two walls", "solid"])
+@pytest.mark.parametrize("glass", [*to_validate("wall", "thin"), "two walls", *to_validate("solid")])
 def test_the_renderer_sees_the_front_surface_and_the_table(
     images: Images, rebuilt: Rebuilt, glass: str, tmp_path: Path
 ) -> None:
