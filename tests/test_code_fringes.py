@@ -26,6 +26,7 @@ from rangesim.codes import (
     PhaseShift,
 )
 from rangesim.conventions import detect_convention
+from rangesim.decoding import decode
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.errors import RangesimWarning
@@ -281,6 +282,21 @@ def test_the_convention_is_found_in_the_frames(start: str, direction: str, origi
     assert detect_convention(frames, sensor).sensor == sensor
     other_period = replace(sensor, code=GrayPhase(23.0))
     assert detect_convention(frames, other_period).sensor == other_period
+
+
+@pytest.mark.parametrize("axis", ["columns", "rows"])
+def test_fringes_alone_that_are_read_mirrored_or_from_elsewhere_are_named(axis: str) -> None:
+    """Nothing in the frames contradicts such a reading, so only the way in which places grow tells."""
+    for code in (PhaseShift(), MultiFrequency((80.0, 20.0, 5.0)), Heterodyne((8.0, 80 / 9, 80 / 7))):
+        sensor = StructuredLight(80, 80, code, axes=(axis,))  # type: ignore[arg-type]
+        capture = Capture(sensor.patterns(), sensor)
+        assert StructuredLightDecoder().likely_cause(capture, decode(capture)) is None
+        for convention, cause in (
+            (FringeConvention(direction="backward"), "grow to the left" if axis == "columns" else "grow upwards"),
+            (FringeConvention(origin_px=-40.0), f"{axis} jump from one end of the projector to the other"),
+        ):
+            other = replace(capture, sensor=replace(sensor, code=replace(code, convention=convention)))
+            assert cause in str(StructuredLightDecoder().likely_cause(other, decode(other)))
 
 
 @pytest.mark.parametrize("start", ["cos", "sin", "-sin"])

@@ -12,12 +12,12 @@ import numpy as np
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.fringe_direction import phase_direction
 from rangesim.codes.fringe_gamma import MAX_SAMPLES, FringeGamma
-from rangesim.codes.fringe_stack import FringeStack
+from rangesim.codes.fringe_stack import MIN_AGREEING, FringeStack
 from rangesim.codes.fringes import FringeConvention
 from rangesim.decoding.phase_shift import Phase, phase_of
 from rangesim.decoding.pixel_samples import MAX_PIXELS, MIN_PIXELS, evenly_spread
 from rangesim.decoding.status import Status
-from rangesim.robust_scale import sigma_from_median
+from rangesim.robust_scale import TO_SIGMA
 
 OUTSIDE_TURNS = 0.005
 """Least distance of a phase from its Gray cell, in turns, at which the phase counts as outside. It allows for rounding:
@@ -71,9 +71,9 @@ MAX_SINUSOID_ERROR = 0.08
 neighbours of 16 frames differ by 0.097, of 4 by 0.35; a gamma of 1.2 that is not corrected
 differs by 0.043 (measured)."""
 
-MIN_AGREEING = 0.8
-"""Least fraction of the pixels that agree after a correction, at which the correction is named: as many as may disagree
-without a word otherwise."""
+MAX_SINUSOID_PIXELS = 5000
+"""Largest number of pixels whose fringes are compared with a sinusoid. An eighth of them is in one part of the period:
+the standard error of its median is 5 % of the noise, so that noise up to a fifth of the swing hides no fault."""
 
 MIN_BACKWARD = 0.5
 """Least disagreement of phase and Gray code from pixel to pixel at which fringes count as backward although every place
@@ -158,7 +158,10 @@ def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, gam
 
 
 def _level_fault(seen: AxisFrames, usable: np.ndarray, gamma: FringeGamma, in_many_cells: bool) -> str | None:
-    """As `level_contradiction`, from the pixels `usable` (h, w), which lie `in_many_cells` or fringes or not."""
+    """A sentence if the fringes contradict white and black at the pixels `usable` (h, w) bool; None if they do not.
+
+    in_many_cells : whether these pixels lie in many Gray cells or fringes, so that a constant frame shows.
+    """
     white, black, axis = seen.contrast.white, seen.contrast.black, seen.axis
     if not seen.contrast.is_measured:
         return None
@@ -210,7 +213,7 @@ def _sinusoid_fault(seen: AxisFrames, usable: np.ndarray, gamma: FringeGamma) ->
             "gamma that explains their shape: check that projector and camera are linear and that no frame is repeated."
         )
     used = evenly_spread(np.flatnonzero(usable))
-    used = used[:: 1 + len(used) // MAX_SAMPLES]
+    used = used[:: 1 + len(used) // MAX_SINUSOID_PIXELS]
     if len(used) < MIN_PIXELS or len(seen.frames) == 3:
         return None
     frames = seen.frames.reshape(len(seen.frames), -1)[:, used].astype(np.float64)
@@ -246,9 +249,8 @@ def _misfit(frames: np.ndarray, gamma: FringeGamma) -> float:
     members = _by_phase(phase.normalised)
     if not members:
         return 0.0
-    found = [_medians(values, members) for values in rest]
-    excess = np.mean([off**2 - 9 * noise**2 for off, noise in found])
-    return float(np.sqrt(max(excess, 0.0)))
+    off, noise = _medians(rest, members)
+    return float(np.sqrt(max((off**2 - 9 * noise**2).mean(), 0.0)))
 
 
 def _agreement_fault(seen: AxisFrames, code: AxisCode, stack: FringeStack, usable: np.ndarray) -> str | None:
@@ -329,10 +331,12 @@ def _odd_frame(values: np.ndarray, members: list[np.ndarray], names: list[str]) 
 
 
 def _medians(values: np.ndarray, members: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Medians of groups of values (n,), and the standard error of each median; `members` are indices of the groups."""
-    medians = np.array([np.median(values[m]) for m in members])
-    spread = [sigma_from_median(values[m], x) for m, x in zip(members, medians, strict=True)]
-    return medians, MEDIAN_ERROR * np.array(spread) / np.sqrt([len(m) for m in members])
+    """Medians (..., groups) of values (..., n), and the standard error of each; `members` are indices of the groups."""
+    groups = [values[..., m] for m in members]
+    medians = [np.median(group, axis=-1, keepdims=True) for group in groups]
+    away = [np.median(np.abs(group - x), axis=-1, keepdims=True) for group, x in zip(groups, medians, strict=True)]
+    spread = MEDIAN_ERROR * TO_SIGMA * np.concatenate(away, axis=-1)
+    return np.concatenate(medians, axis=-1), spread / np.sqrt([len(m) for m in members])
 
 
 def _comparable(gray: AxisCode, refined: AxisCode) -> np.ndarray:

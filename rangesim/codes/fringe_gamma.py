@@ -53,7 +53,8 @@ MIN_CHANGE = 0.02
 pixels of a period of 16; smaller ones are left alone, so that linear fringes are not touched."""
 
 MIN_SIGNIFICANCE = 5.0
-"""Least difference of the exponent from 1 that is corrected, in standard errors."""
+"""Least difference of the exponent from 1 that is corrected, in standard errors: noise alone makes as much in one
+capture of two million."""
 
 MIN_EXPLAINED = 0.8
 """Least fraction of the variance of the ripple that the exponent explains. Frames that are missing, exchanged or
@@ -66,7 +67,7 @@ told."""
 
 @dataclass(frozen=True)
 class FringeGamma:
-    """What fringes tell of the response of projector and camera.
+    """Response of projector and camera as fringes show it.
 
     gamma : float, exponent for which phases are corrected; 1: the fringes are linear, or do not tell.
     is_explained : bool, False if the fringes are not sinusoidal and no exponent explains how.
@@ -90,7 +91,7 @@ class FringeGamma:
 
 
 def gamma_of(seen: AxisFrames, usable: np.ndarray, scale: np.ndarray | None) -> FringeGamma:
-    """What the fringes `seen` tell of the response.
+    """Response of projector and camera as the fringes `seen` show it.
 
     Parameters
     ----------
