@@ -11,7 +11,7 @@ import numpy as np
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.bit_checks import (
-    frame_contradiction,
+    between_contradiction,
     level_contradiction,
     light_of_bits,
     lost_contradiction,
@@ -19,6 +19,7 @@ from rangesim.codes.bit_checks import (
     order_contradiction,
     other_code_contradiction,
     pair_contradiction,
+    uniform_contradiction,
 )
 from rangesim.codes.bits import Words, bit_frames, decode_bits
 from rangesim.codes.code import Code, CodeThresholds, stripes
@@ -102,9 +103,11 @@ class BitCode(Code):
         words = self.words(seen.size)
         if found := pair_contradiction(seen, words) or level_contradiction(seen, words):
             return found
-        light = light_of_bits(seen, words, self.cell_px)
-        if found := frame_contradiction(light) or lost_contradiction(light):
-            return found
+        light = light_of_bits(seen, code, words)
+        if light is not None:
+            found = between_contradiction(light) or uniform_contradiction(light) or lost_contradiction(light)
+            if found:
+                return found
         neighbours = neighbours_of(code, words)
         return other_code_contradiction(seen, neighbours, words, _other_words(words)) or order_contradiction(
             seen, neighbours, words
