@@ -76,10 +76,6 @@ MAX_FROM_MIDDLE = 0.15
 """Distance from the middle of dark and lit up to which a pixel lies between the two, as a fraction of their difference.
 Noise of a fifth of the difference brings 4 % of the pixels there."""
 
-MIN_STRIPE_CELLS = 8
-"""Least mean width of a bit's stripes, in cells, at which they count as wide, because most pixels then lie within them.
-Of a code of few cells, the square root of their number is enough."""
-
 MIN_UNIFORM_FRACTION = 0.98
 """Least fraction of the pixels at which a bit is dark, or lit, so that its frames count as uniform."""
 
@@ -229,10 +225,14 @@ def _along_lines(seen: AxisFrames, is_read: np.ndarray, words: Words, is_down: b
 
 
 def between_contradiction(light: Light) -> str | None:
-    """A sentence if bits of wide stripes lie between dark and lit at many pixels, as fringes do; None if not."""
+    """A sentence if bits of wide stripes lie between dark and lit at many pixels, as fringes do; None if not.
+
+    Stripes are wide if they have the square root of all cells: half of the bits of Gray code, and no bit of a code
+    whose stripes are all narrow.
+    """
     n_cells = light.coded.shape[1]
     mean_stripe = n_cells / (1 + np.count_nonzero(np.diff(light.coded), axis=1))
-    wide = light.lit[mean_stripe >= min(MIN_STRIPE_CELLS, n_cells**0.5)]
+    wide = light.lit[mean_stripe >= n_cells**0.5]
     if not len(wide):
         return None
     between = float(np.median((np.abs(wide - 0.5) < MAX_FROM_MIDDLE).mean(axis=1)))
