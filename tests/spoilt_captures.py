@@ -338,7 +338,7 @@ CASES = [
     Case("one image throughout", lambda g: g.pick(*[_n(g) - 2] * _n(g)), "half of the pixels change"),
     Case("white throughout", lambda g: replace(g, frames=np.full_like(g.frames, 255)), "expose shorter"),
     Case("a projector stated too small", lambda g: _other_size(g, 400, 480), "expected"),
-    Case("a projector stated too large", lambda g: _other_size(g, 1280, 800), "contradict"),
+    Case("a projector stated too large", lambda g: _other_size(g, 1280, 800), "size of the projector"),
     Case(
         "rows shown, columns stated",
         lambda g: replace(g, sensor=g.sensor.for_projector(480, 640, ("columns",))),
