@@ -346,12 +346,16 @@ CASES = [
     Case("a fringe exposed 1.3 times", lambda g: _scaled(g, [_fringes(g)[1]], 1.3), "exposure", (PHASE,)),
     Case("two frames the same", lambda g: _moved(g, [_bits(g)[2]], [_bits(g)[4]]), "same|add up"),
     Case("one frame lost, one repeated", _lost_and_repeated, "add up|same|repeat"),
-    Case("one frame missing", lambda g: g.pick(*range(5), *range(6, _n(g))), "expected"),
+    Case(
+        "one frame missing",
+        lambda g: g.pick(*range(5), *range(6, _n(g))),
+        r"bit\d or of its inverse seems to be missing",
+    ),
     Case("a dark stack", lambda g: replace(g, frames=np.zeros_like(g.frames)), "brightest value is 0"),
     Case("one image throughout", lambda g: g.pick(*[_n(g) - 2] * _n(g)), "half of the pixels change"),
     Case("white throughout", lambda g: replace(g, frames=np.full_like(g.frames, 255)), "expose shorter"),
     Case("a projector stated too small", lambda g: _other_size(g, 400, 480), "expected"),
-    Case("a projector stated too large", lambda g: _other_size(g, 1280, 800), "contradict"),
+    Case("a projector stated too large", lambda g: _other_size(g, 1280, 800), "size of the projector"),
     Case(
         "rows shown, columns stated",
         lambda g: replace(g, sensor=g.sensor.for_projector(480, 640, ("columns",))),

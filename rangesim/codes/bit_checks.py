@@ -7,6 +7,7 @@ contradicts itself nearly everywhere. Each check returns one sentence with the l
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
@@ -75,16 +76,16 @@ MAX_FROM_MIDDLE = 0.15
 """Distance from the middle of dark and lit up to which a pixel lies between the two, as a fraction of their difference.
 Noise of a fifth of the difference brings 4 % of the pixels there."""
 
-MIN_STRIPE_CELLS = 8
-"""Least mean width of a bit's stripes, in cells, at which they count as wide, because most pixels then lie within them.
-Of a code of few cells, the square root of their number is enough."""
-
 MIN_UNIFORM_FRACTION = 0.98
 """Least fraction of the pixels at which a bit is dark, or lit, so that its frames count as uniform."""
 
 MIN_SECOND_FRACTION = 0.15
 """Least fraction of the projector at which the coarsest bit has its rarer value, so that a view without that value is
 worth a word if neither white nor black was shown. It is 0.2 of 1280 pixels and 0.05 of 1080, which few cameras see."""
+
+MIN_READ_FRACTION = 0.1
+"""Least fraction of the pixels that change that must be read, because the others see no more than light from other
+surfaces."""
 
 COVERED_FRACTION = 0.95
 """Fraction of the pixels whose words count as seen. Single wrong bits make the rarest words."""
@@ -169,11 +170,10 @@ def level_contradiction(seen: AxisFrames, words: Words) -> str | None:
 
 
 class Light(NamedTuple):
-    """Light of the bits, most significant first: 0 dark, 1 lit, NaN in shadow.
+    """Light of the bits, most significant first: 0 dark, 1 lit, NaN at pixels that are not read.
 
     seen : frames of the bits. words : those of the code. coded : (b, cells) int, bits of the cells of the projector.
     across, down : (b, n, m) float32, along lines across the image and down the image.
-    decoded : (n, m) bool, pixels of `across` with a word of the code.
     """
 
     seen: AxisFrames
@@ -181,42 +181,40 @@ class Light(NamedTuple):
     coded: np.ndarray
     across: np.ndarray
     down: np.ndarray
-    decoded: np.ndarray
 
     @property
     def lit(self) -> np.ndarray:
-        """(b, n) float32, at pixels that are not in shadow."""
+        """(b, n) float32, at pixels that are read."""
         return self.across[:, np.isfinite(self.across[0])]
 
 
-def light_of_bits(seen: AxisFrames, code: AxisCode, words: Words) -> Light:
-    """Light of the bits at some lines of the image.
+def light_of_bits(seen: AxisFrames, code: AxisCode, words: Words) -> Light | None:
+    """Light of the bits at some lines of the image; None if only few of the pixels that change are read.
 
     Parameters
     ----------
     seen : frames (k, h, w) of the bits. code : what they decode to. words : those of the code.
     """
-    cell_px = round(code.cell_px)
-    coded = (words.of_cell[: -(-seen.size // cell_px)] >> np.arange(words.bits)[::-1, None]) & 1
-    across, down = _along_lines(seen, words, is_down=False), _along_lines(seen, words, is_down=True)
-    return Light(seen, words, coded, across, down, (code.status == Status.OK)[:: _line_step(seen)])
+    swing = seen.contrast.values
+    changes = seen.contrast.is_enough & (swing > MIN_RANGE * bright_level(swing))
+    is_read = changes & (code.status != Status.LOW_SIGNAL) & (code.status != Status.SATURATED)
+    n_read = np.count_nonzero(is_read)
+    if n_read < max(MIN_PIXELS, MIN_READ_FRACTION * np.count_nonzero(changes)):
+        return None
+    coded = (words.of_cell[: math.ceil(seen.size / code.cell_px)] >> np.arange(words.bits)[::-1, None]) & 1
+    across, down = (_along_lines(seen, is_read, words, is_down) for is_down in (False, True))
+    return Light(seen, words, coded, across, down)
 
 
-def _line_step(seen: AxisFrames) -> int:
-    """Distance of the lines of the image that are looked at, in pixels."""
-    return 1 + seen.contrast.values.size // MAX_PIXELS
-
-
-def _along_lines(seen: AxisFrames, words: Words, is_down: bool) -> np.ndarray:
-    """(b, n, m) float32, light of the bits along lines of the image, across or down."""
-    step = _line_step(seen)
+def _along_lines(seen: AxisFrames, is_read: np.ndarray, words: Words, is_down: bool) -> np.ndarray:
+    """(b, n, m) float32, light of the bits along lines of the image, across or down; NaN where not `is_read` (h, w)."""
+    step = 1 + seen.contrast.values.size // MAX_PIXELS
 
     def lines(image: np.ndarray) -> np.ndarray:
         return (image.T if is_down else image)[::step].astype(np.float32)
 
     white, black, swing = lines(seen.contrast.white), lines(seen.contrast.black), lines(seen.contrast.values)
-    usable = lines(seen.contrast.is_enough) * (swing > MIN_RANGE * bright_level(swing))
-    swing[usable == 0] = np.nan
+    swing[lines(is_read) == 0] = np.nan
     result = []
     for bit in bit_frames(seen.names, words.bits):
         pattern, inverse = (None if i is None else lines(seen.frames[i]) for i in (bit.pattern, bit.inverse))
@@ -227,20 +225,15 @@ def _along_lines(seen: AxisFrames, words: Words, is_down: bool) -> np.ndarray:
 
 
 def between_contradiction(light: Light) -> str | None:
-    """A sentence if bits of wide stripes lie between dark and lit at many of the decoded pixels; None if not.
+    """A sentence if bits of wide stripes lie between dark and lit at many pixels, as fringes do; None if not.
 
-    A bit is dark or lit, and between the two only at its edges. Light of interreflection blurs all bits, but such
-    pixels are not decoded.
-
-    Parameters
-    ----------
-    light : what `light_of_bits` returns.
+    Stripes are wide if they have the square root of all cells: half of the bits of Gray code, and no bit of a code
+    whose stripes are all narrow.
     """
     n_cells = light.coded.shape[1]
     mean_stripe = n_cells / (1 + np.count_nonzero(np.diff(light.coded), axis=1))
-    used = np.isfinite(light.across[0]) & light.decoded
-    wide = light.across[:, used][mean_stripe >= min(MIN_STRIPE_CELLS, n_cells**0.5)]
-    if not len(wide) or wide.shape[1] < MIN_PIXELS:
+    wide = light.lit[mean_stripe >= n_cells**0.5]
+    if not len(wide):
         return None
     between = float(np.median((np.abs(wide - 0.5) < MAX_FROM_MIDDLE).mean(axis=1)))
     if between <= MAX_BETWEEN_FRACTION:
@@ -254,17 +247,11 @@ def between_contradiction(light: Light) -> str | None:
 def uniform_contradiction(light: Light) -> str | None:
     """A sentence if a bit is dark or lit at all pixels, and white or black may stand in its place; None if not.
 
-    A bit takes both values in a view of more cells than its widest stripe has. In Gray code, the widest stripe of the
+    It is so where the words are more than the cells of the bit's widest stripe. In Gray code, the widest stripe of the
     coarsest bit is half of the projector. If the camera sees no more than that, the frame counts as white or black if
-    there is no such frame beside it.
-
-    Parameters
-    ----------
-    light : what `light_of_bits` returns.
+    there is no such frame beside it. A pair beside white and black is a bit, perhaps another one.
     """
     seen, words, coded, lit = light.seen, light.words, light.coded, light.lit
-    if lit.shape[1] < MIN_PIXELS:
-        return None
     n_seen = _n_covering(lit > 0.5)
     is_shown = {"white": seen.contrast.has_white, "black": seen.contrast.has_black}
     for i, (bit, values) in enumerate(zip(bit_frames(seen.names, words.bits), lit, strict=True)):
@@ -282,7 +269,8 @@ def uniform_contradiction(light: Light) -> str | None:
         is_in_view = n_seen <= _widest_stripe(coded[i])
         least = 1 - MIN_UNIFORM_FRACTION if any(is_shown.values()) else MIN_SECOND_FRACTION
         is_level = i == 0 and min(coded[i].mean(), 1 - coded[i].mean()) > least
-        if is_in_view and (not is_level or all(is_shown[level] for level in shown.values())):
+        has_level = any(is_shown[level] for level in shown.values())
+        if (has_level and len(shown) == 2) or (is_in_view and (has_level or not is_level)):
             continue
         what = " and ".join(f"frame {name} is {level}" for name, level in shown.items())
         unless = ", unless the camera sees one side of the projector" if is_in_view else ""
@@ -450,7 +438,7 @@ def neighbours_of(code: AxisCode, words: Words) -> list[np.ndarray]:
 
 
 def _that_differ(keys: np.ndarray) -> np.ndarray:
-    """The keys, of keys (n,), whose two words differ."""
+    """Those of the keys (n,) whose two words differ."""
     return np.asarray(keys[keys >> 32 != keys & 0xFFFFFFFF])
 
 

@@ -110,14 +110,14 @@ class BitCode(Code):
         if found := pair_contradiction(seen, words) or level_contradiction(seen, words):
             return found
         light = light_of_bits(seen, code, words)
-        if found := between_contradiction(light):
-            return found
+        if light is not None:
+            found = between_contradiction(light) or uniform_contradiction(light) or lost_contradiction(light)
+            if found:
+                return found
         neighbours = neighbours_of(code, words)
         return (
             other_code_contradiction(seen, neighbours, words, _other_words(words))
             or order_contradiction(seen, neighbours, words)
-            or uniform_contradiction(light)
-            or lost_contradiction(light)
         )
 
     def least_signal(

@@ -59,6 +59,10 @@ MAX_PAIR_ERROR = 0.25
 """Largest mean difference between the sum of a pattern and its inverse and that of the brightest and the darkest value,
 as a fraction of the swing. It is 0 for a pair that is in focus and 0.5 for two frames that are no pair."""
 
+MAX_PAIR_PIXELS = 1000
+"""Largest number of pixels on which all pairs of frames are compared, so that the time is bounded; they tell the mean
+difference to 2 %."""
+
 MAX_LIKENESS_LOSS = 0.15
 """Largest loss against the best order, in the cosine between the fineness of the frames and that of the patterns, at
 which an order is still tried. An exchange of two axes, or of coarse and fine, loses 0.5 and more."""
@@ -144,9 +148,9 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
     """
     is_given = len(frames) == sensor.n_frames
     orders = list(layouts(sensor, len(frames)))
-    if not is_given and not orders:
-        raise ValueError(_wrong_number(len(frames), sensor))
     sample = _sampled(frames)
+    if not is_given and not orders:
+        raise ValueError(_wrong_number(len(frames), sensor, sample))
     found = sensor
     layout: Layout | None = None
     if np.count_nonzero(sample.is_lit) >= MIN_PIXELS:
@@ -155,7 +159,9 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
             found = with_layout(sensor, layout)
         found = _upright(frames, sample, found)
     elif not is_given:
-        raise ValueError(f"{_wrong_number(len(frames), sensor)[:-1]}; and they are too dark to tell which are missing.")
+        raise ValueError(
+            f"{_wrong_number(len(frames), sensor, sample)[:-1]}; and they are too dark to tell which are missing."
+        )
     findings = _order_findings(layout, sensor, found)
     if layout is None and found.axes != sensor.axes:
         findings.insert(0, f"{found.axes[0]} were shown before {found.axes[1]}.")
@@ -200,10 +206,14 @@ def _order_findings(layout: Layout | None, sensor: StructuredLight, found: Struc
     return findings
 
 
-def _wrong_number(n: int, sensor: StructuredLight) -> str:
-    """The sentence that says that no order of the code has that many frames."""
+def _wrong_number(n: int, sensor: StructuredLight, sample: _Sample) -> str:
+    """The sentence that says that no order of the code has that many frames, and of which pair one is missing."""
     names = sensor.frame_names()
-    return f"expected {len(names)} images for {sensor.type_name} ({names[0]} ... {names[-1]}), got {n}."
+    lost = _lost_of_pair(sample, sensor)
+    return (
+        f"expected {len(names)} images for {sensor.type_name} ({names[0]} ... {names[-1]}), got {n}"
+        f"{f'; the image of {lost} or of its inverse seems to be missing' if lost else ''}."
+    )
 
 
 def _sampled(frames: np.ndarray) -> _Sample:
@@ -264,10 +274,44 @@ def _best_layout(sample: _Sample, sensor: StructuredLight, orders: Sequence[Layo
         return layout if score > max(MIN_BITS, least) else None
     if score < MIN_BITS:
         raise ValueError(
-            f"{_wrong_number(len(sample.frames), sensor)[:-1]}; and in no order that misses some of them do "
+            f"{_wrong_number(len(sample.frames), sensor, sample)[:-1]}; and in no order that misses some of them do "
             "neighbouring pixels see neighbouring places."
         )
     return layout
+
+
+def _lost_of_pair(sample: _Sample, sensor: StructuredLight) -> str | None:
+    """Name of the pattern of which an image, or that of its inverse, is missing; None if that cannot be told.
+
+    All other pairs of pattern and inverse add up to the same sum only if the gap is in its right place.
+    """
+    if np.count_nonzero(sample.is_lit) < MIN_PIXELS:
+        return None
+    fineness, error = _fineness(sensor), _pair_errors(sample)
+    ends = {ends: _ends_fit(sample, _at_ends(*ends)) for ends in ENDS}
+    found: dict[str, float] = {}
+    for layout in layouts(sensor, len(sample.frames) + 1):
+        names = layout.names(sensor)
+        for name in names if ends[layout.ends] else ():
+            rest = [other for other in names if other != name]
+            places = {other: i for i, other in enumerate(rest)}
+            pairs = [(i, places[other + INVERSE]) for other, i in places.items() if other + INVERSE in places]
+            worst = max((error[i, j] for i, j in pairs), default=1.0)
+            is_of_pair = name.endswith(INVERSE) or name + INVERSE in names
+            if is_of_pair and worst < MAX_PAIR_ERROR:
+                pattern = name.removesuffix(INVERSE)
+                found[pattern] = max(found.get(pattern, -1.0), _likeness(sample, fineness, rest) - worst)
+    return max(found, key=found.__getitem__, default=None)
+
+
+def _pair_errors(sample: _Sample) -> np.ndarray:
+    """(k, k) mean difference between the sum of any two frames and that of the brightest and the darkest value, as a
+    fraction of the swing, at a few of the pixels."""
+    lit = sample.is_lit
+    few = slice(None, None, 1 + np.count_nonzero(lit) // MAX_PAIR_PIXELS)
+    frames, high, low = sample.frames[:, lit][:, few], sample.high[lit][few], sample.low[lit][few]
+    total, swing = high + low, float((high - low).mean())
+    return np.array([np.abs(frames + frame - total).mean(axis=1) / swing for frame in frames])
 
 
 def _at_ends(first: Sequence[str], last: Sequence[str]) -> list[tuple[int, str]]:
