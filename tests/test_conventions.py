@@ -15,13 +15,14 @@ from tiers import draws
 
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
-from rangesim.codes import FringeConvention, GrayPhase
+from rangesim.codes import FringeConvention, GrayCode, GrayPhase
 from rangesim.conventions import detect_convention
 from rangesim.decoding import decode
 from rangesim.electronics.detector import Detector
+from rangesim.errors import RangesimWarning
 from rangesim.results.captures import import_capture
 from rangesim.rig import Intrinsics
-from rangesim.sensors import StructuredLight, sensor_of
+from rangesim.sensors import StructuredLight, StructuredLightDecoder, sensor_of
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
@@ -149,6 +150,23 @@ def test_fringes_before_bits() -> None:
     order = sorted(range(len(names)), key=lambda i: (names[i] in ("white", "black"), "phase" not in names[i], i))
     found = detect_convention(capture.frames[order], capture.sensor)  # type: ignore[arg-type]
     assert found.findings == ("phase images come before bit images.",)
+
+
+@pytest.mark.parametrize("cell_px", [1, 3])
+def test_gray_codes_of_the_middle_words_are_found(cell_px: int) -> None:
+    """Programs of Lanman, Taubin and Moreno show them; read as the first words, all places would be shifted."""
+    middle = StructuredLight(*SIZE, code=GrayCode(cell_px, "middle"), axes=BOTH)
+    shown = middle.patterns()
+    given = replace(middle, code=GrayCode(cell_px))
+    with pytest.warns(RangesimWarning, match="as if the code showed its middle words instead of the first ones"):
+        StructuredLightDecoder().coordinates(Capture(shown, given))
+    found = detect_convention(shown, given)
+    assert found.sensor == middle
+    assert found.findings == ("the Gray code shows the middle words (words_shown = middle).",)
+    seen = StructuredLightDecoder().coordinates(Capture(shown, middle))
+    cells = np.arange(SIZE[0]) // cell_px * cell_px + cell_px / 2
+    np.testing.assert_allclose(seen.column[0], np.minimum(cells, (SIZE[0] - SIZE[0] % cell_px + SIZE[0]) / 2))
+    assert detect_convention(given.patterns(), middle).sensor == given
 
 
 def test_other_numbers_of_frames_are_refused_or_doubted() -> None:

@@ -24,6 +24,14 @@ from rangesim.settings.config import Named
 AXES = ("columns", "rows")
 """Axes of a projector that a code may follow; the index of an axis here is the index of its projector coordinate."""
 
+MAX_OUTSIDE_FRACTION = 0.02
+"""Largest fraction of the decoded pixels that may see no place of the projector, before other conventions of a code are
+tried. Interreflection and noise make less."""
+
+MAX_LEFT_OUTSIDE = 0.1
+"""Largest number of pixels outside the projector in another convention, as a fraction of that in the given one, at
+which it explains the frames. Pixels that are wrong at random lie outside in both."""
+
 
 class CodeThresholds(NamedTuple):
     """Thresholds of all kinds of codes. Each kind takes those that it needs."""
@@ -121,6 +129,11 @@ class Code(Named, ABC):
         seen : as for `decode`. code : what `decode` returned.
         """
         return None
+
+    def other_conventions(self) -> Iterator[tuple[Code, str]]:
+        """Codes with the same number of frames whose patterns are in use under the same name, each with a sentence that
+        says what differs; by default none. `rangesim.conventions.detect_convention` tries them."""
+        yield from ()
 
     def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
         """(h, w) float64, least light of the projector at full power that the thresholds accept, in the background's

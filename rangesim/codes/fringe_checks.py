@@ -6,14 +6,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations, permutations
-from typing import Literal
 
 import numpy as np
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames
+from rangesim.codes.fringe_direction import phase_direction
 from rangesim.codes.fringe_gamma import MAX_SAMPLES, FringeGamma
 from rangesim.codes.fringe_stack import FringeStack
-from rangesim.codes.fringes import STARTS, FringeConvention
+from rangesim.codes.fringes import FringeConvention
 from rangesim.decoding.phase_shift import Phase, phase_of
 from rangesim.decoding.pixel_samples import MAX_PIXELS, MIN_PIXELS, evenly_spread
 from rangesim.decoding.status import Status
@@ -70,22 +70,10 @@ MIN_AGREEING = 0.8
 """Least fraction of the pixels that agree after a correction, at which the correction is named: as many as may disagree
 without a word otherwise."""
 
-MIN_ORIGIN_PX = 0.15
-"""Least difference of the start of fringes that is told, in projector pixels, below a third of that of a pixel's edge
-and its centre."""
-
-MIN_DIRECTION = 0.5
-"""Least agreement of phase and Gray code from pixel to pixel that tells the direction of the fringes: three of four
-pairs of neighbours. By chance it is 0."""
-
-MIN_CLEAR_TURNS, MAX_CLEAR_TURNS = 0.001, 0.4
-"""Least and largest step of the phase from pixel to pixel, in turns, that shows a direction: above the rounding of the
-phase, and below half a turn by a fifth, because half a turn is the same in both directions."""
-
 MIN_BACKWARD = 0.5
 """Least disagreement of phase and Gray code from pixel to pixel at which fringes count as backward although every place
-lies in its cell. It is 1 if all run backward, -1 if none does, and near 0 if the pixels of the camera are as wide as
-half a period, so that the direction is a guess."""
+lies in its cell. It is 1 if all run backward, -1 if none does, and 0 if the pixels of the camera are too wide to tell
+(`phase_direction`)."""
 
 MEDIAN_ERROR = 1.253
 """Ratio of the standard error of a median to that of a mean, for normally distributed values: sqrt(pi / 2)."""
@@ -119,9 +107,9 @@ def fringe_contradiction(
     mean, resultant = _circular_mean(off)
     offset_px = mean * period_px
     one_sided = max(above, below) > MIN_ONE_SIDED_FRACTION + 3 * min(above, below) and abs(offset_px) > MIN_OFFSET_PX
-    backwards = convention.sign * _direction(_inside_cell(gray, refined), gray, frames)
+    backwards = convention.sign * phase_direction(frames, gray, _inside_cell(gray, refined), period_px)
     if far <= MAX_FAR_FRACTION and not one_sided:
-        if backwards > -MIN_BACKWARD or not _resolves_cells(gray):
+        if backwards > -MIN_BACKWARD:
             return None
         return (
             f"the fringes along {axis} contradict the Gray code: from one cell to the next, their phase runs the other "
@@ -299,90 +287,6 @@ def _other_places(
                 yield f"{name} to {fault}, so check the order of their frames", elsewhere
 
 
-def measured_convention(
-    seen: AxisFrames, gray: AxisCode, period_px: float, given: FringeConvention
-) -> FringeConvention | None:
-    """The convention with which fringes agree best with the Gray code of the same axis; None if none does.
-
-    The places that the phases tell must lie within their Gray cells. Their mean difference, as an angle, tells where
-    the fringes start, for each of the two directions. `given` is returned if it fits within its uncertainty; else the
-    nearest of the known starts at a pixel's edge or centre; else one whose `origin_px` is what was measured.
-
-    Parameters
-    ----------
-    seen : frames (N, h, w), the fringes of the axis, with their contrast. gray : code of the axis.
-    period_px : float, projector pixels. given : FringeConvention that the user stated.
-    """
-    fit = _offset(seen, gray, period_px)
-    if fit is None:
-        return None
-    sign, turns, error = fit
-    tolerance = max(3 * error, MIN_ORIGIN_PX / period_px)
-    direction: Literal["forward", "backward"] = "forward" if sign > 0 else "backward"
-
-    def away(convention: FringeConvention) -> float:
-        return abs(float(_wrapped(np.asarray(turns - convention.shift_turns(0, 1, period_px)))))
-
-    if given.direction == direction and away(given) <= tolerance:
-        return given
-    known = [FringeConvention(start, direction, x) for start in STARTS for x in (0.0, 0.5)]  # type: ignore[arg-type]
-    nearest = min(known, key=away)
-    if away(nearest) <= tolerance:
-        return nearest
-    at_start = replace(nearest, origin_px=0.0)
-    rest = float(_wrapped(np.asarray(turns - at_start.shift_turns(0, 1, period_px)))) * period_px
-    return replace(at_start, origin_px=round(rest, 3))
-
-
-def convention_fit(seen: AxisFrames, gray: AxisCode, period_px: float, convention: FringeConvention) -> float:
-    """Fraction of pixels, 0 to 1, whose place by a convention lies in their Gray cell or a 32nd of a period beyond.
-
-    By chance it is the cell and a 16th of a period, over the period. Parameters as for `measured_convention`.
-    """
-    used = _gray_pixels(seen, gray)
-    if not len(used):
-        return 0.0
-    phase = phase_of(seen.frames.reshape(len(seen.frames), -1)[:, used])
-    place = convention.place_turns(phase.normalised, period_px)
-    off = _wrapped(place - gray.coordinate.ravel()[used] / np.float32(period_px))
-    return float((np.abs(off) <= gray.cell_px / (2 * period_px) + FAR_TURNS / 4).mean())
-
-
-def _offset(seen: AxisFrames, gray: AxisCode, period_px: float) -> tuple[int, float, float] | None:
-    """Direction of fringes (1 or -1), their shift in turns, and its standard error; None if Gray code tells none.
-
-    With place = direction * phase + shift, in turns, the shift is the mean of gray / period - direction * phase.
-    """
-    used = _gray_pixels(seen, gray)
-    if len(used) < MIN_PIXELS:
-        return None
-    phase = phase_of(seen.frames.reshape(len(seen.frames), -1)[:, used])
-    within = gray.coordinate.ravel()[used] / np.float32(period_px)
-    mask = np.zeros(gray.status.size, dtype=bool)
-    mask[used] = True
-    # Cells of half a period lie alike for both directions, so that neighbouring pixels must tell.
-    direction = _direction(mask.reshape(gray.status.shape), gray, seen.frames)
-    if abs(direction) < MIN_DIRECTION:
-        return None
-    sign = 1 if direction > 0 else -1
-    off = within - sign * phase.normalised
-    turns, resultant = _circular_mean(off)
-    if resultant < MIN_CONCENTRATION * float(np.sinc(gray.cell_px / period_px)):
-        return None
-    _, cell, counts = np.unique(gray.coordinate.ravel()[used], return_inverse=True, return_counts=True)
-    of_cells = np.bincount(cell, weights=_wrapped(off - turns)) / counts  # a cell that is seen in part has another mean
-    return sign, turns, float(of_cells.std() / len(counts) ** 0.5)
-
-
-def _gray_pixels(seen: AxisFrames, gray: AxisCode) -> np.ndarray:
-    """(n,) int, flat indices of pixels within a Gray cell, not on an edge, whose fringes swing enough to compare."""
-    inside = ((gray.coordinate / gray.cell_px) % 1 == 0.5) & (gray.status == Status.OK)
-    inside &= ~seen.capture.saturated(seen.frames)
-    used = evenly_spread(np.flatnonzero(inside))
-    swing = 2 * phase_of(seen.frames.reshape(len(seen.frames), -1)[:, used]).modulation
-    return np.asarray(used[swing > 0.5 * MIN_SWING * seen.contrast.values.ravel()[used]])
-
-
 def _expected(phase: Phase, steps: int, gamma: float) -> np.ndarray:
     """(N, n) values from 0 to 1 of fringes of these phases, with a gamma."""
     shifts = np.arange(steps)[:, None] / steps
@@ -433,38 +337,6 @@ def _inside_cell(gray: AxisCode, refined: AxisCode) -> np.ndarray:
     inside = (gray.coordinate / gray.cell_px) % 1 == 0.5
     is_strong = (refined.status == Status.OK) | (refined.status == Status.CODE_ERROR)
     return np.asarray(inside & is_strong & (gray.status == Status.OK))
-
-
-def _direction(usable: np.ndarray, gray: AxisCode, frames: np.ndarray) -> float:
-    """Agreement of phase and Gray code from pixel to pixel: 1 if both grow the same way, -1 if the opposite way.
-
-    It is 0 if no pixels `usable` (h, w) bool are neighbours in neighbouring cells.
-    """
-    cell = gray.coordinate / gray.cell_px
-    agreement, pairs = 0.0, 0
-    for here, there in (
-        (np.s_[..., :, :-1], np.s_[..., :, 1:]),
-        (np.s_[..., :-1, :], np.s_[..., 1:, :]),
-    ):
-        crossed = usable[here] & usable[there] & (np.abs(cell[there] - cell[here]) == 1)
-        y, x = np.nonzero(crossed)
-        turn = _wrapped(
-            phase_of(frames[there][:, y, x]).normalised - phase_of(frames[here][:, y, x]).normalised,
-        )
-        is_clear = (np.abs(turn) > MIN_CLEAR_TURNS) & (np.abs(turn) < MAX_CLEAR_TURNS)
-        agreement += float((is_clear * np.sign(turn) * (cell[there][y, x] - cell[here][y, x])).sum())
-        pairs += len(y)
-    return agreement / max(pairs, 1)
-
-
-def _resolves_cells(gray: AxisCode) -> bool:
-    """Whether most decoded neighbours see the same cell, so that the pixels of the camera are finer than the cells."""
-    ok, same, pairs = gray.status == Status.OK, 0, 0
-    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        both = ok[here] & ok[there]
-        same += int(np.count_nonzero(both & (gray.coordinate[here] == gray.coordinate[there])))
-        pairs += int(np.count_nonzero(both))
-    return 2 * same > pairs
 
 
 def _wrapped(turns: np.ndarray) -> np.ndarray:

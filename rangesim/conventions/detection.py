@@ -16,6 +16,7 @@ import numpy as np
 
 from rangesim.capture import Capture, bright_level
 from rangesim.codes import AXES, AxisCode
+from rangesim.codes.code import MAX_LEFT_OUTSIDE, MAX_OUTSIDE_FRACTION
 from rangesim.conventions.fringe_conventions import measured_fringes, middle_of
 from rangesim.conventions.layouts import (
     ENDS,
@@ -138,8 +139,8 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
     --------
     >>> sensor = StructuredLight(64, 48, code="gray")
     >>> shown = sensor.patterns()  # as a camera sees them that looks straight at the screen
-    >>> detect_convention(np.concatenate([shown[-2:], shown[:-2]]), sensor)
-    Convention(sensor=StructuredLight(...), findings=('white and black come first.',))
+    >>> detect_convention(np.concatenate([shown[-2:], shown[:-2]]), sensor).findings
+    ('white and black come first.', 'this is the order white, black, *.')
     """
     is_given = len(frames) == sensor.n_frames
     orders = list(layouts(sensor, len(frames)))
@@ -160,9 +161,10 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
         findings.append(f"{found.axes[0]} were shown before {found.axes[1]}.")
     if found.order != sensor.order and 0 < len(found.order) <= MAX_ENTRIES:
         findings.append(f"this is the order {', '.join(found.order)}.")
+    found, said_of_places = _within_projector(sample, found)
     code, said = measured_fringes(frames, sample.frames, found)
     found = replace(found, code=code)
-    return Convention(found, (*findings, *said))
+    return Convention(found, (*findings, *said_of_places, *said))
 
 
 def _wrong_number(n: int, sensor: StructuredLight) -> str:
@@ -355,6 +357,26 @@ def _upright(frames: np.ndarray, sample: _Sample, found: StructuredLight) -> Str
     except ValueError:
         return found
     return exchanged if exchanged.n_frames == found.n_frames else found
+
+
+def _within_projector(sample: _Sample, sensor: StructuredLight) -> tuple[StructuredLight, tuple[str, ...]]:
+    """The sensor in a convention of its code in which nearly all places lie in the projector, and what differs."""
+    outside = _outside(sample, sensor)
+    if outside > MAX_OUTSIDE_FRACTION:
+        for code, said in sensor.code.other_conventions():
+            other = replace(sensor, code=code)
+            if _outside(sample, other) < MAX_LEFT_OUTSIDE * outside:
+                return other, (said,)
+    return sensor, ()
+
+
+def _outside(sample: _Sample, sensor: StructuredLight) -> float:
+    """Fraction of the decoded pixels that see no place of the projector; of two axes, that of the worse one."""
+    fractions = []
+    for code in _decoded(sample.frames, sensor).values():
+        outside = int(np.count_nonzero(code.status == Status.CODE_ERROR))
+        fractions.append(outside / max(1, outside + int(np.count_nonzero(code.status == Status.OK))))
+    return max(fractions)
 
 
 def _differences(layout: Layout, sensor: StructuredLight, found: StructuredLight) -> Iterator[str]:
