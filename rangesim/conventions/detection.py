@@ -141,7 +141,7 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
     is_given = len(frames) == sensor.n_frames
     orders = list(layouts(sensor, len(frames)))
     if not is_given and not orders:
-        raise ValueError(_wrong_number(len(frames), sensor))
+        raise ValueError(_wrong_number(len(frames), sensor) + _square(len(frames), sensor))
     sample = _sampled(frames)
     found = sensor
     layout: Layout | None = None
@@ -166,7 +166,16 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
 def _wrong_number(n: int, sensor: StructuredLight) -> str:
     """The sentence that says that no order of the code has that many frames."""
     names = sensor.frame_names()
-    return f"expected {len(names)} images for {sensor.type_name} ({names[0]} ... {names[-1]}), got {n}."
+    return f"expected {len(names)} images for {sensor.code.details} ({names[0]} ... {names[-1]}), got {n}."
+
+
+def _square(n: int, sensor: StructuredLight) -> str:
+    """A sentence if a projector that is as high as wide has that many frames; "" if not."""
+    side = max(sensor.projector_width, sensor.projector_height)
+    square = replace(sensor, projector_width=side, projector_height=side, order=())
+    if len(sensor.axes) < 2 or next(layouts(square, n), None) is None:
+        return ""
+    return f" A projector of {side}x{side} has as many: some programs show as many bits along rows as along columns."
 
 
 def _sampled(frames: np.ndarray) -> _Sample:
