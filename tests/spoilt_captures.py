@@ -18,7 +18,7 @@ from synthetic import plane_signals, stereo_rig
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
 from rangesim.cli.decode_summary import likely_cause, status_fractions, unchecked
-from rangesim.codes import Code, FringeConvention, GrayPhase
+from rangesim.codes import Code, FringeConvention, GrayPhase, MicroPhaseShifting
 from rangesim.conventions import detect_convention
 from rangesim.decoding import decode
 from rangesim.electronics.detector import Detector
@@ -145,7 +145,7 @@ def answer(case: Case, code: str) -> Answer:
     except ValueError as error:
         return Answer("refused", "", str(error))
     cause = likely_cause(image, capture)
-    notes = unchecked(image) if case.is_calibrated else None
+    unknown = unchecked(image) if case.is_calibrated else None
     shares = ", ".join(f"{100 * x:.0f} % {name}" for name, x in status_fractions(image).items() if x >= 0.005)
     wrong = 0.0
     for coordinate, true in ((image.projector_column, uv[..., 0]), (image.projector_row, uv[..., 1])):
@@ -155,11 +155,12 @@ def answer(case: Case, code: str) -> Answer:
             wrong = max(wrong, float(off.mean()) if read.any() else 0.0)
     if case.is_calibrated and image.z.shape == z.shape and image.valid.any():
         wrong = max(wrong, float((np.abs(image.z / z - 1)[image.valid] > TOLERANCE_Z).mean()))
-    said = " ".join([*found.findings, *image.doubts, *(f"{c}." for c in (cause, notes) if c)])
+    said = " ".join([*found.findings, *image.notes, *image.doubts, *(f"{c}." for c in (cause, unknown) if c)])
     is_right = wrong <= MAX_WRONG_FRACTION and image.valid.mean() > 0.5
-    if found.findings and is_right and not image.doubts:
+    is_mended = bool(found.findings or image.notes)
+    if is_mended and is_right and not image.doubts:
         verdict = "mended"
-    elif image.doubts or cause or notes or found.findings:
+    elif image.doubts or cause or unknown or is_mended:
         verdict = "warned"
     else:
         verdict = "right" if is_right else "SILENT"
@@ -194,6 +195,14 @@ def _scaled(given: Given, places: list[int], factor: float) -> Given:
 def _posed(given: Given, change: Callable[[np.ndarray], np.ndarray]) -> Given:
     assert given.rig is not None
     return replace(given, rig=replace(given.rig, T_camera_projector=change(given.rig.T_camera_projector)))
+
+
+def _shorter_lens(given: Given, factor: float) -> Given:
+    """The calibration of a camera of another size of image: focal length and principal point times a factor."""
+    assert given.rig is not None
+    camera = given.rig.pinhole
+    scaled = {name: factor * getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
+    return replace(given, rig=replace(given.rig, camera=replace(camera, **scaled)))
 
 
 def _millimetres(pose: np.ndarray) -> np.ndarray:
@@ -232,6 +241,12 @@ def _n(given: Given) -> int:
 def _lost_and_repeated(given: Given) -> Given:
     """The sixth frame is missing, and the seventh is there twice."""
     return given.pick(*range(5), *range(6, 7), *range(6, _n(given)))
+
+
+def _alone(given: Given, lost: int | None = None) -> Given:
+    """White, black, and the patterns without their inverses and without the bit of the place `lost`."""
+    patterns = [i for k, i in enumerate(_bits(given)[::2]) if k != lost]
+    return given.pick(-2, -1, *patterns)
 
 
 MIRRORED = "mirrored"
@@ -323,6 +338,7 @@ CASES = [
         is_calibrated=True,
         axes=BOTH,
     ),
+    Case("a calibration at half the size", lambda g: _shorter_lens(g, 0.5), "beside the projector", is_calibrated=True),
     Case("a calibration with one axis", lambda g: g, "alone do not check", is_calibrated=True),
     Case("levels that clip at 40 % of the pixels", _clipped, ""),
     Case("plain binary", _plain_binary, "plain binary"),
@@ -350,6 +366,22 @@ CASES = [
         "white and black first, any code", lambda g: g.pick(-2, -1, *range(_n(g) - 2)), "white and black come first", ()
     ),
     Case("black before white, any code", lambda g: g.swap(-2, -1), "black before white", ()),
+    Case("patterns alone, cells of two pixels stated as one", lambda g: _alone(g, 9), "cell_px", (GRAY,)),
+    Case("patterns alone, the coarsest lost", lambda g: _alone(g, 0), "no image is missing", (GRAY,)),
+    Case("patterns alone, the fourth lost", lambda g: _alone(g, 3), "between the two seems to be missing", (GRAY,)),
+    Case(
+        "white and black for the coarsest bit",
+        lambda g: _other_size(g.pick(-2, -1, *_bits(g)), 1280, 480),
+        "size of the projector",
+        (GRAY,),
+    ),
+    Case(
+        "fringes read as bits",
+        lambda g: g,
+        "fringes seem to have been shown",
+        (GRAY,),
+        shows=MicroPhaseShifting(period_px=64.0),
+    ),
     Case("frames in no order", lambda g: g.pick(*np.random.default_rng(0).permutation(_n(g))), "order|add up"),
 ]
 """Captures that were spoilt, each in one way."""

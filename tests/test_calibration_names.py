@@ -17,7 +17,12 @@ from rangesim import Intrinsics, Rig, StructuredLight
 from rangesim.cli import app
 from rangesim.errors import FileFormatError
 from rangesim.files.storage_files import read_storage
-from rangesim.rig.calibration_files import load_calibration, read_calibration, save_calibration
+from rangesim.rig.calibration_files import (
+    load_calibration,
+    principal_point_doubts,
+    read_calibration,
+    save_calibration,
+)
 
 CAMERA, PROJECTOR = (64, 48), (128, 80)
 RIG = stereo_rig(
@@ -233,3 +238,48 @@ def test_yaml_is_read_as_it_is_meant(tmp_path: Path, text: str) -> None:
         {"a": [1, [2, 3], [4]], "b": "text"},
     ]
     assert found in expected
+
+
+# ---- Calibrations of other devices and sizes -------------------------------------------------------------------------
+
+CAMERA_K = Intrinsics(1688, 1352, 2195.0, 2195.0, 844.0, 676.0)
+PROJECTOR_K = Intrinsics(1824, 1140, 2601.0, 2601.0, 867.0, 1109.0)
+"""A camera, and a projector that shines upward from a table."""
+
+
+def resized(device: Intrinsics, factor: float, width: int = 0, height: int = 0) -> Intrinsics:
+    """The device with its K times a factor, or that K for an image of another size."""
+    return Intrinsics(
+        width or device.width,
+        height or device.height,
+        *(factor * x for x in (device.fx, device.fy, device.cx, device.cy)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("camera", "projector", "words"),
+    [
+        (CAMERA_K, PROJECTOR_K, []),
+        (resized(CAMERA_K, 0.5), PROJECTOR_K, ["the camera's principal point, 422, 338, lies far"]),
+        (resized(CAMERA_K, 2.0), PROJECTOR_K, ["images of another size"]),
+        (CAMERA_K, resized(PROJECTOR_K, 0.5), ["the projector's principal point, 434, 554, lies far"]),
+        (
+            resized(PROJECTOR_K, 1.0, CAMERA_K.width, CAMERA_K.height),
+            resized(CAMERA_K, 1.0, PROJECTOR_K.width, PROJECTOR_K.height),
+            ["camera and projector seem to be exchanged"],
+        ),
+    ],
+)
+def test_principal_points_far_from_the_centre_are_named(
+    camera: Intrinsics, projector: Intrinsics, words: list[str]
+) -> None:
+    said = principal_point_doubts(Rig(camera, projector, np.eye(4), RIG.T_camera_projector))
+    assert len(said) == len(words)
+    assert all(word in sentence for word, sentence in zip(words, said, strict=True))
+
+
+@pytest.mark.parametrize(("length", "is_said"), [(0.2, False), (6.0, True), (16.0, True), (200.0, False)])
+def test_a_length_that_may_be_centimetres_is_said(length: float, is_said: bool, tmp_path: Path) -> None:
+    entries = {"K1": K1, "D1": D1, "K2": K2, "D2": D2, "R": R, "T": length * T / np.linalg.norm(T)}
+    findings = read_calibration(as_json(tmp_path / "stereo", entries)).findings
+    assert ("centimetres" in " ".join(findings)) == is_said

@@ -22,7 +22,9 @@ from rangesim.electronics.detector import Detector
 from rangesim.errors import RangesimWarning
 from rangesim.results.captures import import_capture
 from rangesim.rig import Intrinsics
-from rangesim.sensors import StructuredLight, StructuredLightDecoder
+from rangesim.sensors import StructuredLight, StructuredLightDecoder, sensor_of
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
 SIZE = (500, 410)
 BOTH = ("columns", "rows")
@@ -56,6 +58,16 @@ def test_a_capture_in_the_given_convention_changes_nothing(code: str, axes: tupl
     found = detect_convention(capture.frames, capture.sensor)  # type: ignore[arg-type]
     assert found.sensor == capture.sensor
     assert found.findings == ()
+
+
+@pytest.mark.parametrize("amplitude", [60, 200])
+def test_a_close_view_of_an_own_subpixel_code_keeps_its_order(amplitude: int) -> None:
+    """A camera that is finer than the projector: neighbours are a fraction of a pixel apart, and periods far wider."""
+    sensor = sensor_of(f"{EXAMPLES / 'own_code.py'}:TriangleWaves").for_projector(400, 300, BOTH)
+    assert isinstance(sensor, StructuredLight)
+    seen = np.repeat(np.repeat(sensor.patterns()[:, 100:250, 100:300], 2, axis=1), 2, axis=2)
+    noise = np.random.default_rng(0).normal(0, 2, seen.shape)
+    assert detect_convention(np.rint(20 + amplitude * seen + noise).astype(np.uint8), sensor).findings == ()
 
 
 @pytest.mark.parametrize("code", ["gray", "gray-phase"])

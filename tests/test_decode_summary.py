@@ -94,6 +94,13 @@ def test_numbers_that_fill_few_bits_are_the_cause(bits: int, tmp_path: Path) -> 
     assert info["status"]["measured"] > 0.9  # type: ignore[index]
 
 
+def test_few_bits_are_named_even_where_fringes_can_be_read(tmp_path: Path) -> None:
+    capture = bare_capture(StructuredLight(code="micro-phase-shifting"), 12)
+    _, info = decoded(capture, tmp_path)
+    assert info["status"]["measured"] > 0.5  # type: ignore[index]
+    assert "give --bits 12" in str(info["likely_cause"])
+
+
 @pytest.mark.parametrize("size", [(1024, 768), (1280, 800)])
 def test_rows_shown_first_are_found(size: tuple[int, int], tmp_path: Path) -> None:
     rig = stereo_rig()

@@ -91,7 +91,9 @@ def test_images_that_are_no_frames_are_left_out(tmp_path: Path) -> None:
     assert "expected 64 x 48" not in refused(*options)
     run(*options, "--images", "shot*.png")
     check_flat(tmp_path / "out")
-    assert "expected images that match 'pat*'; it holds a_photograph.png" in refused(*options, "--images", "pat*")
+    assert "expected images that match 'pat*', got a folder with a_photograph.png" in refused(
+        *options, "--images", "pat*"
+    )
 
 
 def test_a_list_says_which_images_and_what_they_show(tmp_path: Path) -> None:
@@ -109,9 +111,9 @@ def test_a_list_says_which_images_and_what_they_show(tmp_path: Path) -> None:
     check_flat(tmp_path / "out")
     for text, sentence in (
         ("shot0.png white\nshot1.png", "after each image or after none"),
-        ("shot0.png white\nshot1.png white", "'white' is there twice"),
-        ("shot99.png", "expected a file in"),
-        ("# nothing", "lists no images"),
+        ("shot0.png white\nshot1.png white", "got 'white' twice"),
+        ("shot99.png", "expected the names of files in"),
+        ("# nothing", "got no line with one"),
         ("\n".join(lines).replace("white", "wite"), "did you mean 'white'"),
     ):
         (tmp_path / "order.txt").write_text(text)
@@ -200,6 +202,31 @@ def test_patterns_say_all_that_decoding_needs(tmp_path: Path) -> None:
         assert f"leave out {option[0]}" in refused("decode", tmp_path / "scan", *sidecar, *option, "--out", "x")
 
 
+@pytest.mark.parametrize(
+    ("colour", "channel"), [((1.0, 0.1, 0.05), "red"), ((0.0, 0.1, 1.0), "blue"), ((1, 1, 1), None)]
+)
+def test_light_of_one_colour_names_its_channel(colour: tuple[float, ...], channel: str | None, tmp_path: Path) -> None:
+    images = 40 + 0.8 * FLAT[..., None] * np.array(colour)  # in a lit room
+    write_images(tmp_path / "scan", np.rint(images).astype(np.uint8))
+    said = run("decode", tmp_path / "scan", "--projector", "64x48", "--code", "gray", "--out", tmp_path / "out")
+    assert f"give --channel {channel}" in said if channel else "--channel" not in said
+
+
+def test_photographs_in_another_order_than_patterns_json_states(tmp_path: Path) -> None:
+    run("patterns", "gray", *SIZE, "--axes", "columns", "--out", tmp_path / "patterns")
+    shown = import_capture(tmp_path / "patterns", load_patterns(tmp_path / "patterns").sensor).frames
+    sidecar = ("--patterns", tmp_path / "patterns" / "patterns.json")
+    for name, order, words in (
+        ("first", [-2, -1, *range(len(shown) - 2)], "not as the patterns were written: white and black come first."),
+        ("inverses", [*(i ^ 1 for i in range(len(shown) - 2)), -2, -1], "each inverse stands before its pattern."),
+    ):
+        write_images(tmp_path / name, shown[order])
+        assert words in run("decode", tmp_path / name, *sidecar, "--out", tmp_path / f"out_{name}")
+        with np.load(tmp_path / f"out_{name}" / "range.npz") as maps:
+            column = maps["projector_column"]
+        np.testing.assert_array_equal(column, np.broadcast_to(np.arange(column.shape[1]) + 0.5, column.shape))
+
+
 @pytest.mark.parametrize(("bits", "dtype"), [(8, np.uint8), (5, np.uint8), (10, np.uint16)])
 def test_a_projector_with_that_gamma_shows_the_patterns(bits: int, dtype: type) -> None:
     sensor = StructuredLight(64, 48)
@@ -279,7 +306,7 @@ def test_numbers_of_few_bits_are_stretched() -> None:
     for values, number, sentence in (
         (twelve, NumberFormat(11), "from 0 to 2047 for --bits 11, got 4095"),
         (twelve.astype(np.uint8), NumberFormat(12), "--bits of 1 to 8 for uint8"),
-        (twelve + np.float64(np.nan), NumberFormat(), "expected finite numbers"),
+        (twelve + np.float64(np.nan), NumberFormat(), "expected pixels that are finite"),
         (twelve, NumberFormat(11, True), "expected two's complement of 11 bits"),
     ):
         with pytest.raises(ValueError, match=sentence):
@@ -349,7 +376,7 @@ def test_stacks_are_read_in_any_layout(tmp_path: Path) -> None:
         run("decode", tmp_path / name, *SIZE, *options, "--out", tmp_path / "out")
         check_flat(tmp_path / "out")
     for name, options, sentence in (
-        ("two.npz", (), "holds frames, mask: say which with --images"),
+        ("two.npz", (), "expected one array, got frames, mask: say which with --images"),
         ("two.npz", ("--images", "frame"), "expected an array 'frame'"),
         ("first.npy", ("--images", "a"), "holds one array"),
         ("first.npy", ("--projector", "128x48"), "expected 28 images"),
@@ -430,7 +457,7 @@ def test_the_functions_take_what_the_command_takes(tmp_path: Path) -> None:
         capture = import_capture(folder, BOTH, view=CameraView(mirror=True), images="shot*")
     np.testing.assert_array_equal(capture.frames // 257, FLAT)
     write_images(folder, FLAT[:1])
-    with pytest.raises(FileFormatError, match="holds images and arrays"):
+    with pytest.raises(FileFormatError, match="expected images or arrays"):
         find_frames(folder)
     for wrong in ({"rotate": 45}, {"channel": "alpha"}):
         with pytest.raises(ValueError, match="expected"):

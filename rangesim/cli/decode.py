@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rangesim.cli.images import (
+    ALL_AXES,
     AxesOption,
     BitsOption,
     ChannelOption,
@@ -104,13 +105,15 @@ def decode_command(
     from rangesim.files.atomic_directories import check_directory
     from rangesim.report.figures import map_pictures
     from rangesim.results.decoded_captures import DECODED, Decoded, save_decoded
+    from rangesim.sensors import is_file_name
 
     options = ImageOptions(sensor, code, projector, axes, order, set_, images, rotate, mirror, channel, bits, patterns)
     stored = _stored(calibration, code_step, unit)
     announce_linked_output(out, check_directory(out, DECODED, inputs=[capture]))
     camera_size = None if stored is None else stored.camera_size
+    of_file = sensor is not None and is_file_name(sensor)  # which states its axes
     loaded = load_frames(
-        capture, options, camera_size=camera_size, projector_size=None if stored is None else stored.projector_size
+        capture, options, None if of_file else ALL_AXES, camera_size, None if stored is None else stored.projector_size
     )
     first, findings = loaded.captured.reference, loaded.findings
     if calibration and len(loaded.captured.captures) > 1:
@@ -126,7 +129,8 @@ def decode_command(
                 raise ValueError(f"expected no --set of the decoder with {calibration}, which holds its settings.")
             image = _calibrated_tof(first, calibration)
         else:
-            first, findings = _calibrated(first, stored, calibration), (*findings, *stored.findings)
+            first = _calibrated(first, stored, calibration)
+            findings = (*findings, *stored.findings, *_calibration_doubts(first, calibration))
             image = decode(first, loaded.decoder)
     cause = likely_cause(image, first)
     decoded = Decoded(image, first.sensor, first.rig, status_fractions(image), cause, findings)
@@ -137,7 +141,7 @@ def decode_command(
 
 
 def _stored(calibration: Path | None, code_step: int, unit_m: float | None) -> StoredCalibration | None:
-    """What a calibration file holds; None without a file, and for one of a time-of-flight camera."""
+    """Contents of a calibration file; None without a file, and for one of a time-of-flight camera."""
     from rangesim.rig.calibration_files import read_calibration
 
     if calibration is None or calibration.suffix.lower() == TOF_SUFFIX:
@@ -155,12 +159,28 @@ def _calibrated(capture: Capture, stored: StoredCalibration, calibration: Path) 
 
     size = capture.sensor.default_emitter.size
     height, width = capture.frames.shape[1:]
+    if stored.camera_size not in (None, (width, height)):
+        raise FileFormatError(
+            f"{calibration}: expected the calibration of a camera of {width} x {height} pixels, as the images, got "
+            f"{' x '.join(map(str, stored.camera_size or ()))}: calibrate at the size of the images, and check that "
+            "camera and projector are not exchanged in the file."
+        )
     try:
         if size is None and not capture.sensor.triangulates:
             return replace(capture, rig=stored.rig_of_camera((width, height)))
         return replace(capture, rig=stored.rig((width, height), size))
     except ValueError as error:
         raise FileFormatError(f"{calibration}: {error}") from error
+
+
+def _calibration_doubts(capture: Capture, calibration: Path) -> tuple[str, ...]:
+    """Sentences on what is implausible in the calibration of a capture."""
+    from rangesim.rig import Intrinsics
+    from rangesim.rig.calibration_files import principal_point_doubts
+
+    if capture.rig is None or not isinstance(capture.rig.camera, Intrinsics):
+        return ()
+    return tuple(f"{calibration}: {text}" for text in principal_point_doubts(capture.rig))
 
 
 def _calibrated_tof(capture: Capture, calibration: Path) -> RangeImage:

@@ -24,6 +24,10 @@ MAX_BASELINE_M = 10.0
 Few rigs have a baseline of less than 10 mm, and a file in millimetres would give 10 mm as 10 m."""
 
 
+MIN_BASELINE_M = 1e-3
+"""Least baseline in metres of devices that triangulate. A baseline in metres that is stated in millimetres is less."""
+
+
 def status_fractions(image: RangeImage) -> dict[str, float]:
     """Fractions of the pixels, 0 to 1, by the name of their status, for all statuses."""
     counts = np.bincount(image.status.ravel(), minlength=len(Status))
@@ -41,21 +45,35 @@ def likely_cause(image: RangeImage, capture: Capture) -> str | None:
             f"camera and emitter are {capture.rig.baseline_m:g} m apart: if the calibration is in millimetres, "
             "give --unit 0.001"
         )
+    if capture.rig is not None and capture.sensor.triangulates and capture.rig.baseline_m < MIN_BASELINE_M:
+        return (
+            f"camera and projector are {1000 * capture.rig.baseline_m:.2g} mm apart: if the calibration is in metres, "
+            "give --unit 1"
+        )
     decoder = image.decoder or capture.sensor.default_decoder
     if cause := decoder.likely_cause(capture, image):
         return cause
-    if float(image.valid.mean()) >= MIN_MEASURED:
-        return None
-    if capture.is_digital and capture.detector is None:
+    if capture.is_digital and not capture.frames.any():
+        return (
+            f"the brightest value is 0 of {capture.full_scale:.0f}, so nothing was recorded: check that these are the "
+            "frames (--images), and that the camera exposed them"
+        )
+    measured = float(image.valid.mean())
+    clipped = float((image.status == Status.SATURATED).mean())
+    too_bright = f"{100 * clipped:.0f} % of the pixels are as bright as the camera can tell: expose shorter"
+    may_have_fewer_bits = capture.is_digital and capture.detector is None and capture.sensor.gate is None
+    # Few cameras have 16 bits.
+    if may_have_fewer_bits and (measured < MIN_MEASURED or capture.frames.dtype.itemsize > 1):
         brightest = int(capture.frames.max())
         if brightest < MIN_BRIGHTEST * capture.full_scale:
             return (
-                f"the brightest value is {brightest} of {capture.full_scale:.0f}: give --bits "
-                f"{max(brightest.bit_length(), 1)} if the camera has no more, or expose longer"
+                f"the brightest value is {brightest} of {capture.full_scale:.0f}: give --bits {brightest.bit_length()} "
+                f"if the camera has no more{f'; {too_bright}' if clipped > measured else ', or expose longer'}"
             )
-    measured = float(image.valid.mean())
-    if (clipped := float((image.status == Status.SATURATED).mean())) > measured:
-        return f"{100 * clipped:.0f} % of the pixels are as bright as the camera can tell: expose shorter"
+    if measured >= MIN_MEASURED:
+        return None
+    if clipped > measured:
+        return too_bright
     if capture.is_digital and float((image.status == Status.LOW_SIGNAL).mean()) > measured:
         swing = float(np.median(np.ptp(capture.frames, axis=0)))
         return (
@@ -79,7 +97,7 @@ def unchecked(image: RangeImage) -> str | None:
 
 
 def summary(decoded: Decoded, out: Path, is_given: bool = False) -> str:
-    """One line on the result: fractions of all statuses that pixels have, depths, doubts, and the likely cause.
+    """One line on the result: fractions of all statuses that pixels have, depths, notes, doubts, and the likely cause.
 
     is_given : whether the user gave a calibration for the capture, so that it may be one of another rig.
     """
@@ -95,7 +113,7 @@ def summary(decoded: Decoded, out: Path, is_given: bool = False) -> str:
         parts.append(clause)
     if image.camera is None:
         parts.append("without --calibration there is no depth")
-    parts += [doubt.removesuffix(".") for doubt in image.doubts]
+    parts += [text.removesuffix(".") for text in (*image.notes, *image.doubts)]
     if decoded.likely_cause:
         parts.append(decoded.likely_cause)
     if is_given and (clause := unchecked(image)):

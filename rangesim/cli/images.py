@@ -131,7 +131,7 @@ class ImageOptions:
     patterns: Path | None = None
 
     def given(self, names: Sequence[str]) -> str:
-        """Those of the named options that were given, as on the command line; "" if none was."""
+        """Names of the options that were given, of `names`, as on the command line; "" if none was."""
         return ", ".join(f"--{name}" for name in names if getattr(self, name))
 
 
@@ -146,7 +146,7 @@ class Loaded(NamedTuple):
 def load_frames(
     place: Path,
     options: ImageOptions,
-    axes: str | None = ALL_AXES,
+    axes: str | None,
     camera_size: tuple[int, int] | None = None,
     projector_size: tuple[int, int] | None = None,
 ) -> Loaded:
@@ -226,9 +226,8 @@ def _imported(
     sensor, frames = _by_name(sensor, imported, options.axes)
     findings = imported.findings
     try:
-        if not is_stated:
-            sensor, found = _as_found(sensor, frames)
-            findings += found
+        sensor, found = _as_found(sensor, frames, is_stated)
+        findings += found
     except ValueError as error:
         raise FileFormatError(
             f"{place}: {error} If some images are no frames, name the others with --images."
@@ -240,12 +239,22 @@ def _imported(
         raise FileFormatError(f"{place}: {error}") from error
 
 
-def _as_found(sensor: Sensor, frames: np.ndarray) -> tuple[Sensor, tuple[str, ...]]:
-    """The sensor with the conventions that the frames tell, and what they told; unchanged if an order is stated."""
-    from rangesim.conventions import detect_convention
+def _as_found(sensor: Sensor, frames: np.ndarray, is_stated: bool) -> tuple[Sensor, tuple[str, ...]]:
+    """The sensor with the conventions that the frames tell, and what they told.
+
+    If --order states the order, nothing is looked for; if a patterns.json does, only whether the images are in another.
+    """
+    from rangesim.conventions import detect_convention, detect_order
     from rangesim.sensors import StructuredLight
 
-    if not isinstance(sensor, StructuredLight) or sensor.order:
+    if not isinstance(sensor, StructuredLight):
+        return sensor, ()
+    if is_stated:
+        if len(frames) != sensor.n_frames:
+            return sensor, ()
+        found = detect_order(frames, sensor)
+        return found.sensor, tuple(f"not as the patterns were written: {text}" for text in found.findings)
+    if sensor.order:
         return sensor, ()
     found = detect_convention(frames, sensor)
     return found.sensor, found.findings
@@ -278,7 +287,7 @@ def _by_name(sensor: Sensor, imported: ImportedFrames, axes: str | None) -> tupl
 
 
 def sensor_of_images(
-    options: ImageOptions, axes: str | None = ALL_AXES, projector_size: tuple[int, int] | None = None
+    options: ImageOptions, axes: str | None, projector_size: tuple[int, int] | None = None
 ) -> Sensor | None:
     """The sensor that the options name; None if they name no sensor, or one whose projector has no known size.
 
@@ -291,7 +300,6 @@ def sensor_of_images(
     ValueError
         The options name no known sensor, or settings that the sensor refuses.
     """
-    from rangesim.sensors import is_file_name
     from rangesim.sensors.registry import IMAGES_PRESET
 
     name = options.sensor or options.code
@@ -300,7 +308,7 @@ def sensor_of_images(
     size = _size(options.projector) if options.projector is not None else projector_size if has_projector else None
     if size is None and name is None:
         return None
-    coded = options.axes or (None if name is not None and is_file_name(name) else axes)
+    coded = options.axes or axes
     if size is None and not has_projector:
         if options.axes is not None:
             raise ValueError(f"expected --axes only for a sensor with a projector, got it for {sensor.type_name}.")

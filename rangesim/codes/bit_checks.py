@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of bits: frames that do not add up to white and black, another code, another order of the frames.
+"""Checks of bits: frames that do not add up to white and black or show no bit, another code, another order.
 
 A single pixel may be wrong for many reasons, so the checks look at many pixels at once: a capture that is read wrongly
 contradicts itself nearly everywhere. Each check returns one sentence with the likely cause, or None.
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from rangesim.capture import bright_level
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.bits import Words, bit_frames
-from rangesim.decoding.pixel_samples import MIN_PIXELS, evenly_spread
+from rangesim.decoding.pixel_samples import MAX_PIXELS, MIN_PIXELS, evenly_spread
 from rangesim.decoding.status import Status
 
 MAX_UNPAIRED_FRACTION = 0.2
@@ -65,6 +66,32 @@ from the same frame. In Gray code that the camera sees sharply, no two bits chan
 MIN_ALONE_FRACTION = 0.3
 """Least fraction of these changes at which no third bit changes, if both bits are the same frame. At a step of the
 scene other bits change too."""
+
+MAX_BETWEEN_FRACTION = 0.12
+"""Largest fraction of the pixels that may lie between dark and lit in a bit of wide stripes, the median of these bits.
+They lie there only at the edges of stripes: 0 to 4 % in real captures. A sinusoid spends 19 % of its period there."""
+
+MAX_FROM_MIDDLE = 0.15
+"""Distance from the middle of dark and lit up to which a pixel lies between the two, as a fraction of their difference.
+Noise of a fifth of the difference brings 4 % of the pixels there."""
+
+MIN_STRIPE_CELLS = 8
+"""Least mean width of a bit's stripes, in cells, at which they count as wide, because most pixels then lie within them.
+Of a code of few cells, the square root of their number is enough."""
+
+MIN_UNIFORM_FRACTION = 0.98
+"""Least fraction of the pixels at which a bit is dark, or lit, so that its frames count as uniform."""
+
+MIN_SECOND_FRACTION = 0.15
+"""Least fraction of the projector at which the coarsest bit has its rarer value, so that a view without that value is
+worth a word if neither white nor black was shown. It is 0.2 of 1280 pixels and 0.05 of 1080, which few cameras see."""
+
+COVERED_FRACTION = 0.95
+"""Fraction of the pixels whose words count as seen. Single wrong bits make the rarest words."""
+
+EDGES_BETWEEN = 2
+"""Number of edges of the next finer bit that lie between two edges of a bit of Gray code. There are twice as many if a
+bit between the two is lost, and fewer where the camera does not resolve the finer one."""
 
 
 def pair_contradiction(seen: AxisFrames, words: Words) -> str | None:
@@ -139,6 +166,190 @@ def level_contradiction(seen: AxisFrames, words: Words) -> str | None:
                 "of the pixels: check the order of the frames, and that all have one exposure."
             )
     return None
+
+
+class Light(NamedTuple):
+    """Light of the bits, most significant first: 0 dark, 1 lit, NaN in shadow.
+
+    seen : frames of the bits. words : those of the code. coded : (b, cells) int, bits of the cells of the projector.
+    across, down : (b, n, m) float32, along lines across the image and down the image.
+    decoded : (n, m) bool, pixels of `across` with a word of the code.
+    """
+
+    seen: AxisFrames
+    words: Words
+    coded: np.ndarray
+    across: np.ndarray
+    down: np.ndarray
+    decoded: np.ndarray
+
+    @property
+    def lit(self) -> np.ndarray:
+        """(b, n) float32, at pixels that are not in shadow."""
+        return self.across[:, np.isfinite(self.across[0])]
+
+
+def light_of_bits(seen: AxisFrames, code: AxisCode, words: Words) -> Light:
+    """Light of the bits at some lines of the image.
+
+    Parameters
+    ----------
+    seen : frames (k, h, w) of the bits. code : what they decode to. words : those of the code.
+    """
+    cell_px = round(code.cell_px)
+    coded = (words.of_cell[: -(-seen.size // cell_px)] >> np.arange(words.bits)[::-1, None]) & 1
+    across, down = _along_lines(seen, words, is_down=False), _along_lines(seen, words, is_down=True)
+    return Light(seen, words, coded, across, down, (code.status == Status.OK)[:: _line_step(seen)])
+
+
+def _line_step(seen: AxisFrames) -> int:
+    """Distance of the lines of the image that are looked at, in pixels."""
+    return 1 + seen.contrast.values.size // MAX_PIXELS
+
+
+def _along_lines(seen: AxisFrames, words: Words, is_down: bool) -> np.ndarray:
+    """(b, n, m) float32, light of the bits along lines of the image, across or down."""
+    step = _line_step(seen)
+
+    def lines(image: np.ndarray) -> np.ndarray:
+        return (image.T if is_down else image)[::step].astype(np.float32)
+
+    white, black, swing = lines(seen.contrast.white), lines(seen.contrast.black), lines(seen.contrast.values)
+    usable = lines(seen.contrast.is_enough) * (swing > MIN_RANGE * bright_level(swing))
+    swing[usable == 0] = np.nan
+    result = []
+    for bit in bit_frames(seen.names, words.bits):
+        pattern, inverse = (None if i is None else lines(seen.frames[i]) for i in (bit.pattern, bit.inverse))
+        bright = white + black - inverse if pattern is None else pattern
+        dark = white + black - bright if inverse is None else inverse
+        result.append(0.5 + 0.5 * (bright - dark) / swing)
+    return np.stack(result)
+
+
+def between_contradiction(light: Light) -> str | None:
+    """A sentence if bits of wide stripes lie between dark and lit at many of the decoded pixels; None if not.
+
+    A bit is dark or lit, and between the two only at its edges. Light of interreflection blurs all bits, but such
+    pixels are not decoded.
+
+    Parameters
+    ----------
+    light : what `light_of_bits` returns.
+    """
+    n_cells = light.coded.shape[1]
+    mean_stripe = n_cells / (1 + np.count_nonzero(np.diff(light.coded), axis=1))
+    used = np.isfinite(light.across[0]) & light.decoded
+    wide = light.across[:, used][mean_stripe >= min(MIN_STRIPE_CELLS, n_cells**0.5)]
+    if not len(wide) or wide.shape[1] < MIN_PIXELS:
+        return None
+    between = float(np.median((np.abs(wide - 0.5) < MAX_FROM_MIDDLE).mean(axis=1)))
+    if between <= MAX_BETWEEN_FRACTION:
+        return None
+    return (
+        f"the frames along {light.seen.axis} show no bits: even where stripes are wide, {100 * between:.0f} % of the "
+        "pixels lie between dark and lit: check --code, because fringes seem to have been shown."
+    )
+
+
+def uniform_contradiction(light: Light) -> str | None:
+    """A sentence if a bit is dark or lit at all pixels, and white or black may stand in its place; None if not.
+
+    A bit takes both values in a view of more cells than its widest stripe has. In Gray code, the widest stripe of the
+    coarsest bit is half of the projector. If the camera sees no more than that, the frame counts as white or black if
+    there is no such frame beside it.
+
+    Parameters
+    ----------
+    light : what `light_of_bits` returns.
+    """
+    seen, words, coded, lit = light.seen, light.words, light.coded, light.lit
+    if lit.shape[1] < MIN_PIXELS:
+        return None
+    n_seen = _n_covering(lit > 0.5)
+    is_shown = {"white": seen.contrast.has_white, "black": seen.contrast.has_black}
+    for i, (bit, values) in enumerate(zip(bit_frames(seen.names, words.bits), lit, strict=True)):
+        is_dark, is_lit = (
+            float((sign * (values - 0.5) > MAX_FROM_MIDDLE).mean()) >= MIN_UNIFORM_FRACTION for sign in (-1, 1)
+        )
+        if not (is_dark or is_lit):
+            continue
+        looks = {"": "black" if is_dark else "white", "_inverse": "white" if is_dark else "black"}
+        shown = {
+            seen.shown_name(f"{bit.name}{end}"): looks[end]
+            for end, at in (("", bit.pattern), ("_inverse", bit.inverse))
+            if at is not None
+        }
+        is_in_view = n_seen <= _widest_stripe(coded[i])
+        least = 1 - MIN_UNIFORM_FRACTION if any(is_shown.values()) else MIN_SECOND_FRACTION
+        is_level = i == 0 and min(coded[i].mean(), 1 - coded[i].mean()) > least
+        if is_in_view and (not is_level or all(is_shown[level] for level in shown.values())):
+            continue
+        what = " and ".join(f"frame {name} is {level}" for name, level in shown.items())
+        unless = ", unless the camera sees one side of the projector" if is_in_view else ""
+        lost = lost_contradiction(light)
+        return (
+            f"{what} wherever the projector shines, as no bit along {seen.axis} is{unless}: {words.noun} seems to have "
+            "a bit less than stated: check the size of the projector and of its cells (--set cell_px), and that no "
+            f"image is missing{f': {lost}' if lost else '.'}"
+        )
+    return None
+
+
+def _n_covering(bits: np.ndarray) -> int:
+    """Number of the most frequent words that `COVERED_FRACTION` of the pixels have; bits (b, n) bool."""
+    _, counts = np.unique(np.packbits(bits, axis=0), axis=1, return_counts=True)
+    return int(np.searchsorted(np.cumsum(np.sort(counts)[::-1]), COVERED_FRACTION * bits.shape[1])) + 1
+
+
+def _widest_stripe(bit: np.ndarray) -> int:
+    """Largest number of cells in a row that have the same value of a bit (n,)."""
+    edges = np.flatnonzero(np.diff(bit))
+    return int(np.diff(edges, prepend=-1, append=len(bit) - 1).max())
+
+
+def lost_contradiction(light: Light) -> str | None:
+    """A sentence if four edges of a bit lie between two of the next coarser one in Gray code, where two should lie.
+
+    Parameters
+    ----------
+    light : what `light_of_bits` returns.
+    """
+    expected, _ = _edges_between(light.coded[:, None].astype(np.float32))
+    if (expected[np.isfinite(expected)] != EDGES_BETWEEN).any():
+        return None  # another code
+    found, _ = max((_edges_between(along) for along in (light.across, light.down)), key=lambda result: result[1])
+    other = np.flatnonzero(found > EDGES_BETWEEN)
+    if len(other) != 1 or found[other[0]] != 2 * EDGES_BETWEEN:
+        return None
+    at = int(other[0])
+    if (found[:at] < EDGES_BETWEEN).any() or (found[at + 1 : at + 2] <= 1).any():
+        return None  # frames in another order change several numbers
+    bits = bit_frames(light.seen.names, light.words.bits)
+    coarse, fine = (light.seen.shown_name(bit.name) for bit in bits[at : at + 2])
+    return (
+        f"{found[at]:.0f} edges of frame {fine} lie between two edges of frame {coarse}, and {EDGES_BETWEEN} in "
+        f"{light.words.noun}: the image of a bit between the two seems to be missing."
+    )
+
+
+def _edges_between(light: np.ndarray) -> tuple[np.ndarray, int]:
+    """(b - 1,) median number of edges of each finer bit between two edges of a bit, NaN if unknown; and how many edges
+    there are in all.
+
+    Parameters
+    ----------
+    light : (b, n, m), light of the bits along n lines, most significant first.
+    """
+    places = np.where(np.abs(light - 0.5) > MAX_FROM_MIDDLE, np.arange(light.shape[2]), 0)
+    last_clear = np.maximum.accumulate(places, axis=2)
+    is_edge = np.diff(np.take_along_axis(light > 0.5, last_clear, axis=2), axis=2)
+    n_before = np.cumsum(is_edge, axis=2, dtype=np.int32)
+    medians = []
+    for edges, finer in pairwise(range(len(light))):
+        line, at = np.nonzero(is_edge[edges])
+        between = np.diff(n_before[finer][line, at])[np.diff(line) == 0]
+        medians.append(float(np.median(between)) if between.size >= (MIN_STEPS if len(light[0]) > 1 else 1) else np.nan)
+    return np.array(medians), int(np.count_nonzero(is_edge))
 
 
 def other_code_contradiction(
@@ -239,7 +450,7 @@ def neighbours_of(code: AxisCode, words: Words) -> list[np.ndarray]:
 
 
 def _that_differ(keys: np.ndarray) -> np.ndarray:
-    """Those of the keys (n,) whose two words differ."""
+    """The keys, of keys (n,), whose two words differ."""
     return np.asarray(keys[keys >> 32 != keys & 0xFFFFFFFF])
 
 

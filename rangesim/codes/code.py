@@ -41,7 +41,7 @@ class CodeThresholds(NamedTuple):
 
 
 class Code(Named, ABC):
-    """How a stack of patterns codes one axis of a projector. Subclasses are frozen dataclasses.
+    """A stack of patterns that codes one axis of a projector. Subclasses are frozen dataclasses.
 
     Examples
     --------
@@ -138,9 +138,16 @@ class Code(Named, ABC):
         says what differs; by default none. `rangesim.conventions.detect_convention` tries them."""
         yield from ()
 
-    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
         """(h, w) float64, least light of the projector at full power that the thresholds accept, in the background's
-        unit; by default what the difference of white and black needs."""
+        unit; by default what the difference of white and black needs.
+
+        Parameters
+        ----------
+        size, shown : as for `check_shown`.
+        """
         if background.noise_variance is None:
             return background.floor(thresholds.gray.relative_contrast)
         noise_variance = 2 * (background.ambient + background.noise_variance)  # white - black: the noise of two frames

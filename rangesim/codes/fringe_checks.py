@@ -17,7 +17,7 @@ from rangesim.codes.fringes import FringeConvention
 from rangesim.decoding.phase_shift import Phase, phase_of
 from rangesim.decoding.pixel_samples import MAX_PIXELS, MIN_PIXELS, evenly_spread
 from rangesim.decoding.status import Status
-from rangesim.robust_scale import sigma_from_median
+from rangesim.robust_scale import TO_SIGMA
 
 OUTSIDE_TURNS = 0.005
 """Least distance of a phase from its Gray cell, in turns, at which the phase counts as outside. It allows for rounding:
@@ -49,6 +49,11 @@ MAX_LEVEL_ERROR = 0.03
 """Largest distance of the mean of the fringes from the middle between black and white, as a fraction of white - black.
 A larger one allows a stronger gamma."""
 
+MAX_UNEVEN_LEVEL = 0.01
+"""Largest root mean square of that distance about its own mean over all phases, at which the mean of the fringes counts
+as off by the same at all phases. Blurred fringes of gammas from 0.5 to 3 have at most 0.006 (measured); one of four
+fringes that is exposed 1.3 times makes 0.027."""
+
 PHASE_BINS = 8
 """Number of parts into which a period is divided, to see at which phases the mean of the fringes is off. One missing
 frame of N shows at some phases only; if there were more parts, each would hold fewer pixels."""
@@ -65,6 +70,10 @@ MAX_SINUSOID_ERROR = 0.08
 """Largest systematic difference of four or more fringes from a sinusoid, as a fraction of their swing. Two exchanged
 neighbours of 16 frames differ by 0.097, of 4 by 0.35; a gamma of 1.2 that is not corrected
 differs by 0.043 (measured)."""
+
+MAX_SINUSOID_PIXELS = 5000
+"""Largest number of pixels whose fringes are compared with a sinusoid. An eighth of them is in one part of the period:
+the standard error of its median is 5 % of the noise, so that noise up to a fifth of the swing hides no fault."""
 
 MIN_BACKWARD = 0.5
 """Least disagreement of phase and Gray code from pixel to pixel at which fringes count as backward although every place
@@ -130,24 +139,29 @@ def fringe_contradiction(
     return f"{text}, about as many as by chance: check the period, the steps, the order of the frames and the code."
 
 
-def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> str | None:
+def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, gamma: FringeGamma) -> str | None:
     """A sentence if the fringes contradict white and black as a whole; None if they agree.
 
     Light adds up, also the light of interreflection. So the mean of the fringes is the middle between white and black
-    at every phase, or what the gamma of `refined` makes of it. A frame that is missing or there twice moves this mean
-    at some phases, a gamma at all phases.
+    at every phase, or what a gamma makes of it. A frame that is missing or there twice moves this mean at some phases,
+    a gamma at all phases. If fringes of a gamma are blurred, their ripple is that of a smaller gamma, but their mean
+    stays. So a mean that is off by the same at all phases is no fault where the ripple tells how to correct it.
 
     Parameters
     ----------
-    seen : frames (N, h, w), the fringes of the axis. gray, refined : the code before and after `refine_by_phase`.
+    seen : frames (N, h, w), the fringes of one period. gray, refined : the code before and after they refine it.
+    gamma : what these fringes tell of the response.
     """
     inside = _inside_cell(gray, refined)
     in_many_cells = len(np.unique(gray.coordinate[inside][:: 1 + inside.size // MAX_PIXELS])) >= MIN_CELLS
-    return _level_fault(seen, inside, refined.gamma, in_many_cells)
+    return _level_fault(seen, inside, gamma, in_many_cells)
 
 
-def _level_fault(seen: AxisFrames, usable: np.ndarray, gamma: float, in_many_cells: bool) -> str | None:
-    """As `level_contradiction`, from the pixels `usable` (h, w), which lie `in_many_cells` or fringes or not."""
+def _level_fault(seen: AxisFrames, usable: np.ndarray, gamma: FringeGamma, in_many_cells: bool) -> str | None:
+    """A sentence if the fringes contradict white and black at the pixels `usable` (h, w) bool; None if they do not.
+
+    in_many_cells : whether these pixels lie in many Gray cells or fringes, so that a constant frame shows.
+    """
     white, black, axis = seen.contrast.white, seen.contrast.black, seen.axis
     if not seen.contrast.is_measured:
         return None
@@ -160,8 +174,9 @@ def _level_fault(seen: AxisFrames, usable: np.ndarray, gamma: float, in_many_cel
     members = _by_phase(phase.normalised)
     if not members:
         return None
-    off, noise = _medians(values.mean(axis=0) - _expected(phase, len(values), gamma).mean(axis=0), members)
-    if np.sqrt((off**2).mean()) < MAX_LEVEL_ERROR + 3 * np.sqrt((noise**2).mean()):
+    off, noise = _medians(values.mean(axis=0) - _expected(phase, len(values), gamma.gamma).mean(axis=0), members)
+    margin = 3 * float(np.sqrt((noise**2).mean()))
+    if np.sqrt((off**2).mean()) < MAX_LEVEL_ERROR + margin or (gamma.is_told and off.std() < MAX_UNEVEN_LEVEL + margin):
         return None
     if in_many_cells and (fault := _odd_frame(values, members, [seen.shown_name(name) for name in seen.names])):
         return f"the fringes along {axis} contradict white and black: {fault}."
@@ -181,11 +196,11 @@ def stack_contradiction(seen: AxisFrames, code: AxisCode, stack: FringeStack) ->
     seen : frames (n, h, w), those of the stack. code : what `FringeStack.decode` or `refine_by_phase` made of them.
     """
     usable = ((code.status == Status.OK) | (code.status == Status.CODE_ERROR)) & seen.contrast.is_enough
-    for i in range(len(stack.steps)):
+    for i, gamma in enumerate(code.gammas):
         one = stack.frames_of(seen, i)
-        if code.coarse is None and (text := _level_fault(one, usable, code.gamma, True)):
+        if code.coarse is None and (text := _level_fault(one, usable, gamma, True)):
             return text
-        if text := _sinusoid_fault(one, usable, stack.gamma(seen, i, usable, code.coarse is not None)):
+        if text := _sinusoid_fault(one, usable, gamma):
             return text
     return _agreement_fault(seen, code, stack, usable) if code.coarse is None else None
 
@@ -194,11 +209,11 @@ def _sinusoid_fault(seen: AxisFrames, usable: np.ndarray, gamma: FringeGamma) ->
     """A sentence if no sinusoid of any gamma explains the fringes of one period; None if one does."""
     if not gamma.is_explained and len(seen.frames) == 3:
         return (
-            f"the fringes along {seen.axis} are no sinusoids ({seen.shown_name(seen.names[0])} and next), and no gamma "
-            "explains their shape: check that projector and camera are linear and that no frame is repeated."
+            f"the fringes along {seen.axis} are no sinusoids ({seen.shown_name(seen.names[0])} and next), and tell no "
+            "gamma that explains their shape: check that projector and camera are linear and that no frame is repeated."
         )
     used = evenly_spread(np.flatnonzero(usable))
-    used = used[:: 1 + len(used) // MAX_SAMPLES]
+    used = used[:: 1 + len(used) // MAX_SINUSOID_PIXELS]
     if len(used) < MIN_PIXELS or len(seen.frames) == 3:
         return None
     frames = seen.frames.reshape(len(seen.frames), -1)[:, used].astype(np.float64)
@@ -234,9 +249,8 @@ def _misfit(frames: np.ndarray, gamma: FringeGamma) -> float:
     members = _by_phase(phase.normalised)
     if not members:
         return 0.0
-    found = [_medians(values, members) for values in rest]
-    excess = np.mean([off**2 - 9 * noise**2 for off, noise in found])
-    return float(np.sqrt(max(excess, 0.0)))
+    off, noise = _medians(rest, members)
+    return float(np.sqrt(max((off**2 - 9 * noise**2).mean(), 0.0)))
 
 
 def _agreement_fault(seen: AxisFrames, code: AxisCode, stack: FringeStack, usable: np.ndarray) -> str | None:
@@ -317,10 +331,12 @@ def _odd_frame(values: np.ndarray, members: list[np.ndarray], names: list[str]) 
 
 
 def _medians(values: np.ndarray, members: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Medians of groups of values (n,), and the standard error of each median; `members` are indices of the groups."""
-    medians = np.array([np.median(values[m]) for m in members])
-    spread = [sigma_from_median(values[m], x) for m, x in zip(members, medians, strict=True)]
-    return medians, MEDIAN_ERROR * np.array(spread) / np.sqrt([len(m) for m in members])
+    """Medians (..., groups) of values (..., n), and the standard error of each; `members` are indices of the groups."""
+    groups = [values[..., m] for m in members]
+    medians = [np.median(group, axis=-1, keepdims=True) for group in groups]
+    away = [np.median(np.abs(group - x), axis=-1, keepdims=True) for group, x in zip(groups, medians, strict=True)]
+    spread = MEDIAN_ERROR * TO_SIGMA * np.concatenate(away, axis=-1)
+    return np.concatenate(medians, axis=-1), spread / np.sqrt([len(m) for m in members])
 
 
 def _comparable(gray: AxisCode, refined: AxisCode) -> np.ndarray:

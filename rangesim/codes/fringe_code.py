@@ -15,6 +15,7 @@ from rangesim.codes.fringe_checks import stack_contradiction
 from rangesim.codes.fringe_stack import FringeStack
 from rangesim.codes.fringes import VISIBILITY
 from rangesim.decoding.phase_shift import phase_of
+from rangesim.decoding.row_bands import in_bands
 from rangesim.response import DenseResponse
 from rangesim.sensor import Background, FrameContent
 
@@ -60,11 +61,19 @@ class FringeCode(Code):
     def white_and_black(self, size: int, names: list[str], frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The mean of the fringes plus and minus their largest modulation."""
         stack = self.stack(size)
-        phases = [phase_of(stack.of_period(frames, i)) for i in range(len(stack.steps))]
-        mean = np.mean([p.mean for p in phases], axis=0)
-        modulation = np.max([p.modulation for p in phases], axis=0)
-        return mean + modulation, mean - modulation
+        white, black = np.empty((2, *frames.shape[1:]), dtype=np.float32)
 
-    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
+        def estimate_rows(rows: slice) -> None:
+            phases = [phase_of(stack.of_period(frames, i)[:, rows]) for i in range(len(stack.steps))]
+            mean = np.mean([p.mean for p in phases], axis=0)
+            modulation = np.max([p.modulation for p in phases], axis=0)
+            white[rows], black[rows] = mean + modulation, mean - modulation
+
+        in_bands(estimate_rows, len(white))
+        return white, black
+
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
         steps = min(self.stack(size).steps)
         return thresholds.phase.least_signal(steps, VISIBILITY, FrameContent(), background)

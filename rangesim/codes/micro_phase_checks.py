@@ -26,7 +26,8 @@ MAX_MISFIT_FRACTION = 0.05
 that is wrong makes it 0.2 or more."""
 
 MAX_MENDED_FRACTION = 0.02
-"""Largest fraction of pixels that no place may fit once the right cause is undone."""
+"""Largest fraction of pixels that no place may fit once the right cause is undone, less than half of
+`MAX_MISFIT_FRACTION`, so that a cause is named only if it explains most of the misfits."""
 
 MAX_HARMONIC = 0.06
 """Largest amplitude of the second harmonic of the fringes, as a fraction of the first. A projector's gamma g makes it

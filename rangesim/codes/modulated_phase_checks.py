@@ -30,7 +30,7 @@ MIN_UNEXPLAINED = 0.002
 """Least fraction of the images that is unexplained, in the median over the pixels, at which a gamma is looked for. A
 gamma of 1.2 leaves 0.003."""
 
-MIN_GAMMA_GAIN = 0.5
+MAX_GAMMA_RATIO = 0.5
 """Largest fraction of what is unexplained, in the median over the pixels, that another gamma leaves if it is right."""
 
 
@@ -50,7 +50,7 @@ def modulation_contradiction(seen: AxisFrames, code: ModulatedPhaseShifting) -> 
                 return f"{text}: {fault}."
     level = float(np.median(_unexplained(frames, code, size)))
     curved = min(float(np.median(_unexplained(frames, code, size, gamma))) for gamma in GAMMAS)
-    if curved < MIN_GAMMA_GAIN * level and level > MIN_UNEXPLAINED:
+    if curved < MAX_GAMMA_RATIO * level and level > MIN_UNEXPLAINED:
         return (
             f"the fringes along {seen.axis} are no sinusoids: check that projector and camera are linear (no gamma, no "
             "automatic exposure, no clipping)."

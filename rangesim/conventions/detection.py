@@ -80,6 +80,10 @@ MIN_STEP = 0.5
 """Least distance of two pixels that see different cells, in cells: a pixel on the edge of two cells is half a cell off
 both."""
 
+MIN_SUBPIXEL_FRACTION = 0.5
+"""Least fraction of the places that are neither the centre nor the edge of a cell, at which a code counts as sub-pixel:
+of bits none is, of fringes nearly all are."""
+
 MAX_LOSS_BITS = 0.2
 """Largest loss against the best order, in bits, at which a more usual order is taken. Two orders that are equally right
 differ by less than 0.1 bits."""
@@ -90,7 +94,7 @@ MAX_ENTRIES = 6
 
 @dataclass(frozen=True)
 class Convention:
-    """What the frames tell of how they were taken.
+    """Convention in which frames were taken, as they show it.
 
     sensor : StructuredLight with the settings that the frames agree with.
     findings : sentences, one for each setting that differs from those given; none if nothing does.
@@ -152,15 +156,48 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
         found = _upright(frames, sample, found)
     elif not is_given:
         raise ValueError(f"{_wrong_number(len(frames), sensor)[:-1]}; and they are too dark to tell which are missing.")
-    findings = [] if layout is None else list(_differences(layout, sensor, found))
+    findings = _order_findings(layout, sensor, found)
     if layout is None and found.axes != sensor.axes:
-        findings.append(f"{found.axes[0]} were shown before {found.axes[1]}.")
-    if found.order != sensor.order and 0 < len(found.order) <= MAX_ENTRIES:
-        findings.append(f"this is the order {', '.join(found.order)}.")
+        findings.insert(0, f"{found.axes[0]} were shown before {found.axes[1]}.")
     found, said_of_places = _within_projector(sample, found)
     code, said = measured_fringes(frames, sample.frames, found)
     found = replace(found, code=code)
     return Convention(found, (*findings, *said_of_places, *said))
+
+
+def detect_order(frames: np.ndarray, sensor: StructuredLight) -> Convention:
+    """The sensor with another order of its frames, if the frames agree clearly better with that one; else unchanged.
+
+    Parameters
+    ----------
+    frames : (k, h, w) of any number type, as many as the sensor has frames.
+    sensor : StructuredLight with the order and the code in which its patterns were shown.
+
+    Examples
+    --------
+    >>> sensor = StructuredLight(64, 48, code="gray")
+    >>> detect_order(sensor.patterns()[::-1], sensor).findings[0]
+    'black and white come first, black before white.'
+    """
+    sample = _sampled(frames)
+    if np.count_nonzero(sample.is_lit) < MIN_PIXELS:
+        return Convention(sensor)
+    layout = _best_layout(sample, sensor, list(layouts(sensor, len(frames))), is_given=True)
+    if layout is None:
+        return Convention(sensor)
+    found = _upright(frames, sample, with_layout(sensor, layout))
+    return Convention(found, tuple(_order_findings(layout, sensor, found)))
+
+
+def _order_findings(layout: Layout | None, sensor: StructuredLight, found: StructuredLight) -> list[str]:
+    """Sentences on what of an order differs from that of the sensor; none without a layout."""
+    findings = [] if layout is None else list(_differences(layout, sensor, found))
+    if found.order != sensor.order and 0 < len(found.order) <= MAX_ENTRIES:
+        findings.append(f"this is the order {', '.join(found.order)}.")
+    if layout is not None and not findings:
+        names = found.frame_names()
+        findings.append(f"this is the order {', '.join(names[:MAX_ENTRIES])}, ... {names[-1]}.")
+    return findings
 
 
 def _wrong_number(n: int, sensor: StructuredLight) -> str:
@@ -296,7 +333,7 @@ def _likeness(sample: _Sample, fineness: dict[str, float], names: Sequence[str])
 
 
 def _agreement_bits(sample: _Sample, candidate: StructuredLight) -> float:
-    """How much nearer to each other neighbouring pixels see the projector than any two pixels do, in powers of two.
+    """Ratio of the distance of any two pixels to that of neighbours, on the projector, in powers of two.
 
     It is the mean over all pairs of neighbours that see different cells, times the fraction of the pairs that are
     decoded; of two axes, that of the worse one.
@@ -316,9 +353,10 @@ def _decoded(frames: np.ndarray, sensor: StructuredLight) -> dict[str, AxisCode]
 
 
 def _nearness(sample: _Sample, code: AxisCode) -> float:
-    """Mean of log2 of the distance of any two pixels minus that of neighbours, in cells; see `_agreement_bits`.
+    """Mean of log2 of the distance of any two pixels minus that of neighbours; see `_agreement_bits`.
 
-    Neighbours that see the same cell would agree in every order.
+    Distances are in cells. Neighbours that see the same cell of a code of bits would agree in every order, so they do
+    not count. A sub-pixel code that refines no such cells tells all places from each other; its cells are pixels.
     """
     ok = code.status == Status.OK
     here, there, n = [], [], 0
@@ -328,12 +366,16 @@ def _nearness(sample: _Sample, code: AxisCode) -> float:
         here.append(code.coordinate[a][both])
         there.append(code.coordinate[b][both])
     first, second = np.concatenate(here) / code.cell_px, np.concatenate(there) / code.cell_px
-    differ = np.abs(first - second) >= MIN_STEP
+    is_subpixel = code.coarse is None and np.count_nonzero(first % MIN_STEP) > MIN_SUBPIXEL_FRACTION * len(first)
+    if is_subpixel:
+        first, second = first * code.cell_px, second * code.cell_px
+    distance = np.abs(first - second)
+    differ = (distance >= MIN_STEP) | is_subpixel
     if np.count_nonzero(differ) < MIN_PIXELS:
         return 0.0
     any_other = np.random.default_rng(0).permutation(second)
     octaves = np.log2(np.maximum(np.abs(first - any_other), MIN_STEP)).mean()
-    return float((octaves - np.log2(np.abs(first - second)[differ]).mean()) * len(first) / n)
+    return float((octaves - np.log2(np.maximum(distance, MIN_STEP)[differ]).mean()) * len(first) / n)
 
 
 def _upright(frames: np.ndarray, sample: _Sample, found: StructuredLight) -> StructuredLight:

@@ -252,7 +252,7 @@ def _usual(given: FringeConvention) -> Iterator[FringeConvention]:
 
 
 def _rest_px(other: FringeConvention, given: FringeConvention, off_px: float, period_px: float) -> float:
-    """What is left of the offset `off_px`, seen with the convention `given`, if the fringes follow `other`."""
+    """The rest of the offset `off_px`, seen with the convention `given`, if the fringes follow `other`."""
     change_px = (other.shift_turns(0, 1, period_px) - given.shift_turns(0, 1, period_px)) * period_px
     rest = off_px + change_px
     return rest - period_px * round(rest / period_px)

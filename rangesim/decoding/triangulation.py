@@ -39,8 +39,16 @@ MAX_OFF_LINE_FRACTION = 0.3
 """Largest fraction of the decoded pixels that may miss their epipolar line. Interreflection and noise move a tenth off
 at most; a calibration of another rig, or one that has changed, moves most of them."""
 
+MAX_BESIDE_FRACTION = 0.2
+"""Largest fraction of the decoded points that may lie beside the projector's image, where it shines no light. In real
+captures, none do; with wrong calibrations of the same captures, 40 to 80 %."""
+
+MAX_BESIDE = 0.05
+"""Distance from the projector's image, as a fraction of its size, up to which a point may still lie in it: errors of
+the calibration and of the lens model are smaller."""
+
 MAX_TRIED = 5000
-"""Largest number of pixels on which the inverse of the pose is tried. They tell a fraction to 0.7 %."""
+"""Largest number of pixels on which a pose is tried. They tell a fraction to 0.7 %."""
 
 MIN_BEHIND_PX = 10.0
 """Least distance, in projector pixels, of a coordinate from the one that would make the rays parallel, at which they
@@ -84,6 +92,7 @@ class ProjectorCoordinates(Coordinates):
     limits : TriangulationLimits that `range_image` applies.
     doubts : sentences with which the decoder has warned that the capture contradicts its code. If there are any, the
         cause of rays that meet behind a device is known, and `range_image` does not warn of them.
+    notes : sentences on what the decoder found in the capture and has corrected.
 
     Examples
     --------
@@ -104,6 +113,7 @@ class ProjectorCoordinates(Coordinates):
     row_sigma_px: np.ndarray | None = None
     limits: TriangulationLimits = field(default_factory=TriangulationLimits)
     doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -154,7 +164,7 @@ class ProjectorCoordinates(Coordinates):
             warn(doubt, DoubtWarning)
         image = self._image(rig, z, range_m, status)
         doubts = (*self.doubts, doubt) if doubt else self.doubts
-        return replace(image, projector_column=column, projector_row=row, doubts=doubts)
+        return replace(image, projector_column=column, projector_row=row, doubts=doubts, notes=self.notes)
 
     def _line_contradiction(self, status: np.ndarray) -> str | None:
         """A sentence if many decoded pixels miss their epipolar line; None if not.
@@ -176,9 +186,11 @@ class ProjectorCoordinates(Coordinates):
         )
 
     def _pose_contradiction(self, rig: Rig) -> str | None:
-        """A sentence if the decoded pixels fit the inverse of T_camera_projector, but not itself; None if not.
+        """A sentence if the decoded pixels do not fit T_camera_projector, and fit its inverse or lie beside the
+        projector's image; None if not.
 
-        They fit if their rays meet in front of both devices, and within the epipolar tolerance.
+        They fit if their rays meet in front of both devices and within the epipolar tolerance, or, if one axis is
+        coded, at points that the projector's image covers.
         """
         y, x = np.nonzero(self.valid)
         few = slice(None, None, 1 + len(y) // MAX_TRIED)
@@ -187,21 +199,42 @@ class ProjectorCoordinates(Coordinates):
             return None
         directions = rig.pinhole.directions(np.stack([x + 0.5, y + 0.5], axis=-1))
         column, row = (None if c is None else c[y, x] for c in (self.column, self.row))
-        fractions = []
+        fractions, beside = [], []
         for pose in (rig.T_camera_projector, np.linalg.inv(rig.T_camera_projector)):
-            found = triangulate_coordinates(directions, replace(rig, T_camera_projector=pose), column, row)
-            fits = np.isfinite(found.z) & (found.epipolar_px <= self.limits.epipolar_tolerance_px)
-            fractions.append(float(fits.mean()))
-            if fractions[0] > MAX_FITTING_FRACTION:
+            posed = replace(rig, T_camera_projector=pose)
+            found = triangulate_coordinates(directions, posed, column, row)
+            is_point = np.isfinite(found.z) & (found.epipolar_px <= self.limits.epipolar_tolerance_px)
+            is_lit = _in_projector(posed, directions * found.z[:, None], column is None, row is None)
+            fractions.append(float((is_point & is_lit).mean()))
+            beside.append(float((is_point & ~is_lit).mean()))
+            if fractions[0] > MAX_FITTING_FRACTION and beside[0] <= MAX_BESIDE_FRACTION:
                 return None
         before, after = fractions
-        if after < MIN_IN_FRONT_FRACTION:
+        if before <= MAX_FITTING_FRACTION and after >= MIN_IN_FRONT_FRACTION:
+            return (
+                f"{100 * before:.0f} % of the decoded pixels fit T_camera_projector as given, and "
+                f"{100 * after:.0f} % its inverse: the calibration's pose seems to be inverted, that of the camera in "
+                "the projector's frame."
+            )
+        if beside[0] <= MAX_BESIDE_FRACTION:
             return None
         return (
-            f"{100 * before:.0f} % of the decoded pixels fit T_camera_projector as given, and "
-            f"{100 * after:.0f} % its inverse: the calibration's pose seems to be inverted, that of the camera in "
-            "the projector's frame."
+            f"{100 * beside[0]:.0f} % of the decoded points lie beside the projector's image, where it shines no "
+            "light: check the calibration, that camera and projector are not exchanged in it, and that it was made at "
+            "the size of these images."
         )
+
+
+def _in_projector(rig: Rig, points: np.ndarray, has_no_column: bool, has_no_row: bool) -> np.ndarray:
+    """(n,) bool, whether points (n, 3) in camera coordinates lie within the projector's image along an uncoded axis."""
+    pose = rig.T_camera_projector
+    with np.errstate(invalid="ignore", divide="ignore"):
+        places = rig.image_projector.project((points - pose[:3, 3]) @ pose[:3, :3])
+    result = np.ones(len(points), dtype=bool)
+    for axis, size in ((0, rig.projector.width), (1, rig.projector.height)):
+        if (has_no_column, has_no_row)[axis]:
+            result &= np.abs(places[:, axis] / size - 0.5) <= 0.5 + MAX_BESIDE
+    return result
 
 
 def behind_contradiction(behind_px: np.ndarray) -> str | None:

@@ -55,6 +55,11 @@ class _OtherFormatError(OSError):
     """The format of a file is none of those that Pillow reads here."""
 
 
+ONLY_COLOUR = 0.8
+"""Least fraction of the change between two images that one channel has if the light has one colour. It is 1 if the
+filters of the camera part the colours, and a third in white light."""
+
+
 def write_grey(path: Path, image: np.ndarray) -> None:
     """Write an image (h, w): float32 as OpenEXR with one channel Y if `path` ends in .exr, else uint8 or uint16 as PNG.
 
@@ -261,6 +266,30 @@ def _read_exr(path: Path, channel: str) -> np.ndarray:
         return np.asarray(channels["Y"], dtype=np.float32)
     r, g, b = (np.asarray(channels[c], dtype=np.float32) for c in "RGB")
     return np.asarray(LUMA[0] * r + LUMA[1] * g + LUMA[2] * b, dtype=np.float32)
+
+
+def only_colour(bright: Path, dark: Path) -> str | None:
+    """The channel in which alone two images of a scene differ; None if several do, or if the images have no colours.
+
+    Parameters
+    ----------
+    bright, dark : files of images of equal size, such as one with light and one without.
+    """
+    check_file(bright, FileFormatError)
+    check_file(dark, FileFormatError)
+    colours = []
+    with _quiet():
+        for path in (bright, dark):
+            if path.suffix.lower() == ".exr":
+                return None
+            with _open_raster(path) as image:
+                if image.mode not in ("RGB", "RGBA"):
+                    return None
+                colours.append(np.asarray(image.convert("RGB"), dtype=np.int16))
+    change = np.abs(colours[0] - colours[1]).mean(axis=(0, 1))
+    strongest = int(np.argmax(change))
+    is_alone = change[strongest] > 0 and change[strongest] >= ONLY_COLOUR * change.sum()
+    return list(CHANNELS)[1 + strongest] if is_alone else None
 
 
 @contextmanager

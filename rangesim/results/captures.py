@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +19,6 @@ from rangesim.errors import FileFormatError, warn
 from rangesim.files.atomic_directories import DirectoryKind, new_directory, sidecar_of, write_manifest
 from rangesim.files.frame_files import (
     CameraView,
-    Digital,
     NumberFormat,
     as_counts,
     as_digital,
@@ -26,7 +26,7 @@ from rangesim.files.frame_files import (
     read_frames,
     read_frames_file,
 )
-from rangesim.files.image_files import SUFFIXES, read_stack, write_grey
+from rangesim.files.image_files import CHANNELS, LUMA, SUFFIXES, only_colour, read_stack, write_grey
 from rangesim.files.schema import write_json
 from rangesim.files.text_files import read_json
 from rangesim.rig import Rig
@@ -201,6 +201,7 @@ def import_frames(
     """
     place, number = Path(place), number or NumberFormat()
     names: list[str] | None = None
+    coloured: tuple[str, ...] = ()
     if place.is_file():
         values = read_frames_file(place, sensor.n_frames, images, view, shape or (1, -1))
     else:
@@ -209,20 +210,36 @@ def import_frames(
         if not files.paths:
             raise FileFormatError(f"{place}: expected {sensor.n_frames} images for {sensor.type_name}, got 0.")
         values = read_frames(files, view)
+        coloured = _colour_finding(files.paths, values, view)
         if values.dtype == np.float32 and number.bits is None and files.paths[0].suffix.lower() in SUFFIXES:
             return ImportedFrames(values, names)  # floating-point images hold radiance
     try:
         if sensor.gate is None:
-            return ImportedFrames(*_with_names(as_digital(values, number), names))
+            digital = as_digital(values, number)
+            return ImportedFrames(digital.frames, names, (*digital.findings, *coloured))
         if number != NumberFormat():
             raise ValueError("expected no --bits for histograms, which hold counts of photons.")
-        return ImportedFrames(*_with_names(as_counts(values), names))
+        counts = as_counts(values)
+        return ImportedFrames(counts.frames, names, counts.findings)
     except ValueError as error:
         raise FileFormatError(f"{place}: {error}") from error
 
 
-def _with_names(digital: Digital, names: list[str] | None) -> tuple[np.ndarray, list[str] | None, tuple[str, ...]]:
-    return digital.frames, names, digital.findings
+def _colour_finding(paths: Sequence[Path], frames: np.ndarray, view: CameraView | None) -> tuple[str, ...]:
+    """A sentence if images are read as grey whose light has one colour; none if not.
+
+    Parameters
+    ----------
+    paths : (k,) files of the images. frames : (k, h, w), their frames.
+    """
+    if len(paths) != len(frames) or (view or CameraView()).channel != "grey" or paths[0].suffix.lower() not in SUFFIXES:
+        return ()
+    level = [float(frame.mean()) for frame in frames]
+    channel = only_colour(paths[int(np.argmax(level))], paths[int(np.argmin(level))])
+    if channel is None:
+        return ()
+    weight = LUMA[list(CHANNELS).index(channel) - 1]
+    return (f"the light changes in {channel} alone, of which grey has {weight:.1g}: give --channel {channel}.",)
 
 
 def import_capture(

@@ -38,6 +38,13 @@ longer T cannot be metres, and a shorter one cannot be millimetres."""
 UNITS_M = {"m": 1.0, "metre": 1.0, "meter": 1.0, "cm": 1e-2, "mm": 1e-3, "millimetre": 1e-3, "millimeter": 1e-3,
            "inch": 0.0254}  # fmt: skip
 """Metres of the units that a file may name under `unit`."""
+CENTIMETRES = (1.0, 50.0)
+"""Range of lengths of T that may be centimetres as well, if nothing states the unit: a baseline of 1 cm to half a
+metre."""
+MAX_OFF_CENTRE = 0.24
+"""Largest distance of a principal point from the centre of the image, as a fraction of its size, that needs no word.
+In a calibration at half the size it is 0.25; the largest in a real calibration that serves was 0.22. Projectors have
+more along their height, because they shine upward or downward."""
 ROTATION_TOLERANCE = 2e-3
 """Largest difference of a singular value of R from 1. A rotation written with three decimals is off by at most 1.5e-3;
 it is replaced by the nearest rotation."""
@@ -157,7 +164,7 @@ class DeviceCalibration:
 
 @dataclass(frozen=True)
 class StoredCalibration:
-    """What a calibration file holds. The sizes of the images may be missing; `rig` takes them from elsewhere.
+    """Contents of a calibration file. The sizes of the images may be missing; `rig` takes them from elsewhere.
 
     camera, projector : DeviceCalibration; projector None: the file holds a camera alone.
     T_camera_projector : (4, 4) float64, metres; None likewise. own : the Rig of a JSON file of our own, else None.
@@ -329,6 +336,47 @@ def _own_rig(path: Path, settings: dict[str, Any]) -> Rig:
         raise FileFormatError(f"{path}: {error}") from error
 
 
+def principal_point_doubts(rig: Rig) -> tuple[str, ...]:
+    """Sentences on principal points that lie far from the centre of their image; none if there is nothing to say.
+
+    Examples
+    --------
+    >>> device = Intrinsics(640, 480, 500.0, 500.0, 160.0, 120.0)  # calibrated with images of 320 x 240
+    >>> principal_point_doubts(Rig(device, Intrinsics(1024, 768, 900.0, 900.0, 512.0, 700.0)))[0][:56]
+    "the camera's principal point, 160, 120, lies far from th"
+    """
+    camera, projector = rig.pinhole, rig.projector
+    doubts = []
+    if not (_is_central(camera.cx, camera.width) and _is_central(camera.cy, camera.height)):
+        is_exchanged = isinstance(projector, Intrinsics) and (
+            _is_central(projector.cx, camera.width)
+            and _is_central(projector.cy, camera.height)
+            and _is_central(camera.cx, projector.width)
+        )
+        doubts.append(
+            f"the camera's {_far_from_centre(camera)}, "
+            + (
+                "but that of the projector near it: camera and projector seem to be exchanged in the calibration."
+                if is_exchanged
+                else "as if it was calibrated with images of another size."
+            )
+        )
+    elif isinstance(projector, Intrinsics) and not _is_central(projector.cx, projector.width):
+        doubts.append(f"the projector's {_far_from_centre(projector)}, as if it was calibrated at another resolution.")
+    return tuple(doubts)
+
+
+def _is_central(place: float, size: int) -> bool:
+    return abs(place / size - 0.5) < MAX_OFF_CENTRE
+
+
+def _far_from_centre(device: Intrinsics) -> str:
+    return (
+        f"principal point, {device.cx:.0f}, {device.cy:.0f}, lies far from the centre of its {device.width} x "
+        f"{device.height} pixels"
+    )
+
+
 # ---- Files of OpenCV and others --------------------------------------------------------------------------------------
 
 
@@ -385,7 +433,10 @@ def _unit_m(
     length = float(np.linalg.norm(offset))
     is_millimetres = rotation == PROCAM_ROTATION or length >= LEAST_MM
     unit, name = (1e-3, "millimetres") if is_millimetres else (1.0, "metres")
-    findings.append(f"T is taken as {name}, so the baseline is {length * unit:.4g} m; --unit states another unit.")
+    in_cm = ", such as 0.01 for centimetres" if CENTIMETRES[0] <= length < CENTIMETRES[1] else ""
+    findings.append(
+        f"T is taken as {name}, so the baseline is {length * unit:.4g} m; --unit states another unit{in_cm}."
+    )
     return unit
 
 

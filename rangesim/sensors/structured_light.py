@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Annotated, ClassVar, Literal
@@ -26,7 +26,7 @@ from rangesim.codes.contrast import direct_contrast
 from rangesim.codes.frame_order import in_order
 from rangesim.decoding.orientation import changes_along, fringe_doubt, orientation_contradiction
 from rangesim.decoding.phase_shift import PhaseThresholds
-from rangesim.decoding.pixel_samples import MIN_PIXELS
+from rangesim.decoding.pixel_samples import MIN_PIXELS, equal_frames, same_images
 from rangesim.decoding.range_image import MIN_MEASURED, RangeImage
 from rangesim.decoding.status import Status
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
@@ -48,14 +48,6 @@ BLACK = "black"
 MIN_CONTRAST = 0.02
 """Least difference by which black is brighter than white, as a fraction of full scale, at a pixel that counts as a sign
 that the two frames are exchanged. Noise alone makes black a little brighter in half of the dark pixels."""
-
-MAX_COMPARED = 20_000
-"""Number of pixels, at most, by which frames are first compared with each other; frames that agree at these are then
-compared at all pixels."""
-
-MAX_UNIFORM_FRACTION = 0.98
-"""Largest fraction of the pixels at which a frame may be as dark as the darkest frame, or as bright as the brightest,
-and still count as a pattern."""
 
 MAX_BEYOND_FRACTION = 0.02
 """Largest fraction of the codes that may lie beyond the projector. Errors of single pixels put fewer there, and a
@@ -120,10 +112,14 @@ class StructuredLight(Sensor):
         for axis in self.axes:
             self.code.check(self.size(axis))
         if self.order:
-            in_view = set(self.frame_names())
             for axis in self.axes:
-                coded = [name for name in self.code.names(self.size(axis)) if f"{axis}_{name}" in in_view]
-                self.code.check_shown(self.size(axis), [*coded, *(name for name in (WHITE, BLACK) if name in in_view)])
+                self.code.check_shown(self.size(axis), self.shown_names(axis))
+
+    def shown_names(self, axis: str) -> list[str]:
+        """Names of the frames of an axis that are shown, as the code names them, and white and black if they are."""
+        in_view = set(self.frame_names())
+        coded = [name for name in self.code.names(self.size(axis)) if f"{axis}_{name}" in in_view]
+        return [*coded, *(name for name in (WHITE, BLACK) if name in in_view)]
 
     def size(self, axis: str) -> int:
         """Projector pixels along `axis`."""
@@ -329,7 +325,10 @@ class StructuredLightDecoder(Decoder):
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         shown = of_type(sensor, StructuredLight)
-        each = [shown.code.least_signal(shown.size(axis), self.thresholds, background) for axis in shown.axes]
+        each = [
+            shown.code.least_signal(shown.size(axis), shown.shown_names(axis), self.thresholds, background)
+            for axis in shown.axes
+        ]
         return np.asarray(np.maximum.reduce(each))
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
@@ -367,29 +366,23 @@ def _exchanged_ends(capture: Capture, contrast: Contrast) -> str | None:
 
 
 def _repeated_frames(capture: Capture) -> str | None:
-    """A sentence if two frames of a digital capture are the same to the last digit, and neither is black or white.
-
-    The noise of a camera makes two images of the same pattern differ. Of patterns that lie outside the view, noise-free
-    images are all black or all white, so the frames must change from pixel to pixel as no other frames do.
-    """
+    """A sentence if two frames of a digital capture are the same image, but their patterns are not; None if not."""
     if not capture.is_digital or capture.frames[0].size < MIN_PIXELS:
         return None
     sensor = of_type(capture.sensor, StructuredLight)
-    frames, names = capture.frames, sensor.frame_names()
-    few = frames.reshape(len(frames), -1)[:, :: 1 + frames[0].size // MAX_COMPARED]
-    low, high = few.min(axis=0), few.max(axis=0)
-    seen: dict[bytes, int] = {}
-    for i, values in enumerate(few):
-        j = seen.setdefault(values.tobytes(), i)
-        is_dark, is_bright = (float((values == edge).mean()) > MAX_UNIFORM_FRACTION for edge in (low, high))
-        if j == i or is_dark or is_bright or not np.array_equal(frames[i], frames[j]):
-            continue
-        if not sensor.shows_the_same(names[i], names[j]):
-            return (
-                f"frames {names[j]} and {names[i]} are the same image to the last digit, which no camera takes twice: "
-                "check that no file is there twice or in place of another."
-            )
-    return None
+    names = sensor.frame_names()
+    pairs = ((names[i], names[j]) for i, j in equal_frames(capture.frames))
+    return next((same_images(one, other) for one, other in pairs if not sensor.shows_the_same(one, other)), None)
+
+
+def _corrections(codes: dict[str, AxisCode]) -> Iterator[str]:
+    """Sentences on what was corrected in the codes of all axes."""
+    gammas = {axis: f"{code.gamma:.3g}" for axis, code in codes.items() if code.gamma != 1}
+    if gammas:
+        yield (
+            f"the fringes along {' and '.join(gammas)} were corrected for a gamma of "
+            f"{' and '.join(dict.fromkeys(gammas.values()))} of projector and camera together."
+        )
 
 
 def _orientation(codes: dict[str, AxisCode]) -> str | None:
@@ -454,6 +447,7 @@ def joined_axes(
         intensity=contrast.white.astype(np.float32) - np.float32(capture.black_level),
         limits=triangulation,
         doubts=tuple(contradictions),
+        notes=tuple(_corrections(codes)),
     )
 
 

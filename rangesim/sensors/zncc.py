@@ -95,8 +95,8 @@ class ZnccDecoder(Decoder):
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         """Least light by which white and black are told from each other, whatever the code."""
         shown = of_type(sensor, StructuredLight)
-        thresholds = CodeThresholds(self.gray, PhaseThresholds())
-        return Code.least_signal(shown.code, shown.size(shown.axes[0]), thresholds, background)
+        axis, thresholds = shown.axes[0], CodeThresholds(self.gray, PhaseThresholds())
+        return Code.least_signal(shown.code, shown.size(axis), shown.shown_names(axis), thresholds, background)
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
         return self._by_code.likely_cause(capture, image)
