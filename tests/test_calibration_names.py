@@ -91,7 +91,12 @@ NAMES = [
     ("camK", "camDist", "projK", "projDist", "rvec", "tvec"),
     ("K_cam", "dist_cam", "K_proj", "dist_proj", "R", "T"),
     ("mtx1", "dist1", "mtx2", "dist2", "R", "T"),
-]
+    ("CamMat", "CamDist", "ProMat", "ProDist", "R", "T"),
+    ("camera_matrix", "dist_coeffs", "projector_matrix", "projector_dist_coeffs", "cam_to_proj_rotation",
+     "cam_to_proj_translation"),
+    ("camera_matrix", "distortion_coefficients", "projector_matrix", "projector_distortion_coefficients",
+     "camera_to_projector_rotation", "camera_to_projector_translation"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("names", NAMES, ids=lambda names: names[0])

@@ -89,6 +89,24 @@ def test_periods_that_repeat_within_the_axis_are_refused(code: Code, repeat: str
         code.check(640)
 
 
+def test_numbers_of_fringes_stand_for_periods_of_each_axis() -> None:
+    sensor = StructuredLight(96, 60, MultiFrequency(fringes=(1, 6)), axes=("columns", "rows"))
+    seen = StructuredLightDecoder().coordinates(Capture(sensor.patterns(), sensor))
+    assert seen.column is not None
+    assert seen.row is not None
+    np.testing.assert_allclose(seen.column[0], np.arange(96) + 0.5, atol=1e-3)
+    np.testing.assert_allclose(seen.row[:, 0], np.arange(60) + 0.5, atol=1e-3)
+    with pytest.raises(ValueError, match="expected periods_px or fringes, got both"):
+        MultiFrequency((64.0,), fringes=(1, 6))
+
+
+def test_a_period_of_one_pixel_less_than_the_axis_tells_all_but_the_ends() -> None:
+    """Programs that divide the axis by np.linspace(0, n, n) show it."""
+    column, status = seen_flat(MultiFrequency((95.0, 19.0)), 96)
+    np.testing.assert_allclose(column[0, 1:-1], np.arange(1, 95) + 0.5, atol=1e-3)
+    assert (status[0, [0, -1]] == Status.CODE_ERROR).all()
+
+
 def test_cells_that_fringes_repeat_in_are_refused() -> None:
     with pytest.raises(ValueError, match="expected cell_px to be at most the period"):
         GrayPhase(16.0, cell_px=20).check(640)

@@ -203,6 +203,9 @@ def test_other_numbers_of_frames_are_refused_or_doubted() -> None:
     lost = "the image of columns_bit6 or of its inverse seems to be missing"
     with pytest.raises(ValueError, match=f"expected 20 images .* got 19; {lost}; and in no order"):
         detect_convention(np.delete(capture.frames, 5, axis=0), capture.sensor)  # type: ignore[arg-type]
+    both = StructuredLight(600, SIZE[1], code="gray", axes=BOTH)
+    with pytest.raises(ValueError, match=r"expected 40 images .* got 42\. A projector of 600x600 has as many"):
+        detect_convention(np.zeros((42, 120, 120), np.uint8), both)
     with pytest.raises(ValueError, match="too dark"):
         detect_convention(np.zeros((18, 120, 120), np.uint8), capture.sensor)  # type: ignore[arg-type]
 

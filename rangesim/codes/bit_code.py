@@ -115,9 +115,8 @@ class BitCode(Code):
             if found:
                 return found
         neighbours = neighbours_of(code, words)
-        return (
-            other_code_contradiction(seen, neighbours, words, _other_words(words))
-            or order_contradiction(seen, neighbours, words)
+        return other_code_contradiction(seen, neighbours, words, _other_words(words)) or order_contradiction(
+            seen, neighbours, words
         )
 
     def least_signal(

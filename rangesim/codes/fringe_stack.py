@@ -136,8 +136,11 @@ class FringeStack:
         return float(distance[nearest]), float(steps[nearest])
 
     def check(self, size: int) -> None:
-        """Raise ValueError if the phases do not tell `size` projector pixels apart."""
-        distance, repeat = self.apart(size)
+        """Raise ValueError if the phases do not tell `size` projector pixels apart.
+
+        The first and the last pixel may look alike, as of programs whose coarsest fringe is of size - 1 pixels.
+        """
+        distance, repeat = self.apart(size - 1)
         if distance < MIN_APART_TURNS:
             periods = ", ".join(f"{p:g}" for p in self.periods_px)
             what = "a period" if len(self.periods_px) == 1 else "periods"

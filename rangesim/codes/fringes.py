@@ -11,9 +11,10 @@ import numpy as np
 
 from rangesim.settings.bounds import Bounds, check_fields
 
-STARTS = {"cos": 0.0, "sin": 0.25, "-cos": 0.5, "-sin": 0.75, "cos-120": 1 / 3, "cos+120": 2 / 3}
+STARTS = {"cos": 0.0, "sin": 0.25, "-cos": 0.5, "-sin": 0.75, "cos-120": 1 / 3, "cos+120": 2 / 3, "-cos-120": 5 / 6,
+          "-cos+120": 1 / 6}  # fmt: skip
 """Phase of the first pattern at the origin, by its name, in turns before that of a cosine. Three-step fringes often
-start at -120 degrees, so that the second pattern is the cosine."""
+start at -120 degrees, so that the second pattern is the cosine, or its negative."""
 
 VISIBILITY = 0.5
 """Amplitude of a fringe as a fraction of the light at full power: fringes go from 0 to 1."""
@@ -28,7 +29,7 @@ class FringeConvention:
     Parameters
     ----------
     start : function that the first pattern follows from the origin on: "cos", "sin", "-cos", "-sin", or a cosine whose
-        phase is 120 degrees less or more, "cos-120" and "cos+120".
+        phase is 120 degrees less or more, "cos-120" and "cos+120", or its negative, "-cos-120" and "-cos+120".
     direction : "forward" if each pattern is the one before moved towards larger x (- s / N), as in
         I_s = A + B cos(phi - 2 pi s / N); "backward" if towards smaller x (+ s / N).
     origin_px : float, projector coordinate at which the first pattern starts. Pixel centres lie at integer + 0.5, so
@@ -40,7 +41,7 @@ class FringeConvention:
     array([0.5, 1. , 0.5])
     """
 
-    start: Literal["cos", "sin", "-cos", "-sin", "cos-120", "cos+120"] = "cos"
+    start: Literal["cos", "sin", "-cos", "-sin", "cos-120", "cos+120", "-cos-120", "-cos+120"] = "cos"
     direction: Literal["forward", "backward"] = "forward"
     origin_px: Annotated[float, Bounds("projector pixels", -1e6, 1e6)] = 0.0
 

@@ -35,6 +35,8 @@ class MultiFrequency(FringeCode):
     Parameters
     ----------
     periods_px : float, projector pixels, in the order in which they are shown; none: as `default_periods` makes them.
+    fringes : float, numbers of fringes across the axis, in place of `periods_px`; both axes then have periods of their
+        own.
     steps : int >= 3, phase shifts of each period. steps_each : int >= 3, one per period; none: `steps` of all.
     convention : FringeConvention of all periods.
 
@@ -47,6 +49,8 @@ class MultiFrequency(FringeCode):
     --------
     >>> [round(period, 1) for period in MultiFrequency().default_periods(1280)]
     [1280.0, 143.1, 16.0]
+    >>> MultiFrequency(fringes=(1, 8)).stack(640).periods_px
+    (640.0, 80.0)
     >>> MultiFrequency((64.0, 8.0), steps=3).names(64)
     ['period0_phase0', 'period0_phase1', 'period0_phase2', 'period1_phase0', 'period1_phase1', 'period1_phase2']
     """
@@ -55,12 +59,15 @@ class MultiFrequency(FringeCode):
     steps: Annotated[int, whole(3, "steps")] = 4
     steps_each: tuple[Annotated[int, whole(3, "steps")], ...] = ()
     convention: FringeConvention = field(default_factory=FringeConvention)
+    fringes: tuple[Annotated[float, Bounds("fringes", 1e-3, 1e5)], ...] = ()
 
     type_name: ClassVar[str] = "multi-frequency"
     title: ClassVar[str] = "Structured light (fringes of several periods)"
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if self.periods_px and self.fringes:
+            raise ValueError("expected periods_px or fringes, got both.")
         if self.periods_px and self.steps_each and len(self.steps_each) != len(self.periods_px):
             raise ValueError(
                 f"expected steps_each with one number for each of the {len(self.periods_px)} periods, "
@@ -75,12 +82,16 @@ class MultiFrequency(FringeCode):
         levels = max(1, math.ceil(math.log(ratio) / math.log(MAX_RATIO) - 1e-9))
         return tuple(size / ratio ** (i / levels) for i in range(levels + 1))
 
+    def _periods(self, size: int) -> tuple[float, ...]:
+        """Periods for an axis of `size` pixels, as shown."""
+        return self.periods_px or tuple(size / count for count in self.fringes) or self.default_periods(size)
+
     def stack(self, size: int) -> FringeStack:
-        periods = self.periods_px or self.default_periods(size)
+        periods = self._periods(size)
         return FringeStack(periods, self.steps_each or (self.steps,) * len(periods), self.convention)
 
     def check(self, size: int) -> None:
-        periods = self.periods_px or self.default_periods(size)
+        periods = self._periods(size)
         if self.steps_each and len(self.steps_each) != len(periods):
             raise ValueError(
                 f"expected steps_each with one number for each of the {len(periods)} periods, "
@@ -92,7 +103,8 @@ class MultiFrequency(FringeCode):
     def details(self) -> str:
         steps = "-, ".join(str(s) for s in dict.fromkeys(self.steps_each)) or str(self.steps)
         periods = f" of {', '.join(f'{p:g}' for p in self.periods_px)} px" if self.periods_px else ""
-        return f"{steps}-step fringes{periods or ' of several periods'}"
+        counts = f", {', '.join(f'{n:g}' for n in self.fringes)} across the axis" if self.fringes else ""
+        return f"{steps}-step fringes{periods or counts or ' of several periods'}"
 
     def representative(self, size: int) -> list[str]:
         stack = self.stack(size)

@@ -150,7 +150,7 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
     orders = list(layouts(sensor, len(frames)))
     sample = _sampled(frames)
     if not is_given and not orders:
-        raise ValueError(_wrong_number(len(frames), sensor, sample))
+        raise ValueError(_wrong_number(len(frames), sensor, sample) + _square(len(frames), sensor))
     found = sensor
     layout: Layout | None = None
     if np.count_nonzero(sample.is_lit) >= MIN_PIXELS:
@@ -211,9 +211,18 @@ def _wrong_number(n: int, sensor: StructuredLight, sample: _Sample) -> str:
     names = sensor.frame_names()
     lost = _lost_of_pair(sample, sensor)
     return (
-        f"expected {len(names)} images for {sensor.type_name} ({names[0]} ... {names[-1]}), got {n}"
+        f"expected {len(names)} images for {sensor.code.details} ({names[0]} ... {names[-1]}), got {n}"
         f"{f'; the image of {lost} or of its inverse seems to be missing' if lost else ''}."
     )
+
+
+def _square(n: int, sensor: StructuredLight) -> str:
+    """A sentence if a projector that is as high as wide has that many frames; "" if not."""
+    side = max(sensor.projector_width, sensor.projector_height)
+    square = replace(sensor, projector_width=side, projector_height=side, order=())
+    if len(sensor.axes) < 2 or next(layouts(square, n), None) is None:
+        return ""
+    return f" A projector of {side}x{side} has as many: some programs show as many bits along rows as along columns."
 
 
 def _sampled(frames: np.ndarray) -> _Sample:

@@ -73,7 +73,11 @@ def _names(words: Sequence[str], number: int, letter: str) -> DeviceNames:
     return DeviceNames(
         (
             *(f"K{number}", f"M{number}", f"K{letter}", f"cameraMatrix{number}", f"mtx{number}", f"intrinsics{number}"),
-            *(form.format(w) for w in words for form in ("{}_matrix", "{}_int", "{}_K", "K_{}", "{}_mtx", "mtx_{}")),
+            *(
+                form.format(w)
+                for w in words
+                for form in ("{}_matrix", "{}_int", "{}_K", "K_{}", "{}_mtx", "{}_mat", "mtx_{}")
+            ),
             *(form.format(w) for w in words for form in ("{}_intrinsics", "{}_intrinsic", "{}_intrinsic_matrix")),
             *(form.format(w) for w in words for form in ("{}_camera_matrix", "{}.matrix", "intrinsics_{}")),
         ),
@@ -106,7 +110,7 @@ CAMERA = _and(
 )
 """Names of the parts of the camera; those that name no device are the camera's."""
 PROJECTOR = _and(
-    _names(("projector", "proj", "prj", "camera2", "cam2"), 2, "p"),
+    _names(("projector", "proj", "pro", "prj", "camera2", "cam2"), 2, "p"),
     width=("screen_res_x", "disp_width", "display_width", "screen_width"),
     height=("screen_res_y", "disp_height", "display_height", "screen_height"),
 )
@@ -120,12 +124,24 @@ ROTATION = (
     "rotation",
     "rotation_matrix",
     "rotation_vector",
+    "camera_to_projector_rotation",
+    "cam_to_proj_rotation",
     "rvec",
     "R_stereo",
     "stereo_R",
 )
 """Names of R, a matrix or a rotation vector."""
-TRANSLATION = ("T", "Tp", "t", "translation", "translation_vector", "tvec", "stereo_T")
+TRANSLATION = (
+    "T",
+    "Tp",
+    "t",
+    "translation",
+    "translation_vector",
+    "camera_to_projector_translation",
+    "cam_to_proj_translation",
+    "tvec",
+    "stereo_T",
+)
 """Names of T."""
 
 
