@@ -20,6 +20,18 @@ VISIBILITY = 0.5
 """Amplitude of a fringe as a fraction of the light at full power: fringes go from 0 to 1."""
 
 
+def usual_starts(steps: int) -> list[str]:
+    """Names of the starts that fringes of so many steps may have: quarters of a turn, and starts that make a further
+    pattern the cosine or its negative.
+
+    Examples
+    --------
+    >>> usual_starts(4)
+    ['cos', 'sin', '-cos', '-sin']
+    """
+    return [name for name, turns in STARTS.items() if turns * 4 % 1 == 0 or round(turns * 2 * steps, 6) % 1 == 0]
+
+
 @dataclass(frozen=True)
 class FringeConvention:
     """Start, direction and origin of fringes.

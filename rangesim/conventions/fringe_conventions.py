@@ -7,6 +7,7 @@ places on which they agree. They do not tell which way they move.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from typing import NamedTuple
@@ -17,7 +18,7 @@ from rangesim.capture import Capture, bright_level
 from rangesim.codes import AxisFrames, Code, FringeConvention
 from rangesim.codes.fringe_code import FringeCode
 from rangesim.codes.fringe_direction import phase_direction
-from rangesim.codes.fringes import STARTS
+from rangesim.codes.fringes import usual_starts
 from rangesim.decoding.phase_shift import phase_of
 from rangesim.decoding.pixel_samples import MIN_PIXELS
 from rangesim.decoding.status import Status
@@ -76,7 +77,7 @@ class _Offsets(NamedTuple):
     phase, cell : (n,) turns, `cell` of the centre of the cell or of its edge. agreement : 1 if the phases grow from
     pixel to pixel as their cells do, -1 if the other way, 0 if neighbours do not tell. half_turns : half the width of
     the places that one `cell` stands for, in turns. period_px : projector pixels. largest_rest_px : distance from a
-    usual start, in projector pixels, up to which the fringes count as starting there.
+    usual start, in projector pixels, up to which the fringes count as starting there. steps : number of the fringes.
     """
 
     phase: np.ndarray
@@ -84,6 +85,7 @@ class _Offsets(NamedTuple):
     agreement: float
     half_turns: float
     period_px: float
+    steps: int
     largest_rest_px: float = MAX_REST_PX
 
     def off(self, convention: FringeConvention) -> np.ndarray:
@@ -146,7 +148,8 @@ def with_own_start(frames: np.ndarray, sensor: StructuredLight) -> StructuredLig
         for one, stack, lit in zip(seen, stacks, used, strict=True)
     ]
     biases: dict[FringeConvention, float] = {}
-    for start in (given.start, *STARTS):
+    steps = math.lcm(*(n for stack in stacks for n in stack.steps))
+    for start in (given.start, *usual_starts(steps)):
         here = replace(given, start=start)  # type: ignore[arg-type]
         biases[here] = max(
             stack.bias_turns([here.place_turns(t, p) for t, p in zip(turns, stack.periods_px, strict=True)], one.size)
@@ -179,7 +182,8 @@ def _all_offsets(frames: np.ndarray, sensor: StructuredLight, period_px: float) 
     for seen in decoder.axis_frames(Capture(frames, sensor)):
         code = sensor.code.decode(seen, decoder.thresholds)
         gray, fringes = code.coarse, seen.starting_with("phase" if "phase0" in seen.names else "period0_")
-        if gray is None or not len(fringes.frames):
+        steps = len(fringes.frames)
+        if gray is None or not steps:
             continue
         is_strong = (code.status == Status.OK) | (code.status == Status.CODE_ERROR)
         clear = is_strong & (gray.status == Status.OK) & _is_bright(seen)
@@ -189,10 +193,10 @@ def _all_offsets(frames: np.ndarray, sensor: StructuredLight, period_px: float) 
         if gray.cell_px > MAX_CELL_TURNS * period_px:
             phase, place_px = _at_edges(phase, np.where(clear, gray.coordinate, np.float32(np.nan)), gray.cell_px)
             turns, rest_px = place_px / np.float32(period_px), max(MAX_REST_PX, MAX_EDGE_TURNS * period_px)
-            yield _Offsets(phase, turns, agreement, 0.25, period_px, rest_px)  # within a quarter of a period
+            yield _Offsets(phase, turns, agreement, 0.25, period_px, steps, rest_px)  # within a quarter of a period
             continue
         turns = gray.coordinate[used] / np.float32(period_px)
-        yield _Offsets(phase[used], turns, agreement, gray.cell_px / (2 * period_px), period_px)
+        yield _Offsets(phase[used], turns, agreement, gray.cell_px / (2 * period_px), period_px, steps)
 
 
 def _is_bright(seen: AxisFrames) -> np.ndarray:
@@ -231,7 +235,7 @@ def _measured(offsets: _Offsets, given: FringeConvention) -> FringeConvention | 
         if abs(vector) < MIN_CONCENTRATION * expected:
             continue
         off_px = float(np.angle(vector)) / (2 * np.pi) * offsets.period_px
-        rest_px = {c: abs(_rest_px(c, here, off_px, offsets.period_px)) for c in _usual(here)}
+        rest_px = {c: abs(_rest_px(c, here, off_px, offsets.period_px)) for c in _usual(here, offsets.steps)}
         best = min(rest_px, key=lambda c: rest_px[c])
         if offsets.largest_rest_px > MAX_REST_PX:  # half a pixel may not be told
             best = min(rest_px, key=lambda c: (rest_px[c] > offsets.largest_rest_px, c.origin_px != given.origin_px))
@@ -243,10 +247,10 @@ def _measured(offsets: _Offsets, given: FringeConvention) -> FringeConvention | 
     return None
 
 
-def _usual(given: FringeConvention) -> Iterator[FringeConvention]:
-    """The given convention first, then all usual ones in its direction."""
+def _usual(given: FringeConvention, steps: int) -> Iterator[FringeConvention]:
+    """The given convention first, then all usual ones in its direction of fringes of so many steps."""
     yield given
-    for start in STARTS:
+    for start in usual_starts(steps):
         for origin_px in ORIGINS_PX:
             yield FringeConvention(start, given.direction, origin_px)  # type: ignore[arg-type]
 
