@@ -258,10 +258,11 @@ def score(capture: Capture, signals: StillSignals) -> Score:
         image = decode(capture)
     assert image.projector_column is not None
     lit, valid = truth.projector_visible & np.isfinite(truth.z), image.valid & np.isfinite(truth.z)
+    is_doubted = any(issubclass(one.category, RangesimWarning) for one in caught)  # and not of NumPy
     error = np.abs(image.projector_column - truth.projector_uv[..., 0])[valid]
     wrong = float(np.mean(error > WRONG_PX)) if error.size else 0.0
     median = float(np.median(error)) if error.size else math.nan
-    return Score(float(np.mean(valid[lit])), median, wrong, bool(caught))
+    return Score(float(np.mean(valid[lit])), median, wrong, is_doubted)
 
 
 def markdown(codes: dict[str, Code], scores: dict[str, dict[str, Score]]) -> str:

@@ -17,6 +17,7 @@ Usage: python examples/own_code.py
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -72,7 +73,9 @@ class TriangleWaves(Code):
         status[seen.capture.saturated(seen.frames)] = Status.SATURATED
         return AxisCode(coordinate.astype(np.float32), status, seen.size / self.ratio, sigma_px)
 
-    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
         return thresholds.phase.least_signal(SHIFTS, 1 / np.pi, FrameContent(), background)
 
     @property

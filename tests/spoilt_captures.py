@@ -22,6 +22,7 @@ from rangesim.codes import Code, FringeConvention, GrayPhase, MicroPhaseShifting
 from rangesim.conventions import detect_convention
 from rangesim.decoding import decode
 from rangesim.electronics.detector import Detector
+from rangesim.errors import DoubtWarning
 from rangesim.rig import Intrinsics, Rig
 from rangesim.sensors import StructuredLight
 from rangesim.settings.config import has_defaults
@@ -33,8 +34,11 @@ GRAY, PHASE = "gray", "gray-phase"
 
 MAX_WRONG_FRACTION = 0.02
 """Largest fraction of the readings that may be wrong in a capture that counts as read right."""
-TOLERANCE_PX = 1.0
-"""Largest error of a right projector coordinate, in projector pixels: half a cell of Gray code, and noise."""
+TOLERANCE_CAMERA_PX = 0.5
+"""Largest error of a right projector coordinate in pixels of the camera: an edge that is seen by a camera without blur
+lies anywhere between two of its pixels."""
+TOLERANCE_SIGMAS = 3.0
+"""Largest error of a right coordinate by noise, in standard deviations: 0.3 % of the readings exceed it."""
 TOLERANCE_Z = 0.05
 """Largest relative error of a right depth."""
 
@@ -103,20 +107,32 @@ class Answer:
 
 
 @cache
-def _scene(code: Code, axes: tuple[str, ...], exposure_s: float, gamma: float) -> tuple[Given, np.ndarray, np.ndarray]:
-    """A capture, true projector coordinates (h, w, 2) and depths (h, w)."""
+def _scene(
+    code: Code, axes: tuple[str, ...], exposure_s: float, gamma: float
+) -> tuple[Given, np.ndarray, np.ndarray, float]:
+    """A capture, true projector coordinates (h, w, 2) and depths (h, w), and the largest error of a right coordinate.
+
+    The error by noise is the one that the decoder states for the sound capture, whose detector it knows.
+    """
     sensor = StructuredLight(*PROJECTOR, code=code, axes=axes, projector_gamma=gamma)  # type: ignore[arg-type]
     rig = stereo_rig(*CAMERA, projector=Intrinsics.from_fov(*PROJECTOR, 70))
     signals = plane_signals(rig, sensor, ambient=0.01)
     capture = expose(signals, sensor, Detector(bits=8), exposure_s=exposure_s)
     given = Given(capture.frames.astype(np.uint8), replace(sensor, projector_gamma=1.0), rig)
-    return given, signals.truth.projector_uv, signals.truth.z
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtWarning)  # the gamma
+        sound = sensor.default_decoder.coordinates(capture)
+    sigmas = [s[np.isfinite(s)] for s in (sound.column_sigma_px, sound.row_sigma_px) if s is not None]
+    noise_px = max((float(np.median(s)) for s in sigmas if len(s)), default=0.0)
+    uv = signals.truth.projector_uv
+    camera_px = float(np.median(np.abs(np.diff(uv[..., 0], axis=1))))
+    return given, uv, signals.truth.z, max(TOLERANCE_CAMERA_PX * camera_px, TOLERANCE_SIGMAS * noise_px)
 
 
 def answer(case: Case, code: str) -> Answer:
     """What `rangesim decode` makes of a spoilt capture of that code."""
     stated = Code.known[code]()
-    sound, uv, z = _scene(case.shows or stated, case.axes, case.exposure_s, case.gamma)
+    sound, uv, z, tolerance_px = _scene(case.shows or stated, case.axes, case.exposure_s, case.gamma)
     if case.shows:
         sound = replace(sound, sensor=replace(sound.sensor, code=stated))
     given = case.spoil(sound if case.is_calibrated else replace(sound, rig=None))
@@ -129,21 +145,22 @@ def answer(case: Case, code: str) -> Answer:
     except ValueError as error:
         return Answer("refused", "", str(error))
     cause = likely_cause(image, capture)
-    notes = unchecked(image) if case.is_calibrated else None
+    unknown = unchecked(image) if case.is_calibrated else None
     shares = ", ".join(f"{100 * x:.0f} % {name}" for name, x in status_fractions(image).items() if x >= 0.005)
     wrong = 0.0
     for coordinate, true in ((image.projector_column, uv[..., 0]), (image.projector_row, uv[..., 1])):
         if coordinate is not None and coordinate.shape == true.shape:
             read = np.isfinite(coordinate)
-            off = np.abs(coordinate - true)[read] > TOLERANCE_PX
+            off = np.abs(coordinate - true)[read] > tolerance_px
             wrong = max(wrong, float(off.mean()) if read.any() else 0.0)
     if case.is_calibrated and image.z.shape == z.shape and image.valid.any():
         wrong = max(wrong, float((np.abs(image.z / z - 1)[image.valid] > TOLERANCE_Z).mean()))
-    said = " ".join([*found.findings, *image.doubts, *(f"{c}." for c in (cause, notes) if c)])
+    said = " ".join([*found.findings, *image.notes, *image.doubts, *(f"{c}." for c in (cause, unknown) if c)])
     is_right = wrong <= MAX_WRONG_FRACTION and image.valid.mean() > 0.5
-    if found.findings and is_right and not image.doubts:
+    is_mended = bool(found.findings or image.notes)
+    if is_mended and is_right and not image.doubts:
         verdict = "mended"
-    elif image.doubts or cause or notes or found.findings:
+    elif image.doubts or cause or unknown or is_mended:
         verdict = "warned"
     else:
         verdict = "right" if is_right else "SILENT"

@@ -12,6 +12,7 @@ from synthetic import signals_of_depth, stereo_rig
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
+from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import RangesimWarning
@@ -21,12 +22,12 @@ from rangesim.sensors import AmcwDecoder, AmcwToF, DirectToF, DirectToFDecoder
 SENSORS = [AmcwToF((20e6,)), AmcwToF(), AmcwToF((80e6, 16e6, 120e6), taps=3), AmcwToF((20e6, 60e6), taps=6)]
 
 
-def capture_of(sensor: AmcwToF, noise: bool = True) -> Capture:
+def capture_of(sensor: AmcwToF, noise: bool = True, seed: int = 0) -> Capture:
     """Raw taps of an unknown camera in a room: a slope from 0.7 to 3 m, of two albedos."""
     rig = stereo_rig(64, 48, baseline_m=0.0)
     z = np.tile(np.linspace(0.7, 3.0, 64), (48, 1))
     signals = signals_of_depth(rig, z, [sensor], ambient=0.01)
-    taken = expose(signals, sensor, Detector.time_of_flight() if noise else None)
+    taken = expose(signals, sensor, Detector.time_of_flight() if noise else None, seed=seed)
     return Capture(taken.frames << 4 if noise else taken.frames, sensor)  # 12 bits, as files of 16 have them
 
 
@@ -52,15 +53,6 @@ def test_right_taps_are_quiet(sensor: AmcwToF, noise: bool) -> None:
     assert warnings_of(capture_of(sensor, noise)) == []
 
 
-@pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: s.details)
-def test_a_tap_without_any_light_is_named(sensor: AmcwToF) -> None:
-    capture = capture_of(sensor)
-    frames = capture.frames.copy()
-    frames[1] = 0
-    with pytest.warns(RangesimWarning, match=f"^{sensor.frame_names()[1]} is 0 at all pixels"):
-        decode(Capture(frames, sensor))
-
-
 @pytest.mark.parametrize("sensor", SENSORS[:2], ids=lambda s: s.details)
 @pytest.mark.parametrize(
     ("order", "words"), [([0, 2, 1, 3], "taps 1 and 2 .* 3 and 4"), ([0, 1, 3, 2], "taps 1 and 4 .* 2 and 3")]
@@ -80,6 +72,63 @@ def test_taps_that_run_the_other_way_are_told_by_the_light(sensor: AmcwToF) -> N
     backwards = [0, *range(sensor.taps - 1, 0, -1)]
     with pytest.warns(RangesimWarning, match="brighter where the path is longer"):
         decode(sorted_taps(capture_of(sensor), backwards))
+
+
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        ([1, 2, 3, 0], "90 degrees"),
+        ([2, 3, 0, 1], "180 degrees"),
+        ([2, 1, 0, 3], "180 degrees and run the other way"),
+    ],
+)
+def test_taps_that_start_elsewhere_are_told_by_the_light(order: list[int], words: str) -> None:
+    with pytest.warns(RangesimWarning, match=f"it does if the taps of each frequency start at {words}, so"):
+        decode(sorted_taps(capture_of(SENSORS[0]), order))
+
+
+@pytest.mark.parametrize("sensor", [SENSORS[0], AmcwToF((20e6,), taps=6)], ids=lambda s: s.details)
+@pytest.mark.parametrize("lost", [0, 1, 2])
+def test_a_lost_tap_is_told(sensor: AmcwToF, lost: int) -> None:
+    """The frames move up, and the last one is taken a second time, with other noise."""
+    first, second = capture_of(sensor), capture_of(sensor, seed=1)
+    kept = [i for i in range(sensor.taps) if i != lost]
+    with pytest.warns(RangesimWarning, match="lie on no cosine .* no frame is missing or there twice"):
+        decode(Capture(np.concatenate([first.frames[kept], second.frames[-1:]]), sensor))
+
+
+def test_a_frame_that_is_there_twice_is_told() -> None:
+    taken = capture_of(SENSORS[2])
+    frames = taken.frames.copy()
+    frames[4] = frames[3]
+    with pytest.warns(RangesimWarning, match="frames 16MHz_0deg and 16MHz_120deg are the same image"):
+        decode(Capture(frames, taken.sensor))
+
+
+def test_an_empty_frame_is_told() -> None:
+    taken = capture_of(SENSORS[1])
+    frames = taken.frames.copy()
+    frames[5] = 0
+    with pytest.warns(RangesimWarning, match="80MHz_90deg: the same number at every pixel"):
+        decode(Capture(frames, taken.sensor))
+
+
+@pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: s.details)
+def test_signed_numbers_that_were_read_without_their_sign_are_told(sensor: AmcwToF) -> None:
+    taken = capture_of(sensor)
+    signed = (taken.frames.astype(np.int64) - int(np.median(taken.frames))) // 2  # so that they fit in 16 bits
+    with pytest.warns(RangesimWarning, match="in two's complement.*give --bits with an s"):
+        decode(Capture((signed % 65536).astype(np.uint16), sensor))
+
+
+@pytest.mark.parametrize("fraction", [0.1, 0.5, 0.8])
+def test_taps_that_clip_below_the_largest_number_are_refused(fraction: float) -> None:
+    taken = capture_of(SENSORS[0])
+    brightest = taken.frames.max(axis=0)
+    level = int(np.percentile(brightest, 100 * (1 - fraction)))
+    image = decode(Capture(np.minimum(taken.frames, level), taken.sensor))
+    assert (image.status[brightest > level] == Status.SATURATED).all()
+    assert not (decode(taken).status == Status.SATURATED).any()
 
 
 @pytest.mark.parametrize("number", [0, 2])

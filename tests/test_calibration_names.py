@@ -86,6 +86,7 @@ NAMES = [
     ("cameraMatrix", "distCoeffs", "projectorMatrix", "projectorDistCoeffs", "R", "T"),
     ("camera_matrix", "camera_distortion", "projector_matrix", "projector_distortion", "R", "T"),
     ("cam_int", "cam_dist", "proj_int", "proj_dist", "rotation", "translation"),
+    ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T"),
     ("cam_K", "cam_D", "proj_K", "proj_D", "R", "t"),
     ("camK", "camDist", "projK", "projDist", "rvec", "tvec"),
     ("K_cam", "dist_cam", "K_proj", "dist_proj", "R", "T"),

@@ -180,7 +180,7 @@ def test_real_images_come_in_by_number(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((4, 6), np.uint8)).save(tmp_path / "shot5.png")
     with pytest.raises(FileFormatError, match=r"shot5\.png: expected 5 x 4 uint8"):
         import_capture(tmp_path, SMALL)
-    with pytest.raises(FileFormatError, match="no folder"):
+    with pytest.raises(FileFormatError, match="expected a folder of images, got a path"):
         import_capture(tmp_path / "nowhere", SMALL)
 
 
@@ -210,8 +210,8 @@ def test_rigs_load_back_the_same(tmp_path: Path) -> None:
         ("a.xml", "<opencv_storage/>", "the camera's matrix under a usual name"),
         ("a.xml", "<o><K1><data>1 2 3</data></K1></o>", "expected 'K1' to hold 3 x 3 numbers, got 3"),
         ("a.xml", "<o><K1><data>1 two</data></K1></o>", "does not hold numbers"),
-        ("a.yml", "%YAML:1.0\n---\nK1: [1, 2", "a list in brackets does not end"),
-        ("a.yml", "K1: &a [1]", "is not expected"),
+        ("a.yml", "%YAML:1.0\n---\nK1: [1, 2", "a list in brackets without its end"),
+        ("a.yml", "K1: &a [1]", "a reference or a block of text"),
         ("a.toml", "", "expected a file that ends in .xml"),
     ],
 )

@@ -370,3 +370,33 @@ def test_xor_codes_read_a_corner_that_gray_code_reads_wrongly(indirect: float, o
     for noun in ("XOR-02 code", "XOR-04 code"):
         assert right[noun] > 0.9
         assert wrong[noun] < 0.02
+
+
+# ---- Defocus ---------------------------------------------------------------------------------------------------------
+
+
+def errors_out_of_focus(code: XorCode, sigma_px: float) -> np.ndarray:
+    """(n,) projector pixels, NaN where refused: errors of a camera with eight pixels for each of the projector."""
+    from scipy.ndimage import gaussian_filter1d
+
+    sensor, finer = StructuredLight(512, 2, code), 8
+    patterns = np.repeat(sensor.patterns()[:, :1].astype(np.float32), finer, axis=2)
+    frames = gaussian_filter1d(patterns, sigma_px * finer, axis=2, mode="nearest")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RangesimWarning)
+        image = decode(Capture(frames, sensor))
+    return np.asarray(np.abs(column(image)[0] - (np.arange(512 * finer) + 0.5) / finer))
+
+
+@pytest.mark.parametrize("sigma_px", [0.7, 0.85, 1.0, 1.2])
+def test_xor_02_out_of_focus_reads_the_middle_of_a_stripe(sigma_px: float) -> None:
+    """Blur reverses the bit that changes within a stripe of the base, so a third of the readings were a cell off."""
+    off = errors_out_of_focus(XorCode(0), sigma_px)
+    assert (off <= 1).mean() > 0.5
+    assert (off > 1).mean() < 0.01
+
+
+@pytest.mark.parametrize("sigma_px", [1.2, 1.5, 2.0])
+def test_xor_04_out_of_focus_is_refused(sigma_px: float) -> None:
+    """Blur reverses two bits and more that change within a stripe of the base; a third of the pixels were wrong."""
+    assert (errors_out_of_focus(XorCode(1), sigma_px) > 1).mean() < 0.02

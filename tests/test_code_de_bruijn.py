@@ -99,6 +99,19 @@ def test_pieces_of_different_places_are_read_right_or_refused() -> None:
     assert wrong.sum() / image.valid.sum() < 0.005
 
 
+def test_a_stripe_across_two_surfaces_is_refused() -> None:
+    """Its places were interpolated as on one surface, and up to 4 projector pixels wrong with status OK."""
+    sensor = StructuredLight(640, 4, DeBruijnStripes())
+    for hidden_px in (2.0, 4.0, 6.0):
+        place = np.arange(100.3, 540.0, 1.25)
+        place = np.where(place < 323.0, place, place + hidden_px)  # behind the edge, so many pixels are in shadow
+        image = decode(seen_at(sensor, place))
+        x = 0.5 * (place[1:] + place[:-1])
+        inside = (x > 120) & (x < 530)
+        assert np.nanmax(np.abs(image.projector_column - x)[:, inside]) < 0.7
+        assert image.valid[:, inside].mean() > 0.95
+
+
 def test_random_stripes_are_refused() -> None:
     sensor, rng = StructuredLight(1280, 4, DeBruijnStripes()), np.random.default_rng(0)
     steps = rng.integers(1, 6, (100, 128)).cumsum(axis=1) % 6

@@ -77,5 +77,5 @@ def test_pixels_whose_ramps_do_not_add_up_are_refused() -> None:
 def test_ramps_without_white_or_black_are_refused() -> None:
     with pytest.raises(ValueError, match="expected white and black among the frames"):
         StructuredLight(640, 4, RampCode(), order=("columns_*",))
-    with pytest.raises(ValueError, match="expected an order with a ramp"):
+    with pytest.raises(ValueError, match="expected an order with ramp or ramp_reverse, got white, black"):
         StructuredLight(640, 4, RampCode(), order=("white", "black"))

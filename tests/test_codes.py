@@ -6,18 +6,22 @@ from __future__ import annotations
 import re
 import warnings
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from fnmatch import fnmatchcase
 
 import numpy as np
 import pytest
+from flat_captures import all_columns, noisy
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from rangesim.capture import Capture
 from rangesim.codes import AXES, Code, FringeConvention
 from rangesim.decoding.status import Status
+from rangesim.electronics.detector import Detector
+from rangesim.errors import RangesimWarning
 from rangesim.response import LightPath, NumpyMath
+from rangesim.sensor import Background
 from rangesim.sensors import StructuredLight, StructuredLightDecoder
 from rangesim.settings.config import from_dict, to_dict
 
@@ -130,3 +134,45 @@ def test_a_code_obeys_the_laws(name: str, data: st.DataObject) -> None:
 @given(data=st.data())
 def test_a_code_obeys_the_laws_with_many_settings(name: str, data: st.DataObject) -> None:
     obeys_the_laws(data.draw(sensors(name)))
+
+
+LONE_BITS = ("white", "black", "*_bit*[0-9]")
+"""Order of frames in which codes of bits show no inverse."""
+
+
+@pytest.mark.parametrize("ambient_e", [0.0, 400.0], ids=["dark", "sunlit"])
+@pytest.mark.parametrize(
+    ("name", "order"),
+    [
+        *((name, ()) for name in CODES),
+        *((name, LONE_BITS) for name in sorted(CELL_CODES)),
+        ("gray-phase", (*LONE_BITS, "*phase*")),
+    ],
+)
+def test_the_least_signal_is_that_of_the_thresholds(name: str, order: tuple[str, ...], ambient_e: float) -> None:
+    """With twice the least light most pixels are read, and rightly; with half of it few are, with a tenth none.
+
+    At the least light itself noise decides: a code of many frames is refused if one of them is too weak.
+    """
+    detector, size = Detector(), 640
+    sensor = StructuredLight(size, 4, name, order=order)
+    at_black = np.array([detector.black_level_dn])
+    own_variance = float((detector.noise_dn(at_black)[0] / detector.gain_dn_e) ** 2)
+    background = Background(np.full((1, 1), ambient_e), bright=1e4, noise_variance=own_variance)
+    least_e = float(sensor.default_decoder.least_signal(sensor, background)[0, 0])
+    flat, x = all_columns(sensor, rows=10)
+    read = {}
+    for factor in (0.1, 0.5, 2.0):
+        signal_e = factor * least_e
+        lit = replace(flat, frames=flat.frames + np.float32(ambient_e / signal_e))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RangesimWarning)
+            seen = sensor.default_decoder.coordinates(noisy(lit, signal_e * detector.gain_dn_e))
+        is_read = seen.status == Status.OK
+        read[factor] = is_read.mean()
+        allowed = 1.0 if seen.column_sigma_px is None else 1.0 + 5 * seen.column_sigma_px
+        if factor == 2:
+            assert (np.abs(seen.column - x) > allowed)[is_read].mean() < 0.015
+    assert read[2.0] > 0.65
+    assert read[0.5] < 0.05
+    assert read[0.1] == 0

@@ -8,6 +8,7 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import flat_captures
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d, median_filter
@@ -114,6 +115,17 @@ def test_all_periods_have_two_thirds_of_the_noise_of_the_first() -> None:
     assert first is not None
     assert every is not None
     assert np.mean(every / first) == pytest.approx(0.66, abs=0.02)
+
+
+@pytest.mark.parametrize("n_periods", [3, 4, 5])
+def test_few_periods_in_noise_are_refused_rather_than_wrong(n_periods: int) -> None:
+    """With white at 3 % of full scale, 53, 4 and 0.2 % of the readings lay in another period."""
+    sensor = sensor_of(MicroPhaseShifting(n_periods=n_periods), 1280)
+    capture, x = flat_captures.all_columns(sensor, rows=30)
+    seen = coordinates(flat_captures.noisy(capture, white_dn=122.0))
+    wrong = (np.abs(seen.column - x) > 2) & (seen.status == Status.OK)
+    assert wrong.mean() < 1e-3
+    assert (seen.status == Status.OK).mean() >= {3: 0.0, 4: 0.05, 5: 0.6}[n_periods]
 
 
 @pytest.mark.parametrize("code", CODES, ids=NAMES)

@@ -15,13 +15,16 @@ from tiers import draws
 
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
-from rangesim.codes import FringeConvention, GrayPhase
+from rangesim.codes import FringeConvention, GrayCode, GrayPhase, Heterodyne, MultiFrequency
 from rangesim.conventions import detect_convention
 from rangesim.decoding import decode
 from rangesim.electronics.detector import Detector
+from rangesim.errors import RangesimWarning
 from rangesim.results.captures import import_capture
 from rangesim.rig import Intrinsics
-from rangesim.sensors import StructuredLight
+from rangesim.sensors import StructuredLight, StructuredLightDecoder, sensor_of
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
 SIZE = (500, 410)
 BOTH = ("columns", "rows")
@@ -55,6 +58,16 @@ def test_a_capture_in_the_given_convention_changes_nothing(code: str, axes: tupl
     found = detect_convention(capture.frames, capture.sensor)  # type: ignore[arg-type]
     assert found.sensor == capture.sensor
     assert found.findings == ()
+
+
+@pytest.mark.parametrize("amplitude", [60, 200])
+def test_a_close_view_of_an_own_subpixel_code_keeps_its_order(amplitude: int) -> None:
+    """A camera that is finer than the projector: neighbours are a fraction of a pixel apart, and periods far wider."""
+    sensor = sensor_of(f"{EXAMPLES / 'own_code.py'}:TriangleWaves").for_projector(400, 300, BOTH)
+    assert isinstance(sensor, StructuredLight)
+    seen = np.repeat(np.repeat(sensor.patterns()[:, 100:250, 100:300], 2, axis=1), 2, axis=2)
+    noise = np.random.default_rng(0).normal(0, 2, seen.shape)
+    assert detect_convention(np.rint(20 + amplitude * seen + noise).astype(np.uint8), sensor).findings == ()
 
 
 @pytest.mark.parametrize("code", ["gray", "gray-phase"])
@@ -117,18 +130,45 @@ def test_conventions_of_fringes(seed: int) -> None:
     shown = FringeConvention(
         str(rng.choice(["cos", "sin", "-cos", "-sin"])),  # type: ignore[arg-type]
         str(rng.choice(["forward", "backward"])),  # type: ignore[arg-type]
-        float(rng.choice([0.0, 0.5])),
+        float(rng.choice([0.0, 0.5, -0.5])),
     )
     period_px, steps = float(rng.choice([12.0, 16.0, 20.0, 37.0])), int(rng.integers(3, 7))
-    capture = captured(GrayPhase(period_px, steps, shown), ("columns",))
+    cell_px = None if rng.uniform() < 0.5 else int(period_px)  # of a whole period: only the edges of cells tell
+    capture = captured(GrayPhase(period_px, steps, shown, cell_px), ("columns",))
     sensor = capture.sensor
     assert isinstance(sensor, StructuredLight)
-    given = replace(sensor, code=GrayPhase(period_px, steps))
+    given = replace(sensor, code=GrayPhase(period_px, steps, cell_px=cell_px))
     found = detect_convention(capture.frames, given).sensor.code
     assert isinstance(found, GrayPhase)
     off = found.convention.shift_turns(1, steps, period_px) - shown.shift_turns(1, steps, period_px)
     assert abs(off - round(off)) < 1e-9
     assert found.convention.direction == shown.direction
+
+
+@pytest.mark.parametrize("start", ["sin", "-cos", "-sin"])
+def test_fringes_of_several_periods_tell_where_they_start(start: str) -> None:
+    """Read as a cosine, heterodyne fringes that are a sine would be a quarter of a period off, without a word."""
+    shown = FringeConvention(start, "backward", 0.5)  # type: ignore[arg-type]
+    for code in (Heterodyne((12.5, 500 / 39, 500 / 35)), MultiFrequency((500.0, 125.0, 25.0))):
+        sensor = StructuredLight(*SIZE, code=replace(code, convention=shown), axes=("columns",))
+        given = replace(sensor, code=replace(code, convention=replace(shown, start="cos")))
+        frames = 0.1 + sensor.patterns()
+        for some, ends in ((frames, ()), (frames[:-2], ("there are no white and black images.",))):
+            found = detect_convention(some, given)
+            assert found.sensor.code == sensor.code
+            assert set(found.findings) >= {f"the fringes start as {start} (convention.start = {start}).", *ends}
+
+
+def test_fringes_of_two_periods_before_bits_of_both_axes() -> None:
+    """The order of kamino410/phase-shifting."""
+    code = GrayPhase(400 / 12, 3, FringeConvention("cos-120", "backward", 0.5), 50, (50.0,))
+    capture = captured(code)
+    names = capture.sensor.frame_names()
+    order = sorted(range(len(names)), key=lambda i: (names[i] in ("white", "black"), "phase" not in names[i], i))
+    given = replace(capture.sensor, code=replace(code, convention=FringeConvention()))  # type: ignore[type-var]
+    found = detect_convention(capture.frames[order], given)  # type: ignore[arg-type]
+    assert found.sensor.code == code
+    assert found.findings[0] == "phase images come before bit images."
 
 
 def test_fringes_before_bits() -> None:
@@ -137,6 +177,23 @@ def test_fringes_before_bits() -> None:
     order = sorted(range(len(names)), key=lambda i: (names[i] in ("white", "black"), "phase" not in names[i], i))
     found = detect_convention(capture.frames[order], capture.sensor)  # type: ignore[arg-type]
     assert found.findings == ("phase images come before bit images.",)
+
+
+@pytest.mark.parametrize("cell_px", [1, 3])
+def test_gray_codes_of_the_middle_words_are_found(cell_px: int) -> None:
+    """Programs of Lanman, Taubin and Moreno show them; read as the first words, all places would be shifted."""
+    middle = StructuredLight(*SIZE, code=GrayCode(cell_px, "middle"), axes=BOTH)
+    shown = middle.patterns()
+    given = replace(middle, code=GrayCode(cell_px))
+    with pytest.warns(RangesimWarning, match="as if the code showed its middle words instead of the first ones"):
+        StructuredLightDecoder().coordinates(Capture(shown, given))
+    found = detect_convention(shown, given)
+    assert found.sensor == middle
+    assert found.findings == ("the Gray code shows the middle words (words_shown = middle).",)
+    seen = StructuredLightDecoder().coordinates(Capture(shown, middle))
+    cells = np.arange(SIZE[0]) // cell_px * cell_px + cell_px / 2
+    np.testing.assert_allclose(seen.column[0], np.minimum(cells, (SIZE[0] - SIZE[0] % cell_px + SIZE[0]) / 2))
+    assert detect_convention(given.patterns(), middle).sensor == given
 
 
 def test_other_numbers_of_frames_are_refused_or_doubted() -> None:

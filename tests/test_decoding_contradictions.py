@@ -15,10 +15,13 @@ from synthetic import plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
+from rangesim.cli.decode_summary import summary
 from rangesim.codes import GrayPhase
 from rangesim.decoding import decode
+from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.errors import DoubtWarning, RangesimWarning
+from rangesim.report.palette import STATUS_NAMES
 from rangesim.results.decoded_captures import Decoded, load_decoded, save_decoded
 from rangesim.results.range_images import load_range_image, save_range_image
 from rangesim.rig import translation
@@ -119,7 +122,7 @@ def test_a_black_frame_and_a_repeated_one_are_named(frame: int, steps: int, expo
 @pytest.mark.parametrize("gamma", [1.5, 2.2])
 @pytest.mark.parametrize("steps", [3, 4, 7])
 @pytest.mark.parametrize("exposure_s", [None, 4e-4])
-def test_a_gamma_is_corrected_without_a_word(gamma: float, steps: int, exposure_s: float | None) -> None:
+def test_a_gamma_is_corrected_without_a_doubt(gamma: float, steps: int, exposure_s: float | None) -> None:
     sensor = StructuredLight(code=GrayPhase(steps=steps))
     capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
     frames, run = capture.frames.copy(), fringes(sensor)[0]
@@ -279,6 +282,21 @@ def test_doubts_are_kept_in_files(tmp_path: Path) -> None:
     assert load_decoded(tmp_path / "out").image.doubts == image.doubts
     record = json.loads((tmp_path / "out" / "decoded.json").read_text(encoding="utf-8"))
     assert record["doubts"] == list(image.doubts)
+
+
+def test_notes_are_kept_in_files(tmp_path: Path) -> None:
+    sensor = StructuredLight(projector_gamma=2.2)
+    image = decode(expose(plane_signals(stereo_rig(), sensor), sensor))
+    assert image.notes == (
+        "the fringes along columns were corrected for a gamma of 2.2 of projector and camera together.",
+    )
+    save_range_image(image, tmp_path / "range.npz")
+    assert load_range_image(tmp_path / "range.npz").notes == image.notes
+    decoded = Decoded(image, sensor, None, {STATUS_NAMES[Status.OK]: 1.0}, None)
+    save_decoded(decoded, tmp_path / "out", {})
+    assert load_decoded(tmp_path / "out").image.notes == image.notes
+    assert json.loads((tmp_path / "out" / "decoded.json").read_text(encoding="utf-8"))["notes"] == list(image.notes)
+    assert summary(decoded, tmp_path).count(image.notes[0].removesuffix(".")) == 1
 
 
 def test_fringes_that_mirror_every_place_within_its_cell_are_named() -> None:

@@ -14,7 +14,7 @@ from synthetic import plane_signals, stereo_rig
 
 from rangesim import save_capture
 from rangesim.capture.exposure import expose
-from rangesim.response import Fringes, GrayBits, Images, LightPath, NumpyMath
+from rangesim.response import Fringes, GrayBits, Images, LightPath, NumpyMath, Stripes
 from rangesim.response.defocus import MIN_HARMONIC_SIGMA, blurred_stripes
 from rangesim.results.captures import load_capture
 from rangesim.rig import Intrinsics, Lens, Rig
@@ -150,3 +150,11 @@ def test_captures_keep_the_optics_and_older_ones_load_without(tmp_path: Path) ->
 def test_optics_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"expected {next(iter(wrong))} to be"):
         Lens(**{"aperture_radius_m": 1e-3} | wrong)
+
+
+def test_a_stripe_and_its_inverse_add_up_to_white_at_the_projector_s_ends() -> None:
+    """White has no blur there. Inverses, white - pattern, were too bright, and each bit of the last cells read dark."""
+    pattern = np.array([[0.0, 1.0, 1.0, 0.0, 1.0]])
+    seen = path(np.array([0.1, 2.5, 4.9]), np.zeros(3), 1.3)
+    both = [Stripes(0, shown).weights(seen, MATH)[0] for shown in (pattern, 1 - pattern)]
+    np.testing.assert_allclose(both[0] + both[1], 1, atol=1e-5)

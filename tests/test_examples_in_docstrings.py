@@ -23,6 +23,8 @@ ROOMS = [
     "rangesim.calibration",
     "rangesim.capture",
     "rangesim.causes",
+    "rangesim.codes",
+    "rangesim.conventions",
     "rangesim.decoding",
     "rangesim.electronics",
     "rangesim.environment",

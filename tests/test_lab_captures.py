@@ -91,7 +91,9 @@ def test_images_that_are_no_frames_are_left_out(tmp_path: Path) -> None:
     assert "expected 64 x 48" not in refused(*options)
     run(*options, "--images", "shot*.png")
     check_flat(tmp_path / "out")
-    assert "expected images that match 'pat*'; it holds a_photograph.png" in refused(*options, "--images", "pat*")
+    assert "expected images that match 'pat*', got a folder with a_photograph.png" in refused(
+        *options, "--images", "pat*"
+    )
 
 
 def test_a_list_says_which_images_and_what_they_show(tmp_path: Path) -> None:
@@ -109,9 +111,9 @@ def test_a_list_says_which_images_and_what_they_show(tmp_path: Path) -> None:
     check_flat(tmp_path / "out")
     for text, sentence in (
         ("shot0.png white\nshot1.png", "after each image or after none"),
-        ("shot0.png white\nshot1.png white", "'white' is there twice"),
-        ("shot99.png", "expected a file in"),
-        ("# nothing", "lists no images"),
+        ("shot0.png white\nshot1.png white", "got 'white' twice"),
+        ("shot99.png", "expected the names of files in"),
+        ("# nothing", "got no line with one"),
         ("\n".join(lines).replace("white", "wite"), "did you mean 'white'"),
     ):
         (tmp_path / "order.txt").write_text(text)
@@ -304,7 +306,7 @@ def test_numbers_of_few_bits_are_stretched() -> None:
     for values, number, sentence in (
         (twelve, NumberFormat(11), "from 0 to 2047 for --bits 11, got 4095"),
         (twelve.astype(np.uint8), NumberFormat(12), "--bits of 1 to 8 for uint8"),
-        (twelve + np.float64(np.nan), NumberFormat(), "expected finite numbers"),
+        (twelve + np.float64(np.nan), NumberFormat(), "expected pixels that are finite"),
         (twelve, NumberFormat(11, True), "expected two's complement of 11 bits"),
     ):
         with pytest.raises(ValueError, match=sentence):
@@ -374,7 +376,7 @@ def test_stacks_are_read_in_any_layout(tmp_path: Path) -> None:
         run("decode", tmp_path / name, *SIZE, *options, "--out", tmp_path / "out")
         check_flat(tmp_path / "out")
     for name, options, sentence in (
-        ("two.npz", (), "holds frames, mask: say which with --images"),
+        ("two.npz", (), "expected one array, got frames, mask: say which with --images"),
         ("two.npz", ("--images", "frame"), "expected an array 'frame'"),
         ("first.npy", ("--images", "a"), "holds one array"),
         ("first.npy", ("--projector", "128x48"), "expected 28 images"),
@@ -455,7 +457,7 @@ def test_the_functions_take_what_the_command_takes(tmp_path: Path) -> None:
         capture = import_capture(folder, BOTH, view=CameraView(mirror=True), images="shot*")
     np.testing.assert_array_equal(capture.frames // 257, FLAT)
     write_images(folder, FLAT[:1])
-    with pytest.raises(FileFormatError, match="holds images and arrays"):
+    with pytest.raises(FileFormatError, match="expected images or arrays"):
         find_frames(folder)
     for wrong in ({"rotate": 45}, {"channel": "alpha"}):
         with pytest.raises(ValueError, match="expected"):

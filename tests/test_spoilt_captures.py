@@ -9,6 +9,10 @@ import pytest
 from spoilt_captures import CASES, GRAY, PHASE, Case, answer, other_codes
 from tiers import to_validate
 
+from rangesim.capture import Capture
+from rangesim.errors import DoubtWarning
+from rangesim.sensors import StructuredLight, StructuredLightDecoder
+
 QUICK = ("black before white", "rows first", "finest bit first", "fringes run backward", "a mirrored camera, both axes")
 """Cases that `make test` runs; the others are left to `make validate`."""
 
@@ -44,9 +48,16 @@ def test_no_code_is_read_wrong_in_silence(case: Case, code: str) -> None:
     assert found.verdict != "SILENT", found
 
 
-def test_a_sound_capture_is_right_and_silent() -> None:
-    sound = Case("sound", lambda given: given, "")
-    for code in (GRAY, PHASE):
-        found = answer(sound, code)
-        assert found.verdict == "right", found
-        assert found.said == ""
+@pytest.mark.parametrize("code", [GRAY, PHASE, *to_validate(*other_codes())])
+def test_a_sound_capture_is_right_and_silent(code: str) -> None:
+    found = answer(Case("sound", lambda given: given, ""), code)
+    assert found.verdict == "right", found
+    assert found.said == ""
+
+
+def test_white_and_black_in_a_wrong_order_that_was_stated_are_said() -> None:
+    """Phases tell the place without white and black, so that nothing but their brightness tells."""
+    sensor = StructuredLight(64, 48, "phase-shift")
+    frames = sensor.patterns()[[0, 1, 2, 3, 5, 4]]
+    with pytest.warns(DoubtWarning, match="black is brighter than white at 100 % of the pixels"):
+        StructuredLightDecoder().coordinates(Capture(frames, sensor))

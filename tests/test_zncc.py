@@ -224,10 +224,10 @@ def test_files_that_hold_no_stack_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="No such file"):
         ImageStack(str(tmp_path / "none"))
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="expected images in the folder"):
+    with pytest.raises(ValueError, match=r"expected images \(.*\) in the folder, got 0"):
         ImageStack(str(tmp_path / "empty"))
     write_grey(tmp_path / "empty/a.png", np.arange(12, dtype=np.uint8).reshape(3, 4) * 20)
-    with pytest.raises(ValueError, match=r"a\.png varies along both"):
+    with pytest.raises(ValueError, match=r"a\.png, which varies along both"):
         ImageStack(str(tmp_path / "empty"))
     np.save(tmp_path / "b.npy", some_patterns(64))
     with pytest.raises(ValueError, match="expected patterns of 100 pixels, got 64"):

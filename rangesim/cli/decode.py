@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rangesim.cli.images import (
+    ALL_AXES,
     AxesOption,
     BitsOption,
     ChannelOption,
@@ -104,13 +105,15 @@ def decode_command(
     from rangesim.files.atomic_directories import check_directory
     from rangesim.report.figures import map_pictures
     from rangesim.results.decoded_captures import DECODED, Decoded, save_decoded
+    from rangesim.sensors import is_file_name
 
     options = ImageOptions(sensor, code, projector, axes, order, set_, images, rotate, mirror, channel, bits, patterns)
     stored = _stored(calibration, code_step, unit)
     announce_linked_output(out, check_directory(out, DECODED, inputs=[capture]))
     camera_size = None if stored is None else stored.camera_size
+    of_file = sensor is not None and is_file_name(sensor)  # which states its axes
     loaded = load_frames(
-        capture, options, camera_size=camera_size, projector_size=None if stored is None else stored.projector_size
+        capture, options, None if of_file else ALL_AXES, camera_size, None if stored is None else stored.projector_size
     )
     first, findings = loaded.captured.reference, loaded.findings
     if calibration and len(loaded.captured.captures) > 1:
@@ -138,7 +141,7 @@ def decode_command(
 
 
 def _stored(calibration: Path | None, code_step: int, unit_m: float | None) -> StoredCalibration | None:
-    """What a calibration file holds; None without a file, and for one of a time-of-flight camera."""
+    """Contents of a calibration file; None without a file, and for one of a time-of-flight camera."""
     from rangesim.rig.calibration_files import read_calibration
 
     if calibration is None or calibration.suffix.lower() == TOF_SUFFIX:

@@ -58,20 +58,22 @@ def likely_cause(image: RangeImage, capture: Capture) -> str | None:
             f"the brightest value is 0 of {capture.full_scale:.0f}, so nothing was recorded: check that these are the "
             "frames (--images), and that the camera exposed them"
         )
-    is_measured = float(image.valid.mean()) >= MIN_MEASURED
+    measured = float(image.valid.mean())
+    clipped = float((image.status == Status.SATURATED).mean())
+    too_bright = f"{100 * clipped:.0f} % of the pixels are as bright as the camera can tell: expose shorter"
     may_have_fewer_bits = capture.is_digital and capture.detector is None and capture.sensor.gate is None
-    if may_have_fewer_bits and (not is_measured or capture.frames.dtype.itemsize > 1):  # few cameras have 16 bits
+    # Few cameras have 16 bits.
+    if may_have_fewer_bits and (measured < MIN_MEASURED or capture.frames.dtype.itemsize > 1):
         brightest = int(capture.frames.max())
         if brightest < MIN_BRIGHTEST * capture.full_scale:
             return (
-                f"the brightest value is {brightest} of {capture.full_scale:.0f}: give --bits "
-                f"{max(brightest.bit_length(), 1)} if the camera has no more, or expose longer"
+                f"the brightest value is {brightest} of {capture.full_scale:.0f}: give --bits {brightest.bit_length()} "
+                f"if the camera has no more{f'; {too_bright}' if clipped > measured else ', or expose longer'}"
             )
-    if is_measured:
+    if measured >= MIN_MEASURED:
         return None
-    measured = float(image.valid.mean())
-    if (clipped := float((image.status == Status.SATURATED).mean())) > measured:
-        return f"{100 * clipped:.0f} % of the pixels are as bright as the camera can tell: expose shorter"
+    if clipped > measured:
+        return too_bright
     if capture.is_digital and float((image.status == Status.LOW_SIGNAL).mean()) > measured:
         swing = float(np.median(np.ptp(capture.frames, axis=0)))
         return (
@@ -95,7 +97,7 @@ def unchecked(image: RangeImage) -> str | None:
 
 
 def summary(decoded: Decoded, out: Path, is_given: bool = False) -> str:
-    """One line on the result: fractions of all statuses that pixels have, depths, doubts, and the likely cause.
+    """One line on the result: fractions of all statuses that pixels have, depths, notes, doubts, and the likely cause.
 
     is_given : whether the user gave a calibration for the capture, so that it may be one of another rig.
     """
@@ -111,7 +113,7 @@ def summary(decoded: Decoded, out: Path, is_given: bool = False) -> str:
         parts.append(clause)
     if image.camera is None:
         parts.append("without --calibration there is no depth")
-    parts += [doubt.removesuffix(".") for doubt in image.doubts]
+    parts += [text.removesuffix(".") for text in (*image.notes, *image.doubts)]
     if decoded.likely_cause:
         parts.append(decoded.likely_cause)
     if is_given and (clause := unchecked(image)):

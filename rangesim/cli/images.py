@@ -131,7 +131,7 @@ class ImageOptions:
     patterns: Path | None = None
 
     def given(self, names: Sequence[str]) -> str:
-        """Those of the named options that were given, as on the command line; "" if none was."""
+        """Names of the options that were given, of `names`, as on the command line; "" if none was."""
         return ", ".join(f"--{name}" for name in names if getattr(self, name))
 
 
@@ -146,7 +146,7 @@ class Loaded(NamedTuple):
 def load_frames(
     place: Path,
     options: ImageOptions,
-    axes: str | None = ALL_AXES,
+    axes: str | None,
     camera_size: tuple[int, int] | None = None,
     projector_size: tuple[int, int] | None = None,
 ) -> Loaded:
@@ -287,7 +287,7 @@ def _by_name(sensor: Sensor, imported: ImportedFrames, axes: str | None) -> tupl
 
 
 def sensor_of_images(
-    options: ImageOptions, axes: str | None = ALL_AXES, projector_size: tuple[int, int] | None = None
+    options: ImageOptions, axes: str | None, projector_size: tuple[int, int] | None = None
 ) -> Sensor | None:
     """The sensor that the options name; None if they name no sensor, or one whose projector has no known size.
 
@@ -300,7 +300,6 @@ def sensor_of_images(
     ValueError
         The options name no known sensor, or settings that the sensor refuses.
     """
-    from rangesim.sensors import is_file_name
     from rangesim.sensors.registry import IMAGES_PRESET
 
     name = options.sensor or options.code
@@ -309,7 +308,7 @@ def sensor_of_images(
     size = _size(options.projector) if options.projector is not None else projector_size if has_projector else None
     if size is None and name is None:
         return None
-    coded = options.axes or (None if name is not None and is_file_name(name) else axes)
+    coded = options.axes or axes
     if size is None and not has_projector:
         if options.axes is not None:
             raise ValueError(f"expected --axes only for a sensor with a projector, got it for {sensor.type_name}.")

@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from rangesim.capture import Capture
+
+if TYPE_CHECKING:
+    from rangesim.codes.fringe_gamma import FringeGamma
 
 
 class Contrast(NamedTuple):
@@ -77,7 +80,8 @@ class AxisCode:
     cell_px : float, projector pixels: size of the cell to which the frames tell a place that is not sub-pixel.
     sigma_px : (h, w) float32, standard deviation of `coordinate`, projector pixels; None: not known.
     coarse : AxisCode that was refined to this one, such as Gray code by fringes; None: there is none.
-    gamma : float, exponent of the response that the fringes show, and for which their phases were corrected; 1: linear.
+    gammas : what the fringes of each period tell of the response, for which their phases were corrected; empty: the
+        code has no fringes that are corrected.
     """
 
     coordinate: np.ndarray
@@ -85,4 +89,9 @@ class AxisCode:
     cell_px: float
     sigma_px: np.ndarray | None = None
     coarse: AxisCode | None = None
-    gamma: float = 1.0
+    gammas: tuple[FringeGamma, ...] = ()
+
+    @property
+    def gamma(self) -> float:
+        """Exponent of the response for which the fringes were corrected, the median of their periods; 1: linear."""
+        return float(np.median([one.gamma for one in self.gammas])) if self.gammas else 1.0

@@ -24,6 +24,7 @@ from rangesim.codes.bit_checks import (
 from rangesim.codes.bits import Words, bit_frames, decode_bits
 from rangesim.codes.code import Code, CodeThresholds, stripes
 from rangesim.response import DenseResponse
+from rangesim.sensor import Background, least_signal_for
 from rangesim.settings.config import has_defaults
 
 
@@ -47,11 +48,16 @@ class BitCode(Code):
     @property
     @abstractmethod
     def noun(self) -> str:
-        """What the words are, in running text: "Gray code"."""
+        """Name of the words in running text: "Gray code"."""
 
     @abstractmethod
     def words_of_cells(self, bits: int) -> np.ndarray:
         """(2^bits,) int, the word of each cell; each word is there once."""
+
+    def base_of(self, bits: int) -> int | None:
+        """Number of the bit with which all others are combined, so that the stripes of all bits have about one width;
+        None: they have many widths."""
+        return None
 
     @classmethod
     def variants(cls) -> tuple[BitCode, ...]:
@@ -113,6 +119,22 @@ class BitCode(Code):
             seen, neighbours, words
         )
 
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
+        """The light that white - black needs, or that a bit without inverse needs, if that is more.
+
+        Such a bit is the sign of 2 pattern - (white + black). At a lit pixel that difference is the light S, and its
+        variance is 4 (S + n) + (S + n) + n = 5 S + 6 n, with n of a frame without S; so S = t sqrt(5 S + 6 n) for t
+        sigmas, which is 3 sqrt(6) = 7.3 times sqrt(n) in weak light.
+        """
+        least = super().least_signal(size, shown, thresholds, background)
+        is_alone = any(bit.pattern is None or bit.inverse is None for bit in bit_frames(list(shown), self.bits(size)))
+        if background.noise_variance is None or not is_alone:
+            return least
+        noise_variance = 6 * (background.ambient + background.noise_variance)
+        return np.maximum(least, least_signal_for(thresholds.gray.bit_sigmas**2, 5.0, noise_variance))
+
     @property
     def details(self) -> str:
         name = self.noun[0].upper() + self.noun[1:]
@@ -127,7 +149,7 @@ class BitCode(Code):
     maxsize=256
 )  # the cells do not depend on the size of a cell, but codes of all kinds are asked in each decode
 def _words(code: BitCode, bits: int) -> Words:
-    return Words.of(code.noun, code.words_of_cells(bits))
+    return Words.of(code.noun, code.words_of_cells(bits), code.base_of(bits))
 
 
 @lru_cache(maxsize=64)  # a sensor is asked for its responses again and again

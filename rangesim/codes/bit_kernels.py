@@ -55,6 +55,23 @@ def _at(table, number):  # type: ignore[no-untyped-def]
 
 
 @cached_njit(nogil=True, error_model="numpy")
+def middle_of(values):  # type: ignore[no-untyped-def]
+    """(h, w) float32, median of the values (k, h, w) float32 of each pixel; of an even number, the upper one."""
+    result = np.empty(values.shape[1:], np.float32)
+    sorted_values = np.empty(len(values), np.float32)
+    for row in range(values.shape[1]):
+        for column in range(values.shape[2]):
+            for k in range(len(values)):  # insertion sort, because a word has few bits
+                value, place = values[k, row, column], k
+                while place > 0 and sorted_values[place - 1] > value:
+                    sorted_values[place] = sorted_values[place - 1]
+                    place -= 1
+                sorted_values[place] = value
+            result[row, column] = sorted_values[len(values) // 2]
+    return result
+
+
+@cached_njit(nogil=True, error_model="numpy")
 def neighbour_keys(word, down, across):  # type: ignore[no-untyped-def]
     """(n,) int64, words of each pixel and of the neighbour `down` rows and `across` columns on, as one number each.
 
@@ -95,7 +112,7 @@ def coarse_step(pairs, cell_of, bits):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy")
 def octaves_nearer(pairs, before, after, step):  # type: ignore[no-untyped-def]
-    """How much nearer pairs lie by one table of cells than by another: three sums over the pairs.
+    """Three sums over pairs that compare their distances by two tables of cells.
 
     They are the number of pairs whose distance is halved or doubled at least, the number of those whose distance is
     halved, and the sum of all changes, in powers of two.

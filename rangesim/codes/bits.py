@@ -21,26 +21,59 @@ CELL_SIGMA = 12**-0.5
 """Standard deviation of a place that is known to lie in a cell, in cells: that of an even distribution."""
 
 LONE_NOISE = 3**0.5
-"""Ratio of the noise of 2 pattern - (white + black) to that of pattern - inverse, at equal noise of all frames."""
+"""Ratio of the noise of 2 pattern - (white + black) to that of pattern - inverse, at equal noise of all frames: their
+variances are those of 4 + 1 + 1 frames and of 2."""
+
+
+MIN_EVEN_CONTRAST = 0.5
+"""Least |pattern - inverse| of a certain bit, as a fraction of the median over the bits of the pixel, in codes whose
+stripes have one width. A bit with less comes from a pixel of which a quarter or more sees the other side of an edge. On
+sharp, still surfaces a third to a half lose no pixel; with half, a moving scene has 2 % of wrong readings instead of 11
+% with a third."""
+
+MIN_SHARP_CONTRAST = 0.52
+"""Least median of |pattern - inverse| in codes whose stripes have one width, as a fraction of white - black, at which
+bits that change within a stripe of the base can be trusted. There, a stripe of half the width lies beside its inverse.
+A Gaussian blur of sigma reverses the sign of the pair if exp(-w^2 / 2 sigma^2) > 1/2, with the half width w; that is
+sigma > 0.85 w, and stripes of period 4 w then have the contrast 4 / pi exp(-2 pi^2 sigma^2 / (4 w)^2) = 0.52."""
+
+MAX_EVEN_RATIO = 1.2
+"""Largest ratio of the most contrast of a bit to the median over the bits, in codes whose stripes have one width, at
+which interreflection and not blur has lowered the contrast. It is below 1.08 at 90 % of the pixels of a white corner,
+and above 1.29 at 90 % of the pixels out of focus (docs/codes_table.md)."""
+
+MAX_FINE_RATIO = 0.7
+"""Largest contrast of a bit finer than the base, as a fraction of the median over the bits, that blur leaves. At the
+blur of `MIN_SHARP_CONTRAST` it is 0.56; the rest is for noise. Interreflection leaves the fine bits alone."""
 
 
 class Words(NamedTuple):
     """The words that a code gives to its cells.
 
     noun : what the words are, in running text. of_cell : (2^b,) int32, word of each cell. cell_of : (2^b,) int32, cell
-    of each word.
+    of each word. base_bit : number of the bit with which all others are combined, so that the stripes of all bits have
+    about one width; None: they have many widths. within_stripe : (2^b,) int32, for each cell the set of bits that
+    change within its stripe of the base; (0,) without a base.
     """
 
     noun: str
     of_cell: np.ndarray
     cell_of: np.ndarray
+    base_bit: int | None = None
+    within_stripe: np.ndarray = np.empty(0, np.int32)
 
     @classmethod
-    def of(cls, noun: str, of_cell: np.ndarray) -> Words:
+    def of(cls, noun: str, of_cell: np.ndarray, base_bit: int | None = None) -> Words:
         """Words from those of all cells (2^b,), each word once."""
+        of_cell = of_cell.astype(np.int32)
         cell_of = np.empty(len(of_cell), dtype=np.int32)
         cell_of[of_cell] = np.arange(len(of_cell), dtype=np.int32)
-        return cls(noun, of_cell.astype(np.int32), cell_of)
+        if base_bit is None:
+            return cls(noun, of_cell, cell_of)
+        is_first = np.diff(of_cell >> base_bit & 1, prepend=-1) != 0
+        starts, stripe = np.flatnonzero(is_first), np.cumsum(is_first) - 1
+        within = np.bitwise_or.reduceat(of_cell ^ of_cell[starts[stripe]], starts)[stripe]
+        return cls(noun, of_cell, cell_of, base_bit, within)
 
     @property
     def bits(self) -> int:
@@ -86,6 +119,9 @@ def decode_bits(seen: AxisFrames, words: Words, cell_px: int, thresholds: GrayTh
     edge of a stripe has one uncertain bit, which does no harm if a flip of it leads to a neighbouring cell: the
     function then returns the edge between the two cells. It refuses all other pixels with uncertain bits.
 
+    If the stripes of all bits have one width, as in XOR codes, all bits have one contrast, except at edges and out of
+    focus. A bit with clearly less is uncertain, and out of focus all bits are that change within a stripe.
+
     If white or black was not captured either, it is estimated from the frames. Such an estimate is wrong at cells that
     are dark in all frames, or lit in all. Blur from the next cell can look like a bit there, so cells next to these are
     refused, too, unless two frames show each level. It is right elsewhere, because in a code whose neighbouring cells
@@ -105,6 +141,8 @@ def decode_bits(seen: AxisFrames, words: Words, cell_px: int, thresholds: GrayTh
 
     def decode_rows(rows: slice) -> None:
         word, uncertain = _classify(capture, seen.frames[:, rows], _rows_of(contrast, rows), shown, thresholds, least)
+        if words.base_bit is not None:
+            uncertain |= _uneven(seen.frames[:, rows], _rows_of(contrast, rows), shown, words, word)
         low, high = words.cell_of[word], words.cell_of[word ^ uncertain]
         on_edge = (uncertain & (uncertain - 1) == 0) & (np.abs(low - high) <= 1)
         coordinate[rows] = (0.5 * (low + high) + 0.5) * cell_px
@@ -178,6 +216,36 @@ def _classify(
         word = (word << 1) | (difference > 0)
         uncertain = (uncertain << 1) | is_uncertain
     return word, uncertain
+
+
+def _uneven(
+    frames: np.ndarray, contrast: Contrast, shown: list[BitFrames], words: Words, word: np.ndarray
+) -> np.ndarray:
+    """(h, w) int32, the set of bits that are uncertain because of the contrast of the other bits.
+
+    Parameters
+    ----------
+    word : (h, w) int32, as read.
+    """
+    from rangesim.codes.bit_kernels import middle_of
+
+    total = contrast.white.astype(np.float32) + contrast.black
+    size = np.empty((len(shown), *word.shape), dtype=np.float32)
+    for one, bit in zip(size, shown, strict=True):
+        if bit.pattern is not None and bit.inverse is not None:
+            np.subtract(frames[bit.pattern], frames[bit.inverse], out=one, dtype=np.float32)
+        else:
+            np.subtract(2 * frames[bit.pattern if bit.inverse is None else bit.inverse].astype(np.float32), total, one)
+    np.abs(size, out=size)
+    middle = middle_of(size)
+    uncertain = np.zeros_like(word)
+    for one in size:
+        uncertain = (uncertain << 1) | (one < MIN_EVEN_CONTRAST * middle)
+    is_blurred = (middle < MIN_SHARP_CONTRAST * contrast.values) & (size.max(axis=0) > MAX_EVEN_RATIO * middle)
+    assert words.base_bit is not None
+    for fine in size[len(size) - words.base_bit :]:
+        is_blurred &= fine < MAX_FINE_RATIO * middle
+    return np.asarray(uncertain | np.where(is_blurred, words.within_stripe[words.cell_of[word]], 0))
 
 
 class _Levels(NamedTuple):

@@ -24,6 +24,14 @@ from rangesim.settings.config import Named
 AXES = ("columns", "rows")
 """Axes of a projector that a code may follow; the index of an axis here is the index of its projector coordinate."""
 
+MAX_OUTSIDE_FRACTION = 0.02
+"""Largest fraction of the decoded pixels that may see no place of the projector, before other conventions of a code are
+tried. Interreflection and noise make less."""
+
+MAX_LEFT_OUTSIDE = 0.1
+"""Largest number of pixels outside the projector in another convention, as a fraction of that in the given one, at
+which it explains the frames. Pixels that are wrong at random lie outside in both."""
+
 
 class CodeThresholds(NamedTuple):
     """Thresholds of all kinds of codes. Each kind takes those that it needs."""
@@ -33,7 +41,7 @@ class CodeThresholds(NamedTuple):
 
 
 class Code(Named, ABC):
-    """How a stack of patterns codes one axis of a projector. Subclasses are frozen dataclasses.
+    """A stack of patterns that codes one axis of a projector. Subclasses are frozen dataclasses.
 
     Examples
     --------
@@ -49,6 +57,9 @@ class Code(Named, ABC):
     """Name on the command line and in files."""
     title: ClassVar[str] = ""
     """Name of a sensor with this code in running text; "": made of `type_name`."""
+    tells_direction: ClassVar[bool] = True
+    """Whether frames that are read in the wrong direction contradict each other. Fringes alone do not: if they move the
+    other way, they agree on mirrored places."""
 
     # ---- Patterns ----------------------------------------------------------------------------------------------------
 
@@ -122,9 +133,21 @@ class Code(Named, ABC):
         """
         return None
 
-    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
+    def other_conventions(self) -> Iterator[tuple[Code, str]]:
+        """Codes with the same number of frames whose patterns are in use under the same name, each with a sentence that
+        says what differs; by default none. `rangesim.conventions.detect_convention` tries them."""
+        yield from ()
+
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
         """(h, w) float64, least light of the projector at full power that the thresholds accept, in the background's
-        unit; by default what the difference of white and black needs."""
+        unit; by default what the difference of white and black needs.
+
+        Parameters
+        ----------
+        size, shown : as for `check_shown`.
+        """
         if background.noise_variance is None:
             return background.floor(thresholds.gray.relative_contrast)
         noise_variance = 2 * (background.ambient + background.noise_variance)  # white - black: the noise of two frames

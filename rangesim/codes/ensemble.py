@@ -20,6 +20,7 @@ from rangesim.codes.xor import XorCode
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.response import DenseResponse
+from rangesim.sensor import Background
 from rangesim.settings.bounds import check_fields, whole
 
 MAX_APART_CELLS = 1.0
@@ -89,8 +90,7 @@ class EnsembleCode(Code):
 
     def check_shown(self, size: int, shown: Sequence[str]) -> None:
         for prefix, code in self.members.items():
-            levels = [name for name in shown if name in ("white", "black")]
-            code.check_shown(size, [*levels, *(n.removeprefix(prefix) for n in shown if n.startswith(prefix))])
+            code.check_shown(size, _of_member(shown, prefix))
 
     def responses(self, axis: int, size: int) -> tuple[DenseResponse, ...]:
         return tuple(response for code in self.members.values() for response in code.responses(axis, size))
@@ -131,6 +131,15 @@ class EnsembleCode(Code):
         status[(apart <= within) & (high - low <= 2 * within)] = Status.OK
         return best, status
 
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
+        needed = [
+            code.least_signal(size, _of_member(shown, prefix), thresholds, background)
+            for prefix, code in self.members.items()
+        ]
+        return np.sort(needed, axis=0)[1]  # two codes have to be read
+
     def contradiction(self, seen: AxisFrames, code: AxisCode) -> str | None:
         assert isinstance(code, EnsembleAxisCode)
         for (prefix, member), own in zip(self.members.items(), code.members, strict=True):
@@ -146,3 +155,8 @@ class EnsembleCode(Code):
     def representative(self, size: int) -> list[str]:
         prefix, code = next(iter(self.members.items()))
         return [prefix + name for name in code.representative(size)]
+
+
+def _of_member(shown: Sequence[str], prefix: str) -> list[str]:
+    """White and black, and the frames of a code without their prefix."""
+    return [name.removeprefix(prefix) for name in shown if name in ("white", "black") or name.startswith(prefix)]

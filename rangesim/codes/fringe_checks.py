@@ -6,18 +6,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations, permutations
-from typing import Literal
 
 import numpy as np
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames
+from rangesim.codes.fringe_direction import phase_direction
 from rangesim.codes.fringe_gamma import MAX_SAMPLES, FringeGamma
-from rangesim.codes.fringe_stack import FringeStack
-from rangesim.codes.fringes import STARTS, FringeConvention
+from rangesim.codes.fringe_stack import MIN_AGREEING, FringeStack
+from rangesim.codes.fringes import FringeConvention
 from rangesim.decoding.phase_shift import Phase, phase_of
 from rangesim.decoding.pixel_samples import MAX_PIXELS, MIN_PIXELS, evenly_spread
 from rangesim.decoding.status import Status
-from rangesim.robust_scale import sigma_from_median
+from rangesim.robust_scale import TO_SIGMA
 
 OUTSIDE_TURNS = 0.005
 """Least distance of a phase from its Gray cell, in turns, at which the phase counts as outside. It allows for rounding:
@@ -49,6 +49,11 @@ MAX_LEVEL_ERROR = 0.03
 """Largest distance of the mean of the fringes from the middle between black and white, as a fraction of white - black.
 A larger one allows a stronger gamma."""
 
+MAX_UNEVEN_LEVEL = 0.01
+"""Largest root mean square of that distance about its own mean over all phases, at which the mean of the fringes counts
+as off by the same at all phases. Blurred fringes of gammas from 0.5 to 3 have at most 0.006 (measured); one of four
+fringes that is exposed 1.3 times makes 0.027."""
+
 PHASE_BINS = 8
 """Number of parts into which a period is divided, to see at which phases the mean of the fringes is off. One missing
 frame of N shows at some phases only; if there were more parts, each would hold fewer pixels."""
@@ -66,26 +71,14 @@ MAX_SINUSOID_ERROR = 0.08
 neighbours of 16 frames differ by 0.097, of 4 by 0.35; a gamma of 1.2 that is not corrected
 differs by 0.043 (measured)."""
 
-MIN_AGREEING = 0.8
-"""Least fraction of the pixels that agree after a correction, at which the correction is named: as many as may disagree
-without a word otherwise."""
-
-MIN_ORIGIN_PX = 0.15
-"""Least difference of the start of fringes that is told, in projector pixels, below a third of that of a pixel's edge
-and its centre."""
-
-MIN_DIRECTION = 0.5
-"""Least agreement of phase and Gray code from pixel to pixel that tells the direction of the fringes: three of four
-pairs of neighbours. By chance it is 0."""
-
-MIN_CLEAR_TURNS, MAX_CLEAR_TURNS = 0.001, 0.4
-"""Least and largest step of the phase from pixel to pixel, in turns, that shows a direction: above the rounding of the
-phase, and below half a turn by a fifth, because half a turn is the same in both directions."""
+MAX_SINUSOID_PIXELS = 5000
+"""Largest number of pixels whose fringes are compared with a sinusoid. An eighth of them is in one part of the period:
+the standard error of its median is 5 % of the noise, so that noise up to a fifth of the swing hides no fault."""
 
 MIN_BACKWARD = 0.5
 """Least disagreement of phase and Gray code from pixel to pixel at which fringes count as backward although every place
-lies in its cell. It is 1 if all run backward, -1 if none does, and near 0 if the pixels of the camera are as wide as
-half a period, so that the direction is a guess."""
+lies in its cell. It is 1 if all run backward, -1 if none does, and 0 if the pixels of the camera are too wide to tell
+(`phase_direction`)."""
 
 MEDIAN_ERROR = 1.253
 """Ratio of the standard error of a median to that of a mean, for normally distributed values: sqrt(pi / 2)."""
@@ -119,9 +112,9 @@ def fringe_contradiction(
     mean, resultant = _circular_mean(off)
     offset_px = mean * period_px
     one_sided = max(above, below) > MIN_ONE_SIDED_FRACTION + 3 * min(above, below) and abs(offset_px) > MIN_OFFSET_PX
-    backwards = convention.sign * _direction(_inside_cell(gray, refined), gray, frames)
+    backwards = convention.sign * phase_direction(frames, gray, _inside_cell(gray, refined), period_px)
     if far <= MAX_FAR_FRACTION and not one_sided:
-        if backwards > -MIN_BACKWARD or not _resolves_cells(gray):
+        if backwards > -MIN_BACKWARD:
             return None
         return (
             f"the fringes along {axis} contradict the Gray code: from one cell to the next, their phase runs the other "
@@ -146,24 +139,29 @@ def fringe_contradiction(
     return f"{text}, about as many as by chance: check the period, the steps, the order of the frames and the code."
 
 
-def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode) -> str | None:
+def level_contradiction(seen: AxisFrames, gray: AxisCode, refined: AxisCode, gamma: FringeGamma) -> str | None:
     """A sentence if the fringes contradict white and black as a whole; None if they agree.
 
     Light adds up, also the light of interreflection. So the mean of the fringes is the middle between white and black
-    at every phase, or what the gamma of `refined` makes of it. A frame that is missing or there twice moves this mean
-    at some phases, a gamma at all phases.
+    at every phase, or what a gamma makes of it. A frame that is missing or there twice moves this mean at some phases,
+    a gamma at all phases. If fringes of a gamma are blurred, their ripple is that of a smaller gamma, but their mean
+    stays. So a mean that is off by the same at all phases is no fault where the ripple tells how to correct it.
 
     Parameters
     ----------
-    seen : frames (N, h, w), the fringes of the axis. gray, refined : the code before and after `refine_by_phase`.
+    seen : frames (N, h, w), the fringes of one period. gray, refined : the code before and after they refine it.
+    gamma : what these fringes tell of the response.
     """
     inside = _inside_cell(gray, refined)
     in_many_cells = len(np.unique(gray.coordinate[inside][:: 1 + inside.size // MAX_PIXELS])) >= MIN_CELLS
-    return _level_fault(seen, inside, refined.gamma, in_many_cells)
+    return _level_fault(seen, inside, gamma, in_many_cells)
 
 
-def _level_fault(seen: AxisFrames, usable: np.ndarray, gamma: float, in_many_cells: bool) -> str | None:
-    """As `level_contradiction`, from the pixels `usable` (h, w), which lie `in_many_cells` or fringes or not."""
+def _level_fault(seen: AxisFrames, usable: np.ndarray, gamma: FringeGamma, in_many_cells: bool) -> str | None:
+    """A sentence if the fringes contradict white and black at the pixels `usable` (h, w) bool; None if they do not.
+
+    in_many_cells : whether these pixels lie in many Gray cells or fringes, so that a constant frame shows.
+    """
     white, black, axis = seen.contrast.white, seen.contrast.black, seen.axis
     if not seen.contrast.is_measured:
         return None
@@ -176,8 +174,9 @@ def _level_fault(seen: AxisFrames, usable: np.ndarray, gamma: float, in_many_cel
     members = _by_phase(phase.normalised)
     if not members:
         return None
-    off, noise = _medians(values.mean(axis=0) - _expected(phase, len(values), gamma).mean(axis=0), members)
-    if np.sqrt((off**2).mean()) < MAX_LEVEL_ERROR + 3 * np.sqrt((noise**2).mean()):
+    off, noise = _medians(values.mean(axis=0) - _expected(phase, len(values), gamma.gamma).mean(axis=0), members)
+    margin = 3 * float(np.sqrt((noise**2).mean()))
+    if np.sqrt((off**2).mean()) < MAX_LEVEL_ERROR + margin or (gamma.is_told and off.std() < MAX_UNEVEN_LEVEL + margin):
         return None
     if in_many_cells and (fault := _odd_frame(values, members, [seen.shown_name(name) for name in seen.names])):
         return f"the fringes along {axis} contradict white and black: {fault}."
@@ -197,11 +196,11 @@ def stack_contradiction(seen: AxisFrames, code: AxisCode, stack: FringeStack) ->
     seen : frames (n, h, w), those of the stack. code : what `FringeStack.decode` or `refine_by_phase` made of them.
     """
     usable = ((code.status == Status.OK) | (code.status == Status.CODE_ERROR)) & seen.contrast.is_enough
-    for i in range(len(stack.steps)):
+    for i, gamma in enumerate(code.gammas):
         one = stack.frames_of(seen, i)
-        if code.coarse is None and (text := _level_fault(one, usable, code.gamma, True)):
+        if code.coarse is None and (text := _level_fault(one, usable, gamma, True)):
             return text
-        if text := _sinusoid_fault(one, usable, stack.gamma(seen, i, usable, code.coarse is not None)):
+        if text := _sinusoid_fault(one, usable, gamma):
             return text
     return _agreement_fault(seen, code, stack, usable) if code.coarse is None else None
 
@@ -210,11 +209,11 @@ def _sinusoid_fault(seen: AxisFrames, usable: np.ndarray, gamma: FringeGamma) ->
     """A sentence if no sinusoid of any gamma explains the fringes of one period; None if one does."""
     if not gamma.is_explained and len(seen.frames) == 3:
         return (
-            f"the fringes along {seen.axis} are no sinusoids ({seen.shown_name(seen.names[0])} and next), and no gamma "
-            "explains their shape: check that projector and camera are linear and that no frame is repeated."
+            f"the fringes along {seen.axis} are no sinusoids ({seen.shown_name(seen.names[0])} and next), and tell no "
+            "gamma that explains their shape: check that projector and camera are linear and that no frame is repeated."
         )
     used = evenly_spread(np.flatnonzero(usable))
-    used = used[:: 1 + len(used) // MAX_SAMPLES]
+    used = used[:: 1 + len(used) // MAX_SINUSOID_PIXELS]
     if len(used) < MIN_PIXELS or len(seen.frames) == 3:
         return None
     frames = seen.frames.reshape(len(seen.frames), -1)[:, used].astype(np.float64)
@@ -250,9 +249,8 @@ def _misfit(frames: np.ndarray, gamma: FringeGamma) -> float:
     members = _by_phase(phase.normalised)
     if not members:
         return 0.0
-    found = [_medians(values, members) for values in rest]
-    excess = np.mean([off**2 - 9 * noise**2 for off, noise in found])
-    return float(np.sqrt(max(excess, 0.0)))
+    off, noise = _medians(rest, members)
+    return float(np.sqrt(max((off**2 - 9 * noise**2).mean(), 0.0)))
 
 
 def _agreement_fault(seen: AxisFrames, code: AxisCode, stack: FringeStack, usable: np.ndarray) -> str | None:
@@ -299,90 +297,6 @@ def _other_places(
                 yield f"{name} to {fault}, so check the order of their frames", elsewhere
 
 
-def measured_convention(
-    seen: AxisFrames, gray: AxisCode, period_px: float, given: FringeConvention
-) -> FringeConvention | None:
-    """The convention with which fringes agree best with the Gray code of the same axis; None if none does.
-
-    The places that the phases tell must lie within their Gray cells. Their mean difference, as an angle, tells where
-    the fringes start, for each of the two directions. `given` is returned if it fits within its uncertainty; else the
-    nearest of the known starts at a pixel's edge or centre; else one whose `origin_px` is what was measured.
-
-    Parameters
-    ----------
-    seen : frames (N, h, w), the fringes of the axis, with their contrast. gray : code of the axis.
-    period_px : float, projector pixels. given : FringeConvention that the user stated.
-    """
-    fit = _offset(seen, gray, period_px)
-    if fit is None:
-        return None
-    sign, turns, error = fit
-    tolerance = max(3 * error, MIN_ORIGIN_PX / period_px)
-    direction: Literal["forward", "backward"] = "forward" if sign > 0 else "backward"
-
-    def away(convention: FringeConvention) -> float:
-        return abs(float(_wrapped(np.asarray(turns - convention.shift_turns(0, 1, period_px)))))
-
-    if given.direction == direction and away(given) <= tolerance:
-        return given
-    known = [FringeConvention(start, direction, x) for start in STARTS for x in (0.0, 0.5)]  # type: ignore[arg-type]
-    nearest = min(known, key=away)
-    if away(nearest) <= tolerance:
-        return nearest
-    at_start = replace(nearest, origin_px=0.0)
-    rest = float(_wrapped(np.asarray(turns - at_start.shift_turns(0, 1, period_px)))) * period_px
-    return replace(at_start, origin_px=round(rest, 3))
-
-
-def convention_fit(seen: AxisFrames, gray: AxisCode, period_px: float, convention: FringeConvention) -> float:
-    """Fraction of pixels, 0 to 1, whose place by a convention lies in their Gray cell or a 32nd of a period beyond.
-
-    By chance it is the cell and a 16th of a period, over the period. Parameters as for `measured_convention`.
-    """
-    used = _gray_pixels(seen, gray)
-    if not len(used):
-        return 0.0
-    phase = phase_of(seen.frames.reshape(len(seen.frames), -1)[:, used])
-    place = convention.place_turns(phase.normalised, period_px)
-    off = _wrapped(place - gray.coordinate.ravel()[used] / np.float32(period_px))
-    return float((np.abs(off) <= gray.cell_px / (2 * period_px) + FAR_TURNS / 4).mean())
-
-
-def _offset(seen: AxisFrames, gray: AxisCode, period_px: float) -> tuple[int, float, float] | None:
-    """Direction of fringes (1 or -1), their shift in turns, and its standard error; None if Gray code tells none.
-
-    With place = direction * phase + shift, in turns, the shift is the mean of gray / period - direction * phase.
-    """
-    used = _gray_pixels(seen, gray)
-    if len(used) < MIN_PIXELS:
-        return None
-    phase = phase_of(seen.frames.reshape(len(seen.frames), -1)[:, used])
-    within = gray.coordinate.ravel()[used] / np.float32(period_px)
-    mask = np.zeros(gray.status.size, dtype=bool)
-    mask[used] = True
-    # Cells of half a period lie alike for both directions, so that neighbouring pixels must tell.
-    direction = _direction(mask.reshape(gray.status.shape), gray, seen.frames)
-    if abs(direction) < MIN_DIRECTION:
-        return None
-    sign = 1 if direction > 0 else -1
-    off = within - sign * phase.normalised
-    turns, resultant = _circular_mean(off)
-    if resultant < MIN_CONCENTRATION * float(np.sinc(gray.cell_px / period_px)):
-        return None
-    _, cell, counts = np.unique(gray.coordinate.ravel()[used], return_inverse=True, return_counts=True)
-    of_cells = np.bincount(cell, weights=_wrapped(off - turns)) / counts  # a cell that is seen in part has another mean
-    return sign, turns, float(of_cells.std() / len(counts) ** 0.5)
-
-
-def _gray_pixels(seen: AxisFrames, gray: AxisCode) -> np.ndarray:
-    """(n,) int, flat indices of pixels within a Gray cell, not on an edge, whose fringes swing enough to compare."""
-    inside = ((gray.coordinate / gray.cell_px) % 1 == 0.5) & (gray.status == Status.OK)
-    inside &= ~seen.capture.saturated(seen.frames)
-    used = evenly_spread(np.flatnonzero(inside))
-    swing = 2 * phase_of(seen.frames.reshape(len(seen.frames), -1)[:, used]).modulation
-    return np.asarray(used[swing > 0.5 * MIN_SWING * seen.contrast.values.ravel()[used]])
-
-
 def _expected(phase: Phase, steps: int, gamma: float) -> np.ndarray:
     """(N, n) values from 0 to 1 of fringes of these phases, with a gamma."""
     shifts = np.arange(steps)[:, None] / steps
@@ -417,10 +331,12 @@ def _odd_frame(values: np.ndarray, members: list[np.ndarray], names: list[str]) 
 
 
 def _medians(values: np.ndarray, members: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Medians of groups of values (n,), and the standard error of each median; `members` are indices of the groups."""
-    medians = np.array([np.median(values[m]) for m in members])
-    spread = [sigma_from_median(values[m], x) for m, x in zip(members, medians, strict=True)]
-    return medians, MEDIAN_ERROR * np.array(spread) / np.sqrt([len(m) for m in members])
+    """Medians (..., groups) of values (..., n), and the standard error of each; `members` are indices of the groups."""
+    groups = [values[..., m] for m in members]
+    medians = [np.median(group, axis=-1, keepdims=True) for group in groups]
+    away = [np.median(np.abs(group - x), axis=-1, keepdims=True) for group, x in zip(groups, medians, strict=True)]
+    spread = MEDIAN_ERROR * TO_SIGMA * np.concatenate(away, axis=-1)
+    return np.concatenate(medians, axis=-1), spread / np.sqrt([len(m) for m in members])
 
 
 def _comparable(gray: AxisCode, refined: AxisCode) -> np.ndarray:
@@ -433,38 +349,6 @@ def _inside_cell(gray: AxisCode, refined: AxisCode) -> np.ndarray:
     inside = (gray.coordinate / gray.cell_px) % 1 == 0.5
     is_strong = (refined.status == Status.OK) | (refined.status == Status.CODE_ERROR)
     return np.asarray(inside & is_strong & (gray.status == Status.OK))
-
-
-def _direction(usable: np.ndarray, gray: AxisCode, frames: np.ndarray) -> float:
-    """Agreement of phase and Gray code from pixel to pixel: 1 if both grow the same way, -1 if the opposite way.
-
-    It is 0 if no pixels `usable` (h, w) bool are neighbours in neighbouring cells.
-    """
-    cell = gray.coordinate / gray.cell_px
-    agreement, pairs = 0.0, 0
-    for here, there in (
-        (np.s_[..., :, :-1], np.s_[..., :, 1:]),
-        (np.s_[..., :-1, :], np.s_[..., 1:, :]),
-    ):
-        crossed = usable[here] & usable[there] & (np.abs(cell[there] - cell[here]) == 1)
-        y, x = np.nonzero(crossed)
-        turn = _wrapped(
-            phase_of(frames[there][:, y, x]).normalised - phase_of(frames[here][:, y, x]).normalised,
-        )
-        is_clear = (np.abs(turn) > MIN_CLEAR_TURNS) & (np.abs(turn) < MAX_CLEAR_TURNS)
-        agreement += float((is_clear * np.sign(turn) * (cell[there][y, x] - cell[here][y, x])).sum())
-        pairs += len(y)
-    return agreement / max(pairs, 1)
-
-
-def _resolves_cells(gray: AxisCode) -> bool:
-    """Whether most decoded neighbours see the same cell, so that the pixels of the camera are finer than the cells."""
-    ok, same, pairs = gray.status == Status.OK, 0, 0
-    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        both = ok[here] & ok[there]
-        same += int(np.count_nonzero(both & (gray.coordinate[here] == gray.coordinate[there])))
-        pairs += int(np.count_nonzero(both))
-    return 2 * same > pairs
 
 
 def _wrapped(turns: np.ndarray) -> np.ndarray:

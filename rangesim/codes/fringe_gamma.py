@@ -32,6 +32,14 @@ RIPPLE_BINS = 16
 """Number of parts into which one ripple of the phase is divided. A ripple is nearly a sine, which needs a few; with
 more parts, each would hold fewer pixels."""
 
+MAX_GAP = 0.5
+"""Largest part of a ripple, between 0 and 1, in which three steps may show no phase. With a larger gap, a brightness
+that changes along the image looks like a ripple."""
+
+MIN_SLOPE = 0.02
+"""Least change of the ripple with the exponent, as a root mean square over the phases that are seen, at which they tell
+the exponent. Phases all over the ripple have 0.25 to 0.4 at an exponent of 1, and 0.04 at 4 (measured)."""
+
 TABLE_SIZE = 2048
 """Number of phases in a table of corrections. The error is below 1e-6 turns for gammas from 1.8 to
 2.6 and three or four steps (measured)."""
@@ -45,7 +53,8 @@ MIN_CHANGE = 0.02
 pixels of a period of 16; smaller ones are left alone, so that linear fringes are not touched."""
 
 MIN_SIGNIFICANCE = 5.0
-"""Least difference of the exponent from 1 that is corrected, in standard errors."""
+"""Least difference of the exponent from 1 that is corrected, in standard errors: noise alone makes as much in one
+capture of two million."""
 
 MIN_EXPLAINED = 0.8
 """Least fraction of the variance of the ripple that the exponent explains. Frames that are missing, exchanged or
@@ -58,14 +67,16 @@ told."""
 
 @dataclass(frozen=True)
 class FringeGamma:
-    """What fringes tell of the response of projector and camera.
+    """Response of projector and camera as fringes show it.
 
     gamma : float, exponent for which phases are corrected; 1: the fringes are linear, or do not tell.
     is_explained : bool, False if the fringes are not sinusoidal and no exponent explains how.
+    is_told : bool, False if too few pixels or phases are seen to tell whether the fringes are linear.
     """
 
     gamma: float = 1.0
     is_explained: bool = True
+    is_told: bool = True
 
     def corrected(self, phase: Phase, steps: int) -> Phase:
         """The phases of `steps` fringes as they would be of a linear response."""
@@ -80,7 +91,7 @@ class FringeGamma:
 
 
 def gamma_of(seen: AxisFrames, usable: np.ndarray, scale: np.ndarray | None) -> FringeGamma:
-    """What the fringes `seen` tell of the response.
+    """Response of projector and camera as the fringes `seen` show it.
 
     Parameters
     ----------
@@ -90,7 +101,7 @@ def gamma_of(seen: AxisFrames, usable: np.ndarray, scale: np.ndarray | None) -> 
     used = evenly_spread(np.flatnonzero(usable))
     used = used[:: 1 + len(used) // MAX_SAMPLES]
     if len(used) < MIN_PIXELS:
-        return FringeGamma()
+        return FringeGamma(is_told=False)
     frames = seen.frames.reshape(len(seen.frames), -1)[:, used]
     return measured_gamma(frames, None if scale is None else scale.ravel()[used])
 
@@ -114,29 +125,34 @@ def measured_gamma(frames: np.ndarray, contrast: np.ndarray | None = None) -> Fr
     steps, n = frames.shape[0], frames.shape[1]
     every = slice(None, None, 1 + n // MAX_SAMPLES)
     frames = frames[:, every].astype(np.float64)
-    part, value = _ripple(frames, None if contrast is None else contrast[every])
-    part = np.where(np.isfinite(value), part, -1)
-    members = [np.flatnonzero(part == b) for b in range(RIPPLE_BINS)]
-    used = [b for b, m in enumerate(members) if len(m) >= MIN_PIXELS / 10]
-    if len(used) < 0.75 * RIPPLE_BINS:
-        return FringeGamma()
-    medians = np.array([np.median(value[members[b]]) for b in used])
-    error = np.array([sigma_from_median(value[members[b]], x) for b, x in zip(used, medians, strict=True)])
-    error = 1.253 * error / np.sqrt([len(members[b]) for b in used])  # of a median: sqrt(pi / 2) times that of a mean
-    curves = _curves(steps, contrast is not None)[:, used]
-    difference = medians - curves
+    position, value = _ripple(frames, None if contrast is None else contrast[every])
+    part = np.where(np.isfinite(value), np.minimum((position * RIPPLE_BINS).astype(int), RIPPLE_BINS - 1), -1)
+    members = [m for m in (np.flatnonzero(part == b) for b in range(RIPPLE_BINS)) if len(m) >= MIN_PIXELS / 10]
+    if not members:
+        return FringeGamma(is_told=False)
+    places = np.array([np.median(position[m]) for m in members])
+    medians = np.array([np.median(value[m]) for m in members])
+    error = np.array([sigma_from_median(value[m], x) for m, x in zip(members, medians, strict=True)])
+    error = 1.253 * error / np.sqrt([len(m) for m in members])  # of a median: sqrt(pi / 2) times that of a mean
+    curves = _curves_at(places, steps, contrast is not None)
     if steps == 3:  # the scale of the modulation is not known
-        difference = difference - difference.mean(axis=1, keepdims=True)
+        medians, curves = medians - medians.mean(), curves - curves.mean(axis=1, keepdims=True)
+    difference = medians - curves
     misfit = (difference**2).mean(axis=1)
     best = int(np.argmin(misfit))
     linear = misfit[int(np.argmin(np.abs(GAMMAS - 1)))]
-    gamma, slope = _refined(best, difference, curves - curves.mean(axis=1, keepdims=True) if steps == 3 else curves)
-    sigma = float(np.sqrt((error**2).mean() / len(used)) / max(slope, 1e-9))
+    gamma, slope = _refined(best, difference, curves)
+    is_linear = bool(linear <= MIN_RIPPLE**2 + 9 * (error**2).mean())
+    if steps == 3 and float(np.diff([*places, places[0] + 1]).max()) > MAX_GAP:
+        return FringeGamma(is_told=False)
+    if slope < MIN_SLOPE:
+        return FringeGamma(is_explained=is_linear, is_told=False)
+    sigma = float(np.sqrt((error**2).mean() / len(members)) / slope)
     is_there = linear > MIN_RIPPLE**2 or abs(gamma - 1) > MIN_CHANGE
     if not is_there or abs(gamma - 1) < MIN_SIGNIFICANCE * sigma or abs(gamma - 1) <= MIN_CHANGE:
         return FringeGamma()
     if misfit[best] > (1 - MIN_EXPLAINED) * linear or best in (0, len(GAMMAS) - 1):
-        return FringeGamma(is_explained=bool(linear <= (MIN_RIPPLE**2 + 9 * (error**2).mean())))
+        return FringeGamma(is_explained=is_linear)
     return FringeGamma(round(gamma, 4))
 
 
@@ -150,7 +166,7 @@ def _refined(best: int, difference: np.ndarray, curves: np.ndarray) -> tuple[flo
 
 
 def _ripple(frames: np.ndarray, contrast: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Part of the ripple (n,) int that a pixel lies in, and a value (n,) that a gamma makes change with the part.
+    """Place of a pixel in the ripple (n,), 0 to 1, and a value (n,) that a gamma makes change with the place.
 
     For three steps it is the logarithm of the modulation over white - black, or over the mean. For more it is the
     second harmonic in phase with the fringe, as a fraction of the modulation.
@@ -160,24 +176,30 @@ def _ripple(frames: np.ndarray, contrast: np.ndarray | None) -> tuple[np.ndarray
     first = 2 / steps * (turns.real @ frames + 1j * (turns.imag @ frames))
     modulation = np.maximum(np.abs(first), 1e-30)
     phase = np.angle(first) / (2 * np.pi) * steps
-    part = np.minimum(((phase - np.floor(phase)) * RIPPLE_BINS).astype(int), RIPPLE_BINS - 1)
+    position = phase - np.floor(phase)
     if steps == 3:
         scale = frames.mean(axis=0) if contrast is None else contrast
-        return part, np.log(modulation / np.where(scale > 0, scale, np.nan))
+        return position, np.log(modulation / np.where(scale > 0, scale, np.nan))
     twice = turns**2
     second = 2 / steps * (twice.real @ frames + 1j * (twice.imag @ frames))
-    return part, (second * first.conj() ** 2).real / modulation**3
+    return position, (second * first.conj() ** 2).real / modulation**3
+
+
+def _curves_at(places: np.ndarray, steps: int, has_contrast: bool) -> np.ndarray:
+    """(g, n) value of `_ripple` at places (n,) in the ripple, for each of `GAMMAS`."""
+    curves = _curves(steps, has_contrast)
+    at = places * (curves.shape[1] - 1)
+    low = np.minimum(at.astype(int), curves.shape[1] - 2)
+    return np.asarray(curves[:, low] + (at - low) * (curves[:, low + 1] - curves[:, low]))
 
 
 @lru_cache(maxsize=32)
 def _curves(steps: int, has_contrast: bool) -> np.ndarray:
-    """(g, RIPPLE_BINS) medians of the value of `_ripple` in each part, for each of `GAMMAS`."""
-    result = np.empty((len(GAMMAS), RIPPLE_BINS))
+    """(g, TABLE_SIZE) value of `_ripple` at places from 0 to 1, both included, for each of `GAMMAS`."""
+    result = np.empty((len(GAMMAS), TABLE_SIZE))
     for i, gamma in enumerate(GAMMAS):
-        part, value = _ripple(_shown(float(gamma), steps), np.ones(TABLE_SIZE) if has_contrast else None)
-        order = np.lexsort((value, part))
-        start = np.searchsorted(part[order], np.arange(RIPPLE_BINS + 1))
-        result[i] = value[order][(start[:-1] + start[1:]) // 2]
+        position, value = _ripple(_shown(float(gamma), steps), np.ones(TABLE_SIZE) if has_contrast else None)
+        result[i] = np.interp(np.linspace(0, 1, TABLE_SIZE), position, value, period=1)
     return result
 
 

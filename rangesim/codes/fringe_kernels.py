@@ -4,71 +4,100 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from pcgraph.kernel_cache import cached_njit
 
 
+class Agreement(NamedTuple):
+    """How well the phases of several periods must agree on a place.
+
+    widest : float, turns, distance from the coarsest phase beyond which no place is tried.
+    misfit : float, turns, largest distance of any phase from the place.
+    ambiguity : float, largest cost of the best place as a fraction of that of the second best.
+    """
+
+    widest: float
+    misfit: float
+    ambiguity: float
+
+
 @cached_njit(nogil=True, error_model="numpy")
-def agree(places, weights, periods_px, low, high, widest, result, misfit, ambiguity):  # type: ignore[no-untyped-def]
+def agree(places, weights, periods_px, low, high, limits, result, agrees):  # type: ignore[no-untyped-def]
     """Find, per pixel, the place between `low` and `high` on which all phases agree best.
 
     Every cycle of the finest fringes gives a candidate; each other period takes the cycle that lies nearest to it. The
-    candidate with the least weighted sum of squared differences from their weighted mean wins.
+    candidate with the least weighted sum of squared differences from their weighted mean wins. The one nearest to the
+    coarsest phase is tried first; then those whose distance from that phase alone does not cost too much already to be
+    the best, or to make it ambiguous.
 
     Parameters
     ----------
     places : (K, n) float32, place within the period, in turns, the finest period first and the coarsest last.
     weights : (K, n) float32, inverse variances of the places in projector pixels, in any scale.
-    periods_px : (K,) float64. low, high : (n,) float32, projector pixels.
-    widest : float, turns; candidates farther from the coarsest phase are left out.
+    periods_px : (K,) float64. low, high : (n,) float32, projector pixels. limits : Agreement.
     result : (n,) float32, written: the place of the finest period, projector pixels; NaN if there is no candidate.
-    misfit : (n,) float32, written: largest distance of the other phases from it, in turns, 0 to 0.5.
-    ambiguity : (n,) float32, written: least cost over second least, 0 to 1.
+    agrees : (n,) bool, written: whether there is one, and only one, within the limits.
     """
     count, n = places.shape
-    base, last = periods_px[0], count - 1
-    rate = 1.0 / periods_px
+    last = count - 1
+    base, coarsest = periods_px[0], periods_px[last]
+    rate, ratio = 1.0 / periods_px, coarsest / base
+    widest, sure = limits.widest, 1.0 / limits.ambiguity
     for i in range(n):
-        turn = places[0, i]
-        first = math.ceil(low[i] / base - turn - 1e-6)
-        end = math.floor(high[i] / base - turn + 1e-6)
+        turn, place = places[0, i], places[last, i]
+        first = np.ceil(low[i] / base - turn - 1e-6)
+        end = np.floor(high[i] / base - turn + 1e-6)
         total = 0.0
         for k in range(count):
             total += weights[k, i]
+        per_weight = 1.0 / max(total, 1e-30)
         least = second = math.inf
-        if last > 0:  # what is left out costs at least this
+        rise = 0.0  # a candidate costs at least this times the square of its distance from the coarsest phase
+        if last > 0:
             together = weights[0, i] + weights[last, i]
-            second = weights[0, i] * weights[last, i] / max(together, 1e-30) * (widest * periods_px[last]) ** 2
+            rise = weights[0, i] * weights[last, i] / max(together, 1e-30) * coarsest**2
+            second = rise * widest**2  # what is left out costs at least this
         best = np.nan
-        for cycle in range(first, end + 1):
+        enough = second  # a candidate that costs more is neither best nor does it make the best ambiguous
+        nearest = min(max(np.rint(place * ratio - turn), first), end)
+        cycle, is_first = nearest, True
+        while cycle <= end:
             x = (cycle + turn) * base
-            off = x * rate[last] - places[last, i]
-            off -= np.rint(off)
-            if abs(off) > widest:
-                continue
-            squares = mean = 0.0
-            for k in range(1, count):
-                off = x * rate[k] - places[k, i]
-                off = (off - np.rint(off)) * periods_px[k]
-                squares += weights[k, i] * off * off
-                mean += weights[k, i] * off
-            cost = squares - mean * mean / max(total, 1e-30)
-            if cost < least:
-                second, least, best = min(second, least), cost, x
-            elif cost < second:
-                second = cost
+            far = x * rate[last] - place
+            far -= np.rint(far)
+            ahead = 1.0
+            if abs(far) <= widest and rise * far * far <= enough:
+                squares = mean = 0.0
+                for k in range(1, count):
+                    off = x * rate[k] - places[k, i]
+                    off = (off - np.rint(off)) * periods_px[k]
+                    squares += weights[k, i] * off * off
+                    mean += weights[k, i] * off
+                cost = squares - mean * mean * per_weight
+                if cost < least:
+                    second, least, best = min(second, least), cost, x
+                    enough = min(second, sure * least)
+                elif cost < second:
+                    second = cost
+                    enough = min(second, sure * least)
+            elif ratio > 2:  # to where the coarsest phase is near again
+                reach = min(widest, math.sqrt(enough / max(rise, 1e-30)))
+                ahead = max(np.ceil(((far > 0) - far - reach) * ratio - 1e-6), 1.0)
+            if is_first:
+                cycle, is_first = first, False
+            else:
+                cycle += ahead
+            if cycle == nearest:
+                cycle += 1
         result[i] = best
-        if least == math.inf:
-            misfit[i], ambiguity[i] = 0.5, 1.0
-            continue
         worst = 0.0
         for k in range(1, count):
-            off = best / periods_px[k] - places[k, i]
-            worst = max(worst, abs(off - math.floor(off + 0.5)))
-        misfit[i] = worst
-        ambiguity[i] = 1.0 if least >= second else max(least, 0.0) / max(second, 1e-30)
+            off = best * rate[k] - places[k, i]
+            worst = max(worst, abs(off - np.rint(off)))
+        agrees[i] = least < second and worst <= limits.misfit and max(least, 0.0) <= limits.ambiguity * second
 
 
 @cached_njit(nogil=True, error_model="numpy")

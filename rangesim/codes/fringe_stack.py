@@ -21,29 +21,28 @@ import numpy as np
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.fringe_gamma import FringeGamma, gamma_of
-from rangesim.codes.fringe_kernels import agree, mean_place
+from rangesim.codes.fringe_kernels import Agreement, agree, mean_place
 from rangesim.codes.fringes import FringeConvention
 from rangesim.decoding.phase_shift import PhaseThresholds, modulation_is_weak, phase_of, phase_sigma
-from rangesim.decoding.row_bands import bands
+from rangesim.decoding.row_bands import in_bands
 from rangesim.decoding.status import Status
 from rangesim.response import Fringes
 
-MAX_MISFIT_TURNS = 1 / 8
-"""Largest distance of any phase from the place that was found, in turns. It is four standard deviations of the noisiest
-phase that is accepted (`PhaseThresholds.max_sigma_rad`, 0.2)."""
+LIMITS = Agreement(widest=1 / 4, misfit=1 / 8, ambiguity=1 / 4)
+"""Limits of the agreement of phases.
 
-WIDEST_TURNS = 1 / 4
-"""Distance from the coarsest phase, in turns, up to which candidates are searched: twice the largest misfit, so that
-the second best is known where the best is accepted."""
-
-MAX_AMBIGUITY = 0.25
-"""Largest cost of the best place as a fraction of that of the second best. At 1/4 the best place is half as far from
-the phases as the second; noise would have to move the phases by two thirds of the way between both to deceive, and at
-half of it the pixel counts as ambiguous."""
+The misfit, 1/8 of a turn, is four standard deviations of the noisiest phase that is accepted
+(`PhaseThresholds.max_sigma_rad`, 0.2). The widest distance is twice that, so that the second best is known where the
+best is accepted. At an ambiguity of 1/4 the best place is half as far from the phases as the second; noise would have
+to move the phases by two thirds of the way between both to deceive, and at half of it the pixel counts as ambiguous."""
 
 MIN_APART_TURNS = 0.005
 """Least distance of any two places of the axis in the space of the phases, in turns. A camera of 8 bits tells a phase
 of full contrast to 0.0004 turns; closer places could not be told apart even then."""
+
+MIN_AGREEING = 0.8
+"""Least fraction of the pixels on whose places all phases agree, at which fringes count as read as they were shown.
+Interreflection, noise and edges make up to a fifth disagree."""
 
 MIN_PRECISION = 0.1
 """Least precision (inverse variance) of a period, as a fraction of the finest one's, at which its phase is averaged
@@ -97,11 +96,20 @@ class FringeStack:
         run = slice(start, start + self.steps[i])
         return seen._replace(names=seen.names[run], frames=seen.frames[run])
 
-    def gamma(self, seen: AxisFrames, i: int, usable: np.ndarray, has_bits: bool) -> FringeGamma:
-        """What the fringes of period i tell of the response, from the pixels `usable` (h, w) bool.
+    def gammas(self, seen: AxisFrames, usable: np.ndarray, has_bits: bool) -> tuple[FringeGamma, ...]:
+        """Response of projector and camera as the fringes of each period show it at the pixels `usable` (h, w) bool.
 
-        `has_bits` tells whether the capture has other frames of the axis, from which white - black is estimated well.
+        Blurred fringes have a smaller gamma, so each period has its own. One that does not tell has that of the others,
+        because projector and camera are the same. `has_bits` tells whether the capture has other frames of the axis,
+        from which white - black is estimated well.
         """
+        found = [self._gamma(seen, i, usable, has_bits) for i in range(len(self.steps))]
+        told = [one.gamma for one in found if one.is_told]
+        common = FringeGamma(float(np.median(told))) if told else None
+        return tuple(one if one.is_told else common or one for one in found)
+
+    def _gamma(self, seen: AxisFrames, i: int, usable: np.ndarray, has_bits: bool) -> FringeGamma:
+        """Response of projector and camera as the fringes of period i alone show it at the pixels `usable`."""
         scale: np.ndarray | None = None
         if seen.contrast.is_measured or has_bits:
             scale = seen.contrast.values
@@ -141,14 +149,34 @@ class FringeStack:
 
     def agrees(self, places: list[np.ndarray], size: int) -> np.ndarray:
         """(n,) bool, where the places within the periods, K of (n,) turns in the order of the stack, agree on one."""
+        return self._agreed(places, size)[1]
+
+    def bias_turns(self, places: list[np.ndarray], size: int) -> float:
+        """How far the phases of the periods lie on average beside the places on which they agree, in turns.
+
+        It is the root mean square over the periods, 1 if the phases agree at few pixels. It is near 0 if all fringes
+        start where they should: noise lies on both sides.
+
+        Parameters
+        ----------
+        places : K of (n,) turns, the place within each period in the order of the stack. size : int, projector pixels.
+        """
+        place, ok = self._agreed(places, size)
+        if ok.mean() <= MIN_AGREEING:
+            return 1.0
+        off = [turns[ok] - place[ok] / period for turns, period in zip(places, self.periods_px, strict=True)]
+        return float(np.sqrt(np.mean([float((o - np.rint(o)).mean()) ** 2 for o in off])))
+
+    def _agreed(self, places: list[np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) float32, projector pixels on which the places within the periods agree best, and where they agree."""
         order = np.argsort(self.periods_px, kind="stable")
         periods = np.array(self.periods_px)[order]
         turns = np.stack([places[i] for i in order]).astype(np.float32)
         weights = np.broadcast_to((1 / periods**2)[:, None], turns.shape).astype(np.float32)
         low, high = np.zeros_like(turns[0]), np.full_like(turns[0], size)
-        place, misfit, ambiguity = np.empty((3, turns.shape[1]), dtype=np.float32)
-        agree(turns, weights, periods, low, high, WIDEST_TURNS, place, misfit, ambiguity)
-        return (misfit <= MAX_MISFIT_TURNS) & (ambiguity <= MAX_AMBIGUITY)
+        place, agrees = np.empty(turns.shape[1], dtype=np.float32), np.empty(turns.shape[1], dtype=bool)
+        agree(turns, weights, periods, low, high, LIMITS, place, agrees)
+        return place, agrees
 
     def decode(
         self,
@@ -174,13 +202,14 @@ class FringeStack:
         sigma_px = None if capture.noise(frames[0, :1]) is None else np.empty(shape, dtype=np.float32)
         saturated = capture.saturated(frames)
         usable = (status == Status.OK) & seen.contrast.is_enough & ~saturated
-        gammas = [self.gamma(seen, i, usable, coarse is not None) for i in range(len(self.steps))]
+        gammas = self.gammas(seen, usable, coarse is not None)
         order = np.argsort(self.periods_px, kind="stable")
         periods = np.array(self.periods_px)[order]
         precision = np.array(self.steps)[order] / periods**2
         kept = np.flatnonzero(precision >= MIN_PRECISION * precision[0])
         lows, highs, swings = (np.broadcast_to(np.float32(x), shape) for x in (low, high, least_swing))
-        for rows in bands(shape[0]):
+
+        def decode_rows(rows: slice) -> None:
             refused = status[rows]
             places, weights = np.empty((2, len(order), *refused.shape), dtype=np.float32)
             variance = np.zeros(refused.shape, dtype=np.float32)
@@ -197,15 +226,15 @@ class FringeStack:
                     variance = (sigma * np.float32(period / (2 * math.pi))) ** 2
             flat, inverse = places.reshape(len(order), -1), weights.reshape(len(order), -1)
             margin = np.minimum(3 * np.sqrt(variance).ravel(), np.float32(periods[0]))  # infinite without any swing
-            place, misfit, ambiguity = np.empty((3, refused.size), dtype=np.float32)
+            place, agrees = np.empty(refused.size, dtype=np.float32), np.empty(refused.size, dtype=bool)
             # The noise may put a place beyond an end of the axis: then the other end is as likely.
             start, end = lows[rows].ravel() - margin, highs[rows].ravel() + margin
-            agree(flat, inverse, periods, start, end, WIDEST_TURNS, place, misfit, ambiguity)
+            agree(flat, inverse, periods, start, end, LIMITS, place, agrees)
             precise = inverse[0] > 0
             if len(kept) > 1:
                 mean_place(flat[kept], inverse[kept], periods[kept], place)
             coordinate[rows] = place.reshape(refused.shape)
-            disagrees = (misfit > MAX_MISFIT_TURNS) | (ambiguity > MAX_AMBIGUITY) | ~precise
+            disagrees = ~(agrees & precise)
             ok = refused == Status.OK
             refused[ok & disagrees.reshape(refused.shape)] = Status.CODE_ERROR
             refused[ok & weak] = Status.LOW_SIGNAL
@@ -213,6 +242,7 @@ class FringeStack:
             if sigma_px is not None:
                 gain = inverse[0] / np.maximum(inverse[kept].sum(axis=0), np.float32(1e-30))
                 sigma_px[rows] = np.sqrt(variance * gain.reshape(refused.shape))
+
+        in_bands(decode_rows, shape[0])
         cell_px = 1.0 if coarse is None else coarse.cell_px
-        gamma = float(np.median([g.gamma for g in gammas]))
-        return AxisCode(coordinate, status, cell_px, sigma_px, coarse, gamma)
+        return AxisCode(coordinate, status, cell_px, sigma_px, coarse, gammas)

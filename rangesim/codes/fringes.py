@@ -21,7 +21,9 @@ VISIBILITY = 0.5
 
 @dataclass(frozen=True)
 class FringeConvention:
-    """How fringes are numbered: pattern s of N is 1/2 + 1/2 cos(2 pi ((x - origin_px) / P - start -+ s / N)).
+    """Start, direction and origin of fringes.
+
+    Pattern s of N is 1/2 + 1/2 cos(2 pi ((x - origin_px) / P - start -+ s / N)).
 
     Parameters
     ----------
@@ -65,7 +67,5 @@ class FringeConvention:
         ----------
         normalised : (...) float32, phase in turns of frames I_s = mean + modulation cos(phase - 2 pi s / N).
         """
-        if self == FringeConvention():
-            return normalised
         place = self.sign * normalised + np.float32(self.shift_turns(0, 1, period_px))
         return np.asarray(place - np.floor(place))

@@ -22,8 +22,8 @@ from rangesim.sensor import Background, FrameContent
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 GUARD_TURNS = 1 / 8
-"""Distance beyond the edges of a Gray cell, in periods of the fringes, at which a place may still lie: for noise, and
-for camera pixels across the edge of a cell."""
+"""Distance beyond the edges of a Gray cell, in periods of the fringes, at which a place may still lie: for noise, four
+standard deviations of the noisiest phase that is accepted, and for camera pixels across the edge of a cell."""
 
 
 @dataclass(frozen=True)
@@ -134,14 +134,16 @@ class GrayPhase(Code):
         for i, period_px in enumerate(self.stack.periods_px):
             if text is None:
                 one = self.stack.frames_of(fringes, i)
-                text = level_contradiction(one, gray, code) or fringe_contradiction(
+                text = level_contradiction(one, gray, code, code.gammas[i]) or fringe_contradiction(
                     one, gray, code, period_px, self.convention
                 )
         return text or stack_contradiction(fringes, code, self.stack)
 
-    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
         needed = thresholds.phase.least_signal(self.steps, VISIBILITY, FrameContent(), background)
-        return np.maximum(super().least_signal(size, thresholds, background), needed)
+        return np.maximum(self.gray(size).least_signal(size, shown, thresholds, background), needed)
 
     @property
     def details(self) -> str:

@@ -27,9 +27,15 @@ MAX_UNEVEN = 2 / 255
 DIGEST_LENGTH = 16
 """Number of hexadecimal digits of a digest: 64 bits, so that two stacks never share one by chance."""
 
-SMOOTH_PATTERNS, SMOOTH_PERIODS, SMOOTH_SEED = 12, 16, 7
-"""The stack without a file: number of patterns, most periods of a pattern over the projector, seed. With these, no two
-places that are no neighbours correlate by more than 0.95."""
+SMOOTH_PATTERNS = 12
+"""Number of patterns of the stack without a file. With it, the periods and the seed below, no two places that are no
+neighbours correlate by more than 0.95."""
+
+MAX_SMOOTH_PERIODS = 16
+"""Number of periods over the projector of the finest of these patterns; see `SMOOTH_PATTERNS`."""
+
+SMOOTH_SEED = 7
+"""Seed of the phases of these patterns; see `SMOOTH_PATTERNS`."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,9 @@ class ImageStack(Code):
         check_fields(self)
         if not self.path:
             if self.digest:
-                raise ValueError("expected no digest without a path.")
+                raise ValueError(
+                    f"expected no digest without a path, got {shown(self.digest)}: give the path, or leave it out."
+                )
             return
         patterns = _patterns_in(self.path)
         found = _digest(patterns)
@@ -91,7 +99,10 @@ class ImageStack(Code):
     def check(self, size: int) -> None:
         patterns = self._stack(size)
         if patterns.shape[1] != size:
-            raise ValueError(f"expected patterns of {size} pixels, got {patterns.shape[1]} in {shown(self.path)}.")
+            raise ValueError(
+                f"expected patterns of {size} pixels, got {patterns.shape[1]} in "
+                f"{shown(self.path)}: make them for this size, or choose the projector that they are for."
+            )
         check_columns(patterns, has_white_and_black=True)
 
     def check_shown(self, size: int, shown: Sequence[str]) -> None:
@@ -116,10 +127,10 @@ class ImageStack(Code):
 
 @lru_cache(maxsize=8)
 def _smooth_patterns(size: int) -> np.ndarray:
-    """(n, size) float32, fringes of 1 to `SMOOTH_PERIODS` periods with random phases; read-only."""
+    """(n, size) float32, fringes of 1 to `MAX_SMOOTH_PERIODS` periods with random phases; read-only."""
     rng = np.random.default_rng(SMOOTH_SEED)
     x = (np.arange(size) + 0.5) / size
-    periods = np.linspace(1, SMOOTH_PERIODS, SMOOTH_PATTERNS)
+    periods = np.linspace(1, MAX_SMOOTH_PERIODS, SMOOTH_PATTERNS)
     phases = rng.random(SMOOTH_PATTERNS)
     patterns = (0.5 + 0.5 * np.cos(2 * np.pi * (periods[:, None] * x + phases[:, None]))).astype(np.float32)
     patterns.setflags(write=False)
@@ -155,20 +166,27 @@ def _read(place: Path, files: tuple[tuple[Path, int], ...]) -> np.ndarray:
     if len(files) == 1 and files[0][0] == place:
         patterns = np.load(place, mmap_mode="r", allow_pickle=False)
         if not isinstance(patterns, np.ndarray) or patterns.ndim != 2 or patterns.dtype.kind not in "fiub":
-            raise ValueError("expected an array (n, size) of numbers")
+            raise ValueError(f"expected an array (n, size) of numbers, got {shown(patterns)}")
     else:
         images = [file for file, _ in files if file.suffix.lower() in SUFFIXES]
         if not images:
-            raise ValueError("expected images in the folder")
+            raise ValueError(f"expected images ({', '.join(SUFFIXES)}) in the folder, got {len(files)} other files")
         lines = [_along_axis(read_grey(file), file) for file in images]
-        if len({len(line) for line in lines}) > 1:
-            raise ValueError("expected patterns that all vary along the same axis and have one size")
+        lengths = sorted({len(line) for line in lines})
+        if len(lengths) > 1:
+            raise ValueError(
+                "expected images of one size that all vary along the same axis, got patterns of "
+                f"{lengths[0]} and of {lengths[-1]} pixels"
+            )
         patterns = np.stack(lines)
     limits.check("frames", len(patterns), "patterns")
     limits.check("projector", patterns.shape[1], "pixels of a pattern")
     kept = np.array(patterns, dtype=np.float32, order="C")
-    if not (kept.size and np.isfinite(kept).all() and kept.min() >= 0 and kept.max() <= 1):
-        raise ValueError("expected values from 0 to 1")
+    if not kept.size:
+        raise ValueError(f"expected one pattern or more, got {shown(kept)}")
+    low, high = float(kept.min()), float(kept.max())
+    if not (low >= 0 and high <= 1):  # neither is a NaN
+        raise ValueError(f"expected values from 0 to 1, got {low:g} to {high:g}: divide them by their full scale")
     kept.setflags(write=False)
     return kept
 
@@ -180,7 +198,7 @@ def _along_axis(image: np.ndarray, file: Path) -> np.ndarray:
         values /= np.iinfo(image.dtype).max
     down, across = np.ptp(values, axis=0).max(), np.ptp(values, axis=1).max()
     if min(down, across) > MAX_UNEVEN:
-        raise ValueError(f"expected images that vary along one axis, {file.name} varies along both")
+        raise ValueError(f"expected images that vary along one axis, got {file.name}, which varies along both")
     return np.asarray(values.mean(axis=0) if down <= MAX_UNEVEN else values.mean(axis=1))
 
 

@@ -40,7 +40,7 @@ _CYCLES = {
 
 
 class _Merger(NamedTuple):
-    """How a code is merged from two shorter ones: of 2^bits changes in turn, `part` are those of the shorter code.
+    """Rule that merges two shorter codes: of 2^bits changes in turn, `part` are those of the shorter code.
 
     `part` and 2^bits - part are odd, so that all pairs of words of the two occur, each once (Goddyn and Gvozdjak).
     """

@@ -16,9 +16,12 @@ CANDIDATES = 64
 """Number of steps of the band between the periods from which each is chosen; 128 steps lead to no better set for 1280
 pixels."""
 
-MAX_COLUMNS, MAX_LAGS = 128, 512
-"""Largest numbers of columns, and of distances in fringes, at which confusions are counted, both evenly spread. They
-bound the time, to a tenth of a second for 1280 pixels."""
+MAX_COLUMNS = 128
+"""Largest number of columns at which confusions are counted, evenly spread. Together with `MAX_LAGS` it bounds the
+time, to a tenth of a second for 1280 pixels."""
+
+MAX_LAGS = 512
+"""Largest number of distances, in fringes, at which confusions are counted, evenly spread; see `MAX_COLUMNS`."""
 
 NOISE = 0.25
 """Standard deviation of the noise for which confusions are counted, as a fraction of the amplitude: with three shifts,

@@ -5,21 +5,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rangesim.codes.axis_code import AxisFrames
-from rangesim.codes.fringes import STARTS, FringeConvention
+from rangesim.codes.image_faults import CHECKED_PIXELS, exchanged_images, other_conventions, repeated_image
 from rangesim.decoding.phase_shift import phase_of, phase_sigma
 from rangesim.decoding.pixel_samples import MIN_PIXELS
 
 if TYPE_CHECKING:
     from rangesim.codes.micro_phase_shifting import MicroPhaseShifting
-
-CHECKED_PIXELS = 2000
-"""Largest number of pixels that are checked. A fraction of them has a standard error of at most 1.1 %."""
 
 MAX_SIGMA_RAD = 0.05
 """Largest standard deviation of a phase at a pixel that is checked, radians. With more noise, sound pixels may fit
@@ -30,11 +26,8 @@ MAX_MISFIT_FRACTION = 0.05
 that is wrong makes it 0.2 or more."""
 
 MAX_MENDED_FRACTION = 0.02
-"""Largest fraction of pixels that no place may fit once the right cause is undone."""
-
-MAX_REPEATED = 0.05
-"""Largest root mean square of the difference of two images, as a fraction of the amplitude, at which they count as one
-image shown twice. Between images of two periods it is about 1."""
+"""Largest fraction of pixels that no place may fit once the right cause is undone, less than half of
+`MAX_MISFIT_FRACTION`, so that a cause is named only if it explains most of the misfits."""
 
 MAX_HARMONIC = 0.06
 """Largest amplitude of the second harmonic of the fringes, as a fraction of the first. A projector's gamma g makes it
@@ -61,7 +54,7 @@ def period_contradiction(seen: AxisFrames, code: MicroPhaseShifting) -> str | No
         return _harmonic(frames, code, periods, seen)
     text = f"the images along {seen.axis} contradict the periods at {100 * misfits:.0f} % of the bright pixels"
     names = [seen.shown_name(name) for name in seen.names]
-    if fault := _repeated(frames, names):
+    if fault := repeated_image(frames, names):
         return f"{text}: {fault}."
     for fault, other_frames, other_code, other_periods in _faults(frames, code, periods, names):
         if _misfits(other_frames, other_code, other_periods, seen.size) <= MAX_MENDED_FRACTION:
@@ -86,42 +79,21 @@ def _misfits(frames: np.ndarray, code: MicroPhaseShifting, periods: Sequence[flo
     return float(1 - code.match(frames, periods, table).fits.mean())
 
 
-def _repeated(frames: np.ndarray, names: list[str]) -> str | None:
-    """A clause on two images that are the same one; None if there are none."""
-    values = frames[:, 0].astype(np.float32)
-    amplitude = np.sqrt(2) * np.median(values.std(axis=0))
-    for i, j in combinations(range(len(values)), 2):
-        if np.sqrt(np.mean((values[i] - values[j]) ** 2)) < MAX_REPEATED * amplitude:
-            return f"frame {names[j]} repeats {names[i]}"
-    return None
-
-
 def _faults(
     frames: np.ndarray, code: MicroPhaseShifting, periods: Sequence[float], names: list[str]
 ) -> Iterator[tuple[str, np.ndarray, MicroPhaseShifting, Sequence[float]]]:
     """Faults that images may have, each with frames, code and periods that undo it: the likely ones first."""
-    given = code.convention
-    for direction in (given.direction, "backward" if given.direction == "forward" else "forward"):
-        for start in STARTS:
-            if (start, direction) == (given.start, given.direction):
-                continue
-            words = [f"start at {start} instead of {given.start}"] if start != given.start else []
-            if direction != given.direction:
-                words.append("be shifted in the opposite direction")
-            other = FringeConvention(start, direction, given.origin_px)  # type: ignore[arg-type]
-            yield f"the fringes seem to {' and to '.join(words)}", frames, replace(code, convention=other), periods
+    for fault, other in other_conventions(code.convention):
+        yield fault, frames, replace(code, convention=other), periods
     yield "the order of all images seems to be reversed", frames[::-1], code, periods
-    order = np.arange(len(frames))
-    for i, j in combinations(order, 2):
-        swapped = order.copy()
-        swapped[[i, j]] = j, i
-        yield f"frames {names[i]} and {names[j]} seem to be exchanged", frames[swapped], code, periods
+    for fault, swapped in exchanged_images(frames, names):
+        yield fault, swapped, code, periods
     shifts = len(frames) - len(periods) + 1
     if len(periods) > 3:  # two periods always agree with some place
         for f in range(1, len(periods)):
-            others = np.delete(order, f + shifts - 1)
+            others = np.delete(frames, f + shifts - 1, axis=0)
             fault = f"frame {names[f + shifts - 1]} does not show its period of {periods[f]:g} px"
-            yield fault, frames[others], code, [*periods[:f], *periods[f + 1 :]]
+            yield fault, others, code, [*periods[:f], *periods[f + 1 :]]
 
 
 def _harmonic(frames: np.ndarray, code: MicroPhaseShifting, periods: Sequence[float], seen: AxisFrames) -> str | None:

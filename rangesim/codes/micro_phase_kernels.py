@@ -16,7 +16,7 @@ with a period of 16 pixels, the second one less than 0.001."""
 
 
 class PeriodTable(NamedTuple):
-    """What the frames show at the centre of each projector pixel, as fractions of the amplitude.
+    """Values of the frames at the centre of each projector pixel, as fractions of the amplitude.
 
     values : (size, F + 1) float32: cosine and sine of the first period, then one cosine per further period.
     slopes : (size, F + 1) float32, derivatives of `values`, per projector pixel.

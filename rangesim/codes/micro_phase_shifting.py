@@ -44,6 +44,13 @@ MAX_RESIDUAL_RATIO = 0.25
 """Largest sum of squared residuals at the best place, as a fraction of that in the best other period. In the authors'
 captures, 99 % of the pixels are below 0.1. With wrong periods, half of them are above 0.7."""
 
+MIN_EVIDENCE = 20.0
+"""Least difference of the sums of squared residuals at the best other period and at the best place, in variances of a
+frame. The likelihoods of two places differ by the factor exp(-20 / 2) = 5e-5, so that noise takes a pixel to one of the
+80 other periods of 1280 px with a probability of 0.4 % at most. It matters with few periods, whose residual at a wrong
+place may be small by chance: with five and white at 3 % of full scale, 0.04 % of the readings are wrong instead of 0.2
+%, with three none instead of half of them. Eight periods lose no pixel."""
+
 REACH_PERIODS = 1 / 8
 """Largest distance between the place that the first period tells and the one that all images tell, in periods. In the
 authors' captures 99 % of the pixels are within a fiftieth; from a quarter on, a Gauss-Newton step is wrong."""
@@ -78,6 +85,13 @@ class PeriodMatch(NamedTuple):
     def fits(self) -> np.ndarray:
         """(h, w) bool, whether the best place fits much better than any other."""
         return np.asarray(self.residual < MAX_RESIDUAL_RATIO * self.rival)
+
+    @property
+    def evidence(self) -> np.ndarray:
+        """(h, w) float32, how much more the best other period leaves unexplained, squared units of the frames; NaN
+        where no place fits."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray((self.rival - self.residual) * self.phase.modulation**2)
 
 
 @dataclass(frozen=True)
@@ -159,7 +173,9 @@ class MicroPhaseShifting(Code):
         phase = phase_of(frames[:SHIFTS])
         return phase.mean + phase.modulation, phase.mean - phase.modulation
 
-    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
         return thresholds.phase.least_signal(SHIFTS, FRINGE_VISIBILITY, FrameContent(), background)
 
     @property
@@ -193,6 +209,9 @@ class MicroPhaseShifting(Code):
             else:
                 coordinate[rows] = _within_column(match, OUTSIDE_CURVATURE * (2 * math.pi / min(periods)) ** 2)
                 spread = np.array(periods[0] / (2 * math.pi) * math.sqrt(2 / SHIFTS), dtype=np.float32)
+            noise = capture.noise(match.phase.mean)
+            if noise is not None:
+                refused[~(match.evidence >= MIN_EVIDENCE * noise**2)] = Status.CODE_ERROR
             refused[~match.fits] = Status.CODE_ERROR
             washed_out = 2 * match.phase.modulation < thresholds.gray.relative_bit * seen.contrast.values[rows]
             weak = modulation_is_weak(capture, match.phase, sigma, thresholds.phase)
@@ -226,7 +245,7 @@ class MicroPhaseShifting(Code):
         return phase, places, units
 
     def table_of(self, size: int, gamma: float) -> PeriodTable:
-        """What the images show at each projector pixel if the projector has that gamma."""
+        """Values of the images at each projector pixel if the projector has that gamma."""
         shown = self.patterns(size)[:, None] ** np.float32(gamma)
         values = self._units(shown, self.periods(size))[2]
         slopes = np.gradient(values, axis=0).astype(np.float32)
@@ -283,7 +302,7 @@ def angles(periods: Sequence[float], convention: FringeConvention) -> tuple[np.n
 def period_table(
     periods: Sequence[float], convention: FringeConvention, size: int, contrast: np.ndarray
 ) -> PeriodTable:
-    """What the images show at each projector pixel, if periods have that contrast (F,) as a fraction of the first."""
+    """Values of the images at each projector pixel, if periods have that contrast (F,) as a fraction of the first."""
     omega, start = angles(periods, convention)
     x = np.arange(size)[:, None] + 0.5
     first, further = omega[:1] * x, omega[1:] * x - start[1:]

@@ -5,20 +5,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rangesim.codes.axis_code import AxisFrames
-from rangesim.codes.fringes import STARTS, FringeConvention
+from rangesim.codes.image_faults import CHECKED_PIXELS, exchanged_images, other_conventions, repeated_image
 from rangesim.decoding.pixel_samples import MIN_PIXELS
 
 if TYPE_CHECKING:
     from rangesim.codes.modulated_phase_shifting import ModulatedPhaseShifting
-
-CHECKED_PIXELS = 2000
-"""Largest number of pixels that are checked. A fraction of them has a standard error of at most 1.1 %."""
 
 MAX_CONTRADICTING = 0.1
 """Largest fraction of the brighter pixels that may contradict the code. One image that is wrong makes it 0.1 to 0.5."""
@@ -27,10 +23,6 @@ MAX_RELATIVE_NOISE = 0.03
 """Largest noise at a pixel that is checked, as a fraction of the carrier's amplitude. With more, sound pixels may look
 unexplained: with the default code the limit is 0.09."""
 
-MAX_REPEATED = 0.05
-"""Largest root mean square of the difference of two images, as a fraction of the amplitude, at which they count as one
-image shown twice."""
-
 GAMMAS = (0.45, 0.7, 1.2, 1.5, 1.8, 2.2)
 """Exponents of a projector that are tried. Smaller deviations from 1 move phases by less than 0.06 radians."""
 
@@ -38,7 +30,7 @@ MIN_UNEXPLAINED = 0.002
 """Least fraction of the images that is unexplained, in the median over the pixels, at which a gamma is looked for. A
 gamma of 1.2 leaves 0.003."""
 
-MIN_GAMMA_GAIN = 0.5
+MAX_GAMMA_RATIO = 0.5
 """Largest fraction of what is unexplained, in the median over the pixels, that another gamma leaves if it is right."""
 
 
@@ -51,14 +43,14 @@ def modulation_contradiction(seen: AxisFrames, code: ModulatedPhaseShifting) -> 
     fraction = _contradicting(frames, code, size)
     text = f"the images along {seen.axis} contradict their code at {100 * fraction:.0f} % of the bright pixels"
     if fraction > MAX_CONTRADICTING:
-        if fault := _repeated(frames, names):
+        if fault := repeated_image(frames, names):
             return f"{text}: {fault}."
         for fault, other_frames, other_code in _faults(frames, code, names):
             if _contradicting(other_frames, other_code, size) < min(MAX_CONTRADICTING, fraction / 3):
                 return f"{text}: {fault}."
     level = float(np.median(_unexplained(frames, code, size)))
     curved = min(float(np.median(_unexplained(frames, code, size, gamma))) for gamma in GAMMAS)
-    if curved < MIN_GAMMA_GAIN * level and level > MIN_UNEXPLAINED:
+    if curved < MAX_GAMMA_RATIO * level and level > MIN_UNEXPLAINED:
         return (
             f"the fringes along {seen.axis} are no sinusoids: check that projector and camera are linear (no gamma, no "
             "automatic exposure, no clipping)."
@@ -98,36 +90,15 @@ def _unexplained(frames: np.ndarray, code: ModulatedPhaseShifting, size: int, ga
     return code.unexplained(frames, place, size, gamma)
 
 
-def _repeated(frames: np.ndarray, names: list[str]) -> str | None:
-    """A clause on two images that are the same one; None if there are none."""
-    values = frames[:, 0].astype(np.float32)
-    amplitude = np.sqrt(2) * np.median(values.std(axis=0))
-    for i, j in combinations(range(len(values)), 2):
-        if np.sqrt(np.mean((values[i] - values[j]) ** 2)) < MAX_REPEATED * amplitude:
-            return f"frame {names[j]} repeats {names[i]}"
-    return None
-
-
 def _faults(
     frames: np.ndarray, code: ModulatedPhaseShifting, names: list[str]
 ) -> Iterator[tuple[str, np.ndarray, ModulatedPhaseShifting]]:
     """Faults that images may have, each with frames and code that undo it: the likely ones first."""
-    given = code.convention
-    for direction in (given.direction, "backward" if given.direction == "forward" else "forward"):
-        for start in STARTS:
-            if (start, direction) == (given.start, given.direction):
-                continue
-            words = [f"start at {start} instead of {given.start}"] if start != given.start else []
-            if direction != given.direction:
-                words.append("be shifted in the opposite direction")
-            other = FringeConvention(start, direction, given.origin_px)  # type: ignore[arg-type]
-            yield f"the fringes seem to {' and to '.join(words)}", frames, replace(code, convention=other)
+    for fault, other in other_conventions(code.convention):
+        yield fault, frames, replace(code, convention=other)
     by_carrier = np.arange(len(frames)).reshape(code.levels, code.carrier_steps, code.steps)
     if code.levels * code.steps > 1:
         yield "the long fringes seem to be shifted first", frames[by_carrier.transpose(0, 2, 1).ravel()], code
     yield "the order of all images seems to be reversed", frames[::-1], code
-    order = np.arange(len(frames))
-    for i, j in combinations(order, 2):
-        swapped = order.copy()
-        swapped[[i, j]] = j, i
-        yield f"frames {names[i]} and {names[j]} seem to be exchanged", frames[swapped], code
+    for fault, swapped in exchanged_images(frames, names):
+        yield fault, swapped, code

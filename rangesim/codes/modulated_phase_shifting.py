@@ -18,14 +18,16 @@ from rangesim.decoding.phase_shift import Phase, modulation_is_weak, phase_of
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.response import DenseResponse, Fringes
-from rangesim.sensor import Background, FrameContent
+from rangesim.sensor import Background, FrameContent, least_signal_for
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 CARRIER_VISIBILITY = 0.5
-"""Amplitude of the carrier where the long fringes are brightest, as a fraction of the light at full power."""
+"""Amplitude of the carrier where the long fringes are brightest, as a fraction of the light at full power: half of it,
+because the values of a pattern go from 0 to 1."""
 
 MEAN_SQUARE = 3 / 8
-"""Mean square of a long fringe, 1/2 + 1/2 cos: the fraction of the images' information on the carrier that is left."""
+"""Mean square of a long fringe, 1/2 + 1/2 cos, which is 1/4 + 1/8: the fraction of the images' information on the
+carrier that is left."""
 
 MAX_OFF_PERIODS = 0.2
 """Largest distance of the place that longer fringes tell from the nearest place of the next shorter ones, in periods of
@@ -38,7 +40,7 @@ MAX_SIGMA_PERIODS = 1 / 6
 
 
 class Demodulated(NamedTuple):
-    """What the images of a carrier tell at each pixel.
+    """Phases of the carrier and of the long fringes at each pixel.
 
     carrier : Phase of the carrier; its modulation is the amplitude where the long fringes are brightest.
     long : phases of the long fringes, the longest first, in the amplitude of the carrier.
@@ -152,9 +154,21 @@ class ModulatedPhaseShifting(Code):
         carrier = self.demodulated(frames).carrier
         return carrier.mean + carrier.modulation, carrier.mean - carrier.modulation
 
-    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
+    def least_signal(
+        self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
+    ) -> np.ndarray:
+        """The light that the phase of the carrier needs, or that its period needs, if that is more.
+
+        The period can be told if the noise is at most `_max_relative_noise` of the carrier's amplitude, which is
+        `CARRIER_VISIBILITY` times the light.
+        """
         steps = max(1, round(MEAN_SQUARE * len(self.names(size))))
-        return thresholds.phase.least_signal(steps, CARRIER_VISIBILITY, FrameContent(), background)
+        least = thresholds.phase.least_signal(steps, CARRIER_VISIBILITY, FrameContent(), background)
+        if background.noise_variance is None:
+            return least
+        sigmas2 = (CARRIER_VISIBILITY * self._max_relative_noise(size)) ** -2
+        noise_variance = background.ambient + background.noise_variance
+        return np.maximum(least, least_signal_for(sigmas2, FrameContent().signal, noise_variance))
 
     @property
     def details(self) -> str:
@@ -239,8 +253,11 @@ class ModulatedPhaseShifting(Code):
         It is that of the noise s at which long fringes tell the next shorter period with `MAX_SIGMA_PERIODS`. Images of
         the amplitude B vary by MEAN_SQUARE B^2 / 2 about their mean, so the fraction is 2 s^2 / (MEAN_SQUARE B^2).
         """
-        relative = MAX_SIGMA_PERIODS / float(self._sigma_periods(np.ones(1), size)[0])
-        return min(0.5, 2 * relative**2 / MEAN_SQUARE)
+        return min(0.5, 2 * self._max_relative_noise(size) ** 2 / MEAN_SQUARE)
+
+    def _max_relative_noise(self, size: int) -> float:
+        """Noise, as a fraction of the carrier's amplitude, at which `_sigma_periods` is `MAX_SIGMA_PERIODS`."""
+        return MAX_SIGMA_PERIODS / float(self._sigma_periods(np.ones(1), size)[0])
 
     def _sigma_periods(self, relative_noise: np.ndarray, size: int) -> np.ndarray:
         """Standard deviation of the place that long fringes tell, in periods of the next shorter ones, for noise as a

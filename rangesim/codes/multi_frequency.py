@@ -4,20 +4,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar
 
 import numpy as np
 
-from rangesim.codes.axis_code import AxisCode, AxisFrames
-from rangesim.codes.code import Code, CodeThresholds
-from rangesim.codes.fringe_checks import stack_contradiction
+from rangesim.codes.fringe_code import FringeCode
 from rangesim.codes.fringe_stack import FringeStack
-from rangesim.codes.fringes import VISIBILITY, FringeConvention
-from rangesim.decoding.phase_shift import phase_of
-from rangesim.response import DenseResponse
-from rangesim.sensor import Background, FrameContent
+from rangesim.codes.fringes import FringeConvention
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 FINEST_PX = 16.0
@@ -30,7 +24,7 @@ it chooses the cycle of the next one; with more periods it counts less, but they
 
 
 @dataclass(frozen=True)
-class MultiFrequency(Code):
+class MultiFrequency(FringeCode):
     """Sinusoidal fringes of several periods, `steps` of each, without Gray code.
 
     The decoder looks for the place between 0 and the size of the axis on which all phases agree. So it needs to know
@@ -51,8 +45,8 @@ class MultiFrequency(Code):
 
     Examples
     --------
-    >>> MultiFrequency().default_periods(1280)
-    (1280.0, 143.1083505599865, 16.0)
+    >>> [round(period, 1) for period in MultiFrequency().default_periods(1280)]
+    [1280.0, 143.1, 16.0]
     >>> MultiFrequency((64.0, 8.0), steps=3).names(64)
     ['period0_phase0', 'period0_phase1', 'period0_phase2', 'period1_phase0', 'period1_phase1', 'period1_phase2']
     """
@@ -82,7 +76,6 @@ class MultiFrequency(Code):
         return tuple(size / ratio ** (i / levels) for i in range(levels + 1))
 
     def stack(self, size: int) -> FringeStack:
-        """The fringes for an axis of `size` pixels."""
         periods = self.periods_px or self.default_periods(size)
         return FringeStack(periods, self.steps_each or (self.steps,) * len(periods), self.convention)
 
@@ -93,32 +86,7 @@ class MultiFrequency(Code):
                 f"expected steps_each with one number for each of the {len(periods)} periods, "
                 f"got {len(self.steps_each)}."
             )
-        self.stack(size).check(size)
-
-    def names(self, size: int) -> list[str]:
-        return self.stack(size).names()
-
-    def patterns(self, size: int) -> np.ndarray:
-        return self.stack(size).patterns(size)
-
-    def responses(self, axis: int, size: int) -> tuple[DenseResponse, ...]:
-        return self.stack(size).responses(axis)
-
-    def frames(self, size: int, channels: Sequence[np.ndarray], white: np.ndarray) -> Iterator[np.ndarray]:
-        yield from self.stack(size).frames(channels, white)
-
-    def decode(self, seen: AxisFrames, thresholds: CodeThresholds) -> AxisCode:
-        return decode_fringes(self.stack(seen.size), seen, thresholds)
-
-    def contradiction(self, seen: AxisFrames, code: AxisCode) -> str | None:
-        return stack_contradiction(seen, code, self.stack(seen.size))
-
-    def white_and_black(self, size: int, names: list[str], frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return mean_and_swing(self.stack(size), frames)
-
-    def least_signal(self, size: int, thresholds: CodeThresholds, background: Background) -> np.ndarray:
-        steps = min(self.stack(size).steps)
-        return thresholds.phase.least_signal(steps, VISIBILITY, FrameContent(), background)
+        super().check(size)
 
     @property
     def details(self) -> str:
@@ -190,17 +158,3 @@ class NumberTheoretic(MultiFrequency):
         while m * (m + 1) * (m + 2) < size:
             m += 2
         return float(m + 2), float(m + 1), float(m)
-
-
-def decode_fringes(stack: FringeStack, seen: AxisFrames, thresholds: CodeThresholds) -> AxisCode:
-    """The places on which the fringes of a stack agree, between 0 and the size of the axis."""
-    swing = thresholds.gray.relative_bit * seen.contrast.values if seen.contrast.is_measured else 0.0
-    return stack.decode(seen, 0.0, float(seen.size), swing, thresholds.phase)
-
-
-def mean_and_swing(stack: FringeStack, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(h, w) float32 each: white and black as the mean of the fringes plus and minus their largest modulation."""
-    phases = [phase_of(stack.of_period(frames, i)) for i in range(len(stack.steps))]
-    mean = np.mean([p.mean for p in phases], axis=0)
-    modulation = np.max([p.modulation for p in phases], axis=0)
-    return mean + modulation, mean - modulation

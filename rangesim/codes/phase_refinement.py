@@ -9,7 +9,7 @@ from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.fringe_gamma import gamma_of
 from rangesim.codes.fringes import FringeConvention
 from rangesim.decoding.phase_shift import PhaseThresholds, modulation_is_weak, phase_of, phase_sigma
-from rangesim.decoding.row_bands import bands
+from rangesim.decoding.row_bands import in_bands
 from rangesim.decoding.status import Status
 
 
@@ -42,7 +42,8 @@ def refine_by_phase(
     reach = gray.cell_px / 2 + period_px / 8
     if gray.cell_px <= period_px:  # coarser cells are those of a place that fringes have refined before
         reach = min(reach, period_px - reach)  # a place that is farther off has a second cycle within the range
-    for rows in bands(len(status)):
+
+    def refine_rows(rows: slice) -> None:
         phase = gamma.corrected(phase_of(frames[:, rows]), len(frames))
         whole, refused = gray.coordinate[rows], status[rows]
         sigma = phase_sigma(capture, phase, len(frames))
@@ -57,4 +58,6 @@ def refine_by_phase(
         refused[ok & saturated[rows]] = Status.SATURATED
         if sigma_px is not None and sigma is not None:
             np.multiply(sigma, period_px / (2 * np.pi), out=sigma_px[rows], casting="same_kind")
-    return AxisCode(coordinate, status, gray.cell_px, sigma_px, gray, gamma.gamma)
+
+    in_bands(refine_rows, len(status))
+    return AxisCode(coordinate, status, gray.cell_px, sigma_px, gray, (gamma,))

@@ -65,9 +65,15 @@ class RampCode(Code):
 
     def check_shown(self, size: int, shown: Sequence[str]) -> None:
         if RAMP not in shown and REVERSE not in shown:
-            raise ValueError("expected an order with a ramp or its reverse.")
+            raise ValueError(
+                f"expected an order with {RAMP} or {REVERSE}, got {', '.join(shown) or 'no frames'}: show one of them."
+            )
         if not {"white", "black"} <= set(shown):
-            raise ValueError("expected white and black among the frames: without them, a ramp tells no place.")
+            missing = " and no ".join(level for level in ("white", "black") if level not in shown)
+            raise ValueError(
+                f"expected white and black among the frames, got no {missing}: show them, because a ramp tells no "
+                "place without them."
+            )
 
     def decode(self, seen: AxisFrames, thresholds: CodeThresholds) -> AxisCode:
         capture, contrast = seen.capture, np.maximum(seen.contrast.values, np.float32(1e-30))
@@ -83,13 +89,14 @@ class RampCode(Code):
         sigma_px, allowed = None, thresholds.gray.relative_bit * contrast
         if noises:
             of_ramp, of_reverse, of_white, of_black = (np.square(noise) for noise in noises)
-            if has_both:
-                variance = of_ramp + of_reverse + ratio**2 * (of_white + of_black)
-            else:
-                side = 1 if RAMP in shown else -1
-                of_shown = of_ramp if RAMP in shown else of_reverse
-                variance = 4 * of_shown + (1 - side * ratio) ** 2 * of_black + (1 + side * ratio) ** 2 * of_white
-            sigma_px = (0.5 * seen.size * np.sqrt(variance) / contrast).astype(np.float32)
+            with np.errstate(over="ignore"):  # a pixel without contrast has an infinite deviation
+                if has_both:
+                    variance = of_ramp + of_reverse + ratio**2 * (of_white + of_black)
+                else:
+                    side = 1 if RAMP in shown else -1
+                    of_shown = of_ramp if RAMP in shown else of_reverse
+                    variance = 4 * of_shown + (1 - side * ratio) ** 2 * of_black + (1 + side * ratio) ** 2 * of_white
+                sigma_px = (0.5 * seen.size * np.sqrt(variance) / contrast).astype(np.float32)
             of_sum = np.sqrt(of_ramp + of_reverse + of_white + of_black)
             allowed = np.maximum(allowed, thresholds.gray.bit_sigmas * of_sum)
         elif capture.is_digital:

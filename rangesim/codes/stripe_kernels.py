@@ -9,8 +9,21 @@ import numpy as np
 
 from pcgraph.parallel import kernel
 
-UNCERTAIN, DARK = -1, -2
-"""Words of pixels on the edge of a stripe, and of pixels without light."""
+UNCERTAIN = -1
+"""Word of a pixel on the edge of a stripe; words of colours are numbers from 0 on."""
+
+DARK = -2
+"""Word of a pixel without light, across which no stripes are read; see `UNCERTAIN`."""
+
+MAX_STEP_RATIO = 1.2
+"""Largest ratio of the widths in the image of a stripe and of the more similar of its two neighbours. Between the edges
+of a stripe, places are interpolated, and where two surfaces meet within one they are wrong by up to half of it. Such a
+stripe is wider or narrower than both neighbours. In the scene `matte` with stripes of 10 px, 1.2 refuses 74 % of the
+places that are off by more than a pixel, and 6 % of the others; 1.1 refuses 79 and 10 %, 1.3 65 and 5 %."""
+
+MAX_EDGE_ERROR_PX = 1.0
+"""Largest difference of the widths of two stripes, in pixels of the camera, that may come from their edges alone: each
+is known to half a pixel where pixels do not average over their width."""
 
 CHANCE = 2
 """Number of stripes that are left out where a surface ends beside another one: the first stripe of the other surface
@@ -32,6 +45,7 @@ def decode_lines(  # type: ignore[no-untyped-def]
     colour, chain = np.empty(width, np.int64), np.empty(width, np.int64)
     uncertain = np.empty(width, np.bool_)
     stripe, edge = np.empty(width, np.int64), np.empty(width + 1, np.float64)
+    step, is_bent = np.empty(width, np.float64), np.empty(width, np.bool_)  # projector pixels per pixel; NaN: unknown
     for y in range(start, stop):
         n, part = 0, 0
         for x in range(width):
@@ -100,18 +114,28 @@ def decode_lines(  # type: ignore[no-untyped-def]
                 edge[i + 1] = total / found
         edge[0], edge[n] = math.nan, math.nan
         for i in range(n):
-            if stripe[i] < 0:
+            step[i] = stripe_px / (edge[i + 1] - edge[i])
+        for i in range(n):
+            is_alike, neighbours = False, 0
+            for k in (i - 1, i + 1):
+                if 0 <= k < n and not math.isnan(step[k]):
+                    neighbours += 1
+                    is_alike |= max(step[i] / step[k], step[k] / step[i]) <= MAX_STEP_RATIO
+                    is_alike |= abs(stripe_px / step[i] - stripe_px / step[k]) <= MAX_EDGE_ERROR_PX
+            is_bent[i] = not math.isnan(step[i]) and neighbours > 0 and not is_alike
+        for i in range(n):
+            if stripe[i] < 0 or is_bent[i]:
                 continue
             low, high = edge[i], edge[i + 1]
             has_low, has_high = not math.isnan(low), not math.isnan(high)
             if not has_low and not has_high:
                 continue
             if has_low and has_high:
-                scale = stripe_px / (high - low)
-            elif has_high and i + 2 <= n and not math.isnan(edge[i + 2]):
-                scale = stripe_px / (edge[i + 2] - high)  # as wide as its neighbour
-            elif has_low and i > 0 and not math.isnan(edge[i - 1]):
-                scale = stripe_px / (low - edge[i - 1])
+                scale = step[i]
+            elif has_high and not math.isnan(step[i + 1]) and not is_bent[i + 1]:
+                scale = step[i + 1]  # as wide as its neighbour
+            elif has_low and not math.isnan(step[i - 1]) and not is_bent[i - 1]:
+                scale = step[i - 1]
             else:
                 continue
             begin, end = first[i], last[i] + 1

@@ -65,5 +65,8 @@ class XorCode(BitCode):
     def words_of_cells(self, bits: int) -> np.ndarray:
         cell = np.arange(1 << bits)
         gray = cell ^ (cell >> 1)
-        others = (1 << bits) - 1 - (1 << min(self.base_bit, bits - 1))
+        others = (1 << bits) - 1 - (1 << self.base_of(bits))
         return gray ^ (others * ((gray >> self.base_bit) & 1))
+
+    def base_of(self, bits: int) -> int:
+        return min(self.base_bit, bits - 1)

@@ -15,7 +15,8 @@ LEAST_TURN = 1e-12
 double precision."""
 
 TINY = 1e-30
-"""Squared length that replaces zero where something is divided by it."""
+"""Squared length that replaces zero where something is divided by it, in squared units of the frames: far below that of
+any pixel, and its inverse is still a float32."""
 
 
 class Columns(NamedTuple):

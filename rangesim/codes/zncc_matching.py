@@ -36,12 +36,13 @@ MIN_WRONG = 0.5
 """Least such fraction, beside that of the noise, at which the patterns count as wrong altogether, although no single
 fault explains it."""
 
-MIN_GAIN = 0.5
+MAX_MENDED_RATIO = 0.5
 """Largest ratio of the unexplained variance with a fault undone to that without, at which the fault is named. Undoing
 a fault that is there leaves the noise alone."""
 
 TINY_GAIN = 1e-20
-"""Gain that replaces zero where something is divided by it."""
+"""Gain that replaces zero where something is divided by it, in units of the frames: far below any gain, and its square
+is still a float64."""
 
 GAMMAS = np.arange(1.2, 3.01, 0.2)
 """Exponents of projectors that are tried. Those of video are about 2.2."""
@@ -54,7 +55,7 @@ SUSPECTS = 12
 
 
 class CorrelatedCode(NamedTuple):
-    """What correlation finds along one axis.
+    """Places along one axis that correlation found, and how clearly.
 
     code : AxisCode. distance : (h, w) float32, 0 to 1, correlation with the best place minus that with the best one
         that is no neighbour of it.
@@ -299,7 +300,7 @@ def correlation_contradiction(seen: AxisFrames, patterns: np.ndarray) -> str | N
             )
         )
     ratio, fault = min((float((remains / counts).min()), fault) for remains, fault in faults)
-    if ratio < MIN_GAIN:
+    if ratio < MAX_MENDED_RATIO:
         return f"{text}; {fault}."
     sigma = seen.capture.noise(values.mean(axis=0))
     variance = values.var(axis=0, dtype=np.float64)

@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.codes import AXES, AxisCode, AxisFrames
-from rangesim.conventions.fringe_conventions import measured_fringes, middle_of
+from rangesim.codes import AXES, AxisCode
+from rangesim.codes.code import MAX_LEFT_OUTSIDE, MAX_OUTSIDE_FRACTION
+from rangesim.conventions.fringe_conventions import measured_fringes, middle_of, with_own_start
 from rangesim.conventions.layouts import (
     ENDS,
     INVERSE,
@@ -32,6 +33,7 @@ from rangesim.decoding.orientation import is_mirrored
 from rangesim.decoding.pixel_samples import MIN_PIXELS
 from rangesim.decoding.status import Status
 from rangesim.sensors import StructuredLight, StructuredLightDecoder
+from rangesim.sensors.structured_light import BLACK, WHITE
 
 MAX_SAMPLE = 20_000
 """Largest number of pixels on which orders are tried: about a fifteenth of an image of 640 x 480. A few hundred pixels
@@ -82,6 +84,10 @@ MIN_STEP = 0.5
 """Least distance of two pixels that see different cells, in cells: a pixel on the edge of two cells is half a cell off
 both."""
 
+MIN_SUBPIXEL_FRACTION = 0.5
+"""Least fraction of the places that are neither the centre nor the edge of a cell, at which a code counts as sub-pixel:
+of bits none is, of fringes nearly all are."""
+
 MAX_LOSS_BITS = 0.2
 """Largest loss against the best order, in bits, at which a more usual order is taken. Two orders that are equally right
 differ by less than 0.1 bits."""
@@ -92,7 +98,7 @@ MAX_ENTRIES = 6
 
 @dataclass(frozen=True)
 class Convention:
-    """What the frames tell of how they were taken.
+    """Convention in which frames were taken, as they show it.
 
     sensor : StructuredLight with the settings that the frames agree with.
     findings : sentences, one for each setting that differs from those given; none if nothing does.
@@ -137,8 +143,8 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
     --------
     >>> sensor = StructuredLight(64, 48, code="gray")
     >>> shown = sensor.patterns()  # as a camera sees them that looks straight at the screen
-    >>> detect_convention(np.concatenate([shown[-2:], shown[:-2]]), sensor)
-    Convention(sensor=StructuredLight(...), findings=('white and black come first.',))
+    >>> detect_convention(np.concatenate([shown[-2:], shown[:-2]]), sensor).findings
+    ('white and black come first.', 'this is the order white, black, *.')
     """
     is_given = len(frames) == sensor.n_frames
     orders = list(layouts(sensor, len(frames)))
@@ -159,9 +165,10 @@ def detect_convention(frames: np.ndarray, sensor: StructuredLight) -> Convention
     findings = _order_findings(layout, sensor, found)
     if layout is None and found.axes != sensor.axes:
         findings.insert(0, f"{found.axes[0]} were shown before {found.axes[1]}.")
+    found, said_of_places = _within_projector(sample, found)
     code, said = measured_fringes(frames, sample.frames, found)
     found = replace(found, code=code)
-    return Convention(found, (*findings, *said))
+    return Convention(found, (*findings, *said_of_places, *said))
 
 
 def detect_order(frames: np.ndarray, sensor: StructuredLight) -> Convention:
@@ -241,7 +248,7 @@ def _best_layout(sample: _Sample, sensor: StructuredLight, orders: Sequence[Layo
         The given order has another number of frames, and no other order decodes them.
     """
     given = sensor.frame_names() if is_given else None
-    fineness, ends = _fineness(sensor), {ends: _ends_fit(sample, ends) for ends in ENDS}
+    fineness, ends = _fineness(sensor), {ends: _ends_fit(sample, _at_ends(*ends)) for ends in ENDS}
     possible = []
     for layout in orders:
         if not ends[layout.ends]:
@@ -260,8 +267,11 @@ def _best_layout(sample: _Sample, sensor: StructuredLight, orders: Sequence[Layo
                 continue
     highest = max((score for score, _ in scores), default=0.0)
     score, layout = next((found for found in scores if found[0] >= highest - MAX_LOSS_BITS), (0.0, Layout(sensor.axes)))
-    if is_given:
-        return layout if score > max(MIN_BITS, _agreement_bits(sample, sensor) + MIN_GAIN_BITS) else None
+    if given is not None:
+        # White and black that are exchanged cost fringes nothing, because their phases tell the place without them.
+        fits = _ends_fit(sample, [(i, name) for i, name in enumerate(given) if name in (WHITE, BLACK)])
+        least = _agreement_bits(sample, sensor) + (MIN_GAIN_BITS if fits else -MAX_LOSS_BITS)
+        return layout if score > max(MIN_BITS, least) else None
     if score < MIN_BITS:
         raise ValueError(
             f"{_wrong_number(len(sample.frames), sensor, sample)[:-1]}; and in no order that misses some of them do "
@@ -278,7 +288,7 @@ def _lost_of_pair(sample: _Sample, sensor: StructuredLight) -> str | None:
     if np.count_nonzero(sample.is_lit) < MIN_PIXELS:
         return None
     fineness, error = _fineness(sensor), _pair_errors(sample)
-    ends = {ends: _ends_fit(sample, ends) for ends in ENDS}
+    ends = {ends: _ends_fit(sample, _at_ends(*ends)) for ends in ENDS}
     found: dict[str, float] = {}
     for layout in layouts(sensor, len(sample.frames) + 1):
         names = layout.names(sensor)
@@ -304,16 +314,20 @@ def _pair_errors(sample: _Sample) -> np.ndarray:
     return np.array([np.abs(frames + frame - total).mean(axis=1) / swing for frame in frames])
 
 
-def _ends_fit(sample: _Sample, ends: tuple[tuple[str, ...], tuple[str, ...]]) -> bool:
+def _at_ends(first: Sequence[str], last: Sequence[str]) -> list[tuple[int, str]]:
+    """Places of the first and of the last frames, each with the frame's name."""
+    return [*enumerate(first), *((i - len(last), name) for i, name in enumerate(last))]
+
+
+def _ends_fit(sample: _Sample, places: Sequence[tuple[int, str]]) -> bool:
     """Whether the frames that would be white and black are the brightest and the darkest nearly everywhere.
 
     Parameters
     ----------
-    ends : names of the first and of the last frames.
+    places : places of white and black among the frames, each with its name.
     """
-    lit, limits = sample.is_lit, {"white": sample.high, "black": sample.low}
+    lit, limits = sample.is_lit, {WHITE: sample.high, BLACK: sample.low}
     largest = MAX_END_ERROR * (sample.high - sample.low)[lit]
-    places = [*enumerate(ends[0]), *((i - len(ends[1]), name) for i, name in enumerate(ends[1]))]
     return all(
         (np.abs(sample.frames[i] - limits[name])[lit] <= largest).mean() >= MIN_END_FRACTION for i, name in places
     )
@@ -354,11 +368,12 @@ def _likeness(sample: _Sample, fineness: dict[str, float], names: Sequence[str])
 
 
 def _agreement_bits(sample: _Sample, candidate: StructuredLight) -> float:
-    """How much nearer to each other neighbouring pixels see the projector than any two pixels do, in powers of two.
+    """Ratio of the distance of any two pixels to that of neighbours, on the projector, in powers of two.
 
     It is the mean over all pairs of neighbours that see different cells, times the fraction of the pairs that are
     decoded; of two axes, that of the worse one.
     """
+    candidate = with_own_start(sample.frames, candidate)
     return min(
         max(_nearness(sample, c) for c in (code, code.coarse) if c is not None)
         for code in _decoded(sample.frames, candidate).values()
@@ -367,19 +382,16 @@ def _agreement_bits(sample: _Sample, candidate: StructuredLight) -> float:
 
 def _decoded(frames: np.ndarray, sensor: StructuredLight) -> dict[str, AxisCode]:
     """The codes of all axes."""
-    capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
-    contrast = decoder.contrast(capture, sensor)
-    codes: dict[str, AxisCode] = {}
-    for axis in sensor.axes:
-        seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
-        codes[axis] = sensor.code.decode(seen, decoder.thresholds)
-    return codes
+    decoder = StructuredLightDecoder()
+    axes = decoder.axis_frames(Capture(frames, sensor))
+    return {seen.axis: sensor.code.decode(seen, decoder.thresholds) for seen in axes}
 
 
 def _nearness(sample: _Sample, code: AxisCode) -> float:
-    """Mean of log2 of the distance of any two pixels minus that of neighbours, in cells; see `_agreement_bits`.
+    """Mean of log2 of the distance of any two pixels minus that of neighbours; see `_agreement_bits`.
 
-    Neighbours that see the same cell would agree in every order.
+    Distances are in cells. Neighbours that see the same cell of a code of bits would agree in every order, so they do
+    not count. A sub-pixel code that refines no such cells tells all places from each other; its cells are pixels.
     """
     ok = code.status == Status.OK
     here, there, n = [], [], 0
@@ -389,12 +401,16 @@ def _nearness(sample: _Sample, code: AxisCode) -> float:
         here.append(code.coordinate[a][both])
         there.append(code.coordinate[b][both])
     first, second = np.concatenate(here) / code.cell_px, np.concatenate(there) / code.cell_px
-    differ = np.abs(first - second) >= MIN_STEP
+    is_subpixel = code.coarse is None and np.count_nonzero(first % MIN_STEP) > MIN_SUBPIXEL_FRACTION * len(first)
+    if is_subpixel:
+        first, second = first * code.cell_px, second * code.cell_px
+    distance = np.abs(first - second)
+    differ = (distance >= MIN_STEP) | is_subpixel
     if np.count_nonzero(differ) < MIN_PIXELS:
         return 0.0
     any_other = np.random.default_rng(0).permutation(second)
     octaves = np.log2(np.maximum(np.abs(first - any_other), MIN_STEP)).mean()
-    return float((octaves - np.log2(np.abs(first - second)[differ]).mean()) * len(first) / n)
+    return float((octaves - np.log2(np.maximum(distance, MIN_STEP)[differ]).mean()) * len(first) / n)
 
 
 def _upright(frames: np.ndarray, sample: _Sample, found: StructuredLight) -> StructuredLight:
@@ -419,6 +435,26 @@ def _upright(frames: np.ndarray, sample: _Sample, found: StructuredLight) -> Str
     except ValueError:
         return found
     return exchanged if exchanged.n_frames == found.n_frames else found
+
+
+def _within_projector(sample: _Sample, sensor: StructuredLight) -> tuple[StructuredLight, tuple[str, ...]]:
+    """The sensor in a convention of its code in which nearly all places lie in the projector, and what differs."""
+    outside = _outside(sample, sensor)
+    if outside > MAX_OUTSIDE_FRACTION:
+        for code, said in sensor.code.other_conventions():
+            other = replace(sensor, code=code)
+            if _outside(sample, other) < MAX_LEFT_OUTSIDE * outside:
+                return other, (said,)
+    return sensor, ()
+
+
+def _outside(sample: _Sample, sensor: StructuredLight) -> float:
+    """Fraction of the decoded pixels that see no place of the projector; of two axes, that of the worse one."""
+    fractions = []
+    for code in _decoded(sample.frames, sensor).values():
+        outside = int(np.count_nonzero(code.status == Status.CODE_ERROR))
+        fractions.append(outside / max(1, outside + int(np.count_nonzero(code.status == Status.OK))))
+    return max(fractions)
 
 
 def _differences(layout: Layout, sensor: StructuredLight, found: StructuredLight) -> Iterator[str]:

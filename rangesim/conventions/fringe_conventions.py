@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where fringes start and which way they move, measured against the Gray code that they refine."""
+"""Where fringes start and which way they move, measured against the Gray code that they refine.
+
+Fringes of several periods without a Gray code tell where they start: at a wrong start, their phases lie beside the
+places on which they agree. They do not tell which way they move.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rangesim.capture import Capture
+from rangesim.capture import Capture, bright_level
 from rangesim.codes import AxisFrames, Code, FringeConvention
+from rangesim.codes.fringe_code import FringeCode
 from rangesim.codes.fringe_direction import phase_direction
 from rangesim.codes.fringes import STARTS
 from rangesim.decoding.phase_shift import phase_of
@@ -18,16 +23,18 @@ from rangesim.decoding.pixel_samples import MIN_PIXELS
 from rangesim.decoding.status import Status
 from rangesim.sensors import StructuredLight, StructuredLightDecoder
 
-ORIGINS_PX = (0.0, 0.5)
-"""Places of phase 0 that are in use, in projector pixels: the edge of the first pixel, and its centre."""
+ORIGINS_PX = {0.0: "at the edge of the first pixel", 0.5: "at the centre of the first pixel",
+              -0.5: "half a pixel before the first one, whose number is 1"}  # fmt: skip
+"""Places of phase 0 that are in use, in projector pixels. Programs that count pixels from 1 (MATLAB) take the last."""
 
 MIN_CONCENTRATION = 0.8
 """Least length of the mean vector of phase minus place, as a fraction of that of an even distribution over a Gray cell,
 at which fringes count as following the code. For fringes in the other direction it is near 0."""
 
 MAX_CELL_TURNS = 0.75
-"""Largest Gray cell, in periods of the fringes, that tells where they start. The mean vector of phase minus place over
-a cell has the length sinc(cell / period): 0.3 here, and 0 if the cell is a period, because all phases occur alike."""
+"""Largest Gray cell, in periods of the fringes, whose inside tells where they start. The mean vector of phase minus
+place over a cell has the length sinc(cell / period): 0.3 here, and 0 if the cell is a period, because all phases occur
+alike. Of larger cells, the edges tell."""
 
 MAX_SIDE = 480
 """Largest side in pixels of the part of the image in which contradictions are looked for, so that the time is bounded.
@@ -41,19 +48,35 @@ MAX_REST_PX = 0.2
 """Largest distance of the measured start from one of the usual ones, in projector pixels, at which it counts as that
 one. Usual ones are half a pixel apart; sound captures measure theirs to 0.1 pixels."""
 
-MAX_OUTSIDE_RATIO = 0.5
-"""Largest number of phases outside their Gray cell in another convention, as a fraction of that in the given one, at
-which the convention is changed. Phases that are where they should be lie outside by noise alone in both."""
+MAX_EDGE_TURNS = 0.01
+"""Distance of the start that the edges of cells tell from a usual one, in turns, at which it may still be that one: the
+edges of a real capture lie up to 0.03 turns off, their mean 0.006. Of long periods they do not tell half a pixel; then
+the origin stays as given."""
 
-EDGE_TURNS = 0.005
-"""Least distance of a phase from its Gray cell, in turns, at which it counts as outside; it allows for rounding."""
+MIN_SIGMAS = 5.0
+"""Least distance of a measured start from the given one, in standard errors of the mean of that many pixels, at which
+the start is changed. Neighbours are not independent, so it is more than the usual three."""
+
+MIN_SWING = 0.1
+"""Least swing of the pixels whose phases are compared, as a fraction of that of the bright pixels. Others may lie in
+shadow, where phases are noise."""
+
+MAX_BIAS_TURNS = 0.005
+"""Largest bias of the phases of several periods, in turns (`FringeStack.bias_turns`), at which fringes count as
+starting where they should. Sound fringes have 0.001 (measured); heterodyne fringes that start a quarter of a period
+elsewhere have 0.25 times the relative difference of their periods, 0.02 for 70 and 64 fringes."""
+
+MAX_BIAS_RATIO = 0.3
+"""Largest bias at another start, as a fraction of that at the given one, at which the start is changed."""
 
 
 class _Offsets(NamedTuple):
     """Phases of some pixels, and their Gray cells.
 
-    phase, cell : (n,) turns. agreement : 1 if the phases grow from pixel to pixel as their cells do, -1 if the other
-    way, 0 if neighbours do not tell. half_turns : half a cell, in turns. period_px : projector pixels.
+    phase, cell : (n,) turns, `cell` of the centre of the cell or of its edge. agreement : 1 if the phases grow from
+    pixel to pixel as their cells do, -1 if the other way, 0 if neighbours do not tell. half_turns : half the width of
+    the places that one `cell` stands for, in turns. period_px : projector pixels. largest_rest_px : distance from a
+    usual start, in projector pixels, up to which the fringes count as starting there.
     """
 
     phase: np.ndarray
@@ -61,15 +84,12 @@ class _Offsets(NamedTuple):
     agreement: float
     half_turns: float
     period_px: float
+    largest_rest_px: float = MAX_REST_PX
 
     def off(self, convention: FringeConvention) -> np.ndarray:
         """(n,) turns, -0.5 to 0.5, the place that the phase tells minus the centre of the Gray cell."""
         turns = convention.place_turns(self.phase, self.period_px) - self.cell
         return np.asarray(turns - np.rint(turns))
-
-    def outside(self, convention: FringeConvention) -> float:
-        """Fraction of the phases outside their Gray cell."""
-        return float((np.abs(self.off(convention)) > self.half_turns + EDGE_TURNS).mean())
 
 
 def measured_fringes(frames: np.ndarray, sample: np.ndarray, sensor: StructuredLight) -> tuple[Code, tuple[str, ...]]:
@@ -84,10 +104,15 @@ def measured_fringes(frames: np.ndarray, sample: np.ndarray, sensor: StructuredL
     """
     code = sensor.code
     given = getattr(code, "convention", None) if "convention" in {f.name for f in fields(code)} else None  # type: ignore[arg-type]
-    period_px = getattr(code, "period_px", None)
-    if not isinstance(given, FringeConvention) or not isinstance(period_px, float):
+    if not isinstance(given, FringeConvention):
         return code, ()
-    found = {_measured(offsets, given) for offsets in _all_offsets(sample, sensor, period_px)}
+    if isinstance(code, FringeCode):
+        started = with_own_start(sample, sensor).code
+        return started, tuple(_differences(started.convention, given))  # type: ignore[attr-defined]
+    period_px = getattr(code, "period_px", None)
+    if not isinstance(period_px, float):
+        return code, ()
+    found = {_measured(offsets, given) for offsets in _all_offsets(middle_of(frames), sensor, period_px)}
     if len(found) != 1 or None in found or found == {given}:
         return code, ()
     convention = found.pop()
@@ -99,6 +124,41 @@ def measured_fringes(frames: np.ndarray, sample: np.ndarray, sensor: StructuredL
     return other, tuple(_differences(convention, given))
 
 
+def with_own_start(frames: np.ndarray, sensor: StructuredLight) -> StructuredLight:
+    """The sensor with the usual start at which its fringes of several periods agree; `sensor` if they do so as given.
+
+    Parameters
+    ----------
+    frames : (k, h, w), some of the pixels of all frames.
+    """
+    code = sensor.code
+    given = getattr(code, "convention", None)
+    if not isinstance(code, FringeCode) or not isinstance(given, FringeConvention):
+        return sensor
+    decoder = StructuredLightDecoder()
+    seen = decoder.axis_frames(Capture(frames, sensor))
+    stacks = [code.stack(one.size) for one in seen]
+    used = [_is_bright(one) for one in seen]
+    if min(len(stack.steps) for stack in stacks) < 2 or min(map(np.count_nonzero, used)) < MIN_PIXELS:
+        return sensor
+    phases = [
+        [phase_of(stack.of_period(one.frames, i)[:, lit]).normalised for i in range(len(stack.steps))]
+        for one, stack, lit in zip(seen, stacks, used, strict=True)
+    ]
+    biases: dict[FringeConvention, float] = {}
+    for start in (given.start, *STARTS):
+        here = replace(given, start=start)  # type: ignore[arg-type]
+        biases[here] = max(
+            stack.bias_turns([here.place_turns(t, p) for t, p in zip(turns, stack.periods_px, strict=True)], one.size)
+            for one, stack, turns in zip(seen, stacks, phases, strict=True)
+        )
+    best = min(biases, key=lambda convention: biases[convention])
+    rivals = [c for c, bias in biases.items() if c != best and bias < biases[best] / MAX_BIAS_RATIO]
+    if rivals or not biases[best] < min(MAX_BIAS_TURNS, MAX_BIAS_RATIO * biases[given]):
+        return sensor
+    return replace(sensor, code=replace(code, convention=best))  # type: ignore[type-var]
+
+
 def middle_of(frames: np.ndarray) -> np.ndarray:
     """(k, i, j) float32, all pixels in the middle of frames (k, h, w)."""
     y, x = (slice(max(0, (size - MAX_SIDE) // 2), (size + MAX_SIDE) // 2) for size in frames.shape[1:])
@@ -107,42 +167,60 @@ def middle_of(frames: np.ndarray) -> np.ndarray:
 
 def contradictions(frames: np.ndarray, sensor: StructuredLight) -> list[str]:
     """Sentences on what contradicts the sensor's code as a whole, in the middle of frames (k, h, w)."""
-    frames = middle_of(frames)
-    capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
-    contrast = decoder.contrast(capture, sensor)
-    found = []
-    for axis in sensor.axes:
-        seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
-        found.append(sensor.code.contradiction(seen, sensor.code.decode(seen, decoder.thresholds)))
+    decoder = StructuredLightDecoder()
+    axes = decoder.axis_frames(Capture(middle_of(frames), sensor))
+    found = (sensor.code.contradiction(seen, sensor.code.decode(seen, decoder.thresholds)) for seen in axes)
     return [text for text in found if text]
 
 
 def _all_offsets(frames: np.ndarray, sensor: StructuredLight, period_px: float) -> Iterator[_Offsets]:
-    """Phases and Gray cells along each axis, where both are clear."""
-    capture, decoder = Capture(frames, sensor), StructuredLightDecoder()
-    contrast = decoder.contrast(capture, sensor)
-    for axis in sensor.axes:
-        seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
+    """Phases and Gray cells along each axis, where both are clear; of wide cells, phases at their edges."""
+    decoder = StructuredLightDecoder()
+    for seen in decoder.axis_frames(Capture(frames, sensor)):
         code = sensor.code.decode(seen, decoder.thresholds)
-        gray, fringes = code.coarse, seen.starting_with("phase")
+        gray, fringes = code.coarse, seen.starting_with("phase" if "phase0" in seen.names else "period0_")
         if gray is None or not len(fringes.frames):
             continue
-        inside = (gray.coordinate / gray.cell_px) % 1 == 0.5
         is_strong = (code.status == Status.OK) | (code.status == Status.CODE_ERROR)
-        used = inside & is_strong & (gray.status == Status.OK)
+        clear = is_strong & (gray.status == Status.OK) & _is_bright(seen)
+        used = clear & ((gray.coordinate / gray.cell_px) % 1 == 0.5)
         phase = phase_of(fringes.frames).normalised
-        yield _Offsets(
-            phase[used],
-            gray.coordinate[used] / np.float32(period_px),
-            phase_direction(fringes.frames, gray, used, period_px),
-            gray.cell_px / (2 * period_px),
-            period_px,
-        )
+        agreement = phase_direction(fringes.frames, gray, used, period_px)
+        if gray.cell_px > MAX_CELL_TURNS * period_px:
+            phase, place_px = _at_edges(phase, np.where(clear, gray.coordinate, np.float32(np.nan)), gray.cell_px)
+            turns, rest_px = place_px / np.float32(period_px), max(MAX_REST_PX, MAX_EDGE_TURNS * period_px)
+            yield _Offsets(phase, turns, agreement, 0.25, period_px, rest_px)  # within a quarter of a period
+            continue
+        turns = gray.coordinate[used] / np.float32(period_px)
+        yield _Offsets(phase[used], turns, agreement, gray.cell_px / (2 * period_px), period_px)
+
+
+def _is_bright(seen: AxisFrames) -> np.ndarray:
+    """(h, w) bool, where the difference of white and black is not that of a shadow."""
+    return np.asarray(seen.contrast.values > MIN_SWING * bright_level(seen.contrast.values))
+
+
+def _at_edges(phase: np.ndarray, place_px: np.ndarray, cell_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Phases (n,) of pixels on the edges of cells and on both sides of them, and the places (n,) of these edges.
+
+    Parameters
+    ----------
+    phase : (h, w) turns. place_px : (h, w) centres and edges of cells in projector pixels, NaN where not known.
+    """
+    on_edge = (place_px / cell_px) % 1 == 0
+    phases, edges = [phase[on_edge]], [place_px[on_edge]]
+    for axis in (0, 1):
+        near, far = np.moveaxis(place_px, axis, 0)[:-1], np.moveaxis(place_px, axis, 0)[1:]
+        between = (np.abs(far - near) == cell_px) & ((near / cell_px) % 1 == 0.5)  # False for NaN
+        along = np.moveaxis(phase, axis, 0)
+        phases += [along[:-1][between], along[1:][between]]
+        edges += [(near + far)[between] / 2] * 2
+    return np.concatenate(phases), np.concatenate(edges)
 
 
 def _measured(offsets: _Offsets, given: FringeConvention) -> FringeConvention | None:
-    """The convention that the phases of an axis follow, `given` if they agree with it; None if they follow none."""
-    if len(offsets.phase) < MIN_PIXELS or 2 * offsets.half_turns > MAX_CELL_TURNS:
+    """The usual convention that the phases of an axis follow, `given` if that is it; None if they follow none."""
+    if len(offsets.phase) < MIN_PIXELS:
         return None
     expected = float(np.sinc(2 * offsets.half_turns))
     for direction, sign in (("forward", 1), ("backward", -1)):
@@ -153,13 +231,15 @@ def _measured(offsets: _Offsets, given: FringeConvention) -> FringeConvention | 
         if abs(vector) < MIN_CONCENTRATION * expected:
             continue
         off_px = float(np.angle(vector)) / (2 * np.pi) * offsets.period_px
-        best = min(_usual(here), key=lambda c: abs(_rest_px(c, here, off_px, offsets.period_px)))
-        if abs(_rest_px(best, here, off_px, offsets.period_px)) > MAX_REST_PX:
+        rest_px = {c: abs(_rest_px(c, here, off_px, offsets.period_px)) for c in _usual(here)}
+        best = min(rest_px, key=lambda c: rest_px[c])
+        if offsets.largest_rest_px > MAX_REST_PX:  # half a pixel may not be told
+            best = min(rest_px, key=lambda c: (rest_px[c] > offsets.largest_rest_px, c.origin_px != given.origin_px))
+        if rest_px[best] > offsets.largest_rest_px:
             return None
-        is_turned = direction != given.direction  # its mirror image in each cell may leave no phase outside
-        if not is_turned and (best == given or offsets.outside(best) > MAX_OUTSIDE_RATIO * offsets.outside(given)):
-            return given
-        return best
+        spread_px = float(np.sqrt(-2 * np.log(abs(vector)))) / (2 * np.pi) * offsets.period_px
+        is_clear = abs(off_px) > MIN_SIGMAS * spread_px / np.sqrt(len(offsets.phase))
+        return best if is_clear or direction != given.direction else given
     return None
 
 
@@ -172,7 +252,7 @@ def _usual(given: FringeConvention) -> Iterator[FringeConvention]:
 
 
 def _rest_px(other: FringeConvention, given: FringeConvention, off_px: float, period_px: float) -> float:
-    """What is left of the offset `off_px`, seen with the convention `given`, if the fringes follow `other`."""
+    """The rest of the offset `off_px`, seen with the convention `given`, if the fringes follow `other`."""
     change_px = (other.shift_turns(0, 1, period_px) - given.shift_turns(0, 1, period_px)) * period_px
     rest = off_px + change_px
     return rest - period_px * round(rest / period_px)
@@ -186,5 +266,5 @@ def _differences(found: FringeConvention, given: FringeConvention) -> Iterator[s
         way = "larger" if found.direction == "forward" else "smaller"
         yield f"the fringes move towards {way} pixels (convention.direction = {found.direction})."
     if found.origin_px != given.origin_px:
-        place = {0.0: "at the edge", 0.5: "at the centre"}[found.origin_px]
-        yield f"phase 0 of the fringes lies {place} of the first pixel (convention.origin_px = {found.origin_px:g})."
+        place = ORIGINS_PX[found.origin_px]
+        yield f"phase 0 of the fringes lies {place} (convention.origin_px = {found.origin_px:g})."

@@ -80,7 +80,7 @@ class Layout(NamedTuple):
         result = []
         for i in self.blocks:
             kind = kinds(sensor)[i]
-            own = [name for name in names if kind_of(name) == kind and not name.endswith(INVERSE)]
+            own = [n for n, k in zip(names, kinds_of(names), strict=True) if k == kind and not n.endswith(INVERSE)]
             if self.is_reversed and kind in refined_kinds(sensor):
                 own.reverse()
             pairs = [(f"{axis}_{name}", f"{axis}_{name}{INVERSE}" if name + INVERSE in names else None) for name in own]
@@ -98,23 +98,29 @@ class Layout(NamedTuple):
         return result
 
 
-def kind_of(name: str) -> str:
-    """Kind of a pattern: its name without its number, and without what tells inverses."""
-    return re.sub(r"\d+$", "", name.removesuffix(INVERSE))
+def kinds_of(names: list[str]) -> list[str]:
+    """Kind of each pattern of a code: its name without its number, and without what tells inverses.
+
+    Fringes of several periods are one kind beside other patterns. Alone, each period is a kind.
+    """
+    each = [re.sub(r"\d+$", "", name.removesuffix(INVERSE)) for name in names]
+    merged = [re.sub(r"^period\d+_", "", kind) for kind in each]
+    return merged if len(set(merged)) > 1 else each
 
 
 def kinds(sensor: StructuredLight) -> list[str]:
     """Kinds of patterns of a sensor's code in its own order, such as "bit" and "phase"."""
-    return list(dict.fromkeys(kind_of(name) for name in sensor.code.names(sensor.size(sensor.axes[0]))))
+    return list(dict.fromkeys(kinds_of(sensor.code.names(sensor.size(sensor.axes[0])))))
 
 
 def refined_kinds(sensor: StructuredLight) -> list[str]:
     """Kinds whose patterns become finer, such as bits, so that they may come in reverse."""
     size = sensor.size(sensor.axes[0])
     variation: dict[str, list[float]] = {}
-    for name, total in zip(sensor.code.names(size), variations(sensor.code.patterns(size)), strict=True):
+    names = sensor.code.names(size)
+    for name, kind, total in zip(names, kinds_of(names), variations(sensor.code.patterns(size)), strict=True):
         if not name.endswith(INVERSE):
-            variation.setdefault(kind_of(name), []).append(float(total))
+            variation.setdefault(kind, []).append(float(total))
     return [kind for kind, totals in variation.items() if (np.diff(totals) >= 0).all() and totals[-1] > totals[0]]
 
 

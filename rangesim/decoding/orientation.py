@@ -24,6 +24,14 @@ MIN_MIRRORED_FRACTION = 0.8
 """Least fraction of the areas that are turned over, at which the map counts as mirrored. Of a real camera, only depth
 edges and noise turn areas over; a mirrored image turns over all but those."""
 
+MIN_JUMP = 0.8
+"""Least change over a step, as a fraction of the projector's size, that counts as a jump from one end to the other."""
+
+MIN_JUMP_FRACTION = 0.005
+"""Least fraction of the steps that jump, at which the ends of the projector count as meeting within the image. A line
+across the image makes 0.02 (one step of 40 along the shorter side); noise at the true ends makes none, because there
+is no light beyond them."""
+
 MAX_TURN_DEG = 60.0
 """Largest angle in degrees between the direction in which a coordinate grows and the one that the calibration predicts.
 A wrong image is turned by 90 or 180 degrees or mirrored. A surface that is tilted by 45 degrees changes the angle by 30
@@ -70,6 +78,43 @@ def orientation_contradiction(column: np.ndarray | None, row: np.ndarray | None,
             f"degrees to it: check {cause}."
         )
     return None
+
+
+def fringe_doubt(column: np.ndarray | None, row: np.ndarray | None, size: tuple[int, int]) -> str | None:
+    """A clause if coordinates that fringes alone tell seem to be mirrored or to start elsewhere; None if not.
+
+    An upright camera sees columns grow to the right and rows downwards. On a surface in view, neighbours do not see
+    opposite ends of the projector.
+
+    Parameters
+    ----------
+    column, row : (h, w) float32, projector pixels, NaN where not decoded; None for an axis that is not coded.
+    size : (width, height) of the projector in pixels.
+    """
+    axes = [
+        (name, _slopes(c), n)
+        for name, c, n in zip(("columns", "rows"), (column, row), size, strict=True)
+        if c is not None
+    ]
+    for name, slopes, n in axes:
+        known = np.abs(slopes[:, np.isfinite(slopes).all(axis=0)])
+        if known.size and (known > MIN_JUMP * n).any(axis=0).mean() > MIN_JUMP_FRACTION:
+            return (
+                f"{name} jump from one end of the projector to the other within the image: the fringes start "
+                "elsewhere, give another --set start, or they are shorter than the projector"
+            )
+    if not all(_grows_backwards(slopes, 0 if name == "columns" else 1) for name, slopes, _ in axes):
+        return None
+    ways = " and ".join("columns grow to the left" if name == "columns" else "rows grow upwards" for name, _, _ in axes)
+    return (
+        f"{ways}: the fringes move the other way, give --set direction=backward or forward, unless the camera stood "
+        "upside down; fringes alone do not tell"
+    )
+
+
+def _grows_backwards(slopes: np.ndarray, side: int) -> bool:
+    """Whether a coordinate with these slopes (2, n, m) decreases across (side 0) or down (side 1) the image."""
+    return _along(slopes) == ("width", "height")[side] and float(np.nanmedian(slopes[side])) < 0
 
 
 def is_mirrored(column: np.ndarray, row: np.ndarray) -> bool:

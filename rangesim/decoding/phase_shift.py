@@ -100,9 +100,8 @@ def phase_of(frames: np.ndarray) -> Phase:
         sine += np.float32(np.sin(2 * np.pi * s / n)) * value
         total += value
     normalised = np.arctan2(sine, cosine) * np.float32(1 / (2 * np.pi))
-    return Phase(
-        np.where(normalised < 0, normalised + 1, normalised), np.hypot(cosine, sine) * np.float32(2 / n), total / n
-    )
+    modulation = np.sqrt(cosine * cosine + sine * sine) * np.float32(2 / n)
+    return Phase(normalised - np.floor(normalised), modulation, total / n)
 
 
 def phase_sigma(capture: Capture, phase: Phase, steps: int) -> np.ndarray | None:

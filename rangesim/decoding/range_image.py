@@ -48,6 +48,7 @@ class RangeImage(ShortRepr):
     returns : Returns, all returns of each pixel, of which `range_m` is one (the decoder's `reading`); None: the decoder
         looked for one alone.
     doubts : sentences in which the decoder says what in the capture contradicts itself, each with its likely cause.
+    notes : sentences on what the decoder found in the capture and has corrected, such as a projector's gamma.
 
     Examples
     --------
@@ -75,6 +76,7 @@ class RangeImage(ShortRepr):
     decoder: Decoder | None = None
     returns: Returns | None = None
     doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def valid(self) -> np.ndarray:

@@ -15,16 +15,21 @@ import numpy as np
 
 from rangesim.decoding.phase_shift import Phase
 from rangesim.decoding.phase_unwrapping import unwrap
-
-MIN_PIXELS = 200
-"""Least number of pixels with enough light for a verdict on a capture; of fewer, single objects may decide."""
+from rangesim.decoding.pixel_samples import MIN_PIXELS, equal_frames, same_images
 
 MAX_PIXELS = 2000
 """Number of pixels that are looked at, evenly spread: their medians are known to 3 %."""
 
-MAX_OFF_COSINE = 0.5
-"""Largest typical distance of the taps from a cosine, as a fraction of its amplitude. Taps in another order were 1.2 to
-3.3 off in tests; harmonics of a tenth are 0.1 off, and phases that pass the thresholds have 0.2 of noise."""
+MAX_OFF_COSINE = 0.12
+"""Largest systematic distance of the taps from a cosine, as a fraction of its amplitude. Sound taps were at most 0.006
+off in tests, a second harmonic of a tenth makes 0.1, and a lost frame, with the last one there twice, 0.17 to 0.8."""
+
+PHASE_BINS = 24
+"""Number of parts of a turn, at most, in which the distance from a cosine is averaged, so that noise cancels. Each tap
+of 3, 4, 6 or 8 starts at the edge of one."""
+
+MIN_IN_BIN = 20
+"""Least number of pixels in a part of a turn. Their median has a quarter of the noise of a pixel."""
 
 CLEARER = 3.0
 """Factor by which another order of the taps, or of the frequencies, has to fit better than the stated one."""
@@ -40,6 +45,61 @@ direction: albedos and slopes of one surface differ by less."""
 MAX_FREQUENCIES = 4
 """Largest number of frequencies whose other orders are tried; more have more than 24."""
 
+MIN_CLIPPED = 0.005
+"""Least fraction of the pixels of which several taps have the largest number, at which it is the level where the camera
+clips. A single highlight has fewer pixels."""
+
+MIN_CLIPPED_SPREAD = 0.02
+"""Least spread of the darkest taps of these pixels, as a fraction of the level. If they are alike, as on an evenly lit
+wall, the largest number may be their brightness."""
+
+
+def frame_contradiction(frames: np.ndarray, names: Sequence[str]) -> str | None:
+    """A sentence if a frame has one number everywhere, or is there twice; None if neither.
+
+    Parameters
+    ----------
+    frames : (k, h, w) of digital numbers. names : (k,) names of the frames.
+    """
+    if frames[0].size < MIN_PIXELS:
+        return None
+    flat = [name for frame, name in zip(frames, names, strict=True) if frame.min() == frame.max()]
+    if flat and len(flat) < len(frames):
+        return (
+            f"{', '.join(flat)}: the same number at every pixel, which no camera takes of a scene: check that "
+            "{} written and read as a whole.".format("this frame was" if len(flat) == 1 else "these frames were")
+        )
+    return next((same_images(names[i], names[j]) for i, j in equal_frames(frames)), None)
+
+
+def clipping_level(frames: np.ndarray) -> int | None:
+    """The number at which an unknown camera clips, if many pixels have it in several taps; None if not.
+
+    Without clipping, hardly two taps of a pixel have the same number, and hardly a pixel has the largest one.
+
+    Parameters
+    ----------
+    frames : (k, h, w) of digital numbers.
+    """
+    top = int(frames.max())
+    several = np.count_nonzero(frames == top, axis=0) > 1
+    if np.count_nonzero(several) < max(MIN_PIXELS / 10, MIN_CLIPPED * several.size):
+        return None
+    spread = float(np.ptp(np.percentile(frames.min(axis=0)[several], [10, 90])))
+    return top if spread > MIN_CLIPPED_SPREAD * top else None
+
+
+def signed_readings(taps: np.ndarray, largest: int) -> Iterator[np.ndarray]:
+    """Numbers in two's complement that were read without their sign, each as float32 with the sign.
+
+    Parameters
+    ----------
+    taps : (k, n) of unsigned numbers. largest : largest number of their type.
+    """
+    top = int(taps.max())
+    for size in {largest + 1, 1 << top.bit_length()}:
+        yield np.where(taps >= size // 2, taps.astype(np.float64) - size, taps).astype(np.float32)
+
 
 def chosen(usable: np.ndarray) -> np.ndarray | None:
     """(n,) int, flat indices of up to `MAX_PIXELS` usable pixels, evenly spread; None if there are too few.
@@ -50,20 +110,6 @@ def chosen(usable: np.ndarray) -> np.ndarray | None:
     """
     found = np.flatnonzero(usable)
     return found[:: max(1, len(found) // MAX_PIXELS)] if len(found) >= MIN_PIXELS else None
-
-
-def empty_contradiction(frames: np.ndarray, names: Sequence[str]) -> str | None:
-    """A sentence if some of the taps are 0 at all pixels, and others are not; None if not.
-
-    Parameters
-    ----------
-    frames : (k, h, w), all taps. names : (k,) of the taps.
-    """
-    is_empty = [not frame.any() for frame in frames]
-    if not any(is_empty) or all(is_empty):
-        return None
-    empty = ", ".join(name for name, nothing in zip(names, is_empty, strict=True) if nothing)
-    return f"{empty} is 0 at all pixels, so the ranges are wrong: check that no tap is missing in the capture."
 
 
 def order_contradiction(groups: Sequence[np.ndarray]) -> str | None:
@@ -85,20 +131,19 @@ def order_contradiction(groups: Sequence[np.ndarray]) -> str | None:
         off = [float(np.median([np.median(_unequal(g, pairs)) for g in groups])) for pairs in _PAIRS]
         amplitude = float(np.median([np.median(np.hypot(g[0] - g[2], g[1] - g[3])) / 2 for g in groups]))
         best = int(np.argmin(off))
-        if off[0] > 2 * MAX_OFF_COSINE * amplitude and off[0] > CLEARER * off[best]:
+        if off[0] > amplitude and off[0] > CLEARER * off[best]:
             (a, b), (c, d) = _PAIRS[best]
             return (
                 f"taps {a + 1} and {b + 1} of a frequency add up to as much as {c + 1} and {d + 1}, so these are "
                 "opposite ones, and the frames are not in the order 0, 90, 180, 270 degrees: the ranges are wrong; "
                 "sort the frames."
             )
+    if taps < 4 or max(_off_cosine(group) for group in groups) <= MAX_OFF_COSINE:
         return None
-    if taps > 4 and float(np.median([np.median(_off_cosine(g)) for g in groups])) > MAX_OFF_COSINE:
-        return (
-            f"the {taps} taps of a frequency lie on no cosine of evenly spaced delays, so the ranges are doubtful: "
-            "check the order of the frames."
-        )
-    return None
+    return (
+        f"the {taps} taps of a frequency lie on no cosine of evenly spaced delays, so the ranges are wrong: check that "
+        "no frame is missing or there twice, and the order of the frames."
+    )
 
 
 _PAIRS = (((0, 2), (1, 3)), ((0, 1), (2, 3)), ((0, 3), (1, 2)))
@@ -111,21 +156,49 @@ def _unequal(taps: np.ndarray, pairs: tuple[tuple[int, int], tuple[int, int]]) -
     return np.asarray(np.abs(taps[a] + taps[b] - taps[c] - taps[d]))
 
 
-def _off_cosine(taps: np.ndarray) -> np.ndarray:
-    """(n,) rms distance of taps (N, n) from their cosine, times sqrt(2), as a fraction of its amplitude."""
-    n, spectrum = len(taps), np.fft.fft(taps, axis=0)
-    rest = (np.abs(spectrum[2 : n - 1]) ** 2).sum(axis=0)
-    return np.asarray(np.sqrt(rest / np.maximum(2 * np.abs(spectrum[1]) ** 2, 1e-30)))
+def _off_cosine(taps: np.ndarray) -> float:
+    """Systematic distance of taps (N, n) from a cosine, rms times sqrt(2), as a fraction of its amplitude.
+
+    Light that changes from one exposure to the next scales opposite taps alike, and is taken out. Four taps show even
+    harmonics of the correlation alone, which are small. More taps show others, too. Those move each tap by the same
+    function of the phase minus the tap's delay, and a wrong frame does not: what the taps have in common is taken out,
+    and phases at which only one tap was seen do not count.
+    """
+    values, n = taps.astype(np.float64), len(taps)
+    if n % 2 == 0:
+        sums = values[: n // 2] + values[n // 2 :]
+        scale = (sums[0] * sums).sum(axis=1) / np.maximum((sums**2).sum(axis=1), 1e-12)
+        values = values * np.tile(scale, 2)[:, None]
+    spectrum = np.fft.fft(values, axis=0)
+    amplitude, turns = 2 * np.abs(spectrum[1]) / n, -np.angle(spectrum[1]) / (2 * np.pi) % 1
+    spectrum[[0, 1, n - 1]] = 0
+    rest = np.fft.ifft(spectrum, axis=0).real / np.maximum(amplitude, 1e-12)
+    bins = max(1, PHASE_BINS // n) * n
+    at = np.minimum((turns * bins).astype(int), bins - 1)
+    seen = np.full((n, bins), np.nan)  # by the phase minus the tap's delay
+    for i in range(bins):
+        if np.count_nonzero(at == i) >= MIN_IN_BIN:
+            seen[np.arange(n), (i - np.arange(n) * bins // n) % bins] = np.median(rest[:, at == i], axis=1)
+    known = np.isfinite(seen)
+    count = known.sum(axis=0)
+    common = np.nansum(seen, axis=0) / np.maximum(count, 1) if n > 4 else 0.0
+    used = known & ((count > 1) | (n == 4))
+    return float(np.sqrt(2 * np.mean((seen - common)[used] ** 2))) if used.any() else 0.0
 
 
 def frequency_contradiction(
-    phases: Sequence[Phase], modulation_hz: tuple[float, ...], weights: Sequence[np.ndarray], longest_m: float
+    phases: Sequence[Phase],
+    modulation_hz: tuple[float, ...],
+    weights: Sequence[np.ndarray],
+    longest_m: float,
+    taps: int,
 ) -> str | None:
     """A sentence if the phases of several frequencies agree on no length at most pixels; None if they do.
 
     Parameters
     ----------
     phases : per frequency, of n pixels. weights : per frequency (n,), see `unwrap`. longest_m : see `unwrap`.
+    taps : number of taps of a frequency.
     """
     if len(phases) < 2:
         return None
@@ -139,7 +212,8 @@ def frequency_contradiction(
     )
     if len(turns) <= MAX_FREQUENCIES:
         tried = [
-            (_misfit(other, hz, weights, longest_m), words) for words, hz, other in _hypotheses(turns, modulation_hz)
+            (_misfit(other, hz, weights, longest_m), words)
+            for words, hz, other in _hypotheses(turns, modulation_hz, taps)
         ]
         misfit, words = min(tried)
         if CLEARER * misfit < stated:
@@ -159,9 +233,9 @@ def _misfit(
 
 
 def _hypotheses(
-    turns: Sequence[np.ndarray], modulation_hz: tuple[float, ...]
+    turns: Sequence[np.ndarray], modulation_hz: tuple[float, ...], taps: int
 ) -> Iterator[tuple[str, tuple[float, ...], list[np.ndarray]]]:
-    """Other orders of the frequencies, then other directions of some of them: in words, frequencies and phases."""
+    """Other orders of the frequencies, other directions of some, other first taps: in words, frequencies and phases."""
     for hertz in permutations(modulation_hz):
         if hertz != modulation_hz:
             yield f"they are those of {', '.join(f'{f / 1e6:g}' for f in hertz)} MHz in this order", hertz, list(turns)
@@ -170,15 +244,25 @@ def _hypotheses(
             back = ", ".join(f"{f / 1e6:g}" for f, sign in zip(modulation_hz, signs, strict=True) if sign < 0)
             other = [t if sign > 0 else (1 - t) % 1 for t, sign in zip(turns, signs, strict=True)]
             yield f"the taps of {back} MHz run the other way", modulation_hz, other
+    for words, sign, shift in _other_starts(taps):
+        yield words, modulation_hz, [(sign * t + np.float32(shift)) % 1 for t in turns]
 
 
-def direction_contradiction(length_m: np.ndarray, modulation: np.ndarray, period_m: float) -> str | None:
-    """A sentence if light would fall with the square of the distance with taps in the other direction, and not as read.
+def _other_starts(taps: int) -> Iterator[tuple[str, int, float]]:
+    """Orders of evenly spaced taps that start at another one, or run the other way, too: in words, and the sign and the
+    shift in turns that make the right phases of the phases that were read."""
+    for k, sign in product(range(1, taps), (1, -1)):
+        other = "" if sign > 0 else " and run the other way"
+        yield f"the taps of each frequency start at {360 * k / taps:.4g} degrees{other}", sign, k / taps
+
+
+def direction_contradiction(length_m: np.ndarray, modulation: np.ndarray, period_m: float, taps: int = 1) -> str | None:
+    """A sentence if light would fall with the square of the distance with taps in another order, and not as read.
 
     Parameters
     ----------
     length_m, modulation : (n,) float, path lengths and the light that came along. period_m : path length after which
-        all readings repeat.
+        all readings repeat. taps : number of taps, any of which may be the first; 1: only their direction may be other.
 
     Examples
     --------
@@ -191,13 +275,24 @@ def direction_contradiction(length_m: np.ndarray, modulation: np.ndarray, period
     inside = (length_m > 0) & (length_m < period_m) & (modulation > 0)
     if np.count_nonzero(inside) < MIN_PIXELS:
         return None
-    light, length = np.log(modulation[inside]), length_m[inside]
-    unexplained, stated, mirrored = (_spread(light + 2 * np.log(x)) for x in (1.0, length, period_m - length))
-    if min(stated, unexplained) > max(MIN_SPREAD, CLEARER * mirrored):
+    light, turns = np.log(modulation[inside]), length_m[inside] / period_m
+    unexplained, stated = _spread(light), _spread(light + 2 * np.log(turns))
+    least = min(stated, unexplained)
+    if least > max(MIN_SPREAD, CLEARER * _spread(light + 2 * np.log(1 - turns))):
         return (
             "pixels are brighter where the path is longer, and light falls with the distance if the taps run the other "
             "way, so the ranges may be mirrored: check the order of the frames, and that no surface is beyond "
             f"{period_m / 2:.4g} m."
+        )
+    tried = [
+        (_spread(light + 2 * np.log(np.maximum((sign * turns + shift) % 1, 1e-6))), words)
+        for words, sign, shift in _other_starts(taps)
+    ]
+    spread, words = min(tried, default=(least, ""))
+    if least > max(MIN_SPREAD, CLEARER * spread):
+        return (
+            f"light does not fall with the square of the distance, but it does if {words}, so the ranges may be wrong: "
+            "check the order of the frames."
         )
     return None
 

@@ -92,6 +92,7 @@ class ProjectorCoordinates(Coordinates):
     limits : TriangulationLimits that `range_image` applies.
     doubts : sentences with which the decoder has warned that the capture contradicts its code. If there are any, the
         cause of rays that meet behind a device is known, and `range_image` does not warn of them.
+    notes : sentences on what the decoder found in the capture and has corrected.
 
     Examples
     --------
@@ -112,6 +113,7 @@ class ProjectorCoordinates(Coordinates):
     row_sigma_px: np.ndarray | None = None
     limits: TriangulationLimits = field(default_factory=TriangulationLimits)
     doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -162,7 +164,7 @@ class ProjectorCoordinates(Coordinates):
             warn(doubt, DoubtWarning)
         image = self._image(rig, z, range_m, status)
         doubts = (*self.doubts, doubt) if doubt else self.doubts
-        return replace(image, projector_column=column, projector_row=row, doubts=doubts)
+        return replace(image, projector_column=column, projector_row=row, doubts=doubts, notes=self.notes)
 
     def _line_contradiction(self, status: np.ndarray) -> str | None:
         """A sentence if many decoded pixels miss their epipolar line; None if not.

@@ -64,7 +64,8 @@ def find_frames(folder: Path, images: str | None = None) -> FrameFiles:
         There is no such folder or no such image, or the list is broken.
     """
     if not folder.is_dir():
-        raise FileFormatError(f"{folder} is no folder of images.")
+        got = "a file" if folder.exists() else "a path with nothing there"
+        raise FileFormatError(f"{folder}: expected a folder of images, got {got}.")
     if images is not None and images.lower().endswith(LIST):
         return _listed(folder, Path(images))
     try:
@@ -73,15 +74,20 @@ def find_frames(folder: Path, images: str | None = None) -> FrameFiles:
         raise FileFormatError(f"cannot read {folder}: {error.strerror or error}.") from error
     if images is None:
         if len({path.suffix.lower() == ARRAY for path in known}) > 1:
-            raise FileFormatError(f"{folder} holds images and arrays (.npy): say which with --images, as '*.png'.")
+            raise FileFormatError(
+                f"{folder}: expected images or arrays (.npy), got both: say which with --images, as '*.png'."
+            )
         return FrameFiles(known)
     found: list[Path] = []
     for pattern in (part.strip() for part in images.split(",")):
         matching = [path for path in known if fnmatchcase(path.name, pattern)]
         if not matching:
-            few = ", ".join(path.name for path in known[:MAX_LISTED])
+            few = ", ".join(path.name for path in known[:MAX_LISTED]) + (
+                " and others" if len(known) > MAX_LISTED else ""
+            )
+            got = f"a folder with {few}" if known else f"a folder without any ({', '.join((*SUFFIXES, ARRAY))})"
             hint = nearest(pattern, [path.name for path in known])
-            raise FileFormatError(f"{folder}: expected images that match {shown(pattern)}{hint}; it holds {few} ...")
+            raise FileFormatError(f"{folder}: expected images that match {shown(pattern)}{hint}, got {got}.")
         found += [path for path in matching if path not in found]
     return FrameFiles(found)
 
@@ -99,15 +105,21 @@ def _listed(folder: Path, list_file: Path) -> FrameFiles:
             words = re.split(r"[\s,;]+", entry)
             path, name = folder / entry.removesuffix(words[-1]).rstrip(" \t,;"), words[-1] if len(words) > 1 else ""
             if not name or not _is_file(path):
-                raise FileFormatError(f"{list_file}: expected a file in {folder}, got {shown(entry)}.")
+                raise FileFormatError(
+                    f"{list_file}: expected the names of files in {folder}, one in a line, got {shown(entry)}, which "
+                    "is none."
+                )
         paths.append(path)
         names += [name] if name else []
     if not paths:
-        raise FileFormatError(f"{list_file} lists no images.")
+        raise FileFormatError(f"{list_file}: expected the name of an image in each line, got no line with one.")
     if names and len(names) < len(paths):
-        raise FileFormatError(f"{list_file}: expected the name of a frame after each image or after none.")
+        raise FileFormatError(
+            f"{list_file}: expected the name of a frame after each image or after none, got {len(names)} names for "
+            f"{len(paths)} images."
+        )
     if twice := next((name for name in names if names.count(name) > 1), None):
-        raise FileFormatError(f"{list_file}: the frame {shown(twice)} is there twice.")
+        raise FileFormatError(f"{list_file}: expected each frame once, got {shown(twice)} twice.")
     return FrameFiles(paths, names or None)
 
 
@@ -128,7 +140,7 @@ def _natural(path: Path) -> list[tuple[int, int | str]]:
 
 @dataclass(frozen=True)
 class CameraView:
-    """How images become frames.
+    """Rule by which images become frames.
 
     rotate : degrees clockwise by which the images are turned. mirror : whether left and right are then exchanged.
     channel : one of `CHANNELS`, of images with colours.
@@ -211,15 +223,20 @@ def read_frames_file(
     view = view or CameraView()
     suffix = path.suffix.lower()
     if suffix not in STACKS:
-        raise FileFormatError(f"{path}: expected a folder of images, or a file with all frames ({', '.join(STACKS)}).")
+        raise FileFormatError(
+            f"{path}: expected a folder of images, or a file with all frames ({', '.join(STACKS)}), got "
+            f"{f'a file {suffix}' if suffix else 'a file without suffix'}."
+        )
     if suffix == ARRAY:
         if name is not None:
-            raise FileFormatError(f"{path} holds one array: leave out --images.")
+            raise FileFormatError(
+                f"{path}: expected no name, because it holds one array, got {shown(name)}: leave out --images."
+            )
         array = read_array(path)
     elif suffix == ARRAYS:
         arrays = read_arrays(path, None if name is None else [name])
         if len(arrays) != 1:
-            raise FileFormatError(f"{path} holds {', '.join(arrays)}: say which with --images NAME.")
+            raise FileFormatError(f"{path}: expected one array, got {', '.join(arrays)}: say which with --images NAME.")
         array = next(iter(arrays.values()))
     else:
         array = _of_table(path, read_json(path), name)
@@ -354,7 +371,7 @@ def as_digital(values: np.ndarray, number: NumberFormat) -> Digital:
         raise ValueError(f"expected --bits of 1 to {size} for {values.dtype} images, got {number.bits}.")
     finite = np.isfinite(values).all(axis=0) if kind == "f" else np.ones(values.shape[1:], dtype=bool)
     if not finite.any():
-        raise ValueError("expected finite numbers, got none.")
+        raise ValueError("expected pixels that are finite in all frames, got none: check how the frames were saved.")
     if kind == "u" and number.is_signed:
         values = _twos_complement(values, number.bits or size)
     low, high = (float(of([of(frame[finite]) for frame in values])) for of in (np.min, np.max))

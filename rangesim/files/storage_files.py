@@ -62,18 +62,25 @@ def read_storage(path: str | Path) -> dict[str, Any]:
             try:
                 data = _Yaml(text).read()
             except RecursionError:
-                raise FileFormatError(f"{path} is nested too deep.") from None
+                raise _too_deep(path) from None
             except ValueError as error:
-                raise FileFormatError(f"{path} is no YAML as OpenCV writes it: {error}.") from error
+                raise FileFormatError(f"{path}: expected YAML as OpenCV writes it, got {error}.") from error
         if is_nested_deeper(data, limits.current().nesting):
-            raise FileFormatError(f"expected at most {limits.current().nesting} levels in {path}, got more.")
+            raise _too_deep(path)
     if not isinstance(data, dict):
-        raise FileFormatError(f"{path}: expected a table with names, got {shown(data)}.")
+        raise FileFormatError(f"{path}: expected a table with names, as of a calibration, got {shown(data)}.")
     return data
 
 
 def _too_large(path: Path) -> FileFormatError:
     return FileFormatError(f"{path}: expected at most {MAX_CHARACTERS} bytes, as a calibration has, got more.")
+
+
+def _too_deep(path: Path) -> FileFormatError:
+    most = limits.current().nesting
+    return FileFormatError(
+        f"{path}: expected at most {most} levels of lists and tables, as a calibration has, got more."
+    )
 
 
 def _of_element(element: ET.Element) -> Any:
@@ -87,7 +94,7 @@ def _of_element(element: ET.Element) -> Any:
 
 
 class _Yaml:
-    """The reader of a YAML text. Its methods raise ValueError with a clause that says what is wrong."""
+    """The reader of a YAML text. Its methods raise ValueError with a noun phrase: what came instead of such a text."""
 
     def __init__(self, text: str) -> None:
         self.lines: list[tuple[int, str]] = []  # indentation and text of each line that says something
@@ -98,14 +105,16 @@ class _Yaml:
             if not bare or bare[0] in "#%" or bare == "---":
                 continue
             if "\t" in line[: len(line) - len(line.lstrip())]:
-                raise ValueError(f"line {number + 1} is indented by tabs")
+                raise ValueError(f"line {number + 1}, which is indented by tabs: indent it by blanks")
             self.lines.append((len(line) - len(line.lstrip(" ")), bare))
         self.at = 0
 
     def read(self) -> Any:
         data = self._block(0) if self.lines else None
         if self.at < len(self.lines):
-            raise ValueError(f"{shown(self.lines[self.at][1])} is not expected")
+            raise ValueError(
+                f"{shown(self.lines[self.at][1])}, which belongs to no entry above it: check how it is indented"
+            )
         return data
 
     def _block(self, least: int) -> Any:
@@ -139,7 +148,7 @@ class _Yaml:
                 break
             name, rest = next(part for part in entry.groups()[:3] if part is not None), _TAG.sub("", entry[4], count=1)
             if name in result:
-                raise ValueError(f"{shown(name)} is there twice")
+                raise ValueError(f"{shown(name)} twice in one table: leave one of them out")
             if rest and not rest.startswith("#"):
                 result[name] = self._value(rest, indent)
                 continue
@@ -159,7 +168,7 @@ class _Yaml:
             part.count(mark) for part in parts for mark in "]}"
         ):
             if self.at == len(self.lines):
-                raise ValueError("a list in brackets does not end")
+                raise ValueError("a list in brackets without its end")
             parts.append(self.lines[self.at][1])
             self.at += 1
         return _flow(" ".join(parts))
@@ -185,14 +194,14 @@ def _flow(text: str) -> Any:
             while not ends("}"):
                 name = value()
                 if not ends(":"):
-                    raise ValueError("a map in brackets has an entry without value")
+                    raise ValueError("an entry without value in a map in brackets")
                 table[str(name)] = value()
                 comma("}")
             return table
         if mark:
-            raise ValueError(f"{mark!r} is not expected")
+            raise ValueError(f"{mark!r} where a value should be")
         if mark == "":
-            raise ValueError("a list in brackets does not end")
+            raise ValueError("a list in brackets without its end")
         quoted = next((word for word in words[:2] if word is not None), None)
         return _scalar(str(words[2])) if quoted is None else quoted
 
@@ -204,7 +213,7 @@ def _flow(text: str) -> Any:
 
     def comma(end: str) -> None:
         if not ends(",") and not (place < len(tokens) and tokens[place][0] == end):
-            raise ValueError("a list in brackets lacks a comma or its end")
+            raise ValueError("a list in brackets without a comma or its end")
 
     return value()
 
@@ -216,5 +225,5 @@ def _scalar(text: str) -> Any:
     if text.lower() in _NO_NUMBER:
         return float(_NO_NUMBER[text.lower()])
     if text[:1] in "&*|>`@":
-        raise ValueError(f"{shown(text)} is not expected")
+        raise ValueError(f"{shown(text)}, a reference or a block of text: write plain numbers, lists and tables")
     return text[1:-1] if len(text) > 1 and text[0] == text[-1] and text[0] in "\"'" else text

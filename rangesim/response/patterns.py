@@ -28,6 +28,11 @@ Axis = Annotated[int, Bounds("0 (columns) or 1 (rows)", 0, 1)]
 """Axis along which a pattern varies: 0 for columns (u), 1 for rows (v). It is the index of u or v in `LightPath`."""
 
 
+MIN_INSIDE = 0.1
+"""Least fraction of the blur inside the projector that stripes are divided by. It is a half at the ends of a projector
+that is wider than the blur; points with less are not lit."""
+
+
 @dataclass(frozen=True)
 class GrayBits(DenseResponse):
     """Bits of the Gray code of the projector column or row, one channel per bit, the most significant first.
@@ -262,7 +267,9 @@ class _Tabulated(DenseResponse):
 class Stripes(_Tabulated):
     """Arbitrary stripes along the projector's columns or rows, one channel per pattern.
 
-    Two stacks with the same pixels are equal. If the projector is out of focus, they are read from blurred copies.
+    Two stacks with the same pixels are equal. If the projector is out of focus, they are read from blurred copies, as
+    fractions of white with the same blur: near the projector's ends, where a part of the blur lies outside, patterns
+    and their inverses then still add up to white.
 
     Parameters
     ----------
@@ -289,6 +296,10 @@ class Stripes(_Tabulated):
 
     type_name: ClassVar[str] = "Stripes"
 
+    @cached_property
+    def _blurred_white(self) -> BlurredImage:
+        return BlurredImage(np.ones(self.patterns.shape[1], dtype=np.float32))
+
     def __post_init__(self) -> None:
         check_fields(self)
         self._keep(2, "(k, size)")
@@ -301,7 +312,9 @@ class Stripes(_Tabulated):
     def weights(self, path: LightPath, m: Math) -> list[Any]:
         x, size = path[self.axis], self.patterns.shape[1]
         if path.blur_px is not None:
-            return [image.along(x, path.blur_px, m) for image in self._blurred]
+            white = self._blurred_white.along(x, path.blur_px, m)
+            inside = m.select(white > MIN_INSIDE, white, 1.0)
+            return [image.along(x, path.blur_px, m) / inside for image in self._blurred]
         index = m.unsigned(m.select(x < size, x, size - 1.0))
         return [m.lookup(pattern, index) for pattern in self.patterns]
 

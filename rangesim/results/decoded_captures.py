@@ -4,7 +4,8 @@
 DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.atomic_directories`
     decoded.json         sensor, rig, fraction of the pixels by status, likely cause if few pixels have a reading;
                          findings: what the frames told of themselves, and what was assumed;
-                         doubts: sentences on what in the capture contradicts itself
+                         doubts: sentences on what in the capture contradicts itself;
+                         notes: sentences on what the decoder has corrected
     range.npz            range image
     cloud.ply            points, metres, camera coordinates; missing if there are none
     depth.png ...        pictures of the maps
@@ -36,7 +37,7 @@ DECODED = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
 
 
 class DecodedRecord(Record, frozen=True, kw_only=True):
-    """The contents of `decoded.json`; the fields are those of `Decoded`, and the doubts of its range image."""
+    """The contents of `decoded.json`; the fields are those of `Decoded`, and the doubts and notes of its image."""
 
     format: Literal["rangesim-decoded"] = "rangesim-decoded"
     format_version: Literal[1] = 1
@@ -46,6 +47,7 @@ class DecodedRecord(Record, frozen=True, kw_only=True):
     status: dict[str, Fraction]
     likely_cause: str | None
     doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     findings: tuple[str, ...] = ()
 
 
@@ -88,6 +90,7 @@ def save_decoded(decoded: Decoded, directory: str | Path, pictures: Mapping[str,
         status=decoded.status,
         likely_cause=decoded.likely_cause,
         doubts=decoded.image.doubts,
+        notes=decoded.image.notes,
         findings=decoded.findings,
     )
     image = decoded.image

@@ -45,6 +45,9 @@ _ARRAYS = _RANGE | {_PREFIX + name: spec for name, spec in _RETURNS.items()}
 """Type, shape and bounds of the arrays of a range image, by their names in files. The bound of the confidence leaves
 room for the rounding of single precision."""
 
+_SENTENCES = ("doubts", "notes")
+"""Fields of a range image that hold sentences."""
+
 
 def save_range_image(image: RangeImage, path: str | Path) -> None:
     """Write the arrays of a range image, its camera and its decoder to a compressed .npz file.
@@ -59,8 +62,7 @@ def save_range_image(image: RangeImage, path: str | Path) -> None:
     arrays = {f.name: getattr(image, f.name) for f in fields(image) if isinstance(getattr(image, f.name), np.ndarray)}
     returns = {} if image.returns is None else {_PREFIX + name: getattr(image.returns, name) for name in _RETURNS}
     settings = {"camera": to_dict(image.camera), "decoder": to_dict(image.decoder)}
-    if image.doubts:
-        settings["doubts"] = list(image.doubts)
+    settings |= {name: list(sentences) for name in _SENTENCES if (sentences := getattr(image, name))}
     write_arrays(path, {**arrays, **returns, "settings": settings_array(settings)})
 
 
@@ -87,16 +89,19 @@ def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> R
     try:
         if returns and len(returns) < len(_RETURNS):
             raise ValueError(f"expected all arrays {', '.join(_PREFIX + name for name in _RETURNS)} or none of them.")
-        check_keys(settings, ("camera", "decoder", "doubts"), "settings")
-        camera, decoder, doubts = settings.get("camera"), settings.get("decoder"), settings.get("doubts", [])
-        if not isinstance(doubts, list) or not all(isinstance(doubt, str) for doubt in doubts):
-            raise ValueError("expected doubts as a list of sentences.")
+        check_keys(settings, ("camera", "decoder", *_SENTENCES), "settings")
+        camera, decoder = settings.get("camera"), settings.get("decoder")
+        said = {name: settings.get(name, []) for name in _SENTENCES}
+        for name, sentences in said.items():
+            if not isinstance(sentences, list) or not all(isinstance(sentence, str) for sentence in sentences):
+                raise ValueError(f"expected {name} as a list of sentences.")
         image = RangeImage(
             **arrays,
             returns=Returns(**returns) if returns else None,
             camera=None if camera is None else from_dict(Camera, camera, "camera"),  # type: ignore[type-abstract]
             decoder=None if decoder is None else from_dict(Decoder, decoder, "decoder"),  # type: ignore[type-abstract]
-            doubts=tuple(doubts),
+            doubts=tuple(said["doubts"]),
+            notes=tuple(said["notes"]),
         )
     except (ValueError, TypeError) as error:
         raise FileFormatError(f"{path}: {error}") from error

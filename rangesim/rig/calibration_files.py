@@ -79,9 +79,10 @@ def _names(words: Sequence[str], number: int, letter: str) -> DeviceNames:
         ),
         (
             *(f"D{number}", f"k{letter}", f"distCoeffs{number}", f"dist{number}", f"distortion{number}"),
-            *(form.format(w) for w in words for form in ("{}_distortion", "{}_dist", "{}_D", "D_{}", "dist_{}")),
+            *(form.format(w) for w in words for form in ("{}_distortion", "{}_dist", "{}_D", "{}_kc", "D_{}")),
             *(form.format(w) for w in words for form in ("{}_dist_coeffs", "{}_distortion_coefficients", "{}_coeffs")),
-            *(form.format(w) for w in words for form in ("{}_distortion_coeffs", "dist_coeffs_{}", "distortion_{}")),
+            *(form.format(w) for w in words for form in ("{}_distortion_coeffs", "dist_{}", "dist_coeffs_{}")),
+            *(f"distortion_{w}" for w in words),
         ),
         tuple(f"{word}_width" for word in words),
         tuple(f"{word}_height" for word in words),
@@ -147,7 +148,7 @@ class DeviceCalibration:
 
 @dataclass(frozen=True)
 class StoredCalibration:
-    """What a calibration file holds. The sizes of the images may be missing; `rig` takes them from elsewhere.
+    """Contents of a calibration file. The sizes of the images may be missing; `rig` takes them from elsewhere.
 
     camera, projector : DeviceCalibration; projector None: the file holds a camera alone.
     T_camera_projector : (4, 4) float64, metres; None likewise. own : the Rig of a JSON file of our own, else None.

@@ -18,10 +18,12 @@ from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.decoding.tap_checks import (
     chosen,
+    clipping_level,
     direction_contradiction,
-    empty_contradiction,
+    frame_contradiction,
     frequency_contradiction,
     order_contradiction,
+    signed_readings,
 )
 from rangesim.decoding.two_paths import nearest_length, order_of_ratios, separate, turns_sigma
 from rangesim.decoding.working_range import WorkingRange
@@ -350,6 +352,7 @@ class AmcwDecoder(Decoder):
         status, length = np.zeros(shape, dtype=np.uint8), np.empty(shape)
         amplitude, mean = np.empty((2, *shape), dtype=np.float32)
         sigma_m = None if capture.noise(capture.frames[0, :1]) is None else np.empty(shape, dtype=np.float32)
+        level = clipping_level(capture.frames) if capture.is_digital and capture.detector is None else None
         for rows in bands(len(status)):
             phases = [self._phase(sensor, taps[:, rows]) for taps in groups]
             sigmas = [phase_sigma(capture, phase, sensor.taps) for phase in phases]
@@ -360,6 +363,8 @@ class AmcwDecoder(Decoder):
             for phase, sigma in zip(phases, sigmas, strict=True):
                 status[rows][modulation_is_weak(capture, phase, sigma, self.phase)] = Status.LOW_SIGNAL
             status[rows][capture.saturated(capture.frames[:, rows])] = Status.SATURATED
+            if level is not None:
+                status[rows][capture.frames[:, rows].max(axis=0) >= level] = Status.SATURATED
             length[rows] = unwrapped.length_m
             if sigma_m is not None:
                 sigma_m[rows] = RADIAN_M / np.sqrt(unwrapped.weight)
@@ -369,7 +374,7 @@ class AmcwDecoder(Decoder):
                 _separate(sensor, phases, sigmas, length[rows], None if sigma_m is None else sigma_m[rows])
             amplitude[rows] = np.mean([p.modulation for p in phases], axis=0)
             mean[rows] = np.mean([p.mean for p in phases], axis=0)
-        doubt = self._contradiction(sensor, capture.frames, status, length, amplitude)
+        doubt = self._contradiction(sensor, capture, status, length, amplitude)
         if doubt:
             warn(doubt, DoubtWarning)
         return PathLengths(
@@ -382,24 +387,39 @@ class AmcwDecoder(Decoder):
         )
 
     def _contradiction(
-        self, sensor: AmcwToF, frames: np.ndarray, status: np.ndarray, length_m: np.ndarray, modulation: np.ndarray
+        self, sensor: AmcwToF, capture: Capture, status: np.ndarray, length_m: np.ndarray, modulation: np.ndarray
     ) -> str | None:
         """A sentence if the taps contradict each other as a whole, see `rangesim.decoding.tap_checks`."""
-        if found := empty_contradiction(frames, sensor.frame_names()):
+        frames = capture.frames
+        if capture.is_digital and (found := frame_contradiction(frames, sensor.frame_names())):
             return found
         at = chosen(np.isin(status, [Status.OK, Status.UNWRAPPING_FAILED]))
         if at is None:
             return None
-        taps = frames.reshape(len(frames), -1)[:, at].astype(np.float32)
+        taps = frames.reshape(len(frames), -1)[:, at]
+        if found := self._disagreement(sensor, taps.astype(np.float32)):
+            largest = int(np.iinfo(frames.dtype).max) if capture.is_digital else 0
+            if largest and any(self._disagreement(sensor, t) is None for t in signed_readings(taps, largest)):
+                return (
+                    "the taps agree with each other if their numbers are read with a sign, in two's complement, and "
+                    "not as they were: the ranges are wrong; give --bits with an s, such as s16."
+                )
+            return found
+        at = at[status.ravel()[at] == Status.OK]
+        starts = (
+            sensor.taps if len(sensor.modulation_hz) == 1 else 1
+        )  # of several frequencies, the phases would disagree
+        period_m = 2 * sensor.unambiguous_range_m
+        return direction_contradiction(length_m.ravel()[at], modulation.ravel()[at], period_m, starts)
+
+    def _disagreement(self, sensor: AmcwToF, taps: np.ndarray) -> str | None:
+        """A sentence if taps (k, n) lie on no cosines, or the phases of the frequencies on no length; None if not."""
         groups = np.split(taps, len(sensor.modulation_hz))
         if found := order_contradiction(groups):
             return found
         phases = [self._phase(sensor, group) for group in groups]
         weights = [_weight(*read) for read in zip(phases, [None] * len(phases), sensor.modulation_hz, strict=True)]
-        if found := frequency_contradiction(phases, sensor.modulation_hz, weights, sensor.searched_m):
-            return found
-        at = at[status.ravel()[at] == Status.OK]
-        return direction_contradiction(length_m.ravel()[at], modulation.ravel()[at], 2 * sensor.unambiguous_range_m)
+        return frequency_contradiction(phases, sensor.modulation_hz, weights, sensor.searched_m, sensor.taps)
 
     def _phase(self, sensor: AmcwToF, taps: np.ndarray) -> Phase:
         """Phase of the taps (N, h, w) of one frequency."""

@@ -73,7 +73,7 @@ def sensor_of(name: str, files_in: Path | None = Path()) -> Sensor:
     Examples
     --------
     >>> sensor_of("gray").code
-    GrayCode(cell_px=1)
+    GrayCode(cell_px=1, words_shown='first')
     >>> sensor_of("grey", files_in=None)
     Traceback (most recent call last):
     ValueError: expected a sensor out of ..., got 'grey' (did you mean 'gray'?).

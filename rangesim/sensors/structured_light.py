@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Annotated, ClassVar, Literal
@@ -24,9 +24,9 @@ from rangesim.codes import (
 from rangesim.codes.code import stripes
 from rangesim.codes.contrast import direct_contrast
 from rangesim.codes.frame_order import in_order
-from rangesim.decoding.orientation import changes_along, orientation_contradiction
+from rangesim.decoding.orientation import changes_along, fringe_doubt, orientation_contradiction
 from rangesim.decoding.phase_shift import PhaseThresholds
-from rangesim.decoding.pixel_samples import MIN_PIXELS
+from rangesim.decoding.pixel_samples import MIN_PIXELS, equal_frames, same_images
 from rangesim.decoding.range_image import MIN_MEASURED, RangeImage
 from rangesim.decoding.status import Status
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
@@ -48,14 +48,6 @@ BLACK = "black"
 MIN_CONTRAST = 0.02
 """Least difference by which black is brighter than white, as a fraction of full scale, at a pixel that counts as a sign
 that the two frames are exchanged. Noise alone makes black a little brighter in half of the dark pixels."""
-
-MAX_COMPARED = 20_000
-"""Number of pixels, at most, by which frames are first compared with each other; frames that agree at these are then
-compared at all pixels."""
-
-MAX_UNIFORM_FRACTION = 0.98
-"""Largest fraction of the pixels at which a frame may be as dark as the darkest frame, or as bright as the brightest,
-and still count as a pattern."""
 
 MAX_BEYOND_FRACTION = 0.02
 """Largest fraction of the codes that may lie beyond the projector. Errors of single pixels put fewer there, and a
@@ -118,12 +110,16 @@ class StructuredLight(Sensor):
             raise ValueError(f"expected axes to be columns, rows or both, got {self.axes!r}.")
         limits.check("pixels", self.projector_width * self.projector_height, "pixels of a projector")
         for axis in self.axes:
-            _check_code(self.code, self.size(axis))
+            self.code.check(self.size(axis))
         if self.order:
-            in_view = set(self.frame_names())
             for axis in self.axes:
-                coded = [name for name in self.code.names(self.size(axis)) if f"{axis}_{name}" in in_view]
-                self.code.check_shown(self.size(axis), [*coded, *(name for name in (WHITE, BLACK) if name in in_view)])
+                self.code.check_shown(self.size(axis), self.shown_names(axis))
+
+    def shown_names(self, axis: str) -> list[str]:
+        """Names of the frames of an axis that are shown, as the code names them, and white and black if they are."""
+        in_view = set(self.frame_names())
+        coded = [name for name in self.code.names(self.size(axis)) if f"{axis}_{name}" in in_view]
+        return [*coded, *(name for name in (WHITE, BLACK) if name in in_view)]
 
     def size(self, axis: str) -> int:
         """Projector pixels along `axis`."""
@@ -280,35 +276,31 @@ class StructuredLightDecoder(Decoder):
         `DoubtWarning` if frames and code contradict each other as a whole, or if two frames are the same.
         """
         sensor = of_type(capture.sensor, StructuredLight)
-        contrast = self.contrast(capture, sensor)
         codes: dict[str, AxisCode] = {}
         contradictions: list[str] = []
-        for axis in sensor.axes:
-            seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
+        axes = self.axis_frames(capture)
+        for seen in axes:
             code = sensor.code.decode(seen, self.thresholds)
             outside = (code.coordinate < -0.5) | (code.coordinate > seen.size + 0.5)
             code.status[outside & (code.status == Status.OK)] = Status.CODE_ERROR
-            codes[axis] = code
+            codes[seen.axis] = code
             if contradiction := sensor.code.contradiction(seen, code):
                 contradictions.append(contradiction)
         if not contradictions:  # they name the cause better than what follows
             doubt = _orientation(codes) or _beyond_projector(sensor, codes) or _repeated_frames(capture)
             contradictions += [doubt] if doubt else []
-        for contradiction in contradictions:
-            warn(contradiction, DoubtWarning)
-        coordinate = {axis: code.coordinate for axis, code in codes.items()}
-        sigma_px = {axis: code.sigma_px for axis, code in codes.items()}
-        return ProjectorCoordinates(
-            column=coordinate.get("columns"),
-            row=coordinate.get("rows"),
-            column_sigma_px=sigma_px.get("columns"),
-            row_sigma_px=sigma_px.get("rows"),
-            status=first_failure([codes[axis].status for axis in AXES if axis in codes]),
-            confidence=contrast.values / np.float32(capture.full_scale),
-            intensity=contrast.white.astype(np.float32) - np.float32(capture.black_level),
-            limits=self.triangulation,
-            doubts=tuple(contradictions),
-        )
+        contrast = axes[0].contrast
+        confidence = contrast.values / np.float32(capture.full_scale)
+        return joined_axes(capture, codes, contrast, confidence, self.triangulation, contradictions)
+
+    def axis_frames(self, capture: Capture) -> list[AxisFrames]:
+        """The frames of each coded axis of a `StructuredLight` capture, in the order of the sensor's axes."""
+        sensor = of_type(capture.sensor, StructuredLight)
+        contrast = self.contrast(capture, sensor)
+        return [
+            AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
+            for axis in sensor.axes
+        ]
 
     def contrast(self, capture: Capture, sensor: StructuredLight) -> Contrast:
         """Contrast of white and black, each as captured, or estimated by the code if it was not shown."""
@@ -333,7 +325,10 @@ class StructuredLightDecoder(Decoder):
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         shown = of_type(sensor, StructuredLight)
-        each = [shown.code.least_signal(shown.size(axis), self.thresholds, background) for axis in shown.axes]
+        each = [
+            shown.code.least_signal(shown.size(axis), shown.shown_names(axis), self.thresholds, background)
+            for axis in shown.axes
+        ]
         return np.asarray(np.maximum.reduce(each))
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
@@ -344,53 +339,57 @@ class StructuredLightDecoder(Decoder):
                 f"{axis} change along the image's {along}: {other} may have been shown, or the camera was turned by 90 "
                 "degrees"
             )
+        sensor = of_type(capture.sensor, StructuredLight)
+        is_explained = bool(image.doubts) if image.camera is None else not image.doubts  # a calibration tells more
+        if not sensor.code.tells_direction and not is_explained:
+            size = (sensor.projector_width, sensor.projector_height)
+            if doubt := fringe_doubt(image.projector_column, image.projector_row, size):
+                return doubt
         if float(image.valid.mean()) >= MIN_MEASURED:
             return None
-        contrast = self.contrast(capture, of_type(capture.sensor, StructuredLight)).values
-        clear = MIN_CONTRAST * capture.full_scale
-        inverted = float((contrast < -clear).mean())
-        if inverted > float((contrast > clear).mean()):
-            return (
-                f"black is brighter than white at {100 * inverted:.0f} % of the pixels: the last two images are white, "
-                "then black"
-            )
-        if axis := _axis_along_baseline(image, of_type(capture.sensor, StructuredLight).axes, capture.rig):
+        if axis := _axis_along_baseline(image, sensor.axes, capture.rig):
             other = "rows" if axis == "columns" else "columns"
             return f"{axis} tell no depth here, because camera and projector stand apart along them: code {other}"
         return None
 
 
-def _repeated_frames(capture: Capture) -> str | None:
-    """A sentence if two frames of a digital capture are the same to the last digit, and neither is black or white.
+def _exchanged_ends(capture: Capture, contrast: Contrast) -> str | None:
+    """A sentence if black is brighter than white at most of the pixels where they differ; None if not."""
+    clear = MIN_CONTRAST * capture.full_scale
+    inverted = float((contrast.values < -clear).mean())
+    if not contrast.is_measured or inverted <= float((contrast.values > clear).mean()):
+        return None
+    return (
+        f"black is brighter than white at {100 * inverted:.0f} % of the pixels: the images of white and black seem to "
+        "be exchanged."
+    )
 
-    The noise of a camera makes two images of the same pattern differ. Of patterns that lie outside the view, noise-free
-    images are all black or all white, so the frames must change from pixel to pixel as no other frames do.
-    """
+
+def _repeated_frames(capture: Capture) -> str | None:
+    """A sentence if two frames of a digital capture are the same image, but their patterns are not; None if not."""
     if not capture.is_digital or capture.frames[0].size < MIN_PIXELS:
         return None
     sensor = of_type(capture.sensor, StructuredLight)
-    frames, names = capture.frames, sensor.frame_names()
-    few = frames.reshape(len(frames), -1)[:, :: 1 + frames[0].size // MAX_COMPARED]
-    low, high = few.min(axis=0), few.max(axis=0)
-    seen: dict[bytes, int] = {}
-    for i, values in enumerate(few):
-        j = seen.setdefault(values.tobytes(), i)
-        is_dark, is_bright = (float((values == edge).mean()) > MAX_UNIFORM_FRACTION for edge in (low, high))
-        if j == i or is_dark or is_bright or not np.array_equal(frames[i], frames[j]):
-            continue
-        if not sensor.shows_the_same(names[i], names[j]):
-            return (
-                f"frames {names[j]} and {names[i]} are the same image to the last digit, which no camera takes twice: "
-                "check that no file is there twice or in place of another."
-            )
-    return None
+    names = sensor.frame_names()
+    pairs = ((names[i], names[j]) for i, j in equal_frames(capture.frames))
+    return next((same_images(one, other) for one, other in pairs if not sensor.shows_the_same(one, other)), None)
+
+
+def _corrections(codes: dict[str, AxisCode]) -> Iterator[str]:
+    """Sentences on what was corrected in the codes of all axes."""
+    gammas = {axis: f"{code.gamma:.3g}" for axis, code in codes.items() if code.gamma != 1}
+    if gammas:
+        yield (
+            f"the fringes along {' and '.join(gammas)} were corrected for a gamma of "
+            f"{' and '.join(dict.fromkeys(gammas.values()))} of projector and camera together."
+        )
 
 
 def _orientation(codes: dict[str, AxisCode]) -> str | None:
     """A sentence if the codes of both axes are those of a mirrored image; None if not."""
     if len(codes) < 2:
         return None
-    ok = first_failure([code.status for code in codes.values()]) == Status.OK
+    ok = _first_failure([code.status for code in codes.values()]) == Status.OK
     column, row = (np.where(ok, codes[axis].coordinate, np.float32(np.nan)) for axis in AXES)
     return orientation_contradiction(column, row, None)
 
@@ -416,13 +415,43 @@ def _with_defaults(cls: type[StructuredLight], kind: type[Code]) -> StructuredLi
     return cls(code=kind())
 
 
-@lru_cache(maxsize=256)  # sensors are made anew for each setting that changes, and periods take time to be checked
-def _check_code(code: Code, size: int) -> None:
-    """Raise ValueError if the code cannot tell `size` projector pixels from each other."""
-    code.check(size)
+def joined_axes(
+    capture: Capture,
+    codes: dict[str, AxisCode],
+    contrast: Contrast,
+    confidence: np.ndarray,
+    triangulation: TriangulationLimits,
+    contradictions: list[str],
+) -> ProjectorCoordinates:
+    """The coordinates along all axes as one result.
+
+    `DoubtWarning` of each contradiction; if there is none, of a black frame that is brighter than white.
+
+    Parameters
+    ----------
+    codes : AxisCode by the name of its axis. contrast : Contrast of the capture. confidence : (h, w) float32.
+    """
+    if not contradictions and (exchanged := _exchanged_ends(capture, contrast)):  # a wrong order has other signs, too
+        contradictions = [exchanged]
+    for contradiction in contradictions:
+        warn(contradiction, DoubtWarning)
+    coordinate = {axis: code.coordinate for axis, code in codes.items()}
+    sigma_px = {axis: code.sigma_px for axis, code in codes.items()}
+    return ProjectorCoordinates(
+        column=coordinate.get("columns"),
+        row=coordinate.get("rows"),
+        column_sigma_px=sigma_px.get("columns"),
+        row_sigma_px=sigma_px.get("rows"),
+        status=_first_failure([codes[axis].status for axis in AXES if axis in codes]),
+        confidence=confidence,
+        intensity=contrast.white.astype(np.float32) - np.float32(capture.black_level),
+        limits=triangulation,
+        doubts=tuple(contradictions),
+        notes=tuple(_corrections(codes)),
+    )
 
 
-def first_failure(statuses: list[np.ndarray]) -> np.ndarray:
+def _first_failure(statuses: list[np.ndarray]) -> np.ndarray:
     """(h, w) uint8, per pixel the first status that is not OK."""
     result = statuses[0].copy()
     for status in statuses[1:]:

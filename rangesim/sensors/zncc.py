@@ -9,15 +9,14 @@ from typing import ClassVar
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.codes import AXES, AxisFrames, Code, CodeThresholds, GrayThresholds
+from rangesim.codes import Code, CodeThresholds, GrayThresholds
 from rangesim.codes.zncc_matching import CorrelatedCode, check_columns, correlation_contradiction, decode_by_correlation
 from rangesim.decoding.phase_shift import PhaseThresholds
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
 from rangesim.decoding.working_range import WorkingRange
-from rangesim.errors import DoubtWarning, warn
 from rangesim.sensor import Background, Decoder, Sensor, of_type
-from rangesim.sensors.structured_light import StructuredLight, StructuredLightDecoder, first_failure
+from rangesim.sensors.structured_light import StructuredLight, StructuredLightDecoder, joined_axes
 from rangesim.settings.bounds import check_fields
 
 
@@ -76,31 +75,17 @@ class ZnccDecoder(Decoder):
             The patterns do not tell all pixels of the projector from each other.
         """
         sensor = of_type(capture.sensor, StructuredLight)
-        contrast = self._by_code.contrast(capture, sensor)
         found: dict[str, CorrelatedCode] = {}
         contradictions: list[str] = []
-        for axis in sensor.axes:
-            seen = AxisFrames(capture, axis, sensor.size(axis), *sensor.coded_frames(capture.frames, axis), contrast)
-            patterns = _shown_patterns(sensor, axis)
-            found[axis] = decode_by_correlation(seen, patterns, self.gray)
+        axes = self._by_code.axis_frames(capture)
+        for seen in axes:
+            patterns = _shown_patterns(sensor, seen.axis)
+            found[seen.axis] = decode_by_correlation(seen, patterns, self.gray)
             if contradiction := correlation_contradiction(seen, patterns):
                 contradictions.append(contradiction)
-        for contradiction in contradictions:
-            warn(contradiction, DoubtWarning)
         codes = {axis: one.code for axis, one in found.items()}
-        coordinate = {axis: code.coordinate for axis, code in codes.items()}
-        sigma_px = {axis: code.sigma_px for axis, code in codes.items()}
-        return ProjectorCoordinates(
-            column=coordinate.get("columns"),
-            row=coordinate.get("rows"),
-            column_sigma_px=sigma_px.get("columns"),
-            row_sigma_px=sigma_px.get("rows"),
-            status=first_failure([codes[axis].status for axis in AXES if axis in codes]),
-            confidence=np.minimum.reduce([one.distance for one in found.values()]),
-            intensity=contrast.white.astype(np.float32) - np.float32(capture.black_level),
-            limits=self.triangulation,
-            doubts=tuple(contradictions),
-        )
+        confidence = np.minimum.reduce([one.distance for one in found.values()])
+        return joined_axes(capture, codes, axes[0].contrast, confidence, self.triangulation, contradictions)
 
     @property
     def _by_code(self) -> StructuredLightDecoder:
@@ -110,8 +95,8 @@ class ZnccDecoder(Decoder):
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         """Least light by which white and black are told from each other, whatever the code."""
         shown = of_type(sensor, StructuredLight)
-        thresholds = CodeThresholds(self.gray, PhaseThresholds())
-        return Code.least_signal(shown.code, shown.size(shown.axes[0]), thresholds, background)
+        axis, thresholds = shown.axes[0], CodeThresholds(self.gray, PhaseThresholds())
+        return Code.least_signal(shown.code, shown.size(axis), shown.shown_names(axis), thresholds, background)
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
         return self._by_code.likely_cause(capture, image)
