@@ -227,8 +227,12 @@ def _along_lines(seen: AxisFrames, is_read: np.ndarray, words: Words, is_down: b
 def between_contradiction(light: Light) -> str | None:
     """A sentence if bits of wide stripes lie between dark and lit at many pixels, as fringes do; None if not.
 
-    Stripes are wide if they have the square root of all cells: half of the bits of Gray code, and no bit of a code
-    whose stripes are all narrow.
+    A bit is dark or lit, and between the two only at its edges. Stripes are wide if they have the square root of all
+    cells: half of the bits of Gray code, and no bit of a code whose stripes are all narrow.
+
+    Parameters
+    ----------
+    light : what `light_of_bits` returns.
     """
     n_cells = light.coded.shape[1]
     mean_stripe = n_cells / (1 + np.count_nonzero(np.diff(light.coded), axis=1))
@@ -247,9 +251,13 @@ def between_contradiction(light: Light) -> str | None:
 def uniform_contradiction(light: Light) -> str | None:
     """A sentence if a bit is dark or lit at all pixels, and white or black may stand in its place; None if not.
 
-    It is so where the words are more than the cells of the bit's widest stripe. In Gray code, the widest stripe of the
+    A bit takes both values in a view of more cells than its widest stripe has. In Gray code, the widest stripe of the
     coarsest bit is half of the projector. If the camera sees no more than that, the frame counts as white or black if
     there is no such frame beside it. A pair beside white and black is a bit, perhaps another one.
+
+    Parameters
+    ----------
+    light : what `light_of_bits` returns.
     """
     seen, words, coded, lit = light.seen, light.words, light.coded, light.lit
     n_seen = _n_covering(lit > 0.5)
@@ -438,7 +446,7 @@ def neighbours_of(code: AxisCode, words: Words) -> list[np.ndarray]:
 
 
 def _that_differ(keys: np.ndarray) -> np.ndarray:
-    """Those of the keys (n,) whose two words differ."""
+    """The keys, of keys (n,), whose two words differ."""
     return np.asarray(keys[keys >> 32 != keys & 0xFFFFFFFF])
 
 
