@@ -75,8 +75,8 @@ class _Offsets(NamedTuple):
 
     phase, cell : (n,) turns, `cell` of the centre of the cell or of its edge. agreement : 1 if the phases grow from
     pixel to pixel as their cells do, -1 if the other way, 0 if neighbours do not tell. half_turns : half the width of
-    the places that one `cell` stands for, in turns. period_px : projector pixels. largest_rest_px : distance from a
-    usual start, in projector pixels, up to which the fringes count as starting there.
+    the places that one `cell` stands for, in turns. period_px : projector pixels. steps : number of fringes.
+    largest_rest_px : distance from a usual start, in projector pixels, up to which they count as starting there.
     """
 
     phase: np.ndarray
@@ -84,6 +84,7 @@ class _Offsets(NamedTuple):
     agreement: float
     half_turns: float
     period_px: float
+    steps: int
     largest_rest_px: float = MAX_REST_PX
 
     def off(self, convention: FringeConvention) -> np.ndarray:
@@ -146,7 +147,7 @@ def with_own_start(frames: np.ndarray, sensor: StructuredLight) -> StructuredLig
         for one, stack, lit in zip(seen, stacks, used, strict=True)
     ]
     biases: dict[FringeConvention, float] = {}
-    for start in (given.start, *STARTS):
+    for start in (given.start, *_starts(max(max(stack.steps) for stack in stacks))):
         here = replace(given, start=start)  # type: ignore[arg-type]
         biases[here] = max(
             stack.bias_turns([here.place_turns(t, p) for t, p in zip(turns, stack.periods_px, strict=True)], one.size)
@@ -184,15 +185,15 @@ def _all_offsets(frames: np.ndarray, sensor: StructuredLight, period_px: float) 
         is_strong = (code.status == Status.OK) | (code.status == Status.CODE_ERROR)
         clear = is_strong & (gray.status == Status.OK) & _is_bright(seen)
         used = clear & ((gray.coordinate / gray.cell_px) % 1 == 0.5)
-        phase = phase_of(fringes.frames).normalised
+        phase, steps = phase_of(fringes.frames).normalised, len(fringes.frames)
         agreement = phase_direction(fringes.frames, gray, used, period_px)
         if gray.cell_px > MAX_CELL_TURNS * period_px:
             phase, place_px = _at_edges(phase, np.where(clear, gray.coordinate, np.float32(np.nan)), gray.cell_px)
             turns, rest_px = place_px / np.float32(period_px), max(MAX_REST_PX, MAX_EDGE_TURNS * period_px)
-            yield _Offsets(phase, turns, agreement, 0.25, period_px, rest_px)  # within a quarter of a period
+            yield _Offsets(phase, turns, agreement, 0.25, period_px, steps, rest_px)  # within a quarter of a period
             continue
         turns = gray.coordinate[used] / np.float32(period_px)
-        yield _Offsets(phase[used], turns, agreement, gray.cell_px / (2 * period_px), period_px)
+        yield _Offsets(phase[used], turns, agreement, gray.cell_px / (2 * period_px), period_px, steps)
 
 
 def _is_bright(seen: AxisFrames) -> np.ndarray:
@@ -231,7 +232,7 @@ def _measured(offsets: _Offsets, given: FringeConvention) -> FringeConvention | 
         if abs(vector) < MIN_CONCENTRATION * expected:
             continue
         off_px = float(np.angle(vector)) / (2 * np.pi) * offsets.period_px
-        rest_px = {c: abs(_rest_px(c, here, off_px, offsets.period_px)) for c in _usual(here)}
+        rest_px = {c: abs(_rest_px(c, here, off_px, offsets.period_px)) for c in _usual(here, offsets.steps)}
         best = min(rest_px, key=lambda c: rest_px[c])
         if offsets.largest_rest_px > MAX_REST_PX:  # half a pixel may not be told
             best = min(rest_px, key=lambda c: (rest_px[c] > offsets.largest_rest_px, c.origin_px != given.origin_px))
@@ -243,10 +244,15 @@ def _measured(offsets: _Offsets, given: FringeConvention) -> FringeConvention | 
     return None
 
 
-def _usual(given: FringeConvention) -> Iterator[FringeConvention]:
-    """The given convention first, then all usual ones in its direction."""
+def _starts(steps: int) -> list[str]:
+    """Usual starts of fringes of that many steps. Only those of three steps start at 120 degrees."""
+    return [start for start in STARTS if steps == 3 or not start.endswith("120")]
+
+
+def _usual(given: FringeConvention, steps: int) -> Iterator[FringeConvention]:
+    """The given convention first, then all usual ones of that many steps in its direction."""
     yield given
-    for start in STARTS:
+    for start in _starts(steps):
         for origin_px in ORIGINS_PX:
             yield FringeConvention(start, given.direction, origin_px)  # type: ignore[arg-type]
 
