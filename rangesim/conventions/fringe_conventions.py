@@ -188,7 +188,7 @@ def _all_offsets(frames: np.ndarray, sensor: StructuredLight, period_px: float) 
         is_strong = (code.status == Status.OK) | (code.status == Status.CODE_ERROR)
         clear = is_strong & (gray.status == Status.OK) & _is_bright(seen)
         used = clear & ((gray.coordinate / gray.cell_px) % 1 == 0.5)
-        phase = phase_of(fringes.frames).normalised
+        phase, steps = phase_of(fringes.frames).normalised, len(fringes.frames)
         agreement = phase_direction(fringes.frames, gray, used, period_px)
         if gray.cell_px > MAX_CELL_TURNS * period_px:
             phase, place_px = _at_edges(phase, np.where(clear, gray.coordinate, np.float32(np.nan)), gray.cell_px)
