@@ -90,6 +90,10 @@ surfaces."""
 COVERED_FRACTION = 0.95
 """Fraction of the pixels whose words count as seen. Single wrong bits make the rarest words."""
 
+MIN_MORE_CHANGES = 2.5
+"""Least ratio of the changes of two bits that follow each other, from pixel to pixel, at which a bit between them may
+be missing. It is 2 in Gray code, and 4 if a bit is lost; noise makes more changes in both."""
+
 EDGES_BETWEEN = 2
 """Number of edges of the next finer bit that lie between two edges of a bit of Gray code. There are twice as many if a
 bit between the two is lost, and fewer where the camera does not resolve the finer one."""
@@ -260,7 +264,6 @@ def uniform_contradiction(light: Light) -> str | None:
     light : what `light_of_bits` returns.
     """
     seen, words, coded, lit = light.seen, light.words, light.coded, light.lit
-    n_seen = _n_covering(lit > 0.5)
     is_shown = {"white": seen.contrast.has_white, "black": seen.contrast.has_black}
     for i, (bit, values) in enumerate(zip(bit_frames(seen.names, words.bits), lit, strict=True)):
         is_dark, is_lit = (
@@ -274,7 +277,7 @@ def uniform_contradiction(light: Light) -> str | None:
             for end, at in (("", bit.pattern), ("_inverse", bit.inverse))
             if at is not None
         }
-        is_in_view = n_seen <= _widest_stripe(coded[i])
+        is_in_view = _n_covering(lit > 0.5) <= _widest_stripe(coded[i])
         least = 1 - MIN_UNIFORM_FRACTION if any(is_shown.values()) else MIN_SECOND_FRACTION
         is_level = i == 0 and min(coded[i].mean(), 1 - coded[i].mean()) > least
         has_level = any(is_shown[level] for level in shown.values())
@@ -293,8 +296,11 @@ def uniform_contradiction(light: Light) -> str | None:
 
 def _n_covering(bits: np.ndarray) -> int:
     """Number of the most frequent words that `COVERED_FRACTION` of the pixels have; bits (b, n) bool."""
-    _, counts = np.unique(np.packbits(bits, axis=0), axis=1, return_counts=True)
-    return int(np.searchsorted(np.cumsum(np.sort(counts)[::-1]), COVERED_FRACTION * bits.shape[1])) + 1
+    word = np.zeros(bits.shape[1], dtype=np.int32)
+    for bit in bits:
+        word = (word << 1) | bit
+    counts = np.sort(np.unique(word, return_counts=True)[1])[::-1]
+    return int(np.searchsorted(np.cumsum(counts), COVERED_FRACTION * len(word))) + 1
 
 
 def _widest_stripe(bit: np.ndarray) -> int:
@@ -310,10 +316,14 @@ def lost_contradiction(light: Light) -> str | None:
     ----------
     light : what `light_of_bits` returns.
     """
-    expected, _ = _edges_between(light.coded[:, None].astype(np.float32))
+    expected = _edges_between(light.coded[:, None].astype(np.float32))
     if (expected[np.isfinite(expected)] != EDGES_BETWEEN).any():
         return None  # another code
-    found, _ = max((_edges_between(along) for along in (light.across, light.down)), key=lambda result: result[1])
+    along, changes = max(((x, _changes(x)) for x in (light.across, light.down)), key=lambda pair: int(pair[1].sum()))
+    is_known = changes[:-1] >= MIN_STEPS
+    if not (changes[1:] > MIN_MORE_CHANGES * changes[:-1])[is_known].any():
+        return None
+    found = _edges_between(along)
     other = np.flatnonzero(found > EDGES_BETWEEN)
     if len(other) != 1 or found[other[0]] != 2 * EDGES_BETWEEN:
         return None
@@ -328,9 +338,14 @@ def lost_contradiction(light: Light) -> str | None:
     )
 
 
-def _edges_between(light: np.ndarray) -> tuple[np.ndarray, int]:
-    """(b - 1,) median number of edges of each finer bit between two edges of a bit, NaN if unknown; and how many edges
-    there are in all.
+def _changes(light: np.ndarray) -> np.ndarray:
+    """(b,) int, how often each bit changes from pixel to pixel along the lines (b, n, m)."""
+    bits = light > 0.5
+    return np.count_nonzero(bits[..., 1:] != bits[..., :-1], axis=(1, 2))
+
+
+def _edges_between(light: np.ndarray) -> np.ndarray:
+    """(b - 1,) median number of edges of each finer bit between two edges of a bit, NaN if unknown.
 
     Parameters
     ----------
@@ -345,7 +360,7 @@ def _edges_between(light: np.ndarray) -> tuple[np.ndarray, int]:
         line, at = np.nonzero(is_edge[edges])
         between = np.diff(n_before[finer][line, at])[np.diff(line) == 0]
         medians.append(float(np.median(between)) if between.size >= (MIN_STEPS if len(light[0]) > 1 else 1) else np.nan)
-    return np.array(medians), int(np.count_nonzero(is_edge))
+    return np.array(medians)
 
 
 def other_code_contradiction(
