@@ -120,9 +120,9 @@ def measured_fringes(frames: np.ndarray, sample: np.ndarray, sensor: StructuredL
     convention = found.pop()
     assert convention is not None
     other: Code = replace(code, convention=convention)  # type: ignore[type-var]
-    still = contradictions(frames, replace(sensor, code=other))
-    if still and len(still) >= len(contradictions(frames, sensor)):
-        return code, ()  # something else is wrong
+    said, still = contradictions(frames, sensor), contradictions(frames, replace(sensor, code=other))
+    if len(still) >= len(said) and (still or convention.direction != given.direction):
+        return code, ()  # something else is wrong; and fringes that move the other way are always contradicted
     return other, tuple(_differences(convention, given))
 
 
