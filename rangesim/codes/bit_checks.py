@@ -18,7 +18,7 @@ import numpy as np
 from rangesim.capture import bright_level
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.bits import Words, bit_frames
-from rangesim.decoding.pixel_samples import MAX_PIXELS, MIN_PIXELS, evenly_spread
+from rangesim.decoding.pixel_samples import MIN_PIXELS, evenly_spread
 from rangesim.decoding.status import Status
 
 MAX_UNPAIRED_FRACTION = 0.2
@@ -89,6 +89,14 @@ surfaces."""
 
 COVERED_FRACTION = 0.95
 """Fraction of the pixels whose words count as seen. Single wrong bits make the rarest words."""
+
+MAX_LINE_PIXELS = 12_000
+"""Number of pixels, about, of the lines across the image on which each bit is looked at, and of those down the image.
+Fractions of them have a standard error below 0.5 %; a bit with one edge in view has an edge on each of 25 lines or
+more of a usual image."""
+
+MIN_GAPS = 20
+"""Least number of gaps between edges of a bit whose median number of finer edges is told."""
 
 MIN_MORE_CHANGES = 2.5
 """Least ratio of the changes of two bits that follow each other, from pixel to pixel, at which a bit between them may
@@ -178,6 +186,7 @@ class Light(NamedTuple):
 
     seen : frames of the bits. words : those of the code. coded : (b, cells) int, bits of the cells of the projector.
     across, down : (b, n, m) float32, along lines across the image and down the image.
+    lit : (b, n) float32, at those pixels of `across` that are read.
     """
 
     seen: AxisFrames
@@ -185,11 +194,7 @@ class Light(NamedTuple):
     coded: np.ndarray
     across: np.ndarray
     down: np.ndarray
-
-    @property
-    def lit(self) -> np.ndarray:
-        """(b, n) float32, at pixels that are read."""
-        return self.across[:, np.isfinite(self.across[0])]
+    lit: np.ndarray
 
 
 def light_of_bits(seen: AxisFrames, code: AxisCode, words: Words) -> Light | None:
@@ -207,12 +212,12 @@ def light_of_bits(seen: AxisFrames, code: AxisCode, words: Words) -> Light | Non
         return None
     coded = (words.of_cell[: math.ceil(seen.size / code.cell_px)] >> np.arange(words.bits)[::-1, None]) & 1
     across, down = (_along_lines(seen, is_read, words, is_down) for is_down in (False, True))
-    return Light(seen, words, coded, across, down)
+    return Light(seen, words, coded, across, down, across[:, np.isfinite(across[0])])
 
 
 def _along_lines(seen: AxisFrames, is_read: np.ndarray, words: Words, is_down: bool) -> np.ndarray:
     """(b, n, m) float32, light of the bits along lines of the image, across or down; NaN where not `is_read` (h, w)."""
-    step = 1 + seen.contrast.values.size // MAX_PIXELS
+    step = 1 + seen.contrast.values.size // MAX_LINE_PIXELS
 
     def lines(image: np.ndarray) -> np.ndarray:
         return (image.T if is_down else image)[::step].astype(np.float32)
@@ -320,7 +325,7 @@ def lost_contradiction(light: Light) -> str | None:
     if (expected[np.isfinite(expected)] != EDGES_BETWEEN).any():
         return None  # another code
     along, changes = max(((x, _changes(x)) for x in (light.across, light.down)), key=lambda pair: int(pair[1].sum()))
-    is_known = changes[:-1] >= MIN_STEPS
+    is_known = changes[:-1] >= MIN_GAPS
     if not (changes[1:] > MIN_MORE_CHANGES * changes[:-1])[is_known].any():
         return None
     found = _edges_between(along)
@@ -353,13 +358,14 @@ def _edges_between(light: np.ndarray) -> np.ndarray:
     """
     places = np.where(np.abs(light - 0.5) > MAX_FROM_MIDDLE, np.arange(light.shape[2]), 0)
     last_clear = np.maximum.accumulate(places, axis=2)
-    is_edge = np.diff(np.take_along_axis(light > 0.5, last_clear, axis=2), axis=2)
+    bits = np.take_along_axis(light > 0.5, last_clear, axis=2)
+    is_edge = bits[..., 1:] != bits[..., :-1]
     n_before = np.cumsum(is_edge, axis=2, dtype=np.int32)
     medians = []
     for edges, finer in pairwise(range(len(light))):
         line, at = np.nonzero(is_edge[edges])
         between = np.diff(n_before[finer][line, at])[np.diff(line) == 0]
-        medians.append(float(np.median(between)) if between.size >= (MIN_STEPS if len(light[0]) > 1 else 1) else np.nan)
+        medians.append(float(np.median(between)) if between.size >= (MIN_GAPS if len(light[0]) > 1 else 1) else np.nan)
     return np.array(medians)
 
 
