@@ -16,17 +16,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
+from rangesim.capture import Capture
 from rangesim.codes.axis_code import AxisCode, AxisFrames
-from rangesim.codes.fringe_gamma import FringeGamma, gamma_of
+from rangesim.codes.fringe_gamma import MAX_SAMPLES, FringeGamma, gamma_of
 from rangesim.codes.fringe_kernels import Agreement, agree, mean_place
 from rangesim.codes.fringes import FringeConvention
 from rangesim.decoding.phase_shift import PhaseThresholds, modulation_is_weak, phase_of, phase_sigma
+from rangesim.decoding.pixel_samples import MIN_PIXELS, evenly_spread
 from rangesim.decoding.row_bands import in_bands
 from rangesim.decoding.status import Status
 from rangesim.response import Fringes
+from rangesim.robust_scale import sigma_from_median
 
 LIMITS = Agreement(widest=1 / 4, misfit=1 / 8, ambiguity=1 / 4)
 """Limits of the agreement of phases.
@@ -35,6 +39,10 @@ The misfit, 1/8 of a turn, is four standard deviations of the noisiest phase tha
 (`PhaseThresholds.max_sigma_rad`, 0.2). The widest distance is twice that, so that the second best is known where the
 best is accepted. At an ambiguity of 1/4 the best place is half as far from the phases as the second; noise would have
 to move the phases by two thirds of the way between both to deceive, and at half of it the pixel counts as ambiguous."""
+
+MAX_WEAK = 6.0
+"""Largest modulation of pixels that tell the noise, as a multiple of the least one that is accepted. Brighter pixels
+have more shot noise, and none of them is refused for noise."""
 
 MIN_APART_TURNS = 0.005
 """Least distance of any two places of the axis in the space of the phases, in turns. A camera of 8 bits tells a phase
@@ -117,6 +125,32 @@ class FringeStack:
             others = [k for k in range(len(self.steps)) if k != i]
             scale = np.mean([self.of_period(seen.frames, k).mean(axis=0, dtype=np.float32) for k in others], axis=0)
         return gamma_of(self.frames_of(seen, i), usable, scale)
+
+    def _weak_noise(
+        self, capture: Capture, frames: np.ndarray, usable: np.ndarray, thresholds: PhaseThresholds
+    ) -> float:
+        """Noise of pixels with little modulation, in digital numbers of an unknown detector; 0 if nothing tells it.
+
+        All periods have the same mean, (white + black) / 2, at any blur and interreflection, so that their means differ
+        by noise alone. A gamma adds what is proportional to the modulation, so little at these pixels.
+
+        Parameters
+        ----------
+        frames : (n, h, w), those of the stack. usable : (h, w) bool, pixels that may tell.
+        """
+        if capture.detector is not None or not capture.is_digital or len(self.steps) < 2:
+            return 0.0
+        used = evenly_spread(np.flatnonzero(usable))
+        values = frames.reshape(len(frames), -1)[:, used[:: 1 + len(used) // MAX_SAMPLES]]
+        periods = [phase_of(self.of_period(values, i)) for i in range(len(self.steps))]
+        least = thresholds.modulation_of_scale * capture.full_scale
+        modulation = np.min([phase.modulation for phase in periods], axis=0)
+        weak = (modulation > least) & (modulation < MAX_WEAK * least)
+        if np.count_nonzero(weak) < MIN_PIXELS:
+            return 0.0
+        off = [b.mean[weak] - a.mean[weak] for a, b in pairwise(periods)]
+        spread = [math.sqrt(1 / a + 1 / b) for a, b in pairwise(self.steps)]
+        return max(sigma_from_median(o, float(np.median(o))) / s for o, s in zip(off, spread, strict=True))
 
     def apart(self, size: int) -> tuple[float, float]:
         """Least distance of two places in the space of the phases, in turns, and their distance in projector pixels.
@@ -204,8 +238,9 @@ class FringeStack:
         coordinate = np.empty(shape, dtype=np.float32)
         sigma_px = None if capture.noise(frames[0, :1]) is None else np.empty(shape, dtype=np.float32)
         saturated = capture.saturated(frames)
-        usable = (status == Status.OK) & seen.contrast.is_enough & ~saturated
-        gammas = self.gammas(seen, usable, coarse is not None)
+        usable = (status == Status.OK) & ~saturated
+        gammas = self.gammas(seen, usable & seen.contrast.is_enough, coarse is not None)
+        noise = self._weak_noise(capture, frames, usable, thresholds)
         order = np.argsort(self.periods_px, kind="stable")
         periods = np.array(self.periods_px)[order]
         precision = np.array(self.steps)[order] / periods**2
@@ -223,6 +258,7 @@ class FringeStack:
                 sigma = phase_sigma(capture, phase, steps)
                 weak |= modulation_is_weak(capture, phase, sigma, thresholds)
                 weak |= 2 * phase.modulation < swings[rows]
+                weak |= math.sqrt(2 / steps) * noise > thresholds.max_sigma_rad * phase.modulation
                 places[k] = self.convention.place_turns(phase.normalised, period)
                 weights[k] = steps * (phase.modulation / period) ** 2
                 if sigma is not None and k == 0:

@@ -25,7 +25,7 @@ class PhaseThresholds:
     ----------
     max_sigma_rad : float, radians, largest standard deviation of a phase, where the detector is known.
     modulation_of_scale : float, least modulation as a fraction of full scale, for digital captures of unknown
-        detectors.
+        detectors. Fringes of several periods tell the noise, and ask for more if `max_sigma_rad` does.
     relative_modulation : float, least modulation as a fraction of the pixel's own brightness, for noise-free captures.
 
     Examples
