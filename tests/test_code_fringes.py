@@ -160,7 +160,7 @@ def test_the_noise_of_a_place_follows_its_law(kind: type[Code], steps: int) -> N
 @pytest.mark.parametrize("steps", [3, 4])
 @pytest.mark.parametrize("kind", [MultiFrequency, Heterodyne])
 def test_periods_of_an_unknown_camera_tell_its_noise(kind: type[Code], steps: int) -> None:
-    """Weak pixels are refused as far as the noise asks for it: without that, 1 to 6 % of them are wrong at 2 to 3 DN."""
+    """Weak pixels are refused as far as the noise asks for it; without that, 1 to 6 % of them are wrong."""
     sensor, rng = StructuredLight(640, 8, kind(steps=steps)), np.random.default_rng(0)  # type: ignore[call-arg]
     column = rng.integers(0, 640, (300, 200))
     white = np.linspace(5, 60, 300)[:, None]

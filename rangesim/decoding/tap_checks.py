@@ -42,6 +42,10 @@ MIN_SPREAD = 0.3
 """Least spread of the light, and of the light times the square of its path, in powers of e, for a doubt of its
 direction: albedos and slopes of one surface differ by less."""
 
+MIN_RANGE = 10
+"""Least range of the other frames, in digital numbers, at which a frame of one number was not taken of the scene. In
+weak light, all frames may have one or two numbers."""
+
 MAX_FREQUENCIES = 4
 """Largest number of frequencies whose other orders are tried; more have more than 24."""
 
@@ -63,8 +67,10 @@ def frame_contradiction(frames: np.ndarray, names: Sequence[str]) -> str | None:
     """
     if frames[0].size < MIN_PIXELS:
         return None
-    flat = [name for frame, name in zip(frames, names, strict=True) if frame.min() == frame.max()]
-    if flat and len(flat) < len(frames):
+    ranges = np.array([int(frame.max()) - int(frame.min()) for frame in frames])
+    is_flat = (ranges == 0) & (frames[:, 0, 0] < frames.max())  # the largest number may be the one that clips
+    flat = [name for name, alike in zip(names, is_flat, strict=True) if alike]
+    if flat and len(flat) < len(frames) and np.median(ranges[ranges > 0]) >= MIN_RANGE:
         return (
             f"{', '.join(flat)}: the same number at every pixel, which no camera takes of a scene: check that "
             "{} written and read as a whole.".format("this frame was" if len(flat) == 1 else "these frames were")
