@@ -72,6 +72,26 @@ MAX_BETWEEN_FRACTION = 0.12
 """Largest fraction of the pixels that may lie between dark and lit in a bit of wide stripes, the median of these bits.
 They lie there only at the edges of stripes: 0 to 4 % in real captures. A sinusoid spends 19 % of its period there."""
 
+MAX_MORE_BETWEEN = 0.15
+"""Largest fraction of the pixels by which more may lie between dark and lit in a bit than in a finer one, which has
+more edges. It is at most 0.04 in real captures; a frame at half the exposure makes it 0.3 to 0.5."""
+
+MIN_RARER_FRACTION = 0.1
+"""Least fraction of the pixels at which a bit is dark, and lit, if a coarser one is compared with it. A bit that the
+camera does not resolve may be lit everywhere, and between dark and lit nowhere: 0.05 in a real capture."""
+
+MAX_CLEAR_BETWEEN = 0.15
+"""Largest fraction of the pixels between dark and lit of a bit that the camera resolves, so that its edges have a
+place. In a real capture, the finest bit that it resolves has 0.13, and the next one 0.24."""
+
+MIN_ADJACENT_FRACTION = 0.5
+"""Least fraction of the places where one bit changes alone that lie between neighbouring cells, and least number of
+those in Gray code. It is above 0.98 in real captures; if a frame is displaced by its own stripes, it is below 0.4."""
+
+MIN_CODED_EDGES = 4
+"""Least number of edges of a bit whose places are checked. The edges of the others are one or two lines of the image,
+and steps of the scene may hide them: in a real capture, 24 % of the changes of such a bit led to the next cell."""
+
 MAX_FROM_MIDDLE = 0.15
 """Distance from the middle of dark and lit up to which a pixel lies between the two, as a fraction of their difference.
 Noise of a fifth of the difference brings 4 % of the pixels there."""
@@ -257,6 +277,75 @@ def between_contradiction(light: Light) -> str | None:
     )
 
 
+def uneven_contradiction(light: Light) -> str | None:
+    """A sentence if a bit lies between dark and lit at more pixels than a finer one; None if none does.
+
+    Pixels lie there at the edges of stripes, and a finer bit of Gray code has more edges, at any blur. A frame with
+    another exposure, or that alone is blurred, lies there at many pixels.
+
+    Parameters
+    ----------
+    light : what `light_of_bits` returns.
+    """
+    if not _halves_stripes(light):
+        return None
+    between = (np.abs(light.lit - 0.5) < MAX_FROM_MIDDLE).mean(axis=1)
+    has_both = np.abs((light.lit > 0.5).mean(axis=1) - 0.5) <= 0.5 - MIN_RARER_FRACTION
+    finer = np.where(has_both, between, np.inf)
+    least = np.append(np.minimum.accumulate(finer[::-1])[::-1][1:], np.inf)  # of all bits that are finer
+    excess = between - least
+    worst = int(np.argmax(excess))
+    if excess[worst] <= MAX_MORE_BETWEEN:
+        return None
+    bit = bit_frames(light.seen.names, light.words.bits)[worst]
+    name = light.seen.shown_name(bit.name if bit.pattern is not None else f"{bit.name}_inverse")
+    return (
+        f"frame {name} lies between dark and lit at {100 * between[worst]:.0f} % of the pixels, and a frame of finer "
+        f"stripes at {100 * least[worst]:.0f} %: check that all frames have one exposure and one focus, and that none "
+        "shows another scene."
+    )
+
+
+def displaced_contradiction(light: Light, neighbours: list[np.ndarray]) -> str | None:
+    """A sentence if a bit changes where the finer ones have no edge between cells; None if none does.
+
+    In a code that changes one bit from cell to cell, a bit that changes alone leads to the next cell. If its frame is
+    displaced, or of another scene, it leads elsewhere.
+
+    Parameters
+    ----------
+    light : what `light_of_bits` returns. neighbours : what `neighbours_of` returns.
+    """
+    words = light.words
+    if not (words.change_one_bit and _halves_stripes(light)):
+        return None
+    between = (np.abs(light.lit - 0.5) < MAX_FROM_MIDDLE).mean(axis=1)[::-1]
+    rarer = 0.5 - np.abs((light.lit > 0.5).mean(axis=1) - 0.5)[::-1]
+    clear = np.flatnonzero((between < MAX_CLEAR_BETWEEN) & (rarer >= MIN_RARER_FRACTION))
+    if not len(clear):
+        return None
+    finest = int(clear[0])
+    both = Pairs.of(np.concatenate([_that_differ(part) for part in neighbours]))
+    changed = (both.first ^ both.second) >> finest
+    is_next = np.abs((words.cell_of[both.first] >> finest) - (words.cell_of[both.second] >> finest)) == 1
+    n_edges = np.count_nonzero(np.diff(light.coded), axis=1)[::-1]
+    expected = float(both.counts[changed == 1].sum())  # each coarser bit has half the edges
+    shown = list(reversed(bit_frames(light.seen.names, words.bits)))
+    for k in range(finest + 1, words.bits):
+        expected /= 2
+        alone = changed == 1 << (k - finest)
+        n = int(both.counts[alone].sum())
+        adjacent = int(both.counts[alone & is_next].sum())
+        if n >= MIN_STEPS and n_edges[k] >= MIN_CODED_EDGES and adjacent < MIN_ADJACENT_FRACTION * min(n, expected):
+            name = light.seen.shown_name(shown[k].name if shown[k].pattern is not None else f"{shown[k].name}_inverse")
+            return (
+                f"the bits along {light.seen.axis} contradict {words.noun}: where frame {name} changes, "
+                f"{100 * (1 - adjacent / n):.0f} % of the pixels do not see the next cell: check that nothing moved "
+                "between the frames, and that all show one scene."
+            )
+    return None
+
+
 def uniform_contradiction(light: Light) -> str | None:
     """A sentence if a bit is dark or lit at all pixels, and white or black may stand in its place; None if not.
 
@@ -321,9 +410,8 @@ def lost_contradiction(light: Light) -> str | None:
     ----------
     light : what `light_of_bits` returns.
     """
-    expected = _edges_between(light.coded[:, None].astype(np.float32))
-    if (expected[np.isfinite(expected)] != EDGES_BETWEEN).any():
-        return None  # another code
+    if not _halves_stripes(light):
+        return None
     along, changes = max(((x, _changes(x)) for x in (light.across, light.down)), key=lambda pair: int(pair[1].sum()))
     is_known = changes[:-1] >= MIN_GAPS
     if not (changes[1:] > MIN_MORE_CHANGES * changes[:-1])[is_known].any():
@@ -341,6 +429,12 @@ def lost_contradiction(light: Light) -> str | None:
         f"{found[at]:.0f} edges of frame {fine} lie between two edges of frame {coarse}, and {EDGES_BETWEEN} in "
         f"{light.words.noun}: the image of a bit between the two seems to be missing."
     )
+
+
+def _halves_stripes(light: Light) -> bool:
+    """Whether each finer bit has the edges of Gray code: two between two edges of the next coarser bit."""
+    expected = _edges_between(light.coded[:, None].astype(np.float32))
+    return not (expected[np.isfinite(expected)] != EDGES_BETWEEN).any()
 
 
 def _changes(light: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.bit_checks import (
     between_contradiction,
+    displaced_contradiction,
     level_contradiction,
     light_of_bits,
     lost_contradiction,
@@ -19,6 +20,7 @@ from rangesim.codes.bit_checks import (
     order_contradiction,
     other_code_contradiction,
     pair_contradiction,
+    uneven_contradiction,
     uniform_contradiction,
 )
 from rangesim.codes.bits import Words, bit_frames, decode_bits
@@ -111,13 +113,19 @@ class BitCode(Code):
             return found
         light = light_of_bits(seen, code, words)
         if light is not None:
-            found = between_contradiction(light) or uniform_contradiction(light) or lost_contradiction(light)
+            found = (
+                between_contradiction(light)
+                or uniform_contradiction(light)
+                or lost_contradiction(light)
+                or uneven_contradiction(light)
+            )
             if found:
                 return found
         neighbours = neighbours_of(code, words)
-        return other_code_contradiction(seen, neighbours, words, _other_words(words)) or order_contradiction(
+        found = other_code_contradiction(seen, neighbours, words, _other_words(words)) or order_contradiction(
             seen, neighbours, words
         )
+        return found or (None if light is None else displaced_contradiction(light, neighbours))
 
     def least_signal(
         self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
