@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations, permutations
+from itertools import combinations, pairwise, permutations
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from rangesim.codes.fringes import FringeConvention
 from rangesim.decoding.phase_shift import Phase, phase_of
 from rangesim.decoding.pixel_samples import MAX_PIXELS, MIN_PIXELS, evenly_spread
 from rangesim.decoding.status import Status
-from rangesim.robust_scale import TO_SIGMA
+from rangesim.robust_scale import TO_SIGMA, sigma_from_median
 
 OUTSIDE_TURNS = 0.005
 """Least distance of a phase from its Gray cell, in turns, at which the phase counts as outside. It allows for rounding:
@@ -53,6 +53,10 @@ MAX_UNEVEN_LEVEL = 0.01
 """Largest root mean square of that distance about its own mean over all phases, at which the mean of the fringes counts
 as off by the same at all phases. Blurred fringes of gammas from 0.5 to 3 have at most 0.006 (measured); one of four
 fringes that is exposed 1.3 times makes 0.027."""
+
+MAX_MEANS_APART = 0.03
+"""Largest median difference of the means of two periods, as a fraction of the modulation, beyond that of gammas. It is
+0.000 in a real capture; one of its six frames that is exposed 1.2 times makes 0.08, and a drift of 20 % 0.16."""
 
 PHASE_BINS = 8
 """Number of parts into which a period is divided, to see at which phases the mean of the fringes is off. One missing
@@ -202,7 +206,49 @@ def stack_contradiction(seen: AxisFrames, code: AxisCode, stack: FringeStack) ->
             return text
         if text := _sinusoid_fault(one, usable, gamma):
             return text
+    if text := _means_fault(seen, code, stack, usable):
+        return text
     return _agreement_fault(seen, code, stack, usable) if code.coarse is None else None
+
+
+def _means_fault(seen: AxisFrames, code: AxisCode, stack: FringeStack, usable: np.ndarray) -> str | None:
+    """A sentence if the fringes of two periods have other means; None if they have the same.
+
+    The mean of equally shifted fringes is (white + black) / 2 for every period, at any blur and interreflection. A
+    gamma moves it by its harmonics of the order of the steps, which are summed up as if they had no shift.
+    """
+    used = evenly_spread(np.flatnonzero(usable & ~seen.capture.saturated(seen.frames).reshape(usable.shape)))
+    used = used[:: 1 + len(used) // MAX_SAMPLES]
+    if len(stack.steps) == 1 or len(used) < MIN_PIXELS:
+        return None
+    frames = seen.frames.reshape(len(seen.frames), -1)[:, used].astype(np.float64)
+    phases = [phase_of(stack.of_period(frames, i)) for i in range(len(stack.steps))]
+    harmonics = [_unshifted_harmonic(gamma.gamma, n) for gamma, n in zip(code.gammas, stack.steps, strict=True)]
+    for i, j in pairwise(range(len(phases))):
+        modulation = np.maximum(np.maximum(phases[i].modulation, phases[j].modulation), 1e-12)
+        apart = (phases[i].mean - phases[j].mean) / modulation
+        middle = float(np.median(apart))
+        error = MEDIAN_ERROR * sigma_from_median(apart, middle) / np.sqrt(len(apart))
+        if abs(middle) > MAX_MEANS_APART + harmonics[i] + harmonics[j] + 3 * error:
+            one, other = (f"{stack.periods_px[k]:g}" for k in (i, j))
+            return (
+                f"the fringes along {seen.axis} contradict each other: the means of those of {one} and {other} pixels "
+                f"differ by {100 * abs(middle):.0f} % of their modulation, and light adds up to one mean: check that "
+                "all frames have one exposure, that other light does not change, and that no frame is missing or of "
+                "another scene."
+            )
+    return None
+
+
+def _unshifted_harmonic(gamma: float, steps: int) -> float:
+    """Amplitude of the harmonic of order `steps` of fringes with a gamma, as a fraction of the first."""
+    shown = np.abs(np.fft.rfft(_expected_period(gamma)))
+    return float(shown[steps] / shown[1])
+
+
+def _expected_period(gamma: float) -> np.ndarray:
+    """(64,) values from 0 to 1 of a period of fringes with a gamma."""
+    return np.asarray((0.5 + 0.5 * np.cos(2 * np.pi * np.arange(64) / 64)) ** gamma)
 
 
 def _sinusoid_fault(seen: AxisFrames, usable: np.ndarray, gamma: FringeGamma) -> str | None:
