@@ -189,7 +189,7 @@ class FringeStack:
         return self._agreed(places, size)[1]
 
     def bias_turns(self, places: list[np.ndarray], size: int) -> float:
-        """How far the phases of the periods lie on average beside the places on which they agree, in turns.
+        """Mean distance of the phases of the periods from the places on which they agree, in turns.
 
         It is the root mean square over the periods, 1 if the phases agree at few pixels. It is near 0 if all fringes
         start where they should: noise lies on both sides.
