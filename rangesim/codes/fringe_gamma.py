@@ -19,7 +19,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from rangesim.codes.axis_code import AxisFrames
 from rangesim.decoding.phase_shift import Phase
 from rangesim.decoding.pixel_samples import MIN_PIXELS, evenly_spread
 from rangesim.robust_scale import sigma_from_median
@@ -90,20 +89,20 @@ class FringeGamma:
         return Phase(place - np.floor(place), phase.modulation, phase.mean)
 
 
-def gamma_of(seen: AxisFrames, usable: np.ndarray, scale: np.ndarray | None) -> FringeGamma:
-    """Response of projector and camera as the fringes `seen` show it.
+def gamma_of(frames: np.ndarray, usable: np.ndarray, scale: np.ndarray | None) -> FringeGamma:
+    """Response of projector and camera as fringes show it.
 
     Parameters
     ----------
-    usable : (h, w) bool, pixels that are neither weak nor saturated. scale : (h, w) brightness that the fringes do not
-        change, such as white - black; None: there is none.
+    frames : (N, h, w), fringes of one period. usable : (h, w) bool, pixels that are neither weak nor saturated.
+    scale : (h, w) brightness that the fringes do not change, such as white - black; None: there is none.
     """
     used = evenly_spread(np.flatnonzero(usable))
     used = used[:: 1 + len(used) // MAX_SAMPLES]
     if len(used) < MIN_PIXELS:
         return FringeGamma(is_told=False)
-    frames = seen.frames.reshape(len(seen.frames), -1)[:, used]
-    return measured_gamma(frames, None if scale is None else scale.ravel()[used])
+    few = frames.reshape(len(frames), -1)[:, used]
+    return measured_gamma(few, None if scale is None else scale.ravel()[used])
 
 
 def measured_gamma(frames: np.ndarray, contrast: np.ndarray | None = None) -> FringeGamma:

@@ -124,7 +124,7 @@ class FringeStack:
         elif len(self.steps) > 1:  # the means of the other periods change with other phases
             others = [k for k in range(len(self.steps)) if k != i]
             scale = np.mean([self.of_period(seen.frames, k).mean(axis=0, dtype=np.float32) for k in others], axis=0)
-        return gamma_of(self.frames_of(seen, i), usable, scale)
+        return gamma_of(self.of_period(seen.frames, i), usable, scale)
 
     def _weak_noise(
         self, capture: Capture, frames: np.ndarray, usable: np.ndarray, thresholds: PhaseThresholds

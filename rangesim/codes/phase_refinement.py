@@ -38,7 +38,7 @@ def refine_by_phase(
     coordinate, status = np.empty_like(gray.coordinate), gray.status.copy()
     sigma_px = None if capture.noise(frames[0, :1]) is None else np.empty_like(gray.coordinate)
     saturated = capture.saturated(frames)
-    gamma = gamma_of(seen, (status == Status.OK) & ~saturated, seen.contrast.values)
+    gamma = gamma_of(frames, (status == Status.OK) & ~saturated, seen.contrast.values)
     reach = gray.cell_px / 2 + period_px / 8
     if gray.cell_px <= period_px:  # coarser cells are those of a place that fringes have refined before
         reach = min(reach, period_px - reach)  # a place that is farther off has a second cycle within the range
