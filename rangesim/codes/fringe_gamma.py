@@ -81,12 +81,26 @@ class FringeGamma:
         """The phases of `steps` fringes as they would be of a linear response."""
         if self.gamma == 1:
             return phase
-        table = _corrections(self.gamma, steps)
-        turns = phase.normalised * np.float32(steps)
-        ripple = turns - np.floor(turns)  # the table covers one ripple, and repeats N times per period
-        change = np.interp(ripple, np.linspace(0, 1, len(table)), table).astype(np.float32)
-        place = phase.normalised + change
+        place = phase.normalised + _at_ripple(phase, steps, _corrections(self.gamma, steps))
         return Phase(place - np.floor(place), phase.modulation, phase.mean)
+
+    def slope(self, phase: Phase, steps: int) -> np.ndarray | float:
+        """Change of the corrected phase over that of the measured one, (...) float32: the factor of its noise.
+
+        Parameters
+        ----------
+        phase : as measured. steps : number of fringes.
+        """
+        if self.gamma == 1:
+            return 1.0
+        table = _corrections(self.gamma, steps)
+        return 1 + _at_ripple(phase, steps, np.gradient(table, 1 / steps / (len(table) - 1)))
+
+
+def _at_ripple(phase: Phase, steps: int, table: np.ndarray) -> np.ndarray:
+    """(...) float32, values of a table (t,) over one ripple of the phase, which repeats `steps` times per period."""
+    turns = phase.normalised * np.float32(steps)
+    return np.interp(turns - np.floor(turns), np.linspace(0, 1, len(table)), table).astype(np.float32)
 
 
 def gamma_of(frames: np.ndarray, usable: np.ndarray, scale: np.ndarray | None) -> FringeGamma:

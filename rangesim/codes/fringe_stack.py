@@ -254,13 +254,14 @@ class FringeStack:
             weak = np.zeros(refused.shape, dtype=bool)
             for k, i in enumerate(order):
                 steps, period = self.steps[i], self.periods_px[i]
-                phase = gammas[i].corrected(phase_of(self.of_period(frames, i)[:, rows]), steps)
-                sigma = phase_sigma(capture, phase, steps)
+                measured = phase_of(self.of_period(frames, i)[:, rows])
+                phase, slope = gammas[i].corrected(measured, steps), gammas[i].slope(measured, steps)
+                sigma = phase_sigma(capture, phase, steps, slope)
                 weak |= modulation_is_weak(capture, phase, sigma, thresholds)
                 weak |= 2 * phase.modulation < swings[rows]
                 weak |= math.sqrt(2 / steps) * noise > thresholds.max_sigma_rad * phase.modulation
                 places[k] = self.convention.place_turns(phase.normalised, period)
-                weights[k] = steps * (phase.modulation / period) ** 2
+                weights[k] = steps * (phase.modulation / (period * slope)) ** 2
                 if sigma is not None and k == 0:
                     variance = (sigma * np.float32(period / (2 * math.pi))) ** 2
             flat, inverse = places.reshape(len(order), -1), weights.reshape(len(order), -1)

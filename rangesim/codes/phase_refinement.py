@@ -44,9 +44,10 @@ def refine_by_phase(
         reach = min(reach, period_px - reach)  # a place that is farther off has a second cycle within the range
 
     def refine_rows(rows: slice) -> None:
-        phase = gamma.corrected(phase_of(frames[:, rows]), len(frames))
+        measured = phase_of(frames[:, rows])
+        phase = gamma.corrected(measured, len(frames))
         whole, refused = gray.coordinate[rows], status[rows]
-        sigma = phase_sigma(capture, phase, len(frames))
+        sigma = phase_sigma(capture, phase, len(frames), gamma.slope(measured, len(frames)))
         place = convention.place_turns(phase.normalised, period_px)
         periods = np.rint(whole / np.float32(period_px) - place)
         coordinate[rows] = (periods + place) * np.float32(period_px)
