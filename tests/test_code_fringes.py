@@ -270,7 +270,9 @@ def test_a_gamma_that_three_fringes_alone_do_not_tell_is_named() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::rangesim.errors.RangesimWarning")
-@pytest.mark.parametrize(("code", "most"), [(Heterodyne(), 0.01), (NumberTheoretic(), 0.03), (MultiFrequency(), 0.0015)])
+@pytest.mark.parametrize(
+    ("code", "most"), [(Heterodyne(), 0.01), (NumberTheoretic(), 0.03), (MultiFrequency(), 0.0015)]
+)
 def test_noise_that_could_have_chosen_the_cycle_is_refused(code: Code, most: float) -> None:
     """Of readings with noise of 0.14 radians, 2 %, 10 % and 0.2 % were wrong: a ratio of costs is no evidence."""
     size, rng, detector = 1280, np.random.default_rng(5), Detector(read_noise_e=40.0)
