@@ -23,8 +23,10 @@ from rangesim.codes import (
     NumberTheoretic,
     PhaseShift,
 )
+from rangesim.codes.fringe_gamma import FringeGamma
 from rangesim.conventions import detect_convention
 from rangesim.decoding import decode
+from rangesim.decoding.phase_shift import phase_of
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.errors import RangesimWarning
@@ -179,6 +181,21 @@ def test_periods_of_an_unknown_camera_tell_its_noise(kind: type[Code], steps: in
 
 
 # ---- Gamma ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("steps", "gamma"), [(3, 2.2), (3, 2.8), (4, 2.2)])
+def test_a_corrected_phase_has_the_noise_of_its_slope(steps: int, gamma: float) -> None:
+    """Where the response compresses phases, the correction stretches them, and their noise."""
+    rng, response = np.random.default_rng(0), FringeGamma(gamma)
+    true, noise = np.arange(96) / 96, 0.003
+    shown = (0.5 + 0.5 * np.cos(2 * np.pi * (true - np.arange(steps)[:, None] / steps))) ** gamma
+    measured = phase_of(shown[..., None] + rng.normal(0, noise, (steps, 96, 4000)))
+    found = response.corrected(measured, steps).normalised - true[:, None]
+    scatter = 2 * np.pi * np.std(found - np.rint(found), axis=1)
+    clean = phase_of(shown)
+    law = np.sqrt(2 / steps) * noise / clean.modulation * response.slope(clean, steps)
+    np.testing.assert_allclose(scatter, law, rtol=0.06)
+    assert np.ptp(response.slope(clean, steps)) > 0.05
 
 
 @pytest.mark.parametrize("gamma", [1.8, 2.2, 2.6])

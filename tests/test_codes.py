@@ -17,6 +17,8 @@ from hypothesis import strategies as st
 
 from rangesim.capture import Capture
 from rangesim.codes import AXES, Code, FringeConvention
+from rangesim.codes.fringe_code import FringeCode
+from rangesim.codes.fringe_stack import MIN_APART_TURNS
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.errors import RangesimWarning
@@ -100,13 +102,22 @@ def assert_responses_are_the_patterns(code: Code, axis: int, size: int) -> None:
 
 
 def assert_decodes_or_refuses(sensor: StructuredLight) -> None:
-    """A pixel is within half a cell of its place, or refused; with all frames, none is refused."""
+    """A pixel is within half a cell of its place, or refused; with all frames, none is refused.
+
+    Fringes may repeat after all pixels but one: then the first and the last one look alike.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # doubts have tests of their own
         seen = StructuredLightDecoder().coordinates(Capture(sensor.patterns(), sensor))
     is_ok = seen.status == Status.OK
     if set(sensor.frame_names()) == set(StructuredLight.frame_names(as_the_code_orders(sensor))):
-        assert is_ok.all()
+        inner = is_ok
+        for axis, along in zip(AXES, (1, 0), strict=True):
+            if axis in sensor.axes and isinstance(sensor.code, FringeCode):
+                size = sensor.size(axis)
+                if sensor.code.stack(size).apart(size)[0] < MIN_APART_TURNS:
+                    inner = np.take(inner, range(1, size - 1), along)
+        assert inner.all()
     allowed = MAX_ERROR_PX
     if sensor.code.type_name in CELL_CODES:
         allowed = 0.5 * getattr(sensor.code, "cell_px", 1) + 1e-3

@@ -4,14 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rangesim.capture import Capture
-
-if TYPE_CHECKING:
-    from rangesim.codes.fringe_gamma import FringeGamma
+from rangesim.codes.fringe_gamma import FringeGamma
 
 
 class Contrast(NamedTuple):

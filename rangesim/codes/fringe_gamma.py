@@ -19,7 +19,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from rangesim.codes.axis_code import AxisFrames
 from rangesim.decoding.phase_shift import Phase
 from rangesim.decoding.pixel_samples import MIN_PIXELS, evenly_spread
 from rangesim.robust_scale import sigma_from_median
@@ -82,28 +81,42 @@ class FringeGamma:
         """The phases of `steps` fringes as they would be of a linear response."""
         if self.gamma == 1:
             return phase
-        table = _corrections(self.gamma, steps)
-        turns = phase.normalised * np.float32(steps)
-        ripple = turns - np.floor(turns)  # the table covers one ripple, and repeats N times per period
-        change = np.interp(ripple, np.linspace(0, 1, len(table)), table).astype(np.float32)
-        place = phase.normalised + change
+        place = phase.normalised + _at_ripple(phase, steps, _corrections(self.gamma, steps))
         return Phase(place - np.floor(place), phase.modulation, phase.mean)
 
+    def slope(self, phase: Phase, steps: int) -> np.ndarray | float:
+        """Change of the corrected phase over that of the measured one, (...) float32: the factor of its noise.
 
-def gamma_of(seen: AxisFrames, usable: np.ndarray, scale: np.ndarray | None) -> FringeGamma:
-    """Response of projector and camera as the fringes `seen` show it.
+        Parameters
+        ----------
+        phase : as measured. steps : number of fringes.
+        """
+        if self.gamma == 1:
+            return 1.0
+        table = _corrections(self.gamma, steps)
+        return 1 + _at_ripple(phase, steps, np.gradient(table, 1 / steps / (len(table) - 1)))
+
+
+def _at_ripple(phase: Phase, steps: int, table: np.ndarray) -> np.ndarray:
+    """(...) float32, values of a table (t,) over one ripple of the phase, which repeats `steps` times per period."""
+    turns = phase.normalised * np.float32(steps)
+    return np.interp(turns - np.floor(turns), np.linspace(0, 1, len(table)), table).astype(np.float32)
+
+
+def gamma_of(frames: np.ndarray, usable: np.ndarray, scale: np.ndarray | None) -> FringeGamma:
+    """Response of projector and camera as fringes show it.
 
     Parameters
     ----------
-    usable : (h, w) bool, pixels that are neither weak nor saturated. scale : (h, w) brightness that the fringes do not
-        change, such as white - black; None: there is none.
+    frames : (N, h, w), fringes of one period. usable : (h, w) bool, pixels that are neither weak nor saturated.
+    scale : (h, w) brightness that the fringes do not change, such as white - black; None: there is none.
     """
     used = evenly_spread(np.flatnonzero(usable))
     used = used[:: 1 + len(used) // MAX_SAMPLES]
     if len(used) < MIN_PIXELS:
         return FringeGamma(is_told=False)
-    frames = seen.frames.reshape(len(seen.frames), -1)[:, used]
-    return measured_gamma(frames, None if scale is None else scale.ravel()[used])
+    few = frames.reshape(len(frames), -1)[:, used]
+    return measured_gamma(few, None if scale is None else scale.ravel()[used])
 
 
 def measured_gamma(frames: np.ndarray, contrast: np.ndarray | None = None) -> FringeGamma:

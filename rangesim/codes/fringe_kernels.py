@@ -12,7 +12,7 @@ from pcgraph.kernel_cache import cached_njit
 
 
 class Agreement(NamedTuple):
-    """How well the phases of several periods must agree on a place.
+    """Limits within which the phases of several periods agree on a place.
 
     widest : float, turns, distance from the coarsest phase beyond which no place is tried.
     misfit : float, turns, largest distance of any phase from the place.

@@ -134,7 +134,7 @@ class FringeStack:
         elif len(self.steps) > 1:  # the means of the other periods change with other phases
             others = [k for k in range(len(self.steps)) if k != i]
             scale = np.mean([self.of_period(seen.frames, k).mean(axis=0, dtype=np.float32) for k in others], axis=0)
-        return gamma_of(self.frames_of(seen, i), usable, scale)
+        return gamma_of(self.of_period(seen.frames, i), usable, scale)
 
     def _weak_noise(
         self, capture: Capture, frames: np.ndarray, usable: np.ndarray, thresholds: PhaseThresholds
@@ -204,7 +204,7 @@ class FringeStack:
         return self._agreed(places, size)[1]
 
     def bias_turns(self, places: list[np.ndarray], size: int) -> float:
-        """How far the phases of the periods lie on average beside the places on which they agree, in turns.
+        """Mean distance of the phases of the periods from the places on which they agree, in turns.
 
         It is the root mean square over the periods, 1 if the phases agree at few pixels. It is near 0 if all fringes
         start where they should: noise lies on both sides.
@@ -270,13 +270,14 @@ class FringeStack:
             noise_variance = np.full(refused.shape, noise**2, dtype=np.float32)
             for k, i in enumerate(order):
                 steps, period = self.steps[i], self.periods_px[i]
-                phase = gammas[i].corrected(phase_of(self.of_period(frames, i)[:, rows]), steps)
-                sigma = phase_sigma(capture, phase, steps)
+                measured = phase_of(self.of_period(frames, i)[:, rows])
+                phase, slope = gammas[i].corrected(measured, steps), gammas[i].slope(measured, steps)
+                sigma = phase_sigma(capture, phase, steps, slope)
                 weak |= modulation_is_weak(capture, phase, sigma, thresholds)
                 weak |= 2 * phase.modulation < swings[rows]
                 weak |= math.sqrt(2 / steps) * noise > thresholds.max_sigma_rad * phase.modulation
                 places[k] = self.convention.place_turns(phase.normalised, period)
-                weights[k] = steps * (phase.modulation / period) ** 2
+                weights[k] = steps * (phase.modulation / (period * slope)) ** 2
                 if sigma is not None and k == 0:
                     noise_variance = (sigma * phase.modulation) ** 2 * np.float32(steps / 2)
                     variance = (sigma * np.float32(period / (2 * math.pi))) ** 2

@@ -38,15 +38,16 @@ def refine_by_phase(
     coordinate, status = np.empty_like(gray.coordinate), gray.status.copy()
     sigma_px = None if capture.noise(frames[0, :1]) is None else np.empty_like(gray.coordinate)
     saturated = capture.saturated(frames)
-    gamma = gamma_of(seen, (status == Status.OK) & ~saturated, seen.contrast.values)
+    gamma = gamma_of(frames, (status == Status.OK) & ~saturated, seen.contrast.values)
     reach = gray.cell_px / 2 + period_px / 8
     if gray.cell_px <= period_px:  # coarser cells are those of a place that fringes have refined before
         reach = min(reach, period_px - reach)  # a place that is farther off has a second cycle within the range
 
     def refine_rows(rows: slice) -> None:
-        phase = gamma.corrected(phase_of(frames[:, rows]), len(frames))
+        measured = phase_of(frames[:, rows])
+        phase = gamma.corrected(measured, len(frames))
         whole, refused = gray.coordinate[rows], status[rows]
-        sigma = phase_sigma(capture, phase, len(frames))
+        sigma = phase_sigma(capture, phase, len(frames), gamma.slope(measured, len(frames)))
         place = convention.place_turns(phase.normalised, period_px)
         periods = np.rint(whole / np.float32(period_px) - place)
         coordinate[rows] = (periods + place) * np.float32(period_px)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where fringes start and which way they move, measured against the Gray code that they refine.
+"""Start and direction of fringes, measured against the Gray code that they refine.
 
 Fringes of several periods without a Gray code tell where they start: at a wrong start, their phases lie beside the
 places on which they agree. They do not tell which way they move.

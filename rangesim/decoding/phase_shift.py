@@ -104,7 +104,7 @@ def phase_of(frames: np.ndarray) -> Phase:
     return Phase(normalised - np.floor(normalised), modulation, total / n)
 
 
-def phase_sigma(capture: Capture, phase: Phase, steps: int) -> np.ndarray | None:
+def phase_sigma(capture: Capture, phase: Phase, steps: int, slope: np.ndarray | float = 1.0) -> np.ndarray | None:
     """(h, w) float32, radians, standard deviation of the phase, sqrt(2 / N) sigma_I / B; None if it is not known.
 
     It is not known for unknown detectors and noise-free captures.
@@ -112,11 +112,12 @@ def phase_sigma(capture: Capture, phase: Phase, steps: int) -> np.ndarray | None
     Parameters
     ----------
     capture : Capture that the frames of `phase` belong to. steps : int, N, number of frames.
+    slope : change of the phase over that of the one that was measured, if it was corrected since.
     """
     noise = capture.noise(phase.mean)
     if noise is None:
         return None
-    return np.asarray(np.sqrt(2 / steps) * noise / np.maximum(phase.modulation, MIN_MODULATION))
+    return np.asarray(np.sqrt(2 / steps) * slope * noise / np.maximum(phase.modulation, MIN_MODULATION))
 
 
 def tap_phase(taps: np.ndarray, exact_square: bool = False) -> Phase:
