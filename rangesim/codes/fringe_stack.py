@@ -279,19 +279,17 @@ class FringeStack:
                 places[k] = self.convention.place_turns(phase.normalised, period)
                 weights[k] = steps * (phase.modulation / (period * slope)) ** 2
                 if sigma is not None and k == 0:
-                    noise_variance = (sigma * phase.modulation) ** 2 * np.float32(steps / 2)
+                    noise_variance = (sigma * phase.modulation / slope) ** 2 * np.float32(steps / 2)
                     variance = (sigma * np.float32(period / (2 * math.pi))) ** 2
             flat, inverse = places.reshape(len(order), -1), weights.reshape(len(order), -1)
             margin = np.minimum(3 * np.sqrt(variance).ravel(), np.float32(periods[0]))  # infinite without any swing
-            place, (agrees, is_clear) = (
-                np.empty(refused.size, dtype=np.float32),
-                np.empty((2, refused.size), dtype=bool),
-            )
+            place = np.empty(refused.size, dtype=np.float32)
+            agrees, is_clear = np.empty((2, refused.size), dtype=bool)
             # The noise may put a place beyond an end of the axis: then the other end is as likely.
             start, end = lows[rows].ravel() - margin, highs[rows].ravel() + margin
             gap = noise_variance.ravel() * np.float32(
                 MIN_EVIDENCE / (2 * math.pi**2)
-            )  # a variance in units of `inverse`
+            )  # as costs, which `inverse` weights
             agree(flat, inverse, periods, start, end, gap, LIMITS, place, agrees, is_clear)
             precise = inverse[0] > 0
             if len(kept) > 1:
