@@ -16,7 +16,7 @@ from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import RangesimWarning
-from rangesim.response import SPEED_OF_LIGHT
+from rangesim.response import SPEED_OF_LIGHT, Correlation
 from rangesim.sensors import AmcwDecoder, AmcwToF, DirectToF, DirectToFDecoder
 
 SENSORS = [AmcwToF((20e6,)), AmcwToF(), AmcwToF((80e6, 16e6, 120e6), taps=3), AmcwToF((20e6, 60e6), taps=6)]
@@ -51,6 +51,17 @@ def sorted_taps(capture: Capture, order: list[int], only: int | None = None) -> 
 @pytest.mark.parametrize("noise", [True, False])
 def test_right_taps_are_quiet(sensor: AmcwToF, noise: bool) -> None:
     assert warnings_of(capture_of(sensor, noise)) == []
+
+
+def test_a_stated_even_harmonic_is_no_wrong_order() -> None:
+    """A single-tap pixel shows the second harmonic; a near and a far wall once counted as a lost frame."""
+    shape = Correlation((0.1,))
+    sensor = AmcwToF(50e6, taps_per_exposure=1, contrast=0.7, correlation=shape)
+    phase = np.repeat([0.05, 0.26], 1000).reshape(40, 50)
+    light = 0.02 / phase**2
+    taps = np.stack([1 + light * (1 + 0.7 * shape.values(phase - k / 4)) for k in range(4)]).astype(np.float32)
+    assert warnings_of(Capture(taps, sensor)) == []
+    assert "lie on no cosine" in " ".join(warnings_of(Capture(taps[[0, 1, 3, 3]], sensor)))
 
 
 @pytest.mark.parametrize("sensor", SENSORS[:2], ids=lambda s: s.details)

@@ -86,6 +86,16 @@ def test_places_of_white_and_black(code: str, name: str) -> None:
     np.testing.assert_array_equal(mended.projector_column[both], right.projector_column[both])
 
 
+@pytest.mark.parametrize("first_px", [240, 720])
+def test_a_view_of_a_tenth_of_the_projector_with_wrong_words_keeps_its_order(first_px: int) -> None:
+    """Its coarsest bits are the same everywhere; orders that take them for white and black are smooth, too."""
+    sensor, rng = StructuredLight(800, 600, "gray"), np.random.default_rng(1)
+    column = np.broadcast_to(first_px + np.arange(160) // 2, (120, 160))
+    seen = np.where(rng.random(column.shape) < 0.1, rng.integers(0, 800, column.shape), column)
+    frames = np.rint(20 + 180 * sensor.patterns()[:, 0, seen] + 2 * rng.standard_normal((sensor.n_frames, 120, 160)))
+    assert detect_convention(frames.astype(np.uint8), sensor).findings == ()
+
+
 def test_order_of_bits_and_of_inverses() -> None:
     capture = captured("gray")
     pairs, ends = capture.frames[:-2].reshape(2, -1, 2, 120, 120), capture.frames[-2:]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -75,5 +76,7 @@ class FringeCode(Code):
     def least_signal(
         self, size: int, shown: Sequence[str], thresholds: CodeThresholds, background: Background
     ) -> np.ndarray:
-        steps = min(self.stack(size).steps)
-        return thresholds.phase.least_signal(steps, VISIBILITY, FrameContent(), background)
+        stack = self.stack(size)
+        sigma_rad = min(thresholds.phase.max_sigma_rad, stack.max_sigma_rad(size))
+        phase = replace(thresholds.phase, max_sigma_rad=sigma_rad)
+        return phase.least_signal(min(stack.steps), VISIBILITY, FrameContent(), background)

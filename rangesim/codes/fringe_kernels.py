@@ -25,7 +25,7 @@ class Agreement(NamedTuple):
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def agree(places, weights, periods_px, low, high, limits, result, agrees):  # type: ignore[no-untyped-def]
+def agree(places, weights, periods_px, low, high, gap, limits, result, agrees, is_clear):  # type: ignore[no-untyped-def]
     """Find, per pixel, the place between `low` and `high` on which all phases agree best.
 
     Every cycle of the finest fringes gives a candidate; each other period takes the cycle that lies nearest to it. The
@@ -37,9 +37,11 @@ def agree(places, weights, periods_px, low, high, limits, result, agrees):  # ty
     ----------
     places : (K, n) float32, place within the period, in turns, the finest period first and the coarsest last.
     weights : (K, n) float32, inverse variances of the places in projector pixels, in any scale.
-    periods_px : (K,) float64. low, high : (n,) float32, projector pixels. limits : Agreement.
+    periods_px : (K,) float64. low, high : (n,) float32, projector pixels.
+    gap : (n,) float32, difference of the costs of two places that noise does not make. limits : Agreement.
     result : (n,) float32, written: the place of the finest period, projector pixels; NaN if there is no candidate.
     agrees : (n,) bool, written: whether there is one, and only one, within the limits.
+    is_clear : (n,) bool, written: whether the second best place costs more than the best one by `gap`.
     """
     count, n = places.shape
     last = count - 1
@@ -79,10 +81,10 @@ def agree(places, weights, periods_px, low, high, limits, result, agrees):  # ty
                 cost = squares - mean * mean * per_weight
                 if cost < least:
                     second, least, best = min(second, least), cost, x
-                    enough = min(second, sure * least)
+                    enough = min(second, max(sure * least, least + gap[i]))
                 elif cost < second:
                     second = cost
-                    enough = min(second, sure * least)
+                    enough = min(second, max(sure * least, least + gap[i]))
             elif ratio > 2:  # to where the coarsest phase is near again
                 reach = min(widest, math.sqrt(enough / max(rise, 1e-30)))
                 ahead = max(np.ceil(((far > 0) - far - reach) * ratio - 1e-6), 1.0)
@@ -98,6 +100,7 @@ def agree(places, weights, periods_px, low, high, limits, result, agrees):  # ty
             off = best * rate[k] - places[k, i]
             worst = max(worst, abs(off - np.rint(off)))
         agrees[i] = least < second and worst <= limits.misfit and max(least, 0.0) <= limits.ambiguity * second
+        is_clear[i] = second - least >= gap[i]
 
 
 @cached_njit(nogil=True, error_model="numpy")

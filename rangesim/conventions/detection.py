@@ -79,6 +79,10 @@ MIN_BITS = 0.7
 """Least agreement of neighbours in bits at which frames count as decoded in an order. In a wrong order it is near 0, in
 the right one above 1 if more than four cells are in view."""
 
+DECODED_BITS = 1.0
+"""Agreement of neighbours in bits above which frames count as decoded in the given order, where a pattern is all bright
+or all dark in view. Then less than half of the projector is seen, and orders that miss this pattern are as smooth: with
+10 % of wrong words in views of an eighth, 12 of 18 sound captures were reordered."""
 
 MIN_STEP = 0.5
 """Least distance of two pixels that see different cells, in cells: a pixel on the edge of two cells is half a cell off
@@ -279,7 +283,10 @@ def _best_layout(sample: _Sample, sensor: StructuredLight, orders: Sequence[Layo
     if given is not None:
         # White and black that are exchanged cost fringes nothing, because their phases tell the place without them.
         fits = _ends_fit(sample, [(i, name) for i, name in enumerate(given) if name in (WHITE, BLACK)])
-        least = _agreement_bits(sample, sensor) + (MIN_GAIN_BITS if fits else -MAX_LOSS_BITS)
+        bits = _agreement_bits(sample, sensor)
+        if fits and bits > DECODED_BITS and _has_even_pattern(sample, given):
+            return None
+        least = bits + (MIN_GAIN_BITS if fits else -MAX_LOSS_BITS)
         return layout if score > max(MIN_BITS, least) else None
     if score < MIN_BITS:
         raise ValueError(
@@ -340,6 +347,12 @@ def _ends_fit(sample: _Sample, places: Sequence[tuple[int, str]]) -> bool:
     return all(
         (np.abs(sample.frames[i] - limits[name])[lit] <= largest).mean() >= MIN_END_FRACTION for i, name in places
     )
+
+
+def _has_even_pattern(sample: _Sample, names: Sequence[str]) -> bool:
+    """Whether a pattern, neither white nor black, is the brightest or the darkest frame nearly everywhere."""
+    coded = [i for i, name in enumerate(names) if name not in (WHITE, BLACK)]
+    return any(_ends_fit(sample, [(i, end)]) for i in coded for end in (WHITE, BLACK))
 
 
 def _pairs_fit(sample: _Sample, names: Sequence[str]) -> bool:

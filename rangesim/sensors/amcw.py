@@ -175,6 +175,16 @@ class AmcwToF(Sensor):
         others = self.correlation.orders if self.correlation is not None else ()
         return (1, *(k for k in others if self.sharing == 1 or k % self.sharing))
 
+    def harmonics(self, turns: np.ndarray) -> np.ndarray:
+        """(taps, n) float64, what the correlation's harmonics add to taps at phases (n,) in turns, as fractions of the
+        amplitude of the first one."""
+        delays = turns - np.arange(self.taps)[:, None] / self.taps
+        added = np.zeros(delays.shape)
+        for order in self._orders[1:]:
+            assert self.correlation is not None  # the only one with more orders
+            added += (self.correlation.coefficient(order) * np.exp(2j * np.pi * order * delays)).real
+        return added
+
     @property
     def shortest_period_m(self) -> float:
         """Metres of range after which the phase of the highest frequency repeats."""
@@ -415,9 +425,10 @@ class AmcwDecoder(Decoder):
     def _disagreement(self, sensor: AmcwToF, taps: np.ndarray) -> str | None:
         """A sentence if taps (k, n) lie on no cosines, or the phases of the frequencies on no length; None if not."""
         groups = np.split(taps, len(sensor.modulation_hz))
-        if found := order_contradiction(groups):
-            return found
         phases = [self._phase(sensor, group) for group in groups]
+        read = zip(groups, phases, strict=True)
+        if found := order_contradiction([g - p.modulation * sensor.harmonics(p.normalised) for g, p in read]):
+            return found
         weights = [_weight(*read) for read in zip(phases, [None] * len(phases), sensor.modulation_hz, strict=True)]
         return frequency_contradiction(phases, sensor.modulation_hz, weights, sensor.searched_m, sensor.taps)
 
