@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from rangesim import Capture, Detector, StructuredLight
-from rangesim.codes.bit_checks import Pairs
 from rangesim.codes.bit_kernels import LeastDifference, append_bit, coarse_step, neighbour_keys, octaves_nearer
+from rangesim.codes.bit_neighbours import Pairs
 from rangesim.decoding.row_bands import in_bands
 
 

@@ -10,18 +10,20 @@ from functools import lru_cache
 import numpy as np
 
 from rangesim.codes.axis_code import AxisCode, AxisFrames
-from rangesim.codes.bit_checks import (
+from rangesim.codes.bit_levels import (
     between_contradiction,
-    displaced_contradiction,
     level_contradiction,
     light_of_bits,
     lost_contradiction,
-    neighbours_of,
-    order_contradiction,
-    other_code_contradiction,
     pair_contradiction,
     uneven_contradiction,
     uniform_contradiction,
+)
+from rangesim.codes.bit_neighbours import (
+    displaced_contradiction,
+    neighbours_of,
+    order_contradiction,
+    other_code_contradiction,
 )
 from rangesim.codes.bits import Words, bit_frames, decode_bits
 from rangesim.codes.code import Code, CodeThresholds, stripes

@@ -93,7 +93,7 @@ def neighbour_keys(word, down, across):  # type: ignore[no-untyped-def]
 def coarse_step(pairs, cell_of, bits):  # type: ignore[no-untyped-def]
     """Least number of finest bits to leave out so that half of the pairs see the same cell; -1 if below three are left.
 
-    pairs : `rangesim.codes.bit_checks.Pairs`. cell_of : (2^bits,) int32, cell of each word.
+    pairs : `rangesim.codes.bit_neighbours.Pairs`. cell_of : (2^bits,) int32, cell of each word.
     """
     same = np.zeros(bits + 1, np.int64)
     for i in range(len(pairs.counts)):
@@ -117,7 +117,7 @@ def octaves_nearer(pairs, before, after, step):  # type: ignore[no-untyped-def]
     They are the number of pairs whose distance is halved or doubled at least, the number of those whose distance is
     halved, and the sum of all changes, in powers of two.
 
-    pairs : `rangesim.codes.bit_checks.Pairs`. before, after : (2^b,) int32, cell of each word.
+    pairs : `rangesim.codes.bit_neighbours.Pairs`. before, after : (2^b,) int32, cell of each word.
     step : number of finest bits that are left out.
     """
     moved = nearer = 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of bits: frames that do not add up to white and black or show no bit, another code, another order.
+"""Checks of the light of bits: frames that do not add up to white and black, or that do not show bits of the code.
 
 A single pixel may be wrong for many reasons, so the checks look at many pixels at once: a capture that is read wrongly
 contradicts itself nearly everywhere. Each check returns one sentence with the likely cause, or None.
@@ -8,8 +8,6 @@ contradicts itself nearly everywhere. Each check returns one sentence with the l
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -29,15 +27,6 @@ MIN_UNPAIRED = 0.75
 """Least difference between white + black and the sum of a pattern and its inverse that counts, as a fraction of white -
 black. Where both are lit or both are dark, the difference is 1; a gamma makes a difference of 0.56 at most."""
 
-MAX_PAIRS = 50_000
-"""Largest number of pairs of neighbouring pixels, across and also down the image, on which other orders of the frames
-are tried, so that the time is bounded, which grows with the number of orders. With far fewer, too few of them would lie
-in different cells (see `MIN_STEPS`)."""
-
-MIN_STEPS = 100
-"""Least number of pairs of neighbouring pixels in different cells from which a check of the order draws a
-conclusion."""
-
 MAX_OUTSIDE_FRACTION = 0.2
 """Largest fraction of the pixels at which a frame may be brighter than white or darker than black. If a frame of bits
 is taken for one of the two, half of the pixels are."""
@@ -50,24 +39,6 @@ MIN_RANGE = 0.25
 """Least range of the frames at a pixel that is checked, as a fraction of the range at the bright pixels. Light from
 other surfaces makes a smaller range in the shadow."""
 
-MAX_FARTHER_OCTAVES = 0.3
-"""Largest mean distance by which neighbours may lie farther apart when read as the code than when read as another one,
-in powers of two. For plain binary numbers that are read as Gray code, this distance is about 1. For the right code
-whose neighbours lie one cell apart, it is at most 0, because they cannot lie nearer."""
-
-MAX_NEARER_FRACTION = 0.8
-"""Largest fraction of neighbours that another order of the frames may bring nearer to each other, because the right
-order brings nearly all of them nearer. Only neighbours count whose distance the other order halves or doubles. With a
-larger value, noise at some pixels would hide a wrong order."""
-
-MIN_REPEATED_FRACTION = 0.9
-"""Least fraction of the changes of one bit, from pixel to pixel, at which another bit changes too if both bits come
-from the same frame. In Gray code that the camera sees sharply, no two bits change together."""
-
-MIN_ALONE_FRACTION = 0.3
-"""Least fraction of these changes at which no third bit changes, if both bits are the same frame. At a step of the
-scene other bits change too."""
-
 MAX_BETWEEN_FRACTION = 0.12
 """Largest fraction of the pixels that may lie between dark and lit in a bit of wide stripes, the median of these bits.
 They lie there only at the edges of stripes: 0 to 4 % in real captures. A sinusoid spends 19 % of its period there."""
@@ -79,18 +50,6 @@ more edges. It is at most 0.04 in real captures; a frame at half the exposure ma
 MIN_RARER_FRACTION = 0.1
 """Least fraction of the pixels at which a bit is dark, and lit, if a coarser one is compared with it. A bit that the
 camera does not resolve may be lit everywhere, and between dark and lit nowhere: 0.05 in a real capture."""
-
-MAX_CLEAR_BETWEEN = 0.15
-"""Largest fraction of the pixels between dark and lit of a bit that the camera resolves, so that its edges have a
-place. In a real capture, the finest bit that it resolves has 0.13, and the next one 0.24."""
-
-MIN_ADJACENT_FRACTION = 0.5
-"""Least fraction of the places where one bit changes alone that lie between neighbouring cells, and least number of
-those in Gray code. It is above 0.98 in real captures; if a frame is displaced by its own stripes, it is below 0.4."""
-
-MIN_CODED_EDGES = 4
-"""Least number of edges of a bit whose places are checked. The edges of the others are one or two lines of the image,
-and steps of the scene may hide them: in a real capture, 24 % of the changes of such a bit led to the next cell."""
 
 MAX_FROM_MIDDLE = 0.15
 """Distance from the middle of dark and lit up to which a pixel lies between the two, as a fraction of their difference.
@@ -207,6 +166,7 @@ class Light(NamedTuple):
     seen : frames of the bits. words : those of the code. coded : (b, cells) int, bits of the cells of the projector.
     across, down : (b, n, m) float32, along lines across the image and down the image.
     lit : (b, n) float32, at those pixels of `across` that are read.
+    halves_stripes : whether each finer bit has the edges of Gray code: two between two edges of the next coarser bit.
     """
 
     seen: AxisFrames
@@ -215,6 +175,17 @@ class Light(NamedTuple):
     across: np.ndarray
     down: np.ndarray
     lit: np.ndarray
+    halves_stripes: bool
+
+    @property
+    def between(self) -> np.ndarray:
+        """(b,) fraction of the pixels between dark and lit."""
+        return np.asarray((np.abs(self.lit - 0.5) < MAX_FROM_MIDDLE).mean(axis=1))
+
+    @property
+    def has_both(self) -> np.ndarray:
+        """(b,) bool, where enough pixels are dark, and enough lit."""
+        return np.asarray(np.abs((self.lit > 0.5).mean(axis=1) - 0.5) <= 0.5 - MIN_RARER_FRACTION)
 
 
 def light_of_bits(seen: AxisFrames, code: AxisCode, words: Words) -> Light | None:
@@ -232,7 +203,9 @@ def light_of_bits(seen: AxisFrames, code: AxisCode, words: Words) -> Light | Non
         return None
     coded = (words.of_cell[: math.ceil(seen.size / code.cell_px)] >> np.arange(words.bits)[::-1, None]) & 1
     across, down = (_along_lines(seen, is_read, words, is_down) for is_down in (False, True))
-    return Light(seen, words, coded, across, down, across[:, np.isfinite(across[0])])
+    expected = _edges_between(coded[:, None].astype(np.float32))
+    halves_stripes = not (expected[np.isfinite(expected)] != EDGES_BETWEEN).any()
+    return Light(seen, words, coded, across, down, across[:, np.isfinite(across[0])], halves_stripes)
 
 
 def _along_lines(seen: AxisFrames, is_read: np.ndarray, words: Words, is_down: bool) -> np.ndarray:
@@ -287,11 +260,10 @@ def uneven_contradiction(light: Light) -> str | None:
     ----------
     light : what `light_of_bits` returns.
     """
-    if not _halves_stripes(light):
+    if not light.halves_stripes:
         return None
-    between = (np.abs(light.lit - 0.5) < MAX_FROM_MIDDLE).mean(axis=1)
-    has_both = np.abs((light.lit > 0.5).mean(axis=1) - 0.5) <= 0.5 - MIN_RARER_FRACTION
-    finer = np.where(has_both, between, np.inf)
+    between = light.between
+    finer = np.where(light.has_both, between, np.inf)
     least = np.append(np.minimum.accumulate(finer[::-1])[::-1][1:], np.inf)  # of all bits that are finer
     excess = between - least
     worst = int(np.argmax(excess))
@@ -304,46 +276,6 @@ def uneven_contradiction(light: Light) -> str | None:
         f"stripes at {100 * least[worst]:.0f} %: check that all frames have one exposure and one focus, and that none "
         "shows another scene."
     )
-
-
-def displaced_contradiction(light: Light, neighbours: list[np.ndarray]) -> str | None:
-    """A sentence if a bit changes where the finer ones have no edge between cells; None if none does.
-
-    In a code that changes one bit from cell to cell, a bit that changes alone leads to the next cell. If its frame is
-    displaced, or of another scene, it leads elsewhere.
-
-    Parameters
-    ----------
-    light : what `light_of_bits` returns. neighbours : what `neighbours_of` returns.
-    """
-    words = light.words
-    if not (words.change_one_bit and _halves_stripes(light)):
-        return None
-    between = (np.abs(light.lit - 0.5) < MAX_FROM_MIDDLE).mean(axis=1)[::-1]
-    rarer = 0.5 - np.abs((light.lit > 0.5).mean(axis=1) - 0.5)[::-1]
-    clear = np.flatnonzero((between < MAX_CLEAR_BETWEEN) & (rarer >= MIN_RARER_FRACTION))
-    if not len(clear):
-        return None
-    finest = int(clear[0])
-    both = Pairs.of(np.concatenate([_that_differ(part) for part in neighbours]))
-    changed = (both.first ^ both.second) >> finest
-    is_next = np.abs((words.cell_of[both.first] >> finest) - (words.cell_of[both.second] >> finest)) == 1
-    n_edges = np.count_nonzero(np.diff(light.coded), axis=1)[::-1]
-    expected = float(both.counts[changed == 1].sum())  # each coarser bit has half the edges
-    shown = list(reversed(bit_frames(light.seen.names, words.bits)))
-    for k in range(finest + 1, words.bits):
-        expected /= 2
-        alone = changed == 1 << (k - finest)
-        n = int(both.counts[alone].sum())
-        adjacent = int(both.counts[alone & is_next].sum())
-        if n >= MIN_STEPS and n_edges[k] >= MIN_CODED_EDGES and adjacent < MIN_ADJACENT_FRACTION * min(n, expected):
-            name = light.seen.shown_name(shown[k].name if shown[k].pattern is not None else f"{shown[k].name}_inverse")
-            return (
-                f"the bits along {light.seen.axis} contradict {words.noun}: where frame {name} changes, "
-                f"{100 * (1 - adjacent / n):.0f} % of the pixels do not see the next cell: check that nothing moved "
-                "between the frames, and that all show one scene."
-            )
-    return None
 
 
 def uniform_contradiction(light: Light) -> str | None:
@@ -410,7 +342,7 @@ def lost_contradiction(light: Light) -> str | None:
     ----------
     light : what `light_of_bits` returns.
     """
-    if not _halves_stripes(light):
+    if not light.halves_stripes:
         return None
     along, changes = max(((x, _changes(x)) for x in (light.across, light.down)), key=lambda pair: int(pair[1].sum()))
     is_known = changes[:-1] >= MIN_GAPS
@@ -429,12 +361,6 @@ def lost_contradiction(light: Light) -> str | None:
         f"{found[at]:.0f} edges of frame {fine} lie between two edges of frame {coarse}, and {EDGES_BETWEEN} in "
         f"{light.words.noun}: the image of a bit between the two seems to be missing."
     )
-
-
-def _halves_stripes(light: Light) -> bool:
-    """Whether each finer bit has the edges of Gray code: two between two edges of the next coarser bit."""
-    expected = _edges_between(light.coded[:, None].astype(np.float32))
-    return not (expected[np.isfinite(expected)] != EDGES_BETWEEN).any()
 
 
 def _changes(light: np.ndarray) -> np.ndarray:
@@ -461,196 +387,3 @@ def _edges_between(light: np.ndarray) -> np.ndarray:
         between = np.diff(n_before[finer][line, at])[np.diff(line) == 0]
         medians.append(float(np.median(between)) if between.size >= (MIN_GAPS if len(light[0]) > 1 else 1) else np.nan)
     return np.array(medians)
-
-
-def other_code_contradiction(
-    seen: AxisFrames, neighbours: list[np.ndarray], words: Words, others: Sequence[Words]
-) -> str | None:
-    """A sentence if the patterns look like another code; None if they look like the code that they are read as.
-
-    Neighbouring pixels see neighbouring cells. If the words of one code are read as those of another, the cells of
-    neighbours lie farther apart. If the frames are in another order, they may lie farther apart too, but they lie
-    clearly nearer when read in that order: then the result is None.
-
-    Parameters
-    ----------
-    seen : frames (k, h, w) of the bits. neighbours : what `neighbours_of` returns. words : those of the code.
-    others : those of other codes with as many bits.
-    """
-    keys = np.concatenate([_that_differ(part) for part in neighbours])
-    if len(keys) < MIN_STEPS:
-        return None
-    both = Pairs.of(keys[:: 1 + len(keys) // (2 * MAX_PAIRS)])
-    own = _octaves(both, words.cell_of)
-    nearest = min(others, key=lambda other: _octaves(both, other.cell_of), default=words)
-    least = _octaves(both, nearest.cell_of)
-    if own < least + MAX_FARTHER_OCTAVES:
-        return None
-    orders = [_octaves(both, cell_of) for _, cell_of in _other_orders(seen, words)]
-    if min(orders) + MAX_FARTHER_OCTAVES < least:
-        return None
-    return (
-        f"the bits along {seen.axis} contradict {words.noun}: neighbouring pixels lie {2**own:.1f} cells apart as "
-        f"{words.noun}, and {2**least:.1f} as {nearest.noun}: check which code was shown."
-    )
-
-
-def order_contradiction(seen: AxisFrames, neighbours: list[np.ndarray], words: Words) -> str | None:
-    """A sentence if the bits seem to be in another order, inverted or repeated; None if not.
-
-    Neighbouring pixels see neighbouring cells. The function tries other orders. Each changes the distance of some
-    neighbours; if an order brings nearly all of these nearer to each other, the frames were in that order.
-
-    Parameters
-    ----------
-    seen : frames (k, h, w) of the bits. neighbours : what `neighbours_of` returns. words : those of the code.
-    """
-    from rangesim.codes.bit_kernels import coarse_step
-
-    few = [part[:: 1 + len(part) // MAX_PAIRS] for part in neighbours]
-    across = Pairs.of(max(few, key=lambda part: len(_that_differ(part))))
-    step = coarse_step(across, words.cell_of, words.bits)
-    # This looks at all pairs, because the coarsest bits change at a line or two of the image.
-    text = None
-    if step >= 0 and words.change_one_bit:
-        names = [seen.shown_name(bit.name) for bit in reversed(bit_frames(seen.names, words.bits))]
-        every = Pairs.of(np.concatenate([_that_differ(part) for part in neighbours]))
-        text = _repeated_bit((every.first ^ every.second) >> step, every.counts, names[step:])
-    differing = Pairs.of(np.concatenate([_that_differ(part) for part in few]))
-    text = text or _better_order(across, differing, seen, words)
-    if text is None:
-        return None
-    return (
-        f"the bits along {seen.axis} contradict {words.noun}, where neighbouring pixels see neighbouring cells: {text}."
-    )
-
-
-class Pairs(NamedTuple):
-    """Words of neighbouring pixels; equal pairs are counted, because most are equal to others.
-
-    first, second : (n,) int32, words of the two pixels. counts : (n,) int64, number of such pairs.
-    """
-
-    first: np.ndarray
-    second: np.ndarray
-    counts: np.ndarray
-
-    @classmethod
-    def of(cls, keys: np.ndarray) -> Pairs:
-        """Pairs of keys (m,) int64, as `neighbours_of` returns them."""
-        distinct, counts = np.unique(keys, return_counts=True)
-        return cls((distinct >> 32).astype(np.int32), distinct.astype(np.int32), counts.astype(np.int64))
-
-
-def neighbours_of(code: AxisCode, words: Words) -> list[np.ndarray]:
-    """Words of neighbouring pixels, across and down the image, both inside a cell: (n,) int64 keys each.
-
-    A key has the word of the one pixel in its upper 32 bits, and that of the other in its lower ones.
-
-    Parameters
-    ----------
-    code : what the frames decode to. words : those of the code.
-    """
-    from rangesim.codes.bit_kernels import neighbour_keys
-
-    cell = code.coordinate / np.float32(code.cell_px)
-    number = np.floor(cell)
-    usable = (cell - number == 0.5) & (code.status != Status.LOW_SIGNAL) & (code.status != Status.SATURATED)
-    word = np.where(usable, words.of_cell[number.astype(np.int32)], np.int32(-1))  # the bits as shown
-    return [neighbour_keys(word, 0, 1), neighbour_keys(word, 1, 0)]
-
-
-def _that_differ(keys: np.ndarray) -> np.ndarray:
-    """The keys, of keys (n,), whose two words differ."""
-    return np.asarray(keys[keys >> 32 != keys & 0xFFFFFFFF])
-
-
-def _octaves(both: Pairs, cell_of: np.ndarray) -> float:
-    """Mean distance of neighbours with words that differ, in cells, as a power of two; cell_of : (2^b,), of words."""
-    apart = np.abs(cell_of[both.second] - cell_of[both.first])
-    return float(np.average(np.log2(apart), weights=both.counts))
-
-
-def _better_order(across: Pairs, differing: Pairs, seen: AxisFrames, words: Words) -> str | None:
-    """The fault of the frames whose correction brings neighbours nearest together; None if no correction does.
-
-    Parameters
-    ----------
-    across : words of neighbours in the direction in which the code changes more.
-    differing : words of the neighbours in both directions whose words differ.
-    seen : frames of the bits. words : those of the code.
-    """
-    from rangesim.codes.bit_kernels import coarse_step, octaves_nearer
-
-    best, text = 0.0, None
-    unresolved = max(coarse_step(across, words.cell_of, words.bits), 0)
-    for fault, cell_of in _other_orders(seen, words):
-        step = coarse_step(across, cell_of, words.bits)
-        changed = np.bitwise_xor(words.of_cell[cell_of], np.arange(len(cell_of)))
-        if step < 0 or changed.max() >> unresolved == 0:  # bits that the camera does not resolve tell no order
-            continue
-        moved, nearer, gain = octaves_nearer(differing, words.cell_of, cell_of, step)
-        if moved >= MIN_STEPS and nearer > MAX_NEARER_FRACTION * moved and gain > best:
-            best, text = gain, fault
-    return text
-
-
-def _other_orders(seen: AxisFrames, words: Words) -> Iterator[tuple[str, np.ndarray]]:
-    """Faults that the order of the frames may have, each with the cells (2^b,) int32 of words that it corrects."""
-    every = np.arange(len(words.cell_of), dtype=np.int32)
-    for fault, corrected in _corrections(seen, words):
-        yield fault, words.cell_of[corrected(every)]
-
-
-def _corrections(seen: AxisFrames, words: Words) -> Iterator[tuple[str, Callable[[np.ndarray], np.ndarray]]]:
-    """Faults that the order of the frames may have, each with the function that corrects words for it."""
-    n = words.bits
-    shown = list(reversed(bit_frames(seen.names, n)))
-    is_pair = [bit.pattern is not None and bit.inverse is not None for bit in shown]
-    names = [seen.shown_name(bit.name if bit.pattern is not None else f"{bit.name}_inverse") for bit in shown]
-    if all(is_pair):
-        yield "every inverse seems to stand before its pattern", partial(np.bitwise_xor, (1 << n) - 1)
-    else:
-        lone = sum(1 << i for i in range(n) if not is_pair[i])
-        yield "frames without their inverse seem to be inverted", partial(np.bitwise_xor, lone)
-    yield "the least significant bit seems to come first", partial(_reversed, n)
-    for i in range(n):
-        fault = f"{names[i]} and its inverse seem to be exchanged" if is_pair[i] else f"{names[i]} seems to be inverted"
-        yield f"frame {fault}", partial(np.bitwise_xor, 1 << i)
-        for j in range(i):
-            each = ", each with its inverse," if is_pair[i] and is_pair[j] else ""
-            yield f"frames {names[i]} and {names[j]}{each} seem to be exchanged", partial(_exchanged, i, j)
-
-
-def _reversed(n_bits: int, words: np.ndarray) -> np.ndarray:
-    """Words of `n_bits` bits, with the bits in reverse order."""
-    result = np.zeros_like(words)
-    for k in range(n_bits):
-        result |= ((words >> k) & 1) << (n_bits - 1 - k)
-    return result
-
-
-def _exchanged(i: int, j: int, words: np.ndarray) -> np.ndarray:
-    """Words with bits i and j exchanged."""
-    differ = ((words >> i) ^ (words >> j)) & 1
-    return np.asarray(words ^ (differ << i) ^ (differ << j))
-
-
-def _repeated_bit(changed: np.ndarray, weights: np.ndarray, bits: list[str]) -> str | None:
-    """A clause that names two bits which always change together; None if no two do.
-
-    Parameters
-    ----------
-    changed : (n,) int, bits in which the words of neighbours differ. weights : (n,) int, number of such neighbours.
-    bits : (b,) names of the patterns, least significant first.
-    """
-    counts = [int(weights[changed & (1 << i) > 0].sum()) for i in range(len(bits))]
-    for i in range(len(bits)):
-        for j in range(i):
-            two = (1 << i) | (1 << j)
-            both = int(weights[(changed & two) == two].sum())
-            if both < MIN_STEPS or both < MIN_REPEATED_FRACTION * max(counts[i], counts[j]):
-                continue
-            if weights[changed == two].sum() > MIN_ALONE_FRACTION * both:
-                return f"frames {bits[i]} and {bits[j]} seem to be one pattern shown twice"
-    return None
