@@ -59,7 +59,7 @@ and steps of the scene may hide them: in a real capture, 24 % of the changes of 
 
 
 def other_code_contradiction(
-    seen: AxisFrames, neighbours: list[np.ndarray], words: Words, others: Sequence[Words]
+    seen: AxisFrames, neighbours: Neighbours, words: Words, others: Sequence[Words]
 ) -> str | None:
     """A sentence if the patterns look like another code; None if they look like the code that they are read as.
 
@@ -72,10 +72,9 @@ def other_code_contradiction(
     seen : frames (k, h, w) of the bits. neighbours : what `neighbours_of` returns. words : those of the code.
     others : those of other codes with as many bits.
     """
-    keys = np.concatenate([_that_differ(part) for part in neighbours])
-    if len(keys) < MIN_STEPS:
+    both = neighbours.differing
+    if both.counts.sum() < MIN_STEPS:
         return None
-    both = Pairs.of(keys[:: 1 + len(keys) // (2 * MAX_PAIRS)])
     own = _octaves(both, words.cell_of)
     nearest = min(others, key=lambda other: _octaves(both, other.cell_of), default=words)
     least = _octaves(both, nearest.cell_of)
@@ -90,7 +89,7 @@ def other_code_contradiction(
     )
 
 
-def order_contradiction(seen: AxisFrames, neighbours: list[np.ndarray], words: Words) -> str | None:
+def order_contradiction(seen: AxisFrames, neighbours: Neighbours, words: Words) -> str | None:
     """A sentence if the bits seem to be in another order, inverted or repeated; None if not.
 
     Neighbouring pixels see neighbouring cells. The function tries other orders. Each changes the distance of some
@@ -102,16 +101,12 @@ def order_contradiction(seen: AxisFrames, neighbours: list[np.ndarray], words: W
     """
     from rangesim.codes.bit_kernels import coarse_step
 
-    few = [part[:: 1 + len(part) // MAX_PAIRS] for part in neighbours]
+    few = [part[:: 1 + len(part) // MAX_PAIRS] for part in neighbours.keys]
     across = Pairs.of(max(few, key=lambda part: len(_that_differ(part))))
-    step = coarse_step(across, words.cell_of, words.bits)
-    # This looks at all pairs, because the coarsest bits change at a line or two of the image.
-    text = None
+    step, differing, text = coarse_step(across, words.cell_of, words.bits), neighbours.differing, None
     if step >= 0 and words.change_one_bit:
         names = [seen.shown_name(bit.name) for bit in reversed(bit_frames(seen.names, words.bits))]
-        every = Pairs.of(np.concatenate([_that_differ(part) for part in neighbours]))
-        text = _repeated_bit((every.first ^ every.second) >> step, every.counts, names[step:])
-    differing = Pairs.of(np.concatenate([_that_differ(part) for part in few]))
+        text = _repeated_bit((differing.first ^ differing.second) >> step, differing.counts, names[step:])
     text = text or _better_order(across, differing, seen, words)
     if text is None:
         return None
@@ -120,7 +115,7 @@ def order_contradiction(seen: AxisFrames, neighbours: list[np.ndarray], words: W
     )
 
 
-def displaced_contradiction(light: Light, neighbours: list[np.ndarray]) -> str | None:
+def displaced_contradiction(light: Light, neighbours: Neighbours) -> str | None:
     """A sentence if a bit changes where the finer ones have no edge between cells; None if none does.
 
     In a code that changes one bit from cell to cell, a bit that changes alone leads to the next cell. If its frame is
@@ -137,7 +132,7 @@ def displaced_contradiction(light: Light, neighbours: list[np.ndarray]) -> str |
     if not len(clear):
         return None
     finest = int(clear[0])
-    both = Pairs.of(np.concatenate([_that_differ(part) for part in neighbours]))
+    both = neighbours.differing
     changed = (both.first ^ both.second) >> finest
     is_next = np.abs((words.cell_of[both.first] >> finest) - (words.cell_of[both.second] >> finest)) == 1
     n_edges = np.count_nonzero(np.diff(light.coded), axis=1)[::-1]
@@ -175,10 +170,20 @@ class Pairs(NamedTuple):
         return cls((distinct >> 32).astype(np.int32), distinct.astype(np.int32), counts.astype(np.int64))
 
 
-def neighbours_of(code: AxisCode, words: Words) -> list[np.ndarray]:
-    """Words of neighbouring pixels, across and down the image, both inside a cell: (n,) int64 keys each.
+class Neighbours(NamedTuple):
+    """Words of neighbouring pixels, both inside a cell.
 
-    A key has the word of the one pixel in its upper 32 bits, and that of the other in its lower ones.
+    keys : (n,) int64 each, across and down the image: the word of the one pixel in the upper 32 bits, and that of the
+    other in the lower ones. differing : Pairs, all of those whose words differ, because the coarsest bits change at a
+    line or two of the image.
+    """
+
+    keys: list[np.ndarray]
+    differing: Pairs
+
+
+def neighbours_of(code: AxisCode, words: Words) -> Neighbours:
+    """Words of neighbouring pixels of an image.
 
     Parameters
     ----------
@@ -190,7 +195,8 @@ def neighbours_of(code: AxisCode, words: Words) -> list[np.ndarray]:
     number = np.floor(cell)
     usable = (cell - number == 0.5) & (code.status != Status.LOW_SIGNAL) & (code.status != Status.SATURATED)
     word = np.where(usable, words.of_cell[number.astype(np.int32)], np.int32(-1))  # the bits as shown
-    return [neighbour_keys(word, 0, 1), neighbour_keys(word, 1, 0)]
+    keys = [neighbour_keys(word, 0, 1), neighbour_keys(word, 1, 0)]
+    return Neighbours(keys, Pairs.of(np.concatenate([_that_differ(part) for part in keys])))
 
 
 def _that_differ(keys: np.ndarray) -> np.ndarray:
