@@ -43,7 +43,7 @@ to move the phases by two thirds of the way between both to deceive, and at half
 MIN_EVIDENCE = 10.0
 """Least difference between the costs of the second best place and of the best one, in variances of the noise, where the
 noise is known. The likelihoods of two places then differ by the factor exp(10 / 2) = 150. With noise of 0.14 radians,
-heterodyne fringes on 1280 pixels have 0.5 % of their readings wrong instead of 2 %, number-theoretic ones 1 % instead
+heterodyne fringes on 1280 pixels have 0.5 % of their readings wrong instead of 2 %, number-theoretic ones 1.5 % instead
 of 10 %; at 0.05 radians no code loses a pixel. At 20, fringes of 0.1 radians lose half of the right readings."""
 
 SEEN_FRACTION = 0.9
