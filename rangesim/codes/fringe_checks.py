@@ -242,13 +242,9 @@ def _means_fault(seen: AxisFrames, code: AxisCode, stack: FringeStack, usable: n
 
 def _unshifted_harmonic(gamma: float, steps: int) -> float:
     """Amplitude of the harmonic of order `steps` of fringes with a gamma, as a fraction of the first."""
-    shown = np.abs(np.fft.rfft(_expected_period(gamma)))
+    turns = np.arange(16 * steps) / (16 * steps)
+    shown = np.abs(np.fft.rfft((0.5 + 0.5 * np.cos(2 * np.pi * turns)) ** gamma))
     return float(shown[steps] / shown[1])
-
-
-def _expected_period(gamma: float) -> np.ndarray:
-    """(64,) values from 0 to 1 of a period of fringes with a gamma."""
-    return np.asarray((0.5 + 0.5 * np.cos(2 * np.pi * np.arange(64) / 64)) ** gamma)
 
 
 def _sinusoid_fault(seen: AxisFrames, usable: np.ndarray, gamma: FringeGamma) -> str | None:

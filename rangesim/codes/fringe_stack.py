@@ -22,7 +22,7 @@ import numpy as np
 
 from rangesim.capture import Capture
 from rangesim.codes.axis_code import AxisCode, AxisFrames
-from rangesim.codes.fringe_gamma import MAX_SAMPLES, FringeGamma, gamma_of
+from rangesim.codes.fringe_gamma import FringeGamma, gamma_of
 from rangesim.codes.fringe_kernels import Agreement, agree, mean_place
 from rangesim.codes.fringes import FringeConvention
 from rangesim.decoding.phase_shift import PhaseThresholds, modulation_is_weak, phase_of, phase_sigma
@@ -49,6 +49,9 @@ of 10 %; at 0.05 radians no code loses a pixel. At 20, fringes of 0.1 radians lo
 SEEN_FRACTION = 0.9
 """Distance of two places, as a fraction of the axis, beyond which it does not count that they look alike: few pixels,
 at the ends of the axis, have such a rival."""
+
+NOISE_SAMPLES = 10_000
+"""Largest number of pixels among which those with little modulation are looked for. 1000 tell the noise to 4 %."""
 
 MAX_WEAK = 6.0
 """Largest modulation of pixels that tell the noise, as a multiple of the least one that is accepted. Brighter pixels
@@ -152,7 +155,7 @@ class FringeStack:
         if capture.detector is not None or not capture.is_digital or len(self.steps) < 2:
             return 0.0
         used = evenly_spread(np.flatnonzero(usable))
-        values = frames.reshape(len(frames), -1)[:, used[:: 1 + len(used) // MAX_SAMPLES]]
+        values = frames.reshape(len(frames), -1)[:, used[:: 1 + len(used) // NOISE_SAMPLES]]
         periods = [phase_of(self.of_period(values, i)) for i in range(len(self.steps))]
         least = thresholds.modulation_of_scale * capture.full_scale
         modulation = np.min([phase.modulation for phase in periods], axis=0)
