@@ -51,6 +51,10 @@ MIN_RARER_FRACTION = 0.1
 """Least fraction of the pixels at which a bit is dark, and lit, if a coarser one is compared with it. A bit that the
 camera does not resolve may be lit everywhere, and between dark and lit nowhere: 0.05 in a real capture."""
 
+MAX_CHANGE_RATE = 1 / 3
+"""Largest number of changes of a bit per pixel along the lines at which the camera resolves its stripes: they are three
+pixels wide. If they are narrower than a pixel, a pixel may see one side of an edge only, wherever the edge lies."""
+
 MAX_FROM_MIDDLE = 0.15
 """Distance from the middle of dark and lit up to which a pixel lies between the two, as a fraction of their difference.
 Noise of a fifth of the difference brings 4 % of the pixels there."""
@@ -183,9 +187,11 @@ class Light(NamedTuple):
         return np.asarray((np.abs(self.lit - 0.5) < MAX_FROM_MIDDLE).mean(axis=1))
 
     @property
-    def has_both(self) -> np.ndarray:
-        """(b,) bool, where enough pixels are dark, and enough lit."""
-        return np.asarray(np.abs((self.lit > 0.5).mean(axis=1) - 0.5) <= 0.5 - MIN_RARER_FRACTION)
+    def is_resolved(self) -> np.ndarray:
+        """(b,) bool, where enough pixels are dark, enough lit, and stripes wide enough for the camera to see them."""
+        has_both = np.abs((self.lit > 0.5).mean(axis=1) - 0.5) <= 0.5 - MIN_RARER_FRACTION
+        rates = [_changes(x) / max(1, np.count_nonzero(np.isfinite(x[0]))) for x in (self.across, self.down)]
+        return np.asarray(has_both & (np.maximum(*rates) <= MAX_CHANGE_RATE))
 
 
 def light_of_bits(seen: AxisFrames, code: AxisCode, words: Words) -> Light | None:
@@ -263,7 +269,7 @@ def uneven_contradiction(light: Light) -> str | None:
     if not light.halves_stripes:
         return None
     between = light.between
-    finer = np.where(light.has_both, between, np.inf)
+    finer = np.where(light.is_resolved, between, np.inf)
     least = np.append(np.minimum.accumulate(finer[::-1])[::-1][1:], np.inf)  # of all bits that are finer
     excess = between - least
     worst = int(np.argmax(excess))

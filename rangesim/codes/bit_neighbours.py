@@ -128,13 +128,13 @@ def displaced_contradiction(light: Light, neighbours: Neighbours) -> str | None:
     words = light.words
     if not (words.change_one_bit and light.halves_stripes):
         return None
-    clear = np.flatnonzero((light.between < MAX_CLEAR_BETWEEN)[::-1] & light.has_both[::-1])
+    clear = np.flatnonzero((light.between < MAX_CLEAR_BETWEEN)[::-1] & light.is_resolved[::-1])
     if not len(clear):
         return None
     finest = int(clear[0])
     both = neighbours.differing
     changed = (both.first ^ both.second) >> finest
-    is_next = np.abs((words.cell_of[both.first] >> finest) - (words.cell_of[both.second] >> finest)) == 1
+    is_next = np.abs(words.cell_of[both.first] - words.cell_of[both.second]) < 2 << finest  # finer bits may differ
     n_edges = np.count_nonzero(np.diff(light.coded), axis=1)[::-1]
     expected = float(both.counts[changed == 1].sum())  # each coarser bit has half the edges
     shown = list(reversed(bit_frames(light.seen.names, words.bits)))
