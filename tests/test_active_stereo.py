@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from synthetic import all_bytes, dots_on_plane
+from tiers import to_validate
 
 import rangesim
 from rangesim import (
@@ -119,7 +120,7 @@ MIDDLE = slice(8, -8), slice(60, -8)
 """Pixels whose windows both cameras see."""
 
 
-@pytest.mark.parametrize("distance_m", [0.6, 0.83, 1.1])
+@pytest.mark.parametrize("distance_m", [*to_validate(0.6), 0.83, *to_validate(1.1)])
 @pytest.mark.parametrize("matching", [DenseMatching(), DenseMatching("zncc", "local"), DenseMatching("opencv")])
 def test_a_fronto_parallel_plane_is_read_to_a_twentieth_of_a_pixel(distance_m: float, matching: DenseMatching) -> None:
     sensor, rigs = stereo()

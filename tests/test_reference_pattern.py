@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from synthetic import dots_on_plane
+from tiers import to_validate
 
 import rangesim
 from rangesim import Intrinsics, Rig, Scene, compare, decode, explain, expose, look_at, transport
@@ -32,7 +33,7 @@ def rig_of(width: int = 240, height: int = 160, T: Any = None) -> Rig:
 
 
 @pytest.mark.parametrize("method", ["census", "zncc", "opencv"])
-@pytest.mark.parametrize("distance_m", [0.7, 1.0, 1.37])
+@pytest.mark.parametrize("distance_m", [*to_validate(0.7, 1.0), 1.37])
 def test_a_plane_is_read_to_a_twentieth_of_a_pixel(method: Any, distance_m: float) -> None:
     rig = rig_of()
     capture, _ = dots_on_plane(rig, SENSOR, (0, 0, 1), distance_m)
