@@ -244,10 +244,10 @@ def between_contradiction(light: Light) -> str | None:
     """
     n_cells = light.coded.shape[1]
     mean_stripe = n_cells / (1 + np.count_nonzero(np.diff(light.coded), axis=1))
-    wide = light.lit[mean_stripe >= n_cells**0.5]
-    if not len(wide):
+    is_wide = mean_stripe >= n_cells**0.5
+    if not is_wide.any():
         return None
-    between = float(np.median((np.abs(wide - 0.5) < MAX_FROM_MIDDLE).mean(axis=1)))
+    between = float(np.median(light.between[is_wide]))
     if between <= MAX_BETWEEN_FRACTION:
         return None
     return (
@@ -275,8 +275,7 @@ def uneven_contradiction(light: Light) -> str | None:
     worst = int(np.argmax(excess))
     if excess[worst] <= MAX_MORE_BETWEEN:
         return None
-    bit = bit_frames(light.seen.names, light.words.bits)[worst]
-    name = light.seen.shown_name(bit.name if bit.pattern is not None else f"{bit.name}_inverse")
+    name = light.seen.shown_name(bit_frames(light.seen.names, light.words.bits)[worst].frame_name)
     return (
         f"frame {name} lies between dark and lit at {100 * between[worst]:.0f} % of the pixels, and a frame of finer "
         f"stripes at {100 * least[worst]:.0f} %: check that all frames have one exposure and one focus, and that none "

@@ -144,7 +144,7 @@ def displaced_contradiction(light: Light, neighbours: Neighbours) -> str | None:
         n = int(both.counts[alone].sum())
         adjacent = int(both.counts[alone & is_next].sum())
         if n >= MIN_STEPS and n_edges[k] >= MIN_CODED_EDGES and adjacent < MIN_ADJACENT_FRACTION * min(n, expected):
-            name = light.seen.shown_name(shown[k].name if shown[k].pattern is not None else f"{shown[k].name}_inverse")
+            name = light.seen.shown_name(shown[k].frame_name)
             return (
                 f"the bits along {light.seen.axis} contradict {words.noun}: where frame {name} changes, "
                 f"{100 * (1 - adjacent / n):.0f} % of the pixels do not see the next cell: check that nothing moved "

@@ -97,6 +97,11 @@ class BitFrames(NamedTuple):
     pattern: int | None
     inverse: int | None
 
+    @property
+    def frame_name(self) -> str:
+        """Name of the pattern, or of its inverse if that was shown alone."""
+        return self.name if self.pattern is not None else f"{self.name}_inverse"
+
 
 def bit_frames(names: list[str], bits: int) -> list[BitFrames]:
     """The frames of each bit, most significant first.

@@ -24,7 +24,7 @@ from rangesim.settings.config import Named
 AXES = ("columns", "rows")
 """Axes of a projector that a code may follow; the index of an axis here is the index of its projector coordinate."""
 
-MAX_OUTSIDE_FRACTION = 0.02
+MAX_BEYOND_PROJECTOR = 0.02
 """Largest fraction of the decoded pixels that may see no place of the projector, before other conventions of a code are
 tried. Interreflection and noise make less."""
 

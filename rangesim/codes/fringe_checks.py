@@ -217,8 +217,8 @@ def _means_fault(seen: AxisFrames, code: AxisCode, stack: FringeStack, usable: n
     The mean of equally shifted fringes is (white + black) / 2 for every period, at any blur and interreflection. A
     gamma moves it by its harmonics of the order of the steps, which are summed up as if they had no shift.
     """
-    used = evenly_spread(np.flatnonzero(usable & ~seen.capture.saturated(seen.frames).reshape(usable.shape)))
-    used = used[:: 1 + len(used) // MAX_SAMPLES]
+    usable = usable & ~seen.capture.saturated(seen.frames).reshape(usable.shape)
+    used = evenly_spread(np.flatnonzero(usable), MAX_SAMPLES)
     if len(stack.steps) == 1 or len(used) < MIN_PIXELS:
         return None
     frames = seen.frames.reshape(len(seen.frames), -1)[:, used].astype(np.float64)
@@ -254,8 +254,7 @@ def _sinusoid_fault(seen: AxisFrames, usable: np.ndarray, gamma: FringeGamma) ->
             f"the fringes along {seen.axis} are no sinusoids ({seen.shown_name(seen.names[0])} and next), and tell no "
             "gamma that explains their shape: check that projector and camera are linear and that no frame is repeated."
         )
-    used = evenly_spread(np.flatnonzero(usable))
-    used = used[:: 1 + len(used) // MAX_SINUSOID_PIXELS]
+    used = evenly_spread(np.flatnonzero(usable), MAX_SINUSOID_PIXELS)
     if len(used) < MIN_PIXELS or len(seen.frames) == 3:
         return None
     frames = seen.frames.reshape(len(seen.frames), -1)[:, used].astype(np.float64)
@@ -297,8 +296,7 @@ def _misfit(frames: np.ndarray, gamma: FringeGamma) -> float:
 
 def _agreement_fault(seen: AxisFrames, code: AxisCode, stack: FringeStack, usable: np.ndarray) -> str | None:
     """A sentence if the phases of several periods do not agree on places of the axis; None if they do."""
-    used = evenly_spread(np.flatnonzero(usable))
-    used = used[:: 1 + len(used) // MAX_SAMPLES]
+    used = evenly_spread(np.flatnonzero(usable), MAX_SAMPLES)
     if len(stack.steps) == 1 or len(used) < MIN_PIXELS:
         return None
     refused = float((code.status.ravel()[used] == Status.CODE_ERROR).mean())

@@ -111,8 +111,7 @@ def gamma_of(frames: np.ndarray, usable: np.ndarray, scale: np.ndarray | None) -
     frames : (N, h, w), fringes of one period. usable : (h, w) bool, pixels that are neither weak nor saturated.
     scale : (h, w) brightness that the fringes do not change, such as white - black; None: there is none.
     """
-    used = evenly_spread(np.flatnonzero(usable))
-    used = used[:: 1 + len(used) // MAX_SAMPLES]
+    used = evenly_spread(np.flatnonzero(usable), MAX_SAMPLES)
     if len(used) < MIN_PIXELS:
         return FringeGamma(is_told=False)
     few = frames.reshape(len(frames), -1)[:, used]

@@ -154,8 +154,7 @@ class FringeStack:
         """
         if capture.detector is not None or not capture.is_digital or len(self.steps) < 2:
             return 0.0
-        used = evenly_spread(np.flatnonzero(usable))
-        values = frames.reshape(len(frames), -1)[:, used[:: 1 + len(used) // NOISE_SAMPLES]]
+        values = frames.reshape(len(frames), -1)[:, evenly_spread(np.flatnonzero(usable), NOISE_SAMPLES)]
         periods = [phase_of(self.of_period(values, i)) for i in range(len(self.steps))]
         least = thresholds.modulation_of_scale * capture.full_scale
         modulation = np.min([phase.modulation for phase in periods], axis=0)
@@ -290,9 +289,8 @@ class FringeStack:
             agrees, is_clear = np.empty((2, refused.size), dtype=bool)
             # The noise may put a place beyond an end of the axis: then the other end is as likely.
             start, end = lows[rows].ravel() - margin, highs[rows].ravel() + margin
-            gap = noise_variance.ravel() * np.float32(
-                MIN_EVIDENCE / (2 * math.pi**2)
-            )  # as costs, which `inverse` weights
+            # In units of the costs, which `inverse` weights.
+            gap = noise_variance.ravel() * np.float32(MIN_EVIDENCE / (2 * math.pi**2))
             agree(flat, inverse, periods, start, end, gap, LIMITS, place, agrees, is_clear)
             precise = inverse[0] > 0
             if len(kept) > 1:

@@ -12,7 +12,7 @@ import numpy as np
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.bit_code import BitCode
 from rangesim.codes.bits import Words
-from rangesim.codes.code import MAX_LEFT_OUTSIDE, MAX_OUTSIDE_FRACTION
+from rangesim.codes.code import MAX_BEYOND_PROJECTOR, MAX_LEFT_OUTSIDE
 from rangesim.decoding.pixel_samples import MIN_PIXELS, evenly_spread
 from rangesim.decoding.status import Status
 from rangesim.response import DenseResponse, GrayBits
@@ -88,7 +88,7 @@ class GrayCode(BitCode):
         word = self.words(seen.size).of_cell[(code.coordinate.ravel()[used] / self.cell_px).astype(np.intp)]
         outside = self._outside(word, seen.size)
         for other, _ in self.other_conventions():
-            if outside > MAX_OUTSIDE_FRACTION and other._outside(word, seen.size) < MAX_LEFT_OUTSIDE * outside:
+            if outside > MAX_BEYOND_PROJECTOR and other._outside(word, seen.size) < MAX_LEFT_OUTSIDE * outside:
                 return (
                     f"{100 * outside:.0f} % of the decoded pixels along {seen.axis} see places outside the projector, "
                     f"as if the code showed its {other.words_shown} words instead of the {self.words_shown} ones: "

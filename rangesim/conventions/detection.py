@@ -16,7 +16,7 @@ import numpy as np
 
 from rangesim.capture import Capture, bright_level
 from rangesim.codes import AXES, AxisCode
-from rangesim.codes.code import MAX_LEFT_OUTSIDE, MAX_OUTSIDE_FRACTION
+from rangesim.codes.code import MAX_BEYOND_PROJECTOR, MAX_LEFT_OUTSIDE
 from rangesim.conventions.fringe_conventions import measured_fringes, middle_of, with_own_start
 from rangesim.conventions.layouts import (
     ENDS,
@@ -462,7 +462,7 @@ def _upright(frames: np.ndarray, sample: _Sample, found: StructuredLight) -> Str
 def _within_projector(sample: _Sample, sensor: StructuredLight) -> tuple[StructuredLight, tuple[str, ...]]:
     """The sensor in a convention of its code in which nearly all places lie in the projector, and what differs."""
     outside = _outside(sample, sensor)
-    if outside > MAX_OUTSIDE_FRACTION:
+    if outside > MAX_BEYOND_PROJECTOR:
         for code, said in sensor.code.other_conventions():
             other = replace(sensor, code=code)
             if _outside(sample, other) < MAX_LEFT_OUTSIDE * outside:

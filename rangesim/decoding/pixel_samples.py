@@ -27,8 +27,8 @@ MAX_UNIFORM_FRACTION = 0.98
 and still count as a picture of something."""
 
 
-def evenly_spread(indices: np.ndarray) -> np.ndarray:
-    """At most `MAX_PIXELS` of the indices (n,), evenly spread.
+def evenly_spread(indices: np.ndarray, most: int = MAX_PIXELS) -> np.ndarray:
+    """At most `most` of the indices (n,), evenly spread.
 
     Examples
     --------
@@ -36,7 +36,7 @@ def evenly_spread(indices: np.ndarray) -> np.ndarray:
     >>> len(evenly_spread(np.arange(500_000)))
     166667
     """
-    return indices[:: 1 + len(indices) // MAX_PIXELS]
+    return indices[:: 1 + len(indices) // most]
 
 
 def equal_frames(frames: np.ndarray) -> Iterator[tuple[int, int]]:

@@ -42,7 +42,7 @@ MIN_SPREAD = 0.3
 """Least spread of the light, and of the light times the square of its path, in powers of e, for a doubt of its
 direction: albedos and slopes of one surface differ by less."""
 
-MIN_RANGE = 10
+MIN_RANGE_DN = 10
 """Least range of the other frames, in digital numbers, at which a frame of one number was not taken of the scene. In
 weak light, all frames may have one or two numbers."""
 
@@ -70,7 +70,7 @@ def frame_contradiction(frames: np.ndarray, names: Sequence[str]) -> str | None:
     ranges = np.array([int(frame.max()) - int(frame.min()) for frame in frames])
     is_flat = (ranges == 0) & (frames[:, 0, 0] < frames.max())  # the largest number may be the one that clips
     flat = [name for name, alike in zip(names, is_flat, strict=True) if alike]
-    if flat and len(flat) < len(frames) and np.median(ranges[ranges > 0]) >= MIN_RANGE:
+    if flat and len(flat) < len(frames) and np.median(ranges[ranges > 0]) >= MIN_RANGE_DN:
         return (
             f"{', '.join(flat)}: the same number at every pixel, which no camera takes of a scene: check that "
             "{} written and read as a whole.".format("this frame was" if len(flat) == 1 else "these frames were")

@@ -416,9 +416,8 @@ class AmcwDecoder(Decoder):
                 )
             return found
         at = at[status.ravel()[at] == Status.OK]
-        starts = (
-            sensor.taps if len(sensor.modulation_hz) == 1 else 1
-        )  # of several frequencies, the phases would disagree
+        # Of several frequencies, the phases would disagree.
+        starts = sensor.taps if len(sensor.modulation_hz) == 1 else 1
         period_m = 2 * sensor.unambiguous_range_m
         return direction_contradiction(length_m.ravel()[at], modulation.ravel()[at], period_m, starts)
 
