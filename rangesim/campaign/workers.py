@@ -109,6 +109,7 @@ def _local_cluster(count: int) -> Iterator[object]:
                 host="127.0.0.1",
                 protocol="tcp",
                 dashboard_address=None,
+                scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # its HTTP server takes port 8787 else
                 silence_logs=logging.CRITICAL,
                 memory_limit=MEMORY_LIMIT,
                 worker_class=WorkerNanny,
