@@ -179,6 +179,8 @@ def _computed(
     tell("Loading the scene", 0.0)
     with timed(times, "load"):
         scene = scene or load_scene(experiment.scene, material=experiment.material, unit_m=experiment.unit_m)
+        if experiment.objects is not None:
+            scene = scene.with_objects(experiment.objects)
     if experiment.ambient is not None:
         experiment.ambient.check_emitters(scene.has_ambient)
     groups = group_by_rig(experiment, scene)

@@ -67,10 +67,14 @@ RESULT = DirectoryKind(FORMAT, SETTINGS, FileFormatError)
 
 
 class ShapeRecord(Record, frozen=True, kw_only=True):
-    """A shape of the scene and its material class."""
+    """A shape of the scene and its material class.
+
+    object : name of the object that it is a part of, empty for background; None in results that do not tell.
+    """
 
     name: str
     material: Name
+    object: str | None = None
 
 
 class SceneRecord(Record, frozen=True, kw_only=True):

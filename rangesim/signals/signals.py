@@ -60,6 +60,8 @@ class GroundTruth(ShortRepr):
     projector_visible : (h, w) bool, whether the straight line to the projector is free and the point is in its image.
     nearest_m, farthest_m : (h, w) float32, metres, least and largest range of the surfaces within a zone; the other
         fields then describe the surface that fills most of it. None: pixels are no `rangesim.rig.Zones`.
+    instance_objects : for each instance the name of the object that it is a part of; empty for background, such as a
+        table or a wall (`rangesim.scene.objects`). No names at all: not known.
 
     Examples
     --------
@@ -79,6 +81,25 @@ class GroundTruth(ShortRepr):
     material_names: tuple[str, ...] = ()
     nearest_m: np.ndarray | None = None
     farthest_m: np.ndarray | None = None
+    instance_objects: tuple[str, ...] = ()
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """Names of the objects of the scene, seen or not; none if there is only background, or if it is not known."""
+        return tuple(dict.fromkeys(name for name in self.instance_objects if name))
+
+    @property
+    def object_index(self) -> np.ndarray:
+        """(h, w) int32, index into `object_names` of the object behind each pixel; -1 for background and nothing."""
+        index_of = {name: i for i, name in enumerate(self.object_names)}
+        of_instance = [index_of.get(name, -1) for name in self.instance_objects] or [-1] * len(self.instance_names)
+        return np.array([*of_instance, -1], dtype=np.int32)[self.instance]
+
+    def objects(self) -> dict[str, np.ndarray]:
+        """Pixels of each object that the camera sees, as (h, w) bool by name."""
+        index = self.object_index
+        masks = {name: index == i for i, name in enumerate(self.object_names)}
+        return {name: mask for name, mask in masks.items() if mask.any()}
 
     def classes(self) -> dict[str, np.ndarray]:
         """Pixels of each material class that occurs, as (h, w) bool by name; "all" comes last, and may be empty."""
