@@ -201,8 +201,8 @@ def _computed(
         passes.append(LightPass.of(signals))
         for instrument in instruments:
             tell(f"Measuring with {instrument.name}", end)
-            seed = noise_seed(experiment, instrument)
-            measurements[instrument.name] = measure(instrument, signals, seed, experiment.ambient, number)
+            seed, light = noise_seed(experiment, instrument), signals.at_wavelength(instrument.emitter_wavelength_m)
+            measurements[instrument.name] = measure(instrument, light, seed, experiment.ambient, number)
     info = provenance(experiment, scene, groups, mi.variant(), times)
     return Result(experiment, tuple(measurements[i.name] for i in experiment.instruments), tuple(passes), info)
 
