@@ -21,7 +21,7 @@ from rangesim.causes.range_limits import fraction_beyond_range, warn_of_range
 from rangesim.causes.rules import causes_of
 from rangesim.decoding import decode
 from rangesim.errors import warn
-from rangesim.evaluation.comparison import compare
+from rangesim.evaluation.comparison import TOLERANCE_M, compare
 from rangesim.evaluation.range_noise import noise_of, warn_of_sampling
 from rangesim.evaluation.reference_readings import ReferenceReadings
 from rangesim.experiment import Experiment
@@ -202,7 +202,9 @@ def _computed(
         for instrument in instruments:
             tell(f"Measuring with {instrument.name}", end)
             seed, light = noise_seed(experiment, instrument), signals.at_wavelength(instrument.emitter_wavelength_m)
-            measurements[instrument.name] = measure(instrument, light, seed, experiment.ambient, number)
+            measurements[instrument.name] = measure(
+                instrument, light, seed, experiment.ambient, number, experiment.tolerance_m
+            )
     info = provenance(experiment, scene, groups, mi.variant(), times)
     return Result(experiment, tuple(measurements[i.name] for i in experiment.instruments), tuple(passes), info)
 
@@ -226,7 +228,12 @@ def _warn(result: Result) -> None:
 
 
 def measure(
-    instrument: Instrument, signals: Signals, seed: int, ambient: Ambient | None = None, light_pass: int = 1
+    instrument: Instrument,
+    signals: Signals,
+    seed: int,
+    ambient: Ambient | None = None,
+    light_pass: int = 1,
+    tolerance_m: float = TOLERANCE_M,
 ) -> Measurement:
     """The measurement of one instrument, with its capture, range image, errors, causes and segmentation.
 
@@ -236,6 +243,7 @@ def measure(
     seed : seed of the detector's noise.
     ambient : as for `rangesim.expose`.
     light_pass : number of the pass, counted from 1.
+    tolerance_m : largest error of a right reading, metres.
     """
     times: dict[str, float] = {}
     moves = signals.motion_m is not None
@@ -253,9 +261,9 @@ def measure(
         with timed(times, "noise"):
             noise = noise_of(readings)
         image = replace(image, sampling_sigma_m=np.abs(noise.sampling))
-    comparison = compare(image, signals.truth)
+    comparison = compare(image, signals.truth, tolerance_m)
     with timed(times, "causes"):
-        causes = causes_of(readings, comparison.tolerance_m)
+        causes = causes_of(readings, tolerance_m)
     rows = [row | failures for row, failures in zip(comparison.rows(), causes.fractions(signals.truth), strict=True)]
     if noise is not None:
         rows = [row | sigmas for row, sigmas in zip(rows, noise.by_surface(signals.truth), strict=True)]

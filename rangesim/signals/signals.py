@@ -119,12 +119,6 @@ class GroundTruth(ShortRepr):
         of_class = {name: seen & (self.material == i) for i, name in enumerate(self.material_names)}
         return {name: mask for name, mask in of_class.items() if mask.any()} | {ALL: seen}
 
-    def objects(self) -> dict[str, np.ndarray]:
-        """Pixels of each object that is seen, as (h, w) bool by name."""
-        seen = np.isfinite(self.z)
-        of_object = {name: seen & (self.instance == i) for i, name in enumerate(self.instance_names)}
-        return {name: mask for name, mask in of_object.items() if mask.any()}
-
     def surfaces(self) -> list[Surface]:
         """The surfaces that tables have rows for: each object, each material class, and all together at the end."""
         objects = [Surface("object", *item) for item in self.objects().items()]
