@@ -243,7 +243,7 @@ def _crafted(m: Measurement, name: str, sensor_as_well: bool) -> Measurement:
         capture = copy.copy(m.capture)
         object.__setattr__(capture, "sensor", sensor)
     truth = replace(m.truth, material_names=tuple(f"material {HOSTILE}" for _ in m.truth.material_names))
-    rows = [{**row, "material": f"row {HOSTILE}" if i == 0 else row["material"]} for i, row in enumerate(m.rows)]
+    rows = [{**row, "name": f"row {HOSTILE}" if row["kind"] == "object" else row["name"]} for row in m.rows]
     return replace(m, name=name, capture=capture, truth=truth, rows=rows)
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import overload
+from typing import NamedTuple, overload
 
 import numpy as np
 
@@ -48,6 +48,18 @@ class EnergySplit(ShortRepr):
         return self.direct + self.multipath + self.specular + self.caustic + self.glint
 
 
+class Surface(NamedTuple):
+    """A part of the ground truth that a row of a table is about.
+
+    kind : "object", "material" or "all". name : of the object or of the material class, or "all".
+    mask : (h, w) bool, its pixels.
+    """
+
+    kind: str
+    name: str
+    mask: np.ndarray
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class GroundTruth(ShortRepr):
     """First surface behind each pixel centre. Where there is none, numbers are NaN and indices are -1.
@@ -85,6 +97,18 @@ class GroundTruth(ShortRepr):
         seen = np.isfinite(self.z)
         of_class = {name: seen & (self.material == i) for i, name in enumerate(self.material_names)}
         return {name: mask for name, mask in of_class.items() if mask.any()} | {ALL: seen}
+
+    def objects(self) -> dict[str, np.ndarray]:
+        """Pixels of each object that is seen, as (h, w) bool by name."""
+        seen = np.isfinite(self.z)
+        of_object = {name: seen & (self.instance == i) for i, name in enumerate(self.instance_names)}
+        return {name: mask for name, mask in of_object.items() if mask.any()}
+
+    def surfaces(self) -> list[Surface]:
+        """The surfaces that tables have rows for: each object, each material class, and all together at the end."""
+        objects = [Surface("object", *item) for item in self.objects().items()]
+        *materials, (_, seen) = self.classes().items()
+        return [*objects, *(Surface("material", *item) for item in materials), Surface(ALL, ALL, seen)]
 
 
 @dataclass(frozen=True)
