@@ -64,8 +64,8 @@ def test_every_part_is_there(html: str) -> None:
         assert f'id="{part}"' in html
     for title in ("Structured light", "Time of flight (AMCW)", "Time of flight (direct)", "Ideal time of flight"):
         assert f"<h3>{title}" in html
-    assert [int(n) for n in re.findall(r"<b>Figure (\d+)", html)] == list(range(1, 7))
-    assert [int(n) for n in re.findall(r"<b>Table (\d+)", html)] == list(range(1, 6))
+    assert [int(n) for n in re.findall(r'<b class="number">Figure (\d+)', html)] == list(range(1, 7))
+    assert [int(n) for n in re.findall(r'<b class="number">Table (\d+)', html)] == list(range(1, 6))
     assert html.count('class="cloud"') == html.count('class="labels"') == len(SENSORS)
 
 
