@@ -100,7 +100,7 @@ def run(
         result = _computed(experiment, progress or unwatched, scene, announce)
         if progress:
             progress("Writing the report", 0.97)
-        tables = comparison_markdown([(m.name, m.rows) for m in result.measurements])
+        tables = comparison_markdown([(m.name, m.rows) for m in result.measurements], experiment.tolerance_m)
         write_result(result, folder, {"comparison.md": tables.encode(), "report.html": render_report(result).encode()})
     _warn(result)
     return result

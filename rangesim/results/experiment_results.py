@@ -180,6 +180,10 @@ class ComparisonRecord(Record, frozen=True, kw_only=True):
     tolerance_m: Positive
     rows: list[RowRecord]
 
+    def plain_rows(self) -> list[dict[str, Any]]:
+        """The rows as dicts."""
+        return [msgspec.to_builtins(row) for row in self.rows]
+
 
 _CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpec("float64", (), low=1e-9, high=1e9)}
 """Type, shape and bounds of the arrays of `causes.npz`; the tolerance is in metres."""
@@ -353,8 +357,8 @@ def read_settings(folder: Path) -> ResultRecord:
     return read_record(sidecar_of(folder, RESULT), ResultRecord)
 
 
-def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """The rows of `comparison.json` in the directory of an instrument; FileFormatError if the file is broken."""
+def read_comparison(folder: Path) -> ComparisonRecord:
+    """The contents of `comparison.json` in the directory of an instrument; FileFormatError if the file is broken."""
     path = folder / "comparison.json"
     record = read_record(path, ComparisonRecord)
     keys = [(row.kind, row.name) for row in record.rows]
@@ -375,7 +379,7 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
             raise FileFormatError(
                 f"{path}: expected the causes of {shown(row.name)} to add up to what is wrong or missing."
             )
-    return [msgspec.to_builtins(row) for row in record.rows]
+    return record
 
 
 def _image_sizes(info: ResultRecord, path: Path) -> dict[int, dict[str, int]]:
@@ -415,7 +419,7 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
         image=replace(image, T_world_camera=capture.rig.T_world_camera),
         truth=truth,
         causes=CauseMap(data["cause"], float(data["tolerance_m"])),
-        rows=read_rows(folder),
+        rows=read_comparison(folder).plain_rows(),
         segmentation=_load_segmentation(folder / "segmentation.npz", sizes),
         metadata=metadata,
         light_pass=light_pass,
