@@ -154,7 +154,7 @@ def test_the_result_holds_every_stage() -> None:
         # 1.9 % on one kind of processor, 2.1 % on another, whose compiled kernels round differently
         assert outliers.sum() < 0.04 * m.metadata.points
         assert {"exposure", "decode", "noise", "causes", "points", "segmentation"} == set(m.metadata.times_s)
-        assert m.rows[-1]["material"] == "all"
+        assert m.rows[-1]["kind"] == "all"
     acquired = {m.name: m.metadata.acquisition_s for m in result.measurements}
     assert acquired["ideal"] is None
     lines, histogram = result.measurements[0].metadata, result.measurements[2].metadata

@@ -152,7 +152,7 @@ def _warn_of_instruments_without_points(result: Result) -> None:
     blind: dict[Cause, list[str]] = {}  # names by cause; Cause.NONE stands for a wrong scale
     for measurement in result.measurements:
         if not measurement.metadata.points:
-            fractions = next(row["causes"] for row in measurement.rows if row["material"] == ALL)
+            fractions = next(row["causes"] for row in measurement.rows if row["kind"] == ALL)
             cause = Cause[max(fractions, key=fractions.get).upper()] if fractions else Cause.NONE
             is_wrong_scale = cause in causes_of_wrong_scale
             blind.setdefault(Cause.NONE if is_wrong_scale else cause, []).append(measurement.name)

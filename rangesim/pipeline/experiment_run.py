@@ -272,7 +272,7 @@ def measure(
         causes = causes_of(readings, comparison.tolerance_m)
     rows = [row | failures for row, failures in zip(comparison.rows(), causes.fractions(signals.truth), strict=True)]
     if noise is not None:
-        rows = [row | sigmas for row, sigmas in zip(rows, noise.by_material(signals.truth), strict=True)]
+        rows = [row | sigmas for row, sigmas in zip(rows, noise.by_surface(signals.truth), strict=True)]
     with timed(times, "points"):
         cloud = image.to_point_cloud()
     points, segmentation = int(cloud.valid.sum()), None

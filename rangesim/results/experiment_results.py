@@ -10,7 +10,7 @@ DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.fil
          range.npz       range image
          causes.npz      cause of every failed pixel
          cloud.ply       points, metres, camera coordinates
-         comparison.json statistics per material class
+         comparison.json statistics per object and material class
          measurement.json exposure and times
          segmentation.npz supervoxels, labels and tree
          objects.json    what the segmentation makes of each object
@@ -34,6 +34,7 @@ from rangesim.causes import Cause, CauseMap
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
 from rangesim.evaluation.object_segmentation import ObjectOutcome, ObjectSegmentation, Outcome
+from rangesim.evaluation.surface_rows import OBJECT, OBJECTS, index_of_row
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.files.array_files import write_arrays
 from rangesim.files.atomic_directories import DirectoryKind, sidecar_of
@@ -149,13 +150,14 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
 
 
 class RowRecord(Record, frozen=True, kw_only=True):
-    """Statistics of one material class.
+    """Statistics of one surface.
 
     `rangesim.evaluation.comparison.ErrorStatistics`, `rangesim.causes.CauseMap.fractions` and
-    `rangesim.evaluation.range_noise.RangeNoise.by_material` explain them. None: not known.
+    `rangesim.evaluation.range_noise.RangeNoise.by_surface` explain them. None: not known.
     """
 
-    material: Name
+    kind: Literal["objects", "object", "material", "all"]
+    name: str
     pixels: Count
     lit: Count
     right: Fraction | None
@@ -175,7 +177,7 @@ class RowRecord(Record, frozen=True, kw_only=True):
 
 
 class ComparisonRecord(Record, frozen=True, kw_only=True):
-    """The contents of `comparison.json`: a row for each material class, the last one for "all".
+    """The contents of `comparison.json`: a row for each object and material class, the last one for "all".
 
     tolerance_m : largest error of a right reading, metres.
     """
@@ -249,7 +251,8 @@ class Measurement(ShortRepr):
     image : RangeImage.
     truth : GroundTruth of the instrument's pass.
     causes : CauseMap, the cause of each failed pixel.
-    rows : statistics per material class with the keys of `RowRecord`, "all" last.
+    rows : statistics with the keys of `RowRecord`, in this order: mean over objects, each object, each material class,
+        "all". `row` finds one by its name.
     segmentation : Segmentation; None if there were too few points.
     objects : ObjectSegmentation, what the segmentation makes of each object; None in results that do not tell.
     metadata : MeasurementRecord, frames, exposure, photons per pulse and time per stage.
@@ -266,6 +269,10 @@ class Measurement(ShortRepr):
     objects: ObjectSegmentation | None
     metadata: MeasurementRecord
     light_pass: int
+
+    def row(self, name: str, kind: str | None = None) -> dict[str, Any]:
+        """The row of this name, as `rangesim.evaluation.comparison.Comparison.row` finds it; raises its errors."""
+        return self.rows[index_of_row([(row["kind"], row["name"]) for row in self.rows], name, kind)]
 
     @property
     def camera(self) -> Camera:
@@ -291,7 +298,7 @@ class Result(ShortRepr):
     Examples
     --------
     >>> result = load_result("out/tabletop")  # doctest: +SKIP
-    >>> {m.name: m.rows[-1]["median_abs_m"] for m in result.measurements}  # metres  # doctest: +SKIP
+    >>> {m.name: m.row("objects")["right"] for m in result.measurements}  # doctest: +SKIP
     """
 
     experiment: Experiment
@@ -398,19 +405,23 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     """The rows of `comparison.json` in the directory of an instrument; FileFormatError if the file is broken."""
     path = folder / "comparison.json"
     record = read_record(path, ComparisonRecord)
-    materials = [row.material for row in record.rows]
-    if materials.count(ALL) != 1 or len(set(materials)) < len(materials):
-        raise FileFormatError(f"{path}: expected one row per material, and one {ALL!r}, got {shown(materials)}.")
+    keys = [(row.kind, row.name) for row in record.rows]
+    kinds: list[str] = [kind for kind, _ in keys]
+    if kinds.count(ALL) != 1 or kinds.count(OBJECTS) != (OBJECT in kinds) or len(set(keys)) < len(keys):
+        raise FileFormatError(
+            f"{path}: expected one row per object and material, one {ALL!r}, and {OBJECTS!r} if there are objects, "
+            f"got {shown([name for _, name in keys])}."
+        )
     valid = {c.name.lower() for c in Cause if c}
     for row in record.rows:
         if unknown := set(row.causes) - valid:
-            raise FileFormatError(f"{path}: unknown cause {shown(min(unknown))} of {shown(row.material)}.")
+            raise FileFormatError(f"{path}: unknown cause {shown(min(unknown))} of {shown(row.name)}.")
         failed = (row.wrong or 0) + (row.missing or 0)
         if row.right is not None and abs(row.right + failed - 1) > 1e-6:
-            raise FileFormatError(f"{path}: expected right, wrong and missing of {shown(row.material)} to add up to 1.")
+            raise FileFormatError(f"{path}: expected right, wrong and missing of {shown(row.name)} to add up to 1.")
         if abs(sum(row.causes.values()) - failed) > 1e-6:
             raise FileFormatError(
-                f"{path}: expected the causes of {shown(row.material)} to add up to what is wrong or missing."
+                f"{path}: expected the causes of {shown(row.name)} to add up to what is wrong or missing."
             )
     return [msgspec.to_builtins(row) for row in record.rows]
 

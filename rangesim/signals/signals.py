@@ -6,7 +6,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import overload
+from typing import NamedTuple, overload
 
 import numpy as np
 
@@ -46,6 +46,18 @@ class EnergySplit(ShortRepr):
     def projector(self) -> np.ndarray:
         """All light of the emitter at full power, without ambient light: (h, w) float32, W/m2/sr."""
         return self.direct + self.multipath + self.specular + self.caustic + self.glint
+
+
+class Surface(NamedTuple):
+    """A part of the ground truth that a row of a table is about.
+
+    kind : "object", "material" or "all". name : of the object or of the material class, or "all".
+    mask : (h, w) bool, its pixels.
+    """
+
+    kind: str
+    name: str
+    mask: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -91,8 +103,10 @@ class GroundTruth(ShortRepr):
     @property
     def object_index(self) -> np.ndarray:
         """(h, w) int32, index into `object_names` of the object behind each pixel; -1 for background and nothing."""
+        if not self.instance_objects:
+            return np.full_like(self.instance, -1)
         index_of = {name: i for i, name in enumerate(self.object_names)}
-        of_instance = [index_of.get(name, -1) for name in self.instance_objects] or [-1] * len(self.instance_names)
+        of_instance = [index_of.get(name, -1) for name in self.instance_objects]
         return np.array([*of_instance, -1], dtype=np.int32)[self.instance]
 
     def objects(self) -> dict[str, np.ndarray]:
@@ -106,6 +120,12 @@ class GroundTruth(ShortRepr):
         seen = np.isfinite(self.z)
         of_class = {name: seen & (self.material == i) for i, name in enumerate(self.material_names)}
         return {name: mask for name, mask in of_class.items() if mask.any()} | {ALL: seen}
+
+    def surfaces(self) -> list[Surface]:
+        """The surfaces that tables have rows for: each object, each material class, and all together at the end."""
+        objects = [Surface("object", *item) for item in self.objects().items()]
+        *materials, (_, seen) = self.classes().items()
+        return [*objects, *(Surface("material", *item) for item in materials), Surface(ALL, ALL, seen)]
 
 
 @dataclass(frozen=True)
