@@ -133,7 +133,10 @@ def of_objects(sizes: dict[str, int], material: str = "matte") -> GroundTruth:
     """A row of pixels at 1 m, of objects of these sizes in pixels."""
     instance = np.repeat(np.arange(len(sizes)), list(sizes.values()))[None]
     truth = truth_of(np.ones(instance.shape), np.zeros_like(instance))
-    return dataclasses.replace(truth, instance=instance, instance_names=tuple(sizes), material_names=(material,))
+    names = tuple(sizes)
+    return dataclasses.replace(
+        truth, instance=instance, instance_names=names, instance_objects=names, material_names=(material,)
+    )
 
 
 @pytest.mark.parametrize("pixels", [8, 80, 8000])

@@ -53,6 +53,8 @@ class Experiment:
     instruments : instruments to compare. Those whose emitter, wavelength and camera agree share a light-transport
         pass, if nothing moves, see `rangesim.pipeline.shared_passes`.
     motion : Motion, objects that move; None: nothing moves.
+    objects : names of the shapes, or of the things that they are parts of, that count as objects; all others are
+        background. None: as the scene states, or as follows from its geometry (`rangesim.scene.objects`).
 
     Raises
     ------
@@ -83,6 +85,7 @@ class Experiment:
     ambient: Ambient | None = None
     instruments: tuple[Instrument, ...] = tuple(instrument(name) for name in DEFAULT_SENSORS)
     motion: Motion | None = None
+    objects: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
