@@ -139,6 +139,21 @@ def of_objects(sizes: dict[str, int], material: str = "matte") -> GroundTruth:
     )
 
 
+def test_an_object_of_several_shapes_is_one_object_with_parts() -> None:
+    """A cup of a body and a handle before a wall; background is no object, and a part weighs nothing of its own."""
+    truth = of_objects({"body": 90, "handle": 10, "ball": 20, "wall": 80})
+    truth = dataclasses.replace(truth, instance_objects=("cup", "cup", "ball", ""))
+    measured = np.ones(truth.z.shape)
+    measured[0, 90:100] = np.nan
+    result = compare(image_of(measured), truth)
+    names = ["objects", "cup", "ball", "body", "handle", "matte", "all"]
+    assert [row.name for row in result.table] == names
+    assert (result.row("cup").right, result.row("handle").right, result.row("body").right) == (0.9, 0.0, 1.0)
+    assert result.row("handle").kind == "part"
+    assert result.row("objects").right == pytest.approx(0.95)
+    assert result.row("all").right == 0.95
+
+
 @pytest.mark.parametrize("pixels", [8, 80, 8000])
 def test_an_object_weighs_the_same_at_any_size(pixels: int) -> None:
     """The big one is right, the small one wrong by half and missing by half."""

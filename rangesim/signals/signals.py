@@ -51,7 +51,8 @@ class EnergySplit(ShortRepr):
 class Surface(NamedTuple):
     """A part of the ground truth that a row of a table is about.
 
-    kind : "object", "material" or "all". name : of the object or of the material class, or "all".
+    kind : "object", "part" (a shape of an object that has several), "material" or "all". name : of the object, of the
+        shape or of the material class, or "all".
     mask : (h, w) bool, its pixels.
     """
 
@@ -115,6 +116,13 @@ class GroundTruth(ShortRepr):
         masks = {name: index == i for i, name in enumerate(self.object_names)}
         return {name: mask for name, mask in masks.items() if mask.any()}
 
+    def parts(self) -> dict[str, np.ndarray]:
+        """Pixels of each shape that the camera sees of an object of several shapes, as (h, w) bool by name."""
+        shapes = list(zip(self.instance_names, self.instance_objects, strict=False))
+        several = {thing for _, thing in shapes if thing and self.instance_objects.count(thing) > 1}
+        masks = {name: self.instance == i for i, (name, thing) in enumerate(shapes) if thing in several}
+        return {name: mask for name, mask in masks.items() if mask.any()}
+
     def classes(self) -> dict[str, np.ndarray]:
         """Pixels of each material class that occurs, as (h, w) bool by name; "all" comes last, and may be empty."""
         seen = np.isfinite(self.z)
@@ -122,10 +130,10 @@ class GroundTruth(ShortRepr):
         return {name: mask for name, mask in of_class.items() if mask.any()} | {ALL: seen}
 
     def surfaces(self) -> list[Surface]:
-        """The surfaces that tables have rows for: each object, each material class, and all together at the end."""
-        objects = [Surface("object", *item) for item in self.objects().items()]
+        """The surfaces that tables have rows for: objects, their parts, material classes, and all together."""
         *materials, (_, seen) = self.classes().items()
-        return [*objects, *(Surface("material", *item) for item in materials), Surface(ALL, ALL, seen)]
+        groups = {"object": self.objects().items(), "part": self.parts().items(), "material": materials}
+        return [Surface(kind, *item) for kind, items in groups.items() for item in items] + [Surface(ALL, ALL, seen)]
 
 
 @dataclass(frozen=True)
