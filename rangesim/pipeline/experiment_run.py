@@ -21,7 +21,7 @@ from rangesim.causes.range_limits import fraction_beyond_range, warn_of_range
 from rangesim.causes.rules import causes_of
 from rangesim.decoding import decode
 from rangesim.errors import warn
-from rangesim.evaluation.comparison import compare
+from rangesim.evaluation.comparison import TOLERANCE_M, compare
 from rangesim.evaluation.object_segmentation import object_segmentation
 from rangesim.evaluation.range_noise import noise_of, warn_of_sampling
 from rangesim.evaluation.reference_readings import ReferenceReadings
@@ -101,7 +101,7 @@ def run(
         result = _computed(experiment, progress or unwatched, scene, announce)
         if progress:
             progress("Writing the report", 0.97)
-        tables = comparison_markdown([(m.name, m.rows) for m in result.measurements])
+        tables = comparison_markdown([(m.name, m.rows) for m in result.measurements], experiment.tolerance_m)
         write_result(result, folder, {"comparison.md": tables.encode(), "report.html": render_report(result).encode()})
     _warn(result)
     return result
@@ -209,7 +209,7 @@ def _computed(
             tell(f"Measuring with {instrument.name}", end)
             seed = noise_seed(experiment, instrument)
             measurements[instrument.name] = measure(
-                instrument, signals, seed, experiment.ambient, number, true_labels[view]
+                instrument, signals, seed, experiment.ambient, number, experiment.tolerance_m, true_labels[view]
             )
     info = provenance(experiment, scene, groups, mi.variant(), times)
     return Result(experiment, tuple(measurements[i.name] for i in experiment.instruments), tuple(passes), info)
@@ -239,6 +239,7 @@ def measure(
     seed: int,
     ambient: Ambient | None = None,
     light_pass: int = 1,
+    tolerance_m: float = TOLERANCE_M,
     true_labels: np.ndarray | None = None,
 ) -> Measurement:
     """The measurement of one instrument, with its capture, range image, errors, causes and segmentation.
@@ -249,6 +250,7 @@ def measure(
     seed : seed of the detector's noise.
     ambient : as for `rangesim.expose`.
     light_pass : number of the pass, counted from 1.
+    tolerance_m : largest error of a right reading, metres.
     true_labels : (h, w) int32, as `segments_of_truth`. None: it is computed here.
     """
     times: dict[str, float] = {}
@@ -267,9 +269,9 @@ def measure(
         with timed(times, "noise"):
             noise = noise_of(readings)
         image = replace(image, sampling_sigma_m=np.abs(noise.sampling))
-    comparison = compare(image, signals.truth)
+    comparison = compare(image, signals.truth, tolerance_m)
     with timed(times, "causes"):
-        causes = causes_of(readings, comparison.tolerance_m)
+        causes = causes_of(readings, tolerance_m)
     rows = [row | failures for row, failures in zip(comparison.rows(), causes.fractions(signals.truth), strict=True)]
     if noise is not None:
         rows = [row | sigmas for row, sigmas in zip(rows, noise.by_surface(signals.truth), strict=True)]

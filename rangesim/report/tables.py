@@ -206,10 +206,17 @@ def comparison_tables(tables: Sequence[tuple[str, Rows]]) -> list[Table]:
 
     Parameters
     ----------
-    tables : name of each instrument with its statistics per surface.
+    tables : name of each instrument with its statistics per surface. If causes are not known, they are None in every
+        row, and the table has no column for them.
     """
+    knows_causes = any(row["causes"] is not None for _, rows in tables for row in rows)
     return [
-        _table(tables, [*(f"{c.title} ({c.unit})" for c in OUTCOMES), BECAUSE], _outcomes, KINDS),
+        _table(
+            tables,
+            [*(f"{c.title} ({c.unit})" for c in OUTCOMES), *[BECAUSE] * knows_causes],
+            lambda row: [*(number(c, row[c.key]) for c in OUTCOMES), *([_causes(row)] if knows_causes else [])],
+            KINDS,
+        ),
         _table(
             tables,
             [f"{c.title} ({c.unit})" for c in COLUMNS],
@@ -220,9 +227,14 @@ def comparison_tables(tables: Sequence[tuple[str, Rows]]) -> list[Table]:
     ]
 
 
-def comparison_markdown(tables: Sequence[tuple[str, Rows]]) -> str:
-    """The tables of `comparison_tables` in Markdown."""
-    return "\n".join(table.markdown() for table in comparison_tables(tables))
+def tolerance_line(tolerance_m: float) -> str:
+    """Sentence that says up to which error a reading counts as right, as every table of right readings needs it."""
+    return f"Right readings are off by at most {1e3 * tolerance_m:g} mm."
+
+
+def comparison_markdown(tables: Sequence[tuple[str, Rows]], tolerance_m: float) -> str:
+    """The tables of `comparison_tables` in Markdown, below the tolerance."""
+    return "\n".join([f"{tolerance_line(tolerance_m)}\n", *(table.markdown() for table in comparison_tables(tables))])
 
 
 def errors_markdown(comparison: Comparison) -> str:
@@ -297,11 +309,6 @@ def _table(
         for name, rows in tables:
             lines += [[surface_label(key), name, *texts(row)] for row in rows if (row["kind"], row["name"]) == key]
     return Table(["surface", "sensor", *heads], lines)
-
-
-def _outcomes(row: dict[str, Any]) -> list[str]:
-    """Cells of right, wrong and missing readings, in percent, and of the causes of the last two."""
-    return [*(number(c, row[c.key]) for c in OUTCOMES), _causes(row)]
 
 
 def _causes(row: dict[str, Any]) -> str:
