@@ -64,6 +64,8 @@ def _right(measurement: Measurement) -> str:
     judged = _judged(measurement.rows)
     if judged["right"] is None:
         return "saw no surface."
+    if _row(measurement.rows, ALL)["missing"] == 1:
+        return "measured nothing."
     return (
         f"reads {_percent(judged['right'])} of {_whose_pixels(measurement.rows)} right, to {_limit(measurement)}, and "
         f"{_percent(judged['wrong'])} wrong; {_percent(judged['missing'])} are missing."
@@ -73,7 +75,7 @@ def _right(measurement: Measurement) -> str:
 def _worst(rows: Rows) -> str:
     """Sentences about the objects that a sensor is not right on most of, the worst first, or about the worst one."""
     surfaces, noun = _surfaces(rows)
-    if len(surfaces) < 2:
+    if len(surfaces) < 2 or _row(rows, ALL)["missing"] == 1:
         return ""
     surfaces.sort(key=lambda row: row["right"])
     poor = [row for row in surfaces if not is_reliable(row)]

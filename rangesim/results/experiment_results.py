@@ -13,10 +13,12 @@ DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.fil
          comparison.json statistics per object and material class
          measurement.json exposure and times
          segmentation.npz supervoxels, labels and tree
+         objects.json    what the segmentation makes of each object
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,6 +33,7 @@ from rangesim.capture import Captured
 from rangesim.causes import Cause, CauseMap
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
+from rangesim.evaluation.object_segmentation import ObjectOutcome, ObjectSegmentation, Outcome
 from rangesim.evaluation.surface_rows import OBJECT, OBJECTS, index_of_row
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.files.array_files import write_arrays
@@ -68,10 +71,14 @@ RESULT = DirectoryKind(FORMAT, SETTINGS, FileFormatError)
 
 
 class ShapeRecord(Record, frozen=True, kw_only=True):
-    """A shape of the scene and its material class."""
+    """A shape of the scene and its material class.
+
+    object : name of the object that it is a part of, empty for background; None in results that do not tell.
+    """
 
     name: str
     material: Name
+    object: str | None = None
 
 
 class SceneRecord(Record, frozen=True, kw_only=True):
@@ -181,6 +188,33 @@ class ComparisonRecord(Record, frozen=True, kw_only=True):
     rows: list[RowRecord]
 
 
+class ObjectRecord(Record, frozen=True, kw_only=True):
+    """What the segmentation makes of an object; `rangesim.evaluation.object_segmentation.ObjectOutcome` explains it."""
+
+    name: str
+    pixels: Count
+    covering: Fraction
+    overlap: Fraction
+    outcome: Outcome
+    displaced: bool
+    merged_with: list[str]
+    separable: bool
+
+
+class ObjectsRecord(Record, frozen=True, kw_only=True):
+    """The contents of `objects.json`.
+
+    invented : number of segments that could pass for an object and are none.
+    panoptic_quality : of the objects; None if there are neither objects nor invented ones.
+    """
+
+    format: Literal["rangesim-objects"] = "rangesim-objects"
+    format_version: Literal[1] = 1
+    objects: list[ObjectRecord]
+    invented: Count
+    panoptic_quality: Fraction | None
+
+
 _CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpec("float64", (), low=1e-9, high=1e9)}
 """Type, shape and bounds of the arrays of `causes.npz`; the tolerance is in metres."""
 _SEGMENTATION = {
@@ -220,6 +254,7 @@ class Measurement(ShortRepr):
     rows : statistics with the keys of `RowRecord`, in this order: mean over objects, each object, each material class,
         "all". `row` finds one by its name.
     segmentation : Segmentation; None if there were too few points.
+    objects : ObjectSegmentation, what the segmentation makes of each object; None in results that do not tell.
     metadata : MeasurementRecord, frames, exposure, photons per pulse and time per stage.
     light_pass : number of the light-transport pass, counted from 1.
     """
@@ -231,6 +266,7 @@ class Measurement(ShortRepr):
     causes: CauseMap
     rows: list[dict[str, Any]]
     segmentation: Segmentation | None
+    objects: ObjectSegmentation | None
     metadata: MeasurementRecord
     light_pass: int
 
@@ -308,9 +344,21 @@ def _write_readings(measurement: Measurement, folder: Path) -> None:
     write_arrays(folder / "causes.npz", {"cause": causes.cause, "tolerance_m": np.asarray(causes.tolerance_m)})
     write_record(folder / "comparison.json", ComparisonRecord(tolerance_m=causes.tolerance_m, rows=rows))
     write_record(folder / "measurement.json", measurement.metadata)
+    if measurement.objects is not None:
+        write_record(folder / "objects.json", _objects_record(measurement.objects))
     if measurement.segmentation is not None:
         measurement.image.to_point_cloud().save(folder / "cloud.ply")
         write_arrays(folder / "segmentation.npz", vars(measurement.segmentation))
+
+
+def _objects_record(objects: ObjectSegmentation) -> ObjectsRecord:
+    """The contents of `objects.json`."""
+    quality = objects.panoptic_quality
+    return ObjectsRecord(
+        objects=msgspec.convert(msgspec.to_builtins(objects.objects), list[ObjectRecord]),
+        invented=objects.invented,
+        panoptic_quality=None if math.isnan(quality) else quality,
+    )
 
 
 # ---- Reading -------------------------------------------------------------------------------------------------------
@@ -417,9 +465,19 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
         causes=CauseMap(data["cause"], float(data["tolerance_m"])),
         rows=read_rows(folder),
         segmentation=_load_segmentation(folder / "segmentation.npz", sizes),
+        objects=_load_objects(folder / "objects.json"),
         metadata=metadata,
         light_pass=light_pass,
     )
+
+
+def _load_objects(path: Path) -> ObjectSegmentation | None:
+    """What a file tells of the objects; None if there is no such file."""
+    if not path.is_file():
+        return None
+    record = read_record(path, ObjectsRecord)
+    objects = msgspec.convert(msgspec.to_builtins(record.objects), tuple[ObjectOutcome, ...])
+    return ObjectSegmentation(objects, record.invented)
 
 
 def _load_segmentation(path: Path, sizes: dict[str, int]) -> Segmentation | None:
