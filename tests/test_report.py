@@ -37,8 +37,9 @@ from rangesim.report import palette, render_report, tables, write_report
 from rangesim.report.clouds_page import render_clouds_page
 from rangesim.report.experiment_page import by_camera
 from rangesim.report.objects_section import objects_sentence, objects_table
+from rangesim.report.printing import pdf_of
 from rangesim.report.verdict import verdict
-from rangesim.results.experiment_results import PhotonsRecord, load_result, write_result
+from rangesim.results.experiment_results import PhotonsRecord, Result, load_result, write_result
 from rangesim.rig import Intrinsics
 from rangesim.sensors import IdealToF
 
@@ -432,6 +433,49 @@ def test_photons_per_pulse_have_two_digits() -> None:
     for value, text in shown.items():
         said = tables.photons(PhotonsRecord(median=value, largest=3e4))
         assert said == f"{text} photons detected per pulse in the median pixel, 30 000 in the brightest"
+
+
+def _with_long_names(count: int) -> Result:
+    """The small result with so many measurements, of which two have the same sensor and names of 63 characters."""
+    result = load_result(small_result())
+    lines = result.measurements[0]
+    twins = tuple(replace(lines, name=f"left_camera_of_{letter * 48}") for letter in "ab")
+    measurements = (*twins, *result.measurements[1:])[:count]
+    return replace(result, measurements=measurements, passes=result.passes[: max(m.light_pass for m in measurements)])
+
+
+@needs_browser
+@pytest.mark.parametrize(
+    ("count", "paper", "points"),
+    [(5, "A4", (595, 842)), *to_validate((1, "letter", (612, 792)), (2, "A4", (595, 842)))],
+)
+def test_it_prints_on_two_pages(count: int, paper: str, points: tuple[int, int]) -> None:
+    assert BROWSER is not None
+    pdf = pdf_of(render_report(_with_long_names(count), paper), BROWSER)
+    sizes = re.findall(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", pdf)
+    assert [(round(float(w)), round(float(h))) for w, h in sizes] == [points, points]
+
+
+@needs_browser
+@pytest.mark.parametrize("width", [1280, *to_validate(400)])
+def test_nothing_is_cut_when_it_prints(tmp_path: Path, width: int) -> None:
+    """Also in a narrow window, and in dark mode: what is printed does not depend on the window."""
+    write_report(_with_long_names(5), tmp_path / "report.html")
+    with browser(tmp_path) as page:
+        page.call("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=False)
+        dark = [{"name": "prefers-color-scheme", "value": "dark"}]
+        page.call("Emulation.setEmulatedMedia", features=dark)
+        page.open(tmp_path / "report.html")
+        page.evaluate("dispatchEvent(new Event('beforeprint'))")
+        page.call("Emulation.setEmulatedMedia", media="print", features=dark)
+        sheets = page.evaluate("""[...document.querySelectorAll(".sheet")].map((sheet) => {
+            const { right, height } = sheet.getBoundingClientRect();
+            const outside = [...sheet.querySelectorAll("*")].filter((e) => e.getBoundingClientRect().right > right + 1);
+            return [height, outside.map((e) => e.outerHTML.slice(0, 99))]; })""")
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    for height, outside in sheets:
+        assert height <= 252 / 25.4 * 96 + 1
+        assert outside == []
 
 
 @needs_browser
