@@ -152,6 +152,8 @@ def _local_cluster(count: int) -> Iterator[LocalCluster]:
     settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_DEATHS,
         "distributed.scheduler.worker-saturation": 1.0,  # what waits on a worker that dies is suspected, too
+        # On a busy machine a new process takes longer than the usual 15 s, after which its nanny would be given up.
+        "distributed.deploy.lost-worker-timeout": f"{WAIT_S} s",
         "distributed.scheduler.worker-ttl": None,  # a jump of the clock would end all workers
         # A worker at one of these limits would wait for memory that nothing frees. The last limit is kept: the nanny
         # ends a worker that takes nearly all of the machine's memory.
@@ -160,6 +162,9 @@ def _local_cluster(count: int) -> Iterator[LocalCluster]:
         "distributed.worker.memory.pause": False,
     }
     before = dict(os.environ)
+    # Semaphores of a driver that is ended are removed by a process of their own, without a warning.
+    warned = [os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker:UserWarning"]
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, warned))
     try:
         with dask.config.set(settings):
             cluster = LocalCluster(
