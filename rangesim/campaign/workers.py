@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
@@ -102,13 +102,14 @@ def cores() -> int:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep Dask from logging deaths of workers on stderr while the block runs; the outcome tells them."""
-    logger = logging.getLogger("distributed")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
+    handlers = [(handler, handler.level) for handler in logging.getLogger("distributed").handlers]
+    for handler, _ in handlers:  # all of Dask's loggers have these
+        handler.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        logger.setLevel(level)
+        for handler, level in handlers:
+            handler.setLevel(level)
 
 
 @contextmanager
@@ -132,6 +133,17 @@ def _client_of(scheduler: str, answer_s: float) -> Iterator[Client]:
             raise ValueError(f"expected the address of a scheduler such as tcp://10.0.0.1:8786: {problem}") from problem
     with client:
         yield client
+
+
+def _started(kind: Callable[..., LocalCluster], **options: Any) -> LocalCluster:
+    """A cluster that has started; EnvironmentProblem if its processes do not start."""
+    try:
+        return kind(**options)
+    except RuntimeError as problem:
+        raise EnvironmentProblem(
+            "worker processes could not be started; if this is a script, put what it does below if __name__ == "
+            "'__main__', because every worker imports it."
+        ) from problem
 
 
 @contextmanager
@@ -167,7 +179,8 @@ def _local_cluster(count: int) -> Iterator[LocalCluster]:
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, warned))
     try:
         with dask.config.set(settings):
-            cluster = LocalCluster(
+            cluster = _started(
+                LocalCluster,
                 n_workers=count,
                 threads_per_worker=1,
                 host="127.0.0.1",
