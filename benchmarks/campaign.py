@@ -24,7 +24,6 @@ import itertools
 import json
 import os
 import random
-import shutil
 import signal
 import statistics
 import subprocess
@@ -176,10 +175,7 @@ class Cluster:
         self.keeper.start()
 
     def _keep(self) -> None:
-        dask = [sys.executable, "-m", "dask"] if shutil.which("dask") is None else ["dask"]
-        dask = (
-            [str(Path(sys.executable).with_name("dask"))] if Path(sys.executable).with_name("dask").exists() else dask
-        )
+        dask = [sys.executable, "-m", "dask"]
         lines = {
             "scheduler": [*dask, "scheduler", "--host", "127.0.0.1", "--port", str(PORT), "--no-dashboard"],
             "workers": [*dask, "worker", self.address, "--nworkers", "2", "--nthreads", "1", "--no-dashboard"],
