@@ -41,6 +41,13 @@ class SolidModel:
         return bool((angles > np.radians(FLAT_DEG)).any())
 
     @cached_property
+    def convex_pieces(self) -> tuple[np.ndarray, ...]:
+        """Points (k, 3), metres, part coordinates, of the convex pieces that collide."""
+        if self.pieces is not None:
+            return self.pieces
+        return (self.mesh.vertices,)
+
+    @cached_property
     def size_m(self) -> float:
         """The longest side of the box around the mesh, metres, along the axes of the part."""
         return float(np.ptp(self.mesh.vertices, axis=0).max())
