@@ -52,7 +52,7 @@ def provenance(
             InstrumentRecord(name=i.name, light_pass=placed[i.name][0], rig=to_dict(placed[i.name][1]))
             for i in experiment.instruments
         ],
-        versions={"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
+        versions=versions(),
         variant=variant,
         times_s=times_s,
     )
@@ -61,6 +61,11 @@ def provenance(
 def _checksum(path: Path | None) -> str | None:
     """SHA-256 of the scene's file; None if the scene has no file, or if the file no longer exists."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path is not None and path.is_file() else None
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of `PACKAGES`, by name."""
+    return {"python": platform.python_version(), **{package: _version(package) for package in PACKAGES}}
 
 
 def _version(package: str) -> str:
