@@ -46,13 +46,11 @@ def chosen_view(
     """
     import open3d as o3d
 
-    rays, nearest = o3d.t.geometry.RaycastingScene(nthreads=1), o3d.t.geometry.RaycastingScene(nthreads=1)
-    meshes = [one.world_mesh for one in objects] + list(support.meshes.values())
-    for mesh in meshes:
-        vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float32)
-        for world in (rays, nearest):
-            world.add_triangles(vertices, np.ascontiguousarray(mesh.faces, dtype=np.uint32))
-    boxes = [(one.world_mesh.vertices.min(axis=0), one.world_mesh.vertices.max(axis=0)) for one in objects]
+    world = o3d.t.geometry.RaycastingScene(nthreads=1)
+    meshes = [one.world_mesh for one in objects]
+    for mesh in (*meshes, *support.meshes.values()):
+        world.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
+    boxes = [(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) for mesh in meshes]
     low = support.area_m[0] if not boxes else np.min([b[0][:2] for b in boxes], axis=0)
     high = support.area_m[1] if not boxes else np.max([b[1][:2] for b in boxes], axis=0)
     top = max((float(b[1][2]) for b in boxes), default=support.height_m)
@@ -61,7 +59,7 @@ def chosen_view(
     redrawn: Counter[str] = Counter()
     for _ in range(MAX_TRIES):
         T, values = spec.view.pose(centre, random)
-        reason = _why_not(T, fov_deg, spec, rays, len(objects))
+        reason = _why_not(T, fov_deg, spec, world, len(objects))
         if not reason:
             return ChosenView(T, fov_deg, dict(redrawn), values)
         redrawn[reason] += 1
