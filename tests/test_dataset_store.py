@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from browser import BROWSER, browser
 from PIL import Image
 
 from rangesim.campaign import Outcome
@@ -32,6 +33,7 @@ from rangesim.dataset import (
     spec_from_dict,
     verify_dataset,
 )
+from rangesim.dataset.contact_sheet import contact_sheet
 from rangesim.dataset.sample import sample_bytes
 from rangesim.dataset.sample_files import END_OF_TAR, SCENE_MEMBER, members_of, tar_segment
 from rangesim.errors import FileFormatError
@@ -389,3 +391,35 @@ def test_the_command_checks_and_exports(store: Path, tmp_path: Path) -> None:
     assert run(app, ["export", str(store), "--format", "coco", "--out", str(tmp_path / "coco")]).exit_code == 0
     assert run(app, ["export", str(store), "--format", "voc", "--out", str(tmp_path / "voc")]).exit_code == 2
     assert "data set of another" not in run(app, ["no.toml", "--out", str(tmp_path / "x")]).output
+
+
+# ---- The contact sheet ---------------------------------------------------------------------------------------------
+
+
+def test_the_contact_sheet_shows_scenes_and_filters_them(store: Path, tmp_path: Path) -> None:
+    from typer.testing import CliRunner
+
+    target = tmp_path / "sheet.html"
+    assert CliRunner().invoke(app, ["show", str(store), "--out", str(target)]).exit_code == 0
+    page = target.read_text()
+    assert page.count("<article") == SCENES
+    assert page.count("data:image/png") == 4 * SCENES
+    assert isinstance(CliRunner().invoke(app, ["show", str(store), "--out", str(target)]).exception, FileFormatError)
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_a_browser_filters_the_contact_sheet_without_an_error(store: Path, tmp_path: Path) -> None:
+    target = tmp_path / "sheet.html"
+    target.write_text(contact_sheet(store))
+    held = [{each["category"] for each in one["scene"]["objects"]} for one in Samples(store)]
+    with browser(tmp_path) as page:
+        for width in (1440, 400):
+            page.call("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=False)
+            page.open(target)
+            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+            shown = "[...document.querySelectorAll('article')].filter((each) => !each.hidden).length"
+            assert page.evaluate(shown) == SCENES
+            page.evaluate("document.querySelector('input[value=torus]').click()")
+            assert page.evaluate(shown) == sum("torus" in each for each in held)
+            assert page.said == []
+            assert page.evaluate("violations") == []

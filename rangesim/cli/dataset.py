@@ -74,6 +74,29 @@ def verify_command(store: StoreArgument) -> None:
     raise typer.Exit(1 if findings.problems else 0)
 
 
+@app.command("show")
+def show_command(
+    store: StoreArgument,
+    out: Annotated[Path, typer.Option("--out", "-o", help="HTML file.", show_default=False)],
+    scenes: Annotated[int, typer.Option(help="Largest number of scenes to show.", min=1)] = 24,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a page that exists.")] = False,
+) -> None:
+    """Write a contact sheet: one HTML page with pictures, depth, masks and causes of scenes, and a filter by category.
+
+    Examples:
+
+      rangesim dataset show out/bins --out bins.html
+    """
+    from pcgraph.plumbing.plain_files import write_file
+    from rangesim.dataset.contact_sheet import contact_sheet
+    from rangesim.errors import FileFormatError, one_line
+
+    if out.exists() and not overwrite:
+        raise FileFormatError(f"{out} exists: add --overwrite, or choose another --out.")
+    write_file(out, contact_sheet(store, scenes).encode(), FileFormatError)
+    typer.echo(one_line(out))
+
+
 @app.command("export")
 def export_command(
     store: StoreArgument,
