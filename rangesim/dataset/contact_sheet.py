@@ -79,7 +79,7 @@ def _sentences(rows: Sequence[IndexRow]) -> list[str]:
     if not means:
         return ["No scene has a reading to compare."]
     best, worst = max(means, key=lambda entry: entry[1]), max(means, key=lambda entry: entry[2])
-    said = [f"Most right: {best[0]}, {100 * best[1]:.1f} % of all pixels that see a surface."]
+    said = [f"Most right: {best[0]}, {100 * best[1]:.1f} % of the pixels of objects."]
     if len(means) > 1:
         said.append(f"Most wrong, with no word of the sensor: {worst[0]}, {100 * worst[2]:.1f} %.")
     return said

@@ -35,9 +35,9 @@ from rangesim.dataset.store import (
     read_rows,
     shard_path,
 )
+from rangesim.environment.versions import versions
 from rangesim.errors import FileFormatError
 from rangesim.files.schema import record_bytes
-from rangesim.pipeline.provenance import versions
 from rangesim.pipeline.stages import Progress
 
 SHARD_BYTES = 128 << 20

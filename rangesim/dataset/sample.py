@@ -53,7 +53,7 @@ def bytes_of(drawn: RandomScene, number: int, keeps_frames: bool = False) -> byt
     from rangesim.scene import load_scene
 
     with _collected_warnings() as sentences:
-        scene = load_scene(drawn.scene)
+        scene = load_scene(drawn.scene).with_objects([each.name for each in drawn.objects])
         measurements = carry_out(drawn.experiment, scene=scene).measurements
     shape_of = {instance.name: i for i, instance in enumerate(scene.instances)}
     objects = [shape_of[each.name] for each in drawn.objects]

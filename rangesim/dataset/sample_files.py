@@ -137,7 +137,7 @@ class SensorRecord(Record, frozen=True, kw_only=True):
     """A sensor of the scene.
 
     camera : number of its camera, from 1. projector : plain data of the emitter. exposure_s : None if it is noise-free.
-    rows : statistics by material class, "all" last. doubts, notes : sentences of the decoder.
+    rows : statistics of each object and material class, as in `RowRecord`. doubts, notes : sentences of the decoder.
     """
 
     name: Name

@@ -19,7 +19,9 @@ from typing import Any, Literal
 from pcgraph.plumbing.plain_files import read_file
 from rangesim.dataset.sample_files import SampleRecord, members_of, mesh_in
 from rangesim.errors import EnvironmentProblem, FileFormatError
+from rangesim.evaluation.surface_rows import OBJECTS
 from rangesim.files.schema import Count, Record, read_record
+from rangesim.results.experiment_results import RowRecord
 from rangesim.triangle_mesh import TriangleMesh
 
 SETTINGS, INDEX, CHECKSUMS = "store.json", "index.parquet", "checksums.txt"
@@ -46,8 +48,8 @@ class IndexRow:
     scene : its number. shard, offset, size : where its bytes are; None for a scene that failed.
     sha256 : of these bytes. seed : of its light and noise.
     objects : their count. categories : of the objects, each once.
-    sensors : their names. right, wrong, missing : of each sensor, fractions of the pixels that see a surface; None if
-        none does.
+    sensors : their names. right, wrong, missing : of each sensor, fractions of the pixels of objects, each of which
+        weighs the same; if no object is seen, of all pixels that see a surface, or None if none does.
     error, traceback : why the scene failed; None for all others.
     """
 
@@ -76,7 +78,7 @@ class IndexRow:
     @classmethod
     def of(cls, record: SampleRecord, shard: int, offset: int, segment: bytes) -> IndexRow:
         """The row of a scene whose bytes stand at an offset of a shard."""
-        rows = [sensor.rows[-1] for sensor in record.sensors]
+        rows = [_verdict(sensor.rows) for sensor in record.sensors]
         return cls(
             scene=record.number,
             shard=shard,
@@ -91,6 +93,11 @@ class IndexRow:
             wrong=[row.wrong for row in rows],
             missing=[row.missing for row in rows],
         )
+
+
+def _verdict(rows: Sequence[RowRecord]) -> RowRecord:
+    """The row of the mean over objects; that of all surfaces if no object is seen."""
+    return next((row for row in rows if row.kind == OBJECTS), rows[-1])
 
 
 class Store:

@@ -24,7 +24,7 @@ class SensorTile:
     """What one sensor made of a scene.
 
     intensity : (h, w) float32. outcome : (h, w) uint8, index into `palette.OUTCOME_NAMES`.
-    right, wrong, missing : fractions of the pixels that see a surface; None if none does.
+    right, wrong, missing : fractions of the pixels of objects; None if not known.
     """
 
     name: str
