@@ -137,7 +137,7 @@ def _pile(solids: list[tuple[SolidModel, float]], support: Placed, random: np.ra
         turn = random.normal(size=4)
         body = spec.worldbody.add_body(pos=starts[i], quat=turn / np.linalg.norm(turn))
         body.add_freejoint()
-        for k, points in enumerate(solid.convex_pieces):
+        for k, points in enumerate(solid.collision.points):
             name = f"{i}_{k}"
             vertices = (scale * (points - solid.centre_of_mass_m)).astype(np.float32)
             spec.add_mesh(name=name, uservert=vertices.ravel())

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from rangesim.dataset.convex_pieces import ConvexPieces, convex_pieces
 from rangesim.triangle_mesh import TriangleMesh
 
 CREASE_DEG = 35.0
@@ -41,11 +42,9 @@ class SolidModel:
         return bool((angles > np.radians(FLAT_DEG)).any())
 
     @cached_property
-    def convex_pieces(self) -> tuple[np.ndarray, ...]:
-        """Points (k, 3), metres, part coordinates, of the convex pieces that collide."""
-        if self.pieces is not None:
-            return self.pieces
-        return (self.mesh.vertices,)
+    def collision(self) -> ConvexPieces:
+        """The convex pieces that collide, and how far they stand off the mesh."""
+        return convex_pieces(self.mesh) if self.pieces is None else ConvexPieces(self.pieces, 0.0)
 
     @cached_property
     def size_m(self) -> float:
