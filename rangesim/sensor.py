@@ -8,6 +8,7 @@ a range image. The sensors that come with the package are in `rangesim.sensors`;
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -298,6 +299,36 @@ class Background:
         return np.full(self.ambient.shape, max(fraction * self.bright, float(np.finfo(np.float32).tiny)))
 
 
+@dataclass(frozen=True)
+class ReceivedLight:
+    """Light that the pixels of a capture with noise received, as the closed forms of the noise need it.
+
+    `rangesim.evaluation.closed_forms` makes it from signals; `Decoder.depth_sigma_m` takes it. Electrons are those of
+    one exposure; of a photon counter, they are its counts in all bins together.
+
+    Parameters
+    ----------
+    emitter : (h, w) float64, electrons, light of the emitter at full power.
+    ambient : (h, w) float64, electrons, ambient light that passes the filter.
+    own_variance : float, electrons squared, variance that the detector itself adds to a frame, dark current included.
+    reading_m : (h, w) float64, metres, true reading: z, or the range of a camera that is no pinhole.
+    per_length : (h, w) float64, change of the reading per metre of path length there and back.
+    per_column, per_row : (h, w) float64, metres, change of the reading per projector pixel; NaN without such an axis.
+    focal_px : float, focal length of the camera in pixels along its rows; NaN if it is no pinhole.
+    trials : float, number of pulses of which each can hide later photons; infinite if no photon is hidden.
+    """
+
+    emitter: np.ndarray
+    ambient: np.ndarray
+    own_variance: float
+    reading_m: np.ndarray
+    per_length: np.ndarray
+    per_column: np.ndarray
+    per_row: np.ndarray
+    focal_px: float
+    trials: float = math.inf
+
+
 class FrameContent(NamedTuple):
     """Light and dark current in the frame, or group of frames, that decides about a reading.
 
@@ -369,6 +400,16 @@ class Decoder(Named, ABC):
     @abstractmethod
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         """(h, w) float64, least light of the emitter at full power that the thresholds accept, in `background.unit`."""
+
+    def depth_sigma_m(self, sensor: Sensor, light: ReceivedLight) -> np.ndarray | None:
+        """(h, w) float64, metres, standard deviation of a correct reading by a closed form; None if there is none.
+
+        It follows from the light alone and shares no code with the estimates that `coordinates` makes from frames.
+        """
+        return None
+
+    is_lower_bound: ClassVar[bool] = False
+    """Whether `depth_sigma_m` is a bound that no method can surpass, and not the noise of this decoder's method."""
 
     @property
     def reach_px(self) -> int:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,7 +28,7 @@ from rangesim.decoding.working_range import WorkingRange
 from rangesim.electronics.detector import Gate
 from rangesim.electronics.spad import SpadDetector
 from rangesim.response import SPEED_OF_LIGHT, Pulse, Response, TransientHistogram
-from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, Threshold, of_type
+from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, ReceivedLight, Sensor, Threshold, of_type
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, Fraction, check_fields, whole
 
@@ -345,6 +346,36 @@ class DirectToFDecoder(Decoder):
     def _fits_pulses(self, sensor: DirectToF) -> bool:
         """Whether pulses are fitted, instead of taking the centroid of the highest peak."""
         return sensor.pulse is not None or self.max_returns > 1 or self.min_range_m > 0
+
+    def depth_sigma_m(self, sensor: Sensor, light: ReceivedLight) -> np.ndarray | None:
+        """The noise of the centroid of a window around the peak, from the photons of a Gaussian pulse and an even
+        background; None where pulses are fitted.
+
+        Pile-up hides a photon behind an earlier one of its pulse, so a bin has exp(m) times the variance of its counts,
+        for m photons per trial that come before. The window cuts the pulse off, so its centroid grows with the place
+        of the pulse at the rate r < 1. The window itself stands around a first centroid, at a whole bin: that adds 1 - r
+        times the first centroid's noise, which is the same, and 1 - r times an error spread evenly over a bin.
+        """
+        tof = of_type(sensor, DirectToF)
+        sigma = tof.sigma_bins
+        if self._fits_pulses(tof) or sigma == 0:
+            return None
+        reach = window_reach(tof.bins, sigma, tof.is_cyclic)
+        end = (reach + 0.5) / sigma
+        inside = math.erf(end / math.sqrt(2))
+        rate = 1 - 2 * end * math.exp(-(end**2) / 2) / (math.sqrt(2 * math.pi) * inside)
+        background = light.ambient / tof.bins + light.own_variance
+        length_bins = light.reading_m / np.abs(light.per_length) / (tof.bin_s * SPEED_OF_LIGHT)
+        before = background * np.clip(length_bins - tof.start_s / tof.bin_s, 0, tof.bins)
+        moment = np.zeros(light.emitter.shape)
+        for k in range(-reach, reach + 1):
+            below, above = (0.5 * (1 + math.erf((k + side) / (sigma * math.sqrt(2)))) for side in (-0.5, 0.5))
+            counts = (above - below) * light.emitter + background
+            hidden = np.exp((before + (above + below) / 2 * light.emitter) / light.trials)
+            moment += k**2 * counts * hidden
+        with np.errstate(divide="ignore", invalid="ignore"):
+            variance = moment * ((2 - rate) / (inside * light.emitter)) ** 2 + (1 - rate) ** 2 / 12
+        return np.asarray(np.sqrt(variance) * tof.bin_s * SPEED_OF_LIGHT * np.abs(light.per_length))
 
     def _of_peaks(self, capture: Capture, sensor: DirectToF) -> PathLengths:
         """Path lengths of the highest peaks, by their centroids."""
