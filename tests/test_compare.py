@@ -60,8 +60,8 @@ def test_a_perfect_image_has_no_errors(scene: tuple[np.ndarray, GroundTruth]) ->
     assert [row.material for row in result.table] == ["matte", "glass", "all"]
     for row in result.table:
         assert row.pixels == row.lit == (200 if row.material == "all" else 100)
-        assert (row.completeness, row.coverage) == (1, 1)
-        assert row.bias_m == row.median_abs_m == row.rmse_m == row.p95_abs_m == row.outlier_rate == 0
+        assert (row.right, row.wrong, row.missing, row.completeness) == (1, 0, 0, 1)
+        assert row.bias_m == row.median_abs_m == row.rmse_m == row.p95_abs_m == 0
         assert row.edge_pixels == 0 or row.flying_rate == 0
 
 
@@ -74,15 +74,15 @@ def test_errors_come_out_per_class(scene: tuple[np.ndarray, GroundTruth]) -> Non
     result = compare(image_of(measured), truth)
     matte, glass = result.row("matte"), result.row("glass")
     np.testing.assert_allclose([matte.bias_m, matte.median_abs_m, matte.rmse_m, matte.p95_abs_m], 0.002, atol=1e-6)
-    assert matte.outlier_rate == 0
+    assert (matte.right, matte.wrong, matte.missing) == (1, 0, 0)
+    assert (glass.right, glass.wrong, glass.missing) == (0, 0.5, 0.5)
     assert glass.completeness == 0.5
-    assert glass.outlier_rate == 1
     assert abs(glass.bias_m + 0.05) < 1e-6
-    assert abs(result.row("all").outlier_rate - 50 / 150) < 1e-9
+    assert (result.row("all").right, result.row("all").wrong, result.row("all").missing) == (0.5, 0.25, 0.25)
     assert np.isnan(result.error_m[:5, 10:]).all()
     assert np.isnan(result.error_m[10]).all()
     np.testing.assert_allclose(result.error_m[:10, :10], 0.002, atol=1e-6)
-    assert compare(image_of(measured), truth, outlier_m=0.001).row("matte").outlier_rate == 1
+    assert compare(image_of(measured), truth, tolerance_m=0.001).row("matte").wrong == 1
 
 
 def test_shadow_is_no_incompleteness(scene: tuple[np.ndarray, GroundTruth]) -> None:
@@ -91,7 +91,26 @@ def test_shadow_is_no_incompleteness(scene: tuple[np.ndarray, GroundTruth]) -> N
     visible[:, :5] = False
     measured = np.where(visible, z, np.nan)
     row = compare(image_of(measured), dataclasses.replace(truth, projector_visible=visible)).row("matte")
-    assert (row.pixels, row.lit, row.completeness, row.coverage) == (100, 50, 1.0, 0.5)
+    assert (row.pixels, row.lit, row.completeness) == (100, 50, 1.0)
+    assert (row.right, row.wrong, row.missing) == (0.5, 0.0, 0.5)
+
+
+def test_right_wrong_and_missing_add_up_and_follow_the_tolerance(scene: tuple[np.ndarray, GroundTruth]) -> None:
+    z, truth = scene
+    errors = np.random.default_rng(0).normal(0, 0.01, z.shape)
+    measured = np.where(np.random.default_rng(1).random(z.shape) < 0.3, np.nan, z + errors)
+    measured[0] = z[0]  # a perfect reading is right, whatever the tolerance
+    before = np.zeros(3)
+    for tolerance_m in (1e-12, 1e-3, 1e-2, 1e-1):
+        rows = compare(image_of(measured), truth, tolerance_m).table
+        for row in rows:
+            assert row.right + row.wrong + row.missing == pytest.approx(1, abs=1e-12)
+        right = np.array([row.right for row in rows])
+        assert (right >= before).all()
+        assert (right >= 0.1).all()
+        before = right
+    missing = np.isnan(measured[:10]).mean()
+    assert (rows[-1].right, rows[-1].missing) == pytest.approx((1 - missing, missing))
 
 
 def test_flying_pixels_lie_on_neither_side_of_an_edge() -> None:
@@ -99,15 +118,15 @@ def test_flying_pixels_lie_on_neither_side_of_an_edge() -> None:
     truth = truth_of(z, np.zeros(z.shape, np.int32))
     measured = z.copy()
     measured[:, 9] = 1.5  # between both sides: flies
-    measured[:, 10] = 1.0  # on the wrong side of the edge: an outlier, but no flying pixel
-    measured[:, 3] = 1.5  # far from the edge: an outlier only
+    measured[:, 10] = 1.0  # on the wrong side of the edge: wrong, but no flying pixel
+    measured[:, 3] = 1.5  # far from the edge: wrong only
     result = compare(image_of(measured), truth)
     row = result.row("all")
     assert row.edge_pixels == 60
     assert result.flying.sum() == 10
     assert result.flying[:, 9].all()
     assert abs(row.flying_rate - 10 / 60) < 1e-9
-    assert abs(row.outlier_rate - 30 / 200) < 1e-9
+    assert (row.right, row.wrong, row.missing) == (170 / 200, 30 / 200, 0)
 
 
 def test_tables_are_json_and_markdown(scene: tuple[np.ndarray, GroundTruth]) -> None:
@@ -128,8 +147,8 @@ def test_impossible_comparisons_are_refused(scene: tuple[np.ndarray, GroundTruth
     z, truth = scene
     with pytest.raises(ValueError, match="shape"):
         compare(image_of(z[:5]), truth)
-    with pytest.raises(ValueError, match="outlier_m"):
-        compare(image_of(z), truth, outlier_m=0)
+    with pytest.raises(ValueError, match="tolerance_m"):
+        compare(image_of(z), truth, tolerance_m=0)
     with pytest.raises(ValueError, match="matte, glass, all"):
         compare(image_of(z), truth).row("wood")
 

@@ -24,7 +24,7 @@ from tiers import to_validate
 from typer.testing import CliRunner
 
 from pcgraph.viewer.node_colors import node_colors
-from rangesim.causes import Cause
+from rangesim.causes import Cause, CauseMap
 from rangesim.cli import app
 from rangesim.decoding.status import Status
 from rangesim.environment.doctor import find_browser
@@ -42,6 +42,7 @@ from rangesim.sensors import IdealToF
 BROWSER = find_browser()
 CANVAS = (16, 21, 29)
 """Background of the point clouds."""
+MEDIAN = next(c for c in tables.COLUMNS if c.key == "median_abs_m")
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium found; apt-get install chromium")
 
 
@@ -70,7 +71,7 @@ def test_every_part_is_there(html: str) -> None:
 def test_the_table_shows_the_statistics(html: str) -> None:
     for m in load_result(small_result()).measurements:
         for row in m.rows:
-            assert f">{tables.number(tables.COLUMNS[2], row['median_abs_m'])}</span>" in html
+            assert f">{tables.number(MEDIAN, row['median_abs_m'])}</span>" in html
 
 
 def test_text_from_outside_is_escaped(tmp_path: Path) -> None:
@@ -142,8 +143,9 @@ def test_causes_are_told_apart_without_red_or_green_cones(sight: str) -> None:
 def test_the_failures_of_a_surface_add_up() -> None:
     for m in load_result(small_result()).measurements:
         for row in m.rows:
-            assert sum(row["causes"].values()) == pytest.approx(row["failed"])
-        assert m.rows[-1]["failed"] == pytest.approx(m.causes.failed[np.isfinite(m.truth.z)].mean())
+            assert sum(row["causes"].values()) == pytest.approx(row["wrong"] + row["missing"])
+            assert row["right"] + row["wrong"] + row["missing"] == pytest.approx(1)
+        assert 1 - m.rows[-1]["right"] == pytest.approx(m.causes.failed[np.isfinite(m.truth.z)].mean())
 
 
 def test_a_node_has_the_colour_of_its_largest_child() -> None:
@@ -155,14 +157,14 @@ def test_a_node_has_the_colour_of_its_largest_child() -> None:
 
 
 def test_the_verdict_says_what_the_rows_say() -> None:
-    good = _measured("lines", 0.99, 1e-3, 0.01, acquisition_s=0.2)
-    poor = _measured("amcw", 0.4, 5e-3, 0.7, acquisition_s=0.1)
-    fair = _measured("histogram", 0.9, 2e-3, 0.02, acquisition_s=0.3)
+    good = _measured("lines", right=0.95, wrong=0.01, median=1e-3, acquisition_s=0.2)
+    poor = _measured("amcw", right=0.12, wrong=0.28, median=5e-3, acquisition_s=0.1)
+    fair = _measured("histogram", right=0.88, wrong=0.02, median=2e-3, acquisition_s=0.3)
     first, second, _, both = verdict([good, poor, fair])
-    assert "99.0\xa0% of the pixels" in first.text
+    assert "96.0\xa0% of the pixels" in first.text
     assert "1.00\xa0mm" in first.text
     assert "Unreliable" not in first.text
-    assert "glossy (60\xa0% missing, 70\xa0% of the rest wrong by over 10\xa0mm)" in second.text
+    assert "glossy (60\xa0% missing, 28\xa0% wrong by over 10\xa0mm)" in second.text
     assert "Smallest median error: Structured light, 1.00\xa0mm" in both.text
     assert "Shortest exposure of all frames: Time of flight (AMCW)" in both.text
     assert "It fails on 5.0\xa0% of the pixels: 80\xa0% multipath, 20\xa0% low signal." in first.text
@@ -176,9 +178,9 @@ def _side_by_side(*measurements: Any) -> str:
 
 def test_side_by_side_ranks_by_right_readings() -> None:
     """The one that measures everywhere, but wrong, was "most complete" at 97.0 %; it reads half of the pixels right."""
-    wrong = _measured("amcw", 0.97, 5e-3, 0.4, acquisition_s=0.1, failed=0.5)
-    right = _measured("lines", 0.9, 1e-3, 0.01, acquisition_s=0.2, failed=0.12)
-    fair = _measured("histogram", 0.95, 2e-3, 0.1, acquisition_s=0.3, failed=0.15)
+    wrong = _measured("amcw", right=0.5, wrong=0.47, median=5e-3, acquisition_s=0.1)
+    right = _measured("lines", right=0.88, wrong=0.02, median=1e-3, acquisition_s=0.2)
+    fair = _measured("histogram", right=0.85, wrong=0.1, median=2e-3, acquisition_s=0.3)
     best, against = (
         "Most right readings, to 10\xa0mm: Structured light, 88.0\xa0% of the pixels",
         "50.0\xa0% of the pixels",
@@ -187,24 +189,23 @@ def test_side_by_side_ranks_by_right_readings() -> None:
         assert f"{best} (against {against})." in _side_by_side(*two)
     assert f"{best} (next: Time of flight (direct), 85.0\xa0% of the pixels)." in _side_by_side(wrong, fair, right)
     assert "97.0" not in _side_by_side(wrong, right)
-    assert "right readings" not in _side_by_side(right, _measured("amcw", 0.97, 5e-3, 0.4, 0.1, failed=0.12))
-    assert "right readings" not in _side_by_side(right, _measured("amcw", 0.97, 5e-3, 0.4, 0.1, failed=None))
+    assert "right readings" not in _side_by_side(right, _measured("amcw", right=0.88, wrong=0.12, median=5e-3))
 
 
 def test_no_measurement_is_bold_for_being_there() -> None:
-    wrong = _measured("amcw", 0.97, 5e-3, 0.4, acquisition_s=0.1)
-    right = _measured("lines", 0.9, 1e-3, 0.01, acquisition_s=0.2)
+    wrong = _measured("amcw", right=0.58, wrong=0.39, median=5e-3)
+    right = _measured("lines", right=0.89, wrong=0.01, median=1e-3)
     (_, lines), *_ = tables.comparison_table([wrong, right])
     bold = {
         name: [c.title for c, cell in zip(tables.COLUMNS, cells, strict=True) if cell.best] for name, cells in lines
     }
-    assert bold == {"amcw": [], "lines": ["median error", "95\xa0% within", "outliers"]}
+    assert bold == {"amcw": [], "lines": ["right", "wrong", "median error", "95\xa0% within"]}
 
 
 def test_no_bold_where_a_sensor_is_unreliable() -> None:
-    good = _measured("lines", 0.99, 5e-3, 0.01, acquisition_s=0.2)
-    fair = _measured("histogram", 0.9, 6e-3, 0.02, acquisition_s=0.2)
-    few = _measured("amcw", 0.1, 1e-3, 0.0, acquisition_s=0.1)  # the best error, on the tenth that is left
+    good = _measured("lines", right=0.98, wrong=0.01, median=5e-3)
+    fair = _measured("histogram", right=0.88, wrong=0.02, median=6e-3)
+    few = _measured("amcw", right=0.1, wrong=0.0, median=1e-3)  # the best error, on the tenth that is left
 
     def bold(*measurements: Any) -> list[str]:
         (_, lines), *_ = tables.comparison_table(measurements)
@@ -214,21 +215,22 @@ def test_no_bold_where_a_sensor_is_unreliable() -> None:
     assert bold(good, few) == []
 
 
-def _measured(
-    sensor: str, complete: float, median: float, outliers: float, acquisition_s: float, failed: float | None = 0.05
-) -> Any:
+def _measured(sensor: str, right: float, wrong: float, median: float, acquisition_s: float = 0.1) -> Any:
     row: dict[str, Any] = {
-        "completeness": complete,
+        "right": right,
+        "wrong": wrong,
+        "missing": 1 - right - wrong,
+        "completeness": right + wrong,
         "median_abs_m": median,
         "p95_abs_m": 3 * median,
-        "outlier_rate": outliers,
     }
     row |= {column.key: None for column in tables.COLUMNS if column.key not in row}
-    row |= {"failed": failed, "causes": {"multipath": 0.8 * failed, "low_signal": 0.2 * failed} if failed else {}}
+    row["causes"] = {"multipath": 0.8 * (1 - right), "low_signal": 0.2 * (1 - right)}
     rows: list[dict[str, Any]] = [{"material": name, **row} for name in ("glossy", "all")]
     metadata = SimpleNamespace(acquisition_s=acquisition_s, frames=10)
     capture, camera = SimpleNamespace(sensor=SENSORS[sensor]), Intrinsics.from_fov(4, 3, fov_x_deg=40.0)
-    return SimpleNamespace(name=sensor, capture=capture, camera=camera, rows=rows, metadata=metadata)
+    causes = CauseMap(np.zeros((3, 4), np.uint8), 0.01)
+    return SimpleNamespace(name=sensor, capture=capture, camera=camera, rows=rows, metadata=metadata, causes=causes)
 
 
 @needs_browser

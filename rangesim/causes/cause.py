@@ -111,11 +111,12 @@ class CauseMap(ShortRepr):
         return np.asarray(self.cause != Cause.NONE)
 
     def fractions(self, truth: GroundTruth) -> list[dict[str, Any]]:
-        """Fractions of failed pixels and of their causes, per material class of the first surface, "all" last.
+        """Fractions of right pixels and of the causes of the others, per material class, "all" last.
 
-        Each entry is a dict with `material` (str), `failed` (fraction of the pixels of this class; None if there are
+        Each entry is a dict with `material` (str), `right` (fraction of the pixels of this class; None if there are
         none) and `causes` (name of the cause in lower case -> fraction of the pixels of this class; the largest is
-        first, and none is 0). `rangesim.report.failures_markdown` makes a table of the entries.
+        first, and none is 0). Together they add up to 1. `rangesim.report.failures_markdown` makes a table of the
+        entries.
 
         Parameters
         ----------
@@ -129,4 +130,4 @@ def _row(material: str, causes: np.ndarray) -> dict[str, Any]:
     counts = np.bincount(causes, minlength=len(Cause))
     found = sorted((c for c in Cause if c and counts[c]), key=lambda c: -counts[c])
     fractions = {c.name.lower(): float(counts[c] / causes.size) for c in found}
-    return {"material": material, "failed": float(np.mean(causes > 0)) if causes.size else None, "causes": fractions}
+    return {"material": material, "right": float(np.mean(causes == 0)) if causes.size else None, "causes": fractions}

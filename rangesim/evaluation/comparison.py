@@ -16,11 +16,11 @@ from rangesim.rig import is_same_pose
 from rangesim.settings.config import ShortRepr
 from rangesim.signals import GroundTruth, Signals
 
-OUTLIER_M = 0.010
-"""Error of a reading, in metres, above which it is an outlier and counts as failed.
+TOLERANCE_M = 0.010
+"""Largest error of a right reading, in metres, unless the task states another one.
 
-The value is a choice, not a measurement. It decides what fraction of the readings is called wrong, so every table
-states it.
+The value is a choice, not a measurement. It decides what fraction of the pixels is called wrong, so every table states
+the tolerance.
 """
 EDGE_RADIUS = 2
 """Distance from a depth edge, in pixels, within which a pixel can be a flying pixel.
@@ -39,26 +39,27 @@ class ErrorStatistics:
     material : str, class of the first surface behind the pixel, or "all".
     pixels : int, number of pixels with a true depth.
     lit : int, number of those pixels that the emitter lights; the others lie in its shadow or outside its field.
-    completeness : fraction of the lit pixels that have a reading.
-    coverage : fraction of all pixels that have a reading.
+    right, wrong, missing : fractions of all pixels, lit or not, which add up to 1: with a reading and
+        |z - true z| <= `tolerance_m`, with a reading and a larger error, without a reading.
+    completeness : fraction of the lit pixels that have a reading, right or wrong.
     bias_m : mean of z - true z, metres, over all pixels with a reading, lit or not.
     median_abs_m, rmse_m, p95_abs_m : median, root mean square and 95th percentile of |z - true z|, metres.
-    outlier_rate : fraction of the readings with |z - true z| > `outlier_m`.
     edge_pixels : int, number of pixels with a reading within `EDGE_RADIUS` pixels of a depth edge.
-    flying_rate : fraction of the edge pixels that are flying pixels: their z differs by more than `outlier_m` from
+    flying_rate : fraction of the edge pixels that are flying pixels: their z differs by more than `tolerance_m` from
         every true depth in the window of 5 x 5 pixels, so that they lie on neither side of the edge.
     """
 
     material: str
     pixels: int
     lit: int
+    right: float
+    wrong: float
+    missing: float
     completeness: float
-    coverage: float
     bias_m: float
     median_abs_m: float
     rmse_m: float
     p95_abs_m: float
-    outlier_rate: float
     edge_pixels: int
     flying_rate: float
 
@@ -70,13 +71,13 @@ class Comparison(ShortRepr):
     table : tuple of ErrorStatistics, one for each material class, "all" last.
     error_m : (h, w) float32, metres, z - true z; NaN where there is no reading or no true surface.
     flying : (h, w) bool, flying pixels.
-    outlier_m : float, metres, error above which a reading is an outlier.
+    tolerance_m : float, metres, largest error of a right reading.
     """
 
     table: tuple[ErrorStatistics, ...]
     error_m: np.ndarray
     flying: np.ndarray
-    outlier_m: float
+    tolerance_m: float
 
     def rows(self) -> list[dict[str, Any]]:
         """One dict per material class, as JSON can hold it: None in place of NaN."""
@@ -100,19 +101,19 @@ class Comparison(ShortRepr):
         raise ValueError(f"expected a material class out of {names}, got {material!r}.")
 
 
-def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = OUTLIER_M) -> Comparison:
+def compare(image: RangeImage, truth: GroundTruth | Signals, tolerance_m: float = TOLERANCE_M) -> Comparison:
     """Errors of a range image against the ground truth, per material class and over all pixels.
 
     Parameters
     ----------
     image : RangeImage.
     truth : GroundTruth, or the Signals that contain it.
-    outlier_m : float, metres; readings with a larger error are outliers.
+    tolerance_m : float, metres, largest error of a right reading; what the task of the sensor can bear.
 
     Raises
     ------
     ValueError
-        Image and truth differ in size, the signals are those of a camera at another place, or `outlier_m` is not
+        Image and truth differ in size, the signals are those of a camera at another place, or `tolerance_m` is not
         positive.
 
     Examples
@@ -124,8 +125,10 @@ def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = 
     >>> [statistics.material for statistics in comparison.table]
     ['matte', 'all']
     >>> matte = comparison.row("matte")
-    >>> matte.completeness, matte.median_abs_m < 0.005
-    (1.0, True)
+    >>> matte.right, matte.wrong, matte.missing
+    (1.0, 0.0, 0.0)
+    >>> compare(image, signals, tolerance_m=1e-9).row("matte").right < 0.5
+    True
 
     References
     ----------
@@ -140,15 +143,15 @@ def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = 
     true_m = truth.z if image.camera is None else image.camera.reading(truth)
     if image.z.shape != truth.z.shape:
         raise ValueError(f"expected ground truth of shape {image.z.shape} as the image, got {truth.z.shape}.")
-    if not outlier_m > 0:
-        raise ValueError(f"expected a positive outlier_m in metres, got {outlier_m}.")
+    if not tolerance_m > 0:
+        raise ValueError(f"expected a positive tolerance_m in metres, got {tolerance_m}.")
     error = np.where(image.valid, image.reading_m.astype(np.float64) - true_m, np.nan)
-    edge, flying = _flying(image.reading_m, true_m, outlier_m, neighbourhood(image.camera))
+    edge, flying = _flying(image.reading_m, true_m, tolerance_m, neighbourhood(image.camera))
     table = [
-        _statistics(name, mask, error, truth.projector_visible, edge, flying, outlier_m)
+        _statistics(name, mask, error, truth.projector_visible, edge, flying, tolerance_m)
         for name, mask in truth.classes().items()
     ]
-    return Comparison(tuple(table), error.astype(np.float32), flying, outlier_m)
+    return Comparison(tuple(table), error.astype(np.float32), flying, tolerance_m)
 
 
 def _statistics(
@@ -158,7 +161,7 @@ def _statistics(
     visible: np.ndarray,
     edge: np.ndarray,
     flying: np.ndarray,
-    outlier_m: float,
+    tolerance_m: float,
 ) -> ErrorStatistics:
     """Statistics of the pixels `mask` (h, w) bool, which are those of the material class `name`."""
     measured = mask & np.isfinite(error)
@@ -170,13 +173,14 @@ def _statistics(
         material=name,
         pixels=int(mask.sum()),
         lit=int(lit.sum()),
+        right=_fraction(mask & (np.abs(error) <= tolerance_m), mask),
+        wrong=_fraction(mask & (np.abs(error) > tolerance_m), mask),
+        missing=_fraction(mask & ~measured, mask),
         completeness=_fraction(measured & visible, lit),
-        coverage=_fraction(measured, mask),
         bias_m=float(e.mean()) if e.size else math.nan,
         median_abs_m=float(median),
         rmse_m=float(np.sqrt(np.mean(e**2))) if e.size else math.nan,
         p95_abs_m=float(p95),
-        outlier_rate=float(np.mean(absolute > outlier_m)) if e.size else math.nan,
         edge_pixels=int(at_edge.sum()),
         flying_rate=_fraction(at_edge & flying, at_edge),
     )
@@ -189,7 +193,7 @@ def _fraction(part: np.ndarray, whole: np.ndarray) -> float:
 
 
 def _flying(
-    z: np.ndarray, true_z: np.ndarray, outlier_m: float, pixels: Neighbourhood
+    z: np.ndarray, true_z: np.ndarray, tolerance_m: float, pixels: Neighbourhood
 ) -> tuple[np.ndarray, np.ndarray]:
     """Two masks, (h, w) bool each: pixels near a depth edge, and flying pixels."""
     far = np.where(np.isfinite(true_z), true_z, np.inf)
@@ -197,6 +201,6 @@ def _flying(
     measured = np.where(np.isfinite(z), z, np.nan)
     for shifted in pixels.shifted(far, EDGE_RADIUS):
         np.fmin(nearest, np.abs(measured - shifted), out=nearest)
-    edges = depth_edges(true_z, outlier_m, pixels)
+    edges = depth_edges(true_z, tolerance_m, pixels)
     edge = np.any(pixels.shifted(edges, EDGE_RADIUS), axis=0) & np.isfinite(true_z)
-    return edge, edge & np.isfinite(measured) & (nearest > outlier_m)
+    return edge, edge & np.isfinite(measured) & (nearest > tolerance_m)

@@ -253,7 +253,7 @@ def measure(
         image = replace(image, sampling_sigma_m=np.abs(noise.sampling))
     comparison = compare(image, signals.truth)
     with timed(times, "causes"):
-        causes = causes_of(readings, comparison.outlier_m)
+        causes = causes_of(readings, comparison.tolerance_m)
     rows = [row | failures for row, failures in zip(comparison.rows(), causes.fractions(signals.truth), strict=True)]
     if noise is not None:
         rows = [row | sigmas for row, sigmas in zip(rows, noise.by_material(signals.truth), strict=True)]

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
-from rangesim.evaluation.comparison import OUTLIER_M, Comparison, ErrorStatistics
+from rangesim.evaluation.comparison import Comparison, ErrorStatistics
 from rangesim.evaluation.range_noise import SMALL, noise_ratio
 from rangesim.experiment import Experiment
 from rangesim.presets import catalogue
@@ -21,12 +21,12 @@ from rangesim.results.experiment_results import Measurement, PhotonsRecord
 Rows = list[dict[str, Any]]
 """Statistics per material class, one dict each, with the keys of `rangesim.results.experiment_results.RowRecord`."""
 
-FAILURE_HEADS = ["failed (%)", "because (% of the pixels)"]
-"""Heads of the columns that say how many pixels failed, and why."""
-UNRELIABLE = 0.5
-"""Smallest fraction of outliers, or of missing readings, at which a sensor is called unreliable on a material.
+CAUSE_HEADS = ["right (%)", "others failed because (% of the pixels)"]
+"""Heads of the columns that say how many pixels are right, and why the others are not."""
+MOST = 0.5
+"""Fraction of the pixels of a surface that must be right for a sensor to be reliable on it.
 
-At one half, a reading is as likely wrong as right.
+At one half, a pixel is as likely right as not.
 """
 
 
@@ -34,8 +34,8 @@ At one half, a reading is as likely wrong as right.
 class Column:
     """A column of the table of errors.
 
-    key : name of the value in a row. title, unit, meaning : text of the page. better : which value is best, "low" or
-    "near zero"; "" if no value is better than another.
+    key : name of the value in a row. title, unit, meaning : text of the page. better : which value is best, "high",
+    "low" or "near zero"; "" if no value is better than another.
     """
 
     key: str
@@ -46,6 +46,15 @@ class Column:
 
 
 COLUMNS = (
+    Column("right", "right", "%", "fraction of all pixels with a reading within the tolerance", "high"),
+    Column("wrong", "wrong", "%", "fraction with a reading off by more"),
+    Column(
+        "missing",
+        "missing",
+        "%",
+        "fraction without a reading, in shadow or not",
+        "",  # fewer missing readings are not better if those that are there are wrong
+    ),
     Column(
         "completeness",
         "complete",
@@ -58,7 +67,6 @@ COLUMNS = (
     Column("median_abs_m", "median error", "mm", "median of |z − true z|"),
     Column("rmse_m", "RMSE", "mm", "root mean square of z − true z"),
     Column("p95_abs_m", "95\N{NO-BREAK SPACE}% within", "mm", "95th percentile of |z − true z|"),
-    Column("outlier_rate", "outliers", "%", f"fraction of the measurements off by more than {1e3 * OUTLIER_M:g} mm"),
     Column("flying_rate", "flying", "%", "fraction of the measurements at depth edges that lie on neither side"),
 )
 """Columns of the table of errors, from left to right."""
@@ -99,14 +107,9 @@ def is_reference(measurement: Measurement) -> bool:
     return measurement.capture.sensor.is_ideal
 
 
-def missing_fraction(row: dict[str, Any]) -> float:
-    """Fraction of the lit pixels without a reading; 0 if no pixel is lit."""
-    return 1.0 - row["completeness"] if row["completeness"] is not None else 0.0
-
-
-def is_unreliable(row: dict[str, Any]) -> bool:
-    """Whether half of the lit pixels or more have no measurement, or half of the measurements or more are outliers."""
-    return max(missing_fraction(row), row["outlier_rate"] or 0.0) >= UNRELIABLE
+def is_reliable(row: dict[str, Any]) -> bool:
+    """Whether most pixels of a row are right."""
+    return (row["right"] or 0.0) > MOST
 
 
 def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, list[Cell]]]]]:
@@ -118,7 +121,7 @@ def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, lis
     for material in materials(measurements):
         rows = {m.name: row for m in measurements for row in m.rows if row["material"] == material}
         real = [rows[m.name] for m in measurements if m.name in rows and not is_reference(m)]
-        rivals = [row for row in real if not is_unreliable(row)]  # the few readings of the others prove nothing
+        rivals = [row for row in real if is_reliable(row)]  # the few readings of the others prove nothing
         best = {c.key: _best(c, rivals) for c in COLUMNS}
         lines = [(n, [_cell(c, row, best[c.key], row in rivals) for c in COLUMNS]) for n, row in rows.items()]
         table.append((material, lines))
@@ -126,15 +129,15 @@ def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, lis
 
 
 def failure_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, str, list[LegendEntry]]]]]:
-    """Failed pixels of each instrument per material class, "all" first.
+    """Right pixels of each instrument and causes of the others per material class, "all" first.
 
-    Each entry is the material and a list with, for each instrument, its name, the failed pixels in percent, and the
-    legend of their causes.
+    Each entry is the material and a list with, for each instrument, its name, the right pixels in percent, and the
+    legend of the causes of the others.
     """
     table = []
     for material in materials(measurements):
         rows = [(m.name, row) for m in measurements for row in m.rows if row["material"] == material]
-        lines = [(name, _percent(row["failed"]), parts(row)) for name, row in rows if row["failed"] is not None]
+        lines = [(name, _percent(row["right"]), parts(row)) for name, row in rows if row["right"] is not None]
         table.append((material, lines))
     return table
 
@@ -175,7 +178,7 @@ def materials(measurements: Sequence[Measurement]) -> list[str]:
 
 
 def comparison_tables(tables: Sequence[tuple[str, Rows]]) -> list[Table]:
-    """Tables of errors, of failures and of noise, with one row per material and instrument.
+    """Tables of errors, of causes and of noise, with one row per material and instrument.
 
     Parameters
     ----------
@@ -183,7 +186,7 @@ def comparison_tables(tables: Sequence[tuple[str, Rows]]) -> list[Table]:
     """
     return [
         _table(tables, [f"{c.title} ({c.unit})" for c in COLUMNS], lambda row: [_text(c, row) for c in COLUMNS]),
-        _table(tables, FAILURE_HEADS, _failures),
+        _table(tables, CAUSE_HEADS, _causes),
         _table(tables, ["detector noise (mm)", "sampling noise (mm)"], _noise),
     ]
 
@@ -208,7 +211,7 @@ def errors_markdown(comparison: Comparison) -> str:
 
     >>> from rangesim import errors_markdown
     >>> print(errors_markdown(comparison).splitlines()[0])
-    | material | pixels | lit | completeness | coverage | bias mm | ... | flying rate |
+    | material | pixels | lit | right | wrong | missing | completeness | ... | flying rate |
     """
     heads = [f.name.replace("_m", "_mm") if f.name.endswith("_m") else f.name for f in fields(ErrorStatistics)]
     rows = [[_plain(name, value) for name, value in asdict(row).items()] for row in comparison.table]
@@ -227,7 +230,7 @@ def _plain(name: str, value: Any) -> str:
 
 
 def failures_markdown(rows: Rows) -> str:
-    """Markdown table of the failed pixels and their causes, with one row per material class; fractions in %.
+    """Markdown table of the right pixels and the causes of the others, with one row per material class; in %.
 
     Parameters
     ----------
@@ -236,13 +239,13 @@ def failures_markdown(rows: Rows) -> str:
     Examples
     --------
     >>> from rangesim import failures_markdown
-    >>> rows = [{"material": "glossy", "failed": 0.25, "causes": {"multipath": 0.2, "low_signal": 0.05}}]
+    >>> rows = [{"material": "glossy", "right": 0.75, "causes": {"multipath": 0.2, "low_signal": 0.05}}]
     >>> print(failures_markdown(rows), end="")
-    | material | failed (%) | because (% of the pixels) |
+    | material | right (%) | others failed because (% of the pixels) |
     | --- | --- | --- |
-    | glossy | 25.0 | multipath 20.0, low signal 5.0 |
+    | glossy | 75.0 | multipath 20.0, low signal 5.0 |
     """
-    return Table(["material", *FAILURE_HEADS], [[row["material"], *_failures(row)] for row in rows]).markdown()
+    return Table(["material", *CAUSE_HEADS], [[row["material"], *_causes(row)] for row in rows]).markdown()
 
 
 def _table(tables: Sequence[tuple[str, Rows]], heads: list[str], texts: Callable[[dict[str, Any]], list[str]]) -> Table:
@@ -254,9 +257,9 @@ def _table(tables: Sequence[tuple[str, Rows]], heads: list[str], texts: Callable
     return Table(["material", "sensor", *heads], lines)
 
 
-def _failures(row: dict[str, Any]) -> list[str]:
-    """Cells of the failed pixels, in percent, and of their causes."""
-    return [_percent(row["failed"]), ", ".join(f"{p.name} {p.text}" for p in parts(row)) or "–"]
+def _causes(row: dict[str, Any]) -> list[str]:
+    """Cells of the right pixels, in percent, and of the causes of the others."""
+    return [_percent(row["right"]), ", ".join(f"{p.name} {p.text}" for p in parts(row)) or "–"]
 
 
 def _noise(row: dict[str, Any]) -> list[str]:
@@ -351,7 +354,7 @@ def _best(column: Column, rows: Sequence[dict[str, Any]]) -> float | None:
     values = [row[column.key] for row in rows if row[column.key] is not None]
     if len(rows) < 2 or not values or not column.better:
         return None
-    return float(min(values, key=abs))
+    return float(max(values) if column.better == "high" else min(values, key=abs))
 
 
 def _cell(column: Column, row: dict[str, Any], best: float | None, rival: bool) -> Cell:

@@ -7,13 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rangesim.evaluation.comparison import OUTLIER_M
 from rangesim.report.tables import (
     Rows,
     is_reference,
-    is_unreliable,
+    is_reliable,
     millimetres,
-    missing_fraction,
     parts,
     seconds,
     titles,
@@ -37,7 +35,7 @@ def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
     """Findings about a result: accuracy and failures of each real sensor, and then a comparison side by side."""
     names = titles(measurements)
     real = [m for m in measurements if not is_reference(m)] or list(measurements)
-    findings = [Finding(names[m.name], f"{_accuracy(m)}{_failures(m.rows)}{_reasons(m.rows)}") for m in real]
+    findings = [Finding(names[m.name], f"{_accuracy(m)}{_failures(m)}{_reasons(m.rows)}") for m in real]
     if len(real) > 1:
         parts = [_best_error(real, names), _most_right(real, names), _shortest_exposure(real, names)]
         if any(parts):  # ideal sensors alone may be equal in all of these
@@ -59,14 +57,13 @@ def _accuracy(measurement: Measurement) -> str:
     )
 
 
-def _failures(rows: Rows) -> str:
+def _failures(measurement: Measurement) -> str:
     """Sentence that lists the materials on which a sensor is unreliable; empty if there are none."""
     parts: list[str] = []
-    for row in rows:
-        if row["material"] != "all" and is_unreliable(row):
-            limit = "" if parts else f" by over {_glued(f'{1e3 * OUTLIER_M:g} mm')}"
-            missing, wrong = _percent(missing_fraction(row), 0), _percent(row["outlier_rate"], 0)
-            found = f"{missing} missing, {wrong} of the rest wrong{limit}"
+    for row in measurement.rows:
+        if row["material"] != "all" and not is_reliable(row):
+            limit = "" if parts else f" by over {_limit(measurement)}"
+            found = f"{_percent(row['missing'], 0)} missing, {_percent(row['wrong'], 0)} wrong{limit}"
             parts.append(f"{row['material']} ({found})")
     listed = " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
     return f" Unreliable on these surfaces: {listed}." if parts else ""
@@ -75,17 +72,19 @@ def _failures(rows: Rows) -> str:
 def _reasons(rows: Rows) -> str:
     """Sentence about the causes of failures on the materials where the sensor is unreliable. If there is no such
     material, it is about the failures on all surfaces."""
-    poor = [row for row in rows if row["material"] != "all" and is_unreliable(row)]
+    poor = [row for row in rows if row["material"] != "all" and not is_reliable(row)]
     named = [f"{row['material']}: {_main_causes(row)}" for row in poor if row["causes"]]
     if named:
         return f" Causes of these failures: {'; '.join(named)}."
     total = _total(rows)
-    return f" It fails on {_percent(total['failed'])} of the pixels: {_main_causes(total)}." if total["causes"] else ""
+    return (
+        f" It fails on {_percent(1 - total['right'])} of the pixels: {_main_causes(total)}." if total["causes"] else ""
+    )
 
 
 def _main_causes(row: dict[str, Any]) -> str:
     """The main causes of the failures of a row, each with its fraction of the failures."""
-    fractions = [(p.percent / 100 / row["failed"], p.name) for p in parts(row)]
+    fractions = [(p.percent / 100 / (1 - row["right"]), p.name) for p in parts(row)]
     main = [f"{_percent(fraction, 0)} {name}" for fraction, name in fractions if fraction >= MAIN_CAUSE]
     return ", ".join(main)
 
@@ -95,17 +94,16 @@ def _best_error(real: Sequence[Measurement], names: dict[str, str]) -> str:
 
     Sensors that are unreliable on the whole are left out, because their few readings prove nothing.
     """
-    rows = [(_total(m.rows), names[m.name]) for m in real if not is_unreliable(_total(m.rows))]
+    rows = [(_total(m.rows), names[m.name]) for m in real if is_reliable(_total(m.rows))]
     errors = sorted((row["median_abs_m"], name) for row, name in rows if row["median_abs_m"])
     return _ranked("Smallest median error", [(name, _mm(e)) for e, name in errors])
 
 
 def _most_right(real: Sequence[Measurement], names: dict[str, str]) -> str:
     """Sentence that ranks sensors by their fraction of correct readings; wrong readings do not count."""
-    failed = [(_total(m.rows)["failed"], names[m.name]) for m in real if _total(m.rows)["failed"] is not None]
-    limit = _glued(f"{1e3 * OUTLIER_M:g} mm")
-    entries = [(name, f"{_percent(1.0 - f)} of the pixels") for f, name in sorted(failed)]
-    return _ranked(f"Most right readings, to {limit}", entries)
+    right = [(_total(m.rows)["right"], names[m.name]) for m in real if _total(m.rows)["right"] is not None]
+    entries = [(name, f"{_percent(f)} of the pixels") for f, name in sorted(right, key=lambda pair: -pair[0])]
+    return _ranked(f"Most right readings, to {_limit(real[0])}", entries)
 
 
 def _shortest_exposure(real: Sequence[Measurement], names: dict[str, str]) -> str:
@@ -128,6 +126,11 @@ def _ranked(what: str, entries: Sequence[tuple[str, str]]) -> str:
     (first, value), *others = entries
     against = f" (against {others[0][1]})" if len(others) == 1 else f" (next: {others[0][0]}, {others[0][1]})"
     return f"{what}: {first}, {value}{against}."
+
+
+def _limit(measurement: Measurement) -> str:
+    """Text of the tolerance of a measurement with its unit."""
+    return _glued(f"{1e3 * measurement.causes.tolerance_m:g} mm")
 
 
 def _total(rows: Rows) -> dict[str, Any]:

@@ -151,16 +151,16 @@ class RowRecord(Record, frozen=True, kw_only=True):
     material: Name
     pixels: Count
     lit: Count
+    right: Fraction | None
+    wrong: Fraction | None
+    missing: Fraction | None
     completeness: Fraction | None
-    coverage: Fraction | None
     bias_m: Metres | None
     median_abs_m: Metres | None
     rmse_m: Metres | None
     p95_abs_m: Metres | None
-    outlier_rate: Fraction | None
     edge_pixels: Count
     flying_rate: Fraction | None
-    failed: Fraction | None
     causes: dict[str, Fraction]
     detector_sigma_m: Metres | None = None
     sampling_sigma_m: Metres | None = None
@@ -170,12 +170,12 @@ class RowRecord(Record, frozen=True, kw_only=True):
 class ComparisonRecord(Record, frozen=True, kw_only=True):
     """The contents of `comparison.json`: a row for each material class, the last one for "all".
 
-    outlier_m : error above which a reading counts as an outlier, metres.
+    tolerance_m : largest error of a right reading, metres.
     """
 
     format: Literal["rangesim-comparison"] = "rangesim-comparison"
-    format_version: Literal[1] = 1
-    outlier_m: Positive
+    format_version: Literal[2] = 2
+    tolerance_m: Positive
     rows: list[RowRecord]
 
 
@@ -299,7 +299,7 @@ def _write_readings(measurement: Measurement, folder: Path) -> None:
     causes, rows = measurement.causes, [RowRecord(**row) for row in measurement.rows]
     save_range_image(measurement.image, folder / "range.npz")
     write_arrays(folder / "causes.npz", {"cause": causes.cause, "tolerance_m": np.asarray(causes.tolerance_m)})
-    write_record(folder / "comparison.json", ComparisonRecord(outlier_m=causes.tolerance_m, rows=rows))
+    write_record(folder / "comparison.json", ComparisonRecord(tolerance_m=causes.tolerance_m, rows=rows))
     write_record(folder / "measurement.json", measurement.metadata)
     if measurement.segmentation is not None:
         measurement.image.to_point_cloud().save(folder / "cloud.ply")
@@ -357,9 +357,12 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     for row in record.rows:
         if unknown := set(row.causes) - valid:
             raise FileFormatError(f"{path}: unknown cause {shown(min(unknown))} of {shown(row.material)}.")
-        if abs(sum(row.causes.values()) - (row.failed or 0)) > 1e-6:
+        failed = (row.wrong or 0) + (row.missing or 0)
+        if row.right is not None and abs(row.right + failed - 1) > 1e-6:
+            raise FileFormatError(f"{path}: expected right, wrong and missing of {shown(row.material)} to add up to 1.")
+        if abs(sum(row.causes.values()) - failed) > 1e-6:
             raise FileFormatError(
-                f"{path}: expected the causes of {shown(row.material)} to add up to the fraction that failed."
+                f"{path}: expected the causes of {shown(row.material)} to add up to what is wrong or missing."
             )
     return [msgspec.to_builtins(row) for row in record.rows]
 
