@@ -76,7 +76,7 @@ class BitCode(Code):
         """Words of the cells of `size` projector pixels, and of the further cells that as many bits have."""
         return _words(self, self.bits(size))
 
-    def place_sigma_px(self, size: int, light: ReceivedLight) -> np.ndarray:
+    def place_sigma_px(self, axis: int, size: int, light: ReceivedLight) -> np.ndarray:
         """The standard deviation of an even distribution over a cell, cell / sqrt(12): a place is the cell's middle."""
         return np.full(light.emitter.shape, self.cell_px / np.sqrt(12))
 

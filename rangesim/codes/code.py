@@ -153,12 +153,12 @@ class Code(Named, ABC):
         noise_variance = 2 * (background.ambient + background.noise_variance)  # white - black: the noise of two frames
         return least_signal_for(thresholds.gray.contrast_sigmas**2, 1.0, noise_variance)
 
-    def place_sigma_px(self, size: int, light: ReceivedLight) -> np.ndarray | None:
+    def place_sigma_px(self, axis: int, size: int, light: ReceivedLight) -> np.ndarray | None:
         """(h, w) float64, projector pixels, standard deviation of a place by a closed form; None if there is none.
 
         Parameters
         ----------
-        size : int, projector pixels along the axis.
+        axis, size : as for `responses`.
         """
         return None
 

@@ -56,8 +56,8 @@ class FringeCode(Code):
         swing = thresholds.gray.relative_bit * seen.contrast.values if seen.contrast.is_measured else 0.0
         return self.stack(seen.size).decode(seen, 0.0, float(seen.size), swing, thresholds.phase)
 
-    def place_sigma_px(self, size: int, light: ReceivedLight) -> np.ndarray:
-        return self.stack(size).place_sigma_px(light)
+    def place_sigma_px(self, axis: int, size: int, light: ReceivedLight) -> np.ndarray:
+        return self.stack(size).place_sigma_px(light, axis)
 
     def contradiction(self, seen: AxisFrames, code: AxisCode) -> str | None:
         return stack_contradiction(seen, code, self.stack(seen.size))

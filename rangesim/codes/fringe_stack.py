@@ -107,21 +107,31 @@ class FringeStack:
                 shift = 2 * math.pi * self.convention.shift_turns(step, steps, period)
                 yield 0.5 * (white + math.cos(shift) * cosine + math.sin(shift) * sine)
 
-    def place_sigma_px(self, light: ReceivedLight) -> np.ndarray:
+    def place_sigma_px(self, light: ReceivedLight, axis: int) -> np.ndarray:
         """(h, w) float64, projector pixels, standard deviation of a place: of each period P / (2 pi) sqrt(2 / N) sigma
-        / B, with the modulation B half of the emitter's light, and the means of precise periods add up.
+        / B, and the places of precise periods are averaged.
+
+        The modulation B is half of the emitter's light, less what a camera's pixel averages over the fringe.
+
+        Parameters
+        ----------
+        axis : 0 for columns, 1 for rows.
 
         References
         ----------
         Surrel: "Additive noise effect in digital phase detection", Applied Optics 36 (1997).
         """
-        modulation = VISIBILITY * light.emitter
-        variance = light.emitter / 2 + light.ambient + light.own_variance
+        noise = np.sqrt(light.emitter / 2 + light.ambient + light.own_variance)
+        across_px = (light.pixel_columns, light.pixel_rows)[axis]
+        precisions = np.array(
+            [
+                steps / 2 * (2 * np.pi / period * VISIBILITY * light.emitter * np.sinc(across_px / period) / noise) ** 2
+                for period, steps in zip(self.periods_px, self.steps, strict=True)
+            ]
+        )
+        precise = precisions >= MIN_PRECISION * precisions.max(axis=0)
         with np.errstate(divide="ignore"):
-            relative = np.sqrt(2 * variance) / (2 * np.pi * modulation)
-        precisions = np.array([steps / period**2 for period, steps in zip(self.periods_px, self.steps, strict=True)])
-        kept = precisions[precisions >= MIN_PRECISION * precisions.max()]
-        return np.asarray(relative / np.sqrt(kept.sum()))
+            return np.asarray(1 / np.sqrt((precisions * precise).sum(axis=0)))
 
     def of_period(self, frames: np.ndarray, i: int) -> np.ndarray:
         """The frames (N, ...) of period i, a view."""

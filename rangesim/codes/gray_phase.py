@@ -127,8 +127,8 @@ class GrayPhase(Code):
         """The frames of the fringes alone."""
         return seen.starting_with("p")  # phase0 ... of one period, period0_phase0 ... of several
 
-    def place_sigma_px(self, size: int, light: ReceivedLight) -> np.ndarray:
-        return self.stack.place_sigma_px(light)
+    def place_sigma_px(self, axis: int, size: int, light: ReceivedLight) -> np.ndarray:
+        return self.stack.place_sigma_px(light, axis)
 
     def contradiction(self, seen: AxisFrames, code: AxisCode) -> str | None:
         gray, fringes = code.coarse, self._fringes(seen)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Closed forms of the noise of readings, from the light that the pixels received.
+"""Closed forms of the errors that noise and quantisation make, from the light that the pixels received.
 
-Each decoder has its own (`rangesim.sensor.Decoder.depth_sigma_m`), as far as there is one in the literature. They take
-the light of a pass, the exposure and the detector, and no frame: so they can be compared with what decoded frames
-scatter.
+Each decoder has its own (`rangesim.sensor.Decoder.depth_error_m`), as far as there is one in the literature. They take
+the light of a pass, the exposure and the detector, and no frame: so they can be compared with the errors of
+decoded frames.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ STEP = 1e-4
 float64, and far below the curvature of either."""
 
 
-def noise_by_theory(signals: Signals, captured: Captured, decoder: Decoder) -> np.ndarray | None:
-    """(h, w) float64, metres, standard deviation of correct readings by a closed form; None if there is none.
+def error_by_theory(signals: Signals, captured: Captured, decoder: Decoder) -> np.ndarray | None:
+    """(h, w) float64, metres, root mean square error of correct readings by a closed form; None if there is none.
 
     Parameters
     ----------
@@ -41,12 +41,12 @@ def noise_by_theory(signals: Signals, captured: Captured, decoder: Decoder) -> n
 
     >>> from rangesim import Detector, expose
     >>> capture = expose(signals, sensor, Detector(), exposure_s=1e-3)
-    >>> bool(noise_by_theory(signals, capture, sensor.default_decoder).max() < 1e-3)
+    >>> bool(error_by_theory(signals, capture, sensor.default_decoder).max() < 1e-3)
     True
     """
     if captured.reference.detector is None or not captured.reference.is_digital:
         return None
-    return decoder.depth_sigma_m(captured.sensor, received_light(signals, captured))
+    return decoder.depth_error_m(captured.sensor, received_light(signals, captured))
 
 
 def received_light(signals: Signals, captured: Captured) -> ReceivedLight:
@@ -82,12 +82,22 @@ def received_light(signals: Signals, captured: Captured) -> ReceivedLight:
         ambient=electrons(passed * energy.ambient),
         own_variance=detector.own_noise_e2(dark_e),
         reading_m=reading_m,
+        path_length_m=(near_m + far_m) / 2,
         per_length=per_length,
         per_column=per_column,
         per_row=per_row,
+        pixel_columns=_across((near_px + far_px)[..., 0] / 2),
+        pixel_rows=_across((near_px + far_px)[..., 1] / 2),
         focal_px=rig.camera.fx if isinstance(rig.camera, Intrinsics) else math.nan,
         trials=math.inf if blind is None else blind.trials,
     )
+
+
+def _across(coordinate_px: np.ndarray) -> np.ndarray:
+    """(h, w) float64, change of a projector coordinate (h, w) over a camera's pixel, along columns or rows; where a
+    neighbour sees nothing, no change."""
+    steps = [np.gradient(coordinate_px, axis=axis) for axis in (0, 1) if coordinate_px.shape[axis] > 1]
+    return np.nan_to_num(np.max(np.abs(steps), axis=0)) if steps else np.zeros(coordinate_px.shape)
 
 
 def _seen_at(rig: Rig, reading_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

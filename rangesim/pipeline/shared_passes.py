@@ -26,7 +26,7 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
     groups: list[tuple[Rig, list[Instrument]]] = []
     for instrument in experiment.instruments:
         rig = instrument.rig(scene, experiment.width, experiment.height)
-        shared = None if experiment.motion is not None else _first_that_agrees(groups, rig, instrument)
+        shared = None if experiment.motion is not None else first_that_agrees(groups, rig, instrument)
         if shared is None:
             groups.append((rig, [instrument]))
         else:
@@ -35,13 +35,13 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
     return groups
 
 
-def _first_that_agrees(groups: list[tuple[Rig, list[Instrument]]], rig: Rig, instrument: Instrument) -> int | None:
+def first_that_agrees(groups: list[tuple[Rig, list[Instrument]]], rig: Rig, instrument: Instrument) -> int | None:
     """Index of the first group whose emitter, wavelength and cameras are those of a rig and an instrument; None if
     there is none."""
     for index, (other, members) in enumerate(groups):
-        if members[0].sensor.rigs(rig)[1:] != instrument.sensor.rigs(rig)[1:]:
-            continue
         is_same_light = None in (rig.wavelength_m, other.wavelength_m) or rig.wavelength_m == other.wavelength_m
-        if is_same_light and replace(rig, wavelength_m=other.wavelength_m) == other:
+        if not is_same_light or replace(rig, wavelength_m=other.wavelength_m) != other:
+            continue
+        if members[0].sensor.rigs(rig)[1:] == instrument.sensor.rigs(rig)[1:]:
             return index
     return None

@@ -220,7 +220,7 @@ class StereoDecoder(Decoder):
 
     is_lower_bound: ClassVar[bool] = True
 
-    def depth_sigma_m(self, sensor: Sensor, light: ReceivedLight) -> np.ndarray | None:
+    def depth_error_m(self, sensor: Sensor, light: ReceivedLight) -> np.ndarray | None:
         """The Cramér-Rao bound of a match, z^2 / (f b) sigma_d: the texture of the dots in a window against the noise
         of two images, sigma_d^2 = 2 variance / (pixels * texture * light^2); None for passive stereo.
 

@@ -396,7 +396,7 @@ class AmcwDecoder(Decoder):
             doubts=(doubt,) if doubt else (),
         )
 
-    def depth_sigma_m(self, sensor: Sensor, light: ReceivedLight) -> np.ndarray | None:
+    def depth_error_m(self, sensor: Sensor, light: ReceivedLight) -> np.ndarray | None:
         """The noise of the phases by shot noise and read noise, averaged over the frequencies by their precision, and
         the delays of the pixels; None for correlations that are no sine, and for two paths.
 

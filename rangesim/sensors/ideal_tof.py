@@ -13,7 +13,7 @@ from rangesim.capture import Capture, bright_level
 from rangesim.decoding.path_length import PathLengths
 from rangesim.decoding.status import Status
 from rangesim.response import FirstReturn, Response
-from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, ReceivedLight, Sensor, of_type
+from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, of_type
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from rangesim.geometry.dense_stereo import DenseMatching
 from rangesim.geometry.stereo import rectify
 from rangesim.response import DenseResponse, Dots, LightPath, NumpyMath, Response
 from rangesim.rig import Intrinsics, Rig
-from rangesim.sensor import Background, Decoder, Emitter, FrameContent, ReceivedLight, Sensor, of_type
+from rangesim.sensor import Background, Decoder, Emitter, FrameContent, Sensor, of_type
 from rangesim.sensors.active_stereo import (
     Disparity,
     described,

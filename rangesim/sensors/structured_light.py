@@ -331,14 +331,15 @@ class StructuredLightDecoder(Decoder):
         ]
         return np.asarray(np.maximum.reduce(each))
 
-    def depth_sigma_m(self, sensor: Sensor, light: ReceivedLight) -> np.ndarray | None:
+    def depth_error_m(self, sensor: Sensor, light: ReceivedLight) -> np.ndarray | None:
         """The standard deviation of the code's place times the change of the depth with it; None for codes along both
         axes, or without a closed form."""
         shown = of_type(sensor, StructuredLight)
         if len(shown.axes) > 1:
             return None
-        place_px = shown.code.place_sigma_px(shown.size(shown.axes[0]), light)
-        per_px = light.per_column if shown.axes[0] == "columns" else light.per_row
+        (name,) = shown.axes
+        place_px = shown.code.place_sigma_px(AXES.index(name), shown.size(name), light)
+        per_px = light.per_column if name == "columns" else light.per_row
         return None if place_px is None else place_px * np.abs(per_px)
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rangesim.electronics.ambient import Ambient
 from rangesim.errors import FileFormatError
-from rangesim.evaluation.comparison import OUTLIER_M
+from rangesim.evaluation.comparison import TOLERANCE_M
 from rangesim.experiment import Experiment
 from rangesim.files.text_files import read_toml
 from rangesim.instrument.instrument import Instrument
@@ -22,7 +22,7 @@ from rangesim.settings import limits
 from rangesim.settings.bounds import SECONDS, Bounds, Metres, check_fields, check_number, whole
 from rangesim.settings.config import from_dict, nearest, shown, to_dict
 from rangesim.settings.seeds import check_seed
-from rangesim.sweep.scenes import SceneSource, scene_source
+from rangesim.sweep.scene_sources import SceneSource, scene_source
 
 if TYPE_CHECKING:
     from rangesim.light_transport.transport_settings import TransportSettings
@@ -79,7 +79,7 @@ class Sweep:
     seeds: Annotated[int, Bounds("a number of seeds", 1, 10_000)] = 5
     seed: int = 0
     exposure: Literal["fixed", "auto"] | float = "fixed"
-    tolerance_m: Metres = OUTLIER_M
+    tolerance_m: Metres = TOLERANCE_M
     window_px: Annotated[int, whole(1, "pixels")] | None = None
     title: str = "Sweep"
     folder: Path | None = None
@@ -106,7 +106,7 @@ class Sweep:
     @cached_property
     def given(self) -> dict[str, Instrument]:
         """The sensors as they are without the settings of the sweep, by name."""
-        made = [_instrument_given(one, f"sensors[{i}]", self.folder) for i, one in enumerate(self.sensors)]
+        made = [instrument_given(one, f"sensors[{i}]", self.folder) for i, one in enumerate(self.sensors)]
         names = [one.name for one in made]
         if twice := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"expected sensors of different names, got {twice[0]!r} twice; state a name for each.")
@@ -121,9 +121,7 @@ class Sweep:
     def points(self) -> tuple[Point, ...]:
         """All points of the grid, in the order of their numbers."""
         combinations = itertools.product(*self.vary.values())
-        return tuple(
-            Point(self, i, dict(zip(self.vary, values, strict=True))) for i, values in enumerate(combinations)
-        )
+        return tuple(Point(self, i, dict(zip(self.vary, values, strict=True))) for i, values in enumerate(combinations))
 
     def paths(self) -> list[str]:
         """All paths that the file may set or vary."""
@@ -173,7 +171,7 @@ class Point:
         base: dict[str, Any] | None = dict(DARKNESS) if self.scene.is_of_package else None
         for path, value in self.settings.items():
             if path == "ambient":
-                base = {**({"illuminant": "sun"}), **to_dict(value)} if value is not None else None
+                base = {"illuminant": "sun", **to_dict(value)} if value is not None else None
             elif path.startswith("ambient."):
                 base = {"illuminant": "sun"} if base is None else base
                 if path == "ambient.irradiance_w_m2":
@@ -308,7 +306,8 @@ def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
             yield f"{prefix}{key}", value
 
 
-def _instrument_given(given: Any, place: str, folder: Path | None) -> Instrument:
+def instrument_given(given: Any, place: str, folder: Path | None) -> Instrument:
+    """The instrument that an entry of `Sweep.sensors` names or describes, with its decoder."""
     table = {"sensor": given} if isinstance(given, str) else given
     made = instrument_from_dict(table, place, folder or Path())
     if made.decoder is None:  # so that its settings have paths
