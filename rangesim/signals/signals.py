@@ -47,6 +47,11 @@ class EnergySplit(ShortRepr):
         """All light of the emitter at full power, without ambient light: (h, w) float32, W/m2/sr."""
         return self.direct + self.multipath + self.specular + self.caustic + self.glint
 
+    def scaled(self, factor: float) -> EnergySplit:
+        """The same split with that many times the emitter's light; ambient light stays as it is."""
+        kinds = ("direct", "multipath", "specular", "caustic", "glint")
+        return replace(self, **{kind: np.float32(factor) * getattr(self, kind) for kind in kinds})
+
 
 class Surface(NamedTuple):
     """A part of the ground truth that a row of a table is about.
@@ -254,6 +259,23 @@ class StillSignals(Signals):
     channels: dict[Response, np.ndarray] = field(kw_only=True)
     sampling: SamplingError | None = field(kw_only=True, default=None)
 
+    def at_power(self, power_w: float) -> StillSignals:
+        """The signals of the same pass if its emitter had another power, watts: light is linear."""
+        factor = np.float32(power_w / self.rig.projector_power_w)
+        if factor == 1:
+            return self
+        sampling = self.sampling
+        if sampling is not None:
+            errors = {r: factor * c for r, c in sampling.channels.items()}
+            sampling = SamplingError(errors, factor * sampling.projector)
+        return replace(
+            self,
+            rig=replace(self.rig, projector_power_w=power_w),
+            energy=self.energy.scaled(float(factor)),
+            channels={r: factor * c for r, c in self.channels.items()},
+            sampling=sampling,
+        )
+
     def only(self, sensor: Sensor) -> StillSignals:
         """The same signals without the channels that only other sensors need."""
         kept = sensor.responses()
@@ -363,6 +385,18 @@ class SignalSet(Signals, Sequence[Signals]):
     @property
     def cameras(self) -> tuple[Signals, ...]:
         return self.of_cameras
+
+    def at_power(self, power_w: float) -> SignalSet:
+        """The signals of the same pass if its emitter had another power, watts.
+
+        Raises
+        ------
+        ValueError
+            Something moves in the signals of a camera.
+        """
+        if not all(isinstance(one, StillSignals) for one in self.of_cameras):
+            raise ValueError("expected signals of a world at rest.")
+        return SignalSet.of([one.at_power(power_w) for one in self.of_cameras if isinstance(one, StillSignals)])
 
     @property
     def knows_sampling_error(self) -> bool:
