@@ -4,8 +4,8 @@
     rangesim dataset examples/bins.toml --out out/bins
     python examples/train_on_dataset.py out/bins amcw
 
-rangesim does not need torch; install it beside (https://pytorch.org). `Samples` is a sequence, which DataLoader takes as
-it is: it shuffles by the seed, and gives each worker process and each rank samples of its own.
+rangesim does not need torch; install it beside (https://pytorch.org). `Samples` is a sequence, which DataLoader takes
+as it is: it shuffles by the seed, and gives each worker process and each rank samples of its own.
 """
 
 import sys
