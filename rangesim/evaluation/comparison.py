@@ -38,7 +38,7 @@ class ErrorStatistics:
     Parameters
     ----------
     kind, name : str, what the row is about: "object" or "part" and its name; "material" and the class of the first
-        surface behind the pixel; "all", all surfaces; or "objects", the mean over objects, in which each weighs the same
+        surface behind the pixel; "all", all surfaces; or "objects", their mean, in which each object weighs the same
         (`rangesim.evaluation.surface_rows.with_mean_over_objects`).
     pixels : int, number of pixels with a true depth.
     lit : int, number of those pixels that the emitter lights; the others lie in its shadow or outside its field.
