@@ -81,7 +81,10 @@ def _worst(rows: Rows) -> str:
     poor = [row for row in surfaces if not is_reliable(row)]
     named = [_described(row) for row in (poor or surfaces)[: MAX_NAMED if poor else 1]]
     more = f" and {len(poor) - MAX_NAMED} more" if len(poor) > MAX_NAMED else ""
-    count = f"{len(surfaces) - len(poor)} of {len(surfaces)} {noun}"
+    good = [row["name"] for row in surfaces if row not in poor]
+    count = f"{len(good)} of {len(surfaces)} {noun}"
+    if poor and 0 < len(good) <= MAX_NAMED:
+        count += f" ({', '.join(reversed(good))})"
     return f" Most pixels are right on {count}; worst: {', '.join(named)}{more}."
 
 
@@ -102,9 +105,9 @@ def _reasons(rows: Rows) -> str:
 
 
 def _accuracy(measurement: Measurement) -> str:
-    """Sentence about the errors of the readings, right and wrong ones."""
+    """Sentence about the errors of the readings, right and wrong ones; empty if most pixels are not right."""
     judged = _judged(measurement.rows)
-    if judged["median_abs_m"] is None:
+    if not is_reliable(judged):
         return ""
     true = "true depth" if measurement.camera.is_pinhole else "true range"
     lie = "lie" if judged["kind"] == ALL else "on an object lie, on average,"
