@@ -29,6 +29,7 @@ def truth_of(z: np.ndarray, material: np.ndarray, visible: np.ndarray | None = N
         material=material,
         projector_uv=np.zeros((*shape, 2), np.float32),
         projector_visible=np.isfinite(z) if visible is None else visible,
+        instance_names=("left", "right", "unused"),
         material_names=("matte", "glass", "unused"),
     )
 
@@ -134,9 +135,8 @@ def of_objects(sizes: dict[str, int], material: str = "matte") -> GroundTruth:
     instance = np.repeat(np.arange(len(sizes)), list(sizes.values()))[None]
     truth = truth_of(np.ones(instance.shape), np.zeros_like(instance))
     names = tuple(sizes)
-    return dataclasses.replace(
-        truth, instance=instance, instance_names=names, instance_objects=names, material_names=(material,)
-    )
+    named = {"instance_names": names, "instance_objects": names, "material_names": (material,)}
+    return dataclasses.replace(truth, instance=instance, **named)
 
 
 @pytest.mark.parametrize("pixels", [8, 80, 8000])

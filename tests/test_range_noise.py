@@ -433,18 +433,24 @@ def test_a_run_keeps_the_noise_of_its_readings_and_warns_of_it(tmp_path: Path) -
 
 
 def test_nothing_is_said_where_sampling_is_small_or_pixels_are_few() -> None:
-    row = {"material": "matte", "pixels": 5000, "lit": 4000, "sampling_sigma_m": 1e-4, "detector_sigma_m": 3e-4}
+    row = {
+        "kind": "material",
+        "name": "matte",
+        "pixels": 5000,
+        "lit": 4000,
+        "sampling_sigma_m": 1e-4,
+        "detector_sigma_m": 3e-4,
+    }
     row |= {"completeness": 0.9, "completeness_error": 0.02}
-    unsure = row | {"material": "glossy", "completeness": 0.68, "completeness_error": 0.12}
+    unsure = row | {"name": "glossy", "completeness": 0.68, "completeness_error": 0.12}
+    of_all = {"kind": "all", "name": "all"}
     quiet = [row, row | {"sampling_sigma_m": None}, row | {"pixels": 20, "sampling_sigma_m": 1.0}]
     quiet += [row | {"completeness": None, "completeness_error": None}, unsure | {"lit": 20}]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_sampling(
-            {"amcw": [*quiet, row | {"material": "all", "sampling_sigma_m": 1.0}, unsure | {"material": "all"}]}, 64
-        )
+        warn_of_sampling({"amcw": [*quiet, row | of_all | {"sampling_sigma_m": 1.0}, unsure | of_all]}, 64)
     with pytest.warns(SamplingWarning, match="gray: 2.0 on glossy"):
-        warn_of_sampling({"amcw": quiet, "gray": [row | {"material": "glossy", "sampling_sigma_m": 6e-4}]}, 64)
+        warn_of_sampling({"amcw": quiet, "gray": [row | {"name": "glossy", "sampling_sigma_m": 6e-4}]}, 64)
     with pytest.warns(SamplingWarning, match=r"are gray: 32 ± 12 % on glossy; about spp=1024 would leave 3 points"):
         warn_of_sampling({"amcw": quiet, "gray": [unsure]}, 64)
 

@@ -207,9 +207,9 @@ def _computed(
                 true_labels[view] = segments_of_truth(signals)
         for instrument in instruments:
             tell(f"Measuring with {instrument.name}", end)
-            seed = noise_seed(experiment, instrument)
+            seed, light = noise_seed(experiment, instrument), signals.at_wavelength(instrument.emitter_wavelength_m)
             measurements[instrument.name] = measure(
-                instrument, signals, seed, experiment.ambient, number, experiment.tolerance_m, true_labels[view]
+                instrument, light, seed, experiment.ambient, number, experiment.tolerance_m, true_labels[view]
             )
     info = provenance(experiment, scene, groups, mi.variant(), times)
     return Result(experiment, tuple(measurements[i.name] for i in experiment.instruments), tuple(passes), info)

@@ -25,7 +25,7 @@ from rangesim.scene import retroreflector
 from rangesim.scene.camera import camera_of, warn_of_aperture, warn_of_clipping
 from rangesim.scene.materials import has_texture, is_cutout, is_matte, material_class
 from rangesim.scene.media import is_boundary, why_not_traced
-from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
+from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh, with_plain_data
 from rangesim.scene.nodes import (
     OF_MITSUBA,
     check_camera,
@@ -100,7 +100,8 @@ def load_scene(
         thing.
         `<include filename="materials/silver.xml"/>` finds the material catalogue from everywhere (docs/materials.md),
         but a file beside the scene comes first. BSDFs may be of type `retroreflector`
-        (`rangesim.scene.retroreflector`).
+        (`rangesim.scene.retroreflector`). A shape of a dictionary may be ``{"type": "ply", "mesh": mesh, ...}`` with a
+        `rangesim.triangle_mesh.TriangleMesh` instead of a file, and `to_world` may be an array (4, 4).
     material : material class of a bare mesh: matte (default), glossy, mirror or transparent.
     unit_m : metres per unit of length of a bare mesh, for example 0.001 for millimetres; default 1.
     sensor : index of the sensor of the scene that becomes the camera. By default it is the first, with a warning if the
@@ -240,7 +241,7 @@ def _instantiate(
 def _parse(config: Any, source: Source, material: str, unit_m: float, names: Utf8Names, advises: bool) -> Any:
     if isinstance(source, Mapping):
         check_dictionary(source, "the scene dictionary")
-        return mi.parser.parse_dict(config, dict(source))
+        return mi.parser.parse_dict(config, with_plain_data(source, names.folder))
     path = scene_file(source)
     if _is_mesh(path):
         return mi.parser.parse_dict(config, scene_around_mesh(path, material, unit_m, names.folder, advises))

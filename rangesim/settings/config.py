@@ -27,6 +27,7 @@ import difflib
 import sys
 import types
 import typing
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -46,6 +47,8 @@ def to_dict(setting: Any) -> Any:
 
     For a class with a `type_name`, the table begins with the key `type`, so that `from_dict` finds the class again.
     """
+    if isinstance(setting, Plain):
+        return setting.to_plain()
     if dataclasses.is_dataclass(setting) and not isinstance(setting, type):
         fields = {f.name: to_dict(getattr(setting, f.name)) for f in dataclasses.fields(setting) if f.init}
         tag = getattr(setting, "type_name", None)
@@ -117,7 +120,7 @@ def on_top_of(default: Any, table: Any) -> Any:
     The table is returned unchanged if the default is no dataclass or has another `type`, or if the table is a whole
     member of the family whose tables have no `type`. A value that is no table is returned unchanged too.
     """
-    if not isinstance(table, Mapping) or not dataclasses.is_dataclass(default) or isinstance(default, type):
+    if not isinstance(table, Mapping) or not dataclasses.is_dataclass(default) or isinstance(default, (type, Plain)):
         return table
     untagged = getattr(default, "untagged", None)
     if untagged is not None and {f.name for f in dataclasses.fields(untagged) if _required(f)} <= set(table):
@@ -185,6 +188,19 @@ def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
             f"{place}: expected 'type' to be one of {', '.join(choices)}, got {shown(tag)}{nearest(str(tag), choices)}."
         )
     return choices[tag]
+
+
+class Plain(ABC):
+    """Base of a setting whose plain form is no table of its fields, such as a number that may be drawn at random."""
+
+    @abstractmethod
+    def to_plain(self) -> Any:
+        """The setting as plain data."""
+
+    @classmethod
+    @abstractmethod
+    def from_plain(cls, value: Any, where: str) -> typing.Self:
+        """The setting that plain data describe; ValueError with the place `where` if they describe none."""
 
 
 class Named:
@@ -267,6 +283,8 @@ def _value(hint: Any, value: Any, where: str) -> Any:
         raise ValueError(
             f"{where}: expected one of {', '.join(valid)}, got {shown(value)}{nearest(str(value), valid)}."
         )
+    if isinstance(hint, type) and issubclass(hint, Plain):
+        return hint.from_plain(value, where)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return from_dict(hint, value, where)
     if isinstance(hint, type) and issubclass(hint, Named) and isinstance(value, (Mapping, str)):

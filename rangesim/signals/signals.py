@@ -208,6 +208,13 @@ class Signals(ShortRepr, ABC):
         """Signals of each camera of the pass, the reference camera's first; by default these alone."""
         return (self,)
 
+    def at_wavelength(self, wavelength_m: float | None) -> Signals:
+        """The same signals of an emitter with this wavelength in metres; None: not stated.
+
+        The renderer is monochrome, so the light is the same; what a detector makes of it may differ.
+        """
+        return replace(self, rig=replace(self.rig, wavelength_m=wavelength_m))
+
     @property
     @abstractmethod
     def knows_sampling_error(self) -> bool:
@@ -341,6 +348,9 @@ class SignalSet(Signals, Sequence[Signals]):
             first.rig, first.energy, first.truth, motion_m=first.motion_m, truncation=first.truncation,
             of_cameras=cameras,
         )  # fmt: skip
+
+    def at_wavelength(self, wavelength_m: float | None) -> SignalSet:
+        return SignalSet.of([one.at_wavelength(wavelength_m) for one in self.of_cameras])
 
     @property
     def cameras(self) -> tuple[Signals, ...]:
