@@ -16,25 +16,31 @@ def compare_command(
     results: Annotated[list[Path], typer.Argument(help="Directories that `rangesim run` wrote.", show_default=False)],
     markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown instead of a drawn table.")] = False,
 ) -> None:
-    """Print what is right, wrong and missing per material and sensor, and why. Lengths are in mm, fractions in %.
+    """Print what is right, wrong and missing per material and sensor, why, and the exposures.
+
+    Lengths are in mm, fractions in %.
 
     Example:
 
       rangesim compare out/tabletop out/matte
     """
-    from rangesim.report.tables import comparison_markdown, comparison_tables
-    from rangesim.results.experiment_results import read_rows, read_settings
+    from rangesim.report.tables import automatic_exposures, comparison_markdown, comparison_tables
+    from rangesim.results.experiment_results import read_acquisition, read_rows, read_settings
 
-    tables = []
+    tables, taken = [], []
     for folder in results:
         for entry in read_settings(folder).instruments:
             name = entry.name if len(results) == 1 else f"{folder}: {entry.name}"
             tables.append((name, read_rows(folder / entry.name)))
+            taken.append(read_acquisition(folder / entry.name))
     if markdown:
-        typer.echo(comparison_markdown(tables), nl=False)
+        typer.echo(comparison_markdown(tables, taken), nl=False)
     else:
-        for table in comparison_tables(tables):
+        for table in comparison_tables(tables, taken):
             _print(table)
+    names = [name for name, _ in tables]
+    if said := automatic_exposures(dict(zip(names, taken, strict=True))):
+        typer.echo(f"rangesim: the exposure {said}", err=True)
 
 
 def _print(table: Table) -> None:
