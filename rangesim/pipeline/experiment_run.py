@@ -101,7 +101,8 @@ def run(
         result = _computed(experiment, progress or unwatched, scene, announce)
         if progress:
             progress("Writing the report", 0.97)
-        tables = comparison_markdown([(m.name, m.rows) for m in result.measurements], experiment.tolerance_m)
+        found, taken = [(m.name, m.rows) for m in result.measurements], [m.metadata for m in result.measurements]
+        tables = comparison_markdown(found, taken, experiment.tolerance_m)
         write_result(result, folder, {"comparison.md": tables.encode(), "report.html": render_report(result).encode()})
     _warn(result)
     return result
@@ -366,6 +367,7 @@ def acquisition(
         sensor=capture.sensor.type_name,
         frames=len(capture.frames),
         exposure_s=exposure,
+        exposure_is_automatic=capture.exposure_is_automatic,
         acquisition_s=taken,
         pixels=int(capture.frames[0].size),
         points=points,

@@ -14,6 +14,7 @@ from typing import Any
 from rangesim.evaluation.surface_rows import MATERIAL, OBJECT, OBJECTS
 from rangesim.report.tables import (
     Rows,
+    automatic_exposures,
     is_reference,
     is_reliable,
     millimetres,
@@ -40,7 +41,7 @@ class Finding:
 
 
 def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
-    """Findings about a result: real sensors side by side, and then right readings and failures of each."""
+    """Findings about a result: real sensors side by side, right readings and failures of each, automatic exposures."""
     names = titles(measurements)
     real = [m for m in measurements if not is_reference(m)] or list(measurements)
     findings = [Finding(names[m.name], _right(m) + _worst(m.rows) + _reasons(m.rows) + _accuracy(m)) for m in real]
@@ -53,6 +54,8 @@ def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
         ]
         if any(parts):  # ideal sensors alone may be equal in all of these
             findings.insert(0, Finding("Side by side", " ".join(filter(None, parts))))
+    if text := automatic_exposures({names[m.name]: m.metadata for m in real}):
+        findings.append(Finding("Exposure", text))
     return findings
 
 
