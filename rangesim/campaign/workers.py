@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Annotated, Any
 
 from rangesim.campaign.in_worker import THREAD_VARIABLES
@@ -135,10 +137,26 @@ def _client_of(scheduler: str, answer_s: float) -> Iterator[Client]:
         yield client
 
 
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Keep Ctrl-C from the threads and processes that the block starts, and from all that those start: the driver alone
+    ends on it, and its workers with it."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # the first call would let interrupts through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _started(kind: Callable[..., LocalCluster], **options: Any) -> LocalCluster:
     """A cluster that has started; EnvironmentProblem if its processes do not start."""
     try:
-        return kind(**options)
+        with _without_interrupts():
+            return kind(**options)
     except RuntimeError as problem:
         raise EnvironmentProblem(
             "worker processes could not be started; if this is a script, put what it does below if __name__ == "
@@ -190,7 +208,6 @@ def _local_cluster(count: int) -> Iterator[LocalCluster]:
                 silence_logs=logging.CRITICAL,
                 memory_limit=MEMORY_LIMIT,
                 worker_class=WorkerNanny,
-                preload="import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)",  # Ctrl-C is for the driver
             )
             with cluster:
                 yield cluster
