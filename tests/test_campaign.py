@@ -277,6 +277,11 @@ def test_what_is_not_deterministic_is_said(tmp_path: Path, here: Workers) -> Non
         run_items(answer, items, ItemStore(tmp_path), here)
 
 
+def test_a_function_that_always_fails_ends_the_run(tmp_path: Path, here: Workers) -> None:
+    with pytest.raises(ValueError, match=r"the first 20 items all failed, .* by RuntimeError: no luck"):
+        run_items(answer, {f"i{n}": "raise" for n in range(100)}, ItemStore(tmp_path), here)
+
+
 def test_what_cannot_be_sent_is_refused(tmp_path: Path) -> None:
     lock = threading.Lock()
     with pytest.raises(ValueError, match="cannot be sent"):

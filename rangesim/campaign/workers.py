@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from rangesim.campaign.in_worker import THREAD_VARIABLES
 from rangesim.errors import EnvironmentProblem
-from rangesim.settings.bounds import check_fields, whole
+from rangesim.settings.bounds import Bounds, check_fields
 
 if TYPE_CHECKING:
     from distributed import Client, LocalCluster
@@ -28,6 +28,8 @@ FIRST_ANSWER_S = 10.0
 WAIT_S = 300.0
 """Seconds that a run waits for a scheduler that it has lost, and for workers if there are none: long enough for a
 restart by systemd, Kubernetes or by hand, short enough not to hold an allocation of a cluster for hours."""
+COUNT = Bounds("a whole number of processes", 1, 1024, kind=int)
+"""Bounds of the count of workers on one machine, above the cores of any."""
 BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables of the threads of BLAS and of OpenMP."""
 
@@ -43,7 +45,7 @@ class Workers:
         processes are started on this machine, and end with the run.
     """
 
-    count: Annotated[int | None, whole(1)] = None
+    count: Annotated[int, COUNT] | None = None
     scheduler: str | None = None
 
     def __post_init__(self) -> None:
