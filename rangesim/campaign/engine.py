@@ -305,10 +305,13 @@ class _Session:
         self.alone = True
         while run.suspects:
             key = next(iter(run.suspects))
+            start = time.monotonic()
             self._submit(key)
             self._drain()
             if (deaths := run.suspects.get(key, 0)) >= OWN_DEATHS:
-                run.quarantine(key, f"its worker process died {deaths} times while nothing else ran", "", deaths)
+                took = duration((time.monotonic() - start) / deaths)
+                error = f"its worker process died {deaths} times while nothing else ran, every {took}"
+                run.quarantine(key, error, "", deaths)
 
     def _submit(self, key: str, repeats: bool = False) -> None:
         run, number = self.run, self.number
