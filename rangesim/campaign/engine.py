@@ -36,6 +36,8 @@ WINDOW_PER_WORKER = 4
 """Items that are submitted for each worker, so that none waits for the driver, and that 10^6 items need no memory."""
 OWN_DEATHS = 3
 """Deaths of its worker, while it runs alone, that prove an item to be their cause."""
+MAX_FUNCTION = 1 << 20
+"""Bytes of a function with all that it takes along. It is sent with each item, and should cost less than the result."""
 FIRST_LIMIT_S = 3600.0
 """Seconds that an item may take as long as it is not known how long items take."""
 LIMIT_FACTOR = 30.0
@@ -122,6 +124,11 @@ def run_items(
     >>> outcome = run_items(sample_bytes, {"sample-0": 0}, ItemStore("out/set"))  # doctest: +SKIP
     """
     sent_function = pickled(function)
+    if len(sent_function) > MAX_FUNCTION:
+        raise ValueError(
+            f"expected a function of at most {MAX_FUNCTION} bytes, got {len(sent_function)}: it goes to the workers "
+            "with every item, so let it read large data from files."
+        )
     made_with = all_versions()
     for key in items:
         check_key(key)

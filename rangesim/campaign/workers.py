@@ -160,8 +160,11 @@ def _started(kind: Callable[..., LocalCluster], **options: Any) -> LocalCluster:
         with _without_interrupts():
             return kind(**options)
     except RuntimeError as problem:
+        cause: BaseException = problem
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
         raise EnvironmentProblem(
-            "worker processes could not be started; if this is a script, put what it does below if __name__ == "
+            f"worker processes could not be started ({cause}); a script has to do its work below if __name__ == "
             "'__main__', because every worker imports it."
         ) from problem
 
