@@ -19,6 +19,7 @@ from synthetic import plane_signals, stereo_rig
 
 import rangesim
 from rangesim import decode, explain, expose
+from rangesim.campaign import Workers
 from rangesim.codes import AxisCode, Code, FringeConvention, GrayPhase, GrayThresholds
 from rangesim.codes.fringe_gamma import FringeGamma
 from rangesim.codes.fringe_stack import FringeStack
@@ -256,6 +257,7 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (FirstReturn(), use_response),
     (TransientHistogram(0.0, 0.03, 16), use_response),
     (LengthSplit(0.0, 0.03, 16), use_response),
+    (Workers(), nothing),
 ]  # fmt: skip
 
 FIELDS = [
@@ -336,6 +338,7 @@ MODULES = (
         "decoding.triangulation",
         "decoding.disparities",
     ),
+    "campaign.workers",
     "geometry.dense_stereo",
     "response.correlation",
     *(f"codes.{module.name}" for module in pkgutil.iter_modules(rangesim.codes.__path__)),
