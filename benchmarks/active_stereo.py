@@ -79,7 +79,7 @@ def row(name: str, signals: Signals, sensor: Sensor, decoder: Any = None, **expo
     because = ", ".join(f"{cause.replace('_', ' ')} {100 * f:.1f}" for cause, f in list(causes.items())[:5])
     read = image.valid.any()
     median = f"{1e3 * found.median_abs_m:.2f}" if read else "-"
-    wrong = f"{100 * found.outlier_rate:.1f} %" if read else "-"
+    wrong = f"{100 * found.wrong / (found.right + found.wrong):.1f} %" if read else "-"
     print(f"| {name} | {100 * found.completeness:.1f} % | {median} | {wrong} | {because} |")
     return image, compared
 

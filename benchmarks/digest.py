@@ -77,7 +77,7 @@ def of_readings(signals: Any, one: Instrument, noise: bool) -> Iterator[tuple[st
     image = rangesim.decode(capture)
     maps = ("z", "range_m", "confidence", "status", "intensity", "projector_column", "projector_row")
     comparison = rangesim.compare(image, signals.truth)
-    causes = rangesim.explain(image, capture, signals, tolerance_m=comparison.outlier_m)
+    causes = rangesim.explain(image, capture, signals, tolerance_m=comparison.tolerance_m)
     yield "capture", capture.frames
     yield from ((f"range image/{name}", getattr(image, name)) for name in maps if getattr(image, name) is not None)
     yield "comparison", [list(row.values()) for row in comparison.rows()]

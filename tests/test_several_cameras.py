@@ -173,7 +173,7 @@ def test_cameras_mixed_up_are_noticed() -> None:
     left, right = transport(scene, rigs, [sensor], spp=2, max_depth=2)
     capture = expose(left, sensor)
     image = decode(capture)
-    assert compare(image, left).row("all").outlier_rate < 0.1
+    assert compare(image, left).row("all").wrong < 0.1
     with pytest.raises(ValueError, match="signals that the range image comes from, got those of a camera elsewhere"):
         compare(image, right)
     with pytest.raises(ValueError, match="exposed from these signals, got that of a camera elsewhere"):

@@ -11,7 +11,7 @@ from rangesim.capture import Captured
 from rangesim.causes.cause import Cause, CauseMap
 from rangesim.causes.evidence import Evidence
 from rangesim.decoding.range_image import RangeImage
-from rangesim.evaluation.comparison import OUTLIER_M
+from rangesim.evaluation.comparison import TOLERANCE_M
 from rangesim.evaluation.reference_readings import ReferenceReadings
 from rangesim.response import CAUSTIC, DIRECT, GLINT, MULTIPATH, SPECULAR
 
@@ -29,7 +29,7 @@ def explain(
     image: RangeImage,
     capture: Captured,
     signals: Signals,
-    tolerance_m: float = OUTLIER_M,
+    tolerance_m: float = TOLERANCE_M,
 ) -> CauseMap:
     """The cause of each failed pixel of a range image.
 
@@ -61,7 +61,7 @@ def explain(
     >>> bool(causes.failed.all())
     True
     >>> causes.fractions(signals.truth)[-1]
-    {'material': 'all', 'failed': 1.0, 'causes': {'low_signal': 1.0}}
+    {'kind': 'all', 'name': 'all', 'right': 0.0, 'causes': {'low_signal': 1.0}}
     """
     return causes_of(ReferenceReadings(image, capture, signals), tolerance_m)
 

@@ -16,7 +16,7 @@ def compare_command(
     results: Annotated[list[Path], typer.Argument(help="Directories that `rangesim run` wrote.", show_default=False)],
     markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown instead of a drawn table.")] = False,
 ) -> None:
-    """Print the errors per material and sensor, and why pixels failed. Lengths are in mm, fractions in %.
+    """Print what is right, wrong and missing per material and sensor, and why. Lengths are in mm, fractions in %.
 
     Example:
 
@@ -47,7 +47,7 @@ def _print(table: Table) -> None:
 
     drawing = drawn.Table(box=box.SIMPLE_HEAD)
     for i, head in enumerate(table.heads):
-        is_text = i < 2 or head.startswith("because")
+        is_text = i < 2 or "because" in head
         drawing.add_column(head, justify="left" if is_text else "right", overflow="fold")
     for before, row in zip([table.heads, *table.rows], table.rows, strict=False):
         cells = ("" if row[0] == before[0] else row[0], *row[1:])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of a range image with the ground truth, by material class."""
+"""Comparison of a range image with the ground truth, by object and by material class."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ import numpy as np
 from rangesim.decoding.range_image import RangeImage
 from rangesim.evaluation.depth_edges import depth_edges
 from rangesim.evaluation.neighbourhood import Neighbourhood, neighbourhood
+from rangesim.evaluation.surface_rows import index_of_row, with_mean_over_objects
 from rangesim.rig import is_same_pose
 from rangesim.settings.config import ShortRepr
-from rangesim.signals import GroundTruth, Signals
+from rangesim.signals import GroundTruth, Signals, Surface
 
-OUTLIER_M = 0.010
-"""Error of a reading, in metres, above which it is an outlier and counts as failed.
+TOLERANCE_M = 0.010
+"""Largest error of a right reading, in metres, unless the task states another one.
 
-The value is a choice, not a measurement. It decides what fraction of the readings is called wrong, so every table
-states it.
+The value is a choice, not a measurement. It decides what fraction of the pixels is called wrong, so every table states
+the tolerance.
 """
 EDGE_RADIUS = 2
 """Distance from a depth edge, in pixels, within which a pixel can be a flying pixel.
@@ -32,87 +33,91 @@ values were not measured.
 
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Statistics of the errors of one material class. A value is NaN where there are no pixels to compute it from.
+    """Statistics of the errors on one surface. A value is NaN where there are no pixels to compute it from.
 
     Parameters
     ----------
-    material : str, class of the first surface behind the pixel, or "all".
+    kind, name : str, what the row is about: "object" and its name; "material" and the class of the first surface behind
+        the pixel; "all", all surfaces; or "objects", the mean over the objects, in which each weighs the same
+        (`rangesim.evaluation.surface_rows.with_mean_over_objects`).
     pixels : int, number of pixels with a true depth.
     lit : int, number of those pixels that the emitter lights; the others lie in its shadow or outside its field.
-    completeness : fraction of the lit pixels that have a reading.
-    coverage : fraction of all pixels that have a reading.
+    right, wrong, missing : fractions of all pixels, lit or not, which add up to 1: with a reading and
+        |z - true z| <= `tolerance_m`, with a reading and a larger error, without a reading.
+    completeness : fraction of the lit pixels that have a reading, right or wrong.
     bias_m : mean of z - true z, metres, over all pixels with a reading, lit or not.
     median_abs_m, rmse_m, p95_abs_m : median, root mean square and 95th percentile of |z - true z|, metres.
-    outlier_rate : fraction of the readings with |z - true z| > `outlier_m`.
     edge_pixels : int, number of pixels with a reading within `EDGE_RADIUS` pixels of a depth edge.
-    flying_rate : fraction of the edge pixels that are flying pixels: their z differs by more than `outlier_m` from
+    flying_rate : fraction of the edge pixels that are flying pixels: their z differs by more than `tolerance_m` from
         every true depth in the window of 5 x 5 pixels, so that they lie on neither side of the edge.
     """
 
-    material: str
+    kind: str
+    name: str
     pixels: int
     lit: int
+    right: float
+    wrong: float
+    missing: float
     completeness: float
-    coverage: float
     bias_m: float
     median_abs_m: float
     rmse_m: float
     p95_abs_m: float
-    outlier_rate: float
     edge_pixels: int
     flying_rate: float
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(ShortRepr):
-    """Statistics of the errors of a range image per material class, and its error map.
+    """Statistics of the errors of a range image per object and per material class, and its error map.
 
-    table : tuple of ErrorStatistics, one for each material class, "all" last.
+    table : tuple of ErrorStatistics: the mean over objects, each object, each material class, and "all" at the end.
     error_m : (h, w) float32, metres, z - true z; NaN where there is no reading or no true surface.
     flying : (h, w) bool, flying pixels.
-    outlier_m : float, metres, error above which a reading is an outlier.
+    tolerance_m : float, metres, largest error of a right reading.
     """
 
     table: tuple[ErrorStatistics, ...]
     error_m: np.ndarray
     flying: np.ndarray
-    outlier_m: float
+    tolerance_m: float
 
     def rows(self) -> list[dict[str, Any]]:
-        """One dict per material class, as JSON can hold it: None in place of NaN."""
+        """One dict per row of the table, as JSON can hold it: None in place of NaN."""
         return [
             {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(row).items()}
             for row in self.table
         ]
 
-    def row(self, material: str) -> ErrorStatistics:
-        """Statistics of one material class.
+    def row(self, name: str, kind: str | None = None) -> ErrorStatistics:
+        """Statistics of the object or of the material class of this name, or of "objects" or "all".
+
+        Parameters
+        ----------
+        kind : "object" or "material", if there are both of this name; None: the one that there is.
 
         Raises
         ------
         ValueError
-            The comparison has no class of this name.
+            The comparison has no row of this name, or several.
         """
-        for row in self.table:
-            if row.material == material:
-                return row
-        names = ", ".join(row.material for row in self.table)
-        raise ValueError(f"expected a material class out of {names}, got {material!r}.")
+        return self.table[index_of_row([(row.kind, row.name) for row in self.table], name, kind)]
 
 
-def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = OUTLIER_M) -> Comparison:
-    """Errors of a range image against the ground truth, per material class and over all pixels.
+def compare(image: RangeImage, truth: GroundTruth | Signals, tolerance_m: float = TOLERANCE_M) -> Comparison:
+    """Errors of a range image against the ground truth, per object, per material class and over all pixels.
 
     Parameters
     ----------
     image : RangeImage.
     truth : GroundTruth, or the Signals that contain it.
-    outlier_m : float, metres; readings with a larger error are outliers.
+    tolerance_m : float, metres, largest error of a right reading; what the task of the sensor can bear.
 
     Raises
     ------
     ValueError
-        Image and truth differ in size, the signals are those of a camera at another place, or `outlier_m` is not
+        Image and truth differ in size, the signals are those of a camera at another place, or `tolerance_m` is not
         positive.
 
     Examples
@@ -121,11 +126,13 @@ def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = 
 
     >>> from rangesim import compare
     >>> comparison = compare(image, signals)
-    >>> [statistics.material for statistics in comparison.table]
-    ['matte', 'all']
+    >>> [row.name for row in comparison.table if row.kind == "material"]
+    ['matte']
     >>> matte = comparison.row("matte")
-    >>> matte.completeness, matte.median_abs_m < 0.005
-    (1.0, True)
+    >>> matte.right > 0.999, matte.missing
+    (True, 0.0)
+    >>> compare(image, signals, tolerance_m=1e-9).row("matte").right < 0.5
+    True
 
     References
     ----------
@@ -140,43 +147,46 @@ def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = 
     true_m = truth.z if image.camera is None else image.camera.reading(truth)
     if image.z.shape != truth.z.shape:
         raise ValueError(f"expected ground truth of shape {image.z.shape} as the image, got {truth.z.shape}.")
-    if not outlier_m > 0:
-        raise ValueError(f"expected a positive outlier_m in metres, got {outlier_m}.")
+    if not tolerance_m > 0:
+        raise ValueError(f"expected a positive tolerance_m in metres, got {tolerance_m}.")
     error = np.where(image.valid, image.reading_m.astype(np.float64) - true_m, np.nan)
-    edge, flying = _flying(image.reading_m, true_m, outlier_m, neighbourhood(image.camera))
-    table = [
-        _statistics(name, mask, error, truth.projector_visible, edge, flying, outlier_m)
-        for name, mask in truth.classes().items()
+    edge, flying = _flying(image.reading_m, true_m, tolerance_m, neighbourhood(image.camera))
+    rows = [
+        asdict(_statistics(surface, error, truth.projector_visible, edge, flying, tolerance_m))
+        for surface in truth.surfaces()
     ]
-    return Comparison(tuple(table), error.astype(np.float32), flying, outlier_m)
+    table = tuple(ErrorStatistics(**row) for row in with_mean_over_objects(rows))
+    return Comparison(table, error.astype(np.float32), flying, tolerance_m)
 
 
 def _statistics(
-    name: str,
-    mask: np.ndarray,
+    surface: Surface,
     error: np.ndarray,
     visible: np.ndarray,
     edge: np.ndarray,
     flying: np.ndarray,
-    outlier_m: float,
+    tolerance_m: float,
 ) -> ErrorStatistics:
-    """Statistics of the pixels `mask` (h, w) bool, which are those of the material class `name`."""
+    """Statistics of the pixels of a surface."""
+    mask = surface.mask
     measured = mask & np.isfinite(error)
     lit, at_edge = mask & visible, measured & edge
     e = error[measured]
     absolute = np.abs(e)
     median, p95 = np.percentile(absolute, [50, 95]) if e.size else (np.nan, np.nan)
     return ErrorStatistics(
-        material=name,
+        kind=surface.kind,
+        name=surface.name,
         pixels=int(mask.sum()),
         lit=int(lit.sum()),
+        right=_fraction(mask & (np.abs(error) <= tolerance_m), mask),
+        wrong=_fraction(mask & (np.abs(error) > tolerance_m), mask),
+        missing=_fraction(mask & ~measured, mask),
         completeness=_fraction(measured & visible, lit),
-        coverage=_fraction(measured, mask),
         bias_m=float(e.mean()) if e.size else math.nan,
         median_abs_m=float(median),
         rmse_m=float(np.sqrt(np.mean(e**2))) if e.size else math.nan,
         p95_abs_m=float(p95),
-        outlier_rate=float(np.mean(absolute > outlier_m)) if e.size else math.nan,
         edge_pixels=int(at_edge.sum()),
         flying_rate=_fraction(at_edge & flying, at_edge),
     )
@@ -189,7 +199,7 @@ def _fraction(part: np.ndarray, whole: np.ndarray) -> float:
 
 
 def _flying(
-    z: np.ndarray, true_z: np.ndarray, outlier_m: float, pixels: Neighbourhood
+    z: np.ndarray, true_z: np.ndarray, tolerance_m: float, pixels: Neighbourhood
 ) -> tuple[np.ndarray, np.ndarray]:
     """Two masks, (h, w) bool each: pixels near a depth edge, and flying pixels."""
     far = np.where(np.isfinite(true_z), true_z, np.inf)
@@ -197,6 +207,6 @@ def _flying(
     measured = np.where(np.isfinite(z), z, np.nan)
     for shifted in pixels.shifted(far, EDGE_RADIUS):
         np.fmin(nearest, np.abs(measured - shifted), out=nearest)
-    edges = depth_edges(true_z, outlier_m, pixels)
+    edges = depth_edges(true_z, tolerance_m, pixels)
     edge = np.any(pixels.shifted(edges, EDGE_RADIUS), axis=0) & np.isfinite(true_z)
-    return edge, edge & np.isfinite(measured) & (nearest > outlier_m)
+    return edge, edge & np.isfinite(measured) & (nearest > tolerance_m)

@@ -3,7 +3,7 @@
 
 Every setting of the package is a frozen dataclass, and files of settings are read and written through this module only.
 It refuses unknown keys and names the nearest valid one, and checks the types of values. What it reads back is equal to
-what it wrote.
+what it wrote. Lengths, whose names end in `_m`, are in metres, or texts with a unit (`rangesim.settings.lengths`).
 
 Examples
 --------
@@ -12,6 +12,8 @@ Examples
 >>> table
 {'aperture_radius_m': 0.002, 'focus_m': None, 'vignetting': 0.0, 'stray_light': 0.0}
 >>> from_dict(Lens, table) == Lens(aperture_radius_m=2e-3)
+True
+>>> from_dict(Lens, {"aperture_radius_m": "2 mm"}) == Lens(aperture_radius_m=2e-3)
 True
 >>> from_dict(Lens, {"aperture_radius_m": 2e-3, "focus": 1.0})
 Traceback (most recent call last):
@@ -35,6 +37,7 @@ import numpy as np
 
 from pcgraph.plumbing.short_repr import SHORT
 from pcgraph.plumbing.short_repr import ShortRepr as ShortRepr
+from rangesim.settings.lengths import metres
 
 T = TypeVar("T")
 
@@ -86,12 +89,24 @@ def from_dict(cls: type[T], data: Any, where: str = "") -> T:
     missing = [n for n, f in names.items() if n not in values and _required(f)]
     if missing:
         raise ValueError(f"{place}: missing {', '.join(map(repr, missing))}.")
-    values = {key: on_top_of(names[key].default, value) for key, value in values.items()}
+    try:
+        values = {key: _in_metres(key, on_top_of(names[key].default, value)) for key, value in values.items()}
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
     arguments = {key: _value(hints[key], value, f"{where}.{key}".lstrip(".")) for key, value in values.items()}
     try:
         return cls(**arguments)
     except ValueError as error:
         raise ValueError(f"{place}: {error}") from error
+
+
+def _in_metres(key: str, value: Any) -> Any:
+    """The value of a field; a length (its name ends in "_m") with a unit is converted to metres."""
+    if key.endswith("_m") and isinstance(value, str):
+        return metres(value, key)
+    if key.endswith("_m") and isinstance(value, list):
+        return [_in_metres(key, each) for each in value]
+    return value
 
 
 @lru_cache(maxsize=256)  # evaluating the annotations takes longer than everything else that is done for a table

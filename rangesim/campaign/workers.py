@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The processes that carry out items: an embedded cluster of this machine, or one that a scheduler's address names."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
+
+from rangesim.campaign.in_worker import THREAD_VARIABLES
+from rangesim.errors import EnvironmentProblem
+from rangesim.settings.bounds import check_fields, whole
+
+if TYPE_CHECKING:
+    from distributed import Client, LocalCluster
+
+ALLOWED_DEATHS = 2
+"""Deaths of workers that Dask forgives an item: at the third one it is under suspicion. An item that waited on a worker
+that died counts, too, so less would put many innocent items under suspicion."""
+FIRST_ANSWER_S = 10.0
+"""Seconds in which a scheduler has to answer at first: its address may be wrong, and the user should hear it soon."""
+WAIT_S = 300.0
+"""Seconds that a run waits for a scheduler that it has lost, and for workers if there are none: long enough for a
+restart by systemd, Kubernetes or by hand, short enough not to hold an allocation of a cluster for hours."""
+BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Environment variables of the threads of BLAS and of OpenMP."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Worker processes that carry out items, one item at a time each.
+
+    Parameters
+    ----------
+    count : processes on this machine. None: as many as there are cores.
+    scheduler : address of a Dask scheduler, such as "tcp://10.0.0.1:8786", whose workers do the work. None: the
+        processes are started on this machine, and end with the run.
+    """
+
+    count: Annotated[int | None, whole(1)] = None
+    scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.count is not None and self.scheduler is not None:
+            raise ValueError(
+                f"expected a count of workers or a scheduler, got both, {self.count} and {self.scheduler!r}: the "
+                "scheduler has its own workers."
+            )
+
+    @contextmanager
+    def connected(self, answer_s: float = FIRST_ANSWER_S) -> Iterator[Client]:
+        """A client of the workers' scheduler while the block runs; there is at least one worker.
+
+        Parameters
+        ----------
+        answer_s : seconds in which the scheduler has to answer.
+
+        Raises
+        ------
+        EnvironmentProblem
+            Dask is not installed, the scheduler does not answer, or there is no worker in `WAIT_S` seconds.
+        """
+        try:
+            from distributed import Client
+        except ImportError:
+            raise EnvironmentProblem(
+                "campaigns need Dask, and it is not installed: pip install 'rangesim[campaign]'."
+            ) from None
+        with _quiet():
+            if self.scheduler is None:
+                count = self.count or cores()
+                with _local_cluster(count) as cluster, Client(cluster, set_as_default=False) as client:
+                    yield client
+                return
+            with _client_of(self.scheduler, answer_s) as client:
+                try:
+                    client.wait_for_workers(1, timeout=WAIT_S)
+                except TimeoutError:
+                    raise EnvironmentProblem(no_workers(self.scheduler)) from None
+                yield client
+
+
+def no_workers(scheduler: str | None) -> str:
+    """Sentence about a scheduler that has had no worker for `WAIT_S` seconds."""
+    start = f"no worker has come to {scheduler}" if scheduler else "no worker process could be started here"
+    advice = f": start some, dask worker {scheduler} --nthreads 1 --nworkers N" if scheduler else ""
+    return f"{start} for {WAIT_S:g} s{advice}."
+
+
+def cores() -> int:
+    """Count of cores that this process may use."""
+    from dask.system import CPU_COUNT
+
+    return int(CPU_COUNT)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Dask from logging deaths of workers on stderr while the block runs; the outcome tells them."""
+    logger = logging.getLogger("distributed")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+@contextmanager
+def _client_of(scheduler: str, answer_s: float) -> Iterator[Client]:
+    """A client of the scheduler at an address, which has `answer_s` seconds to answer."""
+    from distributed import Client
+
+    until = time.monotonic() + answer_s
+    client = None
+    while client is None:
+        try:
+            client = Client(scheduler, set_as_default=False, timeout=min(5.0, answer_s))
+        except OSError as problem:
+            if time.monotonic() > until:
+                raise EnvironmentProblem(
+                    f"no scheduler answers at {scheduler} within {answer_s:g} s: start one there, dask scheduler, or "
+                    "correct the address."
+                ) from problem
+            time.sleep(0.5)
+        except ValueError as problem:
+            raise ValueError(f"expected the address of a scheduler such as tcp://10.0.0.1:8786: {problem}") from problem
+    with client:
+        yield client
+
+
+@contextmanager
+def _local_cluster(count: int) -> Iterator[LocalCluster]:
+    """A scheduler in this process and `count` workers, each a process of one Dask thread with a nanny."""
+    import dask
+    from distributed import LocalCluster, Nanny
+    from distributed.system import MEMORY_LIMIT
+
+    # One thread for BLAS and OpenMP, because the order in which they sum depends on the number of threads.
+    threads = {**dict.fromkeys(BLAS_VARIABLES, "1"), **dict.fromkeys(THREAD_VARIABLES, str(max(1, cores() // count)))}
+
+    class WorkerNanny(Nanny):
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            super().__init__(*args, **kwargs)
+            self.pre_spawn_env |= threads  # the libraries read them when they are loaded
+
+    settings = {
+        "distributed.scheduler.allowed-failures": ALLOWED_DEATHS,
+        "distributed.scheduler.worker-saturation": 1.0,  # what waits on a worker that dies is suspected, too
+        "distributed.scheduler.worker-ttl": None,  # a jump of the clock would end all workers
+        # A worker at one of these limits would wait for memory that nothing frees. The last limit is kept: the nanny
+        # ends a worker that takes nearly all of the machine's memory.
+        "distributed.worker.memory.target": False,
+        "distributed.worker.memory.spill": False,
+        "distributed.worker.memory.pause": False,
+    }
+    before = dict(os.environ)
+    try:
+        with dask.config.set(settings):
+            cluster = LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                host="127.0.0.1",
+                protocol="tcp",
+                dashboard_address="127.0.0.1:0",  # any free port: the scheduler has a web server, with no page here
+                scheduler_kwargs={"dashboard": False},
+                silence_logs=logging.CRITICAL,
+                memory_limit=MEMORY_LIMIT,
+                worker_class=WorkerNanny,
+                preload="import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)",  # Ctrl-C is for the driver
+            )
+            with cluster:
+                yield cluster
+    finally:
+        for name in set(os.environ) - set(before):  # nannies set variables in this process, too
+            del os.environ[name]
+        os.environ.update(before)
