@@ -94,7 +94,15 @@ def test_run_takes_an_experiment_file_that_options_override(command: Command, tm
     assert sorted((out / "amcw" / "capture").glob("*.exr"))  # noise-free frames are radiance
 
 
-@pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.toml")), ids=lambda p: p.stem)
+OTHER_COMMANDS = ("dataset_", "sweep_")
+"""First letters of the examples that are for other commands than `run`."""
+
+
+@pytest.mark.parametrize(
+    "example",
+    sorted(p for p in (ROOT / "examples").glob("*.toml") if not p.stem.startswith(OTHER_COMMANDS)),
+    ids=lambda p: p.stem,
+)
 def test_examples_run(command: Command, tmp_path: Path, example: Path) -> None:
     answer = command("run", "--config", example, *TINY, "--out", tmp_path / "out")
     assert answer.status == 0, answer.err

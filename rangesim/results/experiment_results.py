@@ -352,13 +352,13 @@ def _write_readings(measurement: Measurement, folder: Path) -> None:
     write_record(folder / "comparison.json", ComparisonRecord(tolerance_m=causes.tolerance_m, rows=rows))
     write_record(folder / "measurement.json", measurement.metadata)
     if measurement.objects is not None:
-        write_record(folder / "objects.json", _objects_record(measurement.objects))
+        write_record(folder / "objects.json", objects_record(measurement.objects))
     if measurement.segmentation is not None:
         measurement.image.to_point_cloud().save(folder / "cloud.ply")
         write_arrays(folder / "segmentation.npz", vars(measurement.segmentation))
 
 
-def _objects_record(objects: ObjectSegmentation) -> ObjectsRecord:
+def objects_record(objects: ObjectSegmentation) -> ObjectsRecord:
     """The contents of `objects.json`."""
     quality = objects.panoptic_quality
     return ObjectsRecord(
