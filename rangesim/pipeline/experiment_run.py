@@ -209,7 +209,13 @@ def _computed(
             tell(f"Measuring with {instrument.name}", end)
             seed, light = noise_seed(experiment, instrument), signals.at_wavelength(instrument.emitter_wavelength_m)
             measurements[instrument.name] = measure(
-                instrument, light, seed, experiment.ambient, number, experiment.tolerance_m, true_labels[view]
+                instrument,
+                light,
+                seed,
+                experiment.ambient,
+                number,
+                tolerance_m=experiment.tolerance_m,
+                true_labels=true_labels[view],
             )
     info = provenance(experiment, scene, groups, mi.variant(), times)
     return Result(experiment, tuple(measurements[i.name] for i in experiment.instruments), tuple(passes), info)

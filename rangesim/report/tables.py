@@ -11,7 +11,7 @@ from typing import Any
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
 from rangesim.evaluation.comparison import Comparison, ErrorStatistics
 from rangesim.evaluation.range_noise import SMALL, noise_ratio
-from rangesim.evaluation.surface_rows import KINDS, OBJECT, OBJECTS
+from rangesim.evaluation.surface_rows import KINDS, OBJECT, OBJECTS, PART
 from rangesim.experiment import Experiment
 from rangesim.presets import catalogue
 from rangesim.report import palette
@@ -25,7 +25,7 @@ Rows = list[dict[str, Any]]
 
 BECAUSE = "because (% of the pixels)"
 """Head of the column with the causes of wrong and missing readings."""
-SUMMARIES = tuple(kind for kind in KINDS if kind != OBJECT)
+SUMMARIES = tuple(kind for kind in KINDS if kind not in (OBJECT, PART))
 """Kinds of rows of the tables of errors and of noise, which would be long with a row for every object."""
 MOST = 0.5
 """Fraction of the pixels of a surface that must be right for a sensor to be reliable on it.
@@ -137,7 +137,7 @@ def outcome_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[O
 
 
 def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, list[Cell]]]]]:
-    """Errors of each instrument per surface, except single objects.
+    """Errors of each instrument per surface, except single objects and parts.
 
     Each entry is the surface and a list with the name and the cells, one per column, of each instrument.
     """

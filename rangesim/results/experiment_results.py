@@ -156,7 +156,7 @@ class RowRecord(Record, frozen=True, kw_only=True):
     `rangesim.evaluation.range_noise.RangeNoise.by_surface` explain them. None: not known.
     """
 
-    kind: Literal["objects", "object", "material", "all"]
+    kind: Literal["objects", "object", "part", "material", "all"]
     name: str
     pixels: Count
     lit: Count
@@ -255,7 +255,7 @@ class Measurement(ShortRepr):
     image : RangeImage.
     truth : GroundTruth of the instrument's pass.
     causes : CauseMap, the cause of each failed pixel.
-    rows : statistics with the keys of `RowRecord`, in this order: mean over objects, each object, each material class,
+    rows : statistics with the keys of `RowRecord`, in this order: mean over objects, objects, parts, material classes,
         "all". `row` finds one by its name.
     segmentation : Segmentation; None if there were too few points.
     objects : ObjectSegmentation, what the segmentation makes of each object; None in results that do not tell.
