@@ -41,7 +41,7 @@ def provenance(
             name=scene.name,
             sha256=_checksum(scene.source),
             working_distance_m=scene.working_distance_m,
-            shapes=[ShapeRecord(name=i.name, material=i.material) for i in scene.instances],
+            shapes=[ShapeRecord(name=i.name, material=i.material, object=i.object_name) for i in scene.instances],
         ),
         passes=len(passes),
         instruments=[

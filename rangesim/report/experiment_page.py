@@ -13,6 +13,7 @@ from pcgraph.viewer.packing import pack
 from rangesim.errors import FileFormatError
 from rangesim.report import figures, palette, point_viewer, tables
 from rangesim.report.content_security import visible_text
+from rangesim.report.objects_section import objects_sentence, objects_table, totals
 from rangesim.report.template import render_page
 from rangesim.report.verdict import verdict
 from rangesim.results.experiment_results import Measurement, Result
@@ -22,7 +23,14 @@ from rangesim.signals import GroundTruth
 FEW_PX = 64
 """Width of an image, in pixels, below which its pixels are shown as squares: a sensor of 8 x 8 zones has no image that
 could be smoothed. With a larger value the pictures of small trial runs would be squares, too."""
-SCRIPTS = ("scroll.js", "pcgraph.viewer:three.js", "pcgraph.viewer:points.js", "sensor_views.js", "report.js")
+SCRIPTS = (
+    "scroll.js",
+    "print.js",
+    "pcgraph.viewer:three.js",
+    "pcgraph.viewer:points.js",
+    "sensor_views.js",
+    "report.js",
+)
 """Files of the page's JavaScript, in the order in which they use each other."""
 
 
@@ -44,9 +52,9 @@ def write_report(result: Result, path: Path) -> None:
     write_file(path, render_report(result).encode(), FileFormatError)
 
 
-def render_report(result: Result) -> str:
-    """HTML page of the report of a result."""
-    return render_page("report.html.j2", context(result), SCRIPTS)
+def render_report(result: Result, paper: str = "") -> str:
+    """HTML page of the report of a result; `paper` is the size with which it is printed, such as "A4"."""
+    return render_page("report.html.j2", context(result), SCRIPTS, paper)
 
 
 def context(result: Result) -> dict[str, Any]:
@@ -66,7 +74,11 @@ def context(result: Result) -> dict[str, Any]:
         "columns": tables.COLUMNS,
         "along_rays": _along_rays(measurements, names),
         "comparison": tables.comparison_table(measurements),
-        "failures": tables.failure_table(measurements),
+        "outcome_columns": tables.OUTCOMES,
+        "outcomes": tables.outcome_table(measurements),
+        "objects": objects_table(measurements),
+        "object_totals": totals(measurements),
+        "object_sentences": [(names[m.name], objects_sentence(m)) for m in measurements],
         "noise": tables.noise_table(measurements),
         "tolerance_mm": f"{1e3 * measurements[0].causes.tolerance_m:g}",
         "definitions": tables.definitions(measurements),

@@ -6,7 +6,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import overload
+from typing import NamedTuple, overload
 
 import numpy as np
 
@@ -47,6 +47,24 @@ class EnergySplit(ShortRepr):
         """All light of the emitter at full power, without ambient light: (h, w) float32, W/m2/sr."""
         return self.direct + self.multipath + self.specular + self.caustic + self.glint
 
+    def scaled(self, factor: float) -> EnergySplit:
+        """The same split with that many times the emitter's light; ambient light stays as it is."""
+        kinds = ("direct", "multipath", "specular", "caustic", "glint")
+        return replace(self, **{kind: np.float32(factor) * getattr(self, kind) for kind in kinds})
+
+
+class Surface(NamedTuple):
+    """A part of the ground truth that a row of a table is about.
+
+    kind : "object", "part" (a shape of an object that has several), "material" or "all". name : of the object, of the
+        shape or of the material class, or "all".
+    mask : (h, w) bool, its pixels.
+    """
+
+    kind: str
+    name: str
+    mask: np.ndarray
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GroundTruth(ShortRepr):
@@ -60,6 +78,8 @@ class GroundTruth(ShortRepr):
     projector_visible : (h, w) bool, whether the straight line to the projector is free and the point is in its image.
     nearest_m, farthest_m : (h, w) float32, metres, least and largest range of the surfaces within a zone; the other
         fields then describe the surface that fills most of it. None: pixels are no `rangesim.rig.Zones`.
+    instance_objects : for each instance the name of the object that it is a part of; empty for background, such as a
+        table or a wall (`rangesim.scene.objects`). No names at all: not known.
 
     Examples
     --------
@@ -79,12 +99,46 @@ class GroundTruth(ShortRepr):
     material_names: tuple[str, ...] = ()
     nearest_m: np.ndarray | None = None
     farthest_m: np.ndarray | None = None
+    instance_objects: tuple[str, ...] = ()
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """Names of the objects of the scene, seen or not; none if there is only background, or if it is not known."""
+        return tuple(dict.fromkeys(name for name in self.instance_objects if name))
+
+    @property
+    def object_index(self) -> np.ndarray:
+        """(h, w) int32, index into `object_names` of the object behind each pixel; -1 for background and nothing."""
+        if not self.instance_objects:
+            return np.full_like(self.instance, -1)
+        index_of = {name: i for i, name in enumerate(self.object_names)}
+        of_instance = [index_of.get(name, -1) for name in self.instance_objects]
+        return np.array([*of_instance, -1], dtype=np.int32)[self.instance]
+
+    def objects(self) -> dict[str, np.ndarray]:
+        """Pixels of each object that the camera sees, as (h, w) bool by name."""
+        index = self.object_index
+        masks = {name: index == i for i, name in enumerate(self.object_names)}
+        return {name: mask for name, mask in masks.items() if mask.any()}
+
+    def parts(self) -> dict[str, np.ndarray]:
+        """Pixels of each shape that the camera sees of an object of several shapes, as (h, w) bool by name."""
+        shapes = list(zip(self.instance_names, self.instance_objects, strict=False))
+        several = {thing for _, thing in shapes if thing and self.instance_objects.count(thing) > 1}
+        masks = {name: self.instance == i for i, (name, thing) in enumerate(shapes) if thing in several}
+        return {name: mask for name, mask in masks.items() if mask.any()}
 
     def classes(self) -> dict[str, np.ndarray]:
         """Pixels of each material class that occurs, as (h, w) bool by name; "all" comes last, and may be empty."""
         seen = np.isfinite(self.z)
         of_class = {name: seen & (self.material == i) for i, name in enumerate(self.material_names)}
         return {name: mask for name, mask in of_class.items() if mask.any()} | {ALL: seen}
+
+    def surfaces(self) -> list[Surface]:
+        """The surfaces that tables have rows for: objects, their parts, material classes, and all together."""
+        *materials, (_, seen) = self.classes().items()
+        groups = {"object": self.objects().items(), "part": self.parts().items(), "material": materials}
+        return [Surface(kind, *item) for kind, items in groups.items() for item in items] + [Surface(ALL, ALL, seen)]
 
 
 @dataclass(frozen=True)
@@ -167,6 +221,13 @@ class Signals(ShortRepr, ABC):
         """Signals of each camera of the pass, the reference camera's first; by default these alone."""
         return (self,)
 
+    def at_wavelength(self, wavelength_m: float | None) -> Signals:
+        """The same signals of an emitter with this wavelength in metres; None: not stated.
+
+        The renderer is monochrome, so the light is the same; what a detector makes of it may differ.
+        """
+        return replace(self, rig=replace(self.rig, wavelength_m=wavelength_m))
+
     @property
     @abstractmethod
     def knows_sampling_error(self) -> bool:
@@ -197,6 +258,23 @@ class StillSignals(Signals):
 
     channels: dict[Response, np.ndarray] = field(kw_only=True)
     sampling: SamplingError | None = field(kw_only=True, default=None)
+
+    def at_power(self, power_w: float) -> StillSignals:
+        """The signals of the same pass if its emitter had another power, watts: light is linear."""
+        factor = np.float32(power_w / self.rig.projector_power_w)
+        if factor == 1:
+            return self
+        sampling = self.sampling
+        if sampling is not None:
+            errors = {r: factor * c for r, c in sampling.channels.items()}
+            sampling = SamplingError(errors, factor * sampling.projector)
+        return replace(
+            self,
+            rig=replace(self.rig, projector_power_w=power_w),
+            energy=self.energy.scaled(float(factor)),
+            channels={r: factor * c for r, c in self.channels.items()},
+            sampling=sampling,
+        )
 
     def only(self, sensor: Sensor) -> StillSignals:
         """The same signals without the channels that only other sensors need."""
@@ -301,9 +379,24 @@ class SignalSet(Signals, Sequence[Signals]):
             of_cameras=cameras,
         )  # fmt: skip
 
+    def at_wavelength(self, wavelength_m: float | None) -> SignalSet:
+        return SignalSet.of([one.at_wavelength(wavelength_m) for one in self.of_cameras])
+
     @property
     def cameras(self) -> tuple[Signals, ...]:
         return self.of_cameras
+
+    def at_power(self, power_w: float) -> SignalSet:
+        """The signals of the same pass if its emitter had another power, watts.
+
+        Raises
+        ------
+        ValueError
+            Something moves in the signals of a camera.
+        """
+        if not all(isinstance(one, StillSignals) for one in self.of_cameras):
+            raise ValueError("expected signals of a world at rest.")
+        return SignalSet.of([one.at_power(power_w) for one in self.of_cameras if isinstance(one, StillSignals)])
 
     @property
     def knows_sampling_error(self) -> bool:
