@@ -102,7 +102,7 @@ def main() -> None:
     signals = transport(scene, scene.rig(baseline_m, size, width=320, height=240), [sensor], spp=16)
     image = decode(expose(signals, sensor, sensor.default_detector))
     for row in compare(image, signals.truth).rows():
-        print(f"{row['material']}: {row['right']:.1%} right, median error {1e3 * row['median_abs_m']:.2f} mm")
+        print(f"{row['name']}: {row['right']:.1%} right, median error {1e3 * row['median_abs_m']:.2f} mm")
 
 
 if __name__ == "__main__":

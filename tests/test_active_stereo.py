@@ -318,7 +318,7 @@ def test_a_plane_is_measured_compared_and_explained(both: SignalSet, detector: D
     row = compare(image, both).row("all")
     assert row.completeness > 0.8
     assert row.median_abs_m < 0.01
-    noise = range_noise(image, capture, both).by_material(both.truth)[-1]
+    noise = range_noise(image, capture, both).by_surface(both.truth)[-1]
     assert 0 < noise["sampling_sigma_m"] < 0.01
     causes = explain(image, capture, both)
     occluded = causes.cause == Cause.OCCLUDED

@@ -76,7 +76,7 @@ def test_the_figures_are_those_of_the_calibration():
     # an arrow starts where a corner was seen, and is as long as its error, enlarged
     device = found.rig.camera
     enlarged = int(re.findall(r"errors (\d+) times enlarged", page)[0])
-    arrows = np.array(re.findall(r'<path d="M([\d.-]+) ([\d.-]+)L([\d.-]+) ([\d.-]+)" stroke="#d1495b"', page), float)
+    arrows = np.array(re.findall(r'<path d="M([\d.-]+) ([\d.-]+)L([\d.-]+) ([\d.-]+)" class="arrow"', page), float)
     seen, off = np.concatenate([v.pixels for v in found.camera_views]), np.concatenate(found.camera_residuals)
     assert np.abs(arrows[: len(seen), :2] - seen).max() < 0.06
     assert np.abs(arrows[: len(seen), 2:] - seen - enlarged * off).max() < 0.06

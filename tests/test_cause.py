@@ -349,15 +349,20 @@ def test_shares_are_of_the_pixels_of_a_material() -> None:
     )
     fractions = CauseMap(cause, 0.01).fractions(truth)
     matte, mirror, everything = fractions
-    assert matte == {"material": "matte", "right": 2 / 6, "causes": {"multipath": 3 / 6, "shadowed": 1 / 6}}
-    assert mirror == {"material": "mirror", "right": 0.0, "causes": {"specular_away": 1.0}}
+    assert matte == {
+        "kind": "material",
+        "name": "matte",
+        "right": 2 / 6,
+        "causes": {"multipath": 3 / 6, "shadowed": 1 / 6},
+    }
+    assert mirror == {"kind": "material", "name": "mirror", "right": 0.0, "causes": {"specular_away": 1.0}}
     assert everything["right"] == 2 / 7
     assert list(everything["causes"]) == ["multipath", "shadowed", "specular_away"]
     assert failures_markdown(fractions).splitlines() == [
-        "| material | right (%) | others failed because (% of the pixels) |",
+        "| surface | right (%) | because (% of the pixels) |",
         "| --- | --- | --- |",
-        "| matte | 33.3 | multipath 50.0, shadowed from emitter 16.7 |",
-        "| mirror | 0.0 | specular away 100.0 |",
+        "| material matte | 33.3 | multipath 50.0, shadowed from emitter 16.7 |",
+        "| material mirror | 0.0 | specular away 100.0 |",
         "| all | 28.6 | multipath 42.9, shadowed from emitter 14.3, specular away 14.3 |",
     ]
     assert json.loads(json.dumps(fractions)) == list(fractions)
@@ -386,7 +391,7 @@ def test_every_cause_is_printed_in_the_words_of_the_page() -> None:
     listed = ", ".join(f"{TITLES[c]} 5.3" for c in Cause if c)
     assert len(Cause) == 19
     assert failures_markdown(fractions).splitlines()[2:] == [
-        f"| wall | 5.3 | {listed} |",
+        f"| material wall | 5.3 | {listed} |",
         f"| all | 5.3 | {listed} |",
     ]
 
@@ -439,4 +444,4 @@ def test_where_nothing_fails_nothing_is_explained(sensor: Sensor) -> None:
     capture = rangesim.expose(signals, sensor)
     found = explain(rangesim.decode(capture), capture, signals, tolerance_m=0.2)
     assert not found.failed.any()
-    assert found.fractions(signals.truth)[-1] == {"material": "all", "right": 1.0, "causes": {}}
+    assert found.fractions(signals.truth)[-1] == {"kind": "all", "name": "all", "right": 1.0, "causes": {}}

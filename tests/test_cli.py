@@ -108,7 +108,7 @@ def test_run_takes_a_bare_mesh(command: Command, tmp_path: Path) -> None:
     out = tmp_path / "out"
     answer = command("run", tmp_path / "tetrahedron.ply", "--material", "glossy", *IDEAL, *TINY, "--out", out)
     assert answer.status == 0, answer.err
-    assert "| glossy | ideal-tof |" in (out / "comparison.md").read_text(encoding="utf-8")
+    assert "| material glossy | ideal-tof |" in (out / "comparison.md").read_text(encoding="utf-8")
 
 
 def test_decode_gives_the_range_image_of_the_pipeline(command: Command, tmp_path: Path) -> None:

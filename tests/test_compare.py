@@ -29,6 +29,7 @@ def truth_of(z: np.ndarray, material: np.ndarray, visible: np.ndarray | None = N
         material=material,
         projector_uv=np.zeros((*shape, 2), np.float32),
         projector_visible=np.isfinite(z) if visible is None else visible,
+        instance_names=("left", "right", "unused"),
         material_names=("matte", "glass", "unused"),
     )
 
@@ -57,9 +58,9 @@ def scene() -> tuple[np.ndarray, GroundTruth]:
 def test_a_perfect_image_has_no_errors(scene: tuple[np.ndarray, GroundTruth]) -> None:
     z, truth = scene
     result = compare(image_of(z), truth)
-    assert [row.material for row in result.table] == ["matte", "glass", "all"]
+    assert [row.name for row in result.table] == ["matte", "glass", "all"]
     for row in result.table:
-        assert row.pixels == row.lit == (200 if row.material == "all" else 100)
+        assert row.pixels == row.lit == (200 if row.kind == "all" else 100)
         assert (row.right, row.wrong, row.missing, row.completeness) == (1, 0, 0, 1)
         assert row.bias_m == row.median_abs_m == row.rmse_m == row.p95_abs_m == 0
         assert row.edge_pixels == 0 or row.flying_rate == 0
@@ -129,6 +130,55 @@ def test_flying_pixels_lie_on_neither_side_of_an_edge() -> None:
     assert (row.right, row.wrong, row.missing) == (170 / 200, 30 / 200, 0)
 
 
+def of_objects(sizes: dict[str, int], material: str = "matte") -> GroundTruth:
+    """A row of pixels at 1 m, of objects of these sizes in pixels."""
+    instance = np.repeat(np.arange(len(sizes)), list(sizes.values()))[None]
+    truth = truth_of(np.ones(instance.shape), np.zeros_like(instance))
+    names = tuple(sizes)
+    named = {"instance_names": names, "instance_objects": names, "material_names": (material,)}
+    return dataclasses.replace(truth, instance=instance, **named)
+
+
+@pytest.mark.parametrize("pixels", [8, 80, 8000])
+def test_an_object_weighs_the_same_at_any_size(pixels: int) -> None:
+    """The big one is right, the small one wrong by half and missing by half."""
+    truth = of_objects({"big": pixels, "small": 8})
+    measured = np.ones(truth.z.shape)
+    measured[0, pixels : pixels + 4] = 1.1
+    measured[0, pixels + 4 :] = np.nan
+    result = compare(image_of(measured), truth)
+    big, small, mean = result.row("big"), result.row("small"), result.row("objects")
+    assert (big.right, big.wrong, big.missing) == (1, 0, 0)
+    assert (small.right, small.wrong, small.missing) == (0, 0.5, 0.5)
+    assert (mean.right, mean.wrong, mean.missing) == (0.5, 0.25, 0.25)
+    assert mean.completeness == 0.75
+    assert mean.median_abs_m == pytest.approx(0.05)
+    assert mean.pixels == truth.z.size
+    assert [row.kind for row in result.table] == ["objects", "object", "object", "material", "all"]
+
+
+def test_an_object_without_readings_leaves_the_mean_error_to_the_others() -> None:
+    truth = of_objects({"seen": 8, "blind": 8})
+    measured = np.where(np.arange(16)[None] < 8, 1.002, np.nan)
+    result = compare(image_of(measured), truth)
+    assert math.isnan(result.row("blind").median_abs_m)
+    assert result.row("objects").median_abs_m == pytest.approx(0.002, abs=1e-6)
+    assert (result.row("objects").right, result.row("objects").missing) == (0.5, 0.5)
+    unread = compare(image_of(np.full_like(measured, np.nan)), truth)
+    assert unread.rows()[0]["median_abs_m"] is None
+
+
+def test_an_object_and_a_material_of_one_name_are_told_apart_by_kind() -> None:
+    truth = of_objects({"mirror": 8, "cup": 8}, material="mirror")
+    result = compare(image_of(np.ones(truth.z.shape)), truth)
+    assert result.row("mirror", "object").pixels == 8
+    assert result.row("mirror", kind="material").pixels == 16
+    with pytest.raises(ValueError, match="expected the kind of row 'mirror', 'object' or 'material', got none"):
+        result.row("mirror")
+    with pytest.raises(ValueError, match=r"of the kind 'object' out of mirror, cup, got 'cap' \(did you mean 'cup'"):
+        result.row("cap", kind="object")
+
+
 def test_tables_are_json_and_markdown(scene: tuple[np.ndarray, GroundTruth]) -> None:
     z, truth = scene
     result = compare(image_of(np.full_like(z, np.nan)), truth)
@@ -140,7 +190,7 @@ def test_tables_are_json_and_markdown(scene: tuple[np.ndarray, GroundTruth]) -> 
     assert len(lines) == 2 + len(result.table)
     assert len({line.count("|") for line in lines}) == 1
     nothing = truth_of(np.full_like(z, np.nan), np.full(z.shape, -1, np.int32))
-    assert [row.material for row in compare(image_of(z), nothing).table] == ["all"]
+    assert [row.name for row in compare(image_of(z), nothing).table] == ["all"]
 
 
 def test_impossible_comparisons_are_refused(scene: tuple[np.ndarray, GroundTruth]) -> None:

@@ -90,7 +90,7 @@ def test_a_result_holds_every_stage_of_them(result: Path) -> None:
     for name, frames in (("gated-camera", 9), ("fringes", 10)):
         assert len(list((result / name / "capture").glob("*.png"))) == frames
         rows = json.loads((result / name / "comparison.json").read_text())["rows"]
-        matte = next(row for row in rows if row["material"] == "matte")
+        matte = next(row for row in rows if row["name"] == "matte")
         assert matte["completeness"] > 0.9
         assert matte["median_abs_m"] < 0.01
         assert matte["right"] < 1

@@ -51,7 +51,8 @@ def test_the_wheel_holds_scenes_devices_templates_and_types(built: Path) -> None
     assert scenes <= names
     assert {"rangesim/py.typed", "pcgraph/py.typed"} <= names
     assert {
-        f"rangesim/report/{n}" for n in ("report.html.j2", "report.js", "scroll.js", "sensor_views.js", "style.css")
+        f"rangesim/report/{n}"
+        for n in ("print.css", "print.js", "report.html.j2", "report.js", "scroll.js", "sensor_views.js", "style.css")
     } <= names
     viewer = ("viewer.html", "viewer.css", "viewer.js", "points.js", "boxes.js", "tree.js", "three.js")
     assert {f"pcgraph/viewer/{n}" for n in (*viewer, "three.LICENSE.txt")} <= names

@@ -227,9 +227,10 @@ def test_the_error_bar_of_completeness_covers_what_many_samples_read(
         signals = transport(scene, rig, [sensor], spp=spp, seed=seed)
         capture = expose(signals, sensor, one.detector, seed=seed)
         image = decode(capture)
-        table, noise = compare(image, signals).table, range_noise(image, capture, signals).by_material(signals.truth)
+        table, noise = compare(image, signals).table, range_noise(image, capture, signals).by_surface(signals.truth)
         rows = [(row, of_row["completeness_error"]) for row, of_row in zip(table, noise, strict=True) if row.lit >= 200]
-        return {row.material: row.completeness for row, _ in rows}, {row.material: bar for row, bar in rows}
+        materials = [(row, bar) for row, bar in rows if row.kind == "material"]
+        return {row.name: row.completeness for row, _ in materials}, {row.name: bar for row, bar in materials}
 
     few, bars = completeness("auto")
     many, small_bars = completeness(1024)
@@ -266,10 +267,10 @@ def test_readings_that_the_detector_takes_away_are_not_laid_to_sampling(matte: S
     capture = expose(signals, sensor, one.detector, exposure_s=0.03 * bright.exposure_s)
     image, other = decode(capture), decode(expose(signals, sensor, one.detector, capture.exposure_s, seed=1))
     assert np.mean(image.valid != other.valid) > 0.03  # up to a seventh
-    row = range_noise(image, capture, signals).by_material(signals.truth)[-1]
+    row = range_noise(image, capture, signals).by_surface(signals.truth)[-1]
     assert row["completeness_error"] < 0.03
     unknown = Capture(capture.frames, sensor, capture.rig)
-    assert range_noise(decode(unknown), unknown, signals).by_material(signals.truth)[-1]["completeness_error"] is None
+    assert range_noise(decode(unknown), unknown, signals).by_surface(signals.truth)[-1]["completeness_error"] is None
 
 
 # ---- Adaptive sampling -----------------------------------------------------------------------------------------------
@@ -325,7 +326,7 @@ def test_noise_falls_below_the_share_that_was_asked_for(matte: Scene) -> None:
         signals = transport(matte, rig, [one.sensor], spp=adaptive)
         capture = expose(signals, one.sensor, one.detector)
         noise = range_noise(decode(capture), capture, signals)
-        row = noise.by_material(signals.truth)[-1]
+        row = noise.by_surface(signals.truth)[-1]
         ratios.append(row["sampling_sigma_m"] / row["detector_sigma_m"])
         assert ratios[-1] < 1.25 * fraction  # few samples say it roughly
     assert ratios[1] < 0.5 * ratios[0]
@@ -415,7 +416,7 @@ def test_a_run_keeps_the_noise_of_its_readings_and_warns_of_it(tmp_path: Path) -
     amcw, ideal = load_result(tmp_path / "out").measurements
     sigma = amcw.image.sampling_sigma_m
     assert sigma is not None
-    rows = {row["material"]: row for row in amcw.rows}
+    rows = {row["name"]: row for row in amcw.rows if row["kind"] == "material"}
     of_glass = sigma[amcw.truth.classes()["transparent"]]
     assert robust_sigma(of_glass) == pytest.approx(rows["transparent"]["sampling_sigma_m"], rel=1e-6)
     assert rows["transparent"]["sampling_sigma_m"] > 0.5 * rows["transparent"]["detector_sigma_m"] > 0
@@ -432,18 +433,24 @@ def test_a_run_keeps_the_noise_of_its_readings_and_warns_of_it(tmp_path: Path) -
 
 
 def test_nothing_is_said_where_sampling_is_small_or_pixels_are_few() -> None:
-    row = {"material": "matte", "pixels": 5000, "lit": 4000, "sampling_sigma_m": 1e-4, "detector_sigma_m": 3e-4}
+    row = {
+        "kind": "material",
+        "name": "matte",
+        "pixels": 5000,
+        "lit": 4000,
+        "sampling_sigma_m": 1e-4,
+        "detector_sigma_m": 3e-4,
+    }
     row |= {"completeness": 0.9, "completeness_error": 0.02}
-    unsure = row | {"material": "glossy", "completeness": 0.68, "completeness_error": 0.12}
+    unsure = row | {"name": "glossy", "completeness": 0.68, "completeness_error": 0.12}
+    of_all = {"kind": "all", "name": "all"}
     quiet = [row, row | {"sampling_sigma_m": None}, row | {"pixels": 20, "sampling_sigma_m": 1.0}]
     quiet += [row | {"completeness": None, "completeness_error": None}, unsure | {"lit": 20}]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_sampling(
-            {"amcw": [*quiet, row | {"material": "all", "sampling_sigma_m": 1.0}, unsure | {"material": "all"}]}, 64
-        )
+        warn_of_sampling({"amcw": [*quiet, row | of_all | {"sampling_sigma_m": 1.0}, unsure | of_all]}, 64)
     with pytest.warns(SamplingWarning, match="gray: 2.0 on glossy"):
-        warn_of_sampling({"amcw": quiet, "gray": [row | {"material": "glossy", "sampling_sigma_m": 6e-4}]}, 64)
+        warn_of_sampling({"amcw": quiet, "gray": [row | {"name": "glossy", "sampling_sigma_m": 6e-4}]}, 64)
     with pytest.warns(SamplingWarning, match=r"are gray: 32 ± 12 % on glossy; about spp=1024 would leave 3 points"):
         warn_of_sampling({"amcw": quiet, "gray": [unsure]}, 64)
 

@@ -28,8 +28,10 @@ def test_the_python_of_the_readme_runs(tmp_path: Path) -> None:
     ten_lines, *more = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len([line for line in ten_lines.splitlines() if line and not line.startswith("import")]) <= 10
     printed = run([sys.executable, "-c", "".join((ten_lines, *more))], tmp_path)
-    assert "| mirror |" in printed
-    assert re.search(r"^\| mirror \| [\d.]+ \| .*mirrored ghost [\d.]+", printed, re.MULTILINE)  # the report's words
+    assert "| material mirror |" in printed
+    assert re.search(
+        r"^\| material mirror \| [\d.]+ \| .*mirrored ghost [\d.]+", printed, re.MULTILINE
+    )  # the report's words
     assert "sphere [" in printed
     assert (tmp_path / "out" / "tabletop.ply").stat().st_size > 100_000
 

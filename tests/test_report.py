@@ -28,6 +28,7 @@ from rangesim.causes import Cause, CauseMap
 from rangesim.cli import app
 from rangesim.decoding.status import Status
 from rangesim.environment.doctor import find_browser
+from rangesim.evaluation.surface_rows import with_mean_over_objects
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
 from rangesim.pipeline.experiment_run import carry_out
@@ -63,15 +64,17 @@ def test_every_part_is_there(html: str) -> None:
         assert f'id="{part}"' in html
     for title in ("Structured light", "Time of flight (AMCW)", "Time of flight (direct)", "Ideal time of flight"):
         assert f"<h3>{title}" in html
-    assert [int(n) for n in re.findall(r"<b>Figure (\d+)", html)] == list(range(1, 7))
-    assert [int(n) for n in re.findall(r"<b>Table (\d+)", html)] == list(range(1, 6))
+    assert [int(n) for n in re.findall(r'<b class="number">Figure (\d+)', html)] == list(range(1, 7))
+    assert [int(n) for n in re.findall(r'<b class="number">Table (\d+)', html)] == list(range(1, 6))
     assert html.count('class="cloud"') == html.count('class="labels"') == len(SENSORS)
 
 
 def test_the_table_shows_the_statistics(html: str) -> None:
     for m in load_result(small_result()).measurements:
         for row in m.rows:
-            assert f">{tables.number(MEDIAN, row['median_abs_m'])}</span>" in html
+            assert f">{tables.number(tables.OUTCOMES[1], row['wrong'])}</td>" in html
+            if row["kind"] != "object":
+                assert f">{tables.number(MEDIAN, row['median_abs_m'])}</span>" in html
 
 
 def test_text_from_outside_is_escaped(tmp_path: Path) -> None:
@@ -157,87 +160,111 @@ def test_a_node_has_the_colour_of_its_largest_child() -> None:
 
 
 def test_the_verdict_says_what_the_rows_say() -> None:
-    good = _measured("lines", right=0.95, wrong=0.01, median=1e-3, acquisition_s=0.2)
-    poor = _measured("amcw", right=0.12, wrong=0.28, median=5e-3, acquisition_s=0.1)
-    fair = _measured("histogram", right=0.88, wrong=0.02, median=2e-3, acquisition_s=0.3)
-    first, second, _, both = verdict([good, poor, fair])
-    assert "96.0\xa0% of the pixels" in first.text
-    assert "1.00\xa0mm" in first.text
-    assert "Unreliable" not in first.text
-    assert "glossy (60\xa0% missing, 28\xa0% wrong by over 10\xa0mm)" in second.text
-    assert "Smallest median error: Structured light, 1.00\xa0mm" in both.text
-    assert "Shortest exposure of all frames: Time of flight (AMCW)" in both.text
-    assert "It fails on 5.0\xa0% of the pixels: 80\xa0% multipath, 20\xa0% low signal." in first.text
-    assert "Causes of these failures: glossy: 80\xa0% multipath, 20\xa0% low signal." in second.text
-    assert "Smallest median error" not in verdict([good, poor])[-1].text  # on the few pixels that are left
+    good = _measured("lines", acquisition_s=0.2, cup=(0.99, 0.01, 1e-3), pot=(0.91, 0.01, 2e-3))
+    poor = _measured("amcw", acquisition_s=0.1, cup=(0.12, 0.28, 5e-3), pot=(0.0, 1.0, 5e-3))
+    fair = _measured("histogram", acquisition_s=0.3, cup=(0.88, 0.02, 2e-3), pot=(0.3, 0.2, 2e-3))
+    both, first, second, _ = (f.text.replace("\xa0", " ") for f in verdict([good, poor, fair]))
+    assert "reads 95.0 % of the objects’ pixels right, to 10 mm, and 1.0 % wrong; 4.0 % are missing." in first
+    assert "right on most of each of 2 objects; worst: pot (91 % right, 1 % wrong, 8 % missing; multipath)." in first
+    assert "Causes of what is wrong or missing: 80 % multipath, 20 % low signal." in first
+    assert "Half of its readings on an object lie, on average, within 1.50 mm of the true depth" in first
+    assert (
+        "right on most of none of the objects; worst: pot (0 % right, 100 % wrong, 0 % missing; multipath), "
+        "cup (12 % right, 28 % wrong, 60 % missing; multipath)."
+    ) in second
+    assert "Most of the objects’ pixels right, to 10 mm: Structured light, 95.0 % (next: " in both
+    assert "No sensor" not in both
+    assert "Smallest median error: Structured light, 1.50 mm" in both
+    # the exposure of 0.1 s is no merit of a sensor that reads next to nothing right
+    assert "Shortest exposure of all frames: Structured light, 10 frames in 200 ms (against" in both
 
 
 def _side_by_side(*measurements: Any) -> str:
-    return verdict(list(measurements))[-1].text
+    return verdict(list(measurements))[0].text.replace("\xa0", " ")
 
 
 def test_side_by_side_ranks_by_right_readings() -> None:
     """The one that measures everywhere, but wrong, was "most complete" at 97.0 %; it reads half of the pixels right."""
-    wrong = _measured("amcw", right=0.5, wrong=0.47, median=5e-3, acquisition_s=0.1)
-    right = _measured("lines", right=0.88, wrong=0.02, median=1e-3, acquisition_s=0.2)
-    fair = _measured("histogram", right=0.85, wrong=0.1, median=2e-3, acquisition_s=0.3)
-    best, against = (
-        "Most right readings, to 10\xa0mm: Structured light, 88.0\xa0% of the pixels",
-        "50.0\xa0% of the pixels",
-    )
+    wrong = _measured("amcw", cup=(0.51, 0.46, 5e-3), pot=(0.51, 0.46, 5e-3))
+    right = _measured("lines", cup=(0.9, 0.02, 1e-3), pot=(0.86, 0.02, 1e-3))
+    fair = _measured("histogram", cup=(0.9, 0.1, 2e-3), pot=(0.8, 0.1, 2e-3))
+    best = "Most of the objects’ pixels right, to 10 mm: Structured light, 88.0 %"
     for two in ([wrong, right], [right, wrong]):
-        assert f"{best} (against {against})." in _side_by_side(*two)
-    assert f"{best} (next: Time of flight (direct), 85.0\xa0% of the pixels)." in _side_by_side(wrong, fair, right)
+        assert f"{best} (against 51.0 %)." in _side_by_side(*two)
+    assert f"{best} (next: Time of flight (direct), 85.0 %)." in _side_by_side(wrong, fair, right)
     assert "97.0" not in _side_by_side(wrong, right)
-    assert "right readings" not in _side_by_side(right, _measured("amcw", right=0.88, wrong=0.12, median=5e-3))
+    assert "pixels right" not in _side_by_side(right, _measured("amcw", cup=(0.88, 0.12, 5e-3)))
+
+
+def test_a_scene_that_no_sensor_reads_has_no_winner() -> None:
+    blind = _measured("amcw", cup=(0.0, 1.0, 5e-2), pot=(0.2, 0.8, 5e-2), jar=(0.1, 0.9, 1e-2))
+    poor = _measured("lines", cup=(0.1, 0.1, 1e-3), pot=(0.9, 0.0, 1e-3), jar=(0.2, 0.0, 1e-3))
+    said = _side_by_side(blind, poor)
+    assert said == (
+        "No sensor reads most of the objects’ pixels right, to 10 mm; the best, Structured light, reads 40.0 %. "
+        "No sensor is right on most of these objects: cup (at best 10 %, Structured light), "
+        "jar (at best 20 %, Structured light)."
+    )
+    assert _side_by_side(poor, blind) == said
+
+
+def test_without_objects_the_verdict_is_about_materials() -> None:
+    scene = _measured("lines", kind="material", gloss=(0.4, 0.6, 1e-2), matte=(0.9, 0.0, 1e-3))
+    (finding,) = verdict([scene])
+    text = finding.text.replace("\xa0", " ")
+    assert "reads 65.0 % of the pixels right, to 10 mm, and 30.0 % wrong; 5.0 % are missing." in text
+    assert "right on most of 1 of 2 materials; worst: gloss (40 % right, 60 % wrong, 0 % missing; multipath)." in text
 
 
 def test_no_measurement_is_bold_for_being_there() -> None:
-    wrong = _measured("amcw", right=0.58, wrong=0.39, median=5e-3)
-    right = _measured("lines", right=0.89, wrong=0.01, median=1e-3)
-    (_, lines), *_ = tables.comparison_table([wrong, right])
-    bold = {
-        name: [c.title for c, cell in zip(tables.COLUMNS, cells, strict=True) if cell.best] for name, cells in lines
-    }
-    assert bold == {"amcw": [], "lines": ["right", "wrong", "median error", "95\xa0% within"]}
+    wrong = _measured("amcw", cup=(0.58, 0.39, 5e-3))
+    right = _measured("lines", cup=(0.89, 0.01, 1e-3))
+    assert _bold(wrong, right) == {"amcw": [], "lines": ["right", "wrong", "median error", "95\xa0% within"]}
 
 
 def test_no_bold_where_a_sensor_is_unreliable() -> None:
-    good = _measured("lines", right=0.98, wrong=0.01, median=5e-3)
-    fair = _measured("histogram", right=0.88, wrong=0.02, median=6e-3)
-    few = _measured("amcw", right=0.1, wrong=0.0, median=1e-3)  # the best error, on the tenth that is left
-
-    def bold(*measurements: Any) -> list[str]:
-        (_, lines), *_ = tables.comparison_table(measurements)
-        return [name for name, cells in lines if any(cell.best for cell in cells)]
-
-    assert bold(good, fair, few) == ["lines"]
-    assert bold(good, few) == []
+    good = _measured("lines", cup=(0.98, 0.01, 5e-3))
+    fair = _measured("histogram", cup=(0.88, 0.02, 6e-3))
+    few = _measured("amcw", cup=(0.1, 0.0, 1e-3))  # the best error, on the tenth that is left
+    assert [name for name, columns in _bold(good, fair, few).items() if columns] == ["lines"]
+    assert not any(_bold(good, few).values())
 
 
-def _measured(sensor: str, right: float, wrong: float, median: float, acquisition_s: float = 0.1) -> Any:
-    row: dict[str, Any] = {
-        "right": right,
-        "wrong": wrong,
-        "missing": 1 - right - wrong,
-        "completeness": right + wrong,
-        "median_abs_m": median,
-        "p95_abs_m": 3 * median,
+def _bold(*measurements: Any) -> dict[str, list[str]]:
+    """Titles of the bold columns of each instrument, in the rows for all surfaces."""
+    outcomes, errors = tables.outcome_table(measurements), tables.comparison_table(measurements)
+    columns = (*tables.OUTCOMES, *tables.COLUMNS)
+    return {
+        line.name: [c.title for c, cell in zip(columns, (*line.cells, *cells), strict=True) if cell.best]
+        for line, (_, cells) in zip(dict(outcomes)["all"], dict(errors)["all"], strict=True)
     }
-    row |= {column.key: None for column in tables.COLUMNS if column.key not in row}
-    row["causes"] = {"multipath": 0.8 * (1 - right), "low_signal": 0.2 * (1 - right)}
-    rows: list[dict[str, Any]] = [{"material": name, **row} for name in ("glossy", "all")]
-    metadata = SimpleNamespace(acquisition_s=acquisition_s, frames=10)
-    capture, camera = SimpleNamespace(sensor=SENSORS[sensor]), Intrinsics.from_fov(4, 3, fov_x_deg=40.0)
-    causes = CauseMap(np.zeros((3, 4), np.uint8), 0.01)
-    return SimpleNamespace(name=sensor, capture=capture, camera=camera, rows=rows, metadata=metadata, causes=causes)
+
+
+def _measured(sensor: str, acquisition_s: float = 0.1, kind: str = "object", **surfaces: Any) -> Any:
+    """A measurement, from the fractions right and wrong and the median error, metres, of each of its surfaces."""
+    surfaces["all"] = np.mean(list(surfaces.values()), axis=0).tolist()
+    rows = []
+    for name, (right, wrong, median) in surfaces.items():
+        row = {"right": right, "wrong": wrong, "missing": 1 - right - wrong, "completeness": right + wrong}
+        row |= {"median_abs_m": median, "p95_abs_m": 3 * median}
+        row |= {column.key: None for column in tables.COLUMNS if column.key not in row}
+        causes = {"multipath": 0.8 * (1 - right), "low_signal": 0.2 * (1 - right)}
+        rows.append({"kind": "all" if name == "all" else kind, "name": name, **row, "causes": causes})
+    return SimpleNamespace(
+        name=sensor,
+        capture=SimpleNamespace(sensor=SENSORS[sensor]),
+        camera=Intrinsics.from_fov(4, 3, fov_x_deg=40.0),
+        rows=with_mean_over_objects(rows),
+        metadata=SimpleNamespace(acquisition_s=acquisition_s, frames=10),
+        causes=CauseMap(np.zeros((3, 4), np.uint8), 0.01),
+    )
 
 
 @needs_browser
 def test_it_draws_without_errors(tmp_path: Path) -> None:
     """No message on the console, a picture that is not blank, and points in every cloud."""
     picture = tmp_path / "report.png"
-    log = _browse(tmp_path, "color=error", f"--screenshot={picture}", "--window-size=1280,7000")
+    log = _browse(tmp_path, "color=error", f"--screenshot={picture}", "--window-size=1280,12000")
     # software rendering remarks on its own speed when the picture is taken
     said = [line for line in log.splitlines() if "CONSOLE" in line and "GL Driver Message" not in line]
     assert said == []

@@ -243,7 +243,7 @@ def _crafted(m: Measurement, name: str, sensor_as_well: bool) -> Measurement:
         capture = copy.copy(m.capture)
         object.__setattr__(capture, "sensor", sensor)
     truth = replace(m.truth, material_names=tuple(f"material {HOSTILE}" for _ in m.truth.material_names))
-    rows = [{**row, "material": f"row {HOSTILE}" if i == 0 else row["material"]} for i, row in enumerate(m.rows)]
+    rows = [{**row, "name": f"row {HOSTILE}" if row["kind"] == "object" else row["name"]} for row in m.rows]
     return replace(m, name=name, capture=capture, truth=truth, rows=rows)
 
 
@@ -275,7 +275,7 @@ def _explore(page: Page, path: Path) -> str:
     assert page.evaluate("[...document.images].every((i) => i.complete && i.naturalWidth > 0)")
     assert page.evaluate("document.images.length") > 20
     assert (
-        page.evaluate("document.querySelectorAll('script, style, iframe, base, form, main svg, [onload]').length") == 3
+        page.evaluate("document.querySelectorAll('script, style, iframe, base, form, main svg, [onload]').length") == 4
     )
     assert page.evaluate("violations") == []
     assert page.said == []

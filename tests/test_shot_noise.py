@@ -12,8 +12,16 @@ from scipy.special import gammainc, gammaincc, ndtr
 from synthetic import stereo_rig
 
 from rangesim.electronics.detector import Detector
-from rangesim.electronics.shot_noise import MAX_DEVIATE, SMALL_MEAN, poisson, pulses_hit, quantile
-from rangesim.electronics.spad import SpadDetector
+from rangesim.electronics.shot_noise import (
+    MAX_DEVIATE,
+    SMALL_MEAN,
+    count_first_photons,
+    count_photons,
+    poisson,
+    pulses_hit,
+    quantile,
+)
+from rangesim.electronics.spad import CountingPixel, SpadDetector
 from rangesim.sensors import DirectToF, StructuredLight
 
 DRAWS = 1_000_000
@@ -59,6 +67,31 @@ def test_counts_are_poisson(mean: float) -> None:
     draw_poisson(np.random.default_rng(int(1000 * mean)), mean, counts)
     check_moments(counts, stats.poisson(mean))
     check_chi_square(counts, stats.poisson(mean))
+
+
+@pytest.mark.parametrize("pulses", [None, 100, 1000])
+def test_the_bins_of_a_histogram_are_independent_and_follow_their_law(pulses: int | None) -> None:
+    """Dim bins, whose photons come one after the other, stand between a bright one and an empty one."""
+    means, pixel = (0.3, 0.02, 5.0, 0.7, 0.0, 0.9), CountingPixel(1.0, 0.0, 1e6, 65535)
+    radiance = np.repeat(np.float32(means)[:, None], DRAWS // 20, axis=1)
+    counts, rng = np.empty(radiance.shape, np.uint16), np.random.default_rng(1)
+    if pulses is None:
+        count_photons(rng, radiance, pixel, counts)
+    else:
+        count_first_photons(rng, radiance, pixel, pulses, counts)
+    before = 0.0
+    for mean, of_bin in zip(means, counts, strict=True):
+        law = stats.poisson(mean)
+        if pulses is not None:  # a pulse counts in the bin if none of its photons came before, and one comes now
+            law = stats.binom(pulses, np.exp(-before / pulses) * -np.expm1(-mean / pulses))
+        before += mean
+        if mean:
+            check_moments(of_bin, law)
+            check_chi_square(of_bin, law)
+    assert not counts[4].any()
+    if pulses is None:
+        correlation = np.corrcoef(counts[[0, 1, 2, 3, 5]])
+        assert np.abs(correlation - np.eye(5)).max() < 5 / np.sqrt(counts.shape[1])
 
 
 @pytest.mark.parametrize("mean", [4.0, 7.0, 30.0, 1e3, 1e5])

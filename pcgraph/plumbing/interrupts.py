@@ -28,6 +28,8 @@ handled = False
 removers: list[Callable[[], bool]] = []
 """Functions that remove work in progress, called before the process ends, the last one first. Each returns whether
 there was any."""
+endings: list[Callable[[], str]] = []
+"""Functions that return what the last line says after "interrupted", in place of what it says of files."""
 LOST_OUTPUT = 120
 """Exit status of a command whose last output could not be written: 120, as in Python itself."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
@@ -101,6 +103,16 @@ def count() -> None:
 
 
 @contextlib.contextmanager
+def last_words(text: Callable[[], str]) -> Iterator[None]:
+    """Let the last line say what a function returns, if a signal ends the process while the block runs."""
+    endings.append(text)
+    try:
+        yield
+    finally:
+        endings.remove(text)
+
+
+@contextlib.contextmanager
 def holding(lock: threading.RLock) -> Iterator[None]:
     """Hold a lock; never release it if the process is about to end, so that no other thread begins new work."""
     lock.acquire()
@@ -149,6 +161,7 @@ def _end(number: int, screen: int, program: str, writes: bool) -> None:
         _silence_others()
         began = sum(remove() for remove in reversed(removers))
         text = "; nothing was written" if writes and (began or not _written) else ""
+        text = f"; {endings[-1]()}" if endings else text
         with contextlib.suppress(OSError):
             os.write(screen, f"{clear}{program}: interrupted{text}.\n".encode())
     finally:

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import sys
 import sysconfig
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
+from hashlib import sha256
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -36,6 +37,20 @@ def pickled(thing: Any) -> bytes:
                 f"{thing!r:.80} cannot be sent to worker processes ({type(error).__name__}: {error}); it must not hold "
                 "open files, locks, connections or generators."
             ) from error
+
+
+def source_of(function: Callable[..., Any]) -> dict[str, str]:
+    """The name of a function, with the SHA-256 of its file if that is the user's."""
+    while isinstance(function, partial):
+        function = function.func
+    module = sys.modules.get(getattr(function, "__module__", None) or "")
+    source = {
+        "name": f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', type(function).__name__)}"
+    }
+    file = getattr(module, "__file__", None)
+    if module is not None and file and (module.__name__ == "__main__" or _is_users(module.__name__, file)):
+        source["sha256"] = sha256(Path(file).read_bytes()).hexdigest()
+    return source
 
 
 @contextmanager

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The directory of a campaign: the results of its items, each written whole or not at all, and its quarantine.
 
-DIR/campaign.json            what the campaign is: settings, versions, function
-DIR/items/5d0/KEY.item       result of an item: a mark, SHA-256 of key and content, and the content
+DIR/campaign.json            what the campaign is: settings, function, versions
+DIR/items/5d0/KEY.item       result of an item: a mark, two checksums, and the content
 DIR/quarantine/KEY.json      an item that failed: its argument, the error and the traceback
 """
 
@@ -18,15 +18,21 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
+
+from pcgraph.plumbing import interrupts
 from pcgraph.plumbing.plain_files import read_file, replace_file, why
 from rangesim.errors import EnvironmentProblem, FileFormatError
-from rangesim.settings.config import to_dict
+from rangesim.settings.config import shown, to_dict
 
 try:
     import fcntl
 except ImportError:  # Windows has no flock: there, two campaigns in one directory are not kept apart
     fcntl = None  # type: ignore[assignment]
 
+FORMAT = "rangesim campaign 1"
+"""What `campaign.json` says that it is; the number is the version of the format."""
 MARK = b"rangesim item 1\n"
 """The first bytes of an item's file; the number is the version of the format."""
 KEY = re.compile(r"[a-z0-9][a-z0-9._=+-]{0,199}")
@@ -35,6 +41,10 @@ and at most 200 characters, because a name has at most 255 bytes, some of which 
 FOLDER_DIGITS = 3
 """Hexadecimal digits of the names of the folders below `items`: 4096 folders, so that 10^6 items are 250 files in each.
 Every write lists one folder."""
+_HEAD = len(MARK) + 2 * 32
+"""Bytes of an item's file before its content: the mark, SHA-256 of the argument, SHA-256 of everything else."""
+_UNKNOWN = bytes(32)
+"""In place of the SHA-256 of an argument that is no plain data."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +87,16 @@ class ItemStore:
     def __repr__(self) -> str:
         return f"ItemStore({str(self.directory)!r})"
 
+    # ---- Results ---------------------------------------------------------------------------------------------------
+
     def __contains__(self, key: str) -> bool:
         """Whether the store holds the result of an item. Its content is checked when it is read."""
         return os.path.lexists(self._file(key))
+
+    def keys(self) -> Iterator[str]:
+        """The keys of all items that the store holds, in no order."""
+        for path in (self.directory / "items").glob("*/*.item"):
+            yield path.name.removesuffix(".item")
 
     def read(self, key: str) -> bytes:
         """Return the result of an item.
@@ -94,26 +111,40 @@ class ItemStore:
         path = self._file(key)
         if not os.path.lexists(path):
             raise KeyError(key)
-        content = read_file(path, FileFormatError)
-        start = len(MARK) + 32
-        if content[:start] != MARK + _digest(key, content[start:]):
+        file = read_file(path, FileFormatError)
+        head, content = file[:_HEAD], file[_HEAD:]
+        if head[-32:] != _digest(key, head[:-32], content):
             raise FileFormatError(f"{path} is broken: its checksum does not fit; delete it and run the campaign again.")
-        return content[start:]
+        return content
 
-    def write(self, key: str, content: bytes) -> None:
-        """Write the result of an item, whole or not at all; EnvironmentProblem if the disk does not take it."""
-        self._write(self._file(key), MARK + _digest(key, content) + content)
+    def write(self, key: str, content: bytes, argument: Any = None) -> None:
+        """Write the result of an item, whole or not at all; EnvironmentProblem if the disk does not take it.
+
+        `argument` is what the result was computed from.
+        """
+        head = MARK + _digest_of_argument(argument)
+        self._write(self._file(key), head + _digest(key, head, content) + content)
+
+    def check_argument(self, key: str, argument: Any) -> bool:
+        """Return True if the stored item was computed from this argument; ValueError if it was from another one.
+
+        Only numbers, texts, arrays, dataclasses, and lists and dictionaries of them are compared.
+        """
+        with self._file(key).open("rb") as stream:
+            head = stream.read(_HEAD)
+        then, now = head[len(MARK) : len(MARK) + 32], _digest_of_argument(argument)
+        if then != now and _UNKNOWN not in (then, now):
+            raise ValueError(
+                f"{self.directory} holds item {key}, computed from other settings; choose another directory, or "
+                "discard the item."
+            )
+        return True
 
     def discard(self, key: str) -> None:
         """Forget an item, its result and its failure, so that the next run computes it."""
         for path in (self._file(key), self._quarantine_file(key)):
             with suppress(FileNotFoundError):
                 path.unlink()
-
-    def keys(self) -> Iterator[str]:
-        """The keys of all items that the store holds, in no order."""
-        for path in (self.directory / "items").glob("*/*.item"):
-            yield path.name.removesuffix(".item")
 
     # ---- Items that failed -----------------------------------------------------------------------------------------
 
@@ -133,26 +164,53 @@ class ItemStore:
         content = json.dumps(asdict(item), indent=1, default=repr)
         self._write(self._quarantine_file(item.key), content.encode())
 
-    # ---- Files -----------------------------------------------------------------------------------------------------
+    # ---- The campaign ----------------------------------------------------------------------------------------------
+
+    def pin(self, campaign: Mapping[str, Any]) -> None:
+        """Write to `campaign.json` what the campaign is, or compare with what is there.
+
+        Raises
+        ------
+        ValueError
+            The directory holds another campaign; the message says what differs.
+        """
+        now = json.loads(json.dumps({"format": FORMAT, "settings": self.settings, **campaign}, default=repr))
+        path = self.directory / "campaign.json"
+        if not os.path.lexists(path):
+            self._write(path, (json.dumps(now, indent=1, sort_keys=True) + "\n").encode())
+            return
+        try:
+            then = json.loads(read_file(path, FileFormatError))
+        except ValueError:
+            then = None
+        if not isinstance(then, dict) or then.get("format") != FORMAT:
+            raise FileFormatError(f"{path} describes no campaign that this version knows; choose another directory.")
+        if differences := list(_differences(then, now)):
+            raise ValueError(
+                f"{self.directory} holds another campaign: {'; '.join(differences[:5])}. Choose another directory."
+            )
 
     @contextmanager
     def claimed(self) -> Iterator[None]:
         """Keep other processes from running a campaign in the directory while the block runs."""
         with self._saying_why():
             self.directory.mkdir(parents=True, exist_ok=True)
-            handle = os.open(self.directory / ".campaign.lock", os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            if fcntl is not None:
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    raise EnvironmentProblem(
-                        f"another process is running a campaign in {self.directory}; wait until it has ended, or "
-                        "choose another directory."
-                    ) from None
+        if fcntl is None:
             yield
+            return
+        handle = os.open(self.directory, os.O_RDONLY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield
+        except BlockingIOError:
+            raise EnvironmentProblem(
+                f"another process is running a campaign in {self.directory}; wait until it has ended, or choose "
+                "another directory."
+            ) from None
         finally:
             os.close(handle)
+
+    # ---- Files -----------------------------------------------------------------------------------------------------
 
     def _file(self, key: str) -> Path:
         check_key(key)
@@ -167,16 +225,14 @@ class ItemStore:
         with self._saying_why():
             path.parent.mkdir(parents=True, exist_ok=True)
             replace_file(path, content)
+        interrupts.count()
 
     @contextmanager
     def _saying_why(self) -> Iterator[None]:
         try:
             yield
         except OSError as problem:
-            raise EnvironmentProblem(
-                f"cannot write to {self.directory}: {why(problem)}; what is done is kept, so mend that and run the "
-                "same again to go on."
-            ) from problem
+            raise EnvironmentProblem(f"cannot write to {self.directory}: {why(problem)}.") from problem
 
 
 def check_key(key: str) -> None:
@@ -188,8 +244,34 @@ def check_key(key: str) -> None:
         )
 
 
-def _digest(key: str, content: bytes) -> bytes:
-    return hashlib.sha256(key.encode() + b"\0" + content).digest()
+def _digest(key: str, head: bytes, content: bytes) -> bytes:
+    digest = hashlib.sha256(key.encode() + b"\0" + head)
+    digest.update(content)
+    return digest.digest()
+
+
+def _digest_of_argument(argument: Any) -> bytes:
+    """SHA-256 of plain data, the same in every process; `_UNKNOWN` of what is none."""
+    try:
+        plain = msgspec.json.encode(argument, enc_hook=_plain, order="deterministic")
+    except (TypeError, ValueError, RecursionError):
+        return _UNKNOWN
+    return hashlib.sha256(plain).digest()
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is no plain data")
+
+
+def _differences(then: Any, now: Any, place: str = "") -> Iterator[str]:
+    """What differs between two pieces of plain data, one text for each place."""
+    if isinstance(then, dict) and isinstance(now, dict):
+        for name in sorted(then.keys() | now.keys()):
+            yield from _differences(then.get(name), now.get(name), f"{place}.{name}" if place else name)
+    elif then != now:
+        yield f"{place} was {shown(then)} and is {shown(now)} now"
 
 
 def _read_quarantined(path: Path) -> QuarantinedItem:

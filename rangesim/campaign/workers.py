@@ -5,21 +5,29 @@ from __future__ import annotations
 
 import logging
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
+from rangesim.campaign.in_worker import THREAD_VARIABLES
 from rangesim.errors import EnvironmentProblem
 from rangesim.settings.bounds import check_fields, whole
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, LocalCluster
 
 ALLOWED_DEATHS = 2
-"""Deaths of workers that Dask forgives an item: at the third one it is under suspicion. An item that waited on a
-worker that died counts, too, so less would put many innocent items under suspicion."""
-PACKAGES_OF_EXTRA = "pip install 'rangesim[campaign]'"
+"""Deaths of workers that Dask forgives an item: at the third one it is under suspicion. An item that waited on a worker
+that died counts, too, so less would put many innocent items under suspicion."""
+FIRST_ANSWER_S = 10.0
+"""Seconds in which a scheduler has to answer at first: its address may be wrong, and the user should hear it soon."""
+WAIT_S = 300.0
+"""Seconds that a run waits for a scheduler that it has lost, and for workers if there are none: long enough for a
+restart by systemd, Kubernetes or by hand, short enough not to hold an allocation of a cluster for hours."""
+BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Environment variables of the threads of BLAS and of OpenMP."""
 
 
 @dataclass(frozen=True)
@@ -45,26 +53,43 @@ class Workers:
             )
 
     @contextmanager
-    def connected(self) -> Iterator[Client]:
-        """A client of the workers' scheduler while the block runs.
+    def connected(self, answer_s: float = FIRST_ANSWER_S) -> Iterator[Client]:
+        """A client of the workers' scheduler while the block runs; there is at least one worker.
+
+        Parameters
+        ----------
+        answer_s : seconds in which the scheduler has to answer.
 
         Raises
         ------
         EnvironmentProblem
-            Dask is not installed, or no worker can be reached or started.
+            Dask is not installed, the scheduler does not answer, or there is no worker in `WAIT_S` seconds.
         """
         try:
             from distributed import Client
         except ImportError:
             raise EnvironmentProblem(
-                f"campaigns need Dask, which is not installed here: {PACKAGES_OF_EXTRA}."
+                "campaigns need Dask, and it is not installed: pip install 'rangesim[campaign]'."
             ) from None
-        if self.scheduler is not None:
-            with Client(self.scheduler, set_as_default=False, timeout=10) as client:
+        with _quiet():
+            if self.scheduler is None:
+                count = self.count or cores()
+                with _local_cluster(count) as cluster, Client(cluster, set_as_default=False) as client:
+                    yield client
+                return
+            with _client_of(self.scheduler, answer_s) as client:
+                try:
+                    client.wait_for_workers(1, timeout=WAIT_S)
+                except TimeoutError:
+                    raise EnvironmentProblem(no_workers(self.scheduler)) from None
                 yield client
-            return
-        with _local_cluster(self.count or cores()) as cluster, Client(cluster, set_as_default=False) as client:
-            yield client
+
+
+def no_workers(scheduler: str | None) -> str:
+    """Sentence about a scheduler that has had no worker for `WAIT_S` seconds."""
+    start = f"no worker has come to {scheduler}" if scheduler else "no worker process could be started here"
+    advice = f": start some, dask worker {scheduler} --nthreads 1 --nworkers N" if scheduler else ""
+    return f"{start} for {WAIT_S:g} s{advice}."
 
 
 def cores() -> int:
@@ -75,49 +100,83 @@ def cores() -> int:
 
 
 @contextmanager
-def _local_cluster(count: int) -> Iterator[object]:
+def _quiet() -> Iterator[None]:
+    """Keep Dask from logging deaths of workers on stderr while the block runs; the outcome tells them."""
+    logger = logging.getLogger("distributed")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+@contextmanager
+def _client_of(scheduler: str, answer_s: float) -> Iterator[Client]:
+    """A client of the scheduler at an address, which has `answer_s` seconds to answer."""
+    from distributed import Client
+
+    until = time.monotonic() + answer_s
+    client = None
+    while client is None:
+        try:
+            client = Client(scheduler, set_as_default=False, timeout=min(5.0, answer_s))
+        except OSError as problem:
+            if time.monotonic() > until:
+                raise EnvironmentProblem(
+                    f"no scheduler answers at {scheduler} within {answer_s:g} s: start one there, dask scheduler, or "
+                    "correct the address."
+                ) from problem
+            time.sleep(0.5)
+        except ValueError as problem:
+            raise ValueError(f"expected the address of a scheduler such as tcp://10.0.0.1:8786: {problem}") from problem
+    with client:
+        yield client
+
+
+@contextmanager
+def _local_cluster(count: int) -> Iterator[LocalCluster]:
     """A scheduler in this process and `count` workers, each a process of one Dask thread with a nanny."""
     import dask
     from distributed import LocalCluster, Nanny
     from distributed.system import MEMORY_LIMIT
 
-    threads = str(max(1, cores() // count))
     # One thread for BLAS and OpenMP, because the order in which they sum depends on the number of threads.
-    before_start = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    threads = {**dict.fromkeys(BLAS_VARIABLES, "1"), **dict.fromkeys(THREAD_VARIABLES, str(max(1, cores() // count)))}
 
     class WorkerNanny(Nanny):
         def __init__(self, *args: Any, **kwargs: Any) -> None:
             super().__init__(*args, **kwargs)
-            self.pre_spawn_env |= before_start
+            self.pre_spawn_env |= threads  # the libraries read them when they are loaded
 
     settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_DEATHS,
         "distributed.scheduler.worker-saturation": 1.0,  # what waits on a worker that dies is suspected, too
-        # A worker at a limit would wait for memory that nothing frees, so only the last one is kept: the nanny ends a
-        # worker that takes nearly all of the machine's memory.
+        "distributed.scheduler.worker-ttl": None,  # a jump of the clock would end all workers
+        # A worker at one of these limits would wait for memory that nothing frees. The last limit is kept: the nanny
+        # ends a worker that takes nearly all of the machine's memory.
         "distributed.worker.memory.target": False,
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.pause": False,
     }
     before = dict(os.environ)
     try:
-        with (
-            dask.config.set(settings),
-            LocalCluster(
+        with dask.config.set(settings):
+            cluster = LocalCluster(
                 n_workers=count,
                 threads_per_worker=1,
                 host="127.0.0.1",
                 protocol="tcp",
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",  # any free port: the scheduler has a web server, with no page here
+                scheduler_kwargs={"dashboard": False},
                 silence_logs=logging.CRITICAL,
                 memory_limit=MEMORY_LIMIT,
                 worker_class=WorkerNanny,
-                env={**before_start, "NUMBA_NUM_THREADS": threads, "RANGESIM_THREADS": threads},
-            ) as cluster,
-        ):
-            yield cluster
+                preload="import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)",  # Ctrl-C is for the driver
+            )
+            with cluster:
+                yield cluster
     finally:
-        for name in before_start:  # nannies set them in this process, too
-            os.environ.pop(name, None)
-            if name in before:
-                os.environ[name] = before[name]
+        for name in set(os.environ) - set(before):  # nannies set variables in this process, too
+            del os.environ[name]
+        os.environ.update(before)

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from rangesim.evaluation.surface_rows import with_mean_over_objects
 from rangesim.settings.config import ShortRepr
-from rangesim.signals import GroundTruth
+from rangesim.signals import GroundTruth, Surface
 
 
 class Cause(IntEnum):
@@ -111,23 +112,23 @@ class CauseMap(ShortRepr):
         return np.asarray(self.cause != Cause.NONE)
 
     def fractions(self, truth: GroundTruth) -> list[dict[str, Any]]:
-        """Fractions of right pixels and of the causes of the others, per material class, "all" last.
+        """Fractions of right pixels and of the causes of the others, per surface, in the rows of `compare`.
 
-        Each entry is a dict with `material` (str), `right` (fraction of the pixels of this class; None if there are
-        none) and `causes` (name of the cause in lower case -> fraction of the pixels of this class; the largest is
-        first, and none is 0). Together they add up to 1. `rangesim.report.failures_markdown` makes a table of the
-        entries.
+        Each entry is a dict with `kind` and `name` of the row, `right` (fraction of its pixels; None if there are none)
+        and `causes` (name of the cause in lower case -> fraction of its pixels; the largest is first, and none is 0).
+        Together they add up to 1. `rangesim.report.failures_markdown` makes a table of the entries.
 
         Parameters
         ----------
         truth : GroundTruth of the pass that the pixels were measured in.
         """
-        return [_row(name, self.cause[mask]) for name, mask in truth.classes().items()]
+        return with_mean_over_objects([_row(surface, self.cause[surface.mask]) for surface in truth.surfaces()])
 
 
-def _row(material: str, causes: np.ndarray) -> dict[str, Any]:
-    """Entry of `CauseMap.fractions` for a material class, from the causes (n,) of its pixels."""
+def _row(surface: Surface, causes: np.ndarray) -> dict[str, Any]:
+    """Entry of `CauseMap.fractions` for a surface, from the causes (n,) of its pixels."""
     counts = np.bincount(causes, minlength=len(Cause))
     found = sorted((c for c in Cause if c and counts[c]), key=lambda c: -counts[c])
     fractions = {c.name.lower(): float(counts[c] / causes.size) for c in found}
-    return {"material": material, "right": float(np.mean(causes == 0)) if causes.size else None, "causes": fractions}
+    right = float(np.mean(causes == 0)) if causes.size else None
+    return {"kind": surface.kind, "name": surface.name, "right": right, "causes": fractions}

@@ -61,7 +61,7 @@ def explain(
     >>> bool(causes.failed.all())
     True
     >>> causes.fractions(signals.truth)[-1]
-    {'material': 'all', 'right': 0.0, 'causes': {'low_signal': 1.0}}
+    {'kind': 'all', 'name': 'all', 'right': 0.0, 'causes': {'low_signal': 1.0}}
     """
     return causes_of(ReferenceReadings(image, capture, signals), tolerance_m)
 

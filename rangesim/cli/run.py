@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rangesim.cli.lengths import length
 from rangesim.cli.progress import announce_cost, announce_linked_output, one_truncation_warning, progress_bar
 from rangesim.errors import one_line
 from rangesim.files.bundled_scenes import scene_names
@@ -74,8 +75,19 @@ def run_command(
     baseline: Annotated[
         float | None,
         typer.Option(
-            help="Distance from camera to emitter in metres, for every sensor. "
-            "(default: a fifth of the working distance for structured light, 0.03 for time of flight)"
+            parser=length,
+            metavar="LENGTH",
+            help="Distance from camera to emitter, for every sensor: metres, or with a unit, as 50mm. "
+            "(default: a fifth of the working distance for structured light, 0.03 for time of flight)",
+        ),
+    ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            parser=length,
+            metavar="LENGTH",
+            help="Largest error of a right reading, as the task sets it: metres, or with a unit, as 2mm. "
+            "(default: 10mm)",
         ),
     ] = None,
     material: Annotated[
@@ -99,7 +111,7 @@ def run_command(
 
       rangesim run tabletop --out out/tabletop
 
-      rangesim run part.ply --material glossy --sensor gray --sensor gray-phase --baseline 0.1 --out out/part
+      rangesim run part.ply --material glossy --sensor gray --sensor gray-phase --tolerance 2mm --out out/part
 
       rangesim run --config examples/tabletop.toml --spp 16 --width 320 --height 240 --out out/quick
     """
@@ -113,7 +125,7 @@ def run_command(
         "max_depth": max_depth,
         "seed": seed,
     }
-    given |= {"material": material, "unit_m": unit_m, "photons": photons}
+    given |= {"material": material, "unit_m": unit_m, "photons": photons, "tolerance_m": tolerance}
     experiment = _experiment(scene, config, {k: v for k, v in given.items() if v is not None}, sensor)
     if baseline is not None:
         experiment = replace(
@@ -152,7 +164,7 @@ def _warn_of_instruments_without_points(result: Result) -> None:
     blind: dict[Cause, list[str]] = {}  # names by cause; Cause.NONE stands for a wrong scale
     for measurement in result.measurements:
         if not measurement.metadata.points:
-            fractions = next(row["causes"] for row in measurement.rows if row["material"] == ALL)
+            fractions = next(row["causes"] for row in measurement.rows if row["kind"] == ALL)
             cause = Cause[max(fractions, key=fractions.get).upper()] if fractions else Cause.NONE
             is_wrong_scale = cause in causes_of_wrong_scale
             blind.setdefault(Cause.NONE if is_wrong_scale else cause, []).append(measurement.name)

@@ -79,11 +79,11 @@ def coates(counts: np.ndarray, pulses: int) -> np.ndarray:
     ----------
     Coates: "The correction for photon 'pile-up' in the measurement of radiative lifetimes", J. Phys. E 1 (1968).
     """
-    from rangesim.decoding.histogram_kernels import detected_fraction
+    from rangesim.decoding.histogram_kernels import all_photons
 
-    fraction = np.empty((len(counts), counts[0].size))
-    detected_fraction(counts.reshape(fraction.shape), pulses, fraction)
-    return np.asarray(-pulses * np.log1p(-fraction)).reshape(counts.shape)
+    photons = np.empty((len(counts), counts[0].size))
+    all_photons(counts.reshape(photons.shape), pulses, photons)
+    return photons.reshape(counts.shape)
 
 
 def armed(counts: np.ndarray, blind: Blindness) -> np.ndarray:
@@ -187,13 +187,16 @@ def pulses_left(counts: np.ndarray, place: np.ndarray, pulses: int, sigma_bins: 
     >>> pulses_left(np.array([[0], [5], [20], [5], [0], [0]]), np.array([2.5]), 100, sigma_bins=0.5, is_cyclic=False)
     array([70])
     """
+    from rangesim.decoding.histogram_kernels import counts_until
+
     bins = len(counts)
     first = np.clip(np.floor(place).astype(np.int64), 0, bins - 1)
     reach = window_reach(bins, sigma_bins, is_cyclic)
     last = np.minimum(first + reach, bins - 1)
     if is_cyclic:
         last[first < reach] = bins - 1  # the window begins at the other end, where fewest are left
-    used = np.cumsum(counts, axis=0, dtype=np.int64)[last, np.arange(counts.shape[1])]
+    used = np.empty(last.shape, np.int64)
+    counts_until(counts, last.reshape(-1, counts.shape[1]), used.reshape(-1, counts.shape[1]))
     return np.asarray(pulses - used)
 
 

@@ -32,16 +32,39 @@ a million counts it is a thousandth."""
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def detected_fraction(counts, pulses, fraction):  # type: ignore[no-untyped-def]
-    """Write the fraction (k, n) that each bin took of the pulses that were left before it.
+def all_photons(counts, pulses, photons):  # type: ignore[no-untyped-def]
+    """Write the number of photons (k, n) that Coates' formula makes of counts.
 
     counts : (k, n) int, histograms of the first photon of each of `pulses` pulses.
     """
     left = np.full(counts.shape[1], float(pulses))
     for b in range(len(counts)):
         for column in range(counts.shape[1]):
-            fraction[b, column] = min(counts[b, column] / max(left[column], 1.0), MAX_FRACTION)
-            left[column] -= counts[b, column]
+            count = counts[b, column]
+            if count == 0:  # most bins of most histograms
+                photons[b, column] = 0.0
+            else:
+                photons[b, column] = -pulses * math.log1p(-min(count / max(left[column], 1.0), MAX_FRACTION))
+                left[column] -= count
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def total_counts(counts, total):  # type: ignore[no-untyped-def]
+    """Write the sum (n,) float64 of the counts (k, n) of each histogram."""
+    total[:] = 0.0
+    for b in range(len(counts)):
+        for column in range(len(total)):
+            total[column] += counts[b, column]
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def counts_until(counts, last, total):  # type: ignore[no-untyped-def]
+    """Write the sums (m, n) int64 of the counts (k, n) of each histogram, up to and with the bins `last` (m, n)."""
+    total[:] = 0
+    for b in range(len(counts)):
+        for i in range(len(last)):
+            for column in range(counts.shape[1]):
+                total[i, column] += counts[b, column] if b <= last[i, column] else 0
 
 
 @cached_njit(nogil=True, error_model="numpy")

@@ -34,6 +34,9 @@ _RECIPROCAL = 1 / np.arange(1.0, SUMMED + 1)
 """1, 1/2, 1/3 ... for the terms of `SUMMED`, because multiplying is faster than dividing."""
 NEGLIGIBLE = 1e-17
 """Fraction of a sum of probabilities, so small that adding it no longer changes the sum in double precision."""
+DIM = 1.0
+"""Expected photons in a bin below which photons are drawn one after the other, by the gaps between them. An empty bin
+then takes no random number. Both ways are exact, so the value changes the speed alone."""
 SPARSE = 5.0
 """Limit in photons for n^2 / m, with n the expected photons and m the pulses; half of n^2 / m is the number of photons
 that share a pulse with an earlier one. Up to the limit `pulses_hit` draws photons, above it NumPy's binomial. Both are
@@ -62,10 +65,16 @@ def count_photons(rng, radiance, pixel, counts):  # type: ignore[no-untyped-def]
     radiance : (bins, w) float32, W/m2/sr, mean radiance. pixel : `rangesim.electronics.spad.CountingPixel`.
     counts : (bins, w) unsigned integers, the output.
     """
+    gaps = first_gaps(rng, radiance.shape[1])
     for b in range(len(radiance)):
         for column in range(radiance.shape[1]):
             mean = _within(pixel.counts_per_radiance * radiance[b, column] + pixel.dark, pixel.max_mean)
-            counts[b, column] = min(poisson(rng, mean), pixel.max_dn)
+            if 0 <= mean < DIM:
+                gaps[column] -= mean
+                photons = photons_after(rng, gaps, column) if gaps[column] < 0 else 0.0
+            else:
+                photons = poisson(rng, mean)
+            counts[b, column] = min(photons, pixel.max_dn)
 
 
 @cached_njit(nogil=True, error_model="numpy")
@@ -74,12 +83,19 @@ def count_first_photons(rng, radiance, pixel, pulses, counts):  # type: ignore[n
 
     The other arguments are those of `count_photons`.
     """
-    unused = np.full(radiance.shape[1], pulses)
+    unused, gaps = np.full(radiance.shape[1], pulses), first_gaps(rng, radiance.shape[1])
     photons, dark, most = pixel.counts_per_radiance / pulses, pixel.dark / pulses, pixel.max_mean / pulses
     for b in range(len(radiance)):
         for column in range(radiance.shape[1]):
             mean = _within(photons * radiance[b, column] + dark, most)
-            hit = pulses_hit(rng, mean, unused[column])
+            if 0 <= mean * unused[column] < DIM:
+                gaps[column] -= mean * unused[column]
+                if gaps[column] >= 0:
+                    counts[b, column] = 0
+                    continue
+                hit = distinct(rng, int(photons_after(rng, gaps, column)), unused[column])
+            else:
+                hit = pulses_hit(rng, mean, unused[column])
             unused[column] -= hit
             counts[b, column] = min(hit, pixel.max_dn)
 
@@ -94,7 +110,12 @@ def pulses_hit(rng, mean, pulses):  # type: ignore[no-untyped-def]
     expected = mean * pulses
     if expected * expected > SPARSE * pulses:
         return rng.binomial(pulses, -math.expm1(-mean))
-    photons = int(poisson(rng, expected))
+    return distinct(rng, int(poisson(rng, expected)), pulses)
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def distinct(rng, photons, pulses):  # type: ignore[no-untyped-def]
+    """Number of pulses that bring at least one of so many photons, when each photon comes with a random pulse."""
     return photons if photons < 2 else photons - _shared(rng, photons, pulses)
 
 
@@ -114,6 +135,30 @@ def _shared(rng, photons, pulses):  # type: ignore[no-untyped-def]
             return shared
         shared += rng.random() * pulses * -math.expm1(-rate) < number - shared
         number += 1
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def first_gaps(rng, columns):  # type: ignore[no-untyped-def]
+    """(columns,) float64, number of photons that are expected until the first one comes, for each column.
+
+    Photons come one after the other, and the number that is expected between two of them is exponential. So a bin with
+    few expected photons only shortens the gap to the next photon, until the gap is negative (`photons_after`). A
+    brighter bin leaves the gap as it is, because an exponential gap has no memory.
+    """
+    gaps = np.empty(columns)
+    for column in range(columns):
+        gaps[column] = rng.standard_exponential()
+    return gaps
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def photons_after(rng, gaps, column):  # type: ignore[no-untyped-def]
+    """Number of photons in a bin, as float64, that has made the gap of a column negative; updates the gap."""
+    photons = 0.0
+    while gaps[column] < 0:
+        photons += 1
+        gaps[column] += rng.standard_exponential()
+    return photons
 
 
 @cached_njit(nogil=True, error_model="numpy", forceinline=True)

@@ -7,6 +7,7 @@ missing LLVM is no error at this point, because rendering on a GPU does not need
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
@@ -18,6 +19,9 @@ with suppress(EnvironmentProblem):  # `select_variant` raises it again if LLVM i
 
 import drjit as dr
 import mitsuba as mi
+
+if threads := os.environ.get("RANGESIM_THREADS"):  # workers of a campaign share the cores
+    dr.set_thread_count(int(threads))
 
 VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
 """Mitsuba variants that rangesim supports: one band of light, on the CPU or on a GPU."""

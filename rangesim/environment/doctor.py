@@ -24,7 +24,8 @@ from rangesim.errors import EnvironmentProblem
 
 __all__ = ["Check", "doctor_command", "find_browser", "run_checks"]
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome",
+            "microsoft-edge", "microsoft-edge-stable", "msedge")  # fmt: skip
 """Names under which Chromium and its relatives are installed."""
 TIMEOUT_S = 120
 """Seconds that a check may take. An import of Mitsuba or Open3D from a cold disk can take tens of seconds; a check that
@@ -104,7 +105,7 @@ def doctor_command() -> None:
 
 
 def find_browser() -> str | None:
-    """Path of Chromium or of a browser built on it, which can render a report; None if there is none."""
+    """Path of Chromium or of a browser built on it, which can print a report; None if there is none."""
     return next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
@@ -144,7 +145,7 @@ def _check_import(name: str, code: str, fix: str) -> Check:
 
 def _check_browser() -> Check:
     path = find_browser()
-    detail = path or "no Chromium; only the test that looks at the report needs it"
+    detail = path or "no Chromium; only `rangesim report --pdf` and tests of the pages need it"
     return Check("browser", path is not None, detail, "apt-get install chromium (Debian)", required=False)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of a range image with the ground truth, by material class."""
+"""Comparison of a range image with the ground truth, by object and by material class."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ import numpy as np
 from rangesim.decoding.range_image import RangeImage
 from rangesim.evaluation.depth_edges import depth_edges
 from rangesim.evaluation.neighbourhood import Neighbourhood, neighbourhood
+from rangesim.evaluation.surface_rows import index_of_row, with_mean_over_objects
 from rangesim.rig import is_same_pose
 from rangesim.settings.config import ShortRepr
-from rangesim.signals import GroundTruth, Signals
+from rangesim.signals import GroundTruth, Signals, Surface
 
 TOLERANCE_M = 0.010
 """Largest error of a right reading, in metres, unless the task states another one.
@@ -32,11 +33,13 @@ values were not measured.
 
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Statistics of the errors of one material class. A value is NaN where there are no pixels to compute it from.
+    """Statistics of the errors on one surface. A value is NaN where there are no pixels to compute it from.
 
     Parameters
     ----------
-    material : str, class of the first surface behind the pixel, or "all".
+    kind, name : str, what the row is about: "object" and its name; "material" and the class of the first surface behind
+        the pixel; "all", all surfaces; or "objects", the mean over the objects, in which each weighs the same
+        (`rangesim.evaluation.surface_rows.with_mean_over_objects`).
     pixels : int, number of pixels with a true depth.
     lit : int, number of those pixels that the emitter lights; the others lie in its shadow or outside its field.
     right, wrong, missing : fractions of all pixels, lit or not, which add up to 1: with a reading and
@@ -49,7 +52,8 @@ class ErrorStatistics:
         every true depth in the window of 5 x 5 pixels, so that they lie on neither side of the edge.
     """
 
-    material: str
+    kind: str
+    name: str
     pixels: int
     lit: int
     right: float
@@ -66,9 +70,9 @@ class ErrorStatistics:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(ShortRepr):
-    """Statistics of the errors of a range image per material class, and its error map.
+    """Statistics of the errors of a range image per object and per material class, and its error map.
 
-    table : tuple of ErrorStatistics, one for each material class, "all" last.
+    table : tuple of ErrorStatistics: the mean over objects, each object, each material class, and "all" at the end.
     error_m : (h, w) float32, metres, z - true z; NaN where there is no reading or no true surface.
     flying : (h, w) bool, flying pixels.
     tolerance_m : float, metres, largest error of a right reading.
@@ -80,29 +84,29 @@ class Comparison(ShortRepr):
     tolerance_m: float
 
     def rows(self) -> list[dict[str, Any]]:
-        """One dict per material class, as JSON can hold it: None in place of NaN."""
+        """One dict per row of the table, as JSON can hold it: None in place of NaN."""
         return [
             {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(row).items()}
             for row in self.table
         ]
 
-    def row(self, material: str) -> ErrorStatistics:
-        """Statistics of one material class.
+    def row(self, name: str, kind: str | None = None) -> ErrorStatistics:
+        """Statistics of the object or of the material class of this name, or of "objects" or "all".
+
+        Parameters
+        ----------
+        kind : "object" or "material", if there are both of this name; None: the one that there is.
 
         Raises
         ------
         ValueError
-            The comparison has no class of this name.
+            The comparison has no row of this name, or several.
         """
-        for row in self.table:
-            if row.material == material:
-                return row
-        names = ", ".join(row.material for row in self.table)
-        raise ValueError(f"expected a material class out of {names}, got {material!r}.")
+        return self.table[index_of_row([(row.kind, row.name) for row in self.table], name, kind)]
 
 
 def compare(image: RangeImage, truth: GroundTruth | Signals, tolerance_m: float = TOLERANCE_M) -> Comparison:
-    """Errors of a range image against the ground truth, per material class and over all pixels.
+    """Errors of a range image against the ground truth, per object, per material class and over all pixels.
 
     Parameters
     ----------
@@ -122,11 +126,11 @@ def compare(image: RangeImage, truth: GroundTruth | Signals, tolerance_m: float 
 
     >>> from rangesim import compare
     >>> comparison = compare(image, signals)
-    >>> [statistics.material for statistics in comparison.table]
-    ['matte', 'all']
+    >>> [row.name for row in comparison.table if row.kind == "material"]
+    ['matte']
     >>> matte = comparison.row("matte")
-    >>> matte.right, matte.wrong, matte.missing
-    (1.0, 0.0, 0.0)
+    >>> matte.right > 0.999, matte.missing
+    (True, 0.0)
     >>> compare(image, signals, tolerance_m=1e-9).row("matte").right < 0.5
     True
 
@@ -147,30 +151,32 @@ def compare(image: RangeImage, truth: GroundTruth | Signals, tolerance_m: float 
         raise ValueError(f"expected a positive tolerance_m in metres, got {tolerance_m}.")
     error = np.where(image.valid, image.reading_m.astype(np.float64) - true_m, np.nan)
     edge, flying = _flying(image.reading_m, true_m, tolerance_m, neighbourhood(image.camera))
-    table = [
-        _statistics(name, mask, error, truth.projector_visible, edge, flying, tolerance_m)
-        for name, mask in truth.classes().items()
+    rows = [
+        asdict(_statistics(surface, error, truth.projector_visible, edge, flying, tolerance_m))
+        for surface in truth.surfaces()
     ]
-    return Comparison(tuple(table), error.astype(np.float32), flying, tolerance_m)
+    table = tuple(ErrorStatistics(**row) for row in with_mean_over_objects(rows))
+    return Comparison(table, error.astype(np.float32), flying, tolerance_m)
 
 
 def _statistics(
-    name: str,
-    mask: np.ndarray,
+    surface: Surface,
     error: np.ndarray,
     visible: np.ndarray,
     edge: np.ndarray,
     flying: np.ndarray,
     tolerance_m: float,
 ) -> ErrorStatistics:
-    """Statistics of the pixels `mask` (h, w) bool, which are those of the material class `name`."""
+    """Statistics of the pixels of a surface."""
+    mask = surface.mask
     measured = mask & np.isfinite(error)
     lit, at_edge = mask & visible, measured & edge
     e = error[measured]
     absolute = np.abs(e)
     median, p95 = np.percentile(absolute, [50, 95]) if e.size else (np.nan, np.nan)
     return ErrorStatistics(
-        material=name,
+        kind=surface.kind,
+        name=surface.name,
         pixels=int(mask.sum()),
         lit=int(lit.sum()),
         right=_fraction(mask & (np.abs(error) <= tolerance_m), mask),

@@ -28,9 +28,9 @@ from rangesim.capture.exposure import exposed_again
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import SamplingWarning, sentence
 from rangesim.evaluation.reference_readings import ReferenceReadings
+from rangesim.evaluation.surface_rows import MATERIAL, with_mean_over_objects
 from rangesim.robust_scale import sigma_from_median
 from rangesim.settings.seeds import SEEDS
-from rangesim.signals import ALL
 
 if TYPE_CHECKING:
     from rangesim.signals import GroundTruth, Signals
@@ -106,22 +106,25 @@ class RangeNoise:
     sampling: np.ndarray
     repeats: Repeats | None = None
 
-    def by_material(self, truth: GroundTruth) -> list[dict[str, Any]]:
-        """Noise per material class of `truth` that occurs, "all" last; one dict for each.
+    def by_surface(self, truth: GroundTruth) -> list[dict[str, Any]]:
+        """Noise per surface, one dict for each row of `compare`, with its `kind` and `name`.
 
         `detector_sigma_m` and `sampling_sigma_m` are standard deviations in metres, estimated as 1.4826 times the
         median of the absolute error; None where there are no readings, or half of the errors are infinite.
         `completeness_error` is the change of `rangesim.evaluation.comparison.ErrorStatistics.completeness` that a pass
         of very many samples may bring, see `Repeats.completeness_error`; None where it is not known.
         """
-        return [
+        rows = [
             {
+                "kind": kind,
+                "name": name,
                 "detector_sigma_m": robust_sigma(self.detector[mask]),
                 "sampling_sigma_m": robust_sigma(self.sampling[mask]),
                 "completeness_error": self.repeats and self.repeats.completeness_error(mask & truth.projector_visible),
             }
-            for mask in truth.classes().values()
+            for kind, name, mask in truth.surfaces()
         ]
+        return with_mean_over_objects(rows)
 
 
 def range_noise(image: RangeImage, capture: Captured, signals: Signals) -> RangeNoise:
@@ -186,8 +189,8 @@ def warn_of_sampling(tables: Mapping[str, Sequence[dict[str, Any]]], spp: int) -
 
     Parameters
     ----------
-    tables : rows of statistics, by the name of the instrument. Each row has `material`, `pixels`, `lit` and
-        `completeness`, and the values of `RangeNoise.by_material`.
+    tables : rows of statistics, by the name of the instrument. Each row has `kind`, `name`, `pixels`, `lit` and
+        `completeness`, and the values of `RangeNoise.by_surface`.
     spp : largest number of samples that a pixel had.
 
     Warns
@@ -196,8 +199,8 @@ def warn_of_sampling(tables: Mapping[str, Sequence[dict[str, Any]]], spp: int) -
     """
     noisy, lossy, largest = [], [], 0.0
     for name, rows in tables.items():
-        of_class = [r for r in rows if r["material"] != ALL]
-        ratios = {r["material"]: noise_ratio(r) for r in of_class if r["pixels"] >= ENOUGH_PIXELS}
+        of_class = [r for r in rows if r["kind"] == MATERIAL]
+        ratios = {r["name"]: noise_ratio(r) for r in of_class if r["pixels"] >= ENOUGH_PIXELS}
         if found := [f"{ratio:.1f} on {material}" for material, ratio in ratios.items() if ratio > SMALL]:
             noisy.append(f"{name}: {', '.join(found)}")
         known = [r for r in of_class if r["lit"] >= ENOUGH_PIXELS and r["completeness_error"] is not None]
@@ -218,7 +221,7 @@ def warn_of_sampling(tables: Mapping[str, Sequence[dict[str, Any]]], spp: int) -
 
 def _missing(row: dict[str, Any]) -> str:
     """Text of the fraction of lit pixels without a reading in a row, with its uncertainty."""
-    return f"{100 * (1 - row['completeness']):.0f} ± {100 * row['completeness_error']:.0f} % on {row['material']}"
+    return f"{100 * (1 - row['completeness']):.0f} ± {100 * row['completeness_error']:.0f} % on {row['name']}"
 
 
 def _power_of_two(number: int) -> int:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rangesim.electronics.ambient import Ambient
+from rangesim.evaluation.comparison import TOLERANCE_M
 from rangesim.files.settings_files import load_settings
 from rangesim.instrument.instrument import Instrument
 from rangesim.motion import Motion
@@ -44,12 +45,16 @@ class Experiment:
     photons : number of caustic photons of each pass. 0: no light through glass or off mirrors. None: the default of
         `transport`.
     glint : whether the camera sees the projector's lens in mirrors.
+    tolerance_m : largest error of a right reading in metres, which the task sets: what the gripper can bear. Tables and
+        causes count readings that are off by more as wrong.
     seed : seed of light transport and noise, 0 to 2^64 - 1. The same seed gives the same bytes.
     ambient : Ambient, kind and strength of the light that the scene's own emitters give; None: not stated, see
         `rangesim.expose`.
     instruments : instruments to compare. Those whose emitter, wavelength and camera agree share a light-transport
         pass, if nothing moves, see `rangesim.pipeline.shared_passes`.
     motion : Motion, objects that move; None: nothing moves.
+    objects : names of the shapes, or of the things that they are parts of, that count as objects; all others are
+        background. None: as the scene states, or as follows from its geometry (`rangesim.scene.objects`).
 
     Raises
     ------
@@ -75,10 +80,12 @@ class Experiment:
     max_depth: Annotated[int, whole(1, "depth")] = 5
     photons: Annotated[int, whole(0, "photons")] | None = None
     glint: bool = True
+    tolerance_m: Metres = TOLERANCE_M
     seed: int = 0
     ambient: Ambient | None = None
     instruments: tuple[Instrument, ...] = tuple(instrument(name) for name in DEFAULT_SENSORS)
     motion: Motion | None = None
+    objects: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -54,8 +54,7 @@ class Instrument:
         camera looks at.
     baseline_m : metres between camera and emitter. None: as the sensor states, which is a fifth of the working
         distance for structured light and 0.03 m for time of flight.
-    wavelength_m : wavelength of the emitter's light, metres; None: that of the detector. Instruments of different
-        wavelengths do not share a light-transport pass.
+    wavelength_m : wavelength of the emitter's light, metres; None: that of the detector.
     power_w : mean radiant power of the emitter when it is fully on, watts.
     exposure_s : exposure of each frame, seconds; None: automatic.
     camera_lens, projector_lens : Lens, aperture, focus and vignetting.

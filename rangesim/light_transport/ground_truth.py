@@ -66,6 +66,7 @@ def ground_truth(scene: Scene, traced: TracedScene, rig: Rig) -> tuple[GroundTru
         projector_visible=image("visible"),
         instance_names=tuple(i.name for i in scene.instances),
         material_names=MATERIAL_CLASSES,
+        instance_objects=tuple(i.object_name for i in scene.instances),
     )
     is_shared = (instance >= 0) & matte[instance] & (reflectance > 0)
     guides = Guides(

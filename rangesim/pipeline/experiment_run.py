@@ -2,7 +2,7 @@
 """Carries out an experiment, from the scene to the comparison with the ground truth.
 
 `carry_out` computes the result and writes nothing. `run` computes it and writes its directory. Each instrument passes
-through the stages of `measure`: capture, range image, noise, comparison, causes, points, segmentation.
+through the stages of `measure`: capture, range image, noise, comparison, causes, points, segmentation, objects.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from rangesim.causes.range_limits import fraction_beyond_range, warn_of_range
 from rangesim.causes.rules import causes_of
 from rangesim.decoding import decode
 from rangesim.errors import warn
-from rangesim.evaluation.comparison import compare
+from rangesim.evaluation.comparison import TOLERANCE_M, compare
+from rangesim.evaluation.object_segmentation import object_segmentation
 from rangesim.evaluation.range_noise import noise_of, warn_of_sampling
 from rangesim.evaluation.reference_readings import ReferenceReadings
 from rangesim.experiment import Experiment
@@ -179,6 +180,8 @@ def _computed(
     tell("Loading the scene", 0.0)
     with timed(times, "load"):
         scene = scene or load_scene(experiment.scene, material=experiment.material, unit_m=experiment.unit_m)
+        if experiment.objects is not None:
+            scene = scene.with_objects(experiment.objects)
     if experiment.ambient is not None:
         experiment.ambient.check_emitters(scene.has_ambient)
     groups = group_by_rig(experiment, scene)
@@ -189,6 +192,7 @@ def _computed(
     with timed(times, "compile_segmentation"):  # kernels compile once per machine; no sensor's time includes it
         compile_kernels()
     passes, measurements = [], {}
+    true_labels: dict[bytes, np.ndarray] = {}
     for number, (rig, instruments) in enumerate(groups, 1):
         stage = f"Tracing light, pass {number} of {len(groups)} ({', '.join(i.name for i in instruments)})"
         begin, end = (_fraction(number, len(groups), of_pass) for of_pass in (0.0, 1.0))
@@ -197,10 +201,16 @@ def _computed(
         with timed(times, f"transport_{number}"):
             signals = _trace(experiment, scene, rig, instruments, told)
         passes.append(LightPass.of(signals))
+        view = signals.rig.camera.points(signals.truth).tobytes()  # passes of different emitters often share it
+        if view not in true_labels:
+            with timed(times, f"segmentation_of_truth_{number}"):
+                true_labels[view] = segments_of_truth(signals)
         for instrument in instruments:
             tell(f"Measuring with {instrument.name}", end)
-            seed = noise_seed(experiment, instrument)
-            measurements[instrument.name] = measure(instrument, signals, seed, experiment.ambient, number)
+            seed, light = noise_seed(experiment, instrument), signals.at_wavelength(instrument.emitter_wavelength_m)
+            measurements[instrument.name] = measure(
+                instrument, light, seed, experiment.ambient, number, experiment.tolerance_m, true_labels[view]
+            )
     info = provenance(experiment, scene, groups, mi.variant(), times)
     return Result(experiment, tuple(measurements[i.name] for i in experiment.instruments), tuple(passes), info)
 
@@ -224,7 +234,13 @@ def _warn(result: Result) -> None:
 
 
 def measure(
-    instrument: Instrument, signals: Signals, seed: int, ambient: Ambient | None = None, light_pass: int = 1
+    instrument: Instrument,
+    signals: Signals,
+    seed: int,
+    ambient: Ambient | None = None,
+    light_pass: int = 1,
+    tolerance_m: float = TOLERANCE_M,
+    true_labels: np.ndarray | None = None,
 ) -> Measurement:
     """The measurement of one instrument, with its capture, range image, errors, causes and segmentation.
 
@@ -234,6 +250,8 @@ def measure(
     seed : seed of the detector's noise.
     ambient : as for `rangesim.expose`.
     light_pass : number of the pass, counted from 1.
+    tolerance_m : largest error of a right reading, metres.
+    true_labels : (h, w) int32, as `segments_of_truth`. None: it is computed here.
     """
     times: dict[str, float] = {}
     moves = signals.motion_m is not None
@@ -251,18 +269,21 @@ def measure(
         with timed(times, "noise"):
             noise = noise_of(readings)
         image = replace(image, sampling_sigma_m=np.abs(noise.sampling))
-    comparison = compare(image, signals.truth)
+    comparison = compare(image, signals.truth, tolerance_m)
     with timed(times, "causes"):
-        causes = causes_of(readings, comparison.tolerance_m)
+        causes = causes_of(readings, tolerance_m)
     rows = [row | failures for row, failures in zip(comparison.rows(), causes.fractions(signals.truth), strict=True)]
     if noise is not None:
-        rows = [row | sigmas for row, sigmas in zip(rows, noise.by_material(signals.truth), strict=True)]
+        rows = [row | sigmas for row, sigmas in zip(rows, noise.by_surface(signals.truth), strict=True)]
     with timed(times, "points"):
         cloud = image.to_point_cloud()
     points, segmentation = int(cloud.valid.sum()), None
     if points >= MIN_POINTS:
         with timed(times, "segmentation"):
             segmentation = segmented(cloud)
+    true_labels = segments_of_truth(signals) if true_labels is None else true_labels
+    labels = np.full_like(true_labels, -1) if segmentation is None else segmentation.labels
+    wrong = image.valid & ~(np.abs(comparison.error_m) <= comparison.tolerance_m)
     return Measurement(
         name=instrument.name,
         capture=capture,
@@ -271,6 +292,7 @@ def measure(
         causes=causes,
         rows=complete_rows(rows),
         segmentation=segmentation,
+        objects=object_segmentation(labels, signals.truth, wrong, true_labels),
         metadata=acquisition(capture.reference, photons, instrument.timing, moves, points, times),
         light_pass=light_pass,
     )
@@ -292,6 +314,16 @@ def segmented(cloud: PointCloud) -> Segmentation:
 
     result = pcgraph.segment(cloud.points, colors=cloud.colors, viewpoint=(0.0, 0.0, 0.0))
     return Segmentation(result.supervoxels, result.labels, result.tree.parents, result.tree.altitudes)
+
+
+def segments_of_truth(signals: Signals) -> np.ndarray:
+    """(h, w) int32, objects in the cloud of the true depth, segmented as a sensor's cloud; -1 where there is none."""
+    import pcgraph
+
+    points = signals.rig.camera.points(signals.truth).astype(np.float32)
+    if np.isfinite(points).all(axis=-1).sum() < MIN_POINTS:
+        return np.full(points.shape[:-1], -1, dtype=np.int32)
+    return pcgraph.segment(points, viewpoint=(0.0, 0.0, 0.0)).labels
 
 
 def noise_seed(experiment: Experiment, instrument: Instrument) -> int:

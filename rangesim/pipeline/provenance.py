@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import hashlib
-import platform
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rangesim.environment.versions import versions
 from rangesim.experiment import Experiment, experiment_to_dict
 from rangesim.instrument.instrument import Instrument
 from rangesim.results.experiment_results import InstrumentRecord, ResultRecord, SceneRecord, ShapeRecord
@@ -18,9 +17,6 @@ from rangesim.settings.config import to_dict
 if TYPE_CHECKING:
     from rangesim.rig import Rig
     from rangesim.scene import Scene
-
-PACKAGES = ("rangesim", "mitsuba", "drjit", "numpy", "scipy", "numba", "open3d")
-"""Packages whose versions a result records, because the bytes of its files may depend on them."""
 
 
 def provenance(
@@ -45,14 +41,14 @@ def provenance(
             name=scene.name,
             sha256=_checksum(scene.source),
             working_distance_m=scene.working_distance_m,
-            shapes=[ShapeRecord(name=i.name, material=i.material) for i in scene.instances],
+            shapes=[ShapeRecord(name=i.name, material=i.material, object=i.object_name) for i in scene.instances],
         ),
         passes=len(passes),
         instruments=[
             InstrumentRecord(name=i.name, light_pass=placed[i.name][0], rig=to_dict(placed[i.name][1]))
             for i in experiment.instruments
         ],
-        versions={"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
+        versions=dict(versions()),
         variant=variant,
         times_s=times_s,
     )
@@ -61,13 +57,3 @@ def provenance(
 def _checksum(path: Path | None) -> str | None:
     """SHA-256 of the scene's file; None if the scene has no file, or if the file no longer exists."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path is not None and path.is_file() else None
-
-
-def _version(package: str) -> str:
-    """Version of a package, or of its build for the CPU only, such as open3d-cpu."""
-    for name in (package, f"{package}-cpu"):
-        try:
-            return version(name)
-        except PackageNotFoundError:
-            continue
-    return "not installed"

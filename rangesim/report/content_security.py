@@ -16,7 +16,7 @@ from markupsafe import Markup
 
 from rangesim.errors import visible
 
-_DECLARATIONS = re.compile(r"[a-z]+:[-#%.,() a-z0-9]+(;[a-z]+:[-#%.,() a-z0-9]+)*")
+_DECLARATIONS = re.compile(r"[a-z-]+:[-#%.,() a-z0-9]+(;[a-z-]+:[-#%.,() a-z0-9]+)*")
 """CSS declarations that `StyleRules` takes: properties with plain values, and no URL or quote."""
 
 

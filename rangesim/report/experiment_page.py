@@ -22,7 +22,14 @@ from rangesim.signals import GroundTruth
 FEW_PX = 64
 """Width of an image, in pixels, below which its pixels are shown as squares: a sensor of 8 x 8 zones has no image that
 could be smoothed. With a larger value the pictures of small trial runs would be squares, too."""
-SCRIPTS = ("scroll.js", "pcgraph.viewer:three.js", "pcgraph.viewer:points.js", "sensor_views.js", "report.js")
+SCRIPTS = (
+    "scroll.js",
+    "print.js",
+    "pcgraph.viewer:three.js",
+    "pcgraph.viewer:points.js",
+    "sensor_views.js",
+    "report.js",
+)
 """Files of the page's JavaScript, in the order in which they use each other."""
 
 
@@ -44,9 +51,9 @@ def write_report(result: Result, path: Path) -> None:
     write_file(path, render_report(result).encode(), FileFormatError)
 
 
-def render_report(result: Result) -> str:
-    """HTML page of the report of a result."""
-    return render_page("report.html.j2", context(result), SCRIPTS)
+def render_report(result: Result, paper: str = "") -> str:
+    """HTML page of the report of a result; `paper` is the size with which it is printed, such as "A4"."""
+    return render_page("report.html.j2", context(result), SCRIPTS, paper)
 
 
 def context(result: Result) -> dict[str, Any]:
@@ -66,7 +73,8 @@ def context(result: Result) -> dict[str, Any]:
         "columns": tables.COLUMNS,
         "along_rays": _along_rays(measurements, names),
         "comparison": tables.comparison_table(measurements),
-        "failures": tables.failure_table(measurements),
+        "outcome_columns": tables.OUTCOMES,
+        "outcomes": tables.outcome_table(measurements),
         "noise": tables.noise_table(measurements),
         "tolerance_mm": f"{1e3 * measurements[0].causes.tolerance_m:g}",
         "definitions": tables.definitions(measurements),

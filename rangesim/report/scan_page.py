@@ -47,9 +47,9 @@ SOLID = (196, 160, 96)
 """Colour of voxels inside a shape, RGB 0..255."""
 
 
-def render_scan_page(result: ScanResult) -> str:
-    """HTML page of a scan."""
-    return render_page("scan.html.j2", context(result))
+def render_scan_page(result: ScanResult, paper: str = "") -> str:
+    """HTML page of a scan; `paper` is the size with which it is printed, such as "A4"."""
+    return render_page("scan.html.j2", context(result), paper=paper)
 
 
 def context(result: ScanResult) -> dict[str, Any]:

@@ -1,28 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of the report: statistics of each sensor on each material, as text."""
+"""Tables of the report: statistics of each sensor on each surface, as text."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
 from rangesim.evaluation.comparison import Comparison, ErrorStatistics
 from rangesim.evaluation.range_noise import SMALL, noise_ratio
+from rangesim.evaluation.surface_rows import KINDS, OBJECT, OBJECTS
 from rangesim.experiment import Experiment
 from rangesim.presets import catalogue
 from rangesim.report import palette
 from rangesim.report.figures import LegendEntry
 from rangesim.report.markdown_table import Table
 from rangesim.results.experiment_results import Measurement, PhotonsRecord
+from rangesim.signals import ALL
 
 Rows = list[dict[str, Any]]
-"""Statistics per material class, one dict each, with the keys of `rangesim.results.experiment_results.RowRecord`."""
+"""Statistics per surface, one dict each, with the keys of `rangesim.results.experiment_results.RowRecord`."""
 
-CAUSE_HEADS = ["right (%)", "others failed because (% of the pixels)"]
-"""Heads of the columns that say how many pixels are right, and why the others are not."""
+BECAUSE = "because (% of the pixels)"
+"""Head of the column with the causes of wrong and missing readings."""
+SUMMARIES = tuple(kind for kind in KINDS if kind != OBJECT)
+"""Kinds of rows of the tables of errors and of noise, which would be long with a row for every object."""
 MOST = 0.5
 """Fraction of the pixels of a surface that must be right for a sensor to be reliable on it.
 
@@ -45,16 +49,14 @@ class Column:
     better: str = "low"
 
 
+OUTCOMES = (
+    Column("right", "right", "%", "the reading is off by at most the tolerance", "high"),
+    Column("wrong", "wrong", "%", "the reading is off by more"),
+    # fewer missing readings are not better if those that are there are wrong
+    Column("missing", "missing", "%", "there is no reading, in shadow or not", ""),
+)
+"""Columns of the table of right readings, fractions of all pixels of a surface that add up to 1, from left to right."""
 COLUMNS = (
-    Column("right", "right", "%", "fraction of all pixels with a reading within the tolerance", "high"),
-    Column("wrong", "wrong", "%", "fraction with a reading off by more"),
-    Column(
-        "missing",
-        "missing",
-        "%",
-        "fraction without a reading, in shadow or not",
-        "",  # fewer missing readings are not better if those that are there are wrong
-    ),
     Column(
         "completeness",
         "complete",
@@ -81,10 +83,23 @@ class Definition:
 
 
 @dataclass(frozen=True)
+class OutcomeLine:
+    """A line of the table of right readings.
+
+    name : of the instrument. cells : one for each of `OUTCOMES`. parts : legend of the causes of wrong and missing
+    readings; the largest is first.
+    """
+
+    name: str
+    cells: list[Cell]
+    parts: list[LegendEntry]
+
+
+@dataclass(frozen=True)
 class Cell:
     """A cell of the table of errors.
 
-    text : the value. best : whether it is the best one of the real sensors that are reliable on this material.
+    text : the value. best : whether it is the best one of the real sensors that are reliable on this surface.
     bar : the value as a fraction, 0..1, to be drawn as a bar; None for lengths.
     error : uncertainty of the value by sampling; empty if it rounds to 0, None in columns without uncertainty.
     """
@@ -112,49 +127,64 @@ def is_reliable(row: dict[str, Any]) -> bool:
     return (row["right"] or 0.0) > MOST
 
 
+def outcome_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[OutcomeLine]]]:
+    """Right, wrong and missing readings of each instrument per surface, objects first, with the causes."""
+    table = []
+    for surface, rows in _by_surface(measurements, KINDS):
+        lines = zip(_lines(measurements, rows, OUTCOMES), rows, strict=True)
+        table.append((surface, [OutcomeLine(name, cells, parts(row)) for (name, cells), (_, row) in lines]))
+    return table
+
+
 def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, list[Cell]]]]]:
-    """Errors of each instrument per material class, "all" first.
+    """Errors of each instrument per surface, except single objects.
 
-    Each entry is the material and a list with the name and the cells, one per column, of each instrument.
+    Each entry is the surface and a list with the name and the cells, one per column, of each instrument.
     """
-    table = []
-    for material in materials(measurements):
-        rows = {m.name: row for m in measurements for row in m.rows if row["material"] == material}
-        real = [rows[m.name] for m in measurements if m.name in rows and not is_reference(m)]
-        rivals = [row for row in real if is_reliable(row)]  # the few readings of the others prove nothing
-        best = {c.key: _best(c, rivals) for c in COLUMNS}
-        lines = [(n, [_cell(c, row, best[c.key], row in rivals) for c in COLUMNS]) for n, row in rows.items()]
-        table.append((material, lines))
-    return table
-
-
-def failure_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, str, list[LegendEntry]]]]]:
-    """Right pixels of each instrument and causes of the others per material class, "all" first.
-
-    Each entry is the material and a list with, for each instrument, its name, the right pixels in percent, and the
-    legend of the causes of the others.
-    """
-    table = []
-    for material in materials(measurements):
-        rows = [(m.name, row) for m in measurements for row in m.rows if row["material"] == material]
-        lines = [(name, _percent(row["right"]), parts(row)) for name, row in rows if row["right"] is not None]
-        table.append((material, lines))
-    return table
+    return [(surface, _lines(measurements, rows, COLUMNS)) for surface, rows in _by_surface(measurements, SUMMARIES)]
 
 
 def noise_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, list[str], bool]]]]:
-    """Noise of each instrument per material class, "all" first; empty if no instrument knows its noise.
+    """Noise of each instrument per surface, except single objects; empty if no instrument knows its noise.
 
-    Each entry is the material and a list with, for each instrument, its name, the texts of detector noise, sampling
+    Each entry is the surface and a list with, for each instrument, its name, the texts of detector noise, sampling
     noise and their ratio, and whether this ratio is large.
     """
     table = []
-    for material in materials(measurements):
-        rows = [(m.name, row) for m in measurements for row in m.rows if row["material"] == material]
+    for surface, rows in _by_surface(measurements, SUMMARIES):
         lines = [(name, [*_noise(row), _ratio(row)], noise_ratio(row) > SMALL) for name, row in rows]
-        table.append((material, lines))
+        table.append((surface, lines))
     known = any(row["sampling_sigma_m"] is not None for m in measurements for row in m.rows)
     return table if known else []
+
+
+def _by_surface(
+    measurements: Sequence[Measurement], kinds: Sequence[str]
+) -> list[tuple[str, list[tuple[str, dict[str, Any]]]]]:
+    """Rows of these kinds, each with the name of its instrument, by the label of their surface."""
+    found: dict[tuple[str, str], list[tuple[str, dict[str, Any]]]] = {}
+    for m in measurements:
+        for row in m.rows:
+            if row["kind"] in kinds:
+                found.setdefault((row["kind"], row["name"]), []).append((m.name, row))
+    return [(surface_label(key), found[key]) for key in sorted(found, key=lambda key: kinds.index(key[0]))]
+
+
+def surface_label(key: tuple[str, str]) -> str:
+    """Text that names the surface of a row by its kind and name, such as "object bottle"; "objects" and "all" alone."""
+    kind, name = key
+    return kind if kind == name and kind in (OBJECTS, ALL) else f"{kind} {name}"
+
+
+def _lines(
+    measurements: Sequence[Measurement], rows: Sequence[tuple[str, dict[str, Any]]], columns: Sequence[Column]
+) -> list[tuple[str, list[Cell]]]:
+    """Name of each instrument with its cells, one per column, from the rows of one surface."""
+    references = {m.name for m in measurements if is_reference(m)}
+    # the few readings of the others prove nothing
+    rivals = [row for name, row in rows if name not in references and is_reliable(row)]
+    best = {c.key: _best(c, rivals) for c in columns}
+    return [(name, [_cell(c, row, best[c.key], row in rivals) for c in columns]) for name, row in rows]
 
 
 def definitions(measurements: Sequence[Measurement]) -> list[Definition]:
@@ -164,30 +194,29 @@ def definitions(measurements: Sequence[Measurement]) -> list[Definition]:
 
 
 def parts(row: dict[str, Any]) -> list[LegendEntry]:
-    """Legend of the causes of the failed pixels of a row; the largest is first."""
+    """Legend of the causes of the wrong and missing readings of a row; the largest is first."""
     causes = [(Cause[name.upper()], fraction) for name, fraction in row["causes"].items()]
     return [
         LegendEntry(TITLES[c], palette.hexadecimal(palette.OUTCOME_COLORS[c]), 100 * fraction) for c, fraction in causes
     ]
 
 
-def materials(measurements: Sequence[Measurement]) -> list[str]:
-    """Material classes of all rows, "all" first."""
-    names = dict.fromkeys(row["material"] for m in measurements for row in m.rows)
-    return sorted(names, key=lambda n: n != "all")
-
-
 def comparison_tables(tables: Sequence[tuple[str, Rows]]) -> list[Table]:
-    """Tables of errors, of causes and of noise, with one row per material and instrument.
+    """Tables of right readings and causes, of errors and of noise, with one row per surface and instrument.
 
     Parameters
     ----------
-    tables : name of each instrument with its statistics per material class.
+    tables : name of each instrument with its statistics per surface.
     """
     return [
-        _table(tables, [f"{c.title} ({c.unit})" for c in COLUMNS], lambda row: [_text(c, row) for c in COLUMNS]),
-        _table(tables, CAUSE_HEADS, _causes),
-        _table(tables, ["detector noise (mm)", "sampling noise (mm)"], _noise),
+        _table(tables, [*(f"{c.title} ({c.unit})" for c in OUTCOMES), BECAUSE], _outcomes, KINDS),
+        _table(
+            tables,
+            [f"{c.title} ({c.unit})" for c in COLUMNS],
+            lambda row: [_text(c, row) for c in COLUMNS],
+            SUMMARIES,
+        ),
+        _table(tables, ["detector noise (mm)", "sampling noise (mm)"], _noise, SUMMARIES),
     ]
 
 
@@ -197,7 +226,7 @@ def comparison_markdown(tables: Sequence[tuple[str, Rows]]) -> str:
 
 
 def errors_markdown(comparison: Comparison) -> str:
-    """Markdown table of the errors of one range image, with one row per material class.
+    """Markdown table of the errors of one range image, with one row per surface.
 
     Lengths are in mm, fractions in %.
 
@@ -211,11 +240,15 @@ def errors_markdown(comparison: Comparison) -> str:
 
     >>> from rangesim import errors_markdown
     >>> print(errors_markdown(comparison).splitlines()[0])
-    | material | pixels | lit | right | wrong | missing | completeness | ... | flying rate |
+    | surface | pixels | lit | right | wrong | missing | completeness | ... | flying rate |
     """
-    heads = [f.name.replace("_m", "_mm") if f.name.endswith("_m") else f.name for f in fields(ErrorStatistics)]
-    rows = [[_plain(name, value) for name, value in asdict(row).items()] for row in comparison.table]
-    return Table([head.replace("_", " ") for head in heads], rows).markdown()
+    names = [f.name for f in fields(ErrorStatistics) if f.name not in ("kind", "name")]
+    heads = [name.removesuffix("_m") + " mm" if name.endswith("_m") else name for name in names]
+    rows = [
+        [surface_label((row.kind, row.name)), *(_plain(name, getattr(row, name)) for name in names)]
+        for row in comparison.table
+    ]
+    return Table(["surface", *(head.replace("_", " ") for head in heads)], rows).markdown()
 
 
 def _plain(name: str, value: Any) -> str:
@@ -230,7 +263,7 @@ def _plain(name: str, value: Any) -> str:
 
 
 def failures_markdown(rows: Rows) -> str:
-    """Markdown table of the right pixels and the causes of the others, with one row per material class; in %.
+    """Markdown table of the right pixels and the causes of the others, with one row per surface; fractions in %.
 
     Parameters
     ----------
@@ -239,27 +272,41 @@ def failures_markdown(rows: Rows) -> str:
     Examples
     --------
     >>> from rangesim import failures_markdown
-    >>> rows = [{"material": "glossy", "right": 0.75, "causes": {"multipath": 0.2, "low_signal": 0.05}}]
+    >>> causes = {"multipath": 0.2, "low_signal": 0.05}
+    >>> rows = [{"kind": "object", "name": "cup", "right": 0.75, "causes": causes}]
     >>> print(failures_markdown(rows), end="")
-    | material | right (%) | others failed because (% of the pixels) |
+    | surface | right (%) | because (% of the pixels) |
     | --- | --- | --- |
-    | glossy | 75.0 | multipath 20.0, low signal 5.0 |
+    | object cup | 75.0 | multipath 20.0, low signal 5.0 |
     """
-    return Table(["material", *CAUSE_HEADS], [[row["material"], *_causes(row)] for row in rows]).markdown()
+    right = OUTCOMES[0]
+    lines = [[surface_label((row["kind"], row["name"])), number(right, row["right"]), _causes(row)] for row in rows]
+    return Table(["surface", f"{right.title} ({right.unit})", BECAUSE], lines).markdown()
 
 
-def _table(tables: Sequence[tuple[str, Rows]], heads: list[str], texts: Callable[[dict[str, Any]], list[str]]) -> Table:
-    """Table with one row per material class and instrument; `texts` makes the cells from the statistics."""
+def _table(
+    tables: Sequence[tuple[str, Rows]],
+    heads: list[str],
+    texts: Callable[[dict[str, Any]], list[str]],
+    kinds: Sequence[str],
+) -> Table:
+    """Table with one row per surface of these kinds and instrument; `texts` makes the cells from the statistics."""
+    keys = dict.fromkeys((row["kind"], row["name"]) for _, rows in tables for row in rows if row["kind"] in kinds)
     lines = []
-    for material in dict.fromkeys(row["material"] for _, rows in tables for row in rows):
+    for key in sorted(keys, key=lambda key: kinds.index(key[0])):
         for name, rows in tables:
-            lines += [[material, name, *texts(row)] for row in rows if row["material"] == material]
-    return Table(["material", "sensor", *heads], lines)
+            lines += [[surface_label(key), name, *texts(row)] for row in rows if (row["kind"], row["name"]) == key]
+    return Table(["surface", "sensor", *heads], lines)
 
 
-def _causes(row: dict[str, Any]) -> list[str]:
-    """Cells of the right pixels, in percent, and of the causes of the others."""
-    return [_percent(row["right"]), ", ".join(f"{p.name} {p.text}" for p in parts(row)) or "–"]
+def _outcomes(row: dict[str, Any]) -> list[str]:
+    """Cells of right, wrong and missing readings, in percent, and of the causes of the last two."""
+    return [*(number(c, row[c.key]) for c in OUTCOMES), _causes(row)]
+
+
+def _causes(row: dict[str, Any]) -> str:
+    """Text of the causes of wrong and missing readings."""
+    return ", ".join(f"{p.name} {p.text}" for p in parts(row)) or "–"
 
 
 def _noise(row: dict[str, Any]) -> list[str]:
@@ -272,11 +319,6 @@ def _ratio(row: dict[str, Any]) -> str:
     """Cell of the ratio of sampling noise to detector noise."""
     ratio = noise_ratio(row)
     return f"{ratio:.2f}" if ratio else "–"
-
-
-def _percent(fraction: float | None) -> str:
-    """Text of a fraction in percent, without the sign; a dash for None."""
-    return "–" if fraction is None else f"{100 * fraction:.1f}"
 
 
 def number(column: Column, value: float | None) -> str:

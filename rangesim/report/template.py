@@ -14,17 +14,21 @@ from pcgraph.viewer.content_policy import content_policy
 from rangesim.report.content_security import StyleRules, visible_text
 
 
-def render_page(template: str, values: Mapping[str, Any], scripts: Sequence[str] = ("scroll.js",)) -> str:
+def render_page(
+    template: str, values: Mapping[str, Any], scripts: Sequence[str] = ("scroll.js", "print.js"), paper: str = ""
+) -> str:
     """HTML page made from a template of this package and the values of its variables.
 
-    Every page also gets the style sheet (`css`), the scripts (`script`), the rules that the template adds to the style
-    sheet (`rules`) and the function that writes the page's security policy (`content_policy`).
+    Every page also gets the style sheets for the screen (`css`) and for paper (`print`), the scripts (`script`), the
+    rules that the template adds to the style sheet (`rules`) and the function that writes the page's security policy
+    (`content_policy`).
 
     Parameters
     ----------
     template : name of the template's file. values : the other variables of the template, by name.
     scripts : names of the files whose JavaScript the page runs, in this order, of this package or, such as
         "pcgraph.viewer:points.js", of another one.
+    paper : size of the paper for which the page is printed, as CSS names it, such as "A4"; "": the reader chooses it.
 
     Raises
     ------
@@ -36,6 +40,7 @@ def render_page(template: str, values: Mapping[str, Any], scripts: Sequence[str]
     )
     own = {  # `Markup` is not escaped: these files are part of the package
         "css": Markup(text_of_file("style.css")),
+        "print": Markup(text_of_file("print.css") + (f"@page {{ size: {paper}; }}\n" if paper else "")),
         "script": Markup("\n".join(map(text_of_file, scripts))),
         "rules": StyleRules(),
         "content_policy": content_policy,

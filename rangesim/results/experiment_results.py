@@ -10,13 +10,15 @@ DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.fil
          range.npz       range image
          causes.npz      cause of every failed pixel
          cloud.ply       points, metres, camera coordinates
-         comparison.json statistics per material class
+         comparison.json statistics per object and material class
          measurement.json exposure and times
          segmentation.npz supervoxels, labels and tree
+         objects.json    what the segmentation makes of each object
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,6 +33,8 @@ from rangesim.capture import Captured
 from rangesim.causes import Cause, CauseMap
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
+from rangesim.evaluation.object_segmentation import ObjectOutcome, ObjectSegmentation, Outcome
+from rangesim.evaluation.surface_rows import OBJECT, OBJECTS, index_of_row
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.files.array_files import write_arrays
 from rangesim.files.atomic_directories import DirectoryKind, sidecar_of
@@ -67,10 +71,14 @@ RESULT = DirectoryKind(FORMAT, SETTINGS, FileFormatError)
 
 
 class ShapeRecord(Record, frozen=True, kw_only=True):
-    """A shape of the scene and its material class."""
+    """A shape of the scene and its material class.
+
+    object : name of the object that it is a part of, empty for background; None in results that do not tell.
+    """
 
     name: str
     material: Name
+    object: str | None = None
 
 
 class SceneRecord(Record, frozen=True, kw_only=True):
@@ -142,13 +150,14 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
 
 
 class RowRecord(Record, frozen=True, kw_only=True):
-    """Statistics of one material class.
+    """Statistics of one surface.
 
     `rangesim.evaluation.comparison.ErrorStatistics`, `rangesim.causes.CauseMap.fractions` and
-    `rangesim.evaluation.range_noise.RangeNoise.by_material` explain them. None: not known.
+    `rangesim.evaluation.range_noise.RangeNoise.by_surface` explain them. None: not known.
     """
 
-    material: Name
+    kind: Literal["objects", "object", "material", "all"]
+    name: str
     pixels: Count
     lit: Count
     right: Fraction | None
@@ -168,7 +177,7 @@ class RowRecord(Record, frozen=True, kw_only=True):
 
 
 class ComparisonRecord(Record, frozen=True, kw_only=True):
-    """The contents of `comparison.json`: a row for each material class, the last one for "all".
+    """The contents of `comparison.json`: a row for each object and material class, the last one for "all".
 
     tolerance_m : largest error of a right reading, metres.
     """
@@ -177,6 +186,33 @@ class ComparisonRecord(Record, frozen=True, kw_only=True):
     format_version: Literal[2] = 2
     tolerance_m: Positive
     rows: list[RowRecord]
+
+
+class ObjectRecord(Record, frozen=True, kw_only=True):
+    """What the segmentation makes of an object; `rangesim.evaluation.object_segmentation.ObjectOutcome` explains it."""
+
+    name: str
+    pixels: Count
+    covering: Fraction
+    overlap: Fraction
+    outcome: Outcome
+    displaced: bool
+    merged_with: list[str]
+    separable: bool
+
+
+class ObjectsRecord(Record, frozen=True, kw_only=True):
+    """The contents of `objects.json`.
+
+    invented : number of segments that could pass for an object and are none.
+    panoptic_quality : of the objects; None if there are neither objects nor invented ones.
+    """
+
+    format: Literal["rangesim-objects"] = "rangesim-objects"
+    format_version: Literal[1] = 1
+    objects: list[ObjectRecord]
+    invented: Count
+    panoptic_quality: Fraction | None
 
 
 _CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpec("float64", (), low=1e-9, high=1e9)}
@@ -215,8 +251,10 @@ class Measurement(ShortRepr):
     image : RangeImage.
     truth : GroundTruth of the instrument's pass.
     causes : CauseMap, the cause of each failed pixel.
-    rows : statistics per material class with the keys of `RowRecord`, "all" last.
+    rows : statistics with the keys of `RowRecord`, in this order: mean over objects, each object, each material class,
+        "all". `row` finds one by its name.
     segmentation : Segmentation; None if there were too few points.
+    objects : ObjectSegmentation, what the segmentation makes of each object; None in results that do not tell.
     metadata : MeasurementRecord, frames, exposure, photons per pulse and time per stage.
     light_pass : number of the light-transport pass, counted from 1.
     """
@@ -228,8 +266,13 @@ class Measurement(ShortRepr):
     causes: CauseMap
     rows: list[dict[str, Any]]
     segmentation: Segmentation | None
+    objects: ObjectSegmentation | None
     metadata: MeasurementRecord
     light_pass: int
+
+    def row(self, name: str, kind: str | None = None) -> dict[str, Any]:
+        """The row of this name, as `rangesim.evaluation.comparison.Comparison.row` finds it; raises its errors."""
+        return self.rows[index_of_row([(row["kind"], row["name"]) for row in self.rows], name, kind)]
 
     @property
     def camera(self) -> Camera:
@@ -255,7 +298,7 @@ class Result(ShortRepr):
     Examples
     --------
     >>> result = load_result("out/tabletop")  # doctest: +SKIP
-    >>> {m.name: m.rows[-1]["median_abs_m"] for m in result.measurements}  # metres  # doctest: +SKIP
+    >>> {m.name: m.row("objects")["right"] for m in result.measurements}  # doctest: +SKIP
     """
 
     experiment: Experiment
@@ -301,9 +344,21 @@ def _write_readings(measurement: Measurement, folder: Path) -> None:
     write_arrays(folder / "causes.npz", {"cause": causes.cause, "tolerance_m": np.asarray(causes.tolerance_m)})
     write_record(folder / "comparison.json", ComparisonRecord(tolerance_m=causes.tolerance_m, rows=rows))
     write_record(folder / "measurement.json", measurement.metadata)
+    if measurement.objects is not None:
+        write_record(folder / "objects.json", _objects_record(measurement.objects))
     if measurement.segmentation is not None:
         measurement.image.to_point_cloud().save(folder / "cloud.ply")
         write_arrays(folder / "segmentation.npz", vars(measurement.segmentation))
+
+
+def _objects_record(objects: ObjectSegmentation) -> ObjectsRecord:
+    """The contents of `objects.json`."""
+    quality = objects.panoptic_quality
+    return ObjectsRecord(
+        objects=msgspec.convert(msgspec.to_builtins(objects.objects), list[ObjectRecord]),
+        invented=objects.invented,
+        panoptic_quality=None if math.isnan(quality) else quality,
+    )
 
 
 # ---- Reading -------------------------------------------------------------------------------------------------------
@@ -350,19 +405,23 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     """The rows of `comparison.json` in the directory of an instrument; FileFormatError if the file is broken."""
     path = folder / "comparison.json"
     record = read_record(path, ComparisonRecord)
-    materials = [row.material for row in record.rows]
-    if materials.count(ALL) != 1 or len(set(materials)) < len(materials):
-        raise FileFormatError(f"{path}: expected one row per material, and one {ALL!r}, got {shown(materials)}.")
+    keys = [(row.kind, row.name) for row in record.rows]
+    kinds: list[str] = [kind for kind, _ in keys]
+    if kinds.count(ALL) != 1 or kinds.count(OBJECTS) != (OBJECT in kinds) or len(set(keys)) < len(keys):
+        raise FileFormatError(
+            f"{path}: expected one row per object and material, one {ALL!r}, and {OBJECTS!r} if there are objects, "
+            f"got {shown([name for _, name in keys])}."
+        )
     valid = {c.name.lower() for c in Cause if c}
     for row in record.rows:
         if unknown := set(row.causes) - valid:
-            raise FileFormatError(f"{path}: unknown cause {shown(min(unknown))} of {shown(row.material)}.")
+            raise FileFormatError(f"{path}: unknown cause {shown(min(unknown))} of {shown(row.name)}.")
         failed = (row.wrong or 0) + (row.missing or 0)
         if row.right is not None and abs(row.right + failed - 1) > 1e-6:
-            raise FileFormatError(f"{path}: expected right, wrong and missing of {shown(row.material)} to add up to 1.")
+            raise FileFormatError(f"{path}: expected right, wrong and missing of {shown(row.name)} to add up to 1.")
         if abs(sum(row.causes.values()) - failed) > 1e-6:
             raise FileFormatError(
-                f"{path}: expected the causes of {shown(row.material)} to add up to what is wrong or missing."
+                f"{path}: expected the causes of {shown(row.name)} to add up to what is wrong or missing."
             )
     return [msgspec.to_builtins(row) for row in record.rows]
 
@@ -406,9 +465,19 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
         causes=CauseMap(data["cause"], float(data["tolerance_m"])),
         rows=read_rows(folder),
         segmentation=_load_segmentation(folder / "segmentation.npz", sizes),
+        objects=_load_objects(folder / "objects.json"),
         metadata=metadata,
         light_pass=light_pass,
     )
+
+
+def _load_objects(path: Path) -> ObjectSegmentation | None:
+    """What a file tells of the objects; None if there is no such file."""
+    if not path.is_file():
+        return None
+    record = read_record(path, ObjectsRecord)
+    objects = msgspec.convert(msgspec.to_builtins(record.objects), tuple[ObjectOutcome, ...])
+    return ObjectSegmentation(objects, record.invented)
 
 
 def _load_segmentation(path: Path, sizes: dict[str, int]) -> Segmentation | None:

@@ -38,6 +38,7 @@ _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
     "truth_projector_visible": ArraySpec("bool"),
     "truth_instance_names": ArraySpec("str", ("instances",)),
     "truth_material_names": ArraySpec("str", ("materials",)),
+    "truth_instance_objects": ArraySpec("str", ("instances",), required=False),
     "truth_nearest_m": replace(_TRUE_RANGE, required=False),
     "truth_farthest_m": replace(_TRUE_RANGE, required=False),
     "motion_m": ArraySpec("float32", low=0, nan=True, required=False),
@@ -180,6 +181,8 @@ def _pass_arrays(signals: Signals | LightPass) -> dict[str, np.ndarray]:
     """The arrays of a pass by their names in files."""
     arrays = {f"energy_{f.name}": getattr(signals.energy, f.name) for f in fields(EnergySplit)}
     known = {f.name: getattr(signals.truth, f.name) for f in fields(GroundTruth)}
+    if not signals.truth.instance_objects:
+        del known["instance_objects"]
     arrays |= {f"truth_{name}": np.asarray(value) for name, value in known.items() if value is not None}
     if signals.motion_m is not None:
         arrays["motion_m"] = signals.motion_m
@@ -195,8 +198,8 @@ def _energy_and_truth(path: Path, data: dict[str, np.ndarray]) -> tuple[EnergySp
             raise FileFormatError(f"{path}: array truth_{ids}: expected indices into truth_{ids}_names.")
     energy = EnergySplit(**{f.name: data[f"energy_{f.name}"] for f in fields(EnergySplit)})
     truth: dict[str, Any] = {f.name: data.get(f"truth_{f.name}") for f in fields(GroundTruth)}
-    for name in ("instance_names", "material_names"):
-        truth[name] = tuple(map(str, truth[name]))
+    for name in ("instance_names", "material_names", "instance_objects"):
+        truth[name] = tuple(map(str, truth[name])) if truth[name] is not None else ()
     return energy, GroundTruth(**truth)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -25,7 +25,7 @@ from rangesim.scene import retroreflector
 from rangesim.scene.camera import camera_of, warn_of_aperture, warn_of_clipping
 from rangesim.scene.materials import has_texture, is_cutout, is_matte, material_class
 from rangesim.scene.media import is_boundary, why_not_traced
-from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
+from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh, with_plain_data
 from rangesim.scene.nodes import (
     OF_MITSUBA,
     check_camera,
@@ -34,8 +34,10 @@ from rangesim.scene.nodes import (
     ids_of_shapes,
     replace_ignored_plugins,
     take_material_classes,
+    take_objects,
 )
 from rangesim.scene.normals import repeat_normals
+from rangesim.scene.objects import objects_of
 from rangesim.scene.origin import (
     AS_FAR,
     camera_node,
@@ -92,10 +94,14 @@ def load_scene(
 
         An XML file or a dictionary must hold a perspective sensor, which becomes the camera. Its integrator, film
         filter and sampler are ignored. A `projector` emitter in it is ambient light. The material class of a shape is
-        derived from its BSDF, unless shape or BSDF state `<string name="material_class" value="..."/>`.
+        derived from its BSDF, unless shape or BSDF state `<string name="material_class" value="..."/>`. Which shapes
+        are objects follows from the geometry (`rangesim.scene.objects`), unless a shape states
+        `<boolean name="is_object" value="..."/>`. Shapes with the same `<string name="part_of" value="..."/>` are one
+        thing.
         `<include filename="materials/silver.xml"/>` finds the material catalogue from everywhere (docs/materials.md),
         but a file beside the scene comes first. BSDFs may be of type `retroreflector`
-        (`rangesim.scene.retroreflector`).
+        (`rangesim.scene.retroreflector`). A shape of a dictionary may be ``{"type": "ply", "mesh": mesh, ...}`` with a
+        `rangesim.triangle_mesh.TriangleMesh` instead of a file, and `to_world` may be an array (4, 4).
     material : material class of a bare mesh: matte (default), glossy, mirror or transparent.
     unit_m : metres per unit of length of a bare mesh, for example 0.001 for millimetres; default 1.
     sensor : index of the sensor of the scene that becomes the camera. By default it is the first, with a warning if the
@@ -130,8 +136,8 @@ def load_scene(
     retroreflector.register()
     chosen, sensor = sensor, sensor or 0
     instantiate = partial(_instantiate, source, material or "matte", unit_m or 1.0, sensor, label)
-    loaded, ids, classes, origin_m = instantiate(advises=True)
-    _check(loaded, ids, sensor, label)
+    loaded, stated, origin_m = instantiate(advises=True)
+    _check(loaded, stated.ids, sensor, label)
     if chosen is None and (n := len(loaded.sensors())) > 1:
         warn(f"{label} has {n} sensors, and the first becomes the camera; load_scene(sensor=N) takes another.")
     warn_of_emitters_behind_glass(loaded, label)
@@ -143,7 +149,7 @@ def load_scene(
     return Scene(
         name="scene" if isinstance(source, Mapping) else Path(source).stem,
         mitsuba=loaded,
-        instances=tuple(Instance(s.id(), classes.get(s.id()) or _class_of(s)) for s in loaded.shapes()),
+        instances=objects_of(loaded, stated.instances(loaded), stated.objects, T_camera[:3, 3]),
         camera=camera,
         T_world_camera=translation(*origin_m) @ T_camera,
         working_distance_m=working_distance_m,
@@ -155,31 +161,50 @@ def load_scene(
     )
 
 
+class _Stated(NamedTuple):
+    """What a scene states of its shapes, by their ids.
+
+    ids : ids of all shapes. classes : material classes. things : names of the things that shapes are parts of.
+    objects : whether shapes are objects.
+    """
+
+    ids: set[str]
+    classes: dict[str, str]
+    things: dict[str, str]
+    objects: dict[str, bool]
+
+    def instances(self, scene: Any) -> tuple[Instance, ...]:
+        """The instances of a mitsuba.Scene, one per shape, all objects."""
+        names = {s.id(): self.classes.get(s.id()) or _class_of(s) for s in scene.shapes()}
+        return tuple(Instance(name, material, self.things.get(name, name)) for name, material in names.items())
+
+
 @images_can_be_read()
 def _instantiate(
     source: Source, material: str, unit_m: float, sensor: int, label: str, advises: bool = False
-) -> tuple[Any, set[str], dict[str, str], np.ndarray]:
-    """The Mitsuba scene, the ids of its shapes, the material classes stated in the file, and the origin (3,), metres.
+) -> tuple[Any, _Stated, np.ndarray]:
+    """The Mitsuba scene, what the file states of its shapes, and the origin (3,), metres.
 
     advises : whether to warn of settings that probably are mistakes.
     """
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = config.merge_equivalent = False  # merged shapes would lose their instance ids
 
-    def parsed(names: Utf8Names, advises: bool) -> tuple[Any, set[str], dict[str, str]]:
+    def parsed(names: Utf8Names, advises: bool) -> tuple[Any, _Stated]:
         state = _parse(config, source, material, unit_m, names, advises)
         mi.file_resolver().prepend(str(OF_MITSUBA))  # type: ignore[attr-defined]  # again: a scene adds paths
         check_types(state, label)
         check_depth(state, label)
         mi.parser.transform_all(config, state)
         ids, classes = ids_of_shapes(state, label), take_material_classes(state, label)
+        stated = _Stated(ids, classes, *take_objects(state, label))
         take_sensor_reflectances(state, label)
         check_properties(state, label)
         check_evaluable(state, label)
         replace_ignored_plugins(state)
         if (camera := camera_node(state, sensor)) is not None:
             check_camera(state, camera, label)
-        return state, ids, classes
+        return state, stated
 
     def made_of(state: Any) -> Any:
         forget_reading(state)
@@ -189,7 +214,7 @@ def _instantiate(
     with utf8_names() as names:
         try:
             with _own_file_resolver(names):
-                state, ids, classes = parsed(names, advises)
+                state, stated = parsed(names, advises)
                 place, transform = camera_place(state, sensor), coarsest_transform(state) if advises else None
                 coloured = coloured_materials(state) if advises else []
                 loaded, origin_m = made_of(state), np.zeros(3)
@@ -210,13 +235,13 @@ def _instantiate(
     warn_of_coarse_mesh(mesh, label)
     if advises and isinstance(loaded, mi.Scene):
         warn_of_loaded_camera(loaded.sensors(), sensor, place, label)
-    return loaded, ids, classes, origin_m
+    return loaded, stated, origin_m
 
 
 def _parse(config: Any, source: Source, material: str, unit_m: float, names: Utf8Names, advises: bool) -> Any:
     if isinstance(source, Mapping):
         check_dictionary(source, "the scene dictionary")
-        return mi.parser.parse_dict(config, dict(source))
+        return mi.parser.parse_dict(config, with_plain_data(source, names.folder))
     path = scene_file(source)
     if _is_mesh(path):
         return mi.parser.parse_dict(config, scene_around_mesh(path, material, unit_m, names.folder, advises))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from rangesim.scene.origin import Rounding, rounding_of, warn_of_coarse_mesh
 from rangesim.settings import limits
 from rangesim.settings.bounds import MAX_COORDINATE_M
 from rangesim.settings.config import brief, nearest
+from rangesim.triangle_mesh import TriangleMesh
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 """Suffixes of files that are taken for meshes."""
@@ -54,7 +56,7 @@ def scene_around_mesh(path: Path, material: str, unit_m: float, folder: Path, ad
     if material not in MESH_MATERIALS:
         hint = nearest(material, MESH_MATERIALS)
         raise ValueError(f"expected a material out of {', '.join(MESH_MATERIALS)}, got {material!r}{hint}.")
-    vertices, faces = _read(path)
+    vertices, faces = read_mesh(path)
     with np.errstate(over="ignore"):  # coordinates that are too large are refused below
         is_single = np.array_equal(vertices, np.float32(vertices))
     if advises and is_single:
@@ -96,7 +98,38 @@ def scene_around_mesh(path: Path, material: str, unit_m: float, folder: Path, ad
     }
 
 
-def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def with_plain_data(scene: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The scene dictionary with the objects that Mitsuba expects in place of plain data.
+
+    The `mesh` of a shape, a TriangleMesh, becomes a file in `folder`, and a `to_world` (4, 4) of a shape, a sensor or
+    an emitter a transform.
+
+    Raises
+    ------
+    FileFormatError
+        A shape states both `mesh` and `filename`, or a `mesh` of another type.
+    """
+    result = dict(scene)
+    for number, (name, node) in enumerate(scene.items()):
+        if not isinstance(node, Mapping):
+            continue
+        entries = dict(node)
+        if isinstance(matrix := entries.get("to_world"), np.ndarray):
+            entries["to_world"] = mi.ScalarTransform4f(matrix)
+        if "mesh" in entries:
+            mesh = entries.pop("mesh")
+            if not isinstance(mesh, TriangleMesh) or "filename" in entries:
+                raise FileFormatError(
+                    f"expected shape {name!r} with a TriangleMesh as its mesh and without a filename, got "
+                    f"{type(mesh).__name__}{' and a filename' if 'filename' in entries else ''}."
+                )
+            mesh.save(folder / f"shape_{number}.ply")
+            entries["filename"] = str(folder / f"shape_{number}.ply")
+        result[name] = entries
+    return result
+
+
+def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (n, 3), in units of the file, and faces (m, 3) of a mesh file; the parts of a scene graph are joined."""
     import trimesh
 

@@ -20,6 +20,8 @@ from rangesim.settings.config import nearest, shown
 
 CLASS_KEY = "material_class"
 """Property of a shape or BSDF that states its material class; Mitsuba does not know it."""
+PART_KEY, OBJECT_KEY = "part_of", "is_object"
+"""Properties of a shape that name the thing it is a part of, and state whether that is an object or background."""
 COMPOSITES = ("instance", "shapegroup", "merge")
 """Shapes that stand for other shapes. They are refused, because the parts would have neither name nor material."""
 OF_MITSUBA = Path(mi.__file__).resolve().parent
@@ -192,6 +194,41 @@ def take_material_classes(state: Any, label: str) -> dict[str, str]:
             del node.props[CLASS_KEY]
     found = {node.props.id(): _stated_class(state, index, stated) for index, node in _shapes(state)}
     return {name: value for name, value in found.items() if value is not None}
+
+
+def take_objects(state: Any, label: str) -> tuple[dict[str, str], dict[str, bool]]:
+    """What the scene states of its objects: the things that shapes are parts of, and whether shapes are objects.
+
+    Both are by the id of the shape. The entries are removed from the nodes, because Mitsuba does not know them.
+
+    Raises
+    ------
+    FileFormatError
+        The name of a thing is no text or is empty, `is_object` is neither true nor false, or shapes that are part of
+        one thing disagree.
+    """
+    things: dict[str, str] = {}
+    stated: dict[str, bool] = {}
+    for _, node in _shapes(state):
+        place = f"{label}: shape {node.props.id()!r}"
+        if PART_KEY in node.props:
+            thing = node.props[PART_KEY]
+            if not isinstance(thing, str) or not thing:
+                raise FileFormatError(f"{place}: expected {PART_KEY} to be the name of a thing, got {shown(thing)}.")
+            things[node.props.id()] = thing
+            del node.props[PART_KEY]
+        if OBJECT_KEY in node.props:
+            is_object = node.props[OBJECT_KEY]
+            if not isinstance(is_object, bool):
+                raise FileFormatError(f"{place}: expected {OBJECT_KEY} to be true or false, got {shown(is_object)}.")
+            stated[node.props.id()] = is_object
+            del node.props[OBJECT_KEY]
+    agreed: dict[str, bool] = {}
+    for name, is_object in stated.items():
+        thing = things.get(name, name)
+        if agreed.setdefault(thing, is_object) != is_object:
+            raise FileFormatError(f"{label}: expected one {OBJECT_KEY} for all parts of {thing!r}, got true and false.")
+    return things, stated
 
 
 def _shapes(state: Any) -> Iterator[tuple[int, Any]]:

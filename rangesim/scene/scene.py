@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 
 from rangesim.rig import Camera, Intrinsics, Rig, look_at, pose, translation
 from rangesim.settings.bounds import Bounds, check_number, whole
+from rangesim.settings.config import nearest, shown
 
 BASELINE = Bounds("a positive baseline in metres", 1e-9, 1e6)
 """Bounds of the distance between camera and projector, metres."""
@@ -24,10 +25,19 @@ class Instance:
     """A shape of a scene.
 
     name : id of the shape in the scene file. material : its class, one of `rangesim.scene.materials.MATERIAL_CLASSES`.
+    part_of : name of the thing that the shape is a part of, as the scene states it; by default the shape's own name.
+    is_object : whether that thing is an object, or else background (`rangesim.scene.objects`).
     """
 
     name: str
     material: str
+    part_of: str
+    is_object: bool = True
+
+    @property
+    def object_name(self) -> str:
+        """Name of the object that the shape is a part of; empty if it is background."""
+        return self.part_of if self.is_object else ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,6 +76,25 @@ class Scene:
     def __repr__(self) -> str:
         c = self.camera
         return f"Scene({self.name!r}, {len(self.instances)} shapes, camera {c.width} x {c.height})"
+
+    def with_objects(self, names: Sequence[str]) -> Scene:
+        """The same scene with these objects; all other shapes are background.
+
+        names : names of shapes, or of the things that they are parts of (`Instance.part_of`).
+
+        Raises
+        ------
+        ValueError
+            The scene has no shape of such a name.
+        """
+        valid = [name for i in self.instances for name in (i.name, i.part_of)]
+        for name in names:
+            if name not in valid:
+                raise ValueError(
+                    f"expected objects of the scene {self.name!r}, got {shown(name)}{nearest(name, valid)}."
+                )
+        stated = {i.part_of for i in self.instances if not {i.name, i.part_of}.isdisjoint(names)}
+        return replace(self, instances=tuple(replace(i, is_object=i.part_of in stated) for i in self.instances))
 
     @property
     def has_ambient(self) -> bool:

@@ -3,7 +3,7 @@
 
 Every setting of the package is a frozen dataclass, and files of settings are read and written through this module only.
 It refuses unknown keys and names the nearest valid one, and checks the types of values. What it reads back is equal to
-what it wrote.
+what it wrote. Lengths, whose names end in `_m`, are in metres, or texts with a unit (`rangesim.settings.lengths`).
 
 Examples
 --------
@@ -12,6 +12,8 @@ Examples
 >>> table
 {'aperture_radius_m': 0.002, 'focus_m': None, 'vignetting': 0.0, 'stray_light': 0.0}
 >>> from_dict(Lens, table) == Lens(aperture_radius_m=2e-3)
+True
+>>> from_dict(Lens, {"aperture_radius_m": "2 mm"}) == Lens(aperture_radius_m=2e-3)
 True
 >>> from_dict(Lens, {"aperture_radius_m": 2e-3, "focus": 1.0})
 Traceback (most recent call last):
@@ -25,6 +27,7 @@ import difflib
 import sys
 import types
 import typing
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -34,6 +37,7 @@ import numpy as np
 
 from pcgraph.plumbing.short_repr import SHORT
 from pcgraph.plumbing.short_repr import ShortRepr as ShortRepr
+from rangesim.settings.lengths import metres
 
 T = TypeVar("T")
 
@@ -43,6 +47,8 @@ def to_dict(setting: Any) -> Any:
 
     For a class with a `type_name`, the table begins with the key `type`, so that `from_dict` finds the class again.
     """
+    if isinstance(setting, Plain):
+        return setting.to_plain()
     if dataclasses.is_dataclass(setting) and not isinstance(setting, type):
         fields = {f.name: to_dict(getattr(setting, f.name)) for f in dataclasses.fields(setting) if f.init}
         tag = getattr(setting, "type_name", None)
@@ -83,12 +89,24 @@ def from_dict(cls: type[T], data: Any, where: str = "") -> T:
     missing = [n for n, f in names.items() if n not in values and _required(f)]
     if missing:
         raise ValueError(f"{place}: missing {', '.join(map(repr, missing))}.")
-    values = {key: on_top_of(names[key].default, value) for key, value in values.items()}
+    try:
+        values = {key: _in_metres(key, on_top_of(names[key].default, value)) for key, value in values.items()}
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
     arguments = {key: _value(hints[key], value, f"{where}.{key}".lstrip(".")) for key, value in values.items()}
     try:
         return cls(**arguments)
     except ValueError as error:
         raise ValueError(f"{place}: {error}") from error
+
+
+def _in_metres(key: str, value: Any) -> Any:
+    """The value of a field; a length (its name ends in "_m") with a unit is converted to metres."""
+    if key.endswith("_m") and isinstance(value, str):
+        return metres(value, key)
+    if key.endswith("_m") and isinstance(value, list):
+        return [_in_metres(key, each) for each in value]
+    return value
 
 
 @lru_cache(maxsize=256)  # evaluating the annotations takes longer than everything else that is done for a table
@@ -102,7 +120,7 @@ def on_top_of(default: Any, table: Any) -> Any:
     The table is returned unchanged if the default is no dataclass or has another `type`, or if the table is a whole
     member of the family whose tables have no `type`. A value that is no table is returned unchanged too.
     """
-    if not isinstance(table, Mapping) or not dataclasses.is_dataclass(default) or isinstance(default, type):
+    if not isinstance(table, Mapping) or not dataclasses.is_dataclass(default) or isinstance(default, (type, Plain)):
         return table
     untagged = getattr(default, "untagged", None)
     if untagged is not None and {f.name for f in dataclasses.fields(untagged) if _required(f)} <= set(table):
@@ -170,6 +188,19 @@ def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
             f"{place}: expected 'type' to be one of {', '.join(choices)}, got {shown(tag)}{nearest(str(tag), choices)}."
         )
     return choices[tag]
+
+
+class Plain(ABC):
+    """Base of a setting whose plain form is no table of its fields, such as a number that may be drawn at random."""
+
+    @abstractmethod
+    def to_plain(self) -> Any:
+        """The setting as plain data."""
+
+    @classmethod
+    @abstractmethod
+    def from_plain(cls, value: Any, where: str) -> typing.Self:
+        """The setting that plain data describe; ValueError with the place `where` if they describe none."""
 
 
 class Named:
@@ -252,6 +283,8 @@ def _value(hint: Any, value: Any, where: str) -> Any:
         raise ValueError(
             f"{where}: expected one of {', '.join(valid)}, got {shown(value)}{nearest(str(value), valid)}."
         )
+    if isinstance(hint, type) and issubclass(hint, Plain):
+        return hint.from_plain(value, where)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return from_dict(hint, value, where)
     if isinstance(hint, type) and issubclass(hint, Named) and isinstance(value, (Mapping, str)):

@@ -10,6 +10,7 @@ from rangesim.signals.signals import (
     Signals,
     SignalSet,
     StillSignals,
+    Surface,
     Truncation,
 )
 
@@ -22,5 +23,6 @@ __all__ = [
     "SignalSet",
     "Signals",
     "StillSignals",
+    "Surface",
     "Truncation",
 ]

@@ -6,7 +6,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import overload
+from typing import NamedTuple, overload
 
 import numpy as np
 
@@ -53,6 +53,18 @@ class EnergySplit(ShortRepr):
         return replace(self, **{kind: np.float32(factor) * getattr(self, kind) for kind in kinds})
 
 
+class Surface(NamedTuple):
+    """A part of the ground truth that a row of a table is about.
+
+    kind : "object", "material" or "all". name : of the object or of the material class, or "all".
+    mask : (h, w) bool, its pixels.
+    """
+
+    kind: str
+    name: str
+    mask: np.ndarray
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class GroundTruth(ShortRepr):
     """First surface behind each pixel centre. Where there is none, numbers are NaN and indices are -1.
@@ -65,6 +77,8 @@ class GroundTruth(ShortRepr):
     projector_visible : (h, w) bool, whether the straight line to the projector is free and the point is in its image.
     nearest_m, farthest_m : (h, w) float32, metres, least and largest range of the surfaces within a zone; the other
         fields then describe the surface that fills most of it. None: pixels are no `rangesim.rig.Zones`.
+    instance_objects : for each instance the name of the object that it is a part of; empty for background, such as a
+        table or a wall (`rangesim.scene.objects`). No names at all: not known.
 
     Examples
     --------
@@ -84,12 +98,37 @@ class GroundTruth(ShortRepr):
     material_names: tuple[str, ...] = ()
     nearest_m: np.ndarray | None = None
     farthest_m: np.ndarray | None = None
+    instance_objects: tuple[str, ...] = ()
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """Names of the objects of the scene, seen or not; none if there is only background, or if it is not known."""
+        return tuple(dict.fromkeys(name for name in self.instance_objects if name))
+
+    @property
+    def object_index(self) -> np.ndarray:
+        """(h, w) int32, index into `object_names` of the object behind each pixel; -1 for background and nothing."""
+        index_of = {name: i for i, name in enumerate(self.object_names)}
+        of_instance = [index_of.get(name, -1) for name in self.instance_objects] or [-1] * len(self.instance_names)
+        return np.array([*of_instance, -1], dtype=np.int32)[self.instance]
+
+    def objects(self) -> dict[str, np.ndarray]:
+        """Pixels of each object that the camera sees, as (h, w) bool by name."""
+        index = self.object_index
+        masks = {name: index == i for i, name in enumerate(self.object_names)}
+        return {name: mask for name, mask in masks.items() if mask.any()}
 
     def classes(self) -> dict[str, np.ndarray]:
         """Pixels of each material class that occurs, as (h, w) bool by name; "all" comes last, and may be empty."""
         seen = np.isfinite(self.z)
         of_class = {name: seen & (self.material == i) for i, name in enumerate(self.material_names)}
         return {name: mask for name, mask in of_class.items() if mask.any()} | {ALL: seen}
+
+    def surfaces(self) -> list[Surface]:
+        """The surfaces that tables have rows for: each object, each material class, and all together at the end."""
+        objects = [Surface("object", *item) for item in self.objects().items()]
+        *materials, (_, seen) = self.classes().items()
+        return [*objects, *(Surface("material", *item) for item in materials), Surface(ALL, ALL, seen)]
 
 
 @dataclass(frozen=True)
@@ -171,6 +210,13 @@ class Signals(ShortRepr, ABC):
     def cameras(self) -> tuple[Signals, ...]:
         """Signals of each camera of the pass, the reference camera's first; by default these alone."""
         return (self,)
+
+    def at_wavelength(self, wavelength_m: float | None) -> Signals:
+        """The same signals of an emitter with this wavelength in metres; None: not stated.
+
+        The renderer is monochrome, so the light is the same; what a detector makes of it may differ.
+        """
+        return replace(self, rig=replace(self.rig, wavelength_m=wavelength_m))
 
     @property
     @abstractmethod
@@ -322,6 +368,9 @@ class SignalSet(Signals, Sequence[Signals]):
             first.rig, first.energy, first.truth, motion_m=first.motion_m, truncation=first.truncation,
             of_cameras=cameras,
         )  # fmt: skip
+
+    def at_wavelength(self, wavelength_m: float | None) -> SignalSet:
+        return SignalSet.of([one.at_wavelength(wavelength_m) for one in self.of_cameras])
 
     @property
     def cameras(self) -> tuple[Signals, ...]:
