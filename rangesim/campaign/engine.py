@@ -273,7 +273,7 @@ class _Session:
         self.count = 1
         self.sharing = 1
         self.seen_workers = time.monotonic()
-        client.subscribe_topic(self.topic, lambda event: self.news.put(_Ended(**event[1])))
+        client.subscribe_topic(self.topic, self._hear)
 
     def carry_out(self) -> None:
         """Carry out the unfinished items, and at the end each suspect alone."""
@@ -304,6 +304,11 @@ class _Session:
         self.submitted[number] = _Submitted(key, future, repeats)
         run.repeated |= repeats
         future.add_done_callback(lambda _: self.news.put(_Ended(number)))
+
+    def _hear(self, event: tuple[float, dict[str, Any]]) -> None:
+        """Take note of an item that hangs, in Dask's thread."""
+        told = event[1]
+        self.news.put(_Ended(told["number"], told["where"], told["limit_s"]))
 
     def _drain(self) -> None:
         while self.submitted:

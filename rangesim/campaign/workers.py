@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
@@ -102,13 +102,14 @@ def cores() -> int:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep Dask from logging deaths of workers on stderr while the block runs; the outcome tells them."""
-    logger = logging.getLogger("distributed")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
+    handlers = [(handler, handler.level) for handler in logging.getLogger("distributed").handlers]
+    for handler, _ in handlers:  # all of Dask's loggers have these
+        handler.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        logger.setLevel(level)
+        for handler, level in handlers:
+            handler.setLevel(level)
 
 
 @contextmanager
@@ -134,6 +135,17 @@ def _client_of(scheduler: str, answer_s: float) -> Iterator[Client]:
         yield client
 
 
+def _started(kind: Callable[..., LocalCluster], **options: Any) -> LocalCluster:
+    """A cluster that has started; EnvironmentProblem if its processes do not start."""
+    try:
+        return kind(**options)
+    except RuntimeError as problem:
+        raise EnvironmentProblem(
+            "worker processes could not be started; if this is a script, put what it does below if __name__ == "
+            "'__main__', because every worker imports it."
+        ) from problem
+
+
 @contextmanager
 def _local_cluster(count: int) -> Iterator[LocalCluster]:
     """A scheduler in this process and `count` workers, each a process of one Dask thread with a nanny."""
@@ -152,6 +164,8 @@ def _local_cluster(count: int) -> Iterator[LocalCluster]:
     settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_DEATHS,
         "distributed.scheduler.worker-saturation": 1.0,  # what waits on a worker that dies is suspected, too
+        # On a busy machine a new process takes longer than the usual 15 s, after which its nanny would be given up.
+        "distributed.deploy.lost-worker-timeout": f"{WAIT_S} s",
         "distributed.scheduler.worker-ttl": None,  # a jump of the clock would end all workers
         # A worker at one of these limits would wait for memory that nothing frees. The last limit is kept: the nanny
         # ends a worker that takes nearly all of the machine's memory.
@@ -160,9 +174,13 @@ def _local_cluster(count: int) -> Iterator[LocalCluster]:
         "distributed.worker.memory.pause": False,
     }
     before = dict(os.environ)
+    # Semaphores of a driver that is ended are removed by a process of their own, without a warning.
+    warned = [os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker:UserWarning"]
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, warned))
     try:
         with dask.config.set(settings):
-            cluster = LocalCluster(
+            cluster = _started(
+                LocalCluster,
                 n_workers=count,
                 threads_per_worker=1,
                 host="127.0.0.1",

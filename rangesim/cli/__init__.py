@@ -17,6 +17,7 @@ from pcgraph.plumbing.plain_files import said
 from rangesim import __version__
 from rangesim.cli.calibrate import calibrate_command
 from rangesim.cli.compare import compare_command
+from rangesim.cli.dataset import app as dataset_app
 from rangesim.cli.decode import decode_command
 from rangesim.cli.patterns import patterns_command
 from rangesim.cli.presets import presets_command
@@ -44,6 +45,7 @@ app.command("view")(view_command)
 app.command("verify")(verify_command)
 app.command("presets")(presets_command)
 app.command("doctor")(doctor_command)
+app.add_typer(dataset_app, name="dataset")
 
 
 def _version(wanted: bool) -> None:

@@ -101,7 +101,7 @@ def run(
         result = _computed(experiment, progress or unwatched, scene, announce)
         if progress:
             progress("Writing the report", 0.97)
-        tables = comparison_markdown([(m.name, m.rows) for m in result.measurements])
+        tables = comparison_markdown([(m.name, m.rows) for m in result.measurements], experiment.tolerance_m)
         write_result(result, folder, {"comparison.md": tables.encode(), "report.html": render_report(result).encode()})
     _warn(result)
     return result
@@ -209,7 +209,13 @@ def _computed(
             tell(f"Measuring with {instrument.name}", end)
             seed, light = noise_seed(experiment, instrument), signals.at_wavelength(instrument.emitter_wavelength_m)
             measurements[instrument.name] = measure(
-                instrument, light, seed, experiment.ambient, number, experiment.tolerance_m, true_labels[view]
+                instrument,
+                light,
+                seed,
+                experiment.ambient,
+                number,
+                tolerance_m=experiment.tolerance_m,
+                true_labels=true_labels[view],
             )
     info = provenance(experiment, scene, groups, mi.variant(), times)
     return Result(experiment, tuple(measurements[i.name] for i in experiment.instruments), tuple(passes), info)

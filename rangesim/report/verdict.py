@@ -81,9 +81,8 @@ def _worst(rows: Rows) -> str:
     poor = [row for row in surfaces if not is_reliable(row)]
     named = [_described(row) for row in (poor or surfaces)[: MAX_NAMED if poor else 1]]
     more = f" and {len(poor) - MAX_NAMED} more" if len(poor) > MAX_NAMED else ""
-    right = len(surfaces) - len(poor)
-    count = f"each of {len(surfaces)}" if not poor else f"{right} of {len(surfaces)}" if right else "none of the"
-    return f" It is right on most of {count} {noun}; worst: {', '.join(named)}{more}."
+    count = f"{len(surfaces) - len(poor)} of {len(surfaces)} {noun}"
+    return f" Most pixels are right on {count}; worst: {', '.join(named)}{more}."
 
 
 def _described(row: dict[str, Any]) -> str:
@@ -143,7 +142,8 @@ def _nobody_right(real: Sequence[Measurement], names: dict[str, str]) -> str:
         return ""
     named = [f"{name} (at best {_percent(right, 0)}, {sensor})" for right, name, sensor in poor[:MAX_NAMED]]
     more = f" and {len(poor) - MAX_NAMED} more" if len(poor) > MAX_NAMED else ""
-    return f"No sensor is right on most of these {noun}: {', '.join(named)}{more}."
+    which = "any of the" if len(poor) == len(best) else "these"
+    return f"No sensor is right on most of {which} {noun}: {', '.join(named)}{more}."
 
 
 def _best_error(real: Sequence[Measurement], names: dict[str, str]) -> str:

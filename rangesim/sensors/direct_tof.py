@@ -152,6 +152,11 @@ class DirectToF(Sensor):
         beyond: Literal["wrap", "constant"] = "wrap" if self.is_cyclic else "constant"
         fine = np.asarray(channels[0], dtype=np.float32).reshape(len(channels[0]), -1)
         evenly = (ambient / self.bins).astype(np.float32).ravel()
+        if measured is None and self._fine == 1:
+            result = gaussian_filter(fine, np.sqrt(variance), beyond) if variance > 0 else fine.copy()
+            if evenly.any():
+                result += evenly
+            return result.reshape(self.bins, *ambient.shape)
         result = np.empty((self.bins, len(evenly)), dtype=np.float32)
 
         def of_pixels(start: int, stop: int) -> None:
@@ -161,8 +166,7 @@ class DirectToF(Sensor):
                     histogram = measured(histogram)
                 elif variance > 0:
                     histogram = gaussian_filter(histogram, np.sqrt(variance), beyond)
-                if self._fine > 1:
-                    histogram = histogram.reshape(self.bins, self._fine, -1).sum(axis=1)
+                histogram = histogram.reshape(self.bins, self._fine, -1).sum(axis=1)
                 np.add(histogram, evenly[some], out=result[:, some])
 
         in_blocks(of_pixels, len(evenly))
@@ -417,7 +421,7 @@ class DirectToFDecoder(Decoder):
 
         def measure(start: int, stop: int) -> None:
             for some in _together(start, stop):
-                counts, of_pixels = histograms[:, some], [x[some] for x in flat]
+                counts, of_pixels = np.ascontiguousarray(histograms[:, some]), [x[some] for x in flat]
                 histogram = counts if blind is None else undo_pile_up(counts, blind)
                 of_pixels[0][:], of_pixels[1][:], of_pixels[2][:] = find_peak(
                     histogram, sensor.sigma_bins, sensor.is_cyclic

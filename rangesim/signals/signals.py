@@ -56,7 +56,8 @@ class EnergySplit(ShortRepr):
 class Surface(NamedTuple):
     """A part of the ground truth that a row of a table is about.
 
-    kind : "object", "material" or "all". name : of the object or of the material class, or "all".
+    kind : "object", "part" (a shape of an object that has several), "material" or "all". name : of the object, of the
+        shape or of the material class, or "all".
     mask : (h, w) bool, its pixels.
     """
 
@@ -108,14 +109,23 @@ class GroundTruth(ShortRepr):
     @property
     def object_index(self) -> np.ndarray:
         """(h, w) int32, index into `object_names` of the object behind each pixel; -1 for background and nothing."""
+        if not self.instance_objects:
+            return np.full_like(self.instance, -1)
         index_of = {name: i for i, name in enumerate(self.object_names)}
-        of_instance = [index_of.get(name, -1) for name in self.instance_objects] or [-1] * len(self.instance_names)
+        of_instance = [index_of.get(name, -1) for name in self.instance_objects]
         return np.array([*of_instance, -1], dtype=np.int32)[self.instance]
 
     def objects(self) -> dict[str, np.ndarray]:
         """Pixels of each object that the camera sees, as (h, w) bool by name."""
         index = self.object_index
         masks = {name: index == i for i, name in enumerate(self.object_names)}
+        return {name: mask for name, mask in masks.items() if mask.any()}
+
+    def parts(self) -> dict[str, np.ndarray]:
+        """Pixels of each shape that the camera sees of an object of several shapes, as (h, w) bool by name."""
+        shapes = list(zip(self.instance_names, self.instance_objects, strict=False))
+        several = {thing for _, thing in shapes if thing and self.instance_objects.count(thing) > 1}
+        masks = {name: self.instance == i for i, (name, thing) in enumerate(shapes) if thing in several}
         return {name: mask for name, mask in masks.items() if mask.any()}
 
     def classes(self) -> dict[str, np.ndarray]:
@@ -125,10 +135,10 @@ class GroundTruth(ShortRepr):
         return {name: mask for name, mask in of_class.items() if mask.any()} | {ALL: seen}
 
     def surfaces(self) -> list[Surface]:
-        """The surfaces that tables have rows for: each object, each material class, and all together at the end."""
-        objects = [Surface("object", *item) for item in self.objects().items()]
+        """The surfaces that tables have rows for: objects, their parts, material classes, and all together."""
         *materials, (_, seen) = self.classes().items()
-        return [*objects, *(Surface("material", *item) for item in materials), Surface(ALL, ALL, seen)]
+        groups = {"object": self.objects().items(), "part": self.parts().items(), "material": materials}
+        return [Surface(kind, *item) for kind, items in groups.items() for item in items] + [Surface(ALL, ALL, seen)]
 
 
 @dataclass(frozen=True)
