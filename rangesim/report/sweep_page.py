@@ -206,8 +206,8 @@ class _Page:
         if len(known) > 1:
             order = sorted(known, key=lambda name: -known[name])
             text = ", ".join(f"{name} {100 * known[name]:.0f} %" for name in order)
-            of = ", of the objects" if self.kind == OBJECTS else ""
-            yield f"Right within {_metres(self.sweep.tolerance_m)}{of}, mean over all points: {text}."
+            whose = ", of the objects" if self.kind == OBJECTS else ""
+            yield f"Right within {_metres(self.sweep.tolerance_m)}{whose}, mean over all points: {text}."
         for path, values in self.sweep.vary.items():
             if len(self.names) < 2 or len(values) < 2 or all(_is_number(v) for v in values):
                 continue
