@@ -28,6 +28,7 @@ from rangesim.causes import Cause, CauseMap
 from rangesim.cli import app
 from rangesim.decoding.status import Status
 from rangesim.environment.doctor import find_browser
+from rangesim.evaluation.object_segmentation import ObjectOutcome, ObjectSegmentation, Outcome
 from rangesim.evaluation.surface_rows import with_mean_over_objects
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
@@ -35,6 +36,7 @@ from rangesim.pipeline.experiment_run import carry_out
 from rangesim.report import palette, render_report, tables, write_report
 from rangesim.report.clouds_page import render_clouds_page
 from rangesim.report.experiment_page import by_camera
+from rangesim.report.objects_section import objects_sentence, objects_table
 from rangesim.report.printing import pdf_of
 from rangesim.report.verdict import verdict
 from rangesim.results.experiment_results import PhotonsRecord, Result, load_result, write_result
@@ -61,12 +63,12 @@ def test_it_is_one_file_that_needs_no_network(html: str) -> None:
 
 
 def test_every_part_is_there(html: str) -> None:
-    for part in ("scene", "numbers", "maps", "clouds", "captures", "light", "cost", "settings"):
+    for part in ("scene", "numbers", "objects", "maps", "clouds", "captures", "light", "cost", "settings"):
         assert f'id="{part}"' in html
     for title in ("Structured light", "Time of flight (AMCW)", "Time of flight (direct)", "Ideal time of flight"):
         assert f"<h3>{title}" in html
     assert [int(n) for n in re.findall(r'<b class="number">Figure (\d+)', html)] == list(range(1, 7))
-    assert [int(n) for n in re.findall(r'<b class="number">Table (\d+)', html)] == list(range(1, 6))
+    assert [int(n) for n in re.findall(r'<b class="number">Table (\d+)', html)] == list(range(1, 7))
     assert html.count('class="cloud"') == html.count('class="labels"') == len(SENSORS)
 
 
@@ -74,7 +76,7 @@ def test_the_table_shows_the_statistics(html: str) -> None:
     for m in load_result(small_result()).measurements:
         for row in m.rows:
             assert f">{tables.number(tables.OUTCOMES[1], row['wrong'])}</td>" in html
-            if row["kind"] != "object":
+            if row["kind"] not in ("object", "part"):
                 assert f">{tables.number(MEDIAN, row['median_abs_m'])}</span>" in html
 
 
@@ -166,11 +168,13 @@ def test_the_verdict_says_what_the_rows_say() -> None:
     fair = _measured("histogram", acquisition_s=0.3, cup=(0.88, 0.02, 2e-3), pot=(0.3, 0.2, 2e-3))
     both, first, second, _ = (f.text.replace("\xa0", " ") for f in verdict([good, poor, fair]))
     assert "reads 95.0 % of the objects’ pixels right, to 10 mm, and 1.0 % wrong; 4.0 % are missing." in first
-    assert "right on most of each of 2 objects; worst: pot (91 % right, 1 % wrong, 8 % missing; multipath)." in first
+    assert (
+        "Most pixels are right on 2 of 2 objects; worst: pot (91 % right, 1 % wrong, 8 % missing; multipath)." in first
+    )
     assert "Causes of what is wrong or missing: 80 % multipath, 20 % low signal." in first
     assert "Half of its readings on an object lie, on average, within 1.50 mm of the true depth" in first
     assert (
-        "right on most of none of the objects; worst: pot (0 % right, 100 % wrong, 0 % missing; multipath), "
+        "Most pixels are right on 0 of 2 objects; worst: pot (0 % right, 100 % wrong, 0 % missing; multipath), "
         "cup (12 % right, 28 % wrong, 60 % missing; multipath)."
     ) in second
     assert "Most of the objects’ pixels right, to 10 mm: Structured light, 95.0 % (next: " in both
@@ -182,6 +186,59 @@ def test_the_verdict_says_what_the_rows_say() -> None:
 
 def _side_by_side(*measurements: Any) -> str:
     return verdict(list(measurements))[0].text.replace("\xa0", " ")
+
+
+def outcome(name: str, kind: Outcome = Outcome.FOUND, *merged_with: str, **rest: Any) -> ObjectOutcome:
+    return ObjectOutcome(name, 100, 0.9, 0.8, kind, merged_with=merged_with, **rest)
+
+
+@pytest.mark.parametrize(
+    ("objects", "invented", "sentence"),
+    [
+        ([outcome("a"), outcome("b")], 0, "Of 2 objects it finds 2."),
+        ([outcome("a")], 1, "Of 1 object it finds 1; it invents 1."),
+        (
+            [outcome("cup"), outcome("bottle", Outcome.MERGED, "table"), outcome("glass", Outcome.MISSED)],
+            2,
+            "Of 3 objects it finds 1, merges bottle with table, and misses glass; it invents 2.",
+        ),
+        (
+            [outcome("a", Outcome.MERGED, "b"), outcome("b", Outcome.MERGED, "a"), outcome("c", displaced=True)],
+            0,
+            "Of 3 objects it finds none, displaces c by over 10\u00a0mm, and merges a and b.",
+        ),
+        (
+            [*(outcome(n, Outcome.MISSED) for n in "abcde"), outcome("f", Outcome.SPLIT)],
+            0,
+            "Of 6 objects it finds none, splits f, and misses a, b, c and 2 more.",
+        ),
+        (
+            [outcome("a"), outcome("lid", Outcome.MERGED, "a", separable=False)],
+            0,
+            "Of 2 objects it finds 1. Even in the true depth the segmentation does not find lid.",
+        ),
+        ([], 0, ""),
+    ],
+)
+def test_a_sentence_says_what_becomes_of_the_objects(
+    objects: list[ObjectOutcome], invented: int, sentence: str
+) -> None:
+    m = load_result(small_result()).measurements[0]
+    assert objects_sentence(replace(m, objects=ObjectSegmentation(tuple(objects), invented))) == sentence
+    assert objects_sentence(replace(m, objects=None)) == ""
+
+
+def test_the_table_of_objects_has_a_row_for_each_and_none_where_it_is_not_known(html: str) -> None:
+    result = load_result(small_result())
+    for m in result.measurements:
+        assert objects_sentence(m) in html
+    lines = objects_table(result.measurements)
+    assert [line.name for line in lines] == list(result.measurements[0].truth.object_names)
+    assert all(len(line.cells) == len(SENSORS) for line in lines)
+    unknown = tuple(replace(m, objects=None) for m in result.measurements)
+    assert 'id="objects"' not in render_report(replace(result, measurements=unknown))
+    seen_by_one = [result.measurements[0], replace(result.measurements[1], objects=ObjectSegmentation((), 0))]
+    assert {line.cells[1].note for line in objects_table(seen_by_one)} == {"not in view"}
 
 
 def test_side_by_side_ranks_by_right_readings() -> None:
@@ -214,7 +271,9 @@ def test_without_objects_the_verdict_is_about_materials() -> None:
     (finding,) = verdict([scene])
     text = finding.text.replace("\xa0", " ")
     assert "reads 65.0 % of the pixels right, to 10 mm, and 30.0 % wrong; 5.0 % are missing." in text
-    assert "right on most of 1 of 2 materials; worst: gloss (40 % right, 60 % wrong, 0 % missing; multipath)." in text
+    assert (
+        "Most pixels are right on 1 of 2 materials (matte); worst: gloss (40 % right, 60 % wrong, 0 % missing" in text
+    )
 
 
 def test_no_measurement_is_bold_for_being_there() -> None:

@@ -171,7 +171,7 @@ def exposed(
         return Exposure(noise_free_capture(signals, sensor, ambient), signals)
     captures, of_reference, is_automatic = [], None, exposure_s is None
     for number, one in enumerate(signals.cameras):
-        radiance = _mean_radiance(one, sensor, detector, ambient)
+        radiance = mean_radiance(one, sensor, detector, ambient)
         of_reference = radiance if of_reference is None else of_reference
         if exposure_s is None:
             exposure_s = auto_exposure_s(radiance, sensor, detector, one.rig)
@@ -225,14 +225,14 @@ def exposed_again(capture: Captured, signals: Signals, seed: int, sampling_error
     for number, (taken, one) in enumerate(zip(capture.captures, signals.cameras, strict=True)):
         if taken.detector is None:
             raise ValueError("expected a capture whose detector is known, got one without.")
-        radiance = _mean_radiance(one, taken.sensor, taken.detector, taken.ambient, sampling_errors)
+        radiance = mean_radiance(one, taken.sensor, taken.detector, taken.ambient, sampling_errors)
         gate, camera_seed = taken.sensor.gate, _seed_of_camera(seed, number)
         frames = taken.detector.read_out(radiance, gate, one.rig, taken.exposure_s, camera_seed)
         captures.append(replace(taken, frames=frames))
     return together(captures)
 
 
-def _mean_radiance(
+def mean_radiance(
     signals: Signals,
     sensor: Sensor,
     detector: PhotoDetector,

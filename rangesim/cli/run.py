@@ -66,7 +66,7 @@ def run_command(
         int | None,
         typer.Option(
             help="Number of photons for the projector's light through glass and off mirrors. 0 leaves this light out. "
-            "(default: 500000)"
+            "(default: 8 per pixel, 100000 to 500000)"
         ),
     ] = None,
     seed: Annotated[

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ import numpy as np
 
 from rangesim.dataset.dataset_spec import PRIMITIVE_SIZE_M, SIZE, DatasetSpec, drawn_instrument
 from rangesim.dataset.model_files import read_model
+from rangesim.dataset.piles import settled
 from rangesim.dataset.random_primitives import PRIMITIVES, primitive
 from rangesim.dataset.side_by_side import scattered
 from rangesim.dataset.solid_model import SolidModel
@@ -143,12 +145,13 @@ def random_scene(spec: DatasetSpec, index: int) -> RandomScene:
     streams = {name: _generator(spec.seed, index, place) for place, name in enumerate(STREAMS)}
     support = spec.support.draw(streams["support"])
     things = _draw_objects(spec, streams["objects"])
-    arrangement = scattered([(one.solid, one.scale) for one in things], support, streams["arrangement"])
+    arrange = settled if spec.arrangement == "pile" else scattered
+    arrangement = arrange([(one.solid, one.scale) for one in things], support, streams["arrangement"])
     objects: list[tuple[PlacedObject, bool, dict[str, Any]]] = []
     for thing, pose in zip(things, arrangement.poses, strict=True):
         entries, parameters = spec.material_entries(thing.material, streams["materials"])
         if pose is not None:
-            name = f"{thing.solid.name}_{len(objects)}"
+            name = f"{re.sub(r'[^A-Za-z0-9_-]', '_', thing.solid.name)}_{len(objects)}"  # Mitsuba refuses dots
             placed = PlacedObject(
                 name, thing.solid.name, thing.category, thing.material, pose, thing.scale, thing.solid.mesh,
                 parameters, thing.solid.source_sha256,

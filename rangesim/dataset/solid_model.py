@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from rangesim.dataset.convex_pieces import ConvexPieces, convex_pieces
 from rangesim.triangle_mesh import TriangleMesh
 
 CREASE_DEG = 35.0
@@ -39,6 +40,11 @@ class SolidModel:
         """Whether some faces meet smoothly, so that the renderer is to interpolate normals."""
         angles = _edges(self.mesh.faces, self.mesh.face_normals)[2]
         return bool((angles > np.radians(FLAT_DEG)).any())
+
+    @cached_property
+    def collision(self) -> ConvexPieces:
+        """The convex pieces that collide, and how far they stand off the mesh."""
+        return convex_pieces(self.mesh) if self.pieces is None else ConvexPieces(self.pieces, 0.0)
 
     @cached_property
     def size_m(self) -> float:

@@ -11,7 +11,7 @@ from typing import Any
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
 from rangesim.evaluation.comparison import Comparison, ErrorStatistics
 from rangesim.evaluation.range_noise import SMALL, noise_ratio
-from rangesim.evaluation.surface_rows import KINDS, OBJECT, OBJECTS
+from rangesim.evaluation.surface_rows import KINDS, OBJECT, OBJECTS, PART
 from rangesim.experiment import Experiment
 from rangesim.presets import catalogue
 from rangesim.report import palette
@@ -25,7 +25,7 @@ Rows = list[dict[str, Any]]
 
 BECAUSE = "because (% of the pixels)"
 """Head of the column with the causes of wrong and missing readings."""
-SUMMARIES = tuple(kind for kind in KINDS if kind != OBJECT)
+SUMMARIES = tuple(kind for kind in KINDS if kind not in (OBJECT, PART))
 """Kinds of rows of the tables of errors and of noise, which would be long with a row for every object."""
 MOST = 0.5
 """Fraction of the pixels of a surface that must be right for a sensor to be reliable on it.
@@ -137,7 +137,7 @@ def outcome_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[O
 
 
 def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, list[Cell]]]]]:
-    """Errors of each instrument per surface, except single objects.
+    """Errors of each instrument per surface, except single objects and parts.
 
     Each entry is the surface and a list with the name and the cells, one per column, of each instrument.
     """
@@ -207,11 +207,18 @@ def comparison_tables(tables: Sequence[tuple[str, Rows]], taken: Sequence[Measur
 
     Parameters
     ----------
-    tables : name of each instrument with its statistics per surface.
+    tables : name of each instrument with its statistics per surface. If causes are not known, they are None in every
+        row, and the table has no column for them.
     taken : record of each of these measurements.
     """
+    knows_causes = any(row["causes"] is not None for _, rows in tables for row in rows)
     return [
-        _table(tables, [*(f"{c.title} ({c.unit})" for c in OUTCOMES), BECAUSE], _outcomes, KINDS),
+        _table(
+            tables,
+            [*(f"{c.title} ({c.unit})" for c in OUTCOMES), *[BECAUSE] * knows_causes],
+            lambda row: [*(number(c, row[c.key]) for c in OUTCOMES), *([_causes(row)] if knows_causes else [])],
+            KINDS,
+        ),
         _table(
             tables,
             [f"{c.title} ({c.unit})" for c in COLUMNS],
@@ -223,9 +230,17 @@ def comparison_tables(tables: Sequence[tuple[str, Rows]], taken: Sequence[Measur
     ]
 
 
-def comparison_markdown(tables: Sequence[tuple[str, Rows]], taken: Sequence[MeasurementRecord]) -> str:
-    """The tables of `comparison_tables` in Markdown."""
-    return "\n".join(table.markdown() for table in comparison_tables(tables, taken))
+def tolerance_line(tolerance_m: float) -> str:
+    """Sentence that says up to which error a reading counts as right, as every table of right readings needs it."""
+    return f"Right readings are off by at most {1e3 * tolerance_m:g} mm."
+
+
+def comparison_markdown(
+    tables: Sequence[tuple[str, Rows]], taken: Sequence[MeasurementRecord], tolerance_m: float
+) -> str:
+    """The tables of `comparison_tables` in Markdown, below the tolerance."""
+    of_each = [table.markdown() for table in comparison_tables(tables, taken)]
+    return "\n".join([f"{tolerance_line(tolerance_m)}\n", *of_each])
 
 
 def errors_markdown(comparison: Comparison) -> str:
@@ -300,11 +315,6 @@ def _table(
         for name, rows in tables:
             lines += [[surface_label(key), name, *texts(row)] for row in rows if (row["kind"], row["name"]) == key]
     return Table(["surface", "sensor", *heads], lines)
-
-
-def _outcomes(row: dict[str, Any]) -> list[str]:
-    """Cells of right, wrong and missing readings, in percent, and of the causes of the last two."""
-    return [*(number(c, row[c.key]) for c in OUTCOMES), _causes(row)]
 
 
 def _causes(row: dict[str, Any]) -> str:

@@ -41,15 +41,15 @@ def render_page(
         autoescape=True, finalize=visible_text, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     own = {  # `Markup` is not escaped: these files are part of the package
-        "css": Markup("\n".join(map(_file, STYLES)) + (f"@page {{ size: {paper}; }}\n" if paper else "")),
-        "script": Markup("\n".join(map(_file, scripts))),
+        "css": Markup("\n".join(map(text_of_file, STYLES)) + (f"@page {{ size: {paper}; }}\n" if paper else "")),
+        "script": Markup("\n".join(map(text_of_file, scripts))),
         "rules": StyleRules(),
         "content_policy": content_policy,
     }
-    return environment.from_string(_file(template)).render(own, **values)
+    return environment.from_string(text_of_file(template)).render(own, **values)
 
 
-def _file(name: str) -> str:
+def text_of_file(name: str) -> str:
     """Text of a file of this package or, as "package:name", of another one."""
     package, _, file = name.rpartition(":")
     return (files(package or "rangesim.report") / file).read_text(encoding="utf-8")
