@@ -197,7 +197,7 @@ class _Run:
             self.report()
             left = self.left
             try:
-                with workers.connected(answer_s) as client:
+                with workers.connected(self.left, answer_s) as client:
                     _Session(self, client, workers).carry_out()
             except _SchedulerLost as loss:
                 losses = losses + 1 if self.left == left else 0
