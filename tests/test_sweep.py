@@ -133,11 +133,11 @@ def result() -> Any:
     return carry_out(wall(("amcw",), 6, scene__distance_m=(0.5, 1.0), power_w=(1.0, 4.0)))
 
 
-def test_rows_are_of_each_point_sensor_seed_and_material(result: Any) -> None:
+def test_rows_are_of_each_point_sensor_seed_and_surface(result: Any) -> None:
     table = rows_table(result)
     assert len(table["seed"]) == 4 * 1 * 6 * 2  # matte and all
     assert {len(column) for column in table.values()} == {48}
-    assert set(table["material"]) == {"matte", "all"}
+    assert set(zip(table["kind"], table["name"], strict=True)) == {("material", "matte"), ("all", "all")}
     sums = np.sum([table[kind] for kind in ("right", "wrong", "missing")], axis=0)
     np.testing.assert_allclose(sums, 1.0, atol=1e-12)
 
@@ -164,7 +164,7 @@ def test_a_sweep_goes_on_where_it_ended(tmp_path: Path, monkeypatch: pytest.Monk
     """With the engine replaced by a loop: `tests/test_campaign.py` is about the engine."""
     done: list[str] = []
 
-    def run_items(function: Callable[[Any], bytes], items: Any, store: Any, *_: Any) -> Any:
+    def run_items(function: Callable[[Any], bytes], items: Any, store: Any, *_: Any, retry: bool) -> Any:
         for key, item in items.items():
             if key not in store:
                 done.append(key)

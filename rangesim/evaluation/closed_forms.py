@@ -94,10 +94,15 @@ def received_light(signals: Signals, captured: Captured) -> ReceivedLight:
 
 
 def _across(coordinate_px: np.ndarray) -> np.ndarray:
-    """(h, w) float64, change of a projector coordinate (h, w) over a camera's pixel, along columns or rows; where a
-    neighbour sees nothing, no change."""
-    steps = [np.gradient(coordinate_px, axis=axis) for axis in (0, 1) if coordinate_px.shape[axis] > 1]
-    return np.nan_to_num(np.max(np.abs(steps), axis=0)) if steps else np.zeros(coordinate_px.shape)
+    """(h, w) float64, change of a projector coordinate (h, w) over a camera's pixel, along columns or rows: that to the
+    nearer of two neighbours, which lies on the same surface; 0 where no neighbour sees anything."""
+    found = np.zeros(coordinate_px.shape)
+    for axis in (0, 1):
+        step = np.abs(np.diff(coordinate_px, axis=axis))
+        edge = np.full_like(np.take(coordinate_px, [0], axis=axis), np.nan)
+        to_both = np.concatenate([edge, step], axis=axis), np.concatenate([step, edge], axis=axis)
+        found = np.fmax(found, np.fmin(*to_both))
+    return found
 
 
 def _seen_at(rig: Rig, reading_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

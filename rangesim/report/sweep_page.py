@@ -14,6 +14,7 @@ import numpy as np
 from markupsafe import Markup
 
 from rangesim.causes.cause import TITLES, Cause
+from rangesim.evaluation.surface_rows import OBJECTS
 from rangesim.report import figures, palette, tables
 from rangesim.report.line_plots import (
     COLORS,
@@ -59,7 +60,9 @@ class _Page:
 
     def __init__(self, result: SweepResult) -> None:
         self.result, self.sweep = result, result.sweep
-        self.rows = [row for row in result.summary if row["material"] == ALL]
+        kinds = {row["kind"] for row in result.summary}
+        self.kind = OBJECTS if OBJECTS in kinds else ALL
+        self.rows = [row for row in result.summary if row["kind"] == self.kind]
         self.names = self.sweep.sensor_names
         self.color = {name: i % len(COLORS) for i, name in enumerate(self.names)}
 
@@ -92,6 +95,7 @@ class _Page:
                 {"name": "missing", "color": "#9aa5b1"},
             ],
             "shown": self._shown,
+            "whose": "the objects, each with the same weight" if self.kind == OBJECTS else "all surfaces",
             "causes": self._bars(_cause_stack) if self._causes else [],
             "cause_names": [{"name": TITLES[c], "color": _cause_color(c)} for c in self._causes],
             **roc,
@@ -163,6 +167,7 @@ class _Page:
             clauses = [c for name in self.names if (c := self._reach(name, others))]
             yield f"{'; '.join(clauses)}{at}." if clauses else ""
         yield from self._ranking()
+        yield from self._objects()
         yield from self._theory()
         yield from self._exposure()
         yield from self._place()
@@ -201,7 +206,8 @@ class _Page:
         if len(known) > 1:
             order = sorted(known, key=lambda name: -known[name])
             text = ", ".join(f"{name} {100 * known[name]:.0f} %" for name in order)
-            yield f"Right within {_metres(self.sweep.tolerance_m)}, mean over all points: {text}."
+            whose = ", of the objects" if self.kind == OBJECTS else ""
+            yield f"Right within {_metres(self.sweep.tolerance_m)}{whose}, mean over all points: {text}."
         for path, values in self.sweep.vary.items():
             if len(self.names) < 2 or len(values) < 2 or all(_is_number(v) for v in values):
                 continue
@@ -214,8 +220,23 @@ class _Page:
                     best.append(f"{value}: {name} ({100 * of[name]:.0f} %)")
             yield f"Most often right by {label_of(path)}: {'; '.join(best)}."
 
+    def _objects(self) -> Iterator[str]:
+        """What the failures of each sensor do to the objects."""
+        clauses = []
+        for name in self.names:
+            counted = [c.objects for (_, sensor), c in self.result.cells.items() if sensor == name and c.objects]
+            total = {key: sum(one[key] for one in counted) for key in (counted[0] if counted else {})}
+            if total:
+                lost = ", ".join(f"{total[k]} {k}" for k in ("merged", "split", "missed", "invented") if total[k])
+                of = sum(total[k] for k in ("found", "merged", "split", "missed"))
+                clauses.append(f"{name} {total['found']} of {of}{f' ({lost})' if lost else ''}")
+        if clauses:
+            yield f"Objects that the segmentation of the first capture finds, over all points: {'; '.join(clauses)}."
+
     def _theory(self) -> Iterator[str]:
         """In how many points theory lies in the confidence interval."""
+        if self.kind == OBJECTS:  # light that comes by other ways decides there
+            return
         bounds, _ = self._kinds_of_theory()
         clauses = []
         for name in self.names:

@@ -25,15 +25,18 @@ from rangesim.electronics.ambient import Ambient
 from rangesim.errors import RangesimWarning
 from rangesim.evaluation.closed_forms import error_by_theory
 from rangesim.evaluation.comparison import compare
+from rangesim.evaluation.object_segmentation import Outcome, object_segmentation
 from rangesim.evaluation.range_noise import robust_sigma, sampling_draw
 from rangesim.evaluation.reference_readings import ReferenceReadings
+from rangesim.evaluation.surface_rows import with_mean_over_objects
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
-from rangesim.pipeline.experiment_run import acquisition
+from rangesim.pipeline.experiment_run import MIN_POINTS, acquisition, segmented, segments_of_truth
 from rangesim.report import figures, palette
 from rangesim.report.panorama import panorama
 from rangesim.robust_scale import sigma_from_median
 from rangesim.settings.config import from_dict
+from rangesim.signals import SignalSet, StillSignals
 from rangesim.sweep.image_windows import coarse, windowed
 from rangesim.sweep.scene_sources import scene_of_dict
 from rangesim.sweep.sweep_settings import instrument_given, with_settings
@@ -44,7 +47,7 @@ if TYPE_CHECKING:
     from rangesim.decoding.range_image import RangeImage
     from rangesim.evaluation.comparison import Comparison
     from rangesim.rig import Rig
-    from rangesim.signals import GroundTruth, SignalSet, StillSignals
+    from rangesim.signals import GroundTruth
 
 OUTLIER_SIGMAS = 6.0
 """Robust standard deviations from the median beyond which a reading does not belong to the noise: a wrong match, a
@@ -87,15 +90,16 @@ class _Pass:
         self.transport = from_dict(Experiment, {"scene": "-", **item["transport"]})
         self.power_w = max(i.power_w for i in self.instruments)
 
-    def rig_of(self, instrument: Instrument) -> Rig:
-        """Rig of an instrument at the power of the pass."""
-        settings = self.transport
-        return replace(instrument, power_w=self.power_w).rig(self.scene, settings.width, settings.height)
-
     def rig(self) -> Rig:
-        """Rig of the pass: of instruments that agree, one that states a wavelength."""
-        rigs = [self.rig_of(instrument) for instrument in self.instruments]
-        return next((rig for rig in rigs if rig.wavelength_m is not None), rigs[0])
+        """Rig of all instruments, at the power of the pass; as the renderer, it has no wavelength."""
+        one, settings = replace(self.instruments[0], power_w=self.power_w), self.transport
+        return replace(one.rig(self.scene, settings.width, settings.height), wavelength_m=None)
+
+    def light_for(self, instrument: Instrument, signals: StillSignals | SignalSet) -> StillSignals | SignalSet:
+        """Signals of the pass at the power and the wavelength of an instrument."""
+        light = signals.at_power(instrument.power_w).at_wavelength(instrument.emitter_wavelength_m)
+        assert isinstance(light, (StillSignals, SignalSet))
+        return light
 
     def traced(self, rig: Rig, spp: int | None) -> StillSignals | SignalSet:
         """Signals of the pass with a rig.
@@ -134,9 +138,10 @@ def _probe(item: Mapping[str, Any]) -> dict[str, Any]:
         if instrument.exposure_s is not None or detector is None or instrument.sensor.is_ideal:
             found.append(None)
             continue
-        lit = signals.at_power(instrument.power_w)
+        lit = one.light_for(instrument, signals)
         radiance = mean_radiance(lit.cameras[0], instrument.sensor, detector, ambient)
-        found.append(auto_exposure_s(radiance, instrument.sensor, detector, rig))
+        full = replace(rig, wavelength_m=instrument.emitter_wavelength_m)
+        found.append(auto_exposure_s(radiance, instrument.sensor, detector, full))
     return {"exposures_s": found}
 
 
@@ -148,7 +153,7 @@ def _measured(item: Mapping[str, Any]) -> dict[str, Any]:
         warnings.simplefilter("always", RangesimWarning)
         signals = one.traced(rig, None)
         jobs = [
-            _measurements(instrument, signals.at_power(instrument.power_w), ambient, job["seeds"], item["tolerance_m"])
+            _measurements(instrument, one.light_for(instrument, signals), ambient, job["seeds"], item["tolerance_m"])
             for instrument, ambient, job in zip(one.instruments, one.ambients, item["jobs"], strict=True)
         ]
     said = dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, RangesimWarning))
@@ -164,7 +169,6 @@ def _measurements(
 ) -> dict[str, Any]:
     """Rows of all captures of one instrument, one list for each seed, and what they have in common."""
     truth, detector = signals.truth, instrument.detector_in_use
-    masks = list(truth.classes().values())
     rows, counts = [], np.zeros((2, len(CONFIDENCES) + 1), dtype=np.int64)
     common: dict[str, Any] = {}
     for seed in seeds:
@@ -176,12 +180,16 @@ def _measurements(
         theory_m = error_by_theory(signals, capture, image.decoder or instrument.sensor.default_decoder)
         exposure = {"exposure_s": _finite(capture.reference.exposure_s)}
         counts += _by_confidence(image, comparison.error_m, tolerance_m)
-        rows.append(
-            [
-                row | _errors(comparison.error_m[mask], None if theory_m is None else theory_m[mask]) | exposure
-                for row, mask in zip(comparison.rows(), masks, strict=True)
-            ]
-        )
+        errors = [
+            {
+                "kind": kind,
+                "name": name,
+                **_errors(comparison.error_m[mask], None if theory_m is None else theory_m[mask]),
+            }
+            for kind, name, mask in truth.surfaces()
+        ]
+        both = zip(comparison.rows(), with_mean_over_objects(errors), strict=True)
+        rows.append([row | more | exposure for row, more in both])
     return {**common, "rows": rows, "confidence": counts.tolist()}
 
 
@@ -200,15 +208,35 @@ def _of_first(
     causes, sampling = causes_of(readings, comparison.tolerance_m), []
     if signals.knows_sampling_error:
         draw = sampling_draw(image, capture, signals)[1]
-        sampling = [robust_sigma(draw[mask]) for mask in truth.classes().values()]
+        known = [
+            {"kind": kind, "name": name, "sampling_sigma_m": robust_sigma(draw[mask])}
+            for kind, name, mask in truth.surfaces()
+        ]
+        sampling = [row["sampling_sigma_m"] for row in with_mean_over_objects(known)]
     frames = acquisition(capture.reference, None, instrument.timing, False, 0, {})
     return {
         "causes": [row["causes"] for row in causes.fractions(truth)],
         "sampling_sigma_m": sampling,
+        "objects": _objects(image, comparison, signals),
         "pictures": _pictures(image, comparison.error_m, causes, truth),
         "frames": frames.frames,
         "acquisition_s": frames.acquisition_s,
     }
+
+
+def _objects(image: RangeImage, comparison: Comparison, signals: StillSignals | SignalSet) -> dict[str, int] | None:
+    """Numbers of the true objects that the segmentation of the first capture finds, merges, splits and misses, and of
+    the objects that it invents; None for a scene without objects."""
+    if not signals.truth.object_names:
+        return None
+    cloud = image.to_point_cloud()
+    labels = np.full(image.z.shape, -1, dtype=np.int32)
+    if cloud.valid.sum() >= MIN_POINTS:
+        labels = segmented(cloud).labels
+    wrong = image.valid & ~(np.abs(comparison.error_m) <= comparison.tolerance_m)
+    found = object_segmentation(labels, signals.truth, wrong, segments_of_truth(signals))
+    counts = {outcome.value: len(found.names(outcome)) for outcome in Outcome}
+    return {**counts, "displaced": sum(o.displaced for o in found.objects), "invented": found.invented}
 
 
 def _errors(error_m: np.ndarray, theory_m: np.ndarray | None) -> dict[str, float | None]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which light-transport passes a sweep needs: as few as can be.
 
-Scene, camera, emitter, wavelength and the settings of the transport decide a pass. Noise, exposure, power, ambient
+Scene, camera, emitter and the settings of the transport decide a pass. Noise, exposure, power, ambient
 light, detector, decoder and code need none of their own: they are measured on the light of a pass that is there. Light
 is linear, so a pass is traced with the largest power of its measurements.
 """
@@ -167,6 +167,7 @@ def plan(sweep: Sweep) -> Plan:
         for name in sweep.given:
             instrument = point.instrument(name)
             rig = replace(instrument, power_w=1.0).rig(scene, settings.width, settings.height)
+            rig = replace(rig, wavelength_m=None)  # the renderer is monochrome
             index = first_that_agrees(of_place, rig, instrument)
             if index is None:
                 index = len(of_place)
@@ -174,9 +175,6 @@ def plan(sweep: Sweep) -> Plan:
                 numbers[place, index] = len(passes)
                 passes.append(PlannedPass(point, rig))
             number = numbers[place, index]
-            if rig.wavelength_m is not None and passes[number].rig.wavelength_m is None:  # an ideal sensor came first
-                passes[number].rig = rig
-                of_place[index] = (rig, of_place[index][1])
             cells.append(Cell(point.number, name, number, _job(passes[number], point, instrument, scene_key)))
     cost = _cost(sweep, first, passes)
     return Plan(sweep, working_distance_m, tuple(passes), tuple(cells), cost)

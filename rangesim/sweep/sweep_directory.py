@@ -2,7 +2,7 @@
 """The directory of a sweep: the passes, the tables and the page.
 
 DIR/sweep.html          the page
-    rows.csv, .parquet  a row for each point, sensor, seed and material
+    rows.csv, .parquet  a row for each point, sensor, seed and surface
     summary.csv         means over the seeds with 95 % confidence intervals
     sweep.json          the settings, the exposures that were fixed, versions
     campaign.json, items/, quarantine/   finished passes, see `rangesim.campaign`

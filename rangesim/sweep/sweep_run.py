@@ -56,12 +56,13 @@ def carry_out(
         if cell.light_pass in failed:
             continue
         made = results[cell.light_pass]["jobs"][cell.job]
-        names = [row["material"] for row in made["rows"][0]]
+        names = [(row["kind"], row["name"]) for row in made["rows"][0]]
         cells[cell.point, cell.sensor] = CellResult(
             frames=made["frames"],
             acquisition_s=made["acquisition_s"],
             confidence=made["confidence"],
             pictures=made["pictures"],
+            objects=made["objects"],
             causes=dict(zip(names, made["causes"], strict=True)),
             sampling_sigma_m=dict(zip(names, made["sampling_sigma_m"], strict=False)),  # none if it is not known
         )
@@ -82,7 +83,7 @@ class _Run:
     def carry_out(self, items: Mapping[str, Any]) -> None:
         if self.store is not None:
             if items:
-                outcome = run_items(item_bytes, items, self.store, self.workers, self.tell)
+                outcome = run_items(item_bytes, items, self.store, self.workers, self.tell, retry=True)
                 self.failed |= {one.key: one.error for one in outcome.quarantined}
             return
         for number, (key, item) in enumerate(items.items()):

@@ -16,12 +16,12 @@ from rangesim.sweep.sweep_result import SweepResult
 
 
 def rows_table(result: SweepResult) -> dict[str, list[Any]]:
-    """Columns of a row for each point, sensor, seed and material."""
+    """Columns of a row for each point, sensor, seed and surface."""
     return _columns([_spread(row) for row in result.rows])
 
 
 def summary_table(result: SweepResult) -> dict[str, list[Any]]:
-    """Columns of a row for each point, sensor and material: means, and the ends of their confidence intervals in
+    """Columns of a row for each point, sensor and surface: means, and the ends of their confidence intervals in
     columns that end with `_low` and `_high`. A column `cause_NAME` holds the fraction of the pixels that failed by that
     cause."""
     return _columns([_spread(row) for row in result.summary])
