@@ -35,7 +35,7 @@ def answer(question: Any) -> Any:
         case "no bytes":
             return 3
         case "raise":
-            raise RuntimeError("no luck")
+            raise RuntimeError("no\nluck")
         case "exit":
             sys.exit(2)
         case "warn":
