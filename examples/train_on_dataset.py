@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trains a small network to tell which readings of a sensor are wrong, on a data set of `rangesim dataset`.
 
-    rangesim dataset examples/bins.toml --out out/bins
+    rangesim dataset examples/dataset_bin.toml --out out/bins
     python examples/train_on_dataset.py out/bins amcw
 
 rangesim does not need torch; install it beside (https://pytorch.org). `Samples` is a sequence, which DataLoader takes

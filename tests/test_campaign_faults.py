@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import campaign
 import pytest
 
 from rangesim.campaign import ItemStore, Workers, engine, run_items
@@ -65,6 +66,12 @@ def test_a_worker_that_leaks_is_replaced(tmp_path: Path) -> None:
     assert (outcome.computed, outcome.exit_status) == (120, 0)
     assert outcome.replaced >= 1
     assert outcome.rss < 3e9  # 120 items would take 7 GB
+
+
+def test_a_run_that_is_killed_again_and_again_ends_with_the_same_bytes() -> None:
+    """On an embedded cluster, and by the address of a second scheduler process, which is killed, too."""
+    found = campaign.kills(campaign.QUICK)
+    assert (found["kills"], found["differing_bytes"], found["quarantined"], found["litter"]) == (4, 0, 0, 0)
 
 
 SCRIPT = """

@@ -171,7 +171,7 @@ def test_frames_are_kept_on_request(spec: DatasetSpec) -> None:
 
     members = members_of(bytes_of(drawn, 0, keeps_frames=True), "here")
     record = record_of(members, "here")
-    frames = arrays_of(members, "frames.gray-phase.npz", "here", record.sizes("frames.gray-phase"))["frames"]
+    frames = arrays_of(members, "frames.gray-phase.npz", "here", record.sizes("frames.gray-phase"))["camera_1"]
     assert frames.shape[1:] == (24, 32)
     assert frames.dtype == np.uint16
 

@@ -272,8 +272,7 @@ def test_without_objects_the_verdict_is_about_materials() -> None:
     text = finding.text.replace("\xa0", " ")
     assert "reads 65.0 % of the pixels right, to 10 mm, and 30.0 % wrong; 5.0 % are missing." in text
     assert (
-        "Most pixels are right on 1 of 2 materials; worst: gloss (40 % right, 60 % wrong, 0 % missing; multipath)."
-        in text
+        "Most pixels are right on 1 of 2 materials (matte); worst: gloss (40 % right, 60 % wrong, 0 % missing" in text
     )
 
 
@@ -291,6 +290,26 @@ def test_no_bold_where_a_sensor_is_unreliable() -> None:
     assert not any(_bold(good, few).values())
 
 
+def test_automatic_exposures_are_said() -> None:
+    cup = (0.98, 0.01, 5e-3)
+    chosen = _measured("lines", acquisition_s=0.2, is_automatic=True, cup=cup)
+    stated = _measured("amcw", acquisition_s=0.1, cup=cup)
+    said = verdict([chosen, stated])[-1]
+    assert said.subject == "Exposure"
+    assert said.text.startswith("is automatic: Structured light 20 ms per frame.")
+    assert "AMCW" not in said.text
+    assert "Exposure" not in [finding.subject for finding in verdict([stated])]
+    assert [tables.exposure(m.metadata) for m in (chosen, stated)] == ["20 ms automatic", "10 ms"]
+
+
+def test_the_page_says_which_exposures_are_automatic(html: str) -> None:
+    assert ", seed 3, exposure automatic<" in html
+    for m in load_result(small_result()).measurements:
+        assert m.metadata.exposure_is_automatic == m.capture.reference.exposure_is_automatic
+        assert m.metadata.exposure_is_automatic != m.capture.sensor.is_ideal
+        assert (f"<td>{tables.seconds(m.metadata.exposure_s)} automatic</td>" in html) != m.capture.sensor.is_ideal
+
+
 def _bold(*measurements: Any) -> dict[str, list[str]]:
     """Titles of the bold columns of each instrument, in the rows for all surfaces."""
     outcomes, errors = tables.outcome_table(measurements), tables.comparison_table(measurements)
@@ -301,7 +320,9 @@ def _bold(*measurements: Any) -> dict[str, list[str]]:
     }
 
 
-def _measured(sensor: str, acquisition_s: float = 0.1, kind: str = "object", **surfaces: Any) -> Any:
+def _measured(
+    sensor: str, acquisition_s: float = 0.1, kind: str = "object", is_automatic: bool = False, **surfaces: Any
+) -> Any:
     """A measurement, from the fractions right and wrong and the median error, metres, of each of its surfaces."""
     surfaces["all"] = np.mean(list(surfaces.values()), axis=0).tolist()
     rows = []
@@ -316,7 +337,9 @@ def _measured(sensor: str, acquisition_s: float = 0.1, kind: str = "object", **s
         capture=SimpleNamespace(sensor=SENSORS[sensor]),
         camera=Intrinsics.from_fov(4, 3, fov_x_deg=40.0),
         rows=with_mean_over_objects(rows),
-        metadata=SimpleNamespace(acquisition_s=acquisition_s, frames=10),
+        metadata=SimpleNamespace(
+            acquisition_s=acquisition_s, frames=10, exposure_s=acquisition_s / 10, exposure_is_automatic=is_automatic
+        ),
         causes=CauseMap(np.zeros((3, 4), np.uint8), 0.01),
     )
 
@@ -436,10 +459,10 @@ def test_photons_per_pulse_have_two_digits() -> None:
 
 
 def _with_long_names(count: int) -> Result:
-    """The small result with so many measurements, of which two have the same sensor and names of 63 characters."""
+    """The small result with so many measurements, of which two have the same sensor and names of 40 characters."""
     result = load_result(small_result())
     lines = result.measurements[0]
-    twins = tuple(replace(lines, name=f"left_camera_of_{letter * 48}") for letter in "ab")
+    twins = tuple(replace(lines, name=f"left_camera_of_{letter * 25}") for letter in "ab")
     measurements = (*twins, *result.measurements[1:])[:count]
     return replace(result, measurements=measurements, passes=result.passes[: max(m.light_pass for m in measurements)])
 

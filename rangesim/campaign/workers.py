@@ -5,15 +5,17 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Annotated, Any
 
 from rangesim.campaign.in_worker import THREAD_VARIABLES
 from rangesim.errors import EnvironmentProblem
-from rangesim.settings.bounds import check_fields, whole
+from rangesim.settings.bounds import Bounds, check_fields
 
 if TYPE_CHECKING:
     from distributed import Client, LocalCluster
@@ -26,6 +28,8 @@ FIRST_ANSWER_S = 10.0
 WAIT_S = 300.0
 """Seconds that a run waits for a scheduler that it has lost, and for workers if there are none: long enough for a
 restart by systemd, Kubernetes or by hand, short enough not to hold an allocation of a cluster for hours."""
+COUNT = Bounds("a whole number of processes", 1, 1024, kind=int)
+"""Bounds of the count of workers on one machine, above the cores of any."""
 BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables of the threads of BLAS and of OpenMP."""
 
@@ -41,7 +45,7 @@ class Workers:
         processes are started on this machine, and end with the run.
     """
 
-    count: Annotated[int | None, whole(1)] = None
+    count: Annotated[int, COUNT] | None = None
     scheduler: str | None = None
 
     def __post_init__(self) -> None:
@@ -135,13 +139,32 @@ def _client_of(scheduler: str, answer_s: float) -> Iterator[Client]:
         yield client
 
 
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Keep Ctrl-C from the threads and processes that the block starts, and from all that those start: the driver alone
+    ends on it, and its workers with it."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # the first call would let interrupts through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _started(kind: Callable[..., LocalCluster], **options: Any) -> LocalCluster:
     """A cluster that has started; EnvironmentProblem if its processes do not start."""
     try:
-        return kind(**options)
+        with _without_interrupts():
+            return kind(**options)
     except RuntimeError as problem:
+        cause: BaseException = problem
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
         raise EnvironmentProblem(
-            "worker processes could not be started; if this is a script, put what it does below if __name__ == "
+            f"worker processes could not be started ({cause}); a script has to do its work below if __name__ == "
             "'__main__', because every worker imports it."
         ) from problem
 
@@ -190,7 +213,6 @@ def _local_cluster(count: int) -> Iterator[LocalCluster]:
                 silence_logs=logging.CRITICAL,
                 memory_limit=MEMORY_LIMIT,
                 worker_class=WorkerNanny,
-                preload="import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)",  # Ctrl-C is for the driver
             )
             with cluster:
                 yield cluster

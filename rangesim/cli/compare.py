@@ -28,8 +28,9 @@ def compare_command(
         ),
     ] = None,
 ) -> None:
-    """Print what each sensor reads right, wrong and not at all, per object and material, and why. Lengths are in mm,
-    fractions in %.
+    """Print what each sensor reads right, wrong and not at all, per object and material, why, and the exposures.
+
+    Lengths are in mm, fractions in %.
 
     Examples:
 
@@ -37,8 +38,8 @@ def compare_command(
 
       rangesim compare out/tabletop --tolerance 2mm
     """
-    from rangesim.report.tables import comparison_markdown, comparison_tables, tolerance_line
-    from rangesim.results.experiment_results import read_comparison, read_settings
+    from rangesim.report.tables import automatic_exposures, comparison_markdown, comparison_tables, tolerance_line
+    from rangesim.results.experiment_results import read_acquisition, read_comparison, read_settings
 
     found = {
         (folder, entry.name): read_comparison(folder / entry.name)
@@ -53,12 +54,16 @@ def compare_command(
     is_new = set(stored) != {tolerance_m}
     rows = _compared_again(results, tolerance_m) if is_new else {key: r.plain_rows() for key, r in found.items()}
     tables = [(name if len(results) == 1 else f"{folder}: {name}", rows[folder, name]) for folder, name in found]
+    taken = [read_acquisition(folder / name) for folder, name in found]
     if markdown:
-        typer.echo(comparison_markdown(tables, tolerance_m), nl=False)
+        typer.echo(comparison_markdown(tables, taken, tolerance_m), nl=False)
     else:
         typer.echo(tolerance_line(tolerance_m))
-        for table in comparison_tables(tables):
+        for table in comparison_tables(tables, taken):
             _print(table)
+    names = [name for name, _ in tables]
+    if said := automatic_exposures(dict(zip(names, taken, strict=True))):
+        typer.echo(f"rangesim: the exposure {said}", err=True)
 
 
 def _compared_again(results: list[Path], tolerance_m: float) -> dict[tuple[Path, str], Rows]:

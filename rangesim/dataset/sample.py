@@ -7,7 +7,7 @@ import hashlib
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,7 +18,7 @@ from rangesim.dataset.sample_files import (
     MODELS_MEMBER,
     SCENE_MEMBER,
     CameraRecord,
-    ObjectRecord,
+    PlacedObjectRecord,
     SampleRecord,
     SensorRecord,
     ShapeRecord,
@@ -27,13 +27,10 @@ from rangesim.dataset.sample_files import (
 from rangesim.errors import RangesimWarning
 from rangesim.files.array_files import arrays_to_bytes
 from rangesim.pipeline.experiment_run import MIN_POINTS, carry_out, segmented
-from rangesim.point_cloud.point_cloud import organised_cloud
-from rangesim.results.experiment_results import Measurement, RowRecord, Segmentation
+from rangesim.point_cloud import PointCloud
+from rangesim.results.experiment_results import Measurement, RowRecord, Segmentation, objects_record
 from rangesim.rig import Rig
 from rangesim.settings.config import to_dict
-
-if TYPE_CHECKING:
-    from rangesim.point_cloud import PointCloud
 
 
 def sample_bytes(spec: DatasetSpec, index: int) -> bytes:
@@ -62,11 +59,7 @@ def bytes_of(drawn: RandomScene, number: int, keeps_frames: bool = False) -> byt
     sensors: list[SensorRecord] = []
     for one in measurements:
         rig = _rig(one)
-        camera = CameraRecord(
-            camera=to_dict(one.camera),
-            T_world_camera=rig.T_world_camera.tolist(),
-            reads="z" if one.camera.is_pinhole else "range",
-        )
+        camera = _camera(rig)
         if camera not in [known for known, _ in cameras]:
             suffix = f"camera.{len(cameras) + 1}.npz"
             members[suffix] = arrays_to_bytes(_truth(one, shapes_on_rays(scene, rig)[objects]))
@@ -74,7 +67,9 @@ def bytes_of(drawn: RandomScene, number: int, keeps_frames: bool = False) -> byt
         number_of_camera = 1 + [known for known, _ in cameras].index(camera)
         members[f"sensor.{one.name}.npz"] = arrays_to_bytes(_readings(one))
         if keeps_frames:
-            members[f"frames.{one.name}.npz"] = arrays_to_bytes({"frames": one.capture.reference.frames})
+            members[f"frames.{one.name}.npz"] = arrays_to_bytes(
+                {f"camera_{n}": capture.frames for n, capture in enumerate(one.capture.captures, 1)}
+            )
         sensors.append(_sensor(one, rig, number_of_camera))
     if models := _models(drawn.objects):
         members[MODELS_MEMBER] = arrays_to_bytes(models)
@@ -116,9 +111,17 @@ def _rig(measurement: Measurement) -> Rig:
     return rig
 
 
+def _camera(rig: Rig) -> CameraRecord:
+    return CameraRecord(
+        camera=to_dict(rig.camera),
+        T_world_camera=rig.T_world_camera.tolist(),
+        reads="z" if rig.camera.is_pinhole else "range",
+    )
+
+
 def _truth(one: Measurement, amodal: np.ndarray) -> dict[str, np.ndarray]:
     """Arrays of a camera, see `rangesim.dataset.sample_files.CAMERA_ARRAYS`."""
-    truth, ones = one.truth, np.ones(one.true_m.shape, np.float32)
+    truth = one.truth
     arrays = {
         "true_m": one.true_m,
         "normal": truth.normal.astype(np.float16),
@@ -128,12 +131,14 @@ def _truth(one: Measurement, amodal: np.ndarray) -> dict[str, np.ndarray]:
         "nearest_m": truth.nearest_m,
         "farthest_m": truth.farthest_m,
     }
-    cloud = organised_cloud(one.true_m, one.camera, _rig(one).T_world_camera, ones, ones)
-    return {name: array for name, array in arrays.items() if array is not None} | _segments(_segmentation(cloud))
+    return {name: array for name, array in arrays.items() if array is not None} | _segments(_true_segmentation(one))
 
 
-def _segmentation(cloud: PointCloud) -> Segmentation | None:
-    return segmented(cloud) if int(cloud.valid.sum()) >= MIN_POINTS else None
+def _true_segmentation(one: Measurement) -> Segmentation | None:
+    """The segmentation of the true surface, as `rangesim.pipeline.experiment_run.segments_of_truth` makes it."""
+    points = one.camera.points(one.truth).astype(np.float32)
+    is_enough = int(np.isfinite(points).all(axis=-1).sum()) >= MIN_POINTS
+    return segmented(PointCloud(points)) if is_enough else None
 
 
 def _segments(segmentation: Segmentation | None) -> dict[str, np.ndarray]:
@@ -163,10 +168,12 @@ def _sensor(one: Measurement, rig: Rig, camera: int) -> SensorRecord:
     return SensorRecord(
         name=one.name,
         camera=camera,
+        further_cameras=[_camera(capture.rig) for capture in one.capture.captures[1:] if capture.rig is not None],
         projector=to_dict(rig.projector),
         T_camera_projector=rig.T_camera_projector.tolist(),
         exposure_s=one.metadata.exposure_s,
         rows=[RowRecord(**row) for row in one.rows],
+        objects=None if one.objects is None else objects_record(one.objects),
         doubts=list(one.image.doubts),
         notes=list(one.image.notes),
     )
@@ -178,8 +185,8 @@ def _models(objects: Sequence[PlacedObject]) -> dict[str, np.ndarray]:
     return {f"{name}_{index}": getattr(mesh, name) for index, mesh in own.items() for name in ("vertices", "faces")}
 
 
-def _object(each: PlacedObject, shape: int) -> ObjectRecord:
-    return ObjectRecord(
+def _object(each: PlacedObject, shape: int) -> PlacedObjectRecord:
+    return PlacedObjectRecord(
         shape=shape,
         model=each.model,
         sha256=hashlib.sha256(each.mesh.to_ply("part")).hexdigest(),

@@ -4,7 +4,7 @@
 NUMBER.scene.json        what was drawn, the objects with their poses, the cameras, the sensors and their statistics
 NUMBER.camera.1.npz      the truth that the first camera sees, once for all sensors that share it
 NUMBER.sensor.NAME.npz   the readings of the sensor NAME, and why they failed
-NUMBER.frames.NAME.npz   its frames, if the data set keeps them
+NUMBER.frames.NAME.npz   the frames (k, h, w) of each of its cameras, if the data set keeps them
 NUMBER.models.npz        meshes of the objects that come from no file: primitives, which are drawn for one scene alone
 
 NUMBER is the scene's number in at least six digits. Members have no times, no owners and one order, so the same scene
@@ -27,7 +27,7 @@ from rangesim.decoding.status import Status
 from rangesim.errors import FileFormatError
 from rangesim.files.array_files import arrays_from_bytes
 from rangesim.files.schema import MAX_METRES, ArraySpec, Count, Name, Record, checked_arrays
-from rangesim.results.experiment_results import RowRecord
+from rangesim.results.experiment_results import ObjectsRecord, RowRecord
 from rangesim.rig import Camera
 from rangesim.settings.config import from_dict
 from rangesim.triangle_mesh import TriangleMesh
@@ -97,7 +97,7 @@ class ShapeRecord(Record, frozen=True, kw_only=True):
     material: Name
 
 
-class ObjectRecord(Record, frozen=True, kw_only=True):
+class PlacedObjectRecord(Record, frozen=True, kw_only=True):
     """An object of the scene.
 
     shape : index of its shape in `SampleRecord.shapes`, which is its number in `instance`.
@@ -136,16 +136,21 @@ class CameraRecord(Record, frozen=True, kw_only=True):
 class SensorRecord(Record, frozen=True, kw_only=True):
     """A sensor of the scene.
 
-    camera : number of its camera, from 1. projector : plain data of the emitter. exposure_s : None if it is noise-free.
-    rows : statistics of each object and material class, as in `RowRecord`. doubts, notes : sentences of the decoder.
+    camera : number of its camera, from 1. further_cameras : those of a sensor with several.
+    projector : plain data of the emitter. exposure_s : None if it is noise-free.
+    rows : statistics of each object and material class, as in `RowRecord`.
+    objects : what the segmentation of its cloud makes of the objects.
+    doubts, notes : sentences of the decoder.
     """
 
     name: Name
     camera: Count
+    further_cameras: list[CameraRecord]
     projector: dict[str, Any]
     T_camera_projector: list[list[float]]
     exposure_s: float | None
     rows: list[RowRecord]
+    objects: ObjectsRecord | None
     doubts: list[str]
     notes: list[str]
 
@@ -165,7 +170,7 @@ class SampleRecord(Record, frozen=True, kw_only=True):
     seed: Annotated[int, msgspec.Meta(ge=0)]
     drawn: dict[str, Any]
     shapes: list[ShapeRecord]
-    objects: list[ObjectRecord]
+    objects: list[PlacedObjectRecord]
     material_names: list[Name]
     cameras: list[CameraRecord]
     sensors: list[SensorRecord]
@@ -288,7 +293,12 @@ def arrays_of(members: Mapping[str, bytes], suffix: str, place: str, sizes: dict
     where, kind = f"{place}: {suffix}", suffix.partition(".")[0]
     if kind != "frames":
         return checked_arrays(members[suffix], where, CAMERA_ARRAYS if kind == "camera" else SENSOR_ARRAYS, sizes)
-    frames = arrays_from_bytes(members[suffix], where, ["frames"])["frames"]
-    if frames.dtype not in DTYPES or frames.ndim != 3 or frames.shape[1:] != (sizes["h"], sizes["w"]):
-        raise FileFormatError(f"{where}: expected frames of {sizes['h']} x {sizes['w']}, got {frames.shape}.")
-    return {"frames": frames}
+    frames = arrays_from_bytes(members[suffix], where)
+    if not frames or any(name != f"camera_{n}" for n, name in enumerate(frames, 1)):
+        raise FileFormatError(f"{where}: expected arrays camera_1, camera_2 ..., got {', '.join(frames) or 'none'}.")
+    for name, array in frames.items():
+        if array.dtype not in DTYPES or array.ndim != 3:
+            raise FileFormatError(f"{where}: expected frames as {name}, got {array.dtype} of shape {array.shape}.")
+    if frames["camera_1"].shape[1:] != (sizes["h"], sizes["w"]):
+        raise FileFormatError(f"{where}: expected frames of {sizes['h']} x {sizes['w']} pixels.")
+    return frames

@@ -68,7 +68,7 @@ def context(result: Result) -> dict[str, Any]:
         "scene": result.info.scene,
         "titles": names,
         "references": [m.name for m in measurements if tables.is_reference(m)],
-        "settings_line": tables.settings_line(result.experiment, [m.truth.z.shape for m in measurements]),
+        "settings_line": tables.settings_line(result.experiment, measurements),
         "verdict": verdict(measurements),
         "cameras": [_camera(result, group) for group in cameras],
         "columns": tables.COLUMNS,
@@ -161,7 +161,7 @@ def _frames(m: Measurement) -> dict[str, Any]:
     f = m.metadata
     taken = f"{f.frames} frame{'s' * (f.frames != 1)}"
     if f.exposure_s is not None:
-        taken += f", {tables.seconds(f.exposure_s)} each" if f.frames != 1 else f", {tables.seconds(f.exposure_s)}"
+        taken += f", {tables.exposure(f)}{' each' * (f.frames != 1)}"
     else:
         taken += ", noise-free"
     details = [m.capture.sensor.details]

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -17,7 +17,7 @@ from rangesim.presets import catalogue
 from rangesim.report import palette
 from rangesim.report.figures import LegendEntry
 from rangesim.report.markdown_table import Table
-from rangesim.results.experiment_results import Measurement, PhotonsRecord
+from rangesim.results.experiment_results import Measurement, MeasurementRecord, PhotonsRecord
 from rangesim.signals import ALL
 
 Rows = list[dict[str, Any]]
@@ -201,13 +201,15 @@ def parts(row: dict[str, Any]) -> list[LegendEntry]:
     ]
 
 
-def comparison_tables(tables: Sequence[tuple[str, Rows]]) -> list[Table]:
-    """Tables of right readings and causes, of errors and of noise, with one row per surface and instrument.
+def comparison_tables(tables: Sequence[tuple[str, Rows]], taken: Sequence[MeasurementRecord]) -> list[Table]:
+    """Tables of right readings and causes, of errors and of noise, with one row per surface and instrument, and of the
+    exposures.
 
     Parameters
     ----------
     tables : name of each instrument with its statistics per surface. If causes are not known, they are None in every
         row, and the table has no column for them.
+    taken : record of each of these measurements.
     """
     knows_causes = any(row["causes"] is not None for _, rows in tables for row in rows)
     return [
@@ -224,6 +226,7 @@ def comparison_tables(tables: Sequence[tuple[str, Rows]]) -> list[Table]:
             SUMMARIES,
         ),
         _table(tables, ["detector noise (mm)", "sampling noise (mm)"], _noise, SUMMARIES),
+        _exposure_table([name for name, _ in tables], taken),
     ]
 
 
@@ -232,9 +235,12 @@ def tolerance_line(tolerance_m: float) -> str:
     return f"Right readings are off by at most {1e3 * tolerance_m:g} mm."
 
 
-def comparison_markdown(tables: Sequence[tuple[str, Rows]], tolerance_m: float) -> str:
+def comparison_markdown(
+    tables: Sequence[tuple[str, Rows]], taken: Sequence[MeasurementRecord], tolerance_m: float
+) -> str:
     """The tables of `comparison_tables` in Markdown, below the tolerance."""
-    return "\n".join([f"{tolerance_line(tolerance_m)}\n", *(table.markdown() for table in comparison_tables(tables))])
+    of_each = [table.markdown() for table in comparison_tables(tables, taken)]
+    return "\n".join([f"{tolerance_line(tolerance_m)}\n", *of_each])
 
 
 def errors_markdown(comparison: Comparison) -> str:
@@ -353,6 +359,41 @@ def seconds(value: float | None) -> str:
     return f"{value * 1e6:.2g} µs"
 
 
+def exposure(taken: MeasurementRecord) -> str:
+    """Text of the exposure of each frame, which says whether it is automatic; a dash for a noise-free capture."""
+    return f"{seconds(taken.exposure_s)}{' automatic' * taken.exposure_is_automatic}"
+
+
+def automatic_exposures(taken: Mapping[str, MeasurementRecord]) -> str:
+    """Sentences, after the word "exposure", on exposures that were chosen automatically; empty if none was.
+
+    Parameters
+    ----------
+    taken : record of each measurement, by the name that the sentence gives it.
+    """
+    chosen = [f"{name} {seconds(one.exposure_s)}" for name, one in taken.items() if one.exposure_is_automatic]
+    if not chosen:
+        return ""
+    return (
+        f"is automatic: {', '.join(chosen)} per frame. Another distance, material or light gets another exposure, and "
+        "so another noise: state exposure_s to compare them."
+    )
+
+
+def _exposure_table(names: Sequence[str], taken: Sequence[MeasurementRecord]) -> Table:
+    """Table of the exposure of each instrument, and of whether it was chosen automatically."""
+    lines = [
+        [name, _choice(one), str(one.frames), seconds(one.exposure_s), seconds(one.acquisition_s)]
+        for name, one in zip(names, taken, strict=True)
+    ]
+    return Table(["sensor", "exposure", "frames", "per frame", "acquisition"], lines)
+
+
+def _choice(taken: MeasurementRecord) -> str:
+    """Text that says who chose the exposure."""
+    return "–" if taken.exposure_s is None else "automatic" if taken.exposure_is_automatic else "as stated"
+
+
 def photons(per_pulse: PhotonsRecord) -> str:
     """Sentence part that says how many photons per laser pulse the median and the brightest pixel detect."""
     median, largest = (_amount(value) for value in (per_pulse.median, per_pulse.largest))
@@ -372,7 +413,7 @@ def cost_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[str]
     table = []
     for m in measurements:
         f, times = m.metadata, m.metadata.times_s
-        cells = [str(f.frames), seconds(f.exposure_s), seconds(f.acquisition_s)]
+        cells = [str(f.frames), exposure(f), seconds(f.acquisition_s)]
         cells += [seconds(times.get(stage)) for stage in ("exposure", "decode", "points", "segmentation")]
         table.append((m.name, [*cells, f"{f.points:,}".replace(",", " "), f"{f.points / f.pixels:.2f}"]))
     return table
@@ -383,18 +424,17 @@ def size_text(shape: tuple[int, ...]) -> str:
     return f"{shape[1]} × {shape[0]}"
 
 
-def settings_line(experiment: Experiment, shapes: Sequence[tuple[int, ...]]) -> str:
-    """The settings of the light transport in one line.
-
-    Parameters
-    ----------
-    shapes : height and width of the images of each instrument, pixels.
-    """
-    sizes = " and ".join(dict.fromkeys(map(size_text, shapes)))
+def settings_line(experiment: Experiment, measurements: Sequence[Measurement]) -> str:
+    """The settings of the light transport, and the kind of exposure, in one line."""
+    sizes = " and ".join(dict.fromkeys(size_text(m.truth.z.shape) for m in measurements))
     paths = f"up to {experiment.max_spp}" if experiment.spp is None else experiment.spp
+    exposed = [m.metadata for m in measurements if m.metadata.exposure_s is not None]
+    automatic = [one.exposure_is_automatic for one in exposed]
+    some = f"{sum(automatic)} of {len(exposed)} automatic" if any(automatic) else "fixed"
+    kind = "automatic" if all(automatic) else some
     return (
         f"{sizes} pixels, {paths} light paths per pixel of up to {experiment.max_depth} segments, "
-        f"seed {experiment.seed}"
+        f"seed {experiment.seed}" + (f", exposure {kind}" if exposed else "")
     )
 
 

@@ -130,6 +130,8 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
     """The contents of `measurement.json`.
 
     exposure_s : exposure of each frame, seconds; None for a noise-free capture.
+    exposure_is_automatic : whether it was chosen for the light of this scene, so that at another distance it is another
+        one.
     acquisition_s : time from the start of the first exposure to the end of the last, seconds; of a scanner, that of its
         last ray.
     points : number of pixels with a reading.
@@ -142,6 +144,7 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
     sensor: Name
     frames: Count
     exposure_s: Positive | None
+    exposure_is_automatic: bool
     acquisition_s: Seconds | None
     pixels: Count
     points: Count
@@ -349,13 +352,13 @@ def _write_readings(measurement: Measurement, folder: Path) -> None:
     write_record(folder / "comparison.json", ComparisonRecord(tolerance_m=causes.tolerance_m, rows=rows))
     write_record(folder / "measurement.json", measurement.metadata)
     if measurement.objects is not None:
-        write_record(folder / "objects.json", _objects_record(measurement.objects))
+        write_record(folder / "objects.json", objects_record(measurement.objects))
     if measurement.segmentation is not None:
         measurement.image.to_point_cloud().save(folder / "cloud.ply")
         write_arrays(folder / "segmentation.npz", vars(measurement.segmentation))
 
 
-def _objects_record(objects: ObjectSegmentation) -> ObjectsRecord:
+def objects_record(objects: ObjectSegmentation) -> ObjectsRecord:
     """The contents of `objects.json`."""
     quality = objects.panoptic_quality
     return ObjectsRecord(
@@ -430,6 +433,11 @@ def read_comparison(folder: Path) -> ComparisonRecord:
     return record
 
 
+def read_acquisition(folder: Path) -> MeasurementRecord:
+    """The contents of `measurement.json` in the directory of an instrument; FileFormatError if the file is broken."""
+    return read_record(folder / "measurement.json", MeasurementRecord)
+
+
 def _image_sizes(info: ResultRecord, path: Path) -> dict[int, dict[str, int]]:
     """Height "h" and width "w" of the camera of each pass in pixels, by the number of the pass."""
     sizes: dict[int, dict[str, int]] = {}
@@ -456,7 +464,7 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
     if image.camera != capture.rig.camera:
         raise FileFormatError(f"{folder / 'range.npz'}: expected the camera of the capture.")
     data = read_checked_arrays(folder / "causes.npz", _CAUSES, sizes)
-    metadata = read_record(folder / "measurement.json", MeasurementRecord)
+    metadata = read_acquisition(folder)
     if (metadata.sensor, metadata.frames, metadata.pixels) != (
         capture.sensor.type_name, len(capture.frames), capture.frames[0].size
     ):  # fmt: skip
