@@ -19,7 +19,7 @@ from rangesim.dataset.piles import GAP_M
 from rangesim.dataset.random_primitives import PRIMITIVES, primitive
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.transport_settings import TransportSettings
-from rangesim.settings.draws import Draw, Of, draw_table
+from rangesim.settings.draws import ANY_NUMBER, Draw, Of, draw_table
 from rangesim.triangle_mesh import TriangleMesh
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -44,7 +44,7 @@ def spec_of(**changes: Any) -> DatasetSpec:
 def test_draws_have_their_distributions() -> None:
     random = np.random.default_rng(0)
 
-    def values(plain: Any, of: Of = Of(float)) -> np.ndarray:
+    def values(plain: Any, of: Of = ANY_NUMBER) -> np.ndarray:
         return np.array([Draw.of(plain).value(random, of) for _ in range(4000)])
 
     assert np.mean(values({"uniform": [1, 3]})) == pytest.approx(2, abs=0.04)
@@ -252,7 +252,7 @@ def test_a_pile_lies_in_its_bin_and_nothing_intersects() -> None:
 def test_penetration_is_measured() -> None:
     ball = primitive("sphere", 0.05, np.random.default_rng(0)).mesh
     for overlap_m in (1e-3, 2e-4):
-        other = TriangleMesh(ball.vertices + [0.05 - overlap_m, 0, 0], ball.faces)
+        other = TriangleMesh(ball.vertices + np.array([0.05 - overlap_m, 0, 0]), ball.faces)
         assert penetration_m({"a": ball, "b": other}) == pytest.approx(overlap_m, abs=1e-4)
 
 
