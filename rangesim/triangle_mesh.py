@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +16,7 @@ from rangesim.settings.config import ShortRepr, shown
 _FACE = np.dtype([("n", "u1"), ("v", "<i4", 3)])
 """Layout of a triangle in a PLY file."""
 _HEAD = (
-    "ply\nformat binary_little_endian 1.0\ncomment coordinates world, metres\n"
+    "ply\nformat binary_little_endian 1.0\ncomment coordinates {coordinates}, metres\n"
     "element vertex {vertices}\nproperty double x\nproperty double y\nproperty double z\n"
     "element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
 )
@@ -167,10 +168,17 @@ class TriangleMesh(ShortRepr):
         path = Path(path)
         if path.suffix.lower() != ".ply":
             raise ValueError(f"expected a file name ending in .ply, got {path.name!r}.")
+        write_file(path, self.to_ply(), FileFormatError)
+
+    def to_ply(self, coordinates: Literal["world", "part"] = "world") -> bytes:
+        """The bytes of the file that `save` writes.
+
+        coordinates : what the vertices are coordinates of; the file says it in a comment.
+        """
         table = np.empty(len(self.faces), _FACE)
         table["n"], table["v"] = 3, self.faces
-        head = _HEAD.format(vertices=len(self.vertices), faces=len(self.faces))
-        write_file(path, head.encode() + self.vertices.astype("<f8").tobytes() + table.tobytes(), FileFormatError)
+        head = _HEAD.format(vertices=len(self.vertices), faces=len(self.faces), coordinates=coordinates)
+        return head.encode() + self.vertices.astype("<f8").tobytes() + table.tobytes()
 
     @classmethod
     def load(cls, path: str | Path) -> TriangleMesh:
@@ -188,7 +196,8 @@ class TriangleMesh(ShortRepr):
         head, end, body = content.partition(b"end_header\n")
         counts = re.findall(rb"element (?:vertex|face) ([0-9]{1,10})\n", head)
         n, m = map(int, counts) if len(counts) == 2 else (0, 0)
-        is_own = head + end == _HEAD.format(vertices=n, faces=m).encode()
+        kinds = [_HEAD.format(vertices=n, faces=m, coordinates=kind).encode() for kind in ("world", "part")]
+        is_own = head + end in kinds
         if not is_own or len(body) != 24 * n + _FACE.itemsize * m:
             raise FileFormatError(f"{path}: expected a mesh that rangesim wrote, complete.")
         table = np.frombuffer(body, _FACE, offset=24 * n)

@@ -19,6 +19,7 @@ from synthetic import plane_signals, stereo_rig
 
 import rangesim
 from rangesim import decode, explain, expose
+from rangesim.campaign import Workers
 from rangesim.codes import AxisCode, Code, FringeConvention, GrayPhase, GrayThresholds
 from rangesim.codes.fringe_gamma import FringeGamma
 from rangesim.codes.fringe_stack import FringeStack
@@ -272,6 +273,7 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (FirstReturn(), use_response),
     (TransientHistogram(0.0, 0.03, 16), use_response),
     (LengthSplit(0.0, 0.03, 16), use_response),
+    (Workers(), nothing),
     (ONE_BOX, use_spec),
     (BOXES, use_in_spec("objects")),
     (RoomLight(), use_in_spec("light")),
@@ -362,6 +364,7 @@ MODULES = (
         "decoding.triangulation",
         "decoding.disparities",
     ),
+    "campaign.workers",
     *("dataset.dataset_spec", "dataset.supports", "dataset.view_poses"),
     "geometry.dense_stereo",
     "response.correlation",

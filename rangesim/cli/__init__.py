@@ -17,12 +17,14 @@ from pcgraph.plumbing.plain_files import said
 from rangesim import __version__
 from rangesim.cli.calibrate import calibrate_command
 from rangesim.cli.compare import compare_command
+from rangesim.cli.dataset import app as dataset_app
 from rangesim.cli.decode import decode_command
 from rangesim.cli.patterns import patterns_command
 from rangesim.cli.presets import presets_command
 from rangesim.cli.report import report_command
 from rangesim.cli.run import run_command
 from rangesim.cli.scan import scan_command
+from rangesim.cli.sweep import sweep_command
 from rangesim.cli.verify import verify_command
 from rangesim.cli.view import view_command
 from rangesim.environment.doctor import doctor_command
@@ -33,6 +35,7 @@ app = typer.Typer(
 )
 app.command("run")(run_command)
 app.command("scan")(scan_command)
+app.command("sweep")(sweep_command)
 app.command("decode")(decode_command)
 app.command("calibrate")(calibrate_command)
 app.command("patterns")(patterns_command)
@@ -42,6 +45,7 @@ app.command("view")(view_command)
 app.command("verify")(verify_command)
 app.command("presets")(presets_command)
 app.command("doctor")(doctor_command)
+app.add_typer(dataset_app, name="dataset")
 
 
 def _version(wanted: bool) -> None:

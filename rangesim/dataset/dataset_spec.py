@@ -147,6 +147,7 @@ class DatasetSpec:
     light : RoomLight.
     instruments : tables as in an experiment's file, whose values may be distributions; `{choice = [...]}` is one of
         several values. A list is a choice too where an instrument holds a single value.
+    frames : whether the sensors' frames are kept, too; they take more space than all else together.
     spp, max_spp, max_depth, photons, glint : as of `rangesim.experiment.Experiment`.
 
     Raises
@@ -173,6 +174,7 @@ class DatasetSpec:
     view: View = Shell()
     light: RoomLight = RoomLight()
     instruments: tuple[Mapping[str, Any], ...] = tuple({"sensor": name} for name in DEFAULT_SENSORS)
+    frames: bool = False
     spp: Annotated[int, whole(1, "spp")] | None = None
     max_spp: Annotated[int, whole(1, "spp")] = 64
     max_depth: Annotated[int, whole(1, "depth")] = 5

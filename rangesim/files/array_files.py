@@ -64,6 +64,18 @@ def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], seal: str |
     ...     read_arrays(f"{folder}/depth.npz")["z"].shape
     (2, 3)
     """
+    write_file(Path(path), arrays_to_bytes(arrays, seal), FileFormatError)
+
+
+def arrays_to_bytes(arrays: Mapping[str, np.ndarray], seal: str | None = None) -> bytes:
+    """The bytes of the .npz file that `write_arrays` writes.
+
+    Examples
+    --------
+    >>> content = arrays_to_bytes({"z": np.ones((2, 3), np.float32)})
+    >>> arrays_from_bytes(content, "an example")["z"].shape
+    (2, 3)
+    """
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=COMPRESSION_LEVEL) as archive:
         for name, values in arrays.items():
@@ -71,7 +83,7 @@ def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], seal: str |
                 np.lib.format.write_array(entry, np.asarray(values), allow_pickle=False)
         archive.comment = unsealed(seal).encode() if seal else b""
     content = stream.getvalue()
-    write_file(Path(path), sealed(content, seal, at_end=True) if seal else content, FileFormatError)
+    return sealed(content, seal, at_end=True) if seal else content
 
 
 def read_arrays(
@@ -93,10 +105,26 @@ def read_arrays(
     FileFormatError
         The file is missing, broken or too large, lacks one of `names`, or holds objects.
     """
-    path = Path(path)
-    check_file(path, FileFormatError)
+    check_file(Path(path), FileFormatError)
+    return _arrays_in(Path(path), str(path), names, check)
+
+
+def arrays_from_bytes(
+    content: bytes, place: str, names: Iterable[str] | None = None, check: Check | None = None
+) -> dict[str, np.ndarray]:
+    """The arrays of the bytes of a .npz file, as `read_arrays` reads them of a file.
+
+    place : where the bytes come from, for messages.
+    """
+    return _arrays_in(io.BytesIO(content), place, names, check)
+
+
+def _arrays_in(
+    source: Path | io.BytesIO, path: str, names: Iterable[str] | None, check: Check | None
+) -> dict[str, np.ndarray]:
+    """The arrays of a .npz file; `path` is its name in messages."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(source) as archive:
             members = _members(archive, path)
             wanted = list(members) if names is None else list(names)
             missing = [name for name in wanted if name not in members]
@@ -147,7 +175,7 @@ def read_array(path: str | Path, check: Check | None = None) -> np.ndarray:
     return values.reshape(shape, order="F" if fortran_order else "C")
 
 
-def _members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
+def _members(archive: zipfile.ZipFile, path: str) -> dict[str, zipfile.ZipInfo]:
     entries = archive.infolist()
     if len(entries) > MAX_ARRAYS:
         raise FileFormatError(f"{path}: expected at most {MAX_ARRAYS} arrays, got {len(entries)}.")

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from rangesim.errors import FileFormatError
-from rangesim.files.array_files import read_arrays
+from rangesim.files.array_files import Check, arrays_from_bytes, read_arrays
 from rangesim.files.text_files import read_json
 from rangesim.settings import limits
 from rangesim.settings.config import shown
@@ -80,12 +80,16 @@ def read_record(path: Path, kind: type[R]) -> R:
 
 def write_record(path: Path, record: Record) -> None:
     """Write a record as indented JSON; `read_record` reads it back equal."""
+    path.write_bytes(record_bytes(record))
+
+
+def record_bytes(record: Record) -> bytes:
+    """The bytes of the file that `write_record` writes."""
     try:
         content = msgspec.json.encode(record)
     except UnicodeEncodeError:  # a file name that is not UTF-8 has lone surrogates, which `json` escapes
-        write_json(path, msgspec.to_builtins(record))
-    else:
-        path.write_bytes(msgspec.json.format(content, indent=1) + b"\n")
+        content = json.dumps(msgspec.to_builtins(record)).encode()
+    return msgspec.json.format(content, indent=1) + b"\n"
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
@@ -138,13 +142,35 @@ def read_checked_arrays(path: Path, specs: Mapping[str, ArraySpec], sizes: dict[
     """
     if not path.is_file():
         raise FileFormatError(f"{path} is missing.")
+    arrays = read_arrays(path, check=_header_check(str(path), specs, sizes))
+    return _with_checked_values(arrays, str(path), specs)
+
+
+def checked_arrays(
+    content: bytes, place: str, specs: Mapping[str, ArraySpec], sizes: dict[str, int]
+) -> dict[str, np.ndarray]:
+    """The arrays in the bytes of a .npz file, checked as `read_checked_arrays` checks those of a file.
+
+    place : where the bytes come from, for messages.
+    """
+    arrays = arrays_from_bytes(content, place, check=_header_check(place, specs, sizes))
+    return _with_checked_values(arrays, place, specs)
+
+
+def _header_check(path: str, specs: Mapping[str, ArraySpec], sizes: dict[str, int]) -> Check:
+    """A check of the names, types and shapes of arrays, which adds to `sizes`."""
 
     def check(name: str, place: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         if name not in specs:
             raise FileFormatError(f"{path}: expected the arrays {', '.join(specs)}, got {shown(name)} as well.")
         _check_header(shape, dtype, specs[name], sizes, place)
 
-    arrays = read_arrays(path, check=check)
+    return check
+
+
+def _with_checked_values(
+    arrays: dict[str, np.ndarray], path: str, specs: Mapping[str, ArraySpec]
+) -> dict[str, np.ndarray]:
     for name, spec in specs.items():
         if name in arrays:
             _check_values(arrays[name], spec, f"{path}: array {name!r}")
