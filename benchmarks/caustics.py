@@ -48,7 +48,7 @@ def photon_times(scene: Any, rig: Any, spp: int, repeats: int) -> tuple[int, np.
     from rangesim.light_transport.photon_maps import MAX_MAPS, PhotonMaps
     from rangesim.light_transport.photons import trace_photons
     from rangesim.light_transport.traced_scene import TracedScene
-    from rangesim.light_transport.transport_settings import PHOTONS
+    from rangesim.light_transport.transport_settings import MOST_PHOTONS as PHOTONS
 
     maps = min(spp, MAX_MAPS)
     trace = partial(trace_photons, TracedScene.of(scene.mitsuba, rig), rig.projector_power_w, PHOTONS, maps)

@@ -8,6 +8,7 @@ Without this, each kernel is compiled when it is first called. Either way it is 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,10 +45,12 @@ _SPACING = 0.01
 """Distance of neighbouring points, metres. Chosen by eye; not varied."""
 
 
+@cache
 def compile_kernels() -> None:
     """Compile what `pcgraph.segment` would otherwise compile in its first calls, with its defaults.
 
-    It segments two small clouds, one as a camera's image and one as a list, and calls what these two do not reach.
+    A process does so once; further calls do nothing. It segments two small clouds, one as a camera's image and one as a
+    list, and calls what these two do not reach.
     Results are the same without it.
     """
     image, normals = _image_of_a_step()

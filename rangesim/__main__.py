@@ -10,7 +10,7 @@ def main() -> None:
     """Run the command line."""
     from pcgraph.plumbing.interrupts import end_on_signals, run
 
-    end_on_signals("rangesim", writes=bool({"run", "scan", "decode", "report"} & set(sys.argv[1:3])))
+    end_on_signals("rangesim", writes=bool({"run", "scan", "decode", "report", "sweep"} & set(sys.argv[1:3])))
     from rangesim.cli import main as command
 
     run(command)

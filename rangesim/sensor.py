@@ -8,6 +8,7 @@ a range image. The sensors that come with the package are in `rangesim.sensors`;
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -298,6 +299,41 @@ class Background:
         return np.full(self.ambient.shape, max(fraction * self.bright, float(np.finfo(np.float32).tiny)))
 
 
+@dataclass(frozen=True)
+class ReceivedLight:
+    """Light that the pixels of a capture with noise received, as the closed forms of the noise need it.
+
+    `rangesim.evaluation.closed_forms` makes it from signals; `Decoder.depth_error_m` takes it. Electrons are those of
+    one exposure; of a photon counter, they are its counts in all bins together.
+
+    Parameters
+    ----------
+    emitter : (h, w) float64, electrons, light of the emitter at full power.
+    ambient : (h, w) float64, electrons, ambient light that passes the filter.
+    own_variance : float, electrons squared, variance that the detector itself adds to a frame, dark current included.
+    reading_m : (h, w) float64, metres, true reading: z, or the range of a camera that is no pinhole.
+    path_length_m : (h, w) float64, metres, true length of the path from the emitter to the surface and to the camera.
+    per_length : (h, w) float64, change of the reading per metre of path length there and back.
+    per_column, per_row : (h, w) float64, metres, change of the reading per projector pixel; NaN without such an axis.
+    pixel_columns, pixel_rows : (h, w) float64, projector pixels across that a camera's pixel covers; NaN likewise.
+    focal_px : float, focal length of the camera in pixels along its rows; NaN if it is no pinhole.
+    trials : float, number of pulses of which each can hide later photons; infinite if no photon is hidden.
+    """
+
+    emitter: np.ndarray
+    ambient: np.ndarray
+    own_variance: float
+    reading_m: np.ndarray
+    path_length_m: np.ndarray
+    per_length: np.ndarray
+    per_column: np.ndarray
+    per_row: np.ndarray
+    pixel_columns: np.ndarray
+    pixel_rows: np.ndarray
+    focal_px: float
+    trials: float = math.inf
+
+
 class FrameContent(NamedTuple):
     """Light and dark current in the frame, or group of frames, that decides about a reading.
 
@@ -332,6 +368,8 @@ class Decoder(Named, ABC):
     """Name in configuration files."""
     reads: ClassVar[type[Sensor]] = Sensor  # type: ignore[type-abstract]
     """Class of the sensors whose captures this decoder accepts."""
+    is_lower_bound: ClassVar[bool] = False
+    """Whether `depth_error_m` is a bound that no method can surpass, and not the error of this decoder's method."""
     working_range: Any = None
     """A `rangesim.decoding.working_range.WorkingRange`, outside which readings are refused; None: all are kept. A
     decoder with this setting has a field for it."""
@@ -369,6 +407,14 @@ class Decoder(Named, ABC):
     @abstractmethod
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         """(h, w) float64, least light of the emitter at full power that the thresholds accept, in `background.unit`."""
+
+    def depth_error_m(self, sensor: Sensor, light: ReceivedLight) -> np.ndarray | None:
+        """(h, w) float64, metres, root mean square error of a correct reading by a closed form; None if there is none.
+
+        It is the error by noise and by quantisation in direct light. It follows from the light alone, and shares no
+        code with the estimates that `coordinates` makes from frames.
+        """
+        return None
 
     @property
     def reach_px(self) -> int:

@@ -19,9 +19,13 @@ from synthetic import plane_signals, stereo_rig
 
 import rangesim
 from rangesim import decode, explain, expose
+from rangesim.campaign import Workers
 from rangesim.codes import AxisCode, Code, FringeConvention, GrayPhase, GrayThresholds
 from rangesim.codes.fringe_gamma import FringeGamma
 from rangesim.codes.fringe_stack import FringeStack
+from rangesim.dataset import DatasetSpec, ObjectGroup, RoomLight, spec_from_dict, spec_to_dict
+from rangesim.dataset.supports import Bin, Floor, Table
+from rangesim.dataset.view_poses import Path, Shell
 from rangesim.decoding.disparities import Disparities, ImageNoise
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
@@ -29,7 +33,7 @@ from rangesim.electronics.ambient import Ambient, Tungsten
 from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import RangesimWarning
-from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
+from rangesim.experiment import Experiment, Turntable, experiment_from_dict, experiment_to_dict
 from rangesim.geometry.dense_stereo import DenseMatching
 from rangesim.motion import ConstantTwist, Motion, PoseTrack, Timing
 from rangesim.presets import instrument
@@ -66,6 +70,7 @@ from rangesim.sensors import (
     ZnccDecoder,
 )
 from rangesim.settings.config import has_defaults
+from rangesim.settings.draws import Of
 from rangesim.signals import SignalSet
 
 NONSENSE = (
@@ -196,6 +201,18 @@ def use_experiment(experiment: Any) -> None:
     experiment_from_dict(experiment_to_dict(experiment))
 
 
+def use_spec(spec: DatasetSpec) -> None:
+    assert spec_from_dict(spec_to_dict(spec)) == spec
+
+
+BOXES = ObjectGroup("box")  # type: ignore[arg-type]
+ONE_BOX = DatasetSpec((BOXES,), instruments=({"sensor": "ideal-tof"},))
+
+
+def use_in_spec(name: str) -> Callable[[Any], None]:
+    return lambda part: use_spec(dataclasses.replace(ONE_BOX, **{name: (part,) if name == "objects" else part}))
+
+
 def nothing(_: Any) -> None: ...
 
 
@@ -256,6 +273,15 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (FirstReturn(), use_response),
     (TransientHistogram(0.0, 0.03, 16), use_response),
     (LengthSplit(0.0, 0.03, 16), use_response),
+    (Workers(), nothing),
+    (ONE_BOX, use_spec),
+    (BOXES, use_in_spec("objects")),
+    (RoomLight(), use_in_spec("light")),
+    (Table(), use_in_spec("support")),
+    (Floor(), use_in_spec("support")),
+    (Bin(), use_in_spec("support")),
+    (Shell(), use_in_spec("view")),
+    (Path(Turntable(centre_m=(0, 0, 0), distance_m=1.0, elevation_deg=45.0)), use_in_spec("view")),
 ]  # fmt: skip
 
 FIELDS = [
@@ -292,6 +318,8 @@ def ends(hint: Any) -> list[Any]:
     """The ends of the bounds that a field's annotation states; of a whole number, its limit or a moderate value."""
     if get_origin(hint) is Annotated:
         kind, bounds = get_args(hint)
+        if isinstance(bounds, Of):  # a setting that may be drawn
+            return ends(Annotated[bounds.kind, bounds.bounds]) if bounds.bounds else []
         low, high = bounds.low, min(bounds.high, 50)
         return [int(low), int(high)] if kind is int else [bounds.low, bounds.high, *([0.0] if bounds.or_zero else [])]
     if get_origin(hint) is tuple:
@@ -336,6 +364,8 @@ MODULES = (
         "decoding.triangulation",
         "decoding.disparities",
     ),
+    "campaign.workers",
+    *("dataset.dataset_spec", "dataset.supports", "dataset.view_poses"),
     "geometry.dense_stereo",
     "response.correlation",
     *(f"codes.{module.name}" for module in pkgutil.iter_modules(rangesim.codes.__path__)),

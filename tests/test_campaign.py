@@ -180,6 +180,14 @@ def test_a_file_in_the_way_is_said(tmp_path: Path) -> None:
         run_items(answer, {"a": 1}, ItemStore(tmp_path / "c"))
 
 
+def test_a_broken_file_is_said_before_anything_runs(tmp_path: Path) -> None:
+    store = ItemStore(tmp_path)
+    store.write("a", b"result", 1)
+    store._file("a").write_bytes(b"")
+    with pytest.raises(FileFormatError, match="is broken; delete it"):
+        run_items(answer, {"a": 1, "b": 2}, ItemStore(tmp_path))
+
+
 def test_one_process_at_a_time_has_a_directory(tmp_path: Path) -> None:
     store = ItemStore(tmp_path)
     with store.claimed(), pytest.raises(EnvironmentProblem, match="another process"):
@@ -258,7 +266,7 @@ class Million(Mapping[str, int]):
 
     def __getitem__(self, key: str) -> int:
         self.asked += 1
-        if self.asked > 100:
+        if self.asked > 50:
             raise KeyboardInterrupt
         return int(key[1:])
 
@@ -267,7 +275,7 @@ def test_a_lazy_campaign_is_submitted_in_a_window(tmp_path: Path, here: Workers)
     items, done = Million(), []
     with pytest.raises(KeyboardInterrupt):
         run_items(answer, items, ItemStore(tmp_path), here, on_done=done.append)
-    assert len(done) >= 40  # each item is asked for when it is submitted and when it is stored, and 4 are submitted
+    assert len(done) >= 15  # each item is asked for when it is submitted and when it is stored, and 4 are submitted
 
 
 def test_what_is_not_deterministic_is_said(tmp_path: Path, here: Workers) -> None:
@@ -277,10 +285,18 @@ def test_what_is_not_deterministic_is_said(tmp_path: Path, here: Workers) -> Non
         run_items(answer, items, ItemStore(tmp_path), here)
 
 
+def test_a_function_that_always_fails_ends_the_run(tmp_path: Path, here: Workers) -> None:
+    with pytest.raises(ValueError, match=r"the first 20 items all failed, .* by RuntimeError: no luck"):
+        run_items(answer, {f"i{n}": "raise" for n in range(100)}, ItemStore(tmp_path), here)
+
+
 def test_what_cannot_be_sent_is_refused(tmp_path: Path) -> None:
     lock = threading.Lock()
     with pytest.raises(ValueError, match="cannot be sent"):
         run_items(lambda x: repr(lock).encode(), {"a": 1}, ItemStore(tmp_path))
+    data = bytes(2 << 20)
+    with pytest.raises(ValueError, match="at most 1048576 bytes"):
+        run_items(lambda x: data, {"a": 1}, ItemStore(tmp_path))
 
 
 def test_a_worker_of_another_version_is_refused(tmp_path: Path, here: Workers, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,6 +57,7 @@ def test_captures_load_back_the_same(tmp_path: Path, sensor: Sensor, detector: P
     assert loaded.frames.tobytes() == capture.frames.tobytes()
     assert (loaded.sensor, loaded.rig, loaded.detector) == (capture.sensor, capture.rig, capture.detector)
     np.testing.assert_equal(loaded.exposure_s, capture.exposure_s)
+    assert loaded.exposure_is_automatic == capture.exposure_is_automatic == (detector is not None)
     suffix = ".exr" if detector is None else ".png"
     names = sorted(p.name for p in (tmp_path / "out" / "capture").glob("0*"))
     assert names == [f"{i:03d}_{name}{suffix}" for i, name in enumerate(sensor.frame_names())]

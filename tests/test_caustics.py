@@ -77,7 +77,7 @@ def test_the_length_of_light_through_a_slab_is_that_of_snell_s_law() -> None:
     camera_at, limit_m = 0.6, 1.5
     scene = scene_of(slab=slab(NEAR, FAR), wall=wall(PLANE, matte()))
     rig = rig_of(CAMERA, Intrinsics.from_fov(160, 120, 12), camera_at=(0.0, 0.0, camera_at))
-    signals = transport(scene, rig, [ShortPaths(limit_m)], spp=64, max_depth=2, caustic_radius_m=4e-3)
+    signals = transport(scene, rig, [ShortPaths(limit_m)], spp=64, max_depth=2, photons=500_000, caustic_radius_m=4e-3)
     across = across_of_pixels(CAMERA, PLANE - camera_at)
     path = SlabPath(PLANE, FAR - NEAR)
     light, optical = path.irradiance(across), path.length(path.tangent(across)) + np.hypot(across, PLANE - camera_at)

@@ -22,6 +22,7 @@ from small_result import ROOT, SCENES, SENSORS, small_result
 import rangesim
 from rangesim.cli import main
 from rangesim.cli.progress import progress_bar
+from rangesim.results.experiment_results import load_result
 from rangesim.rig.calibration_files import save_calibration
 
 PLANE = str(SCENES / "plane.xml")
@@ -74,7 +75,7 @@ def test_run_says_in_one_line_what_light_it_leaves_out(command: Command, tmp_pat
     assert answer.status == 0
     assert re.fullmatch(
         r"rangesim: about \d+% of the projector's light is left out: a max_depth of 4 ends light paths early; "
-        r"a larger one includes this light\.\n",
+        r"a larger one includes this light\.\nrangesim: the exposure is automatic: gray [\d.]+ .?s per frame\. .*\n",
         answer.err,
     )
 
@@ -162,7 +163,9 @@ def test_decode_of_a_real_capture(command: Command, tmp_path: Path, real_data: P
 def test_compare_and_report(command: Command, tmp_path: Path) -> None:
     answer = command("compare", small_result())
     assert answer.status == 0
-    assert all(word in answer.out for word in (*SENSORS, "transparent", "median error"))
+    assert all(word in answer.out for word in (*SENSORS, "transparent", "median error", "automatic"))
+    assert answer.err.startswith("rangesim: the exposure is automatic: lines ")
+    assert answer.err.endswith("state exposure_s to compare them.\n")
     answer = command("compare", small_result(), "--markdown")
     assert answer.out == (small_result() / "comparison.md").read_text(encoding="utf-8")
     copy = tmp_path / "copy"
@@ -170,6 +173,51 @@ def test_compare_and_report(command: Command, tmp_path: Path) -> None:
     (copy / "report.html").unlink()
     assert command("report", copy).status == 0
     assert (copy / "report.html").read_bytes() == (small_result() / "report.html").read_bytes()
+
+
+def test_compare_takes_another_tolerance(command: Command, tmp_path: Path) -> None:
+    """A tolerance of the run prints its tables; another one counts the readings anew, and names no causes for them."""
+    stored = command("compare", small_result(), "--markdown").out
+    assert "Right readings are off by at most 10 mm." in stored
+    assert command("compare", small_result(), "--markdown", "--tolerance", "1cm").out == stored
+    loose = command("compare", small_result(), "--markdown", "--tolerance", "0.1").out
+    assert "Right readings are off by at most 100 mm." in loose
+    assert "because" not in loose
+
+    def right(text: str) -> list[float]:
+        lines = [line.split(" | ") for line in text.splitlines() if line.startswith("| object ")]
+        return [float(cells[2]) for cells in lines if cells[2].replace(".", "").isdigit()]
+
+    before, after = right(stored), right(loose)
+    assert len(before) == len(after) > len(SENSORS)
+    assert all(a >= b for a, b in zip(after, before, strict=True))
+    assert sum(after) > sum(before)
+    copy = tmp_path / "copy"
+    shutil.copytree(small_result(), copy)
+    for path in copy.glob("*/comparison.json"):
+        path.write_text(path.read_text().replace('"tolerance_m": 0.01', '"tolerance_m": 0.002'))
+    answer = command("compare", small_result(), copy)
+    assert answer.status == 1
+    assert re.search(r"expected results of one tolerance, got 10 mm \(.*\) and 2 mm \(.*\); state one", answer.err)
+    assert command("compare", small_result(), copy, "--tolerance", "2mm").status == 0
+
+
+def test_run_takes_a_tolerance_with_a_unit(command: Command, tmp_path: Path) -> None:
+    (tmp_path / "one.toml").write_text(f'scene = "{PLANE}"\ntolerance_m = "0.5 mm"\n[[instrument]]\nsensor = "amcw"\n')
+    for options, tolerance_m in (((), 0.0005), (("--tolerance", "2mm"), 0.002)):
+        answer = command("run", "--config", tmp_path / "one.toml", *TINY, *options, "--out", tmp_path / "out")
+        assert answer.status == 0, answer.err
+        result = load_result(tmp_path / "out")
+        (m,) = result.measurements
+        assert result.experiment.tolerance_m == m.causes.tolerance_m == tolerance_m
+        off = np.abs(m.image.reading_m - m.true_m)
+        assert m.row("all")["right"] == pytest.approx(np.mean(off <= tolerance_m))
+        assert m.row("all")["missing"] == pytest.approx(np.isnan(off).mean())
+        assert sum(m.row("all")["causes"].values()) == pytest.approx(1 - m.row("all")["right"])
+    answer = command("run", PLANE, "--tolerance", "2 feet", "--out", tmp_path / "feet")
+    assert answer.status == 2
+    assert "such as" in answer.err
+    assert "'2mm'" in answer.err
 
 
 @pytest.mark.parametrize("options", [[], ["--markdown"]])

@@ -135,8 +135,24 @@ def of_objects(sizes: dict[str, int], material: str = "matte") -> GroundTruth:
     instance = np.repeat(np.arange(len(sizes)), list(sizes.values()))[None]
     truth = truth_of(np.ones(instance.shape), np.zeros_like(instance))
     names = tuple(sizes)
-    named = {"instance_names": names, "instance_objects": names, "material_names": (material,)}
-    return dataclasses.replace(truth, instance=instance, **named)
+    return dataclasses.replace(
+        truth, instance=instance, instance_names=names, instance_objects=names, material_names=(material,)
+    )
+
+
+def test_an_object_of_several_shapes_is_one_object_with_parts() -> None:
+    """A cup of a body and a handle before a wall; background is no object, and a part weighs nothing of its own."""
+    truth = of_objects({"body": 90, "handle": 10, "ball": 20, "wall": 80})
+    truth = dataclasses.replace(truth, instance_objects=("cup", "cup", "ball", ""))
+    measured = np.ones(truth.z.shape)
+    measured[0, 90:100] = np.nan
+    result = compare(image_of(measured), truth)
+    names = ["objects", "cup", "ball", "body", "handle", "matte", "all"]
+    assert [row.name for row in result.table] == names
+    assert (result.row("cup").right, result.row("handle").right, result.row("body").right) == (0.9, 0.0, 1.0)
+    assert result.row("handle").kind == "part"
+    assert result.row("objects").right == pytest.approx(0.95)
+    assert result.row("all").right == 0.95
 
 
 @pytest.mark.parametrize("pixels", [8, 80, 8000])

@@ -81,6 +81,7 @@ def test_auto_exposure_puts_the_bright_pixels_at_its_target() -> None:
     rig, detector = stereo_rig(), Detector()
     for ambient in (0.0, 5.0):
         capture = expose(plane_signals(rig, SENSOR, ambient=ambient), SENSOR, detector)
+        assert capture.exposure_is_automatic
         brightest = (capture.frames.max(axis=0) - detector.offset_dn) / (detector.max_dn - detector.offset_dn)
         assert abs(np.percentile(brightest, BRIGHT_PERCENTILE) - TARGET_FRACTION) < 0.03
         assert not capture.saturated(capture.frames).any()
@@ -243,6 +244,8 @@ def test_without_a_detector_frames_are_the_radiance() -> None:
     assert capture.detector is None
     assert np.isnan(capture.exposure_s)
     assert expose(signals, IdealToF(), Detector()).detector is None
+    assert not capture.exposure_is_automatic
+    assert not expose(signals, SENSOR, Detector(), exposure_s=1e-3).exposure_is_automatic
 
 
 def test_detectors_are_settings() -> None:

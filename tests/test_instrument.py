@@ -96,6 +96,7 @@ def test_an_instrument_has_rays_of_its_own_and_a_beam(plane: Scene) -> None:
 
 
 def test_a_pass_is_shared_where_emitter_and_camera_agree(plane: Scene) -> None:
+    """Each instrument keeps its wavelength. What is left out without the sampling error changes no reading."""
     near_infrared = Instrument("a", AmcwToF())
     others = (
         Instrument("ideal", IdealToF()),

@@ -28,6 +28,7 @@ from rangesim.causes import Cause, CauseMap
 from rangesim.cli import app
 from rangesim.decoding.status import Status
 from rangesim.environment.doctor import find_browser
+from rangesim.evaluation.object_segmentation import ObjectOutcome, ObjectSegmentation, Outcome
 from rangesim.evaluation.surface_rows import with_mean_over_objects
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
@@ -35,8 +36,10 @@ from rangesim.pipeline.experiment_run import carry_out
 from rangesim.report import palette, render_report, tables, write_report
 from rangesim.report.clouds_page import render_clouds_page
 from rangesim.report.experiment_page import by_camera
+from rangesim.report.objects_section import objects_sentence, objects_table
+from rangesim.report.printing import pdf_of
 from rangesim.report.verdict import verdict
-from rangesim.results.experiment_results import PhotonsRecord, load_result, write_result
+from rangesim.results.experiment_results import PhotonsRecord, Result, load_result, write_result
 from rangesim.rig import Intrinsics
 from rangesim.sensors import IdealToF
 
@@ -60,12 +63,12 @@ def test_it_is_one_file_that_needs_no_network(html: str) -> None:
 
 
 def test_every_part_is_there(html: str) -> None:
-    for part in ("scene", "numbers", "maps", "clouds", "captures", "light", "cost", "settings"):
+    for part in ("scene", "numbers", "objects", "maps", "clouds", "captures", "light", "cost", "settings"):
         assert f'id="{part}"' in html
     for title in ("Structured light", "Time of flight (AMCW)", "Time of flight (direct)", "Ideal time of flight"):
         assert f"<h3>{title}" in html
     assert [int(n) for n in re.findall(r'<b class="number">Figure (\d+)', html)] == list(range(1, 7))
-    assert [int(n) for n in re.findall(r'<b class="number">Table (\d+)', html)] == list(range(1, 6))
+    assert [int(n) for n in re.findall(r'<b class="number">Table (\d+)', html)] == list(range(1, 7))
     assert html.count('class="cloud"') == html.count('class="labels"') == len(SENSORS)
 
 
@@ -73,7 +76,7 @@ def test_the_table_shows_the_statistics(html: str) -> None:
     for m in load_result(small_result()).measurements:
         for row in m.rows:
             assert f">{tables.number(tables.OUTCOMES[1], row['wrong'])}</td>" in html
-            if row["kind"] != "object":
+            if row["kind"] not in ("object", "part"):
                 assert f">{tables.number(MEDIAN, row['median_abs_m'])}</span>" in html
 
 
@@ -165,11 +168,13 @@ def test_the_verdict_says_what_the_rows_say() -> None:
     fair = _measured("histogram", acquisition_s=0.3, cup=(0.88, 0.02, 2e-3), pot=(0.3, 0.2, 2e-3))
     both, first, second, _ = (f.text.replace("\xa0", " ") for f in verdict([good, poor, fair]))
     assert "reads 95.0 % of the objects’ pixels right, to 10 mm, and 1.0 % wrong; 4.0 % are missing." in first
-    assert "right on most of each of 2 objects; worst: pot (91 % right, 1 % wrong, 8 % missing; multipath)." in first
+    assert (
+        "Most pixels are right on 2 of 2 objects; worst: pot (91 % right, 1 % wrong, 8 % missing; multipath)." in first
+    )
     assert "Causes of what is wrong or missing: 80 % multipath, 20 % low signal." in first
     assert "Half of its readings on an object lie, on average, within 1.50 mm of the true depth" in first
     assert (
-        "right on most of none of the objects; worst: pot (0 % right, 100 % wrong, 0 % missing; multipath), "
+        "Most pixels are right on 0 of 2 objects; worst: pot (0 % right, 100 % wrong, 0 % missing; multipath), "
         "cup (12 % right, 28 % wrong, 60 % missing; multipath)."
     ) in second
     assert "Most of the objects’ pixels right, to 10 mm: Structured light, 95.0 % (next: " in both
@@ -181,6 +186,59 @@ def test_the_verdict_says_what_the_rows_say() -> None:
 
 def _side_by_side(*measurements: Any) -> str:
     return verdict(list(measurements))[0].text.replace("\xa0", " ")
+
+
+def outcome(name: str, kind: Outcome = Outcome.FOUND, *merged_with: str, **rest: Any) -> ObjectOutcome:
+    return ObjectOutcome(name, 100, 0.9, 0.8, kind, merged_with=merged_with, **rest)
+
+
+@pytest.mark.parametrize(
+    ("objects", "invented", "sentence"),
+    [
+        ([outcome("a"), outcome("b")], 0, "Of 2 objects it finds 2."),
+        ([outcome("a")], 1, "Of 1 object it finds 1; it invents 1."),
+        (
+            [outcome("cup"), outcome("bottle", Outcome.MERGED, "table"), outcome("glass", Outcome.MISSED)],
+            2,
+            "Of 3 objects it finds 1, merges bottle with table, and misses glass; it invents 2.",
+        ),
+        (
+            [outcome("a", Outcome.MERGED, "b"), outcome("b", Outcome.MERGED, "a"), outcome("c", displaced=True)],
+            0,
+            "Of 3 objects it finds none, displaces c by over 10\u00a0mm, and merges a and b.",
+        ),
+        (
+            [*(outcome(n, Outcome.MISSED) for n in "abcde"), outcome("f", Outcome.SPLIT)],
+            0,
+            "Of 6 objects it finds none, splits f, and misses a, b, c and 2 more.",
+        ),
+        (
+            [outcome("a"), outcome("lid", Outcome.MERGED, "a", separable=False)],
+            0,
+            "Of 2 objects it finds 1. Even in the true depth the segmentation does not find lid.",
+        ),
+        ([], 0, ""),
+    ],
+)
+def test_a_sentence_says_what_becomes_of_the_objects(
+    objects: list[ObjectOutcome], invented: int, sentence: str
+) -> None:
+    m = load_result(small_result()).measurements[0]
+    assert objects_sentence(replace(m, objects=ObjectSegmentation(tuple(objects), invented))) == sentence
+    assert objects_sentence(replace(m, objects=None)) == ""
+
+
+def test_the_table_of_objects_has_a_row_for_each_and_none_where_it_is_not_known(html: str) -> None:
+    result = load_result(small_result())
+    for m in result.measurements:
+        assert objects_sentence(m) in html
+    lines = objects_table(result.measurements)
+    assert [line.name for line in lines] == list(result.measurements[0].truth.object_names)
+    assert all(len(line.cells) == len(SENSORS) for line in lines)
+    unknown = tuple(replace(m, objects=None) for m in result.measurements)
+    assert 'id="objects"' not in render_report(replace(result, measurements=unknown))
+    seen_by_one = [result.measurements[0], replace(result.measurements[1], objects=ObjectSegmentation((), 0))]
+    assert {line.cells[1].note for line in objects_table(seen_by_one)} == {"not in view"}
 
 
 def test_side_by_side_ranks_by_right_readings() -> None:
@@ -213,7 +271,9 @@ def test_without_objects_the_verdict_is_about_materials() -> None:
     (finding,) = verdict([scene])
     text = finding.text.replace("\xa0", " ")
     assert "reads 65.0 % of the pixels right, to 10 mm, and 30.0 % wrong; 5.0 % are missing." in text
-    assert "right on most of 1 of 2 materials; worst: gloss (40 % right, 60 % wrong, 0 % missing; multipath)." in text
+    assert (
+        "Most pixels are right on 1 of 2 materials (matte); worst: gloss (40 % right, 60 % wrong, 0 % missing" in text
+    )
 
 
 def test_no_measurement_is_bold_for_being_there() -> None:
@@ -230,6 +290,26 @@ def test_no_bold_where_a_sensor_is_unreliable() -> None:
     assert not any(_bold(good, few).values())
 
 
+def test_automatic_exposures_are_said() -> None:
+    cup = (0.98, 0.01, 5e-3)
+    chosen = _measured("lines", acquisition_s=0.2, is_automatic=True, cup=cup)
+    stated = _measured("amcw", acquisition_s=0.1, cup=cup)
+    said = verdict([chosen, stated])[-1]
+    assert said.subject == "Exposure"
+    assert said.text.startswith("is automatic: Structured light 20 ms per frame.")
+    assert "AMCW" not in said.text
+    assert "Exposure" not in [finding.subject for finding in verdict([stated])]
+    assert [tables.exposure(m.metadata) for m in (chosen, stated)] == ["20 ms automatic", "10 ms"]
+
+
+def test_the_page_says_which_exposures_are_automatic(html: str) -> None:
+    assert ", seed 3, exposure automatic<" in html
+    for m in load_result(small_result()).measurements:
+        assert m.metadata.exposure_is_automatic == m.capture.reference.exposure_is_automatic
+        assert m.metadata.exposure_is_automatic != m.capture.sensor.is_ideal
+        assert (f"<td>{tables.seconds(m.metadata.exposure_s)} automatic</td>" in html) != m.capture.sensor.is_ideal
+
+
 def _bold(*measurements: Any) -> dict[str, list[str]]:
     """Titles of the bold columns of each instrument, in the rows for all surfaces."""
     outcomes, errors = tables.outcome_table(measurements), tables.comparison_table(measurements)
@@ -240,7 +320,9 @@ def _bold(*measurements: Any) -> dict[str, list[str]]:
     }
 
 
-def _measured(sensor: str, acquisition_s: float = 0.1, kind: str = "object", **surfaces: Any) -> Any:
+def _measured(
+    sensor: str, acquisition_s: float = 0.1, kind: str = "object", is_automatic: bool = False, **surfaces: Any
+) -> Any:
     """A measurement, from the fractions right and wrong and the median error, metres, of each of its surfaces."""
     surfaces["all"] = np.mean(list(surfaces.values()), axis=0).tolist()
     rows = []
@@ -255,7 +337,9 @@ def _measured(sensor: str, acquisition_s: float = 0.1, kind: str = "object", **s
         capture=SimpleNamespace(sensor=SENSORS[sensor]),
         camera=Intrinsics.from_fov(4, 3, fov_x_deg=40.0),
         rows=with_mean_over_objects(rows),
-        metadata=SimpleNamespace(acquisition_s=acquisition_s, frames=10),
+        metadata=SimpleNamespace(
+            acquisition_s=acquisition_s, frames=10, exposure_s=acquisition_s / 10, exposure_is_automatic=is_automatic
+        ),
         causes=CauseMap(np.zeros((3, 4), np.uint8), 0.01),
     )
 
@@ -372,6 +456,49 @@ def test_photons_per_pulse_have_two_digits() -> None:
     for value, text in shown.items():
         said = tables.photons(PhotonsRecord(median=value, largest=3e4))
         assert said == f"{text} photons detected per pulse in the median pixel, 30 000 in the brightest"
+
+
+def _with_long_names(count: int) -> Result:
+    """The small result with so many measurements, of which two have the same sensor and names of 40 characters."""
+    result = load_result(small_result())
+    lines = result.measurements[0]
+    twins = tuple(replace(lines, name=f"left_camera_of_{letter * 25}") for letter in "ab")
+    measurements = (*twins, *result.measurements[1:])[:count]
+    return replace(result, measurements=measurements, passes=result.passes[: max(m.light_pass for m in measurements)])
+
+
+@needs_browser
+@pytest.mark.parametrize(
+    ("count", "paper", "points"),
+    [(5, "A4", (595, 842)), *to_validate((1, "letter", (612, 792)), (2, "A4", (595, 842)))],
+)
+def test_it_prints_on_two_pages(count: int, paper: str, points: tuple[int, int]) -> None:
+    assert BROWSER is not None
+    pdf = pdf_of(render_report(_with_long_names(count), paper), BROWSER)
+    sizes = re.findall(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", pdf)
+    assert [(round(float(w)), round(float(h))) for w, h in sizes] == [points, points]
+
+
+@needs_browser
+@pytest.mark.parametrize("width", [1280, *to_validate(400)])
+def test_nothing_is_cut_when_it_prints(tmp_path: Path, width: int) -> None:
+    """Also in a narrow window, and in dark mode: what is printed does not depend on the window."""
+    write_report(_with_long_names(5), tmp_path / "report.html")
+    with browser(tmp_path) as page:
+        page.call("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=False)
+        dark = [{"name": "prefers-color-scheme", "value": "dark"}]
+        page.call("Emulation.setEmulatedMedia", features=dark)
+        page.open(tmp_path / "report.html")
+        page.evaluate("dispatchEvent(new Event('beforeprint'))")
+        page.call("Emulation.setEmulatedMedia", media="print", features=dark)
+        sheets = page.evaluate("""[...document.querySelectorAll(".sheet")].map((sheet) => {
+            const { right, height } = sheet.getBoundingClientRect();
+            const outside = [...sheet.querySelectorAll("*")].filter((e) => e.getBoundingClientRect().right > right + 1);
+            return [height, outside.map((e) => e.outerHTML.slice(0, 99))]; })""")
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    for height, outside in sheets:
+        assert height <= 252 / 25.4 * 96 + 1
+        assert outside == []
 
 
 @needs_browser

@@ -138,6 +138,14 @@ def test_a_table_with_legs_is_as_flat_as_its_top_and_a_hollow_vessel_is_not_flat
     assert objects(before) == {"vase", "ball"}
 
 
+def test_a_ring_around_a_ball_is_no_container(tmp_path: Path) -> None:
+    import trimesh
+
+    trimesh.creation.torus(0.1, 0.03).apply_translation([0, 0, 0.03]).export(tmp_path / "ring.ply")
+    ring = {"type": "ply", "filename": str(tmp_path / "ring.ply"), "bsdf": GREY}
+    assert objects(scene({**TABLE, "ring": ring, "ball": ball(0.03, [0, 0, 0.03])})) == {"ring", "ball"}
+
+
 @pytest.mark.parametrize(
     ("name", "background", "count"),
     [

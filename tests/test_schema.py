@@ -79,6 +79,9 @@ JSON_DAMAGES: list[tuple[str, Edit, str]] = [
     ("lines/comparison.json", put("format_version", 1), r"expected format version 2, got 1; write it anew"),
     ("lines/comparison.json", lambda d: d["rows"].pop(), r"one row per object and material, one 'all'"),
     ("lines/comparison.json", lambda d: d["rows"].append(d["rows"][0]), r"one row per object and material"),
+    ("lines/objects.json", put("objects.0.outcome", "lost"), r"Invalid enum value 'lost', at objects"),
+    ("lines/objects.json", put("objects.0.covering", 1.5), r"expected float <= 1.0, at objects"),
+    ("lines/objects.json", put("invented", -1), r"expected int >= 0, at invented"),
     ("lines/measurement.json", put("pixels", 0), r"expected sensor, frames and pixels of the capture"),
     ("lines/measurement.json", put("exposure_s", 0.0), r"expected float > 0"),
     ("histogram/measurement.json", put("photons_per_pulse", {"median": 1.0, "largest": -1.0}), r"expected float >= 0"),
@@ -123,6 +126,23 @@ def test_damaged_results_are_refused(original: Path, name: str, edit: Edit, mess
         assert "\n" not in str(caught.value)
     finally:
         path.write_bytes(before)
+
+
+def test_results_that_do_not_tell_of_objects_are_read(original: Path) -> None:
+    """As older versions wrote them: no `objects.json`, no objects in the pass, none in the settings."""
+    paths = [original / name for name in ("lines/objects.json", "pass_1.npz", "experiment.json")]
+    before = [path.read_bytes() for path in paths]
+    try:
+        paths[0].unlink()
+        edit_arrays(paths[1], drop("truth_instance_objects"))
+        edit_json(paths[2], lambda d: [shape.pop("object") for shape in d["scene"]["shapes"]])
+        result = load_result(original)
+        assert result.measurements[0].objects is None
+        assert result.measurements[0].truth.object_names == ()
+        assert "Structured light" in render_report(result)
+    finally:
+        for path, content in zip(paths, before, strict=True):
+            path.write_bytes(content)
 
 
 @pytest.mark.parametrize("name", ["experiment.json", "pass_1.npz", "lines/range.npz", "lines/comparison.json"])

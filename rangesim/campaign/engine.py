@@ -36,6 +36,8 @@ WINDOW_PER_WORKER = 4
 """Items that are submitted for each worker, so that none waits for the driver, and that 10^6 items need no memory."""
 OWN_DEATHS = 3
 """Deaths of its worker, while it runs alone, that prove an item to be their cause."""
+MAX_FUNCTION = 1 << 20
+"""Bytes of a function with all that it takes along. It is sent with each item, and should cost less than the result."""
 FIRST_LIMIT_S = 3600.0
 """Seconds that an item may take as long as it is not known how long items take."""
 LIMIT_FACTOR = 30.0
@@ -47,6 +49,10 @@ KNOWN_AFTER = 5
 MIN_REPEATED = 20
 """Items that a run computes at least if it computes one of them twice, to see whether the bytes are the same. So the
 second time costs at most 5 %."""
+FIRST_FAILURES = 20
+"""Failures without any success that end a run: the function is at fault, and not the items."""
+MAX_LOSSES = 5
+"""Times that the scheduler may be lost without an item done in between."""
 POLL_S = 1.0
 """Seconds between two looks at the connection and at the number of workers, while no item ends."""
 
@@ -107,8 +113,8 @@ def run_items(
     Raises
     ------
     ValueError
-        A key cannot be the name of an item, the function cannot be sent to a worker or is not deterministic, or the
-        directory holds a campaign of other settings.
+        A key cannot be the name of an item; the function cannot be sent to a worker, is not deterministic or fails for
+        all of the first items; or the directory holds a campaign of other settings.
     EnvironmentProblem
         Dask is missing, no worker can be reached, a worker has other versions, another process works in the same
         directory, or the disk is full. What is done is kept.
@@ -118,6 +124,11 @@ def run_items(
     >>> outcome = run_items(sample_bytes, {"sample-0": 0}, ItemStore("out/set"))  # doctest: +SKIP
     """
     sent_function = pickled(function)
+    if len(sent_function) > MAX_FUNCTION:
+        raise ValueError(
+            f"expected a function of at most {MAX_FUNCTION} bytes, got {len(sent_function)}: it goes to the workers "
+            "with every item, so let it read large data from files."
+        )
     made_with = all_versions()
     for key in items:
         check_key(key)
@@ -181,13 +192,19 @@ class _Run:
 
     def carry_out(self, workers: Workers) -> None:
         """Carry out all items; go on after the scheduler was lost."""
-        answer_s = FIRST_ANSWER_S
+        answer_s, losses = FIRST_ANSWER_S, 0
         while self.left:
             self.report()
+            left = self.left
             try:
                 with workers.connected(answer_s) as client:
                     _Session(self, client, workers).carry_out()
-            except _SchedulerLost:
+            except _SchedulerLost as loss:
+                losses = losses + 1 if self.left == left else 0
+                if losses == MAX_LOSSES:
+                    raise EnvironmentProblem(
+                        f"the scheduler was lost {losses} times without an item done in between; {self.how_to_go_on()}."
+                    ) from loss
                 self.tell(f"waiting for the scheduler, {self.how_to_go_on()}", self._fraction())
                 answer_s = WAIT_S
             except EnvironmentProblem as problem:
@@ -214,6 +231,11 @@ class _Run:
         self.failed += 1
         self.suspects.pop(key, None)
         self.report()
+        if self.failed >= FIRST_FAILURES and not self.kept + self.computed:
+            raise ValueError(
+                f"the first {self.failed} items all failed, {key} by {error}; mend the function, and choose another "
+                f"directory; the tracebacks are in {self.store.directory / 'quarantine'}."
+            )
 
     def learn(self, reply: Reply) -> None:
         """Take note of the warnings, the time and the memory of an item."""
@@ -273,7 +295,7 @@ class _Session:
         self.count = 1
         self.sharing = 1
         self.seen_workers = time.monotonic()
-        client.subscribe_topic(self.topic, lambda event: self.news.put(_Ended(**event[1])))
+        client.subscribe_topic(self.topic, self._hear)
 
     def carry_out(self) -> None:
         """Carry out the unfinished items, and at the end each suspect alone."""
@@ -290,10 +312,13 @@ class _Session:
         self.alone = True
         while run.suspects:
             key = next(iter(run.suspects))
+            start = time.monotonic()
             self._submit(key)
             self._drain()
             if (deaths := run.suspects.get(key, 0)) >= OWN_DEATHS:
-                run.quarantine(key, f"its worker process died {deaths} times while nothing else ran", "", deaths)
+                took = duration((time.monotonic() - start) / deaths)
+                error = f"its worker process died {deaths} times while nothing else ran, every {took}"
+                run.quarantine(key, error, "", deaths)
 
     def _submit(self, key: str, repeats: bool = False) -> None:
         run, number = self.run, self.number
@@ -304,6 +329,11 @@ class _Session:
         self.submitted[number] = _Submitted(key, future, repeats)
         run.repeated |= repeats
         future.add_done_callback(lambda _: self.news.put(_Ended(number)))
+
+    def _hear(self, event: tuple[float, dict[str, Any]]) -> None:
+        """Take note of an item that hangs, in Dask's thread."""
+        told = event[1]
+        self.news.put(_Ended(told["number"], told["where"], told["limit_s"]))
 
     def _drain(self) -> None:
         while self.submitted:

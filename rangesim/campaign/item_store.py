@@ -8,6 +8,7 @@ DIR/quarantine/KEY.json      an item that failed: its argument, the error and th
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -128,10 +129,13 @@ class ItemStore:
     def check_argument(self, key: str, argument: Any) -> bool:
         """Return True if the stored item was computed from this argument; ValueError if it was from another one.
 
-        Only numbers, texts, arrays, dataclasses, and lists and dictionaries of them are compared.
+        Only numbers, texts, arrays, dataclasses, and lists and dictionaries of them are compared. FileFormatError if
+        the file is broken.
         """
         with self._file(key).open("rb") as stream:
             head = stream.read(_HEAD)
+        if len(head) < _HEAD or not head.startswith(MARK):
+            raise FileFormatError(f"{self._file(key)} is broken; delete it and run the campaign again.")
         then, now = head[len(MARK) : len(MARK) + 32], _digest_of_argument(argument)
         if then != now and _UNKNOWN not in (then, now):
             raise ValueError(
@@ -195,20 +199,17 @@ class ItemStore:
         """Keep other processes from running a campaign in the directory while the block runs."""
         with self._saying_why():
             self.directory.mkdir(parents=True, exist_ok=True)
-        if fcntl is None:
-            yield
-            return
-        handle = os.open(self.directory, os.O_RDONLY)
+            handle = os.open(self.directory, os.O_RDONLY) if fcntl is not None else None
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if handle is not None and not _locked(handle):
+                raise EnvironmentProblem(
+                    f"another process is running a campaign in {self.directory}; wait until it has ended, or choose "
+                    "another directory."
+                )
             yield
-        except BlockingIOError:
-            raise EnvironmentProblem(
-                f"another process is running a campaign in {self.directory}; wait until it has ended, or choose "
-                "another directory."
-            ) from None
         finally:
-            os.close(handle)
+            if handle is not None:
+                os.close(handle)
 
     # ---- Files -----------------------------------------------------------------------------------------------------
 
@@ -233,6 +234,18 @@ class ItemStore:
             yield
         except OSError as problem:
             raise EnvironmentProblem(f"cannot write to {self.directory}: {why(problem)}.") from problem
+
+
+def _locked(handle: int) -> bool:
+    """Whether a directory is locked for this process now; True also on file systems that have no locks."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as problem:
+        if problem.errno not in (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP):  # Lustre without flock, and others
+            raise
+    return True
 
 
 def check_key(key: str) -> None:

@@ -5,15 +5,17 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Annotated, Any
 
 from rangesim.campaign.in_worker import THREAD_VARIABLES
 from rangesim.errors import EnvironmentProblem
-from rangesim.settings.bounds import check_fields, whole
+from rangesim.settings.bounds import Bounds, check_fields
 
 if TYPE_CHECKING:
     from distributed import Client, LocalCluster
@@ -26,6 +28,8 @@ FIRST_ANSWER_S = 10.0
 WAIT_S = 300.0
 """Seconds that a run waits for a scheduler that it has lost, and for workers if there are none: long enough for a
 restart by systemd, Kubernetes or by hand, short enough not to hold an allocation of a cluster for hours."""
+COUNT = Bounds("a whole number of processes", 1, 1024, kind=int)
+"""Bounds of the count of workers on one machine, above the cores of any."""
 BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables of the threads of BLAS and of OpenMP."""
 
@@ -41,7 +45,7 @@ class Workers:
         processes are started on this machine, and end with the run.
     """
 
-    count: Annotated[int | None, whole(1)] = None
+    count: Annotated[int, COUNT] | None = None
     scheduler: str | None = None
 
     def __post_init__(self) -> None:
@@ -102,13 +106,14 @@ def cores() -> int:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep Dask from logging deaths of workers on stderr while the block runs; the outcome tells them."""
-    logger = logging.getLogger("distributed")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
+    handlers = [(handler, handler.level) for handler in logging.getLogger("distributed").handlers]
+    for handler, _ in handlers:  # all of Dask's loggers have these
+        handler.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        logger.setLevel(level)
+        for handler, level in handlers:
+            handler.setLevel(level)
 
 
 @contextmanager
@@ -135,6 +140,36 @@ def _client_of(scheduler: str, answer_s: float) -> Iterator[Client]:
 
 
 @contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Keep Ctrl-C from the threads and processes that the block starts, and from all that those start: the driver alone
+    ends on it, and its workers with it."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # the first call would let interrupts through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _started(kind: Callable[..., LocalCluster], **options: Any) -> LocalCluster:
+    """A cluster that has started; EnvironmentProblem if its processes do not start."""
+    try:
+        with _without_interrupts():
+            return kind(**options)
+    except RuntimeError as problem:
+        cause: BaseException = problem
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        raise EnvironmentProblem(
+            f"worker processes could not be started ({cause}); a script has to do its work below if __name__ == "
+            "'__main__', because every worker imports it."
+        ) from problem
+
+
+@contextmanager
 def _local_cluster(count: int) -> Iterator[LocalCluster]:
     """A scheduler in this process and `count` workers, each a process of one Dask thread with a nanny."""
     import dask
@@ -152,6 +187,8 @@ def _local_cluster(count: int) -> Iterator[LocalCluster]:
     settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_DEATHS,
         "distributed.scheduler.worker-saturation": 1.0,  # what waits on a worker that dies is suspected, too
+        # On a busy machine a new process takes longer than the usual 15 s, after which its nanny would be given up.
+        "distributed.deploy.lost-worker-timeout": f"{WAIT_S} s",
         "distributed.scheduler.worker-ttl": None,  # a jump of the clock would end all workers
         # A worker at one of these limits would wait for memory that nothing frees. The last limit is kept: the nanny
         # ends a worker that takes nearly all of the machine's memory.
@@ -160,9 +197,13 @@ def _local_cluster(count: int) -> Iterator[LocalCluster]:
         "distributed.worker.memory.pause": False,
     }
     before = dict(os.environ)
+    # Semaphores of a driver that is ended are removed by a process of their own, without a warning.
+    warned = [os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker:UserWarning"]
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, warned))
     try:
         with dask.config.set(settings):
-            cluster = LocalCluster(
+            cluster = _started(
+                LocalCluster,
                 n_workers=count,
                 threads_per_worker=1,
                 host="127.0.0.1",
@@ -172,7 +213,6 @@ def _local_cluster(count: int) -> Iterator[LocalCluster]:
                 silence_logs=logging.CRITICAL,
                 memory_limit=MEMORY_LIMIT,
                 worker_class=WorkerNanny,
-                preload="import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)",  # Ctrl-C is for the driver
             )
             with cluster:
                 yield cluster

@@ -108,6 +108,8 @@ class Capture(ShortRepr):
     detector : PhotoDetector; None: unknown (a real capture), or the capture is noise-free.
     exposure_s : float, seconds per frame; NaN if unknown.
     ambient : Ambient, the ambient light that the capture was taken in; None: not stated.
+    exposure_is_automatic : bool, whether the exposure was chosen for this light. At another distance, on another
+        material or in other light it would be another one.
 
     Raises
     ------
@@ -134,6 +136,7 @@ class Capture(ShortRepr):
     detector: PhotoDetector | None = None
     exposure_s: float = float("nan")
     ambient: Ambient | None = None
+    exposure_is_automatic: bool = False
 
     def __post_init__(self) -> None:
         if self.frames.ndim != 3 or len(self.frames) != self.sensor.n_frames or self.frames.size == 0:

@@ -72,7 +72,8 @@ def expose(
     detector : Detector (EMVA 1288) or, for direct time of flight, SpadDetector. None: the capture is noise-free; its
         frames are float32 radiance in W/m2/sr and contain the ambient light without a filter. The frames of an ideal
         sensor (`Sensor.is_ideal`) are always noise-free.
-    exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`. A noise-free capture has none.
+    exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`, and the capture says so
+        (`Capture.exposure_is_automatic`). A noise-free capture has none.
     seed : int from 0 to 2^64 - 1, seed of the noise. Every frame has its own random stream (with a SpadDetector, every
         image row has one); the same seed gives the same bytes on any number of threads.
     ambient : Ambient, kind and strength of the light of the scene's own emitters; the detector's band
@@ -168,14 +169,14 @@ def exposed(
         ambient.check_emitters(bool(signals.energy.ambient.any()))
     if detector is None or sensor.is_ideal:
         return Exposure(noise_free_capture(signals, sensor, ambient), signals)
-    captures, of_reference = [], None
+    captures, of_reference, is_automatic = [], None, exposure_s is None
     for number, one in enumerate(signals.cameras):
-        radiance = _mean_radiance(one, sensor, detector, ambient)
+        radiance = mean_radiance(one, sensor, detector, ambient)
         of_reference = radiance if of_reference is None else of_reference
         if exposure_s is None:
             exposure_s = auto_exposure_s(radiance, sensor, detector, one.rig)
         frames = detector.read_out(radiance, sensor.gate, one.rig, exposure_s, _seed_of_camera(seed, number))
-        captures.append(Capture(frames, sensor, one.rig, detector, exposure_s, ambient))
+        captures.append(Capture(frames, sensor, one.rig, detector, exposure_s, ambient, is_automatic))
     return Exposure(together(captures), signals, of_reference)
 
 
@@ -224,14 +225,14 @@ def exposed_again(capture: Captured, signals: Signals, seed: int, sampling_error
     for number, (taken, one) in enumerate(zip(capture.captures, signals.cameras, strict=True)):
         if taken.detector is None:
             raise ValueError("expected a capture whose detector is known, got one without.")
-        radiance = _mean_radiance(one, taken.sensor, taken.detector, taken.ambient, sampling_errors)
+        radiance = mean_radiance(one, taken.sensor, taken.detector, taken.ambient, sampling_errors)
         gate, camera_seed = taken.sensor.gate, _seed_of_camera(seed, number)
         frames = taken.detector.read_out(radiance, gate, one.rig, taken.exposure_s, camera_seed)
         captures.append(replace(taken, frames=frames))
     return together(captures)
 
 
-def _mean_radiance(
+def mean_radiance(
     signals: Signals,
     sensor: Sensor,
     detector: PhotoDetector,

@@ -24,6 +24,7 @@ from rangesim.cli.presets import presets_command
 from rangesim.cli.report import report_command
 from rangesim.cli.run import run_command
 from rangesim.cli.scan import scan_command
+from rangesim.cli.sweep import sweep_command
 from rangesim.cli.verify import verify_command
 from rangesim.cli.view import view_command
 from rangesim.environment.doctor import doctor_command
@@ -34,6 +35,7 @@ app = typer.Typer(
 )
 app.command("run")(run_command)
 app.command("scan")(scan_command)
+app.command("sweep")(sweep_command)
 app.command("decode")(decode_command)
 app.command("calibrate")(calibrate_command)
 app.command("patterns")(patterns_command)

@@ -8,33 +8,75 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rangesim.cli.lengths import length
+
 if TYPE_CHECKING:
     from rangesim.report.markdown_table import Table
+    from rangesim.report.tables import Rows
 
 
 def compare_command(
     results: Annotated[list[Path], typer.Argument(help="Directories that `rangesim run` wrote.", show_default=False)],
     markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown instead of a drawn table.")] = False,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            parser=length,
+            metavar="LENGTH",
+            help="Largest error of a right reading: metres, or with a unit, as 2mm. With another one than that of the "
+            "run, no causes are printed. (default: that of the run)",
+        ),
+    ] = None,
 ) -> None:
-    """Print what is right, wrong and missing per material and sensor, and why. Lengths are in mm, fractions in %.
+    """Print what each sensor reads right, wrong and not at all, per object and material, why, and the exposures.
 
-    Example:
+    Lengths are in mm, fractions in %.
+
+    Examples:
 
       rangesim compare out/tabletop out/matte
-    """
-    from rangesim.report.tables import comparison_markdown, comparison_tables
-    from rangesim.results.experiment_results import read_rows, read_settings
 
-    tables = []
-    for folder in results:
-        for entry in read_settings(folder).instruments:
-            name = entry.name if len(results) == 1 else f"{folder}: {entry.name}"
-            tables.append((name, read_rows(folder / entry.name)))
+      rangesim compare out/tabletop --tolerance 2mm
+    """
+    from rangesim.report.tables import automatic_exposures, comparison_markdown, comparison_tables, tolerance_line
+    from rangesim.results.experiment_results import read_acquisition, read_comparison, read_settings
+
+    found = {
+        (folder, entry.name): read_comparison(folder / entry.name)
+        for folder in dict.fromkeys(results)
+        for entry in read_settings(folder).instruments
+    }
+    stored = {record.tolerance_m: folder for (folder, _), record in found.items()}
+    if tolerance is None and len(stored) > 1:
+        of_each = " and ".join(f"{1e3 * each:g} mm ({folder})" for each, folder in stored.items())
+        raise ValueError(f"expected results of one tolerance, got {of_each}; state one by --tolerance.")
+    tolerance_m = tolerance if tolerance is not None else next(iter(stored))
+    is_new = set(stored) != {tolerance_m}
+    rows = _compared_again(results, tolerance_m) if is_new else {key: r.plain_rows() for key, r in found.items()}
+    tables = [(name if len(results) == 1 else f"{folder}: {name}", rows[folder, name]) for folder, name in found]
+    taken = [read_acquisition(folder / name) for folder, name in found]
     if markdown:
-        typer.echo(comparison_markdown(tables), nl=False)
+        typer.echo(comparison_markdown(tables, taken, tolerance_m), nl=False)
     else:
-        for table in comparison_tables(tables):
+        typer.echo(tolerance_line(tolerance_m))
+        for table in comparison_tables(tables, taken):
             _print(table)
+    names = [name for name, _ in tables]
+    if said := automatic_exposures(dict(zip(names, taken, strict=True))):
+        typer.echo(f"rangesim: the exposure {said}", err=True)
+
+
+def _compared_again(results: list[Path], tolerance_m: float) -> dict[tuple[Path, str], Rows]:
+    """Rows of each instrument of the results, by directory and name, for another tolerance; the causes are None."""
+    from rangesim.evaluation.comparison import compare
+    from rangesim.results.experiment_results import load_result
+
+    found = {}
+    for folder in results:
+        for m in load_result(folder).measurements:
+            again = compare(m.image, m.truth, tolerance_m).rows()
+            found[folder, m.name] = [old | new | {"causes": None} for old, new in zip(m.rows, again, strict=True)]
+    return found
 
 
 def _print(table: Table) -> None:

@@ -66,7 +66,7 @@ def run_command(
         int | None,
         typer.Option(
             help="Number of photons for the projector's light through glass and off mirrors. 0 leaves this light out. "
-            "(default: 500000)"
+            "(default: 8 per pixel, 100000 to 500000)"
         ),
     ] = None,
     seed: Annotated[
@@ -135,6 +135,7 @@ def run_command(
         experiment = replace(experiment, instruments=tuple(replace(i, noise=False) for i in experiment.instruments))
     from rangesim.files.atomic_directories import check_directory
     from rangesim.pipeline import experiment_run
+    from rangesim.report.tables import automatic_exposures
     from rangesim.results.experiment_results import RESULT
 
     if estimate or out is None:
@@ -147,6 +148,8 @@ def run_command(
     with one_truncation_warning(), progress_bar() as progress:
         result = experiment_run.run(experiment, out, progress, announce=announce_cost)
     _warn_of_instruments_without_points(result)
+    if exposures := automatic_exposures({m.name: m.metadata for m in result.measurements}):
+        typer.echo(f"rangesim: the exposure {exposures}", err=True)
     typer.echo(one_line(out / "report.html"))
 
 

@@ -28,7 +28,7 @@ from rangesim.codes.bit_neighbours import (
 from rangesim.codes.bits import Words, bit_frames, decode_bits
 from rangesim.codes.code import Code, CodeThresholds, stripes
 from rangesim.response import DenseResponse
-from rangesim.sensor import Background, least_signal_for
+from rangesim.sensor import Background, ReceivedLight, least_signal_for
 from rangesim.settings.config import has_defaults
 
 
@@ -75,6 +75,10 @@ class BitCode(Code):
     def words(self, size: int) -> Words:
         """Words of the cells of `size` projector pixels, and of the further cells that as many bits have."""
         return _words(self, self.bits(size))
+
+    def place_sigma_px(self, axis: int, size: int, light: ReceivedLight) -> np.ndarray:
+        """The standard deviation of an even distribution over a cell, cell / sqrt(12): a place is the cell's middle."""
+        return np.full(light.emitter.shape, self.cell_px / np.sqrt(12))
 
     def names(self, size: int) -> list[str]:
         return [f"bit{bit}{suffix}" for bit in reversed(range(self.bits(size))) for suffix in ("", "_inverse")]

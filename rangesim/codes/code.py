@@ -18,7 +18,7 @@ from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.thresholds import GrayThresholds
 from rangesim.decoding.phase_shift import PhaseThresholds
 from rangesim.response import DenseResponse, Stripes
-from rangesim.sensor import Background, least_signal_for
+from rangesim.sensor import Background, ReceivedLight, least_signal_for
 from rangesim.settings.config import Named
 
 AXES = ("columns", "rows")
@@ -152,6 +152,15 @@ class Code(Named, ABC):
             return background.floor(thresholds.gray.relative_contrast)
         noise_variance = 2 * (background.ambient + background.noise_variance)  # white - black: the noise of two frames
         return least_signal_for(thresholds.gray.contrast_sigmas**2, 1.0, noise_variance)
+
+    def place_sigma_px(self, axis: int, size: int, light: ReceivedLight) -> np.ndarray | None:
+        """(h, w) float64, projector pixels, standard deviation of a place by a closed form; None if there is none.
+
+        Parameters
+        ----------
+        axis, size : as for `responses`.
+        """
+        return None
 
     # ---- How it is presented -----------------------------------------------------------------------------------------
 

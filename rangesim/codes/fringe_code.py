@@ -18,7 +18,7 @@ from rangesim.codes.fringes import VISIBILITY
 from rangesim.decoding.phase_shift import phase_of
 from rangesim.decoding.row_bands import in_bands
 from rangesim.response import DenseResponse
-from rangesim.sensor import Background, FrameContent
+from rangesim.sensor import Background, FrameContent, ReceivedLight
 
 
 class FringeCode(Code):
@@ -55,6 +55,9 @@ class FringeCode(Code):
     def decode(self, seen: AxisFrames, thresholds: CodeThresholds) -> AxisCode:
         swing = thresholds.gray.relative_bit * seen.contrast.values if seen.contrast.is_measured else 0.0
         return self.stack(seen.size).decode(seen, 0.0, float(seen.size), swing, thresholds.phase)
+
+    def place_sigma_px(self, axis: int, size: int, light: ReceivedLight) -> np.ndarray:
+        return self.stack(size).place_sigma_px(light, axis)
 
     def contradiction(self, seen: AxisFrames, code: AxisCode) -> str | None:
         return stack_contradiction(seen, code, self.stack(seen.size))

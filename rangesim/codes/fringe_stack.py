@@ -24,13 +24,14 @@ from rangesim.capture import Capture
 from rangesim.codes.axis_code import AxisCode, AxisFrames
 from rangesim.codes.fringe_gamma import FringeGamma, gamma_of
 from rangesim.codes.fringe_kernels import Agreement, agree, mean_place
-from rangesim.codes.fringes import FringeConvention
+from rangesim.codes.fringes import VISIBILITY, FringeConvention
 from rangesim.decoding.phase_shift import PhaseThresholds, modulation_is_weak, phase_of, phase_sigma
 from rangesim.decoding.pixel_samples import MIN_PIXELS, evenly_spread
 from rangesim.decoding.row_bands import in_bands
 from rangesim.decoding.status import Status
 from rangesim.response import Fringes
 from rangesim.robust_scale import sigma_from_median
+from rangesim.sensor import ReceivedLight
 
 LIMITS = Agreement(widest=1 / 4, misfit=1 / 8, ambiguity=1 / 4)
 """Limits of the agreement of phases.
@@ -105,6 +106,32 @@ class FringeStack:
             for step in range(steps):
                 shift = 2 * math.pi * self.convention.shift_turns(step, steps, period)
                 yield 0.5 * (white + math.cos(shift) * cosine + math.sin(shift) * sine)
+
+    def place_sigma_px(self, light: ReceivedLight, axis: int) -> np.ndarray:
+        """(h, w) float64, projector pixels, standard deviation of a place: of each period P / (2 pi) sqrt(2 / N) sigma
+        / B, and the places of precise periods are averaged.
+
+        The modulation B is half of the emitter's light, less what a camera's pixel averages over the fringe.
+
+        Parameters
+        ----------
+        axis : 0 for columns, 1 for rows.
+
+        References
+        ----------
+        Surrel: "Additive noise effect in digital phase detection", Applied Optics 36 (1997).
+        """
+        noise = np.sqrt(light.emitter / 2 + light.ambient + light.own_variance)
+        across_px = (light.pixel_columns, light.pixel_rows)[axis]
+        precisions = np.array(
+            [
+                steps / 2 * (2 * np.pi / period * VISIBILITY * light.emitter * np.sinc(across_px / period) / noise) ** 2
+                for period, steps in zip(self.periods_px, self.steps, strict=True)
+            ]
+        )
+        precise = precisions >= MIN_PRECISION * precisions.max(axis=0)
+        with np.errstate(divide="ignore"):
+            return np.asarray(1 / np.sqrt((precisions * precise).sum(axis=0)))
 
     def of_period(self, frames: np.ndarray, i: int) -> np.ndarray:
         """The frames (N, ...) of period i, a view."""

@@ -18,7 +18,7 @@ from rangesim.codes.fringes import VISIBILITY, FringeConvention
 from rangesim.codes.gray import GrayCode
 from rangesim.codes.phase_refinement import refine_by_phase
 from rangesim.response import DenseResponse
-from rangesim.sensor import Background, FrameContent
+from rangesim.sensor import Background, FrameContent, ReceivedLight
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 GUARD_TURNS = 1 / 8
@@ -126,6 +126,9 @@ class GrayPhase(Code):
     def _fringes(self, seen: AxisFrames) -> AxisFrames:
         """The frames of the fringes alone."""
         return seen.starting_with("p")  # phase0 ... of one period, period0_phase0 ... of several
+
+    def place_sigma_px(self, axis: int, size: int, light: ReceivedLight) -> np.ndarray:
+        return self.stack.place_sigma_px(light, axis)
 
     def contradiction(self, seen: AxisFrames, code: AxisCode) -> str | None:
         gray, fringes = code.coarse, self._fringes(seen)

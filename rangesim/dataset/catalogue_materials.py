@@ -28,11 +28,11 @@ def material_names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in (CATALOGUE / "materials").glob("*.xml")))
 
 
-def check_material(name: str) -> None:
-    """Raise ValueError if the catalogue has no material of that name."""
+def check_material(name: str, place: str = "a material") -> None:
+    """Raise ValueError if the catalogue has no material of that name; `place` says what states it."""
     if name not in material_names():
         raise ValueError(
-            f"expected a material of the catalogue (docs/materials.md), got {shown(name)}"
+            f"expected {place} to be in the catalogue (docs/materials.md), got {shown(name)}"
             f"{nearest(name, material_names())}."
         )
 

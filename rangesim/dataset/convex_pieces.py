@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from rangesim.triangle_mesh import TriangleMesh
 
 TOLERANCE = 0.01
-"""Largest distance from a piece to the solid that is good enough, of the solid's size: 0.6 mm for an object of 60 mm."""
+"""Largest distance from a piece to the solid that is good enough, as a fraction of its size: 0.6 mm of 60 mm."""
 MAX_PIECES = 32
 """Largest number of pieces. Physics takes time in proportion; smooth hollows would need ever more."""
 SAMPLES = 4

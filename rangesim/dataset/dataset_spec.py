@@ -6,6 +6,7 @@ Numbers and names may be constants or distributions, see `rangesim.settings.draw
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from dataclasses import field as dataclass_field
@@ -23,7 +24,8 @@ from rangesim.electronics.ambient import Strength
 from rangesim.errors import FileFormatError
 from rangesim.files.text_files import read_toml
 from rangesim.instrument.instrument import Instrument
-from rangesim.presets import DEFAULT_SENSORS, instrument_from_dict
+from rangesim.presets import DEFAULT_SENSORS, instrument_from_dict, is_device_file
+from rangesim.sensors import is_file_name
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, Fraction, Metres, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, nearest, shown, to_dict
@@ -87,7 +89,7 @@ def _with_files(model: Draw) -> Draw:
     if name in PRIMITIVES:
         return model
     path = Path(name)
-    if "/" not in name and "\\" not in name and not path.exists():
+    if not name or not os.path.exists(name):  # False for impossible names too
         raise ValueError(
             f"expected a model out of {', '.join(PRIMITIVES)}, a mesh file or a folder of them, got "
             f"{shown(name)}{nearest(name, PRIMITIVES)}."
@@ -180,9 +182,9 @@ class DatasetSpec:
     glint: bool = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "seed", check_seed(self.seed))
         check_draws(self)
         check_fields(self)
+        object.__setattr__(self, "seed", check_seed(self.seed))
         if not isinstance(self.materials, Mapping):
             raise ValueError(f"expected materials as tables by name, got {shown(self.materials)}.")
         limits.check("pixels", self.width * self.height, f"pixels, not {self.width} x {self.height}")
@@ -207,10 +209,7 @@ class DatasetSpec:
         for place, draw in draws:
             for leaf in draw.leaves():
                 if leaf.values[0] not in self.materials:
-                    try:
-                        check_material(leaf.values[0])
-                    except ValueError as error:
-                        raise ValueError(f"{place}: {error}") from error
+                    check_material(leaf.values[0], place)
 
     def material_entries(self, name: str, random: np.random.Generator) -> tuple[dict[str, Any], dict[str, Any]]:
         """Entries of a shape of this material, as of `surface`, and the parameters that were drawn."""
@@ -227,7 +226,7 @@ class DatasetSpec:
 def _check_instrument(table: Any, place: str) -> None:
     """Raise ValueError if an instrument cannot be made of some values of a table's distributions."""
     if not isinstance(table, Mapping):
-        raise ValueError(f"{place}: expected a table of settings, got {shown(table)}.")
+        raise ValueError(f"expected {place} to be a table of settings, got {shown(table)}.")
     for seed in range(CHECKED_DRAWS):
         drawn_instrument(table, np.random.default_rng(seed), place)
 
@@ -283,7 +282,12 @@ def spec_from_dict(data: Mapping[str, Any], files_in: Path = Path()) -> DatasetS
         tables = values.pop("instrument")
         if not isinstance(tables, list):
             raise ValueError("expected instruments as tables with the header [[instrument]], with two brackets.")
-        values["instruments"] = tables
+        values["instruments"] = [
+            {**table, "sensor": _sensor_with_path(table["sensor"], files_in)}
+            if isinstance(table, Mapping) and "sensor" in table
+            else table
+            for table in tables
+        ]
     groups = values.get("objects")
     if not isinstance(groups, list):
         raise ValueError("expected groups of objects as tables with the header [[objects]], with two brackets.")
@@ -301,6 +305,16 @@ def spec_to_dict(spec: DatasetSpec) -> dict[str, Any]:
     return dict(data)
 
 
+def _sensor_with_path(sensor: Any, folder: Path) -> Any:
+    """The sensor of a table in which files of sensors and devices, or a choice of them, have absolute paths."""
+    if isinstance(sensor, list):
+        return [_sensor_with_path(entry, folder) for entry in sensor]
+    if isinstance(sensor, Mapping) and "choice" in sensor:
+        return {"choice": _sensor_with_path(sensor["choice"], folder)}
+    is_file = isinstance(sensor, str) and (is_device_file(sensor) or is_file_name(sensor))
+    return str(folder.resolve() / sensor) if is_file else sensor
+
+
 def _with_paths(group: Any, folder: Path) -> Any:
     """A table of objects whose models are names of primitives or absolute paths."""
 
@@ -311,7 +325,7 @@ def _with_paths(group: Any, folder: Path) -> Any:
             return {key: resolved(value) for key, value in model.items()}
         if not isinstance(model, str) or model in PRIMITIVES:
             return model
-        path = (folder / model).resolve()
-        return str(path) if path.exists() or "/" in model else model
+        path = os.path.abspath(folder / model)
+        return path if os.path.exists(path) else model
 
     return {**group, "model": resolved(group["model"])} if isinstance(group, Mapping) and "model" in group else group

@@ -111,8 +111,13 @@ def settled(solids: list[tuple[SolidModel, float]], support: Placed, random: np.
         pose[:3, :3] = data.xmat[body + 1].reshape(3, 3)
         pose[:3, 3] = data.xpos[body + 1] - pose[:3, :3] @ (scale * solid.centre_of_mass_m)
         poses.append(pose if inside[body] else None)
-    speed = float(moved[inside].max(initial=0.0)) / (CHUNK_STEPS * STEP_S)
-    return Arrangement(poses, reasons, {"type": "pile", "time_s": round(float(data.time), 3), "max_speed_m_s": speed})
+    values = {
+        "type": "pile",
+        "time_s": round(float(data.time), 3),
+        "max_speed_m_s": float(moved[inside].max(initial=0.0)) / (CHUNK_STEPS * STEP_S),
+        "collision_standoff_m": max(scale * solid.collision.standoff_m for solid, scale in solids),
+    }
+    return Arrangement(poses, reasons, values)
 
 
 def _pile(solids: list[tuple[SolidModel, float]], support: Placed, random: np.random.Generator) -> _Pile:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -150,7 +151,7 @@ def random_scene(spec: DatasetSpec, index: int) -> RandomScene:
     for thing, pose in zip(things, arrangement.poses, strict=True):
         entries, parameters = spec.material_entries(thing.material, streams["materials"])
         if pose is not None:
-            name = f"{thing.solid.name}_{len(objects)}"
+            name = f"{re.sub(r'[^A-Za-z0-9_-]', '_', thing.solid.name)}_{len(objects)}"  # Mitsuba refuses dots
             placed = PlacedObject(
                 name, thing.solid.name, thing.category, thing.material, pose, thing.scale, thing.solid.mesh,
                 parameters, thing.solid.source_sha256,

@@ -11,7 +11,7 @@ import numpy as np
 
 from rangesim.experiment.camera_paths import CameraPath
 from rangesim.rig import look_at
-from rangesim.settings.bounds import Bounds
+from rangesim.settings.bounds import Bounds, check_fields
 from rangesim.settings.config import Named
 from rangesim.settings.draws import Draw, Of, check_draws, drawn
 
@@ -95,6 +95,7 @@ class Path(View):
     type_name: ClassVar[str] = "path"
 
     def __post_init__(self) -> None:
+        check_fields(self)
         self.path.poses()  # a path that leaves its place open is refused
 
     def pose(self, centre_m: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, dict[str, Any]]:

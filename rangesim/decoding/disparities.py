@@ -129,7 +129,7 @@ class Disparities(Coordinates):
             range_m = (z * np.linalg.norm(directions, axis=-1)).astype(np.float32)
         return self._image(rig, z, range_m, status)
 
-    def depth_sigma_m(self, image: RangeImage) -> np.ndarray:
+    def depth_error_m(self, image: RangeImage) -> np.ndarray:
         """(h, w) float64, metres, standard deviation of z by the noise of the images: z^2 sigma / (f b).
 
         image : the range image of these disparities.

@@ -39,7 +39,9 @@ def find_peak(
     from rangesim.decoding.histogram_kernels import measure_peaks
     from rangesim.decoding.matched_filter import gaussian_filter
 
-    filtered = gaussian_filter(histogram, sigma_bins, "wrap" if is_cyclic else "edge") if sigma_bins > 0 else histogram
+    filtered = histogram.astype(np.float32, copy=False)  # which tells where the peak is, and no more
+    if sigma_bins > 0:
+        filtered = gaussian_filter(filtered, sigma_bins, "wrap" if is_cyclic else "edge")
     place, height, background = np.empty((3, histogram.shape[1]))
     reach = window_reach(len(histogram), sigma_bins, is_cyclic)
     measure_peaks(histogram, filtered, reach, float(sigma_bins), is_cyclic, place, height, background)

@@ -78,14 +78,14 @@ def measure_peaks(  # type: ignore[no-untyped-def]
     pulse.
     """
     bins, columns = histograms.shape
-    everything, highest, largest = np.zeros(columns), np.zeros(columns, np.int64), filtered[0].copy()
+    everything, highest, largest = np.zeros(columns), np.zeros(columns, np.int32), filtered[0].copy()
+    total_counts(histograms, everything)
     for b in range(bins):
-        for column in range(columns):
-            everything[column] += histograms[b, column]
-            highest[column] = b if filtered[b, column] > largest[column] else highest[column]
+        for column in range(columns):  # a loop of its own, without branches, is vectorised
+            highest[column] = np.int32(b) if filtered[b, column] > largest[column] else highest[column]
             largest[column] = max(filtered[b, column], largest[column])
     for column in range(columns):
-        peak = highest[column]
+        peak = int(highest[column])
         width = 2 * reach + 1
         if not is_cyclic:
             width = min(peak + reach, bins - 1) - max(peak - reach, 0) + 1

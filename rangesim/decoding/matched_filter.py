@@ -14,7 +14,11 @@ REACH_SIGMAS = 4.0
 it."""
 
 COLUMNS = 128
-"""Number of histograms that are filtered together, so that they stay in a core's cache: with 256 bins, 256 kB."""
+"""Number of histograms that are filtered together, so that they stay in a core's cache: with 256 bins, 128 kB in single
+precision."""
+
+AT_ONCE = 1024
+"""Number of totals that are added up together, so that they stay in the cache nearest to the processor: 4 kB."""
 
 NOTHING = -1
 """Index that stands for an empty bin beyond the ends; no bin has it."""
@@ -36,42 +40,54 @@ def gaussian_filter(histograms: np.ndarray, sigma_bins: float, mode: Literal["wr
     >>> gaussian_filter(np.array([[0.0], [0.0], [1.0], [0.0], [0.0]]), 0.5, "constant").ravel().round(3)
     array([0.   , 0.106, 0.787, 0.106, 0.   ])
     """
+    from pcgraph.parallel import in_blocks
+
     reach = int(REACH_SIGMAS * sigma_bins + 0.5)
     weights = np.exp(-0.5 / (sigma_bins * sigma_bins) * np.arange(-reach, reach + 1.0) ** 2)
     weights /= weights.sum()
     bins = np.arange(len(histograms))
     sources = np.pad(bins, reach, constant_values=NOTHING) if mode == "constant" else np.pad(bins, reach, mode=mode)
-    result = np.empty(histograms.shape, histograms.dtype)
-    _correlate(histograms, sources, weights[reach:], result)
+    histograms = np.ascontiguousarray(histograms)
+    result, half = np.empty(histograms.shape, histograms.dtype), weights[reach:].astype(histograms.dtype)
+    in_blocks(_correlate, histograms.shape[1], histograms, sources, half, result)
     return result
 
 
-@cached_njit(nogil=True, error_model="numpy")
-def _correlate(histograms, sources, weights, result):  # type: ignore[no-untyped-def]
-    """Write the symmetric correlation along the bins into `result`.
+@cached_njit(nogil=True, error_model="numpy", fastmath={"contract"})
+def _correlate(start, stop, histograms, sources, weights, result):  # type: ignore[no-untyped-def]
+    """Write the symmetric correlation along the bins into the columns of `result` from `start` to `stop`.
 
     weights : from the middle outwards. sources : for each bin of the histograms, lengthened on both sides by the
     filter's reach, the index of the bin whose content it has.
     """
-    (bins, columns), reach = result.shape, len(weights) - 1
-    lengthened, totals = np.zeros((len(sources), COLUMNS)), np.empty(COLUMNS)
-    for first in range(0, columns, COLUMNS):
-        stop = min(first + COLUMNS, columns)
+    bins, reach, zero = len(result), len(weights) - 1, np.zeros(1, histograms.dtype)[0]
+    lengthened = np.zeros(len(sources) * COLUMNS, histograms.dtype)  # bin after bin
+    totals = np.empty(bins * COLUMNS, histograms.dtype)
+    for first in range(start, stop, COLUMNS):
+        last = min(first + COLUMNS, stop)
         for b in range(len(sources)):
+            row = lengthened[b * COLUMNS : b * COLUMNS + last - first]
             if sources[b] == NOTHING:
-                lengthened[b] = 0.0
+                row[:] = zero
             else:
-                lengthened[b, : stop - first] = histograms[sources[b], first:stop]
+                row[:] = histograms[sources[b], first:last]
+        for begin in range(0, bins * COLUMNS, AT_ONCE):
+            total, middle = totals[begin : begin + AT_ONCE], begin + reach * COLUMNS
+            total[:] = lengthened[middle : middle + len(total)] * weights[0]
+            distance = reach
+            while distance >= 4:  # four at a time, from far to near, so that the totals are read and written less often
+                far, w = distance * COLUMNS, weights[distance - 3 : distance + 1]
+                a0, b0 = lengthened[middle - far :], lengthened[middle + far :]
+                a1, b1 = lengthened[middle - far + COLUMNS :], lengthened[middle + far - COLUMNS :]
+                a2, b2 = lengthened[middle - far + 2 * COLUMNS :], lengthened[middle + far - 2 * COLUMNS :]
+                a3, b3 = lengthened[middle - far + 3 * COLUMNS :], lengthened[middle + far - 3 * COLUMNS :]
+                for i in range(len(total)):
+                    outer = total[i] + (a0[i] + b0[i]) * w[3] + (a1[i] + b1[i]) * w[2]
+                    total[i] = outer + (a2[i] + b2[i]) * w[1] + (a3[i] + b3[i]) * w[0]
+                distance -= 4
+            for near in range(distance, 0, -1):
+                below, above = lengthened[middle - near * COLUMNS :], lengthened[middle + near * COLUMNS :]
+                for i in range(len(total)):
+                    total[i] += (below[i] + above[i]) * weights[near]
         for b in range(bins):
-            middle = lengthened[b + reach]
-            for i in range(COLUMNS):
-                totals[i] = middle[i] * weights[0]
-            for distance in range(reach, 0, -1):
-                below, above, weight = (
-                    lengthened[b + reach - distance],
-                    lengthened[b + reach + distance],
-                    weights[distance],
-                )
-                for i in range(COLUMNS):
-                    totals[i] += (below[i] + above[i]) * weight
-            result[b, first:stop] = totals[: stop - first]
+            result[b, first:last] = totals[b * COLUMNS : b * COLUMNS + last - first]

@@ -37,8 +37,8 @@ class ErrorStatistics:
 
     Parameters
     ----------
-    kind, name : str, what the row is about: "object" and its name; "material" and the class of the first surface behind
-        the pixel; "all", all surfaces; or "objects", the mean over the objects, in which each weighs the same
+    kind, name : str, what the row is about: "object" or "part" and its name; "material" and the class of the first
+        surface behind the pixel; "all", all surfaces; or "objects", the mean over objects, each of the same weight
         (`rangesim.evaluation.surface_rows.with_mean_over_objects`).
     pixels : int, number of pixels with a true depth.
     lit : int, number of those pixels that the emitter lights; the others lie in its shadow or outside its field.
@@ -72,7 +72,7 @@ class ErrorStatistics:
 class Comparison(ShortRepr):
     """Statistics of the errors of a range image per object and per material class, and its error map.
 
-    table : tuple of ErrorStatistics: the mean over objects, each object, each material class, and "all" at the end.
+    table : tuple of ErrorStatistics: the mean over objects, objects, parts, material classes, "all".
     error_m : (h, w) float32, metres, z - true z; NaN where there is no reading or no true surface.
     flying : (h, w) bool, flying pixels.
     tolerance_m : float, metres, largest error of a right reading.
@@ -91,11 +91,11 @@ class Comparison(ShortRepr):
         ]
 
     def row(self, name: str, kind: str | None = None) -> ErrorStatistics:
-        """Statistics of the object or of the material class of this name, or of "objects" or "all".
+        """Statistics of the object, part or material class of this name, or of "objects" or "all".
 
         Parameters
         ----------
-        kind : "object" or "material", if there are both of this name; None: the one that there is.
+        kind : "object", "part" or "material", if several have this name; None: the one that there is.
 
         Raises
         ------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of statistics, one for each surface of the ground truth: its objects, its material classes, and all of it."""
+"""Rows of statistics, one for each surface of the ground truth: objects, their parts, material classes, and all."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Any
 from rangesim.settings.config import nearest, shown
 from rangesim.signals import ALL
 
-OBJECTS, OBJECT, MATERIAL = "objects", "object", "material"
-"""Kinds of rows besides "all": the mean over objects, one object, one material class."""
-KINDS = (OBJECTS, OBJECT, MATERIAL, ALL)
+OBJECTS, OBJECT, PART, MATERIAL = "objects", "object", "part", "material"
+"""Kinds of rows besides "all": the mean over objects, one object, one shape of an object that has several, one material
+class."""
+KINDS = (OBJECTS, OBJECT, PART, MATERIAL, ALL)
 """Kinds of rows in the order of every table."""
 
 
@@ -52,7 +53,7 @@ def index_of_row(keys: Iterable[tuple[str, str]], name: str, kind: str | None) -
     Raises
     ------
     ValueError
-        No row has this name, or an object and a material have it and `kind` does not say which.
+        No row has this name, or rows of several kinds have it and `kind` does not say which.
     """
     keys = list(keys)
     found = [i for i, key in enumerate(keys) if key[1] == name and kind in (None, key[0])]

@@ -110,15 +110,14 @@ class Experiment:
     def transport_settings(self, instruments: Sequence[Instrument]) -> TransportSettings:
         """Settings of the light-transport pass that these instruments share."""
         from rangesim.instrument.adaptive_sampling import AdaptiveSampling
-        from rangesim.light_transport.transport_settings import PHOTONS, TransportSettings
+        from rangesim.light_transport.transport_settings import TransportSettings
 
         spp: int | Literal["auto"] | AdaptiveSampling = "auto"
         if self.spp is not None:
             spp = self.spp
         elif self.motion is None:
             spp = AdaptiveSampling(tuple(instruments), self.max_spp, ambient=self.ambient)
-        photons = PHOTONS if self.photons is None else self.photons
-        return TransportSettings(spp, self.max_depth, seed=self.seed, photons=photons, glint=self.glint)
+        return TransportSettings(spp, self.max_depth, seed=self.seed, photons=self.photons, glint=self.glint)
 
 
 def load_experiment(path: str | Path) -> Experiment:

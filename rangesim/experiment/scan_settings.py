@@ -85,11 +85,10 @@ class ScanSettings:
 
     def transport_settings(self) -> TransportSettings:
         """Settings of the light-transport pass of each view."""
-        from rangesim.light_transport.transport_settings import PHOTONS, TransportSettings
+        from rangesim.light_transport.transport_settings import TransportSettings
 
-        photons = PHOTONS if self.photons is None else self.photons
         return TransportSettings(
-            "auto" if self.spp is None else self.spp, self.max_depth, photons=photons, glint=self.glint
+            "auto" if self.spp is None else self.spp, self.max_depth, photons=self.photons, glint=self.glint
         )
 
 

@@ -45,20 +45,27 @@ would bring any amount of light. A smaller bound would darken caustics beside ed
 
 
 def caustic_photons(
-    traced: TracedScene, rig: Rig, settings: TransportSettings, spp: int, report: Callable[[], None] = lambda: None
+    traced: TracedScene,
+    rig: Rig,
+    settings: TransportSettings,
+    pixels: int,
+    spp: int,
+    report: Callable[[], None] = lambda: None,
 ) -> Photons | None:
     """Photons for a pass of any camera; None if the caller wants none, no surface has a delta interaction, or none
     landed. A beam needs none, see `rangesim.light_transport.beams`.
 
     Parameters
     ----------
+    pixels : int, number of pixels of the largest camera, on which the number of photons depends by default.
     spp : int, number of samples of a pixel, which is the number of photon maps up to `MAX_MAPS`.
     report : called after each kernel launch.
     """
-    if not settings.photons or not has_delta(traced.scene) or isinstance(traced.projector, BeamDevice):
+    number = settings.photons_for(pixels)
+    if not number or not has_delta(traced.scene) or isinstance(traced.projector, BeamDevice):
         return None
     maps, memory_bytes = min(spp, MAX_MAPS), settings.memory_bytes
-    landed = trace_photons(traced, rig.projector_power_w, settings.photons, maps, settings.seed, memory_bytes, report)
+    landed = trace_photons(traced, rig.projector_power_w, number, maps, settings.seed, memory_bytes, report)
     return landed if len(landed.flux) else None
 
 

@@ -317,7 +317,7 @@ class LensDisc:
 def _worth_probing(traced: TracedScene, h: int, w: int) -> np.ndarray:
     """Flat indices of the pixels to be probed: beside a delta surface, or beside the lens in plain view."""
     assert isinstance(traced.projector, Device)
-    meets, exists = meets_delta(traced.scene, traced.camera)
+    meets, exists = meets_delta(traced.scene, traced.camera.pixels, traced.camera.centre_rays)
     mask = meets.reshape(h, w)
     if isinstance(traced.camera, Device):
         uv, z = traced.camera.project(mi.Point3f(traced.projector.centre))

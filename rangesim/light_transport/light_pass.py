@@ -91,7 +91,8 @@ def trace_light(
     views = [_CameraPass(scene, traced, one, settings, number) for number, one in enumerate(rigs)]
     fewest = min(int(view.samples.min()) for view in views)
     at_work = partial(report, 0.0)
-    photons = caustic_photons(traced, rigs[0], settings, fewest, at_work)
+    pixels = max(len(view.samples) for view in views)
+    photons = caustic_photons(traced, rigs[0], settings, pixels, fewest, at_work)
     signals = []
     for number, view in enumerate(views):
         part = partial(report_part, report, number / len(views), 1 / len(views))

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.camera_rays import Device
+from rangesim.light_transport.camera_rays import CellGrid, Device
 from rangesim.light_transport.sampling import Continued, Seed, aligned, random_stream
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray, survival
@@ -54,22 +54,22 @@ class PhotonEnergy(NamedTuple):
 
 
 def trace_photon_paths(
-    traced: TracedScene, pixel: np.ndarray, flux: np.ndarray, number: np.ndarray, seed: int
+    traced: TracedScene, grid: CellGrid, cell: np.ndarray, flux: np.ndarray, number: np.ndarray, seed: int
 ) -> tuple[PhotonDeposit, PhotonEnergy]:
-    """Send photons through projector pixels; returns where they landed, and where their power went.
+    """Send photons through cells of the projector's image; returns where they landed, and where their power went.
 
     Parameters
     ----------
-    pixel : (n,) int, flat indices of projector pixels.
+    grid : CellGrid of the projector.
+    cell : (n,) int, flat indices of its cells.
     flux : (n,) float, watts.
     number : (n,) int, numbers of the photons, on which their random numbers depend.
     """
     assert isinstance(traced.projector, Device)
-    pixel, width = mi.UInt32(aligned(pixel, np.uint32)), mi.UInt32(traced.projector.size.x)
     photon = mi.UInt32(aligned(number, np.uint32))
     rng = random_stream(Seed.of(seed), photon ^ 0x9E3779B9)
     jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
-    uv = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + jitter
+    uv = grid.place(mi.UInt32(aligned(cell, np.uint32)), jitter)
     power, most = mi.Float(aligned(flux, np.float32)), dr.opaque(mi.UInt32, MAX_CHAIN)
     return _chain(traced, uv, power, rng, most)
 

@@ -34,8 +34,7 @@ ALPHA = 2 / 3
 noise of n maps falls as n^(-alpha / 2) and their bias as n^(alpha - 1). With this value both fall equally fast; with 1
 the radii would not shrink, and the blur would stay."""
 MAX_MAPS = 64
-"""Largest number of photon maps. With more samples per pixel than this, several samples share a map. The number of maps
-is a multiple of 32, because `_occupancy` keeps a bit for each in words of 32."""
+"""Largest number of photon maps. With more samples per pixel than this, several samples share a map."""
 CLASSES_PER_OCTAVE = 4
 """Number of classes of radii per factor of two. It is small, because photons near a border between two classes are
 stored twice. With fewer classes, cells would be larger than their radii need."""
@@ -50,8 +49,8 @@ MAX_LOOKED_AT = 16
 """Number of photons that a gather looks at, so that the time per vertex is bounded. If n times as many are near, it
 looks at every n-th photon and counts it n times. A larger number makes less noise in bright caustics."""
 OCCUPANCY_CELLS = 1 << 18
-"""Number of places per level in the table that says where photons may be, a power of two. At 2 MiB it fits into caches;
-a smaller table has more false hits, because more cells share a place."""
+"""Number of places per level in the table that says where photons may be, a power of two. At 1 MiB for 32 maps it
+fits into caches; a smaller table has more false hits, because more cells share a place."""
 PRIMES = (73856093, 19349663, 83492791)
 """Factors of the spatial hash of a cell's coordinates (Teschner et al. 2003). The products are added up here. The paper
 combines them by exclusive or; opposite cells would then share a place."""
@@ -215,7 +214,7 @@ class PhotonMaps:
         key = (level * maps + of_map) * stride + _row(cell[:, 1], cell[:, 2], kind, rows - 1) + _column(cell[:, 0])
         order = np.argsort(key, kind="stable")
         starts = np.cumsum(np.bincount(key + 1, minlength=len(LEVELS) * maps * stride + 1))
-        order, occupancy_of = copies[order], (position - origin, of_map, kind, edge)
+        order = copies[order]
         points = np.column_stack([photons.position, photons.flux])
         padding = np.zeros(len(points), np.float32)
         columns = [photons.direction, photons.u, photons.v, photons.length_m, photons.cosine, padding]
@@ -231,7 +230,12 @@ class PhotonMaps:
         )
         self.bounds, self.unit = [opaque(x) for x in radius.bounds()], opaque(unit)
         self.row_mask, self.stride = dr.opaque(mi.UInt32, rows - 1), dr.opaque(mi.UInt32, stride)
-        self.occupied = [mi.UInt32(_occupancy(*(x[level == i] for x in occupancy_of))) for i in range(len(LEVELS))]
+        words = -(-maps // 32)  # a bit for each map
+        self.words = dr.opaque(mi.UInt32, words)
+        of_levels = [level == i for i in range(len(LEVELS))]
+        self.occupied = [
+            mi.UInt32(_occupancy(position[x] - origin, of_map[x], kind[x], edge[x], words)) for x in of_levels
+        ]
         dr.eval([self.starts, self.points, self.flights, self.shrinkage, *self.occupied])
 
     def reach(self, point: mi.Point3f) -> Reach:
@@ -250,7 +254,7 @@ class PhotonMaps:
         index = _hash(*(mi.UInt32(mi.Int32(x)) for x in cell)) + reach.kind * CLASS_PRIME
         index &= OCCUPANCY_CELLS - 1
         of_map = sample % self.maps
-        bits = dr.gather(mi.UInt32, self.occupied[level], index * (MAX_MAPS // 32) + (of_map >> 5), active)
+        bits = dr.gather(mi.UInt32, self.occupied[level], index * self.words + (of_map >> 5), active)
         return active & ((bits >> (of_map & 31)) & 1 != 0)
 
     @dr.syntax
@@ -395,15 +399,15 @@ def _row(y: Whole, z: Whole, kind: Whole, mask: int | mi.UInt32) -> Whole:
     return (y * ROW_FACTORS[0] + z * ROW_FACTORS[1] + kind * CLASS_FACTOR) & mask
 
 
-def _occupancy(position: np.ndarray, of_map: np.ndarray, kind: np.ndarray, edge: np.ndarray) -> np.ndarray:
-    """(cells * MAX_MAPS / 32,) uint32, a bit for each hash of a cell and each map.
+def _occupancy(position: np.ndarray, of_map: np.ndarray, kind: np.ndarray, edge: np.ndarray, words: int) -> np.ndarray:
+    """(cells * words,) uint32, a bit for each hash of a cell and each map.
 
     The bit is set if some point in such a cell has a photon of that map within the radius, which is half an edge.
     """
-    occupied = np.zeros(OCCUPANCY_CELLS * MAX_MAPS, dtype=bool)
+    from rangesim.light_transport.photon_kernels import mark
+
+    occupied = np.zeros((OCCUPANCY_CELLS, words), np.uint32)
     low, high = (_cells(position + offset * edge[:, None], edge) for offset in (-0.5, 0.5))
-    for corner in range(8):
-        cell = [np.where(corner >> axis & 1, high[:, axis], low[:, axis]) for axis in range(3)]
-        index = _hash(*cell) + kind * CLASS_PRIME
-        occupied[(index & (OCCUPANCY_CELLS - 1)) * MAX_MAPS + of_map] = True
-    return np.packbits(occupied, bitorder="little").view(np.uint32)
+    factors = np.array(PRIMES)
+    mark(low * factors, high * factors, kind * CLASS_PRIME, of_map, occupied)
+    return occupied.ravel()

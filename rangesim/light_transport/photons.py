@@ -8,9 +8,10 @@ to next-event estimation, so such a photon ends at once (`rangesim.light_transpo
 translucent object scatters light out of the way of photons and so weakens them; the photons do not follow that
 scattered light. Glass that absorbs weakens them on their way inside (`rangesim.light_transport.absorption`).
 
-Most photons are sent through projector pixels whose light meets a delta surface first. A pre-pass with one ray per
-pixel finds these pixels; their neighbours count as well. A small fraction of the photons goes through all other pixels,
-so that the estimate has no bias where a surface is finer than a pixel.
+Most photons are sent through cells of the projector's image whose light meets a delta surface first. A cell is a pixel,
+or a few of them where the image has very many. A pre-pass with one ray per cell finds these cells; their neighbours
+count as well. A small fraction of the photons goes through all other cells, so that the estimate has no bias where a
+surface is finer than a cell.
 """
 
 from __future__ import annotations
@@ -23,10 +24,9 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from rangesim.light_transport.camera_rays import Device
+from rangesim.light_transport.camera_rays import CellGrid, Device, PrimaryRay
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.photon_flight import trace_photon_paths
-from rangesim.light_transport.ray_tables import RayTableDevice
 from rangesim.light_transport.sampling import Seed, Stream, random_stream
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
@@ -114,18 +114,24 @@ def _is_delta(shape: mi.Shape) -> bool:
     return bool(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta)) and not is_boundary(shape)
 
 
-def meets_delta(scene: mi.Scene, device: Device | RayTableDevice) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the first surface behind each pixel's centre has a delta interaction.
+def meets_delta(
+    scene: mi.Scene, count: int, rays_of: Callable[[int, int], PrimaryRay]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whether the first surface that each of `count` rays meets has a delta interaction.
+
+    Parameters
+    ----------
+    rays_of : function that returns the rays from one number up to another, such as those through pixels' centres.
 
     Returns
     -------
-    meets : (pixels,) bool, whether it has one.
-    exists : (pixels,) bool, whether the lens sends a ray through the pixel's centre at all.
+    meets : (count,) bool, whether it has one.
+    exists : (count,) bool, whether the lens sends such a ray at all.
     """
-    launches, meets, exists = Launches(), np.zeros(device.pixels, dtype=bool), np.ones(device.pixels, dtype=bool)
+    launches, meets, exists = Launches(), np.zeros(count, dtype=bool), np.ones(count, dtype=bool)
     table = mi.Bool(table_of(scene, list(map(_is_delta, scene.shapes()))))
-    for begin, end in launches.ranges(device.pixels):
-        rays = device.centre_rays(begin, end)
+    for begin, end in launches.ranges(count):
+        rays = rays_of(begin, end)
         found = scene.ray_intersect_preliminary(mi.Ray3f(rays.origin, rays.direction))
         delta = dr.gather(mi.Bool, table, number_of(found.shape), found.is_valid())
         launches.evaluate([delta, rays.exists], end - begin)
@@ -155,7 +161,8 @@ def trace_photons(
     report : called after each kernel launch.
     """
     assert isinstance(traced.projector, Device)  # a beam needs no photons
-    pixels, fraction = _chances(traced.scene, traced.projector)
+    grid = CellGrid.of(traced.projector)
+    cells, fraction = _chances(traced.scene, traced.projector, grid)
     per_map = -(-photons // maps)
     cumulative, shift = np.cumsum(fraction), shift_of(seed)
     total = per_map * maps
@@ -166,8 +173,8 @@ def trace_photons(
     for begin, end in launches.ranges(total, SURFACES_PER_PHOTON, min(most, SUMMED_TOGETHER), at_most=most):
         number = np.arange(begin, end)
         chosen = stratified_choice(cumulative, number, per_map, shift)
-        flux = power_w / (len(pixels) * per_map * fraction[chosen] / cumulative[-1])
-        landing, parts = trace_photon_paths(traced, pixels[chosen], flux, number, seed)
+        flux = power_w / (len(cells) * per_map * fraction[chosen] / cumulative[-1])
+        landing, parts = trace_photon_paths(traced, grid, cells[chosen], flux, number, seed)
         launches.evaluate([list(landing), list(parts)], SURFACES_PER_PHOTON * (end - begin))
         kept = np.flatnonzero(landing.flux)
         landed.append([_columns(x)[kept] for x in landing] + [number[kept] // per_map])
@@ -177,19 +184,20 @@ def trace_photons(
         report()
     position, direction, flux, u, v, length, cosine, of_map = (np.concatenate(c) for c in zip(*landed, strict=True))
     mean_budget = EnergyBudget(*(energy / maps))
-    return Photons(position, direction, flux, u, v, length, cosine, of_map, maps, mean_budget, total / cumulative[-1])
+    per_pixel = total / (cumulative[-1] * grid.pixels_per_cell)
+    return Photons(position, direction, flux, u, v, length, cosine, of_map, maps, mean_budget, per_pixel)
 
 
-def _chances(scene: mi.Scene, projector: Device) -> tuple[np.ndarray, np.ndarray]:
-    """The projector pixels, and the relative chance that a photon is sent through each of them.
+def _chances(scene: mi.Scene, projector: Device, grid: CellGrid) -> tuple[np.ndarray, np.ndarray]:
+    """The cells of the projector's image, and the relative chance that a photon is sent through each of them.
 
     Returns
     -------
-    pixels : (n,) int, flat indices of all pixels, in the order of a Morton curve.
-    chance : (n,) float, 1 for pixels whose light meets a delta surface first and for their neighbours.
+    cells : (n,) int, flat indices of all cells, in the order of a Morton curve.
+    chance : (n,) float, 1 for cells whose light meets a delta surface first and for their neighbours.
     """
-    meets, _ = meets_delta(scene, projector)
-    w, h = (int(n[0]) for n in projector.size)
+    w, h = grid.columns, grid.rows
+    meets, _ = meets_delta(scene, w * h, lambda begin, end: projector.centre_ray(grid.centres(begin, end)))
     mask = binary_dilation(meets.reshape(h, w), np.ones((3, 3))).ravel()
     rest = ~mask
     chance = np.where(

@@ -181,7 +181,8 @@ def estimate_cost(
     """
     from rangesim.light_transport.photons import has_delta
 
-    photons = experiment.transport_settings(()).photons if has_delta(scene.mitsuba) else 0
+    largest = max(rig.traced.camera.width * rig.traced.camera.height for rig, _ in passes)
+    photons = experiment.transport_settings(()).photons_for(largest) if has_delta(scene.mitsuba) else 0
     pixels, count = 0, 0
     for rig, instruments in passes:
         size = rig.camera.width * rig.camera.height * TRUTH_BYTES  # the file of a pass, as it is read for a report

@@ -26,7 +26,7 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
     groups: list[tuple[Rig, list[Instrument]]] = []
     for instrument in experiment.instruments:
         rig = replace(instrument.rig(scene, experiment.width, experiment.height), wavelength_m=None)
-        shared = None if experiment.motion is not None else _first_that_agrees(groups, rig, instrument)
+        shared = None if experiment.motion is not None else first_that_agrees(groups, rig, instrument)
         if shared is None:
             groups.append((rig, [instrument]))
         else:
@@ -34,7 +34,7 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
     return groups
 
 
-def _first_that_agrees(groups: list[tuple[Rig, list[Instrument]]], rig: Rig, instrument: Instrument) -> int | None:
+def first_that_agrees(groups: list[tuple[Rig, list[Instrument]]], rig: Rig, instrument: Instrument) -> int | None:
     """Index of the first group whose emitter and cameras are those of a rig and an instrument; None if there is
     none."""
     for index, (other, members) in enumerate(groups):

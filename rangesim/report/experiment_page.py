@@ -13,6 +13,7 @@ from pcgraph.viewer.packing import pack
 from rangesim.errors import FileFormatError
 from rangesim.report import figures, palette, point_viewer, tables
 from rangesim.report.content_security import visible_text
+from rangesim.report.objects_section import objects_sentence, objects_table, totals
 from rangesim.report.template import render_page
 from rangesim.report.verdict import verdict
 from rangesim.results.experiment_results import Measurement, Result
@@ -67,7 +68,7 @@ def context(result: Result) -> dict[str, Any]:
         "scene": result.info.scene,
         "titles": names,
         "references": [m.name for m in measurements if tables.is_reference(m)],
-        "settings_line": tables.settings_line(result.experiment, [m.truth.z.shape for m in measurements]),
+        "settings_line": tables.settings_line(result.experiment, measurements),
         "verdict": verdict(measurements),
         "cameras": [_camera(result, group) for group in cameras],
         "columns": tables.COLUMNS,
@@ -75,6 +76,9 @@ def context(result: Result) -> dict[str, Any]:
         "comparison": tables.comparison_table(measurements),
         "outcome_columns": tables.OUTCOMES,
         "outcomes": tables.outcome_table(measurements),
+        "objects": objects_table(measurements),
+        "object_totals": totals(measurements),
+        "object_sentences": [(names[m.name], objects_sentence(m)) for m in measurements],
         "noise": tables.noise_table(measurements),
         "tolerance_mm": f"{1e3 * measurements[0].causes.tolerance_m:g}",
         "definitions": tables.definitions(measurements),
@@ -157,7 +161,7 @@ def _frames(m: Measurement) -> dict[str, Any]:
     f = m.metadata
     taken = f"{f.frames} frame{'s' * (f.frames != 1)}"
     if f.exposure_s is not None:
-        taken += f", {tables.seconds(f.exposure_s)} each" if f.frames != 1 else f", {tables.seconds(f.exposure_s)}"
+        taken += f", {tables.exposure(f)}{' each' * (f.frames != 1)}"
     else:
         taken += ", noise-free"
     details = [m.capture.sensor.details]

@@ -78,8 +78,8 @@ def grey(image: np.ndarray, white: float, black: float = 0.0) -> str:
 
 
 def color_map(fraction: np.ndarray, table: np.ndarray) -> str:
-    """PNG, as a data URI, of values 0..1 in the colours of a table, see `_indexed`."""
-    return png(*_indexed(fraction, table))
+    """PNG, as a data URI, of values 0..1 in the colours of a table, see `indexed`."""
+    return png(*indexed(fraction, table))
 
 
 def map_pictures(image: RangeImage) -> dict[str, bytes]:
@@ -87,7 +87,7 @@ def map_pictures(image: RangeImage) -> dict[str, bytes]:
     maps = {"columns": image.projector_column, "rows": image.projector_row, "depth": image.z}
     table = palette.color_table("viridis")
     pictures = {
-        name: png_bytes(*_indexed(_stretched(values), table))
+        name: png_bytes(*indexed(_stretched(values), table))
         for name, values in maps.items()
         if values is not None and np.isfinite(values).any()
     }
@@ -101,7 +101,7 @@ def _stretched(values: np.ndarray) -> np.ndarray:
     return np.asarray((values - low) / max(high - low, 1e-12))
 
 
-def _indexed(fraction: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def indexed(fraction: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(h, w) uint8 indices of values 0..1 into a colour table (256, 3), and that table with light grey for NaN."""
     index = np.rint(np.clip(np.nan_to_num(fraction), 0, 1) * 254).astype(np.uint8)
     index[~np.isfinite(fraction)] = 255
@@ -168,7 +168,7 @@ def unrolled(ranges: np.ndarray, directions: np.ndarray) -> Picture:
         low, high = np.exp(np.nanpercentile(shown, [1, 99]))
         caption = f"Range over azimuth and elevation, {low:.1f} m (dark) to {high:.1f} m (bright)."
         shown = _stretched(shown)
-    return Picture(png(*_indexed(shown, palette.color_table("viridis"))), caption, "the panorama")
+    return Picture(png(*indexed(shown, palette.color_table("viridis"))), caption, "the panorama")
 
 
 def error_map(measurement: Measurement, table: np.ndarray) -> str:

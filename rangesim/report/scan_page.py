@@ -102,10 +102,12 @@ def _line(result: ScanResult) -> str:
     """The settings of the scan in one line."""
     height, width = result.scan.images[0].z.shape
     s, fused = result.settings, result.fused
+    is_automatic = s.instrument.exposure_s is None and s.instrument.detector_in_use is not None
+    exposure = ", exposure automatic in each view" if is_automatic and not s.instrument.sensor.is_ideal else ""
     known = "poses known" if s.registration == "known" else "poses found from the readings"
     return (
         f"{len(result.scan)} views of {width} × {height} pixels, {s.path.type_name} · "
-        f"{s.instrument.sensor.title} · {known} · voxels of {1e3 * fused.voxel_m:.3g} mm, truncation "
+        f"{s.instrument.sensor.title}{exposure} · {known} · voxels of {1e3 * fused.voxel_m:.3g} mm, truncation "
         f"{1e3 * fused.truncation_m:.3g} mm, weights by {s.weights}"
     )
 

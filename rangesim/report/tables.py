@@ -4,20 +4,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
 from rangesim.evaluation.comparison import Comparison, ErrorStatistics
 from rangesim.evaluation.range_noise import SMALL, noise_ratio
-from rangesim.evaluation.surface_rows import KINDS, OBJECT, OBJECTS
+from rangesim.evaluation.surface_rows import KINDS, OBJECT, OBJECTS, PART
 from rangesim.experiment import Experiment
 from rangesim.presets import catalogue
 from rangesim.report import palette
 from rangesim.report.figures import LegendEntry
 from rangesim.report.markdown_table import Table
-from rangesim.results.experiment_results import Measurement, PhotonsRecord
+from rangesim.results.experiment_results import Measurement, MeasurementRecord, PhotonsRecord
 from rangesim.signals import ALL
 
 Rows = list[dict[str, Any]]
@@ -25,7 +25,7 @@ Rows = list[dict[str, Any]]
 
 BECAUSE = "because (% of the pixels)"
 """Head of the column with the causes of wrong and missing readings."""
-SUMMARIES = tuple(kind for kind in KINDS if kind != OBJECT)
+SUMMARIES = tuple(kind for kind in KINDS if kind not in (OBJECT, PART))
 """Kinds of rows of the tables of errors and of noise, which would be long with a row for every object."""
 MOST = 0.5
 """Fraction of the pixels of a surface that must be right for a sensor to be reliable on it.
@@ -137,7 +137,7 @@ def outcome_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[O
 
 
 def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, list[Cell]]]]]:
-    """Errors of each instrument per surface, except single objects.
+    """Errors of each instrument per surface, except single objects and parts.
 
     Each entry is the surface and a list with the name and the cells, one per column, of each instrument.
     """
@@ -201,15 +201,24 @@ def parts(row: dict[str, Any]) -> list[LegendEntry]:
     ]
 
 
-def comparison_tables(tables: Sequence[tuple[str, Rows]]) -> list[Table]:
-    """Tables of right readings and causes, of errors and of noise, with one row per surface and instrument.
+def comparison_tables(tables: Sequence[tuple[str, Rows]], taken: Sequence[MeasurementRecord]) -> list[Table]:
+    """Tables of right readings and causes, of errors and of noise, with one row per surface and instrument, and of the
+    exposures.
 
     Parameters
     ----------
-    tables : name of each instrument with its statistics per surface.
+    tables : name of each instrument with its statistics per surface. If causes are not known, they are None in every
+        row, and the table has no column for them.
+    taken : record of each of these measurements.
     """
+    knows_causes = any(row["causes"] is not None for _, rows in tables for row in rows)
     return [
-        _table(tables, [*(f"{c.title} ({c.unit})" for c in OUTCOMES), BECAUSE], _outcomes, KINDS),
+        _table(
+            tables,
+            [*(f"{c.title} ({c.unit})" for c in OUTCOMES), *[BECAUSE] * knows_causes],
+            lambda row: [*(number(c, row[c.key]) for c in OUTCOMES), *([_causes(row)] if knows_causes else [])],
+            KINDS,
+        ),
         _table(
             tables,
             [f"{c.title} ({c.unit})" for c in COLUMNS],
@@ -217,12 +226,21 @@ def comparison_tables(tables: Sequence[tuple[str, Rows]]) -> list[Table]:
             SUMMARIES,
         ),
         _table(tables, ["detector noise (mm)", "sampling noise (mm)"], _noise, SUMMARIES),
+        _exposure_table([name for name, _ in tables], taken),
     ]
 
 
-def comparison_markdown(tables: Sequence[tuple[str, Rows]]) -> str:
-    """The tables of `comparison_tables` in Markdown."""
-    return "\n".join(table.markdown() for table in comparison_tables(tables))
+def tolerance_line(tolerance_m: float) -> str:
+    """Sentence that says up to which error a reading counts as right, as every table of right readings needs it."""
+    return f"Right readings are off by at most {1e3 * tolerance_m:g} mm."
+
+
+def comparison_markdown(
+    tables: Sequence[tuple[str, Rows]], taken: Sequence[MeasurementRecord], tolerance_m: float
+) -> str:
+    """The tables of `comparison_tables` in Markdown, below the tolerance."""
+    of_each = [table.markdown() for table in comparison_tables(tables, taken)]
+    return "\n".join([f"{tolerance_line(tolerance_m)}\n", *of_each])
 
 
 def errors_markdown(comparison: Comparison) -> str:
@@ -299,11 +317,6 @@ def _table(
     return Table(["surface", "sensor", *heads], lines)
 
 
-def _outcomes(row: dict[str, Any]) -> list[str]:
-    """Cells of right, wrong and missing readings, in percent, and of the causes of the last two."""
-    return [*(number(c, row[c.key]) for c in OUTCOMES), _causes(row)]
-
-
 def _causes(row: dict[str, Any]) -> str:
     """Text of the causes of wrong and missing readings."""
     return ", ".join(f"{p.name} {p.text}" for p in parts(row)) or "–"
@@ -346,6 +359,41 @@ def seconds(value: float | None) -> str:
     return f"{value * 1e6:.2g} µs"
 
 
+def exposure(taken: MeasurementRecord) -> str:
+    """Text of the exposure of each frame, which says whether it is automatic; a dash for a noise-free capture."""
+    return f"{seconds(taken.exposure_s)}{' automatic' * taken.exposure_is_automatic}"
+
+
+def automatic_exposures(taken: Mapping[str, MeasurementRecord]) -> str:
+    """Sentences, after the word "exposure", on exposures that were chosen automatically; empty if none was.
+
+    Parameters
+    ----------
+    taken : record of each measurement, by the name that the sentence gives it.
+    """
+    chosen = [f"{name} {seconds(one.exposure_s)}" for name, one in taken.items() if one.exposure_is_automatic]
+    if not chosen:
+        return ""
+    return (
+        f"is automatic: {', '.join(chosen)} per frame. Another distance, material or light gets another exposure, and "
+        "so another noise: state exposure_s to compare them."
+    )
+
+
+def _exposure_table(names: Sequence[str], taken: Sequence[MeasurementRecord]) -> Table:
+    """Table of the exposure of each instrument, and of whether it was chosen automatically."""
+    lines = [
+        [name, _choice(one), str(one.frames), seconds(one.exposure_s), seconds(one.acquisition_s)]
+        for name, one in zip(names, taken, strict=True)
+    ]
+    return Table(["sensor", "exposure", "frames", "per frame", "acquisition"], lines)
+
+
+def _choice(taken: MeasurementRecord) -> str:
+    """Text that says who chose the exposure."""
+    return "–" if taken.exposure_s is None else "automatic" if taken.exposure_is_automatic else "as stated"
+
+
 def photons(per_pulse: PhotonsRecord) -> str:
     """Sentence part that says how many photons per laser pulse the median and the brightest pixel detect."""
     median, largest = (_amount(value) for value in (per_pulse.median, per_pulse.largest))
@@ -365,7 +413,7 @@ def cost_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[str]
     table = []
     for m in measurements:
         f, times = m.metadata, m.metadata.times_s
-        cells = [str(f.frames), seconds(f.exposure_s), seconds(f.acquisition_s)]
+        cells = [str(f.frames), exposure(f), seconds(f.acquisition_s)]
         cells += [seconds(times.get(stage)) for stage in ("exposure", "decode", "points", "segmentation")]
         table.append((m.name, [*cells, f"{f.points:,}".replace(",", " "), f"{f.points / f.pixels:.2f}"]))
     return table
@@ -376,18 +424,17 @@ def size_text(shape: tuple[int, ...]) -> str:
     return f"{shape[1]} × {shape[0]}"
 
 
-def settings_line(experiment: Experiment, shapes: Sequence[tuple[int, ...]]) -> str:
-    """The settings of the light transport in one line.
-
-    Parameters
-    ----------
-    shapes : height and width of the images of each instrument, pixels.
-    """
-    sizes = " and ".join(dict.fromkeys(map(size_text, shapes)))
+def settings_line(experiment: Experiment, measurements: Sequence[Measurement]) -> str:
+    """The settings of the light transport, and the kind of exposure, in one line."""
+    sizes = " and ".join(dict.fromkeys(size_text(m.truth.z.shape) for m in measurements))
     paths = f"up to {experiment.max_spp}" if experiment.spp is None else experiment.spp
+    exposed = [m.metadata for m in measurements if m.metadata.exposure_s is not None]
+    automatic = [one.exposure_is_automatic for one in exposed]
+    some = f"{sum(automatic)} of {len(exposed)} automatic" if any(automatic) else "fixed"
+    kind = "automatic" if all(automatic) else some
     return (
         f"{sizes} pixels, {paths} light paths per pixel of up to {experiment.max_depth} segments, "
-        f"seed {experiment.seed}"
+        f"seed {experiment.seed}" + (f", exposure {kind}" if exposed else "")
     )
 
 

@@ -13,15 +13,17 @@ from markupsafe import Markup
 from pcgraph.viewer.content_policy import content_policy
 from rangesim.report.content_security import StyleRules, visible_text
 
+STYLES = ("style.css", "print.css")
+"""Files of the style sheet of every page: the second one holds the rules for paper."""
+
 
 def render_page(
     template: str, values: Mapping[str, Any], scripts: Sequence[str] = ("scroll.js", "print.js"), paper: str = ""
 ) -> str:
     """HTML page made from a template of this package and the values of its variables.
 
-    Every page also gets the style sheets for the screen (`css`) and for paper (`print`), the scripts (`script`), the
-    rules that the template adds to the style sheet (`rules`) and the function that writes the page's security policy
-    (`content_policy`).
+    Every page also gets the style sheet (`css`), the scripts (`script`), the rules that the template adds to the style
+    sheet (`rules`) and the function that writes the page's security policy (`content_policy`).
 
     Parameters
     ----------
@@ -39,16 +41,15 @@ def render_page(
         autoescape=True, finalize=visible_text, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     own = {  # `Markup` is not escaped: these files are part of the package
-        "css": Markup(_file("style.css")),
-        "print": Markup(_file("print.css") + (f"@page {{ size: {paper}; }}\n" if paper else "")),
-        "script": Markup("\n".join(map(_file, scripts))),
+        "css": Markup("\n".join(map(text_of_file, STYLES)) + (f"@page {{ size: {paper}; }}\n" if paper else "")),
+        "script": Markup("\n".join(map(text_of_file, scripts))),
         "rules": StyleRules(),
         "content_policy": content_policy,
     }
-    return environment.from_string(_file(template)).render(own, **values)
+    return environment.from_string(text_of_file(template)).render(own, **values)
 
 
-def _file(name: str) -> str:
+def text_of_file(name: str) -> str:
     """Text of a file of this package or, as "package:name", of another one."""
     package, _, file = name.rpartition(":")
     return (files(package or "rangesim.report") / file).read_text(encoding="utf-8")

@@ -14,6 +14,7 @@ from typing import Any
 from rangesim.evaluation.surface_rows import MATERIAL, OBJECT, OBJECTS
 from rangesim.report.tables import (
     Rows,
+    automatic_exposures,
     is_reference,
     is_reliable,
     millimetres,
@@ -40,7 +41,7 @@ class Finding:
 
 
 def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
-    """Findings about a result: real sensors side by side, and then right readings and failures of each."""
+    """Findings about a result: real sensors side by side, right readings and failures of each, automatic exposures."""
     names = titles(measurements)
     real = [m for m in measurements if not is_reference(m)] or list(measurements)
     findings = [Finding(names[m.name], _right(m) + _worst(m.rows) + _reasons(m.rows) + _accuracy(m)) for m in real]
@@ -53,6 +54,8 @@ def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
         ]
         if any(parts):  # ideal sensors alone may be equal in all of these
             findings.insert(0, Finding("Side by side", " ".join(filter(None, parts))))
+    if text := automatic_exposures({names[m.name]: m.metadata for m in real}):
+        findings.append(Finding("Exposure", text))
     return findings
 
 
@@ -81,9 +84,11 @@ def _worst(rows: Rows) -> str:
     poor = [row for row in surfaces if not is_reliable(row)]
     named = [_described(row) for row in (poor or surfaces)[: MAX_NAMED if poor else 1]]
     more = f" and {len(poor) - MAX_NAMED} more" if len(poor) > MAX_NAMED else ""
-    right = len(surfaces) - len(poor)
-    count = f"each of {len(surfaces)}" if not poor else f"{right} of {len(surfaces)}" if right else "none of the"
-    return f" It is right on most of {count} {noun}; worst: {', '.join(named)}{more}."
+    good = [row["name"] for row in surfaces if row not in poor]
+    count = f"{len(good)} of {len(surfaces)} {noun}"
+    if poor and 0 < len(good) <= MAX_NAMED:
+        count += f" ({', '.join(reversed(good))})"
+    return f" Most pixels are right on {count}; worst: {', '.join(named)}{more}."
 
 
 def _described(row: dict[str, Any]) -> str:
@@ -103,9 +108,9 @@ def _reasons(rows: Rows) -> str:
 
 
 def _accuracy(measurement: Measurement) -> str:
-    """Sentence about the errors of the readings, right and wrong ones."""
+    """Sentence about the errors of the readings, right and wrong ones; empty if most pixels are not right."""
     judged = _judged(measurement.rows)
-    if judged["median_abs_m"] is None:
+    if not is_reliable(judged):
         return ""
     true = "true depth" if measurement.camera.is_pinhole else "true range"
     lie = "lie" if judged["kind"] == ALL else "on an object lie, on average,"
@@ -143,7 +148,8 @@ def _nobody_right(real: Sequence[Measurement], names: dict[str, str]) -> str:
         return ""
     named = [f"{name} (at best {_percent(right, 0)}, {sensor})" for right, name, sensor in poor[:MAX_NAMED]]
     more = f" and {len(poor) - MAX_NAMED} more" if len(poor) > MAX_NAMED else ""
-    return f"No sensor is right on most of these {noun}: {', '.join(named)}{more}."
+    which = "any of the" if len(poor) == len(best) else "these"
+    return f"No sensor is right on most of {which} {noun}: {', '.join(named)}{more}."
 
 
 def _best_error(real: Sequence[Measurement], names: dict[str, str]) -> str:

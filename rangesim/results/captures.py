@@ -51,6 +51,7 @@ _KEYS = (
     "rig",
     "detector",
     "exposure_s",
+    "exposure_is_automatic",
     "ambient",
     "further_cameras",
 )
@@ -160,7 +161,10 @@ def _read_capture(sidecar: Path) -> tuple[Capture, list[str]]:
         if not isinstance(further, list) or not all(isinstance(n, str) and _CAMERA.fullmatch(n) for n in further):
             raise ValueError(f"expected names such as camera_2 under further_cameras, got {shown(further)}.")
         exposure_s = math.nan if exposure is None else float(exposure)
-        return Capture(frames, sensor, rig, detector, exposure_s, ambient), further
+        is_automatic = settings.get("exposure_is_automatic", False)
+        if not isinstance(is_automatic, bool):
+            raise ValueError(f"expected true or false under exposure_is_automatic, got {shown(is_automatic)}.")
+        return Capture(frames, sensor, rig, detector, exposure_s, ambient, is_automatic), further
     except (ValueError, TypeError) as error:
         raise FileFormatError(f"{sidecar}: {str(error).removeprefix(f'{sidecar}: ')}") from error
 
@@ -316,6 +320,7 @@ def _sidecar(capture: Capture, names: list[str]) -> dict[str, Any]:
         "rig": to_dict(capture.rig),
         "detector": to_dict(capture.detector),
         "exposure_s": None if math.isnan(capture.exposure_s) else capture.exposure_s,
+        "exposure_is_automatic": capture.exposure_is_automatic,
         **({} if capture.ambient is None else {"ambient": to_dict(capture.ambient)}),
         "frames": names,
     }

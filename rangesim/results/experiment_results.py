@@ -130,6 +130,8 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
     """The contents of `measurement.json`.
 
     exposure_s : exposure of each frame, seconds; None for a noise-free capture.
+    exposure_is_automatic : whether it was chosen for the light of this scene, so that at another distance it is another
+        one.
     acquisition_s : time from the start of the first exposure to the end of the last, seconds; of a scanner, that of its
         last ray.
     points : number of pixels with a reading.
@@ -142,6 +144,7 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
     sensor: Name
     frames: Count
     exposure_s: Positive | None
+    exposure_is_automatic: bool
     acquisition_s: Seconds | None
     pixels: Count
     points: Count
@@ -156,7 +159,7 @@ class RowRecord(Record, frozen=True, kw_only=True):
     `rangesim.evaluation.range_noise.RangeNoise.by_surface` explain them. None: not known.
     """
 
-    kind: Literal["objects", "object", "material", "all"]
+    kind: Literal["objects", "object", "part", "material", "all"]
     name: str
     pixels: Count
     lit: Count
@@ -186,6 +189,10 @@ class ComparisonRecord(Record, frozen=True, kw_only=True):
     format_version: Literal[2] = 2
     tolerance_m: Positive
     rows: list[RowRecord]
+
+    def plain_rows(self) -> list[dict[str, Any]]:
+        """The rows as dicts."""
+        return [msgspec.to_builtins(row) for row in self.rows]
 
 
 class ObjectRecord(Record, frozen=True, kw_only=True):
@@ -251,7 +258,7 @@ class Measurement(ShortRepr):
     image : RangeImage.
     truth : GroundTruth of the instrument's pass.
     causes : CauseMap, the cause of each failed pixel.
-    rows : statistics with the keys of `RowRecord`, in this order: mean over objects, each object, each material class,
+    rows : statistics with the keys of `RowRecord`, in this order: mean over objects, objects, parts, material classes,
         "all". `row` finds one by its name.
     segmentation : Segmentation; None if there were too few points.
     objects : ObjectSegmentation, what the segmentation makes of each object; None in results that do not tell.
@@ -401,8 +408,8 @@ def read_settings(folder: Path) -> ResultRecord:
     return read_record(sidecar_of(folder, RESULT), ResultRecord)
 
 
-def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """The rows of `comparison.json` in the directory of an instrument; FileFormatError if the file is broken."""
+def read_comparison(folder: Path) -> ComparisonRecord:
+    """The contents of `comparison.json` in the directory of an instrument; FileFormatError if the file is broken."""
     path = folder / "comparison.json"
     record = read_record(path, ComparisonRecord)
     keys = [(row.kind, row.name) for row in record.rows]
@@ -423,7 +430,12 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
             raise FileFormatError(
                 f"{path}: expected the causes of {shown(row.name)} to add up to what is wrong or missing."
             )
-    return [msgspec.to_builtins(row) for row in record.rows]
+    return record
+
+
+def read_acquisition(folder: Path) -> MeasurementRecord:
+    """The contents of `measurement.json` in the directory of an instrument; FileFormatError if the file is broken."""
+    return read_record(folder / "measurement.json", MeasurementRecord)
 
 
 def _image_sizes(info: ResultRecord, path: Path) -> dict[int, dict[str, int]]:
@@ -452,7 +464,7 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
     if image.camera != capture.rig.camera:
         raise FileFormatError(f"{folder / 'range.npz'}: expected the camera of the capture.")
     data = read_checked_arrays(folder / "causes.npz", _CAUSES, sizes)
-    metadata = read_record(folder / "measurement.json", MeasurementRecord)
+    metadata = read_acquisition(folder)
     if (metadata.sensor, metadata.frames, metadata.pixels) != (
         capture.sensor.type_name, len(capture.frames), capture.frames[0].size
     ):  # fmt: skip
@@ -463,7 +475,7 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
         image=replace(image, T_world_camera=capture.rig.T_world_camera),
         truth=truth,
         causes=CauseMap(data["cause"], float(data["tolerance_m"])),
-        rows=read_rows(folder),
+        rows=read_comparison(folder).plain_rows(),
         segmentation=_load_segmentation(folder / "segmentation.npz", sizes),
         objects=_load_objects(folder / "objects.json"),
         metadata=metadata,

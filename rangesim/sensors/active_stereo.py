@@ -19,7 +19,7 @@ from rangesim.geometry.stereo import rectify
 from rangesim.response import DenseResponse, Dots, Images, Response
 from rangesim.response.patterns import image_of
 from rangesim.rig import translation
-from rangesim.sensor import Background, Decoder, Emitter, FrameContent, Sensor, least_signal_for, of_type
+from rangesim.sensor import Background, Decoder, Emitter, FrameContent, ReceivedLight, Sensor, least_signal_for, of_type
 from rangesim.settings.bounds import Bounds, Metres, check_fields
 
 if TYPE_CHECKING:
@@ -217,6 +217,24 @@ class StereoDecoder(Decoder):
         """Least light whose dots locate a match to `matching.max_sigma_px`, if a camera's pixel is as wide as a
         projector's. A passive sensor needs no light of the emitter."""
         return least_light(of_type(sensor, ActiveStereo).pattern, self.matching, self.noise, background, images=2)
+
+    is_lower_bound: ClassVar[bool] = True
+
+    def depth_error_m(self, sensor: Sensor, light: ReceivedLight) -> np.ndarray | None:
+        """The Cramér-Rao bound of a match, z^2 / (f b) sigma_d: the texture of the dots in a window against the noise
+        of two images, sigma_d^2 = 2 variance / (pixels * texture * light^2); None for passive stereo.
+
+        It takes a camera's pixel to be as wide as a projector's. Matchers draw disparities to whole pixels and round
+        them, so they stay above.
+        """
+        stereo = of_type(sensor, ActiveStereo)
+        texture = texture_of(pattern_of(stereo.pattern))
+        if not texture:
+            return None
+        variance = 2 * (light.emitter + light.ambient + light.own_variance)
+        with np.errstate(divide="ignore"):
+            disparity_px = np.sqrt(variance / texture) / (self.matching.window_px * light.emitter)
+        return np.asarray(light.reading_m**2 / (light.focal_px * stereo.baseline_m) * disparity_px)
 
     @property
     def reach_px(self) -> int:

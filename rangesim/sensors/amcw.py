@@ -30,7 +30,7 @@ from rangesim.decoding.working_range import WorkingRange
 from rangesim.electronics.detector import Detector
 from rangesim.errors import DoubtWarning, warn
 from rangesim.response import SPEED_OF_LIGHT, Correlation, Phasor, Response
-from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, of_type
+from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, ReceivedLight, Sensor, of_type
 from rangesim.settings import limits
 from rangesim.settings.bounds import HERTZ, Bounds, Hertz, Pause, check_fields, check_number
 
@@ -395,6 +395,31 @@ class AmcwDecoder(Decoder):
             intensity=mean - capture.black_level,
             doubts=(doubt,) if doubt else (),
         )
+
+    def depth_error_m(self, sensor: Sensor, light: ReceivedLight) -> np.ndarray | None:
+        """The noise of the phases by shot noise and read noise, averaged over the frequencies by their precision, and
+        the delays of the pixels; None for correlations that are no sine, and for two paths.
+
+        Of N taps with mean q A and amplitude q C S, where q is the fraction of an exposure's light that a tap gets, a
+        phase has the standard deviation sqrt(2 / N) sigma / (q C S).
+
+        References
+        ----------
+        Lange: "3D time-of-flight distance measurement with custom solid-state image sensors in CMOS/CCD technology",
+        thesis, Siegen (2000).
+        """
+        amcw = of_type(sensor, AmcwToF)
+        if amcw.waveform != "sine" or amcw.correlation is not None or self.two_paths:
+            return None
+        q = amcw.tap_fraction
+        noise_e = np.sqrt(q * (light.emitter + light.ambient) + light.own_variance)
+        precision = np.zeros(light.emitter.shape)
+        for hertz, contrast in zip(amcw.modulation_hz, amcw.contrast_of_each, strict=True):
+            radians_per_m = 2 * np.pi * hertz / SPEED_OF_LIGHT
+            precision += amcw.taps / 2 * (radians_per_m * q * contrast * light.emitter / noise_e) ** 2
+        with np.errstate(divide="ignore"):
+            variance_m2 = 1 / precision + (amcw.pixel_delay_s * SPEED_OF_LIGHT) ** 2
+        return np.asarray(np.sqrt(variance_m2) * np.abs(light.per_length))
 
     def _contradiction(
         self, sensor: AmcwToF, capture: Capture, status: np.ndarray, length_m: np.ndarray, modulation: np.ndarray

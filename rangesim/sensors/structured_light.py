@@ -34,7 +34,7 @@ from rangesim.decoding.working_range import WorkingRange
 from rangesim.errors import DoubtWarning, warn
 from rangesim.response import DenseResponse
 from rangesim.rig import Rig
-from rangesim.sensor import Background, Decoder, Emitter, Sensor, of_type
+from rangesim.sensor import Background, Decoder, Emitter, ReceivedLight, Sensor, of_type
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, check_fields, whole
 from rangesim.settings.config import has_defaults, nearest, shown
@@ -330,6 +330,17 @@ class StructuredLightDecoder(Decoder):
             for axis in shown.axes
         ]
         return np.asarray(np.maximum.reduce(each))
+
+    def depth_error_m(self, sensor: Sensor, light: ReceivedLight) -> np.ndarray | None:
+        """The standard deviation of the code's place times the change of the depth with it; None for codes along both
+        axes, or without a closed form."""
+        shown = of_type(sensor, StructuredLight)
+        if len(shown.axes) > 1:
+            return None
+        (name,) = shown.axes
+        place_px = shown.code.place_sigma_px(AXES.index(name), shown.size(name), light)
+        per_px = light.per_column if name == "columns" else light.per_row
+        return None if place_px is None else place_px * np.abs(per_px)
 
     def likely_cause(self, capture: Capture, image: RangeImage) -> str | None:
         if image.camera is None and (axis := _another_axis(image)):

@@ -24,6 +24,7 @@ True
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -93,23 +94,23 @@ class Draw(Plain):
         if len(value) != 1 or (kind := next(iter(value))) not in DISTRIBUTIONS:
             hint = nearest(str(next(iter(value), "")), DISTRIBUTIONS)
             raise ValueError(
-                f"{where}: expected a value, a list, or a table with one of {', '.join(DISTRIBUTIONS)}, "
+                f"expected {where} to be a value, a list, or a table with one of {', '.join(DISTRIBUTIONS)}, "
                 f"got {shown(dict(value))}{hint}."
             )
         given = value[kind]
         if not isinstance(given, (list, tuple)) or not given:
-            raise ValueError(f"{where}: expected {kind} to be a list of values, got {shown(given)}.")
+            raise ValueError(f"expected {kind} of {where} to be a list of values, got {shown(given)}.")
         if kind == "choice":
             return cls(kind, tuple(cls.of(entry, f"{where}[{i}]") for i, entry in enumerate(given)))
         if len(given) != 2 or not all(_is_number(number) for number in given):
-            raise ValueError(f"{where}: expected {kind} to be two numbers, got {shown(given)}.")
+            raise ValueError(f"expected {kind} of {where} to be two numbers, got {shown(given)}.")
         first, second = given
         if kind == "normal" and second < 0:
-            raise ValueError(f"{where}: expected a standard deviation of at least 0, got {shown(second)}.")
+            raise ValueError(f"expected a standard deviation of at least 0 for {where}, got {shown(second)}.")
         if kind != "normal" and not first <= second:
-            raise ValueError(f"{where}: expected {kind} from the lower to the higher end, got {shown(given)}.")
+            raise ValueError(f"expected {kind} of {where} from the lower to the higher end, got {shown(given)}.")
         if kind == "log_uniform" and not first > 0:
-            raise ValueError(f"{where}: expected positive ends of log_uniform, got {shown(given)}.")
+            raise ValueError(f"expected positive ends of log_uniform for {where}, got {shown(given)}.")
         return cls(kind, (first, second))
 
     @classmethod
@@ -180,7 +181,8 @@ class Draw(Plain):
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return is_number and abs(value) <= sys.float_info.max  # an int may be too large for a float; NaN fails
 
 
 @lru_cache(maxsize=256)
@@ -196,9 +198,10 @@ def _draws(cls: type) -> dict[str, Of]:
 
 def check_draws(setting: Any) -> None:
     """Make draws of the plain values in the fields that are annotated with `Of`; raise ValueError on wrong ones."""
+    defaults = {field.name: field.default for field in fields(setting)}
     for name, of in _draws(type(setting)).items():  # type: ignore[arg-type]
         value = getattr(setting, name)
-        if value is not None:
+        if value is not None or defaults[name] is not None:  # a default of None is allowed
             draw = Draw.of(value, name)
             draw.check(name, of)
             object.__setattr__(setting, name, draw)

@@ -6,8 +6,6 @@ from __future__ import annotations
 import re
 from decimal import Decimal
 
-from pcgraph.plumbing.short_repr import SHORT
-
 EXPONENTS = {"nm": -9, "um": -6, "µm": -6, "mm": -3, "cm": -2, "m": 0, "km": 3}
 """Decimal exponent of each unit in metres."""
 _LENGTH = re.compile(r"\s*([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[-+]?[0-9]{1,3})?)\s*([^\W\d_]*)\s*", re.IGNORECASE)
@@ -36,6 +34,6 @@ def metres(text: str, name: str = "a length") -> float:
     if found is None or exponent is None:
         *units, last = EXPONENTS
         raise ValueError(
-            f"expected {name} to be a length such as '2mm', in {', '.join(units)} or {last}, got {SHORT.repr(text)}."
+            f"expected {name} to be a length such as '2mm', in {', '.join(units)} or {last}, got {text[:60]!r}."
         )
     return float(Decimal(found[1]).scaleb(exponent))  # in decimal digits, so that "1.1mm" is 0.0011

@@ -47,11 +47,17 @@ class EnergySplit(ShortRepr):
         """All light of the emitter at full power, without ambient light: (h, w) float32, W/m2/sr."""
         return self.direct + self.multipath + self.specular + self.caustic + self.glint
 
+    def scaled(self, factor: float) -> EnergySplit:
+        """The same split with that many times the emitter's light; ambient light stays as it is."""
+        kinds = ("direct", "multipath", "specular", "caustic", "glint")
+        return replace(self, **{kind: np.float32(factor) * getattr(self, kind) for kind in kinds})
+
 
 class Surface(NamedTuple):
     """A part of the ground truth that a row of a table is about.
 
-    kind : "object", "material" or "all". name : of the object or of the material class, or "all".
+    kind : "object", "part" (a shape of an object that has several), "material" or "all". name : of the object, of the
+        shape or of the material class, or "all".
     mask : (h, w) bool, its pixels.
     """
 
@@ -103,14 +109,23 @@ class GroundTruth(ShortRepr):
     @property
     def object_index(self) -> np.ndarray:
         """(h, w) int32, index into `object_names` of the object behind each pixel; -1 for background and nothing."""
+        if not self.instance_objects:
+            return np.full_like(self.instance, -1)
         index_of = {name: i for i, name in enumerate(self.object_names)}
-        of_instance = [index_of.get(name, -1) for name in self.instance_objects] or [-1] * len(self.instance_names)
+        of_instance = [index_of.get(name, -1) for name in self.instance_objects]
         return np.array([*of_instance, -1], dtype=np.int32)[self.instance]
 
     def objects(self) -> dict[str, np.ndarray]:
         """Pixels of each object that the camera sees, as (h, w) bool by name."""
         index = self.object_index
         masks = {name: index == i for i, name in enumerate(self.object_names)}
+        return {name: mask for name, mask in masks.items() if mask.any()}
+
+    def parts(self) -> dict[str, np.ndarray]:
+        """Pixels of each shape that the camera sees of an object of several shapes, as (h, w) bool by name."""
+        shapes = list(zip(self.instance_names, self.instance_objects, strict=False))
+        several = {thing for _, thing in shapes if thing and self.instance_objects.count(thing) > 1}
+        masks = {name: self.instance == i for i, (name, thing) in enumerate(shapes) if thing in several}
         return {name: mask for name, mask in masks.items() if mask.any()}
 
     def classes(self) -> dict[str, np.ndarray]:
@@ -120,10 +135,10 @@ class GroundTruth(ShortRepr):
         return {name: mask for name, mask in of_class.items() if mask.any()} | {ALL: seen}
 
     def surfaces(self) -> list[Surface]:
-        """The surfaces that tables have rows for: each object, each material class, and all together at the end."""
-        objects = [Surface("object", *item) for item in self.objects().items()]
+        """The surfaces that tables have rows for: objects, their parts, material classes, and all together."""
         *materials, (_, seen) = self.classes().items()
-        return [*objects, *(Surface("material", *item) for item in materials), Surface(ALL, ALL, seen)]
+        groups = {"object": self.objects().items(), "part": self.parts().items(), "material": materials}
+        return [Surface(kind, *item) for kind, items in groups.items() for item in items] + [Surface(ALL, ALL, seen)]
 
 
 @dataclass(frozen=True)
@@ -244,6 +259,23 @@ class StillSignals(Signals):
     channels: dict[Response, np.ndarray] = field(kw_only=True)
     sampling: SamplingError | None = field(kw_only=True, default=None)
 
+    def at_power(self, power_w: float) -> StillSignals:
+        """The signals of the same pass if its emitter had another power, watts: light is linear."""
+        factor = np.float32(power_w / self.rig.projector_power_w)
+        if factor == 1:
+            return self
+        sampling = self.sampling
+        if sampling is not None:
+            errors = {r: factor * c for r, c in sampling.channels.items()}
+            sampling = SamplingError(errors, factor * sampling.projector)
+        return replace(
+            self,
+            rig=replace(self.rig, projector_power_w=power_w),
+            energy=self.energy.scaled(float(factor)),
+            channels={r: factor * c for r, c in self.channels.items()},
+            sampling=sampling,
+        )
+
     def only(self, sensor: Sensor) -> StillSignals:
         """The same signals without the channels that only other sensors need."""
         kept = sensor.responses()
@@ -353,6 +385,18 @@ class SignalSet(Signals, Sequence[Signals]):
     @property
     def cameras(self) -> tuple[Signals, ...]:
         return self.of_cameras
+
+    def at_power(self, power_w: float) -> SignalSet:
+        """The signals of the same pass if its emitter had another power, watts.
+
+        Raises
+        ------
+        ValueError
+            Something moves in the signals of a camera.
+        """
+        if not all(isinstance(one, StillSignals) for one in self.of_cameras):
+            raise ValueError("expected signals of a world at rest.")
+        return SignalSet.of([one.at_power(power_w) for one in self.of_cameras if isinstance(one, StillSignals)])
 
     @property
     def knows_sampling_error(self) -> bool:
