@@ -206,7 +206,15 @@ def test_the_page_and_the_tables_are_written(result: Any, tmp_path: Path) -> Non
     page = write_sweep(result, tmp_path).read_text()
     rows = list(csv.DictReader((tmp_path / "rows.csv").read_text().splitlines()))
     assert len(rows) == len(result.rows)
-    assert "amcw stays within 10 mm" in page
+    reach = next(line for line in page.split("<p>") if "95 % of the readings are within 10 mm" in line)
+    assert "amcw" in reach
+    (lowest, highest) = (
+        next(r for r in result.summary if r["sensor"] == "amcw" and r["kind"] == "all" and r["scene.distance_m"] == d)
+        for d in (min(result.sweep.vary["scene.distance_m"]), max(result.sweep.vary["scene.distance_m"]))
+    )
+    grown = next(line for line in page.split("<p>") if line.startswith("Error over distance"))
+    for row in (lowest, highest):
+        assert f"{1e3 * row['error_m'].mean:.3g} mm at {row['scene.distance_m']:g} m" in grown
     assert "Exposures are fixed" in page
     import pyarrow.parquet as pq
 
