@@ -56,7 +56,8 @@ def _line(samples: Samples, rows: Sequence[IndexRow]) -> str:
     objects = sum(row.objects or 0 for row in samples.rows)
     version = samples.store.record.versions.get("rangesim")
     failed = len(rows) - len(samples)
-    text = f"{len(samples)} scenes with {objects} objects · {len(shards)} shards, {size / 1e6:.1f} MB"
+    packed = f"{len(shards)} shard{'s' * (len(shards) != 1)}, {size / 1e6:.1f} MB"
+    text = f"{len(samples)} scenes with {objects} objects · {packed}"
     return f"{text} · {failed} scenes failed · rangesim {version}"
 
 
@@ -81,7 +82,7 @@ def _sentences(rows: Sequence[IndexRow]) -> list[str]:
     best, worst = max(means, key=lambda entry: entry[1]), max(means, key=lambda entry: entry[2])
     said = [f"Most right: {best[0]}, {100 * best[1]:.1f} % of the pixels of objects."]
     if len(means) > 1:
-        said.append(f"Most wrong, with no word of the sensor: {worst[0]}, {100 * worst[2]:.1f} %.")
+        said.append(f"Most wrong, without a warning from the sensor: {worst[0]}, {100 * worst[2]:.1f} %.")
     return said
 
 
@@ -101,7 +102,7 @@ def _tile(record: SampleRecord, sample: dict[str, Any], row: IndexRow) -> SceneT
     return SceneTile(
         number=record.number,
         categories=sorted(counts),
-        names=[each.category for each in record.objects],
+        models=[each.model for each in record.objects],
         depth_m=truth["true_m"],
         instance=instance,
         amodal=truth["amodal"],
