@@ -278,6 +278,7 @@ def test_penetration_is_measured() -> None:
         assert penetration_m({"a": ball, "b": other}) == pytest.approx(overlap_m, abs=1e-4)
 
 
+@pytest.mark.validation
 def test_objects_that_fall_off_are_counted() -> None:
     small = {"type": "table", "width_m": 0.12, "depth_m": 0.12}
     scene = random_scene(spec_of(support=small, arrangement="pile"), 0)
