@@ -20,6 +20,8 @@ LEFT, RIGHT, TOP, BOTTOM = 58.0, 12.0, 12.0, 46.0
 """Margins around the axes, in the units of the plot: room for labels."""
 LOG_RATIO = 4.0
 """Ratio of the largest to the least value from which an axis is logarithmic."""
+MAX_DOTS = 24
+"""Points of a curve up to which each has a dot; more dots would be a line of their own."""
 CHARACTER = 7.0
 """Mean width of a character of the labels, in the units of the plot."""
 COLORS = ("#2f7fd6", "#d9661f", "#2a9d5c", "#c2458f", "#8a63d2", "#a98400", "#0f9aa8", "#d64545", "#7a8a99", "#5b7a1f")
@@ -136,7 +138,8 @@ def line_plot(curves: Sequence[Curve], x: Axis, y: Axis, alt: str, bound: float 
         parts.append(
             f'<path class="curve k{curve.color}" d="M{_path([place(p.x, p.y) for p in shown])}"/>' if shown else ""
         )
-        parts += [_dot(place(p.x, p.y), curve.color) for p in shown]
+        if len(shown) <= MAX_DOTS:
+            parts += [_dot(place(p.x, p.y), curve.color) for p in shown]
     return _svg(parts, alt)
 
 

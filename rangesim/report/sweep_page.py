@@ -268,6 +268,11 @@ class _Page:
                 f"Exposures are fixed at the shortest that automatic exposure would choose at any point, so that none "
                 f"saturates: {'; '.join(each)}.{still}"
             )
+        own = [
+            n for n, i in self.sweep.given.items() if i.exposure_s is not None and "exposure_s" not in self.sweep.vary
+        ]
+        if own:
+            yield f"The same at all points is the exposure of {', '.join(own)}, which they state themselves."
         automatic = {}
         for name in self.names:
             found = [r["exposure_s"] for r in self._rows_of(name) if r["exposure_s"] is not None]

@@ -400,8 +400,9 @@ class AmcwDecoder(Decoder):
         """The noise of the phases by shot noise and read noise, averaged over the frequencies by their precision, and
         the delays of the pixels; None for correlations that are no sine, and for two paths.
 
-        Of N taps with mean q A and amplitude q C S, where q is the fraction of an exposure's light that a tap gets, a
-        phase has the standard deviation sqrt(2 / N) sigma / (q C S).
+        Of N taps with mean q A and amplitude B = q C S, where q is the fraction of an exposure's light that a tap gets,
+        a phase has the standard deviation sqrt(2 / N) sigma / B. The shot noise of three taps depends on the phase too:
+        sigma^2 has a term -B / 2 cos(3 phase), which the decoder, who averages by precision, does not know.
 
         References
         ----------
@@ -412,13 +413,17 @@ class AmcwDecoder(Decoder):
         if amcw.waveform != "sine" or amcw.correlation is not None or self.two_paths:
             return None
         q = amcw.tap_fraction
-        noise_e = np.sqrt(q * (light.emitter + light.ambient) + light.own_variance)
-        precision = np.zeros(light.emitter.shape)
+        even_e2 = q * (light.emitter + light.ambient) + light.own_variance
+        precision, weighted = np.zeros((2, *light.emitter.shape))
         for hertz, contrast in zip(amcw.modulation_hz, amcw.contrast_of_each, strict=True):
             radians_per_m = 2 * np.pi * hertz / SPEED_OF_LIGHT
-            precision += amcw.taps / 2 * (radians_per_m * q * contrast * light.emitter / noise_e) ** 2
-        with np.errstate(divide="ignore"):
-            variance_m2 = 1 / precision + (amcw.pixel_delay_s * SPEED_OF_LIGHT) ** 2
+            amplitude_e = q * contrast * light.emitter
+            third = amplitude_e / 2 * np.cos(3 * radians_per_m * light.path_length_m) if amcw.taps == 3 else 0.0
+            of_one = amcw.taps / 2 * (radians_per_m * amplitude_e) ** 2 / even_e2
+            precision += of_one
+            weighted += of_one * (even_e2 - third) / even_e2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            variance_m2 = weighted / precision**2 + (amcw.pixel_delay_s * SPEED_OF_LIGHT) ** 2
         return np.asarray(np.sqrt(variance_m2) * np.abs(light.per_length))
 
     def _contradiction(
