@@ -35,7 +35,7 @@ def answer(question: Any) -> Any:
         case "no bytes":
             return 3
         case "raise":
-            raise RuntimeError("no luck")
+            raise RuntimeError("no\nluck")
         case "exit":
             sys.exit(2)
         case "warn":
@@ -371,7 +371,7 @@ def test_workers_divide_the_cores_among_them(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(workers, "cores", lambda: 4)
     monkeypatch.setenv("OMP_NUM_THREADS", "3")  # the user's setting would make the workers fight
     store = ItemStore(tmp_path)
-    run_items(threads_in_force, {"a": 0}, store, Workers(count=count))
+    run_items(threads_in_force, {"a": 0, "b": 1}, store, Workers(count=count))
     drjit, numba, pools = json.loads(store.read("a"))
     assert (drjit, numba, pools) == (4 // count, 4 // count, [1])
     assert os.environ["OMP_NUM_THREADS"] == "3"

@@ -19,7 +19,7 @@ from rangesim.dataset.piles import GAP_M
 from rangesim.dataset.random_primitives import PRIMITIVES, primitive
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.transport_settings import TransportSettings
-from rangesim.settings.draws import Draw, Of, draw_table
+from rangesim.settings.draws import ANY_NUMBER, Draw, Of, draw_table
 from rangesim.triangle_mesh import TriangleMesh
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -44,8 +44,7 @@ def spec_of(**changes: Any) -> DatasetSpec:
 def test_draws_have_their_distributions() -> None:
     random = np.random.default_rng(0)
 
-    def values(plain: Any, of: Of | None = None) -> np.ndarray:
-        of = of or Of(float)
+    def values(plain: Any, of: Of = ANY_NUMBER) -> np.ndarray:
         return np.array([Draw.of(plain).value(random, of) for _ in range(4000)])
 
     assert np.mean(values({"uniform": [1, 3]})) == pytest.approx(2, abs=0.04)
@@ -140,6 +139,28 @@ def test_models_of_a_folder_have_their_units_and_categories(tmp_path: Path) -> N
         assert 0.5 <= one.scale <= 1
         assert len(one.source_sha256) == 64
         assert "." not in one.name
+
+
+def test_a_urdf_file_has_its_links_where_the_joints_put_them(tmp_path: Path) -> None:
+    import trimesh
+
+    (tmp_path / "arm" / "meshes").mkdir(parents=True)
+    trimesh.creation.box((20, 20, 20)).export(tmp_path / "arm" / "meshes" / "cube.stl")
+    (tmp_path / "arm" / "arm.urdf").write_text(
+        """<robot name="arm">
+        <link name="base"><visual><geometry><box size="0.1 0.1 0.02"/></geometry></visual></link>
+        <link name="tip"><visual><origin xyz="0 0 0.05"/><geometry>
+          <mesh filename="package://arm/meshes/cube.stl" scale="0.001 0.001 0.001"/></geometry></visual></link>
+        <joint name="j" type="revolute"><parent link="base"/><child link="tip"/>
+          <origin xyz="0.04 0 0.1" rpy="0 1.5707963267948966 0"/></joint></robot>"""
+    )
+    solid = read_model(tmp_path / "arm" / "arm.urdf", 1.0)
+    np.testing.assert_allclose(solid.mesh.vertices.min(axis=0), [-0.05, -0.05, -0.01], atol=1e-9)
+    np.testing.assert_allclose(
+        solid.mesh.vertices.max(axis=0), [0.1, 0.05, 0.11], atol=1e-9
+    )  # the turned z points to x
+    assert solid.mesh.volume_m3 == pytest.approx(0.1 * 0.1 * 0.02 + 0.02**3)
+    assert solid.category == "arm"
 
 
 def test_an_open_mesh_is_refused_by_name_and_one_inside_out_is_turned(tmp_path: Path) -> None:
@@ -257,6 +278,7 @@ def test_penetration_is_measured() -> None:
         assert penetration_m({"a": ball, "b": other}) == pytest.approx(overlap_m, abs=1e-4)
 
 
+@pytest.mark.validation
 def test_objects_that_fall_off_are_counted() -> None:
     small = {"type": "table", "width_m": 0.12, "depth_m": 0.12}
     scene = random_scene(spec_of(support=small, arrangement="pile"), 0)

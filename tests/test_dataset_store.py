@@ -71,8 +71,11 @@ def inline(function: Any, items: Any, store: Any, workers: Any, tell: Any, on_do
     """`rangesim.campaign.run_items` in this process, one item after the other."""
     for key in items:
         if key not in store and not store.is_quarantined(key):
-            store.write(key, function(items[key]))
+            content = function(items[key])
+            store.write(key, content, items[key])
             on_done(key)
+            assert key in store  # also if it is in a shard by now
+            assert store.read(key) == content
     return Outcome(len(items), 0, store.quarantined)
 
 

@@ -197,7 +197,7 @@ class _Run:
             self.report()
             left = self.left
             try:
-                with workers.connected(answer_s) as client:
+                with workers.connected(self.left, answer_s) as client:
                     _Session(self, client, workers).carry_out()
             except _SchedulerLost as loss:
                 losses = losses + 1 if self.left == left else 0
@@ -387,8 +387,9 @@ class _Session:
         run.learn(reply)
         if item.repeats:
             if reply.content != run.store.read(item.key):
+                gave = "other bytes" if reply.content is not None else reply.error
                 raise ValueError(
-                    f"item {item.key} gave other bytes when it was computed again: the function must depend on its "
+                    f"item {item.key} gave {gave} when it was computed again: the function must depend on its "
                     "argument alone (no time, no unseeded random numbers), and a campaign stays on processors of one "
                     "kind; mend that, and choose another directory."
                 )

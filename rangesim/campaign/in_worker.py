@@ -17,6 +17,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rangesim.environment.versions import source_digest, versions
+from rangesim.errors import sentence
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -108,9 +109,9 @@ def carry_out(job: Job) -> Reply:
             else:
                 error = f"expected bytes of the function, got {type(result).__name__}"
         except BaseException as problem:  # noqa: BLE001  # an item that calls sys.exit has failed, too
-            error = f"{type(problem).__name__}: {problem}"
+            error = sentence(f"{type(problem).__name__}: {problem}")
             trace = "".join(traceback.format_exception(problem))
-    warned = tuple(dict.fromkeys((one.category.__name__, str(one.message)) for one in caught))
+    warned = tuple(dict.fromkeys((one.category.__name__, sentence(str(one.message))) for one in caught))
     seconds = time.monotonic() - start
     return Reply(content, error, trace, "", warned, seconds, worker.address, *_memory())
 

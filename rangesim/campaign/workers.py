@@ -40,7 +40,7 @@ class Workers:
 
     Parameters
     ----------
-    count : processes on this machine. None: as many as there are cores.
+    count : largest number of processes on this machine. None: as many as there are cores.
     scheduler : address of a Dask scheduler, such as "tcp://10.0.0.1:8786", whose workers do the work. None: the
         processes are started on this machine, and end with the run.
     """
@@ -57,11 +57,12 @@ class Workers:
             )
 
     @contextmanager
-    def connected(self, answer_s: float = FIRST_ANSWER_S) -> Iterator[Client]:
+    def connected(self, items: int, answer_s: float = FIRST_ANSWER_S) -> Iterator[Client]:
         """A client of the workers' scheduler while the block runs; there is at least one worker.
 
         Parameters
         ----------
+        items : count of items that are to be done. No more processes than that are started on this machine.
         answer_s : seconds in which the scheduler has to answer.
 
         Raises
@@ -77,7 +78,7 @@ class Workers:
             ) from None
         with _quiet():
             if self.scheduler is None:
-                count = self.count or cores()
+                count = min(self.count or cores(), items)
                 with _local_cluster(count) as cluster, Client(cluster, set_as_default=False) as client:
                     yield client
                 return
@@ -190,6 +191,8 @@ def _local_cluster(count: int) -> Iterator[LocalCluster]:
         # On a busy machine a new process takes longer than the usual 15 s, after which its nanny would be given up.
         "distributed.deploy.lost-worker-timeout": f"{WAIT_S} s",
         "distributed.scheduler.worker-ttl": None,  # a jump of the clock would end all workers
+        # Dask's profiler keeps the call stacks of an hour, so a worker would grow by 0.7 MB with each scene.
+        "distributed.worker.profile.enabled": False,
         # A worker at one of these limits would wait for memory that nothing frees. The last limit is kept: the nanny
         # ends a worker that takes nearly all of the machine's memory.
         "distributed.worker.memory.target": False,

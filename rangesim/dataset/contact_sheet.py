@@ -56,7 +56,8 @@ def _line(samples: Samples, rows: Sequence[IndexRow]) -> str:
     objects = sum(row.objects or 0 for row in samples.rows)
     version = samples.store.record.versions.get("rangesim")
     failed = len(rows) - len(samples)
-    text = f"{len(samples)} scenes with {objects} objects · {len(shards)} shards, {size / 1e6:.1f} MB"
+    in_shards = f"{len(shards)} shard{'s' * (len(shards) != 1)}, {size / 1e6:.1f} MB"
+    text = f"{len(samples)} scenes with {objects} objects · {in_shards}"
     return f"{text} · {failed} scenes failed · rangesim {version}"
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models from files: STL, OBJ, GLB, PLY and OFF."""
+"""Models from files: STL, OBJ, GLB, PLY, OFF and URDF."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ import numpy as np
 
 from pcgraph.plumbing.plain_files import read_file
 from rangesim.dataset.solid_model import SolidModel, merged, split_at_creases
+from rangesim.dataset.urdf import read_urdf
 from rangesim.errors import FileFormatError
 from rangesim.triangle_mesh import TriangleMesh
 
-MODEL_SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".ply", ".off")
+MODEL_SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".ply", ".off", ".urdf")
 """Suffixes of the files that are taken for models."""
 MAX_MODELS = 256
 """Largest number of models that a process keeps in memory: 256 models of 20 000 faces take about 0.3 GB."""
@@ -22,6 +23,8 @@ MAX_MODELS = 256
 
 def model_files(path: Path) -> tuple[Path, ...]:
     """The model files that a path stands for: the file itself, or all in a folder and its subfolders, sorted.
+
+    If there are URDF files in the folder, only these count, because the meshes are their parts.
 
     Raises
     ------
@@ -37,7 +40,8 @@ def model_files(path: Path) -> tuple[Path, ...]:
     found = sorted(p for p in path.rglob("*") if p.suffix.lower() in MODEL_SUFFIXES and p.is_file())
     if not found:
         raise FileFormatError(f"expected models ({', '.join(MODEL_SUFFIXES)}) in {path}, found none.")
-    return tuple(found)
+    urdfs = [p for p in found if p.suffix.lower() == ".urdf"]
+    return tuple(urdfs or found)
 
 
 @lru_cache(maxsize=MAX_MODELS)
@@ -54,8 +58,14 @@ def read_model(path: Path, unit_m: float) -> SolidModel:
     """
     from rangesim.scene.mesh import read_mesh
 
-    vertices, faces = read_mesh(path)
-    mesh = merged(TriangleMesh(vertices.astype(np.float64) * unit_m, faces))
+    files = [path]
+    if path.suffix.lower() == ".urdf":
+        mesh, meshes = read_urdf(path, unit_m)
+        files += meshes
+    else:
+        vertices, faces = read_mesh(path)
+        mesh = TriangleMesh(vertices.astype(np.float64) * unit_m, faces)
+    mesh = merged(mesh)
     if not mesh.is_closed:
         raise FileFormatError(
             f"expected a closed mesh in {path}, but some of its edges have no face, or an equally turned one, on the "
@@ -66,5 +76,5 @@ def read_model(path: Path, unit_m: float) -> SolidModel:
         raise FileFormatError(f"expected a mesh with a volume in {path}, got {volume_m3:.3g} cubic metres.")
     if volume_m3 < 0:
         mesh = TriangleMesh(mesh.vertices, mesh.faces[:, ::-1])
-    digest = hashlib.sha256(read_file(path, FileFormatError)).hexdigest()
+    digest = hashlib.sha256(b"".join(read_file(file, FileFormatError) for file in files)).hexdigest()
     return SolidModel(path.stem, path.parent.name, split_at_creases(mesh), None, digest)

@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pcgraph.plumbing.plain_files import read_file, write_file
 from rangesim.campaign import ItemStore, Outcome, QuarantinedItem, Workers, run_items
@@ -80,7 +81,7 @@ def make_dataset(
         computed = 0
         if not Store(folder).is_complete:
             packing.advance()
-            left = _Items(spec, packing.packed)
+            left = _Items(spec, packing.items.packed)
             computed = run_items(
                 _scene_bytes, left, packing.items, workers, tell, lambda key: packing.advance()
             ).computed
@@ -133,31 +134,47 @@ def _begin(spec: DatasetSpec, folder: Path) -> None:
         raise FileFormatError(f"{folder} was begun with {was}; go on with these versions, or name another directory.")
 
 
+class _Scenes(ItemStore):
+    """The results of the campaign. It also holds those that were moved into shards, so none is computed again.
+
+    packed : count of the scenes in complete shards. read_packed : function that returns the bytes of one of these.
+    """
+
+    def __init__(self, directory: Path, settings: Mapping[str, Any], read_packed: Callable[[int], bytes]) -> None:
+        super().__init__(directory, settings)
+        self.packed, self.read_packed = 0, read_packed
+
+    def __contains__(self, key: str) -> bool:
+        return int(key) < self.packed or super().__contains__(key)
+
+    def read(self, key: str) -> bytes:
+        return super().read(key) if super().__contains__(key) else self.read_packed(int(key))
+
+
 class _Packing:
     """The shards of a data set that is being made.
 
     Attributes
     ----------
-    items : the campaign's results that are not in a shard yet.
-    packed : count of the scenes in complete shards.
+    items : the campaign's results.
     """
 
     def __init__(self, spec: DatasetSpec, folder: Path) -> None:
         self.spec, self.folder = spec, folder
-        self.items = ItemStore(folder / "work", {"spec": spec_to_dict(spec)})
+        self.items = _Scenes(folder / "work", {"spec": spec_to_dict(spec)}, self._read_packed)
         self.parts = folder / "parts"
-        self.shards, self.packed = 0, 0
+        self.shards = 0
         while self._part(self.shards).exists():
             rows = read_rows(read_file(self._part(self.shards), FileFormatError), str(self._part(self.shards)))
             self._discard(rows)  # a run may have been killed before it did
-            self.shards, self.packed = self.shards + 1, rows[-1].scene + 1
+            self.shards, self.items.packed = self.shards + 1, rows[-1].scene + 1
         self._start_shard()
 
     def _part(self, shard: int) -> Path:
         return self.parts / f"{shard:06d}.parquet"
 
     def _start_shard(self) -> None:
-        self.next = self.packed
+        self.next = self.items.packed
         self.segments: list[bytes] = []
         self.rows: list[IndexRow] = []
         self.size = 0
@@ -204,8 +221,8 @@ class _Packing:
         write_file(shard_path(self.folder, self.shards), content, FileFormatError, make_parents=True)
         part = parquet_bytes(self.rows, {"shard_sha256": hashlib.sha256(content).hexdigest()})
         write_file(self._part(self.shards), part, FileFormatError, make_parents=True)
+        self.shards, self.items.packed = self.shards + 1, self.next
         self._discard(self.rows)
-        self.shards, self.packed = self.shards + 1, self.next
         self._start_shard()
 
     def _discard(self, rows: Sequence[IndexRow]) -> None:
@@ -213,6 +230,14 @@ class _Packing:
         for row in rows:
             if row.error is None:
                 self.items.discard(scene_key(row.scene))
+
+    def _read_packed(self, number: int) -> bytes:
+        """The bytes of a scene that is in a shard."""
+        for shard in range(self.shards):
+            for row in read_rows(read_file(self._part(shard), FileFormatError), str(self._part(shard))):
+                if row.scene == number and row.error is None:
+                    return Store(self.folder).segment(row)
+        raise KeyError(scene_key(number))
 
     def finish(self) -> None:
         """Close the last shard, and write the index and the checksums."""

@@ -26,6 +26,11 @@ THICKNESS_M = 0.03
 """Thickness of a table top or a floor, metres. Only its upper side is seen, as a rule."""
 
 
+SEAM_M = 1e-4
+"""Gap between a bin and the table below, metres: light that leaves a clear bin must meet the table after it, and single
+precision resolves 1e-7 m here."""
+
+
 class Placed(NamedTuple):
     """A support of drawn size.
 
@@ -130,7 +135,7 @@ class Bin(Support):
         half = np.array([values["width_m"], values["depth_m"]]) / 2
         x, y = half
         outer = half + wall
-        table = _plate("table", 2 * outer + 0.2, half, {})
+        table = _plate("table", 2 * outer + 0.2, half, {}, -SEAM_M)
         top = wall + height
         lower = [(-x - wall, -y - wall, 0), (-x - wall, -y - wall, wall), (x, -y - wall, wall)]
         upper = [(x + wall, y + wall, wall), (-x, y + wall, top), (x + wall, y + wall, top)]
@@ -148,9 +153,9 @@ class Bin(Support):
         )
 
 
-def _plate(name: str, half: np.ndarray, usable: np.ndarray, values: dict[str, Any]) -> Placed:
-    """A plate whose upper side is at z = 0; half, usable : (2,) half sizes of all of it and of the part for objects."""
-    low, high = np.array([*-half, -THICKNESS_M]), np.array([*half, 0.0])
+def _plate(name: str, half: np.ndarray, usable: np.ndarray, values: dict[str, Any], top: float = 0.0) -> Placed:
+    """A plate; half, usable : (2,) half sizes of all of it and of the part for objects. top : z of its upper side."""
+    low, high = np.array([*-half, top - THICKNESS_M]), np.array([*half, top])
     material = {name: values["material"]} if values else {}
     area = np.stack([-usable, usable])
     return Placed({name: box_mesh(low, high)}, material, np.stack([low, high])[None], area, 0.0, None, values)

@@ -130,4 +130,4 @@ def _objects(tile: SceneTile) -> np.ndarray:
 
 
 def _percent(fraction: float | None) -> str:
-    return "-" if fraction is None or np.isnan(fraction) else f"{100 * fraction:.1f} %"
+    return "-" if fraction is None or np.isnan(fraction) else f"{100 * fraction:.1f}\u00a0%"
