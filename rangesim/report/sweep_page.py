@@ -272,7 +272,7 @@ class _Page:
             n for n, i in self.sweep.given.items() if i.exposure_s is not None and "exposure_s" not in self.sweep.vary
         ]
         if own:
-            yield f"The same at all points is the exposure of {', '.join(own)}, which they state themselves."
+            yield f"The exposure of {', '.join(own)} is the device's own, and the same at all points."
         automatic = {}
         for name in self.names:
             found = [r["exposure_s"] for r in self._rows_of(name) if r["exposure_s"] is not None]
@@ -489,7 +489,7 @@ def _hashable(value: Any) -> Any:
 
 
 def _number(value: float) -> str:
-    return f"{value:.3g}"
+    return f"{value:.3g}" if abs(value) < 1000 else f"{float(f'{value:.2g}'):,.0f}".replace(",", "\u202f")
 
 
 def _scene_name(scene: Any) -> str:
