@@ -12,13 +12,13 @@ import pytest
 
 import rangesim
 from rangesim.dataset import DatasetSpec, RandomScene, load_spec, random_scene, spec_from_dict, spec_to_dict
-from rangesim.dataset.catalogue_materials import material_names, surface
 from rangesim.dataset.convex_pieces import convex_pieces
 from rangesim.dataset.model_files import read_model
 from rangesim.dataset.piles import GAP_M
 from rangesim.dataset.random_primitives import PRIMITIVES, primitive
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.transport_settings import TransportSettings
+from rangesim.scene.catalogue_materials import material_names, surface
 from rangesim.settings.draws import ANY_NUMBER, Draw, Of, draw_table
 from rangesim.triangle_mesh import TriangleMesh
 
