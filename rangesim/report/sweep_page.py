@@ -187,7 +187,7 @@ class _Page:
             )
 
     def _reach(self, name: str, others: Mapping[str, Any]) -> str | None:
-        """How far along the axis a sensor stays within the tolerance."""
+        """Sentence that says how far along the axis a sensor stays within the tolerance."""
         axis = self.axis
         assert axis is not None
         rows = sorted(self._of(name, others), key=lambda row: row[axis])
@@ -247,7 +247,7 @@ class _Page:
             yield f"Most often right by {label_of(path)}: {'; '.join(best)}."
 
     def _objects(self) -> Iterator[str]:
-        """What the failures of each sensor do to the objects."""
+        """Sentences about what the failures of each sensor do to the objects."""
         clauses = []
         for name in self.names:
             counted = [c.objects for (_, sensor), c in self.result.cells.items() if sensor == name and c.objects]
@@ -279,7 +279,7 @@ class _Page:
             )
 
     def _exposure(self) -> Iterator[str]:
-        """Which exposures are fixed, and which are automatic."""
+        """Sentence that says which exposures are fixed, and which are automatic."""
         fixed = self.result.exposures
         if fixed:
             each = []
@@ -317,7 +317,7 @@ class _Page:
             yield f"{name} {tables.seconds(self.sweep.given[name].exposure_s)}"
 
     def _place(self) -> Iterator[str]:
-        """For which distance sensors without a place of their own are set up."""
+        """Sentence about the distance for which sensors without a place of their own are set up."""
         free = [n for n, i in self.sweep.given.items() if i.T_camera_projector is None and i.sensor.triangulates]
         if free:
             yield (
@@ -520,7 +520,7 @@ def _hashable(value: Any) -> Any:
 
 
 def _number(value: float) -> str:
-    return f"{value:.3g}"
+    return f"{value:.3g}" if abs(value) < 1000 else f"{float(f'{value:.2g}'):,.0f}".replace(",", "\u202f")
 
 
 def _scene_name(scene: Any) -> str:
