@@ -120,6 +120,10 @@ class Store:
 
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(directory)
+        if not (self.directory / SETTINGS).is_file():
+            raise FileFormatError(
+                f"expected a data set of `rangesim dataset`, got {directory}, which has no {SETTINGS}."
+            )
         self.record = read_record(self.directory / SETTINGS, StoreRecord)
 
     @property
