@@ -139,7 +139,7 @@ class Evidence:
         refused = self.image.status == Status.OUT_OF_RANGE
         if decoder.working_range is None:
             return np.zeros(refused.shape, dtype=bool)
-        return np.asarray(refused & decoder.working_range.is_outside(self.truth))
+        return np.asarray(refused & decoder.working_range.is_outside(self.truth.z, self.truth.range_m))
 
     @cached_property
     def off_glass(self) -> np.ndarray:

@@ -14,7 +14,6 @@ from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds, Metres, check_fie
 
 if TYPE_CHECKING:
     from rangesim.rig import Camera
-    from rangesim.signals import GroundTruth
 
 Nearest = Annotated[float, Bounds("0 or positive", 1e-9, MAX_COORDINATE_M, or_zero=True)]
 """A least range in metres, which may be 0."""
@@ -58,9 +57,9 @@ class WorkingRange:
                 f"along z: rays of this {type(camera).__name__} lead sideways or backwards, where z is no range."
             )
 
-    def is_outside(self, surfaces: RangeImage | GroundTruth) -> np.ndarray:
-        """(h, w) bool, whether a reading, or a true surface, lies outside this range; False where there is none."""
-        reading = surfaces.z if self.along == "z" else surfaces.range_m
+    def is_outside(self, z: np.ndarray, range_m: np.ndarray) -> np.ndarray:
+        """(h, w) bool, whether depths and ranges (h, w), metres, lie outside this range; False for NaN."""
+        reading = z if self.along == "z" else range_m
         with np.errstate(invalid="ignore"):  # NaN compares as inside
             is_outside = reading < self.near_m
             if self.far_m is not None:
@@ -69,7 +68,7 @@ class WorkingRange:
 
     def applied_to(self, image: RangeImage) -> RangeImage:
         """The range image with NaN and `OUT_OF_RANGE` where it had a reading outside this range."""
-        is_outside, nan = self.is_outside(image), np.float32(np.nan)
+        is_outside, nan = self.is_outside(image.z, image.range_m), np.float32(np.nan)
         return replace(
             image,
             z=np.where(is_outside, nan, image.z),
