@@ -265,6 +265,8 @@ def test_a_scene_that_no_sensor_reads_has_no_winner() -> None:
         "jar (at best 20 %, Structured light)."
     )
     assert _side_by_side(poor, blind) == said
+    nothing = _side_by_side(_measured("amcw", cup=(0.0, 1.0, 5e-2)), _measured("lines", cup=(0.0, 0.0, 1e-3)))
+    assert nothing.startswith("No sensor reads any of the pixels of cup right, to 10 mm. ")
 
 
 def test_without_objects_the_verdict_is_about_materials() -> None:

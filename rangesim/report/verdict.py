@@ -133,6 +133,8 @@ def _most_right(real: Sequence[Measurement], names: dict[str, str]) -> str:
         name, most = entries[0]
         wrong = _percent(_judged(right[0][1].rows)["wrong"])
         most_of = f"{whose} right, to {_limit(real[0])}"
+        if most == _percent(0.0):
+            return f"No sensor reads any of {most_of}."
         return f"No sensor reads most of {most_of}; {name} reads most, {most}, and {wrong} wrong."
     return _ranked(f"Most of {whose} right, to {_limit(real[0])}", entries)
 
