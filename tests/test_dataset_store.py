@@ -501,7 +501,7 @@ def test_the_contact_sheet_shows_scenes_and_filters_them(store: Path, tmp_path: 
 
 
 def test_a_folder_of_something_else_is_no_data_set(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match="expected a data set of `rangesim dataset`, got .* has no store.json"):
+    with pytest.raises(FileFormatError, match=r"expected a data set of `rangesim dataset`, got .* has no store\.json"):
         Samples(tmp_path)
 
 
