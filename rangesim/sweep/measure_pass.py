@@ -26,7 +26,7 @@ from rangesim.errors import RangesimWarning
 from rangesim.evaluation.closed_forms import error_by_theory
 from rangesim.evaluation.comparison import compare
 from rangesim.evaluation.object_segmentation import Outcome, object_segmentation
-from rangesim.evaluation.range_noise import robust_sigma, sampling_draw
+from rangesim.evaluation.range_noise import robust_sigma, sampling_errors
 from rangesim.evaluation.reference_readings import ReferenceReadings
 from rangesim.evaluation.surface_rows import with_mean_over_objects
 from rangesim.experiment import Experiment
@@ -207,7 +207,7 @@ def _of_first(
     readings, truth = ReferenceReadings(image, capture, signals), signals.truth
     causes, sampling = causes_of(readings, comparison.tolerance_m), []
     if signals.knows_sampling_error:
-        draw = sampling_draw(image, capture, signals)[1]
+        draw = sampling_errors(readings)
         known = [
             {"kind": kind, "name": name, "sampling_sigma_m": robust_sigma(draw[mask])}
             for kind, name, mask in truth.surfaces()
