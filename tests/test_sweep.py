@@ -52,6 +52,11 @@ def wall(sensors: tuple[Any, ...] = ("amcw",), seeds: int = 2, **vary: Any) -> S
         ({"scene": {"name": "wall", "distance": 1.0}}, "did you mean 'distance_m'"),
         ({"exposure": "fix"}, "expected exposure"),
         ({"exposure": "auto", "exposure_s": 0.1}, "expected exposure or exposure_s, got both"),
+        ({"exposure": "auto", "vary": {"exposure_s": [0.1, 0.2]}}, "expected exposure or exposure_s, got both"),
+        ({"power_w": 1.0, "vary": {"power_w": [1.0, 2.0]}}, "expected power_w as one value or in vary, got both"),
+        ({"vary": {"power_w": [1, 2.0, 1.0]}}, r"expected different values of vary\.power_w, got 1\.0 twice"),
+        ({"vary": {key: [*range(1, 1001)] for key in ("power_w", "baseline_m", "exposure_s")}}, "at most 10000 combin"),
+        ({"tolerence_m": 0.1}, "did you mean 'tolerance_m'"),
     ],
 )
 def test_what_a_sweep_cannot_be_is_said_in_a_sentence(change: dict[str, Any], sentence: str) -> None:

@@ -26,12 +26,12 @@ from rangesim.errors import RangesimWarning
 from rangesim.evaluation.closed_forms import error_by_theory
 from rangesim.evaluation.comparison import compare
 from rangesim.evaluation.object_segmentation import Outcome, object_segmentation
-from rangesim.evaluation.range_noise import robust_sigma, sampling_draw
+from rangesim.evaluation.range_noise import robust_sigma, sampling_errors
 from rangesim.evaluation.reference_readings import ReferenceReadings
 from rangesim.evaluation.surface_rows import with_mean_over_objects
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
-from rangesim.pipeline.experiment_run import MIN_POINTS, acquisition, segmented, segments_of_truth
+from rangesim.pipeline.experiment_run import acquisition, labels_of, segmented, segmented_truth
 from rangesim.report import figures, palette
 from rangesim.report.panorama import panorama
 from rangesim.robust_scale import sigma_from_median
@@ -208,7 +208,7 @@ def _of_first(
     readings, truth = ReferenceReadings(image, capture, signals), signals.truth
     causes, sampling = causes_of(readings, comparison.tolerance_m), []
     if signals.knows_sampling_error:
-        draw = sampling_draw(image, capture, signals)[1]
+        draw = sampling_errors(readings)
         known = [
             {"kind": kind, "name": name, "sampling_sigma_m": robust_sigma(draw[mask])}
             for kind, name, mask in truth.surfaces()
@@ -230,12 +230,10 @@ def _objects(image: RangeImage, comparison: Comparison, signals: StillSignals | 
     the objects that it invents; None for a scene without objects."""
     if not signals.truth.object_names:
         return None
-    cloud = image.to_point_cloud()
-    labels = np.full(image.z.shape, -1, dtype=np.int32)
-    if cloud.valid.sum() >= MIN_POINTS:
-        labels = segmented(cloud).labels
+    both = segmented(image.to_point_cloud()), segmented_truth(signals.rig.camera, signals.truth)
+    labels, true_labels = (labels_of(one, image.z.shape) for one in both)
     wrong = image.valid & ~(np.abs(comparison.error_m) <= comparison.tolerance_m)
-    found = object_segmentation(labels, signals.truth, wrong, segments_of_truth(signals))
+    found = object_segmentation(labels, signals.truth, wrong, true_labels)
     counts = {outcome.value: len(found.names(outcome)) for outcome in Outcome}
     return {**counts, "displaced": sum(o.displaced for o in found.objects), "invented": found.invented}
 
