@@ -186,7 +186,7 @@ def test_the_depth_s_standard_deviation_is_that_of_parallel_cameras() -> None:
     taken, _ = set_of_plane(sensor, rigs, (0, 0, 1), 0.8)
     found = StereoDecoder(disparities=64).coordinates(taken)
     image = found.range_image(rigs[0])
-    sigma = found.depth_sigma_m(image)[found.valid]
+    sigma = found.depth_error_m(image)[found.valid]
     np.testing.assert_allclose(
         sigma, (image.z**2 / (rigs[0].camera.fx * 0.05) * found.sigma_px)[found.valid], rtol=1e-5
     )

@@ -504,6 +504,11 @@ def test_the_contact_sheet_shows_scenes_and_filters_them(store: Path, tmp_path: 
     assert isinstance(CliRunner().invoke(app, ["show", str(store), "--out", str(target)]).exception, FileFormatError)
 
 
+def test_a_folder_of_something_else_is_no_data_set(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"expected a data set of `rangesim dataset`, got .* has no store\.json"):
+        Samples(tmp_path)
+
+
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
 def test_a_browser_filters_the_contact_sheet_without_an_error(store: Path, tmp_path: Path) -> None:
     target = tmp_path / "sheet.html"

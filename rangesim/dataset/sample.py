@@ -26,8 +26,7 @@ from rangesim.dataset.sample_files import (
 )
 from rangesim.errors import RangesimWarning
 from rangesim.files.array_files import arrays_to_bytes
-from rangesim.pipeline.experiment_run import MIN_POINTS, carry_out, segmented
-from rangesim.point_cloud import PointCloud
+from rangesim.pipeline.experiment_run import carry_out, segmented_truth
 from rangesim.results.experiment_results import Measurement, RowRecord, Segmentation, objects_record
 from rangesim.rig import Rig
 from rangesim.settings.config import to_dict
@@ -51,7 +50,7 @@ def bytes_of(drawn: RandomScene, number: int, keeps_frames: bool = False) -> byt
 
     with _collected_warnings() as sentences:
         scene = load_scene(drawn.scene).with_objects([each.name for each in drawn.objects])
-        measurements = carry_out(drawn.experiment, scene=scene).measurements
+        measurements = carry_out(drawn.experiment, scene=scene, sampling_error=False).measurements
     shape_of = {instance.name: i for i, instance in enumerate(scene.instances)}
     objects = [shape_of[each.name] for each in drawn.objects]
     members: dict[str, bytes] = {}
@@ -131,14 +130,9 @@ def _truth(one: Measurement, amodal: np.ndarray) -> dict[str, np.ndarray]:
         "nearest_m": truth.nearest_m,
         "farthest_m": truth.farthest_m,
     }
-    return {name: array for name, array in arrays.items() if array is not None} | _segments(_true_segmentation(one))
-
-
-def _true_segmentation(one: Measurement) -> Segmentation | None:
-    """The segmentation of the true surface, as `rangesim.pipeline.experiment_run.segments_of_truth` makes it."""
-    points = one.camera.points(one.truth).astype(np.float32)
-    is_enough = int(np.isfinite(points).all(axis=-1).sum()) >= MIN_POINTS
-    return segmented(PointCloud(points)) if is_enough else None
+    return {name: array for name, array in arrays.items() if array is not None} | _segments(
+        segmented_truth(one.camera, one.truth)
+    )
 
 
 def _segments(segmentation: Segmentation | None) -> dict[str, np.ndarray]:

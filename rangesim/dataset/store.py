@@ -125,6 +125,10 @@ class Store:
 
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(directory)
+        if not (self.directory / SETTINGS).is_file():
+            raise FileFormatError(
+                f"expected a data set of `rangesim dataset`, got {directory}, which has no {SETTINGS}."
+            )
         self.record = read_record(self.directory / SETTINGS, StoreRecord)
 
     @property
@@ -182,7 +186,7 @@ class Store:
         return content
 
     def place(self, row: IndexRow) -> str:
-        """Where a scene stands, for messages."""
+        """Place of a scene in its shard, for messages."""
         return f"{shard_path(self.directory, row.place[0])}, scene {row.scene}"
 
     def mesh(self, record: SampleRecord, index: int, members: Mapping[str, bytes]) -> TriangleMesh:

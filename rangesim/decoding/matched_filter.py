@@ -61,6 +61,7 @@ def _correlate(start, stop, histograms, sources, weights, result):  # type: igno
     filter's reach, the index of the bin whose content it has.
     """
     bins, reach, zero = len(result), len(weights) - 1, np.zeros(1, histograms.dtype)[0]
+    filled = np.zeros(len(sources) + 1, np.int64)  # number of bins before each one that are not empty
     lengthened = np.zeros(len(sources) * COLUMNS, histograms.dtype)  # bin after bin
     totals = np.empty(bins * COLUMNS, histograms.dtype)
     for first in range(start, stop, COLUMNS):
@@ -71,8 +72,15 @@ def _correlate(start, stop, histograms, sources, weights, result):  # type: igno
                 row[:] = zero
             else:
                 row[:] = histograms[sources[b], first:last]
+            counts = 0
+            for i in range(last - first):  # without a branch, so that it is vectorised
+                counts += row[i] != zero
+            filled[b + 1] = filled[b] + (counts > 0)
         for begin in range(0, bins * COLUMNS, AT_ONCE):
             total, middle = totals[begin : begin + AT_ONCE], begin + reach * COLUMNS
+            if filled[begin // COLUMNS] == filled[(begin + len(total)) // COLUMNS + 2 * reach]:
+                total[:] = zero  # histograms of one surface are empty in most bins
+                continue
             total[:] = lengthened[middle : middle + len(total)] * weights[0]
             distance = reach
             while distance >= 4:  # four at a time, from far to near, so that the totals are read and written less often

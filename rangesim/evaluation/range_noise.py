@@ -27,7 +27,7 @@ from rangesim.capture import Captured
 from rangesim.capture.exposure import exposed_again
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import SamplingWarning, sentence
-from rangesim.evaluation.reference_readings import ReferenceReadings
+from rangesim.evaluation.reference_readings import ReferenceReadings, sampling_draw
 from rangesim.evaluation.surface_rows import MATERIAL, with_mean_over_objects
 from rangesim.robust_scale import sigma_from_median
 from rangesim.settings.seeds import SEEDS
@@ -147,11 +147,11 @@ def range_noise(image: RangeImage, capture: Captured, signals: Signals) -> Range
 def noise_of(readings: ReferenceReadings) -> RangeNoise:
     """Noise of a range image, from its reference readings; the errors are those of `range_noise`."""
     image, capture = readings.image, readings.capture.reference
-    above, below = readings.halves
-    _, sampling = _middle_and_draw(image, above, below)
+    sampling = sampling_errors(readings)
     if not capture.is_digital:
         nothing = np.full(image.z.shape, np.nan, np.float32)
-        return RangeNoise(nothing, sampling, Repeats(~image.valid, ~image.valid, (np.isnan(above), np.isnan(below))))
+        above, below = (np.isnan(half) for half in readings.halves)
+        return RangeNoise(nothing, sampling, Repeats(~image.valid, ~image.valid, (above, below)))
     clean = readings.noise_free.astype(np.float64)
     repeats = None
     if capture.detector is not None:
@@ -162,26 +162,18 @@ def noise_of(readings: ReferenceReadings) -> RangeNoise:
     return RangeNoise((image.reading_m - clean).astype(np.float32), sampling, repeats)
 
 
-def sampling_draw(image: RangeImage, capture: Captured, signals: Signals) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of the noise-free depths of both halves of the samples, (h, w) float64, metres, and `RangeNoise.sampling`.
-
-    Where the sampling error is large, a decoder does not act linearly: the mean then differs from the reading of all
-    samples.
+def sampling_errors(readings: ReferenceReadings) -> np.ndarray:
+    """`RangeNoise.sampling` of a range image, (h, w) float32, metres.
 
     Raises
     ------
     ValueError
         As `range_noise`.
     """
-    return _middle_and_draw(image, *ReferenceReadings(image, capture, signals).halves)
-
-
-def _middle_and_draw(image: RangeImage, above: np.ndarray, below: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of the depths of both halves, and `RangeNoise.sampling`, each (h, w), metres."""
-    above, below = above.astype(np.float64), below.astype(np.float64)
-    sampling = np.where(np.isnan(above) | np.isnan(below), np.inf, (above - below) / 2)
-    sampling[~image.valid] = np.nan
-    return (above + below) / 2, sampling.astype(np.float32)
+    draw, is_read = sampling_draw(*readings.halves), readings.image.valid
+    draw[is_read & np.isnan(draw)] = np.inf
+    draw[~is_read] = np.nan
+    return draw
 
 
 def warn_of_sampling(tables: Mapping[str, Sequence[dict[str, Any]]], spp: int) -> None:

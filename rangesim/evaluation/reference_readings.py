@@ -15,9 +15,10 @@ from rangesim.capture.exposure import capture_of_frames, noise_free_capture
 from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import without_warnings
-from rangesim.sensor import Decoder
+from rangesim.sensor import Decoder, Sensor
 
 if TYPE_CHECKING:
+    from rangesim.electronics.ambient import Ambient
     from rangesim.signals import Signals
 
 
@@ -47,8 +48,7 @@ class ReferenceReadings:
 
     def read(self, captures: Sequence[Captured]) -> list[np.ndarray]:
         """Depths of captures, read by the decoder of the range image."""
-        with without_warnings():
-            return [decode(capture, self.decoder).reading_m for capture in captures]
+        return read(captures, self.decoder)
 
     @cached_property
     def noise_free(self) -> np.ndarray:
@@ -57,16 +57,8 @@ class ReferenceReadings:
 
     @cached_property
     def halves(self) -> tuple[np.ndarray, np.ndarray]:
-        """Depths of each half of the samples, without noise, in the ambient light of the capture.
-
-        Raises
-        ------
-        ValueError
-            The signals do not know their sampling error (`Signals.knows_sampling_error`).
-        """
-        sensor, ambient = self.capture.sensor, self.capture.reference.ambient
-        above, below = self.read([noise_free_capture(self.signals, sensor, ambient, error) for error in (1.0, -1.0)])
-        return above, below
+        """Depths of each half of the samples, without noise, in the ambient light of the capture: see `halves`."""
+        return halves(self.signals, self.capture.sensor, self.decoder, self.capture.reference.ambient)
 
     @cached_property
     def without_glass(self) -> np.ndarray | None:
@@ -102,3 +94,33 @@ class ReferenceReadings:
             return sensor.at_pixels(one.frames(sensor, 0.0))
 
         return self.read([capture_of_frames(self.signals, sensor, frames_of)])[0]
+
+
+def read(captures: Sequence[Captured], decoder: Decoder) -> list[np.ndarray]:
+    """Depths of captures, (h, w) float32 each, metres. The decoder does not warn."""
+    with without_warnings():
+        return [decode(capture, decoder).reading_m for capture in captures]
+
+
+def halves(
+    signals: Signals, sensor: Sensor, decoder: Decoder, ambient: Ambient | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depths of each half of the samples, without noise, (h, w) float64 each, metres.
+
+    Raises
+    ------
+    ValueError
+        The signals do not know their sampling error (`Signals.knows_sampling_error`), or lack the sensor.
+    """
+    above, below = read([noise_free_capture(signals, sensor, ambient, error) for error in (1.0, -1.0)], decoder)
+    return above.astype(np.float64), below.astype(np.float64)
+
+
+def sampling_draw(above: np.ndarray, below: np.ndarray) -> np.ndarray:
+    """(h, w) float32, metres, a draw with the variance of the error that sampling makes in each reading.
+
+    It is infinite where only one half has a reading, and NaN where none has.
+
+    above, below : (h, w) float64, metres, depths of the halves.
+    """
+    return np.where(np.isnan(above) != np.isnan(below), np.inf, (above - below) / 2).astype(np.float32)

@@ -9,16 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from rangesim.capture import bright_level
-from rangesim.capture.exposure import expose
+from rangesim.capture import Capture, bright_level
+from rangesim.capture.exposure import auto_exposure_s, expose, mean_radiance
 from rangesim.decoding import decode
 from rangesim.decoding.disparities import ImageNoise
 from rangesim.electronics.ambient import Ambient
-from rangesim.evaluation.range_noise import sampling_draw
+from rangesim.evaluation.closed_forms import received_light
+from rangesim.evaluation.reference_readings import halves, sampling_draw
 from rangesim.instrument.instrument import Instrument
 from rangesim.light_transport.samples_per_pixel import Sampler
 from rangesim.robust_scale import TO_SIGMA
-from rangesim.sensor import Sensor
+from rangesim.sensor import Decoder, Sensor
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 if TYPE_CHECKING:
@@ -115,21 +116,43 @@ class AdaptiveSampling(Sampler):
                 continue
             true_m = signals.rig.camera.reading(truth)[np.isfinite(truth.z)]
             negligible = NEGLIGIBLE * float(np.median(true_m)) if true_m.size else 0.0
-            capture = expose(
-                signals, instrument.sensor, instrument.detector_in_use, instrument.exposure_s, 0, self.ambient
-            )
-            image = decode(capture, instrument.decoder)
-            middle, sampling = sampling_draw(image, capture, signals)
-            # z less the middle of the two draws estimates the detector's error, without a further decoding.
-            from_middle = (image.reading_m - middle).astype(np.float32)
+            decoder = instrument.decoder or instrument.sensor.default_decoder
+            above, below = halves(signals, instrument.sensor, decoder, self.ambient)
             enough = np.full(len(excess), negligible)
-            if capture.is_digital:  # a group without any reading needs no further samples: its limit is infinite
-                enough = np.maximum(enough, self.fraction * group_sigma(from_middle, group, where_unknown=np.inf))
+            if instrument.detector_in_use is not None and not instrument.sensor.is_ideal:
+                of_detector = self._detector_sigma(instrument, decoder, signals, group, (above + below) / 2)
+                enough = np.maximum(enough, self.fraction * of_detector)
             with np.errstate(divide="ignore", invalid="ignore"):
-                excess = np.fmax(excess, (group_sigma(sampling, group) / enough) ** 2)
+                excess = np.fmax(excess, (group_sigma(sampling_draw(above, below), group) / enough) ** 2)
         wanted = SPP_STEP * np.ceil(self.first_spp * np.minimum(excess, self.max_spp) / SPP_STEP)
         most = max(self.first_spp, self.max_spp // SPP_STEP * SPP_STEP)
         return np.clip(wanted, self.first_spp, most).astype(np.int64)[group]
+
+    def _detector_sigma(
+        self, instrument: Instrument, decoder: Decoder, signals: StillSignals, group: np.ndarray, clean_m: np.ndarray
+    ) -> np.ndarray:
+        """(k,) float64, metres, standard deviation of the readings by the detector's noise, in the middle of each
+        group; infinite where there is no reading.
+
+        The decoder's closed form tells it from the light. If there is none, a capture is decoded.
+
+        Parameters
+        ----------
+        clean_m : (h, w) float64, metres, readings without the detector's noise.
+        """
+        sensor, detector = instrument.sensor, instrument.detector_in_use
+        assert detector is not None
+        radiance, exposure_s = mean_radiance(signals, sensor, detector, self.ambient), instrument.exposure_s
+        if exposure_s is None:
+            exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
+        mean = Capture(radiance, sensor, signals.rig, detector, exposure_s, self.ambient)
+        theory_m = decoder.depth_error_m(sensor, received_light(signals, mean))
+        if theory_m is not None:
+            brightest_e = radiance.max(axis=0) * detector.electron_rate_per_radiance(signals.rig) * exposure_s
+            read_m = np.where(brightest_e < detector.capacity_e, theory_m, np.nan)
+            return group_median(read_m, group, where_unknown=np.inf)
+        image = decode(expose(signals, sensor, detector, exposure_s, 0, self.ambient), decoder)
+        return group_sigma(image.reading_m - clean_m, group, where_unknown=np.inf)
 
     def _excess_of_frames(self, instrument: Instrument, signals: StillSignals, group: np.ndarray) -> np.ndarray:
         """Ratio of the sampling variance of the frames of one camera to the largest one allowed, per group.
@@ -180,9 +203,18 @@ def group_sigma(errors: np.ndarray, group: np.ndarray, where_unknown: float = 0.
     errors : (h, w) with mean 0; NaN where there is none. group : (h, w) int, number of the group.
     where_unknown : value for a group without any error.
     """
-    known = ~np.isnan(errors)
-    values, of = np.abs(errors[known]), group[known]
-    values = np.append(values[np.lexsort((values, of))], 0)
+    return TO_SIGMA * group_median(np.abs(errors), group, where_unknown)
+
+
+def group_median(values: np.ndarray, group: np.ndarray, where_unknown: float = 0.0) -> np.ndarray:
+    """Median of the values in each group, (k,) float64; of two in the middle, the larger one.
+
+    values : (h, w); NaN where there is none. group : (h, w) int, number of the group.
+    where_unknown : value for a group without any.
+    """
+    known = ~np.isnan(values)
+    some, of = values[known], group[known]
+    some = np.append(some[np.lexsort((some, of))], 0)
     n = np.bincount(of, minlength=int(group.max()) + 1)
     middle = np.where(n > 0, np.cumsum(n) - n + n // 2, -1)
-    return np.asarray(np.where(n > 0, TO_SIGMA * values[middle], where_unknown))
+    return np.asarray(np.where(n > 0, some[middle], where_unknown))

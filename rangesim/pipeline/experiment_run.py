@@ -44,6 +44,7 @@ from rangesim.results.experiment_results import (
     write_result,
 )
 from rangesim.results.saved_signals import LightPass
+from rangesim.rig import Beam
 from rangesim.settings.seeds import derived_seed
 
 if TYPE_CHECKING:
@@ -51,9 +52,9 @@ if TYPE_CHECKING:
     from rangesim.electronics.detector import PhotoDetector
     from rangesim.motion import Timing
     from rangesim.point_cloud import PointCloud
-    from rangesim.rig import Rig
+    from rangesim.rig import Camera, Rig
     from rangesim.scene import Scene
-    from rangesim.signals import Signals
+    from rangesim.signals import GroundTruth, Signals
 
 _TRANSPORT_FRACTION = 0.7
 """Fraction of a pass that the progress bar shows as done when its light is traced; the rest is for its instruments. It
@@ -201,7 +202,7 @@ def _computed(
     with timed(times, "compile_segmentation"):  # kernels compile once per machine; no sensor's time includes it
         compile_kernels()
     passes, measurements = [], {}
-    true_labels: dict[bytes, np.ndarray] = {}
+    of_truth: dict[bytes, Segmentation | None] = {}
     for number, (rig, instruments) in enumerate(groups, 1):
         stage = f"Tracing light, pass {number} of {len(groups)} ({', '.join(i.name for i in instruments)})"
         begin, end = (_fraction(number, len(groups), of_pass) for of_pass in (0.0, 1.0))
@@ -211,9 +212,9 @@ def _computed(
             signals = _trace(experiment, scene, rig, instruments, told)
         passes.append(LightPass.of(signals))
         view = signals.rig.camera.points(signals.truth).tobytes()  # passes of different emitters often share it
-        if view not in true_labels:
+        if view not in of_truth:
             with timed(times, f"segmentation_of_truth_{number}"):
-                true_labels[view] = segments_of_truth(signals)
+                of_truth[view] = segmented_truth(signals.rig.camera, signals.truth)
         for instrument in instruments:
             tell(f"Measuring with {instrument.name}", end)
             seed, light = noise_seed(experiment, instrument), signals.at_wavelength(instrument.emitter_wavelength_m)
@@ -221,10 +222,10 @@ def _computed(
                 instrument,
                 light,
                 seed,
+                of_truth[view],
                 experiment.ambient,
                 number,
                 tolerance_m=experiment.tolerance_m,
-                true_labels=true_labels[view],
                 sampling_error=sampling_error,
             )
     info = provenance(experiment, scene, groups, mi.variant(), times)
@@ -253,10 +254,10 @@ def measure(
     instrument: Instrument,
     signals: Signals,
     seed: int,
+    true_segmentation: Segmentation | None,
     ambient: Ambient | None = None,
     light_pass: int = 1,
     tolerance_m: float = TOLERANCE_M,
-    true_labels: np.ndarray | None = None,
     sampling_error: bool = True,
 ) -> Measurement:
     """The measurement of one instrument, with its capture, range image, errors, causes and segmentation.
@@ -265,10 +266,10 @@ def measure(
     ----------
     signals : Signals of the light-transport pass that the instrument shares.
     seed : seed of the detector's noise.
+    true_segmentation : Segmentation of the true depth, as `segmented_truth` returns it.
     ambient : as for `rangesim.expose`.
     light_pass : number of the pass, counted from 1.
     tolerance_m : largest error of a right reading, metres.
-    true_labels : (h, w) int32, as `segments_of_truth`. None: it is computed here.
     sampling_error : as for `carry_out`.
     """
     times: dict[str, float] = {}
@@ -295,12 +296,9 @@ def measure(
         rows = [row | sigmas for row, sigmas in zip(rows, noise.by_surface(signals.truth), strict=True)]
     with timed(times, "points"):
         cloud = image.to_point_cloud()
-    points, segmentation = int(cloud.valid.sum()), None
-    if points >= MIN_POINTS:
-        with timed(times, "segmentation"):
-            segmentation = segmented(cloud)
-    true_labels = segments_of_truth(signals) if true_labels is None else true_labels
-    labels = np.full_like(true_labels, -1) if segmentation is None else segmentation.labels
+    with timed(times, "segmentation"):
+        segmentation = segmented(cloud)
+    labels, true_labels = (labels_of(one, image.z.shape) for one in (segmentation, true_segmentation))
     wrong = image.valid & ~(np.abs(comparison.error_m) <= comparison.tolerance_m)
     return Measurement(
         name=instrument.name,
@@ -311,7 +309,7 @@ def measure(
         rows=complete_rows(rows),
         segmentation=segmentation,
         objects=object_segmentation(labels, signals.truth, wrong, true_labels),
-        metadata=acquisition(capture.reference, photons, instrument.timing, moves, points, times),
+        metadata=acquisition(capture.reference, photons, instrument.timing, moves, int(cloud.valid.sum()), times),
         light_pass=light_pass,
     )
 
@@ -326,22 +324,26 @@ def _detector_within_frame_period(instrument: Instrument) -> PhotoDetector | Non
     return replace(detector, max_exposure_s=longest_s)  # type: ignore[type-var]
 
 
-def segmented(cloud: PointCloud) -> Segmentation:
-    """Supervoxels, objects and the tree of an organised cloud in camera coordinates."""
+def segmented(cloud: PointCloud) -> Segmentation | None:
+    """Supervoxels, objects and the tree of an organised cloud in camera coordinates; None below `MIN_POINTS`."""
     import pcgraph
 
+    if cloud.valid.sum() < MIN_POINTS:
+        return None
     result = pcgraph.segment(cloud.points, colors=cloud.colors, viewpoint=(0.0, 0.0, 0.0))
     return Segmentation(result.supervoxels, result.labels, result.tree.parents, result.tree.altitudes)
 
 
-def segments_of_truth(signals: Signals) -> np.ndarray:
-    """(h, w) int32, objects in the cloud of the true depth, segmented as a sensor's cloud; -1 where there is none."""
-    import pcgraph
+def segmented_truth(camera: Camera, truth: GroundTruth) -> Segmentation | None:
+    """The cloud of the true depth, segmented as a sensor's cloud is."""
+    from rangesim.point_cloud import PointCloud
 
-    points = signals.rig.camera.points(signals.truth).astype(np.float32)
-    if np.isfinite(points).all(axis=-1).sum() < MIN_POINTS:
-        return np.full(points.shape[:-1], -1, dtype=np.int32)
-    return pcgraph.segment(points, viewpoint=(0.0, 0.0, 0.0)).labels
+    return segmented(PointCloud(camera.points(truth).astype(np.float32)))
+
+
+def labels_of(segmentation: Segmentation | None, shape: tuple[int, ...]) -> np.ndarray:
+    """(h, w) int32, objects of a segmentation; -1 where there is none, and everywhere if there is no segmentation."""
+    return np.full(shape, -1, dtype=np.int32) if segmentation is None else segmentation.labels
 
 
 def noise_seed(experiment: Experiment, instrument: Instrument) -> int:
@@ -355,7 +357,8 @@ def acquisition(
     """The record of a capture: its frames, exposure, acquisition time and photons.
 
     A noise-free capture has no exposure and takes no time. The rays of a scanner are exposed one after the other, so
-    its acquisition lasts as long as its turn.
+    its acquisition lasts as long as its turn. A beam that goes over the pixels of a pinhole has no times, so how long
+    its acquisition takes is not known.
 
     Parameters
     ----------
@@ -369,7 +372,7 @@ def acquisition(
     camera = capture.frames.shape[1:]
     shots = len(timing.exposure_times_s(capture.sensor))
     taken = None
-    if exposure is not None:
+    if exposure is not None and not _scans_untimed(capture):
         pause = max(exposure, timing.frame_period_s) if moves else exposure
         lines = camera[0] if timing.lines == "rows" else camera[1]
         taken = (shots - 1) * pause + exposure + (lines - 1) * (timing.line_period_s if moves else 0.0)
@@ -391,6 +394,11 @@ def _scan_s(capture: Capture) -> float:
     """Seconds from the first ray of a scanner to its last one; 0 for a camera that measures all pixels at once."""
     times_s = capture.rig.camera.times_s if capture.rig is not None else None
     return float(np.ptp(times_s)) if times_s is not None else 0.0
+
+
+def _scans_untimed(capture: Capture) -> bool:
+    """Whether a beam lights the pixels of a pinhole one after the other, at times that nobody states."""
+    return capture.rig is not None and isinstance(capture.rig.projector, Beam) and capture.rig.camera.is_pinhole
 
 
 def _photons_record(photons: np.ndarray) -> PhotonsRecord:
