@@ -79,7 +79,7 @@ def test_draws_of_tables_leave_lists_alone() -> None:
         ({"materials": {"steel": {"alpha": 0.1}}}, "parameter of steel"),
         ({"light": {"illuminant": "moon"}}, "sun, tungsten or led"),
         ({"objects": [{"model": ""}]}, "expected a model out of"),
-        ({"objects": [{"model": "box", "category": ""}]}, "a category of 1 to 200 characters"),
+        ({"objects": [{"model": "box", "category": ""}]}, "category as a name of 1 to 200 characters"),
         ({"instrument": [{"sensor": "amcw", "name": "a" * 80}]}, "at most 79 characters"),
     ],
 )
