@@ -78,6 +78,9 @@ def test_draws_of_tables_leave_lists_alone() -> None:
         ({"instrument": [{"sensor": "amcw", "power_w": {"uniform": [-2, -1]}}]}, "power_w"),
         ({"materials": {"steel": {"alpha": 0.1}}}, "parameter of steel"),
         ({"light": {"illuminant": "moon"}}, "sun, tungsten or led"),
+        ({"objects": [{"model": ""}]}, "expected a model out of"),
+        ({"objects": [{"model": "box", "category": ""}]}, "category as a name of 1 to 200 characters"),
+        ({"instrument": [{"sensor": "amcw", "name": "a" * 80}]}, "at most 79 characters"),
     ],
 )
 def test_what_is_wrong_in_a_specification_is_named(changes: dict[str, Any], message: str) -> None:

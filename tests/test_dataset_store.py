@@ -34,6 +34,7 @@ from rangesim.dataset import (
     spec_from_dict,
     verify_dataset,
 )
+from rangesim.dataset.bop_export import camera_of
 from rangesim.dataset.contact_sheet import contact_sheet
 from rangesim.dataset.sample import sample_bytes
 from rangesim.dataset.sample_files import END_OF_TAR, SCENE_MEMBER, arrays_of, members_of, record_of, tar_segment
@@ -417,10 +418,13 @@ def test_bop_readers_find_poses_masks_and_depth(store: Path, tmp_path: Path) -> 
     cameras, poses, infos = (read_json(scene / f"scene_{name}.json") for name in ("camera", "gt", "gt_info"))
     models_info = read_json(tmp_path / "bop" / "models" / "models_info.json")
     compared = 0
-    for one in Samples(store):
+    for one in (samples := Samples(store)):
         number, truth = one["scene"]["number"], one["camera.1"]
         camera = cameras[str(number)]
         K = np.reshape(camera["cam_K"], (3, 3))
+        rays = camera_of(samples.record(number)[0], "gray-phase").rays_at(np.ones((24, 32), bool), (0.0, 0.0))[1]
+        v, u = np.mgrid[:24, :32].reshape(2, -1)  # in BOP, the ray at integer coordinates is that of a pixel's centre
+        np.testing.assert_allclose((rays / rays[:, 2:]) @ K.T, np.stack([u, v, np.ones_like(u)], axis=1), atol=1e-4)
         depth = pixels(scene / "depth" / f"{number:06d}.png") * camera["depth_scale"]
         reading_mm = 1e3 * np.nan_to_num(one["sensor.gray-phase"]["reading_m"])
         assert np.abs(depth - reading_mm).max() <= camera["depth_scale"]
@@ -439,9 +443,9 @@ def test_bop_readers_find_poses_masks_and_depth(store: Path, tmp_path: Path) -> 
             points = mesh.vertices @ np.reshape(pose["cam_R_m2c"], (3, 3)).T + pose["cam_t_m2c"]
             x, y = (points @ K.T)[:, :2].T / points[:, 2]
             left, top, width, height = info["bbox_obj"]
-            if x.min() > 0 and y.min() > 0 and x.max() < 32 and y.max() < 24:
+            if x.min() > -0.5 and y.min() > -0.5 and x.max() < 31.5 and y.max() < 23.5:
                 compared += 1
-                projected = [x.min(), y.min(), x.max(), y.max()]
+                projected = 0.5 + np.array([x.min(), y.min(), x.max(), y.max()])
                 np.testing.assert_allclose(projected, [left, top, left + width, top + height], atol=1.01)
     assert compared >= 3
 

@@ -40,6 +40,9 @@ MM = 1e3
 """Millimetres per metre: lengths are millimetres in BOP."""
 IMAGES = 1000
 """Images of a folder, as in the training sets of BOP that are rendered."""
+CENTRE_PX = 0.5
+"""Pixel coordinates of the middle of the first pixel here. In BOP, as in OpenCV, they are 0: `bop_toolkit` takes the
+ray of a depth pixel at its integer coordinates, and BlenderProc writes principal points so."""
 DEPTH_SCALES = (0.1, 1.0, 10.0, 100.0)
 """Millimetres per step of a depth image: an image has the first with which its depths fit into 16 bits."""
 WHITE_PERCENTILE = 99.5
@@ -166,7 +169,7 @@ def _write_image(
         infos.append(_info(whole, visible, depth > 0))
     return {
         "scene_camera": {
-            "cam_K": [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0],
+            "cam_K": [camera.fx, 0.0, camera.cx - CENTRE_PX, 0.0, camera.fy, camera.cy - CENTRE_PX, 0.0, 0.0, 1.0],
             "cam_R_w2c": T_camera_world[:3, :3].ravel().tolist(),
             "cam_t_w2c": (MM * T_camera_world[:3, 3]).tolist(),
             "depth_scale": scale,
@@ -199,8 +202,9 @@ def box_of(mask: np.ndarray) -> list[int] | None:
 
 
 def _write_camera(path: Path, camera: Intrinsics, entry: dict[str, Any]) -> None:
-    parts = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    write_json(path, {**parts, "depth_scale": entry["depth_scale"]})
+    parts = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy")}
+    middle = {name: getattr(camera, name) - CENTRE_PX for name in ("cx", "cy")}
+    write_json(path, {**parts, **middle, "depth_scale": entry["depth_scale"]})
 
 
 class _Models:

@@ -40,6 +40,11 @@ SCALE = Bounds("a positive scale", 1e-3, 1e3)
 """Bounds of the scale of an object, dimensionless."""
 PRIMITIVE_SIZE_M = Draw.of({"uniform": [0.03, 0.08]})
 """Size of a primitive if none is stated, metres: what a hand holds and a small bin takes."""
+MAX_CATEGORY = 200
+"""Largest number of characters of a category: more than a line of text."""
+MAX_SENSOR_NAME = 79
+"""Largest number of characters of an instrument's name. The name of a file in a tar file has at most 100; the number of
+the scene, the kind and the suffix take up to 21."""
 CHECKED_DRAWS = 8
 """Number of random draws of each instrument that are tried when a specification is made, besides the ends of all
 distributions, so that a wrong key or value is refused before the first scene."""
@@ -78,6 +83,10 @@ class ObjectGroup:
     def __post_init__(self) -> None:
         check_draws(self)
         check_fields(self)
+        if self.category is not None and not 0 < len(self.category) <= MAX_CATEGORY:
+            raise ValueError(
+                f"expected category as a name of 1 to {MAX_CATEGORY} characters, got {shown(self.category)}."
+            )
         object.__setattr__(self, "model", _with_files(self.model))
 
 
@@ -228,7 +237,9 @@ def _check_instrument(table: Any, place: str) -> None:
     if not isinstance(table, Mapping):
         raise ValueError(f"expected {place} to be a table of settings, got {shown(table)}.")
     for seed in range(CHECKED_DRAWS):
-        drawn_instrument(table, np.random.default_rng(seed), place)
+        name = drawn_instrument(table, np.random.default_rng(seed), place).name
+        if len(name) > MAX_SENSOR_NAME:
+            raise ValueError(f"expected a name of {place} of at most {MAX_SENSOR_NAME} characters, got {shown(name)}.")
 
 
 def drawn_instrument(table: Mapping[str, Any], random: np.random.Generator, place: str) -> Instrument:
@@ -323,7 +334,7 @@ def _with_paths(group: Any, folder: Path) -> Any:
             return [resolved(entry) for entry in model]
         if isinstance(model, Mapping):
             return {key: resolved(value) for key, value in model.items()}
-        if not isinstance(model, str) or model in PRIMITIVES:
+        if not isinstance(model, str) or not model or model in PRIMITIVES:
             return model
         path = os.path.abspath(folder / model)
         return path if os.path.exists(path) else model
