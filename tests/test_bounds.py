@@ -165,9 +165,11 @@ def use_camera(camera: Any) -> None:
 
 
 def use_detector(detector: Any) -> None:
-    sensor: Sensor = DirectToF(bins=32) if isinstance(detector, SpadDetector) else AmcwToF()
-    expose_and_decode(sensor, RIG, detector)
-    expose_and_decode(sensor, RIG, detector, Ambient("led", illuminance_lux=500.0))
+    counts_photons = isinstance(detector, SpadDetector)
+    sensor: Sensor = DirectToF(bins=32) if counts_photons else AmcwToF()
+    rig = stereo_rig(8, 6) if counts_photons else RIG  # dead times and afterpulses are followed from photon to photon
+    expose_and_decode(sensor, rig, detector)
+    expose_and_decode(sensor, rig, detector, Ambient("led", illuminance_lux=500.0))
 
 
 def use_instrument(one: Any) -> None:

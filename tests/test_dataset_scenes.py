@@ -12,13 +12,13 @@ import pytest
 
 import rangesim
 from rangesim.dataset import DatasetSpec, RandomScene, load_spec, piles, random_scene, spec_from_dict, spec_to_dict
-from rangesim.dataset.catalogue_materials import material_names, surface
 from rangesim.dataset.convex_pieces import convex_pieces
 from rangesim.dataset.model_files import read_model
 from rangesim.dataset.piles import GAP_M
 from rangesim.dataset.random_primitives import PRIMITIVES, primitive
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.transport_settings import TransportSettings
+from rangesim.scene.catalogue_materials import material_names, surface
 from rangesim.settings.draws import ANY_NUMBER, Draw, Of, draw_table
 from rangesim.triangle_mesh import TriangleMesh
 
@@ -278,6 +278,7 @@ def test_penetration_is_measured() -> None:
         assert penetration_m({"a": ball, "b": other}) == pytest.approx(overlap_m, abs=1e-4)
 
 
+@pytest.mark.validation
 def test_objects_that_fall_off_are_counted() -> None:
     small = {"type": "table", "width_m": 0.12, "depth_m": 0.12}
     scene = random_scene(spec_of(support=small, arrangement="pile"), 0)

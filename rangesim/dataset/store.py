@@ -159,7 +159,7 @@ class Store:
         return content
 
     def place(self, row: IndexRow) -> str:
-        """Where a scene stands, for messages."""
+        """Place of a scene in its shard, for messages."""
         return f"{shard_path(self.directory, row.place[0])}, scene {row.scene}"
 
     def mesh(self, record: SampleRecord, index: int, members: Mapping[str, bytes]) -> TriangleMesh:

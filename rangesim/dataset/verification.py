@@ -41,7 +41,7 @@ precision explains 1e-6, and ten times more where a ray grazes a surface; a wron
 
 @dataclass(frozen=True)
 class Findings:
-    """What is broken in a data set.
+    """Check of a data set, which lists what is broken.
 
     scenes : count of scenes that were checked. failed : count of scenes that failed when the data set was made; the
     index has their errors. problems : sentences, each with its place.

@@ -21,7 +21,7 @@ BACKGROUND = (226, 228, 231)
 
 @dataclass(frozen=True, eq=False)
 class SensorTile:
-    """What one sensor made of a scene.
+    """Pictures and figures of one sensor for a scene.
 
     intensity : (h, w) float32. outcome : (h, w) uint8, index into `palette.OUTCOME_NAMES`.
     right, wrong, missing : fractions of the pixels of objects; None if not known.

@@ -180,7 +180,7 @@ class _Page:
             )
 
     def _reach(self, name: str, others: Mapping[str, Any]) -> str | None:
-        """How far along the axis a sensor stays within the tolerance."""
+        """Sentence that says how far along the axis a sensor stays within the tolerance."""
         axis = self.axis
         assert axis is not None
         rows = sorted(self._of(name, others), key=lambda row: row[axis])
@@ -221,7 +221,7 @@ class _Page:
             yield f"Most often right by {label_of(path)}: {'; '.join(best)}."
 
     def _objects(self) -> Iterator[str]:
-        """What the failures of each sensor do to the objects."""
+        """Sentences about what the failures of each sensor do to the objects."""
         clauses = []
         for name in self.names:
             counted = [c.objects for (_, sensor), c in self.result.cells.items() if sensor == name and c.objects]
@@ -253,7 +253,7 @@ class _Page:
             )
 
     def _exposure(self) -> Iterator[str]:
-        """Which exposures are fixed, and which are automatic."""
+        """Sentence that says which exposures are fixed, and which are automatic."""
         fixed = self.result.exposures
         if fixed:
             each = []
@@ -272,7 +272,7 @@ class _Page:
             n for n, i in self.sweep.given.items() if i.exposure_s is not None and "exposure_s" not in self.sweep.vary
         ]
         if own:
-            yield f"The same at all points is the exposure of {', '.join(own)}, which they state themselves."
+            yield f"The exposure of {', '.join(own)} is the device's own, and the same at all points."
         automatic = {}
         for name in self.names:
             found = [r["exposure_s"] for r in self._rows_of(name) if r["exposure_s"] is not None]
@@ -286,7 +286,7 @@ class _Page:
             )
 
     def _place(self) -> Iterator[str]:
-        """For which distance sensors without a place of their own are set up."""
+        """Sentence about the distance for which sensors without a place of their own are set up."""
         free = [n for n, i in self.sweep.given.items() if i.T_camera_projector is None and i.sensor.triangulates]
         if free:
             yield (
@@ -489,7 +489,7 @@ def _hashable(value: Any) -> Any:
 
 
 def _number(value: float) -> str:
-    return f"{value:.3g}"
+    return f"{value:.3g}" if abs(value) < 1000 else f"{float(f'{value:.2g}'):,.0f}".replace(",", "\u202f")
 
 
 def _scene_name(scene: Any) -> str:

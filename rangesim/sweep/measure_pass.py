@@ -200,7 +200,7 @@ def _of_first(
     image: RangeImage,
     comparison: Comparison,
 ) -> dict[str, Any]:
-    """What is known from the first capture of an instrument: causes, noise of the renderer, pictures, frames.
+    """Findings from the first capture of an instrument: causes, noise of the renderer, pictures, frames.
 
     The causes of one capture are enough: they take as long as ten captures, and it has many pixels.
     """

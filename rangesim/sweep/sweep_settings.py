@@ -69,7 +69,7 @@ class Sweep:
     (2, ('amcw', 'gray-phase'))
     >>> Sweep(scene="wall", sensors=("amcw",), vary={"scene.distance": (1.0,)})
     Traceback (most recent call last):
-    ValueError: vary: unknown path 'scene.distance' (did you mean 'scene.distance_m'?) ...
+    ValueError: vary: unknown path 'scene.distance' (did you mean 'scene.distance_m'?); ...
     """
 
     scene: object
