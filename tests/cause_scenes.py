@@ -16,6 +16,7 @@ import pytest
 import rangesim
 from rangesim import AmcwToF, Capture, Detector, RangeImage, Rig, Scene, Signals, StructuredLight, transport
 from rangesim.causes import Cause
+from rangesim.decoding.working_range import WorkingRange
 from rangesim.electronics.spad import SpadDetector
 from rangesim.environment.backend import select_variant
 from rangesim.errors import RangesimWarning
@@ -392,6 +393,18 @@ def range_ambiguity() -> Case:
     healed = right(measure(signals, slow, None)[1], signals)
     with pytest.warns(RangesimWarning, match="that no surface is beyond 1.874 m"):
         return case(signals, sensor, detector, lambda c, i: [(healed, Cause.RANGE_AMBIGUITY), (True, Cause.DEPTH_EDGE)])
+
+
+def out_of_range() -> Case:
+    """A wall beyond the range that the device promises; healed by a decoder that promises nothing."""
+    scene = room(wall=board(0, 0, 3.0, 4), post=board(0.3, 0, 1.5, 0.2))
+    sensor = AmcwToF((80e6, 16e6))
+    signals = transport(scene, scene.rig(0.001, **SIZE), [sensor], spp=64, max_depth=2)
+    capture, unlimited = measure(signals, sensor, Detector.time_of_flight())
+    image = rangesim.decode(capture, replace(sensor.default_decoder, working_range=WorkingRange(0.5, 2.0)))
+    healed = right(unlimited, signals) & (signals.truth.z > 2.5)
+    decided = np.where(healed, Cause.OUT_OF_RANGE, np.where(signals.truth.z > 2.5, Cause.LOW_SIGNAL, Cause.DEPTH_EDGE))
+    return Case(signals, capture, image, decided)
 
 
 def resolution() -> Case:

@@ -566,6 +566,27 @@ def test_photons_of_many_seeds_light_every_pixel_that_sees_glass() -> None:
     assert np.any(lit, axis=0).mean() > 0.99
 
 
+@pytest.mark.parametrize("turned", [False, True], ids=["columns", "rows"])
+def test_a_wire_that_passes_between_the_centres_of_cells_gets_its_photons(turned: bool) -> None:
+    """A cell of the pre-pass is 2 x 2 projector pixels here, and the wire one pixel wide, along columns or rows.
+
+    With rays through the centres of the cells, no photon at all met it at two of these four places.
+    """
+    import mitsuba as mi
+
+    projector = Intrinsics.from_fov(1280, 800, 50)
+    pixel_m, half_length_m = 0.7 / projector.fx, 0.07
+    for shift_px in (0.0, 0.5, 1.0, 1.5):
+        place = transform().rotate([0, 0, 1], 90.0 * turned).translate([0.1 + shift_px * pixel_m, 0, 0.7])
+        size = mi.ScalarTransform4f().rotate([0, 1, 0], 45).scale([pixel_m / 8**0.5, half_length_m, pixel_m / 8**0.5])
+        wire = {"type": "cube", "to_world": place @ size, "bsdf": MIRROR}
+        scene, maps = scene_of(wire=wire, wall=wall(PLANE, matte())), 4
+        traced = TracedScene.of(scene.mitsuba, rig_of(CAMERA, projector))
+        energy = trace_photons(traced, 1.0, 40_000, maps, 1, 1 << 30).energy
+        met = 1 - energy.direct / energy.emitted
+        assert met == pytest.approx(2 * half_length_m / pixel_m / (1280 * 800), rel=0.3)
+
+
 # ---- Same bytes -------------------------------------------------------------------------------------
 
 

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 import rangesim
-from rangesim.dataset import DatasetSpec, RandomScene, load_spec, random_scene, spec_from_dict, spec_to_dict
-from rangesim.dataset.catalogue_materials import material_names, surface
+from rangesim.dataset import DatasetSpec, RandomScene, load_spec, piles, random_scene, spec_from_dict, spec_to_dict
 from rangesim.dataset.convex_pieces import convex_pieces
 from rangesim.dataset.model_files import read_model
 from rangesim.dataset.piles import GAP_M
 from rangesim.dataset.random_primitives import PRIMITIVES, primitive
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.transport_settings import TransportSettings
+from rangesim.scene.catalogue_materials import material_names, surface
 from rangesim.settings.draws import ANY_NUMBER, Draw, Of, draw_table
 from rangesim.triangle_mesh import TriangleMesh
 
@@ -295,6 +295,16 @@ def test_piles_rest_and_masks_are_first_hits() -> None:
         check_pile(scene)
         assert len(scene.objects) >= 8
         assert different_pixels(scene) == 0
+
+
+@pytest.mark.validation
+def test_objects_that_are_wedged_when_the_time_is_over_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sixteen objects, some as large as half of the bin: four of them lie 0.9 mm deep in others after 2.4 s."""
+    monkeypatch.setattr(piles, "MAX_CHUNKS", 24)
+    objects = [{"model": list(PRIMITIVES), "count": 16, "size_m": {"uniform": [0.02, 0.12]}}]
+    scene = random_scene(spec_of(objects=objects, arrangement="pile", seed=9001), 8)
+    assert scene.left_out["wedged in another object"] > 0
+    check_pile(scene)
 
 
 # ---- Masks ---------------------------------------------------------------------------------------------------------

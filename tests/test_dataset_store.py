@@ -8,6 +8,7 @@ import json
 import shutil
 import tarfile
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,8 @@ from rangesim.dataset import (
 )
 from rangesim.dataset.contact_sheet import contact_sheet
 from rangesim.dataset.sample import sample_bytes
-from rangesim.dataset.sample_files import END_OF_TAR, SCENE_MEMBER, members_of, tar_segment
+from rangesim.dataset.sample_files import END_OF_TAR, SCENE_MEMBER, arrays_of, members_of, record_of, tar_segment
+from rangesim.dataset.store import IndexRow, parquet_bytes, read_rows
 from rangesim.errors import FileFormatError
 
 SCENES = 3
@@ -170,7 +172,6 @@ def test_webdataset_reads_the_shards(store: Path) -> None:
 def test_frames_are_kept_on_request(spec: DatasetSpec) -> None:
     drawn = random_scene(spec, 0)
     from rangesim.dataset.sample import bytes_of
-    from rangesim.dataset.sample_files import arrays_of, record_of
 
     members = members_of(bytes_of(drawn, 0, keeps_frames=True), "here")
     record = record_of(members, "here")
@@ -275,7 +276,96 @@ def test_verify_says_what_is_broken_and_where(store: Path, tmp_path: Path) -> No
     assert any("000000.tar was changed" in each for each in problems)
     assert any(f"{model.name} is missing" in each for each in problems)
     assert any("more.tar does not belong" in each for each in problems)
-    assert any("scene 0: its bytes in shard 0 are not those" in each for each in problems)
+    assert any("scene 0: its bytes are not those that the index lists" in each for each in problems)
+
+
+def test_changed_files_are_refused_when_samples_are_read(store: Path, tmp_path: Path) -> None:
+    """Each byte of the record, the index and the settings counts, also where it still is valid JSON or Parquet."""
+    copy = tmp_path / "set"
+    shutil.copytree(store, copy)
+
+    def read_all() -> None:
+        for number, _ in enumerate(samples := Samples(copy)):
+            record, members = samples.record(number)
+            for index in range(len(record.objects)):
+                samples.store.mesh(record, index, members)
+
+    def refused(name: str, content: bytes) -> str:
+        original = (copy / name).read_bytes()
+        (copy / name).write_bytes(content)
+        with pytest.raises(FileFormatError) as caught:
+            read_all()
+        (copy / name).write_bytes(original)
+        return str(caught.value)
+
+    first, second = ((copy / "shards" / f"{number:06d}.tar").read_bytes() for number in range(2))
+    digit = first.index(b'"scale":1.') + len(b'"scale":')
+    assert "scene 0: its bytes are not" in refused("shards/000000.tar", first[:digit] + b"2" + first[digit + 1 :])
+    assert "scene 0" in refused("shards/000000.tar", second)
+    (model,) = (copy / "models").iterdir()
+    assert "its checksum is not its name" in refused(f"models/{model.name}", model.read_bytes()[:-1] + b"\1")
+    rows = Store(copy).rows
+    assert "index.parquet was changed" in refused("index.parquet", parquet_bytes(rows[::-1]))
+    settings = (copy / "store.json").read_bytes()
+    assert "store.json was changed" in refused("store.json", settings.replace(b'"seed": 0', b'"seed": 1'))
+    sums = (copy / "checksums.txt").read_bytes()
+    assert "checksums.txt is broken" in refused("checksums.txt", sums.replace(b"index", b"indfx"))
+    assert "checksums.txt is broken" in refused("checksums.txt", sums[:-1])
+
+
+def test_an_index_from_elsewhere_is_refused() -> None:
+    row = IndexRow(0, 0, 0, 512, "0" * 64, 1, 0, (), ("amcw",), (1.0,), (0.0,), (0.0,))
+    assert read_rows(parquet_bytes([row]), "here")[0].place == (0, 0, 512)
+    for changed in ({"offset": -512}, {"size": None}, {"scene": None}, {"right": []}):
+        with pytest.raises(FileFormatError, match="here"):
+            read_rows(parquet_bytes([replace(row, **changed)]), "here")
+
+
+def hostile_entry(**values: Any) -> bytes:
+    entry = tarfile.TarInfo("000000.scene.json")
+    for name, value in values.items():
+        setattr(entry, name, value)
+    return entry.tobuf(tarfile.GNU_FORMAT)
+
+
+@pytest.mark.parametrize(
+    "segment",
+    [
+        hostile_entry(name="../evil.json"),
+        hostile_entry(type=tarfile.SYMTYPE, linkname="/etc/passwd"),
+        hostile_entry(type=tarfile.GNUTYPE_SPARSE, size=1 << 60),
+        hostile_entry(size=1 << 60),
+        hostile_entry(size=-512),
+        hostile_entry() * 2,
+        hostile_entry(type=tarfile.XHDTYPE, size=0) * 5000,
+        hostile_entry(mode=0o4777),
+        b"no tar",
+        b"",
+    ],
+)
+def test_hostile_tar_files_are_refused(segment: bytes) -> None:
+    with pytest.raises(FileFormatError, match=r"^here"):
+        members_of(segment, "here")
+
+
+@pytest.mark.parametrize(
+    ("part", "values"),
+    [
+        ("objects", {"shape": 99}),
+        ("objects", {"T_world_part": [[0.0] * 4] * 4}),
+        ("objects", {"sha256": "../" * 20}),
+        ("objects", {"scale": -1.0}),
+        ("cameras", {"T_world_camera": [[1.0]]}),
+        ("sensors", {"name": "../../home"}),
+        ("sensors", {"camera": 2}),
+        ("sensors", {"rows": []}),
+    ],
+)
+def test_records_that_contradict_themselves_are_refused(sample: Any, part: str, values: dict[str, Any]) -> None:
+    record = json.loads(members_of(sample(0), "here")[SCENE_MEMBER])
+    record[part][0] |= values
+    with pytest.raises(FileFormatError, match=r"here: scene\.json is broken"):
+        record_of({SCENE_MEMBER: json.dumps(record).encode()}, "here")
 
 
 @pytest.mark.parametrize("what", ["pose", "mask", "array", "mesh"])
@@ -408,6 +498,11 @@ def test_the_contact_sheet_shows_scenes_and_filters_them(store: Path, tmp_path: 
     assert page.count("<article") == SCENES
     assert page.count("data:image/png") == 4 * SCENES
     assert isinstance(CliRunner().invoke(app, ["show", str(store), "--out", str(target)]).exception, FileFormatError)
+
+
+def test_a_folder_of_something_else_is_no_data_set(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"expected a data set of `rangesim dataset`, got .* has no store\.json"):
+        Samples(tmp_path)
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")

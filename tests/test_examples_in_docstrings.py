@@ -48,6 +48,7 @@ ROOMS = [
     "rangesim.sensors",
     "rangesim.settings",
     "rangesim.signals",
+    "rangesim.sweep",
 ]
 """Packages whose docstrings are run, all of their modules."""
 MODULES = [

@@ -259,7 +259,8 @@ def test_a_scene_that_no_sensor_reads_has_no_winner() -> None:
     poor = _measured("lines", cup=(0.1, 0.1, 1e-3), pot=(0.9, 0.0, 1e-3), jar=(0.2, 0.0, 1e-3))
     said = _side_by_side(blind, poor)
     assert said == (
-        "No sensor reads most of the objects’ pixels right, to 10 mm; the best, Structured light, reads 40.0 %. "
+        "No sensor reads most of the objects’ pixels right, to 10 mm; Structured light reads most, 40.0 %, "
+        "and 3.3 % wrong. "
         "No sensor is right on most of these objects: cup (at best 10 %, Structured light), "
         "jar (at best 20 %, Structured light)."
     )

@@ -52,6 +52,11 @@ def wall(sensors: tuple[Any, ...] = ("amcw",), seeds: int = 2, **vary: Any) -> S
         ({"scene": {"name": "wall", "distance": 1.0}}, "did you mean 'distance_m'"),
         ({"exposure": "fix"}, "expected exposure"),
         ({"exposure": "auto", "exposure_s": 0.1}, "expected exposure or exposure_s, got both"),
+        ({"exposure": "auto", "vary": {"exposure_s": [0.1, 0.2]}}, "expected exposure or exposure_s, got both"),
+        ({"power_w": 1.0, "vary": {"power_w": [1.0, 2.0]}}, "expected power_w as one value or in vary, got both"),
+        ({"vary": {"power_w": [1, 2.0, 1.0]}}, r"expected different values of vary\.power_w, got 1\.0 twice"),
+        ({"vary": {key: [*range(1, 1001)] for key in ("power_w", "baseline_m", "exposure_s")}}, "at most 10000 combin"),
+        ({"tolerence_m": 0.1}, "did you mean 'tolerance_m'"),
     ],
 )
 def test_what_a_sweep_cannot_be_is_said_in_a_sentence(change: dict[str, Any], sentence: str) -> None:
@@ -206,7 +211,15 @@ def test_the_page_and_the_tables_are_written(result: Any, tmp_path: Path) -> Non
     page = write_sweep(result, tmp_path).read_text()
     rows = list(csv.DictReader((tmp_path / "rows.csv").read_text().splitlines()))
     assert len(rows) == len(result.rows)
-    assert "amcw stays within 10 mm" in page
+    reach = next(line for line in page.split("<p>") if "95 % of the readings are within 10 mm" in line)
+    assert "amcw" in reach
+    (lowest, highest) = (
+        next(r for r in result.summary if r["sensor"] == "amcw" and r["kind"] == "all" and r["scene.distance_m"] == d)
+        for d in (min(result.sweep.vary["scene.distance_m"]), max(result.sweep.vary["scene.distance_m"]))
+    )
+    grown = next(line for line in page.split("<p>") if line.startswith("Error over distance"))
+    for row in (lowest, highest):
+        assert f"{1e3 * row['error_m'].mean:.3g} mm at {row['scene.distance_m']:g} m" in grown
     assert "Exposures are fixed" in page
     import pyarrow.parquet as pq
 

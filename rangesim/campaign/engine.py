@@ -59,7 +59,7 @@ POLL_S = 1.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of the items of a run.
+    """The fate of a run's items: computed, kept or quarantined.
 
     computed : count of items that this run has computed. kept : count that the store held already. quarantined : the
     items that failed, in this run or in an earlier one. warned : by category of warnings, the count of items of this
@@ -246,7 +246,7 @@ class _Run:
             self.warned[kind] = count + 1, first
 
     def how_to_go_on(self) -> str:
-        """What is kept, and how to go on."""
+        """Sentence that says what is kept, and how to go on."""
         return f"{self.kept + self.computed} of {len(self.items)} items are done and kept; run the same again to go on"
 
     def report(self) -> None:

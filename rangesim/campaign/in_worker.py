@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a worker process does with one item."""
+"""The part of a campaign that runs in worker processes: one item at a time."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Job(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """What a worker says of an item.
+    """Answer of a worker process for one item.
 
     content : the result; None if there is none. error : one line about the failure, else empty. traceback : of the
     exception. unfit : why this worker takes no items of the run, else empty. warned : category and text of each

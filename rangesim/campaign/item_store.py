@@ -279,7 +279,7 @@ def _plain(value: Any) -> Any:
 
 
 def _differences(then: Any, now: Any, place: str = "") -> Iterator[str]:
-    """What differs between two pieces of plain data, one text for each place."""
+    """Differences between two pieces of plain data, one text for each place."""
     if isinstance(then, dict) and isinstance(now, dict):
         for name in sorted(then.keys() | now.keys()):
             yield from _differences(then.get(name), now.get(name), f"{place}.{name}" if place else name)

@@ -191,6 +191,8 @@ def _local_cluster(count: int) -> Iterator[LocalCluster]:
         # On a busy machine a new process takes longer than the usual 15 s, after which its nanny would be given up.
         "distributed.deploy.lost-worker-timeout": f"{WAIT_S} s",
         "distributed.scheduler.worker-ttl": None,  # a jump of the clock would end all workers
+        # Dask's profiler keeps the call stacks of an hour, so a worker would grow by 0.7 MB with each scene.
+        "distributed.worker.profile.enabled": False,
         # A worker at one of these limits would wait for memory that nothing frees. The last limit is kept: the nanny
         # ends a worker that takes nearly all of the machine's memory.
         "distributed.worker.memory.target": False,

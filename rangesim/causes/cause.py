@@ -46,6 +46,7 @@ class Cause(IntEnum):
     NO_TEXTURE = 16
     COVER_GLASS = 17
     STRAY_LIGHT = 18
+    OUT_OF_RANGE = 19
 
 
 DEFINITIONS = {
@@ -68,6 +69,7 @@ DEFINITIONS = {
     Cause.NO_TEXTURE: "The surface shows no texture by which the images of two cameras could be matched.",
     Cause.COVER_GLASS: "Light off the window of the device disturbed the reading, or hid a surface close before it.",
     Cause.STRAY_LIGHT: "Light of the rest of the image, which the camera's lens scatters, disturbed the reading.",
+    Cause.OUT_OF_RANGE: "The surface lies outside the working range of the device, which refuses readings there.",
 }
 """Meaning of each cause, in one sentence, which the tables of docs/causes.md and of reports show."""
 
@@ -91,6 +93,7 @@ TITLES = {
     Cause.NO_TEXTURE: "no texture",
     Cause.COVER_GLASS: "cover glass",
     Cause.STRAY_LIGHT: "stray light",
+    Cause.OUT_OF_RANGE: "out of range",
 }
 """Name of each cause in tables and legends."""
 

@@ -133,6 +133,15 @@ class Evidence:
         return full & (self.missing | ~self.optical)
 
     @cached_property
+    def out_of_range(self) -> np.ndarray:
+        """Whether the decoder refused the reading, and the surface lies outside the decoder's working range indeed."""
+        decoder = self.image.decoder or self.capture.sensor.default_decoder
+        refused = self.image.status == Status.OUT_OF_RANGE
+        if decoder.working_range is None:
+            return np.zeros(refused.shape, dtype=bool)
+        return np.asarray(refused & decoder.working_range.is_outside(self.truth))
+
+    @cached_property
     def off_glass(self) -> np.ndarray:
         """Whether light off the device's window is to blame.
 

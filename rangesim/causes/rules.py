@@ -101,6 +101,8 @@ def rules(e: Evidence) -> list[Rule]:
         (e.saturated & e.mostly_ambient & ~e.mostly(GLINT), Cause.AMBIENT),
         (e.saturated & e.piled_up & ~e.mostly(GLINT), Cause.PILE_UP),
         (e.saturated | e.mostly(GLINT), Cause.GLINT),
+        # ---- The device refuses what is nearer or farther than it promises to read
+        (e.out_of_range, Cause.OUT_OF_RANGE),
         # ---- Surfaces that reflect or transmit the light: it does not matter whether they are lit. Direct light in
         # such a pixel comes from a neighbouring surface
         (e.is_a("transparent", "mirror") & e.at_edge & e.enough & e.mostly(DIRECT), Cause.DEPTH_EDGE),

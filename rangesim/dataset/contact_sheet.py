@@ -50,13 +50,14 @@ def contact_sheet(directory: str | Path, scenes: int = SCENES) -> str:
 
 
 def _line(samples: Samples, rows: Sequence[IndexRow]) -> str:
-    """What the data set is, in one line."""
+    """Line with the numbers of scenes, objects and shards."""
     shards = {row.shard for row in samples.rows}
     size = sum(row.size or 0 for row in samples.rows)
     objects = sum(row.objects or 0 for row in samples.rows)
     version = samples.store.record.versions.get("rangesim")
     failed = len(rows) - len(samples)
-    text = f"{len(samples)} scenes with {objects} objects · {len(shards)} shards, {size / 1e6:.1f} MB"
+    in_shards = f"{len(shards)} shard{'s' * (len(shards) != 1)}, {size / 1e6:.1f} MB"
+    text = f"{len(samples)} scenes with {objects} objects · {in_shards}"
     return f"{text} · {failed} scenes failed · rangesim {version}"
 
 
@@ -74,14 +75,14 @@ def _means(rows: Sequence[IndexRow]) -> list[tuple[str, float, float, float]]:
 
 
 def _sentences(rows: Sequence[IndexRow]) -> list[str]:
-    """What stands out."""
+    """Findings for the head of the page."""
     means = [entry for entry in _means(rows) if not np.isnan(entry[1])]
     if not means:
         return ["No scene has a reading to compare."]
     best, worst = max(means, key=lambda entry: entry[1]), max(means, key=lambda entry: entry[2])
     said = [f"Most right: {best[0]}, {100 * best[1]:.1f} % of the pixels of objects."]
     if len(means) > 1:
-        said.append(f"Most wrong, with no word of the sensor: {worst[0]}, {100 * worst[2]:.1f} %.")
+        said.append(f"Most wrong, without a warning from the sensor: {worst[0]}, {100 * worst[2]:.1f} %.")
     return said
 
 
@@ -101,7 +102,7 @@ def _tile(record: SampleRecord, sample: dict[str, Any], row: IndexRow) -> SceneT
     return SceneTile(
         number=record.number,
         categories=sorted(counts),
-        names=[each.category for each in record.objects],
+        models=[each.model for each in record.objects],
         depth_m=truth["true_m"],
         instance=instance,
         amodal=truth["amodal"],

@@ -40,7 +40,7 @@ class ConvexPieces(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """What a cell cuts out of the solid.
+    """The part of the solid within a cell.
 
     cell : (2, 3) lower and upper corner. triangles : (t, 3, 3) of the mesh in the cell. points : (k, 3) corners of the
     hull. standoff : largest distance from hull to solid. farthest : (3,) the place of it.

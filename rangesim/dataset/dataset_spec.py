@@ -15,7 +15,6 @@ from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import numpy as np
 
-from rangesim.dataset.catalogue_materials import check_material, surface
 from rangesim.dataset.model_files import model_files
 from rangesim.dataset.random_primitives import PRIMITIVES
 from rangesim.dataset.supports import Support, Table
@@ -25,6 +24,7 @@ from rangesim.errors import FileFormatError
 from rangesim.files.text_files import read_toml
 from rangesim.instrument.instrument import Instrument
 from rangesim.presets import DEFAULT_SENSORS, instrument_from_dict, is_device_file
+from rangesim.scene.catalogue_materials import check_material, surface
 from rangesim.sensors import is_file_name
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, Fraction, Metres, check_fields, whole

@@ -96,6 +96,7 @@ def settled(solids: list[tuple[SolidModel, float]], support: Placed, random: np.
             calm_chunks = 0
     else:
         leave_out(inside & (moved >= REST_M), "still moving")
+        leave_out(_wedged(pile, inside), "wedged in another object")
     poses: list[np.ndarray | None] = []
     for body, (solid, scale) in enumerate(solids):
         pose = np.eye(4)

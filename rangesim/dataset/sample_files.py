@@ -13,7 +13,6 @@ always has the same bytes. Readers of WebDataset find JSON and NumPy's .npz; not
 
 from __future__ import annotations
 
-import io
 import tarfile
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
@@ -26,10 +25,12 @@ from rangesim.causes import Cause
 from rangesim.decoding.status import Status
 from rangesim.errors import FileFormatError
 from rangesim.files.array_files import arrays_from_bytes
-from rangesim.files.schema import MAX_METRES, ArraySpec, Count, Name, Record, checked_arrays
+from rangesim.files.schema import MAX_METRES, ArraySpec, Count, Name, Positive, Record, checked_arrays
+from rangesim.instrument.instrument import is_name
 from rangesim.results.experiment_results import ObjectsRecord, RowRecord
 from rangesim.rig import Camera
-from rangesim.settings.config import from_dict
+from rangesim.rig.poses import pose
+from rangesim.settings.config import from_dict, shown
 from rangesim.triangle_mesh import TriangleMesh
 
 SCENE_MEMBER = "scene.json"
@@ -87,6 +88,10 @@ the point. The last are the segmentation of the measured cloud.
 """
 
 
+Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+"""A SHA-256 in hexadecimal digits."""
+
+
 # ---- Records -------------------------------------------------------------------------------------------------------
 
 
@@ -109,11 +114,11 @@ class PlacedObjectRecord(Record, frozen=True, kw_only=True):
 
     shape: Count
     model: Name
-    sha256: Name
+    sha256: Sha256
     from_file: bool
     category: Name
     material: Name
-    scale: float
+    scale: Positive
     T_world_part: list[list[float]]
 
 
@@ -149,7 +154,7 @@ class SensorRecord(Record, frozen=True, kw_only=True):
     projector: dict[str, Any]
     T_camera_projector: list[list[float]]
     exposure_s: float | None
-    rows: list[RowRecord]
+    rows: Annotated[list[RowRecord], msgspec.Meta(min_length=1)]
     objects: ObjectsRecord | None
     doubts: list[str]
     notes: list[str]
@@ -231,33 +236,55 @@ def members_of(segment: bytes, place: str) -> dict[str, bytes]:
     Raises
     ------
     FileFormatError
-        The bytes are no part of a tar file, or hold members of several scenes.
+        The bytes are no such part of a tar file, or hold members of several scenes.
     """
-    members, keys = {}, set()
+    members: dict[str, bytes] = {}
+    keys, at = set(), 0
     try:
-        with tarfile.open(fileobj=io.BytesIO(segment + END_OF_TAR), mode="r:") as archive:
-            for entry in archive:
-                file = archive.extractfile(entry)
-                if file is None:
-                    raise FileFormatError(f"{place}: expected plain files, got {entry.name!r}.")
-                key, _, suffix = entry.name.partition(".")
-                keys.add(key)
-                members[suffix] = file.read()
+        while at < len(segment):
+            entry = tarfile.TarInfo.frombuf(segment[at : at + BLOCK], "utf-8", "surrogateescape")
+            if entry.type != tarfile.REGTYPE or entry.size < 0:
+                raise FileFormatError(f"{place}: expected plain files, got {shown(entry.name)}.")
+            key, _, suffix = entry.name.partition(".")
+            keys.add(key)
+            members[suffix] = segment[at + BLOCK : at + BLOCK + entry.size]
+            at += BLOCK + -(-entry.size // BLOCK) * BLOCK
     except tarfile.TarError as error:
         raise FileFormatError(f"{place}: expected a part of a tar file: {error}.") from error
     if len(keys) != 1:
         raise FileFormatError(f"{place}: expected the members of one scene, got {len(keys)}.")
+    key = keys.pop()
+    if not key.isascii() or not key.isdecimal() or tar_segment(int(key), members) != segment:
+        raise FileFormatError(f"{place}: expected members as rangesim writes them, each once and whole.")
     return members
 
 
 def record_of(members: Mapping[str, bytes], place: str) -> SampleRecord:
-    """The record of a scene; FileFormatError if it is missing or broken."""
+    """The record of a scene; FileFormatError if it is missing or broken, or contradicts itself."""
     if SCENE_MEMBER not in members:
         raise FileFormatError(f"{place}: expected the member {SCENE_MEMBER}, got {', '.join(members) or 'none'}.")
     try:
-        return msgspec.json.decode(members[SCENE_MEMBER], type=SampleRecord)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{place}: {SCENE_MEMBER} is broken: {error}.") from error
+        record = msgspec.json.decode(members[SCENE_MEMBER], type=SampleRecord)
+        _check(record)
+    except (msgspec.DecodeError, UnicodeDecodeError, ValueError) as error:
+        raise FileFormatError(f"{place}: {SCENE_MEMBER} is broken: {str(error).rstrip('.')}.") from error
+    return record
+
+
+def _check(record: SampleRecord) -> None:
+    """Raise ValueError if the parts of a record do not fit together."""
+    for index, each in enumerate(record.objects):
+        pose(each.T_world_part, f"T_world_part of object {index}")
+        if each.shape >= len(record.shapes):
+            raise ValueError(f"expected object {index} to be one of {len(record.shapes)} shapes, got {each.shape}.")
+    for number, camera in enumerate(record.cameras, 1):
+        pose(camera.T_world_camera, f"T_world_camera of camera {number}")
+    for sensor in record.sensors:
+        if not is_name(sensor.name) or not 1 <= sensor.camera <= len(record.cameras):
+            raise ValueError(
+                f"expected sensors with the name of an instrument and one of {len(record.cameras)} cameras, got "
+                f"{shown(sensor.name)} with camera {sensor.camera}."
+            )
 
 
 def mesh_in(members: Mapping[str, bytes], index: int, place: str) -> TriangleMesh:

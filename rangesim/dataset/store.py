@@ -11,10 +11,13 @@ DIR/store.json           the specification, the count of scenes, and the version
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+
+import msgspec
 
 from pcgraph.plumbing.plain_files import read_file
 from rangesim.dataset.sample_files import SampleRecord, members_of, mesh_in
@@ -53,13 +56,13 @@ class IndexRow:
     error, traceback : why the scene failed; None for all others.
     """
 
-    scene: int
-    shard: int | None = None
-    offset: int | None = None
-    size: int | None = None
+    scene: Count
+    shard: Count | None = None
+    offset: Count | None = None
+    size: Count | None = None
     sha256: str | None = None
     seed: int | None = None
-    objects: int | None = None
+    objects: Count | None = None
     categories: Sequence[str] = ()
     sensors: Sequence[str] = ()
     right: Sequence[float | None] = ()
@@ -112,6 +115,8 @@ class Store:
     FileFormatError
         The directory holds no data set, or `store.json` is broken.
 
+    What is read of a complete data set is compared with its checksums first, so a file that was changed is refused.
+
     Examples
     --------
     >>> store = Store("out/bins")  # doctest: +SKIP
@@ -120,12 +125,27 @@ class Store:
 
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(directory)
+        if not (self.directory / SETTINGS).is_file():
+            raise FileFormatError(
+                f"expected a data set of `rangesim dataset`, got {directory}, which has no {SETTINGS}."
+            )
         self.record = read_record(self.directory / SETTINGS, StoreRecord)
 
     @property
     def is_complete(self) -> bool:
         """Whether all scenes are there."""
         return (self.directory / CHECKSUMS).is_file()
+
+    @property
+    def checksums(self) -> dict[str, str]:
+        """SHA-256 of each file by its name, as `checksums.txt` lists them; FileFormatError if that file is broken."""
+        path = self.directory / CHECKSUMS
+        lines = read_file(path, FileFormatError).decode(errors="replace").split("\n")
+        found = [re.fullmatch(r"([0-9a-f]{64})  (\S+)", line) for line in lines[:-1]]
+        listed = {match[2]: match[1] for match in found if match}
+        if len(listed) < len(found) or lines[-1] or not {INDEX, SETTINGS} <= listed.keys():
+            raise FileFormatError(f"{path} is broken: expected a checksum for each file, {INDEX} and {SETTINGS} too.")
+        return listed
 
     @property
     def rows(self) -> list[IndexRow]:
@@ -138,14 +158,19 @@ class Store:
         """
         if not self.is_complete:
             raise FileFormatError(f"{self.directory} is not complete; run `rangesim dataset make` again to go on.")
-        return read_rows(read_file(self.directory / INDEX, FileFormatError), str(self.directory / INDEX))
+        listed = self.checksums
+        contents = {name: read_file(self.directory / name, FileFormatError) for name in (SETTINGS, INDEX)}
+        for name, content in contents.items():
+            if hashlib.sha256(content).hexdigest() != listed[name]:
+                raise FileFormatError(f"{self.directory / name} was changed: its checksum is not that in {CHECKSUMS}.")
+        return read_rows(contents[INDEX], str(self.directory / INDEX))
 
     def members(self, row: IndexRow) -> dict[str, bytes]:
         """The members of a scene by suffix, see `rangesim.dataset.sample_files`; FileFormatError if they are broken."""
         return members_of(self.segment(row), self.place(row))
 
     def segment(self, row: IndexRow) -> bytes:
-        """The bytes of a scene."""
+        """The bytes of a scene; FileFormatError if they are missing or changed."""
         shard, offset, size = row.place
         path = shard_path(self.directory, shard)
         try:
@@ -156,10 +181,12 @@ class Store:
             raise FileFormatError(f"cannot read {path}: {problem.strerror or problem}.") from problem
         if len(content) < size:
             raise FileFormatError(f"{path} ends early, within scene {row.scene}.")
+        if hashlib.sha256(content).hexdigest() != row.sha256:
+            raise FileFormatError(f"{path}, scene {row.scene}: its bytes are not those that the index lists.")
         return content
 
     def place(self, row: IndexRow) -> str:
-        """Where a scene stands, for messages."""
+        """Place of a scene in its shard, for messages."""
         return f"{shard_path(self.directory, row.place[0])}, scene {row.scene}"
 
     def mesh(self, record: SampleRecord, index: int, members: Mapping[str, bytes]) -> TriangleMesh:
@@ -169,7 +196,10 @@ class Store:
         """
         each = record.objects[index]
         if each.from_file:
-            return TriangleMesh.load(model_path(self.directory, each.sha256))
+            path = model_path(self.directory, each.sha256)
+            if hashlib.sha256(read_file(path, FileFormatError)).hexdigest() != each.sha256:
+                raise FileFormatError(f"{path} was changed: its checksum is not its name.")
+            return TriangleMesh.load(path)
         return mesh_in(members, index, f"scene {record.number}")
 
 
@@ -205,7 +235,16 @@ def parquet_bytes(rows: Sequence[IndexRow], metadata: Mapping[str, str] | None =
 
 def read_rows(content: bytes, place: str) -> list[IndexRow]:
     """The rows of a Parquet file that `parquet_bytes` made; FileFormatError if it is broken."""
-    return [IndexRow(**row) for row in _table(content, place).to_pylist()]
+    try:
+        rows = msgspec.convert(_table(content, place).to_pylist(), list[IndexRow])
+    except msgspec.ValidationError as error:
+        raise FileFormatError(f"{place} is broken: {error}.") from error
+    for row in rows:
+        if row.error is None and None in (row.shard, row.offset, row.size):
+            raise FileFormatError(f"{place}: expected a place or an error of scene {row.scene}.")
+        if not len(row.sensors) == len(row.right) == len(row.wrong) == len(row.missing):
+            raise FileFormatError(f"{place}: expected fractions of {len(row.sensors)} sensors of scene {row.scene}.")
+    return rows
 
 
 def parquet_metadata(content: bytes, place: str) -> dict[str, str]:

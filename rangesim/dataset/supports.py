@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the objects lie on: a table, a floor, or a bin. The surface that bears them, or the bin, is centred at the
+"""Supports that objects lie on: a table, a floor, or a bin. The surface that bears them, or the bin, is centred at the
 origin, and z points up.
 """
 

@@ -14,6 +14,7 @@ from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds, Metres, check_fie
 
 if TYPE_CHECKING:
     from rangesim.rig import Camera
+    from rangesim.signals import GroundTruth
 
 Nearest = Annotated[float, Bounds("0 or positive", 1e-9, MAX_COORDINATE_M, or_zero=True)]
 """A least range in metres, which may be 0."""
@@ -57,14 +58,18 @@ class WorkingRange:
                 f"along z: rays of this {type(camera).__name__} lead sideways or backwards, where z is no range."
             )
 
-    def applied_to(self, image: RangeImage) -> RangeImage:
-        """The range image with NaN and `OUT_OF_RANGE` where it had a reading outside this range."""
-        reading = image.z if self.along == "z" else image.range_m
-        with np.errstate(invalid="ignore"):  # NaN compares as inside; its status stays
+    def is_outside(self, surfaces: RangeImage | GroundTruth) -> np.ndarray:
+        """(h, w) bool, whether a reading, or a true surface, lies outside this range; False where there is none."""
+        reading = surfaces.z if self.along == "z" else surfaces.range_m
+        with np.errstate(invalid="ignore"):  # NaN compares as inside
             is_outside = reading < self.near_m
             if self.far_m is not None:
                 is_outside |= reading > self.far_m
-        nan = np.float32(np.nan)
+        return np.asarray(is_outside)
+
+    def applied_to(self, image: RangeImage) -> RangeImage:
+        """The range image with NaN and `OUT_OF_RANGE` where it had a reading outside this range."""
+        is_outside, nan = self.is_outside(image), np.float32(np.nan)
         return replace(
             image,
             z=np.where(is_outside, nan, image.z),

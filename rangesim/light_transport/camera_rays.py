@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.sampling import GOLDEN_STEP
 from rangesim.light_transport.scattering import Media, Medium
 from rangesim.rig import Intrinsics, Lens, Rig
 from rangesim.rig.camera_model import CameraModel, appears, distort, project, unproject
@@ -310,7 +311,14 @@ class CellGrid(NamedTuple):
         columns = dr.opaque(mi.UInt32, self.columns)
         return (mi.Point2f(mi.Float(cell % columns), mi.Float(cell // columns)) + within) * self.size
 
-    def centres(self, begin: int, end: int) -> mi.Point2f:
-        """Pixel coordinates of the centres of the cells `begin` to `end` - 1, row by row."""
+    def probes(self, begin: int, end: int) -> mi.Point2f:
+        """Pixel coordinates of one place in each of the cells `begin` to `end` - 1, row by row.
+
+        The places shift from row to row and from column to column by the golden ratio of a cell. Three neighbours are
+        so spread that a line along rows or columns cannot pass all of them by if it is wider than 0.39 of a cell, and
+        no line passes by all cells that it crosses, as it could pass by their centres.
+        """
         cell = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin)
-        return self.place(cell, mi.Point2f(0.5))
+        columns = dr.opaque(mi.UInt32, self.columns)
+        shift_x, shift_y = (mi.Float(k * mi.UInt32(GOLDEN_STEP)) * 2.0**-32 for k in (cell // columns, cell % columns))
+        return self.place(cell, mi.Point2f(shift_x, shift_y))

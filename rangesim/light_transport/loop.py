@@ -40,7 +40,16 @@ from rangesim.light_transport.caustics import Vertex, caustic_light, gather
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
 from rangesim.light_transport.photon_maps import PhotonMaps
 from rangesim.light_transport.photons import has_delta
-from rangesim.light_transport.sampling import Continued, Seed, Stream, aligned, in_pairs, of_part, random_stream
+from rangesim.light_transport.sampling import (
+    GOLDEN_STEP,
+    Continued,
+    Seed,
+    Stream,
+    aligned,
+    in_pairs,
+    of_part,
+    random_stream,
+)
 from rangesim.light_transport.scattering import MAX_EVENTS, ROULETTE_BELOW
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray, survival
@@ -59,9 +68,6 @@ lanes), one vector would hold pixels whose paths differ."""
 ITERATIONS_PER_SAMPLE = 2
 """Number of iterations of the loop per sample that is assumed before any were counted. It need not be exact, because
 only the size of the first launch depends on it; the size of later ones depends on the count."""
-GOLDEN_STEP = 2654435769
-"""Step of a sequence of fractions of 2^32: 2^32 divided by the golden ratio, because its multiples modulo 2^32 are
-spread evenly, however many there are."""
 
 Array = TypeVar("Array")
 

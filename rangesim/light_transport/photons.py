@@ -197,7 +197,7 @@ def _chances(scene: mi.Scene, projector: Device, grid: CellGrid) -> tuple[np.nda
     chance : (n,) float, 1 for cells whose light meets a delta surface first and for their neighbours.
     """
     w, h = grid.columns, grid.rows
-    meets, _ = meets_delta(scene, w * h, lambda begin, end: projector.centre_ray(grid.centres(begin, end)))
+    meets, _ = meets_delta(scene, w * h, lambda begin, end: projector.centre_ray(grid.probes(begin, end)))
     mask = binary_dilation(meets.reshape(h, w), np.ones((3, 3))).ravel()
     rest = ~mask
     chance = np.where(

@@ -15,6 +15,9 @@ R2 = (0.7548776662466927, 0.5698402909980532)
 R4 = (0.8566748838545029, 0.733891856627126, 0.6287067210378087, 0.5385972572236101)
 """Steps of the R4 sequence, fractions of a pixel and of the lens: the first four powers of 1 / phi with phi^5 = phi + 1
 (Roberts 2018)."""
+GOLDEN_STEP = 2654435769
+"""Step of a sequence of fractions of 2^32: 2^32 divided by the golden ratio, because its multiples modulo 2^32 are
+spread evenly, however many there are."""
 
 
 class Seed(NamedTuple):

@@ -44,6 +44,7 @@ from rangesim.results.experiment_results import (
     write_result,
 )
 from rangesim.results.saved_signals import LightPass
+from rangesim.rig import Beam
 from rangesim.settings.seeds import derived_seed
 
 if TYPE_CHECKING:
@@ -356,7 +357,8 @@ def acquisition(
     """The record of a capture: its frames, exposure, acquisition time and photons.
 
     A noise-free capture has no exposure and takes no time. The rays of a scanner are exposed one after the other, so
-    its acquisition lasts as long as its turn.
+    its acquisition lasts as long as its turn. A beam that goes over the pixels of a pinhole has no times, so how long
+    its acquisition takes is not known.
 
     Parameters
     ----------
@@ -370,7 +372,7 @@ def acquisition(
     camera = capture.frames.shape[1:]
     shots = len(timing.exposure_times_s(capture.sensor))
     taken = None
-    if exposure is not None:
+    if exposure is not None and not _scans_untimed(capture):
         pause = max(exposure, timing.frame_period_s) if moves else exposure
         lines = camera[0] if timing.lines == "rows" else camera[1]
         taken = (shots - 1) * pause + exposure + (lines - 1) * (timing.line_period_s if moves else 0.0)
@@ -392,6 +394,11 @@ def _scan_s(capture: Capture) -> float:
     """Seconds from the first ray of a scanner to its last one; 0 for a camera that measures all pixels at once."""
     times_s = capture.rig.camera.times_s if capture.rig is not None else None
     return float(np.ptp(times_s)) if times_s is not None else 0.0
+
+
+def _scans_untimed(capture: Capture) -> bool:
+    """Whether a beam lights the pixels of a pinhole one after the other, at times that nobody states."""
+    return capture.rig is not None and isinstance(capture.rig.projector, Beam) and capture.rig.camera.is_pinhole
 
 
 def _photons_record(photons: np.ndarray) -> PhotonsRecord:

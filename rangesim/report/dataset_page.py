@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from rangesim.evaluation.comparison import TOLERANCE_M
 from rangesim.report import figures, palette
 from rangesim.report.template import render_page
 
@@ -21,7 +23,7 @@ BACKGROUND = (226, 228, 231)
 
 @dataclass(frozen=True, eq=False)
 class SensorTile:
-    """What one sensor made of a scene.
+    """Pictures and figures of one sensor for a scene.
 
     intensity : (h, w) float32. outcome : (h, w) uint8, index into `palette.OUTCOME_NAMES`.
     right, wrong, missing : fractions of the pixels of objects; None if not known.
@@ -40,13 +42,13 @@ class SceneTile:
     """A scene of the contact sheet.
 
     depth_m : (h, w) float32, true readings, NaN where there is no surface. instance : (h, w) int32, number of the
-    object at each pixel, -1 for none. amodal : (objects, h, w) bool. names : of the objects, with their categories.
+    object at each pixel, -1 for none. amodal : (objects, h, w) bool. models : name of the model of each object.
     warnings : sentences.
     """
 
     number: int
     categories: Sequence[str]
-    names: Sequence[str]
+    models: Sequence[str]
     depth_m: np.ndarray
     instance: np.ndarray
     amodal: np.ndarray
@@ -80,6 +82,7 @@ def render_dataset_page(sheet: ContactSheet) -> str:
         "sheet": sheet,
         "rows": [(name, [_percent(value) for value in parts]) for name, *parts in sheet.sensors],
         "scenes": [_scene(tile) for tile in sheet.tiles],
+        "tolerance": f"{1e3 * TOLERANCE_M:g} mm",
         "legend": [(palette.OUTCOME_NAMES[i], color[i]) for i in seen],
     }
     return render_page("dataset.html.j2", values, scripts=("scroll.js", "dataset.js"))
@@ -92,7 +95,7 @@ def _scene(tile: SceneTile) -> dict[str, object]:
     depth = (_thinned(tile.depth_m) - low) / max(high - low, 1e-12)
     pictures = [
         (figures.color_map(depth, palette.color_table("viridis")), f"depth, {low:.2f} to {high:.2f} m"),
-        (figures.png(_thinned(_objects(tile))), f"{len(tile.names)} objects; outlines: also what is hidden"),
+        (figures.png(_thinned(_objects(tile))), f"{len(tile.models)} objects; outlines: also what is hidden"),
     ]
     for sensor in tile.sensors:
         white = float(np.nanpercentile(sensor.intensity, 99.5)) if np.isfinite(sensor.intensity).any() else 1.0
@@ -103,7 +106,7 @@ def _scene(tile: SceneTile) -> dict[str, object]:
     return {
         "number": tile.number,
         "categories": sorted(set(tile.categories)),
-        "names": tile.names,
+        "models": [f"{count} × {model}" if count > 1 else model for model, count in Counter(tile.models).items()],
         "pictures": pictures,
         "warnings": tile.warnings,
     }
@@ -120,7 +123,7 @@ def _objects(tile: SceneTile) -> np.ndarray:
     from matplotlib import colormaps
     from scipy.ndimage import binary_erosion
 
-    colors = np.rint(255 * np.array([colormaps[OBJECT_COLORS](i % 20)[:3] for i in range(len(tile.names))]))
+    colors = np.rint(255 * np.array([colormaps[OBJECT_COLORS](i % 20)[:3] for i in range(len(tile.models))]))
     picture = np.full((*tile.instance.shape, 3), BACKGROUND, np.uint8)
     for number, color in enumerate(colors):
         picture[tile.instance == number] = color

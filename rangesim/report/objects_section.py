@@ -32,7 +32,7 @@ class ObjectLine:
 
 
 def objects_table(measurements: Sequence[Measurement]) -> list[ObjectLine]:
-    """What becomes of each object, with one cell per instrument; empty if no object is in view, or it is not known."""
+    """Outcomes of each object, one cell per instrument; empty if no object is in view, or it is not known."""
     known = [{o.name: o for o in m.objects.objects} if m.objects is not None else {} for m in measurements]
     lines = []
     for name in dict.fromkeys(name for of_one in known for name in of_one):

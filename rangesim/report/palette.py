@@ -72,11 +72,12 @@ OUTCOME_COLORS = np.array(
         (0, 0, 12),  # no texture: black
         (252, 72, 78),  # cover glass: a red, as other light
         (236, 32, 192),  # stray light: a magenta, as other light
+        (152, 144, 248),  # out of range: a violet, as decoder
         (203, 206, 210),  # nothing there
     ],
     dtype=np.uint8,
 )
-"""(20, 3) uint8, colour of each value of `outcomes`, RGB.
+"""(21, 3) uint8, colour of each value of `outcomes`, RGB.
 
 Each family of causes has a hue. Within a hue, the lightness differs, so that people without red or green cones can
 distinguish the causes too (tests/test_report.py measures it).

@@ -46,8 +46,10 @@ ENOUGH = 0.9
 left, whose errors are smaller."""
 HALF = 0.5
 """Fraction of pixels with a reading from which a sensor counts as reading a scene at all."""
-WITHIN = "95 % of its readings"
-"""What the verdict means by "stays within": the 95th percentile of the absolute errors."""
+RELIED = 0.95
+"""Fraction of the readings whose error the verdict asks to be within the tolerance: rows have this percentile."""
+MIN_FIT = 3
+"""Values of a setting from which the growth of the error is a power of it: a line through two fits always."""
 
 
 def render_sweep_page(result: SweepResult) -> str:
@@ -164,8 +166,13 @@ class _Page:
         others = self.others[0] if self.others else {}
         at = f" (at {_values(others)})" if others else ""
         if self.is_numeric:
-            clauses = [c for name in self.names if (c := self._reach(name, others))]
-            yield f"{'; '.join(clauses)}{at}." if clauses else ""
+            grown = [c for name in self.names if (c := self._growth(name, others))]
+            if grown:
+                yield f"Error over {label_of(self.axis or '').partition(',')[0]}{at}: {'; '.join(grown)}."
+            reached = [c for name in self.names if (c := self._reach(name, others))]
+            if reached:
+                within = _metres(self.sweep.tolerance_m)
+                yield f"Where {100 * RELIED:.0f} % of the readings are within {within}{at}: {'; '.join(reached)}."
         yield from self._ranking()
         yield from self._objects()
         yield from self._theory()
@@ -180,7 +187,7 @@ class _Page:
             )
 
     def _reach(self, name: str, others: Mapping[str, Any]) -> str | None:
-        """How far along the axis a sensor stays within the tolerance."""
+        """Sentence that says how far along the axis a sensor stays within the tolerance."""
         axis = self.axis
         assert axis is not None
         rows = sorted(self._of(name, others), key=lambda row: row[axis])
@@ -189,15 +196,34 @@ class _Page:
         if not rows:
             return None
         if not any(good):
-            return f"{name} never stays within {_metres(tolerance)}"
+            return f"{name} nowhere"
         first = good.index(True)
         last = next((i for i in range(first, len(rows)) if not good[i]), len(rows)) - 1
         start = "" if first == 0 else f" from {_number(rows[first][axis])}{unit}"
-        end = _number(rows[last][axis])
-        if last + 1 < len(rows) and rows[last + 1]["p95_abs_m"].mean > tolerance and rows[last]["p95_abs_m"].mean > 0:
-            end = _number(float(f"{_crossing(rows[last], rows[last + 1], axis, tolerance):.2g}"))
-        end_text = f" up to {end}{unit}" if last + 1 < len(rows) else f" up to the last value, {end}{unit}"
-        return f"{name} stays within {_metres(tolerance)}{start}{end_text}"
+        if last + 1 == len(rows):
+            return f"{name}{start} up to the last value, {_number(rows[last][axis])}{unit}"
+        after = rows[last + 1]
+        if not _reads(after):
+            lost = f"at {_number(after[axis])}{unit} it reads less than half of the pixels"
+            return f"{name}{start} up to {_number(rows[last][axis])}{unit} ({lost})"
+        end = _number(float(f"{_crossing(rows[last], after, axis, tolerance):.2g}"))
+        return f"{name}{start} up to about {end}{unit}"
+
+    def _growth(self, name: str, others: Mapping[str, Any]) -> str | None:
+        """Errors of a sensor at the ends of the axis, where it reads, and the power of the axis that fits between."""
+        axis = self.axis
+        assert axis is not None
+        rows = sorted(self._of(name, others), key=lambda row: row[axis])
+        known = [(float(r[axis]), float(r["error_m"].mean)) for r in rows if _reads(r) and r["error_m"].mean > 0]
+        if len(known) < 2:
+            return None
+        ends = [f"{_millimetres(error)} mm at {_number(at)}{_unit(axis)}" for at, error in (known[0], known[-1])]
+        text = f"{name} {', '.join(ends)}"
+        if len(known) < MIN_FIT or known[0][0] <= 0:
+            return text
+        places, errors = np.log(known).T
+        power = float(np.polyfit(places, errors, 1)[0])
+        return f"{text}, about as the power {power:.1f}"
 
     def _ranking(self) -> Iterator[str]:
         """Who is right most often, over all points and at the values of a setting that is no number."""
@@ -221,7 +247,7 @@ class _Page:
             yield f"Most often right by {label_of(path)}: {'; '.join(best)}."
 
     def _objects(self) -> Iterator[str]:
-        """What the failures of each sensor do to the objects."""
+        """Sentences about what the failures of each sensor do to the objects."""
         clauses = []
         for name in self.names:
             counted = [c.objects for (_, sensor), c in self.result.cells.items() if sensor == name and c.objects]
@@ -253,7 +279,7 @@ class _Page:
             )
 
     def _exposure(self) -> Iterator[str]:
-        """Which exposures are fixed, and which are automatic."""
+        """Sentence that says which exposures are fixed, and which are automatic."""
         fixed = self.result.exposures
         if fixed:
             each = []
@@ -272,7 +298,7 @@ class _Page:
             n for n, i in self.sweep.given.items() if i.exposure_s is not None and "exposure_s" not in self.sweep.vary
         ]
         if own:
-            yield f"The same at all points is the exposure of {', '.join(own)}, which they state themselves."
+            yield f"Exposures that do not change, because the settings state them: {', '.join(self._stated(own))}."
         automatic = {}
         for name in self.names:
             found = [r["exposure_s"] for r in self._rows_of(name) if r["exposure_s"] is not None]
@@ -285,8 +311,13 @@ class _Page:
                 f"{', '.join(each)}."
             )
 
+    def _stated(self, names: Sequence[str]) -> Iterator[str]:
+        """Names of sensors with the exposure that they state."""
+        for name in names:
+            yield f"{name} {tables.seconds(self.sweep.given[name].exposure_s)}"
+
     def _place(self) -> Iterator[str]:
-        """For which distance sensors without a place of their own are set up."""
+        """Sentence about the distance for which sensors without a place of their own are set up."""
         free = [n for n, i in self.sweep.given.items() if i.T_camera_projector is None and i.sensor.triangulates]
         if free:
             yield (
@@ -386,7 +417,7 @@ class _Page:
         """Acquisition time against error, a point for each sensor; and the names of sensors without either."""
         points, without = [], []
         for name in self.names:
-            rows = [r for r in self._rows_of(name) if r["right"].mean + r["wrong"].mean >= HALF and r["acquisition_s"]]
+            rows = [r for r in self._rows_of(name) if _reads(r) and r["acquisition_s"]]
             errors = [1e3 * r["median_abs_m"].mean for r in rows if r["median_abs_m"].mean > 0]
             if not errors:
                 without.append(name)
@@ -489,7 +520,7 @@ def _hashable(value: Any) -> Any:
 
 
 def _number(value: float) -> str:
-    return f"{value:.3g}"
+    return f"{value:.3g}" if abs(value) < 1000 else f"{float(f'{value:.2g}'):,.0f}".replace(",", "\u202f")
 
 
 def _scene_name(scene: Any) -> str:
@@ -507,7 +538,12 @@ def _millimetres(value: float | None) -> str:
 
 def _is_within(row: Mapping[str, Any], tolerance_m: float) -> bool:
     """Whether a sensor reads at least half of the pixels, and 95 % of its readings are right."""
-    return bool(row["p95_abs_m"].mean <= tolerance_m and row["right"].mean + row["wrong"].mean >= HALF)
+    return bool(row["p95_abs_m"].mean <= tolerance_m and _reads(row))
+
+
+def _reads(row: Mapping[str, Any]) -> bool:
+    """Whether a sensor reads at least half of the pixels."""
+    return bool(row["right"].mean + row["wrong"].mean >= HALF)
 
 
 def _is_comparable(row: Mapping[str, Any]) -> bool:

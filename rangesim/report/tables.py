@@ -353,10 +353,10 @@ def seconds(value: float | None) -> str:
     """Text of a duration with its unit; a dash for None."""
     if value is None:
         return "–"
-    for unit, factor in (("s", 1.0), ("ms", 1e3), ("µs", 1e6)):
+    for unit, factor in (("s", 1.0), ("ms", 1e3), ("µs", 1e6), ("ns", 1e9)):
         if value * factor >= 0.9995:
             return f"{value * factor:.3g} {unit}"
-    return f"{value * 1e6:.2g} µs"
+    return f"{value * 1e9:.2g} ns"
 
 
 def exposure(taken: MeasurementRecord) -> str:

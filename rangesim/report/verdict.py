@@ -130,8 +130,10 @@ def _most_right(real: Sequence[Measurement], names: dict[str, str]) -> str:
     entries = [(names[m.name], _percent(f)) for f, m in right]
     whose = _whose_pixels(real[0].rows)
     if right and not any(is_reliable(_judged(m.rows)) for _, m in right):
-        name, best = entries[0]
-        return f"No sensor reads most of {whose} right, to {_limit(real[0])}; the best, {name}, reads {best}."
+        name, most = entries[0]
+        wrong = _percent(_judged(right[0][1].rows)["wrong"])
+        most_of = f"{whose} right, to {_limit(real[0])}"
+        return f"No sensor reads most of {most_of}; {name} reads most, {most}, and {wrong} wrong."
     return _ranked(f"Most of {whose} right, to {_limit(real[0])}", entries)
 
 

@@ -196,7 +196,7 @@ class ComparisonRecord(Record, frozen=True, kw_only=True):
 
 
 class ObjectRecord(Record, frozen=True, kw_only=True):
-    """What the segmentation makes of an object; `rangesim.evaluation.object_segmentation.ObjectOutcome` explains it."""
+    """Record of an object in the segmentation; `rangesim.evaluation.object_segmentation.ObjectOutcome` explains it."""
 
     name: str
     pixels: Count
@@ -484,7 +484,7 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
 
 
 def _load_objects(path: Path) -> ObjectSegmentation | None:
-    """What a file tells of the objects; None if there is no such file."""
+    """The objects in the segmentation, read from a file; None if there is no such file."""
     if not path.is_file():
         return None
     record = read_record(path, ObjectsRecord)

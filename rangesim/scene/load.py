@@ -162,7 +162,7 @@ def load_scene(
 
 
 class _Stated(NamedTuple):
-    """What a scene states of its shapes, by their ids.
+    """Statements of a scene about its shapes, by their ids.
 
     ids : ids of all shapes. classes : material classes. things : names of the things that shapes are parts of.
     objects : whether shapes are objects.

@@ -197,7 +197,7 @@ def take_material_classes(state: Any, label: str) -> dict[str, str]:
 
 
 def take_objects(state: Any, label: str) -> tuple[dict[str, str], dict[str, bool]]:
-    """What the scene states of its objects: the things that shapes are parts of, and whether shapes are objects.
+    """Statements of the scene about its objects: the things that shapes are parts of, and whether shapes are objects.
 
     Both are by the id of the shape. The entries are removed from the nodes, because Mitsuba does not know them.
 

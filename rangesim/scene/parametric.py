@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from rangesim.scene.catalogue_materials import catalogue_material, material_names
+from rangesim.scene.catalogue_materials import material_names, surface
 from rangesim.scene.mesh import MESH_MATERIALS
 from rangesim.settings.bounds import Bounds, check_number
 from rangesim.settings.config import nearest, shown
@@ -41,7 +41,7 @@ def wall(
     distance_m : depth of the wall on the camera's axis, metres.
     tilt_deg : angle between the wall's normal and the camera's axis, degrees; the wall turns about its vertical.
     reflectance : of a matte wall.
-    material : "matte", or another class or material, see `bsdf`.
+    material : "matte", or another class or material, see `surface_of`.
     """
     from mitsuba import ScalarTransform4f as T
 
@@ -51,7 +51,7 @@ def wall(
     surface = {
         "type": "rectangle",
         "to_world": place @ T().scale(WALL_DISTANCES * distance_m),
-        "bsdf": bsdf(material, reflectance),
+        "bsdf": surface_of(material, reflectance)["bsdf"],
     }
     return {**_empty(), "wall": surface}
 
@@ -73,7 +73,7 @@ def step(
         raise ValueError(f"expected height_m below the distance_m of {distance_m:g}, got {height_m:g}.")
     edge = WALL_DISTANCES * distance_m / 2
     place = T().translate([edge, distance_m - height_m / 2, 0]) @ T().scale([edge, height_m / 2, 2 * edge])
-    block = {"type": "cube", "to_world": place, "bsdf": bsdf(material, reflectance)}
+    block = {"type": "cube", "to_world": place, **surface_of(material, reflectance)}
     return {**wall(distance_m, 0.0, reflectance, material), "step": block}
 
 
@@ -84,7 +84,7 @@ def part_on_table(
 
     Parameters
     ----------
-    material : of the parts, see `bsdf`.
+    material : of the parts, see `surface_of`.
     distance_m : from the camera to the middle of the table, metres.
     elevation_deg : angle of the camera's axis above the table, degrees.
     reflectance : of the table, and of matte parts.
@@ -97,12 +97,12 @@ def part_on_table(
     table = T().translate([0, distance_m, 0]) @ T().rotate([1, 0, 0], elevation_deg)
 
     def part(kind: str, place: Any) -> dict[str, Any]:
-        return {"type": kind, "to_world": table @ place, "bsdf": bsdf(material, reflectance)}
+        return {"type": kind, "to_world": table @ place, **surface_of(material, reflectance)}
 
     leaning = T().translate([0.015, 0.075, 0.033]).rotate([1, 0, 0], 55) @ T().scale([0.06, 0.04, 0.003])
     return {
         **_empty(),
-        "table": {"type": "rectangle", "to_world": table @ T().scale(TABLE_M), "bsdf": bsdf("matte", reflectance)},
+        "table": {"type": "rectangle", "to_world": table @ T().scale(TABLE_M), **surface_of("matte", reflectance)},
         "ball": part("sphere", T().translate([-0.09, 0.0, 0.035]) @ T().scale(0.035)),
         "block": part(
             "cube", T().translate([0.07, -0.03, 0.02]).rotate([0, 0, 1], 30) @ T().scale([0.04, 0.025, 0.02])
@@ -115,8 +115,8 @@ PARAMETRIC: dict[str, Callable[..., dict[str, Any]]] = {"wall": wall, "step": st
 """The functions by the names that settings give them."""
 
 
-def bsdf(material: str, reflectance: float) -> dict[str, Any]:
-    """The BSDF of a material, as a Mitsuba dictionary.
+def surface_of(material: str, reflectance: float) -> dict[str, Any]:
+    """Entries of a shape that give it a material, as of `rangesim.scene.catalogue_materials.surface`.
 
     Parameters
     ----------
@@ -130,11 +130,11 @@ def bsdf(material: str, reflectance: float) -> dict[str, Any]:
     """
     check_number("reflectance", reflectance, _REFLECTANCE)
     if material == "matte":
-        return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": float(reflectance)}}
+        return {"bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": float(reflectance)}}}
     if material in MESH_MATERIALS:
-        return MESH_MATERIALS[material]
+        return {"bsdf": MESH_MATERIALS[material]}
     if material in material_names():
-        return catalogue_material(material)
+        return surface(material)
     known = (*MESH_MATERIALS, *material_names())
     raise ValueError(
         f"expected material to be one of {', '.join(MESH_MATERIALS)} or a material of the catalogue "

@@ -44,7 +44,7 @@ of all numbers do, unless the standard deviation is a hundred times the width of
 
 @dataclass(frozen=True)
 class Of:
-    """What a field of type `Draw` may hold, as its annotation states it: `count: Annotated[Draw, Of(int, bounds)]`.
+    """Values that a field of type `Draw` may hold, as annotated: `count: Annotated[Draw, Of(int, bounds)]`.
 
     kind : `float`, `int`, `str` or `bool`. bounds : those of a number; None: any finite one.
     """

@@ -153,7 +153,7 @@ def _measured(item: Mapping[str, Any]) -> dict[str, Any]:
         warnings.simplefilter("always", RangesimWarning)
         signals = one.traced(rig, None)
         jobs = [
-            _measurements(instrument, one.light_for(instrument, signals), ambient, job["seeds"], item["tolerance_m"])
+            _measurements(instrument, one.light_for(instrument, signals), ambient, job["seeds"], item)
             for instrument, ambient, job in zip(one.instruments, one.ambients, item["jobs"], strict=True)
         ]
     said = dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, RangesimWarning))
@@ -165,10 +165,10 @@ def _measurements(
     signals: StillSignals | SignalSet,
     ambient: Ambient | None,
     seeds: Sequence[int],
-    tolerance_m: float,
+    item: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Rows of all captures of one instrument, one list for each seed, and what they have in common."""
-    truth, detector = signals.truth, instrument.detector_in_use
+    truth, detector, tolerance_m = signals.truth, instrument.detector_in_use, item["tolerance_m"]
     rows, counts = [], np.zeros((2, len(CONFIDENCES) + 1), dtype=np.int64)
     common: dict[str, Any] = {}
     for seed in seeds:
@@ -176,7 +176,7 @@ def _measurements(
         image = decode(capture, instrument.decoder)
         comparison = compare(image, truth, tolerance_m)
         if not common:
-            common = _of_first(instrument, signals, capture, image, comparison)
+            common = _of_first(instrument, signals, capture, image, comparison, item["window_px"])
         theory_m = error_by_theory(signals, capture, image.decoder or instrument.sensor.default_decoder)
         exposure = {"exposure_s": _finite(capture.reference.exposure_s)}
         counts += _by_confidence(image, comparison.error_m, tolerance_m)
@@ -199,8 +199,9 @@ def _of_first(
     capture: Captured,
     image: RangeImage,
     comparison: Comparison,
+    window_px: int | None,
 ) -> dict[str, Any]:
-    """What is known from the first capture of an instrument: causes, noise of the renderer, pictures, frames.
+    """Findings from the first capture of an instrument: causes, noise of the renderer, pictures, frames.
 
     The causes of one capture are enough: they take as long as ten captures, and it has many pixels.
     """
@@ -218,7 +219,7 @@ def _of_first(
         "causes": [row["causes"] for row in causes.fractions(truth)],
         "sampling_sigma_m": sampling,
         "objects": _objects(image, comparison, signals),
-        "pictures": _pictures(image, comparison.error_m, causes, truth),
+        "pictures": _pictures(image, comparison.error_m, causes, truth, window_px),
         "frames": frames.frames,
         "acquisition_s": frames.acquisition_s,
     }
@@ -261,13 +262,21 @@ def _by_confidence(image: RangeImage, error_m: np.ndarray, tolerance_m: float) -
     return np.array([np.bincount(at[part], minlength=len(CONFIDENCES) + 1) for part in (is_right, ~is_right)])
 
 
-def _pictures(image: RangeImage, error_m: np.ndarray, causes: CauseMap, truth: GroundTruth) -> dict[str, str]:
-    """PNG files, base64, of the errors and of the causes, no wider than `PICTURE_PX`."""
+def _pictures(
+    image: RangeImage, error_m: np.ndarray, causes: CauseMap, truth: GroundTruth, window_px: int | None
+) -> dict[str, str]:
+    """PNG files, base64, of the errors and of the causes, no wider than `PICTURE_PX`.
+
+    Of whole rows that a window has kept for a sensor that matches texture, they show the middle.
+    """
     assert image.camera is not None
     layout = panorama(image.camera)
     outcome = np.where(np.isfinite(truth.z), causes.cause, palette.NOTHING).astype(np.uint8)
     error = layout.picture(palette.error_fraction(error_m), np.nan)
     cause = layout.picture(outcome, palette.NOTHING)
+    if window_px is not None and image.camera.is_pinhole:
+        left = max(0, (error.shape[1] - window_px) // 2)
+        error, cause = (picture[:, left : left + window_px] for picture in (error, cause))
     step = math.ceil(error.shape[1] / PICTURE_PX)
     thin = (slice(step // 2, None, step),) * 2
     indices, colors = figures.indexed(error[thin], palette.color_table("RdBu_r"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which light-transport passes a sweep needs: as few as can be.
+"""The light-transport passes that a sweep needs: as few as can be.
 
 Scene, camera, emitter and the settings of the transport decide a pass. Noise, exposure, power, ambient
 light, detector, decoder and code need none of their own: they are measured on the light of a pass that is there. Light

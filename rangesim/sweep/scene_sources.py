@@ -40,7 +40,7 @@ class SceneSource:
 
     @property
     def is_of_package(self) -> bool:
-        """Whether it is a function of the package, whose even light is 1 W/m2."""
+        """Whether the scene comes from a function of the package, whose even light is 1 W/m2."""
         return self.kind == "function"
 
     def with_parameters(self, values: Mapping[str, Any]) -> SceneSource:

@@ -35,7 +35,7 @@ class Exposure:
 
 @dataclass(frozen=True)
 class CellResult:
-    """What the captures of a sensor at a point have in common.
+    """Findings that the captures of a sensor at a point have in common.
 
     frames : number of frames. acquisition_s : seconds; None without an exposure. confidence : right and wrong readings
     by classes of confidence, (2, classes). pictures : PNG files, base64, by name. causes : fractions of the pixels that

@@ -96,7 +96,7 @@ class _Run:
 
 
 def _exposures(planned: Plan, run: _Run) -> dict[str, Exposure]:
-    """For each sensor that states no exposure, the shortest one that automatic exposure would choose in the sweep.
+    """Exposures of the sensors that state none: the shortest that automatic exposure would choose in the sweep.
 
     So no point has more saturated pixels than automatic exposure allows, and all are comparable.
     """
