@@ -118,23 +118,24 @@ class AdaptiveSampling(Sampler):
             negligible = NEGLIGIBLE * float(np.median(true_m)) if true_m.size else 0.0
             decoder = instrument.decoder or instrument.sensor.default_decoder
             above, below = halves(signals, instrument.sensor, decoder, self.ambient)
-            enough = np.full(len(excess), negligible)
+            draw, enough = sampling_draw(above, below), np.full(len(excess), negligible)
             if instrument.detector_in_use is not None and not instrument.sensor.is_ideal:
-                of_detector = self._detector_sigma(instrument, decoder, signals, group, (above + below) / 2)
-                enough = np.maximum(enough, self.fraction * of_detector)
+                errors = self._detector_errors(instrument, decoder, signals, (above + below) / 2)
+                errors[np.isnan(draw)] = np.nan
+                # A group without any reading needs no further samples: its limit is infinite
+                enough = np.maximum(enough, self.fraction * group_sigma(errors, group, where_unknown=np.inf))
             with np.errstate(divide="ignore", invalid="ignore"):
-                excess = np.fmax(excess, (group_sigma(sampling_draw(above, below), group) / enough) ** 2)
+                excess = np.fmax(excess, (group_sigma(draw, group) / enough) ** 2)
         wanted = SPP_STEP * np.ceil(self.first_spp * np.minimum(excess, self.max_spp) / SPP_STEP)
         most = max(self.first_spp, self.max_spp // SPP_STEP * SPP_STEP)
         return np.clip(wanted, self.first_spp, most).astype(np.int64)[group]
 
-    def _detector_sigma(
-        self, instrument: Instrument, decoder: Decoder, signals: StillSignals, group: np.ndarray, clean_m: np.ndarray
+    def _detector_errors(
+        self, instrument: Instrument, decoder: Decoder, signals: StillSignals, clean_m: np.ndarray
     ) -> np.ndarray:
-        """(k,) float64, metres, standard deviation of the readings by the detector's noise, in the middle of each
-        group; infinite where there is no reading.
+        """(h, w) float64, metres, errors that the detector's noise makes, for `group_sigma`; NaN without a reading.
 
-        The decoder's closed form tells it from the light. If there is none, a capture is decoded.
+        They are the typical ones by the decoder's closed form. If there is none, they are those of a capture.
 
         Parameters
         ----------
@@ -149,10 +150,9 @@ class AdaptiveSampling(Sampler):
         theory_m = decoder.depth_error_m(sensor, received_light(signals, mean))
         if theory_m is not None:
             brightest_e = radiance.max(axis=0) * detector.electron_rate_per_radiance(signals.rig) * exposure_s
-            read_m = np.where(brightest_e < detector.capacity_e, theory_m, np.nan)
-            return group_median(read_m, group, where_unknown=np.inf)
+            return np.where(brightest_e < detector.capacity_e, theory_m / TO_SIGMA, np.nan)
         image = decode(expose(signals, sensor, detector, exposure_s, 0, self.ambient), decoder)
-        return group_sigma(image.reading_m - clean_m, group, where_unknown=np.inf)
+        return np.asarray(image.reading_m - clean_m)
 
     def _excess_of_frames(self, instrument: Instrument, signals: StillSignals, group: np.ndarray) -> np.ndarray:
         """Ratio of the sampling variance of the frames of one camera to the largest one allowed, per group.
@@ -203,18 +203,9 @@ def group_sigma(errors: np.ndarray, group: np.ndarray, where_unknown: float = 0.
     errors : (h, w) with mean 0; NaN where there is none. group : (h, w) int, number of the group.
     where_unknown : value for a group without any error.
     """
-    return TO_SIGMA * group_median(np.abs(errors), group, where_unknown)
-
-
-def group_median(values: np.ndarray, group: np.ndarray, where_unknown: float = 0.0) -> np.ndarray:
-    """Median of the values in each group, (k,) float64; of two in the middle, the larger one.
-
-    values : (h, w); NaN where there is none. group : (h, w) int, number of the group.
-    where_unknown : value for a group without any.
-    """
-    known = ~np.isnan(values)
-    some, of = values[known], group[known]
-    some = np.append(some[np.lexsort((some, of))], 0)
+    known = ~np.isnan(errors)
+    values, of = np.abs(errors[known]), group[known]
+    values = np.append(values[np.lexsort((values, of))], 0)
     n = np.bincount(of, minlength=int(group.max()) + 1)
     middle = np.where(n > 0, np.cumsum(n) - n + n // 2, -1)
-    return np.asarray(np.where(n > 0, some[middle], where_unknown))
+    return np.asarray(np.where(n > 0, TO_SIGMA * values[middle], where_unknown))
