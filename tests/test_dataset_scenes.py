@@ -38,6 +38,10 @@ def spec_of(**changes: Any) -> DatasetSpec:
     return spec_from_dict({**data, **changes})
 
 
+def test_the_tolerance_of_the_task_is_that_of_each_experiment() -> None:
+    assert random_scene(spec_of(tolerance_m="2mm"), 0).experiment.tolerance_m == 0.002
+
+
 # ---- Draws ---------------------------------------------------------------------------------------------------------
 
 

@@ -39,6 +39,7 @@ def contact_sheet(directory: str | Path, scenes: int = SCENES) -> str:
     places = [round(i * (len(samples) - 1) / max(shown - 1, 1)) for i in range(shown)]
     sheet = ContactSheet(
         title=Path(directory).resolve().name,
+        tolerance_m=samples.store.record.tolerance_m,
         line=_line(samples, rows),
         sentences=_sentences(samples.rows),
         sensors=_means(samples.rows),

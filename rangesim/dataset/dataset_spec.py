@@ -21,6 +21,7 @@ from rangesim.dataset.supports import Support, Table
 from rangesim.dataset.view_poses import Shell, View
 from rangesim.electronics.ambient import Strength
 from rangesim.errors import FileFormatError
+from rangesim.evaluation.comparison import TOLERANCE_M
 from rangesim.files.text_files import read_toml
 from rangesim.instrument.instrument import Instrument
 from rangesim.presets import DEFAULT_SENSORS, instrument_from_dict, is_device_file
@@ -156,6 +157,7 @@ class DatasetSpec:
     light : RoomLight.
     instruments : tables as in an experiment's file, whose values may be distributions; `{choice = [...]}` is one of
         several values. A list is a choice too where an instrument holds a single value.
+    tolerance_m : largest error of a right reading, metres.
     frames : whether the sensors' frames are kept, too; they take more space than all else together.
     spp, max_spp, max_depth, photons, glint : as of `rangesim.experiment.Experiment`.
 
@@ -183,6 +185,7 @@ class DatasetSpec:
     view: View = Shell()
     light: RoomLight = RoomLight()
     instruments: tuple[Mapping[str, Any], ...] = tuple({"sensor": name} for name in DEFAULT_SENSORS)
+    tolerance_m: Metres = TOLERANCE_M
     frames: bool = False
     spp: Annotated[int, whole(1, "spp")] | None = None
     max_spp: Annotated[int, whole(1, "spp")] = 64

@@ -116,7 +116,7 @@ class _Items(Mapping[str, tuple[DatasetSpec, int]]):
 
 def _begin(spec: DatasetSpec, folder: Path) -> None:
     """Write `store.json`, or check that it is that of the same data set."""
-    wanted = StoreRecord(spec=spec_to_dict(spec), scenes=spec.scenes, versions=versions())
+    wanted = StoreRecord(spec=spec_to_dict(spec), scenes=spec.scenes, tolerance_m=spec.tolerance_m, versions=versions())
     if not (folder / SETTINGS).exists():
         foreign = [each.name for each in folder.iterdir() if each.name != ".campaign.lock"]
         if foreign:

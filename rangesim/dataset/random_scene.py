@@ -26,6 +26,8 @@ from rangesim.triangle_mesh import TriangleMesh
 STREAMS = ("objects", "support", "arrangement", "materials", "view", "light", "instruments", "experiment")
 """What is drawn, each from random numbers of its own: another light leaves the objects where they are. New streams come
 last, because their places in this list are part of the seeds."""
+OF_EXPERIMENT = ("width", "height", "tolerance_m", "spp", "max_spp", "max_depth", "photons", "glint")
+"""Settings that the experiment of each scene takes over from the specification."""
 MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 """(4, 4) transform from coordinates of a camera here (x right, y down) to those of Mitsuba (x left, y up)."""
 
@@ -170,9 +172,7 @@ def random_scene(spec: DatasetSpec, index: int) -> RandomScene:
         for number, table in enumerate(spec.instruments)
     )
     seed = int(streams["experiment"].integers(1 << 64, dtype=np.uint64))
-    settings = {
-        key: getattr(spec, key) for key in ("width", "height", "spp", "max_spp", "max_depth", "photons", "glint")
-    }
+    settings = {key: getattr(spec, key) for key in OF_EXPERIMENT}
     experiment = Experiment(f"scene {index}", seed=seed, ambient=ambient, instruments=instruments, **settings)
     return RandomScene(
         index,

@@ -23,7 +23,7 @@ from pcgraph.plumbing.plain_files import read_file
 from rangesim.dataset.sample_files import SampleRecord, members_of, mesh_in
 from rangesim.errors import EnvironmentProblem, FileFormatError
 from rangesim.evaluation.surface_rows import OBJECTS
-from rangesim.files.schema import Count, Record, read_record
+from rangesim.files.schema import Count, Positive, Record, read_record
 from rangesim.results.experiment_results import RowRecord
 from rangesim.triangle_mesh import TriangleMesh
 
@@ -34,13 +34,15 @@ SETTINGS, INDEX, CHECKSUMS = "store.json", "index.parquet", "checksums.txt"
 class StoreRecord(Record, frozen=True, kw_only=True):
     """The contents of `store.json`.
 
-    spec : plain data of the specification. scenes : count of scenes. versions : of the packages on which bytes depend.
+    spec : plain data of the specification. scenes : count of scenes. tolerance_m : largest error of a right reading,
+    metres. versions : of the packages on which bytes depend.
     """
 
     format: Literal["rangesim-dataset"] = "rangesim-dataset"
     format_version: Literal[1] = 1
     spec: dict[str, Any]
     scenes: Count
+    tolerance_m: Positive
     versions: dict[str, str]
 
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rangesim.evaluation.comparison import TOLERANCE_M
 from rangesim.report import figures, palette
 from rangesim.report.template import render_page
 
@@ -60,12 +59,14 @@ class SceneTile:
 class ContactSheet:
     """A data set to show.
 
-    title : its name. line : what it is, in one line. sentences : what stands out.
+    title : its name. tolerance_m : largest error of a right reading, metres. line : what it is, in one line.
+    sentences : what stands out.
     sensors : name, and mean of the fractions right, wrong and missing over all scenes. categories : count of scenes of
     each. failed : number and error of each scene that failed. tiles : the scenes that are shown.
     """
 
     title: str
+    tolerance_m: float
     line: str
     sentences: Sequence[str]
     sensors: Sequence[tuple[str, float, float, float]]
@@ -82,7 +83,7 @@ def render_dataset_page(sheet: ContactSheet) -> str:
         "sheet": sheet,
         "rows": [(name, [_percent(value) for value in parts]) for name, *parts in sheet.sensors],
         "scenes": [_scene(tile) for tile in sheet.tiles],
-        "tolerance": f"{1e3 * TOLERANCE_M:g} mm",
+        "tolerance": f"{1e3 * sheet.tolerance_m:g} mm",
         "legend": [(palette.OUTCOME_NAMES[i], color[i]) for i in seen],
     }
     return render_page("dataset.html.j2", values, scripts=("scroll.js", "dataset.js"))
