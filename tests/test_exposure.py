@@ -115,7 +115,7 @@ def test_light_too_strong_for_the_shortest_exposure_is_said_with_its_share(
     with pytest.warns(
         RangesimWarning, match=r"near: the detector's shortest .* take less light .its power_w is 1."
     ) as said:
-        capture = measure(near, signals, 0).capture
+        capture = measure(near, signals, 0, None).capture
     saturated = np.mean(capture.saturated(capture.frames)[lit])
     told = float(str(said[0].message).split("saturates ")[1].split(" %")[0])
     assert saturated > 0.5
@@ -127,7 +127,7 @@ def test_light_too_strong_for_the_shortest_exposure_is_said_with_its_share(
     ):
         with warnings.catch_warnings(record=True) as said_else:
             warnings.simplefilter("always")
-            measure(instrument, light, 0)
+            measure(instrument, light, 0, None)
         assert not [w for w in said_else if "shortest exposure" in str(w.message)]
 
 

@@ -429,11 +429,11 @@ def test_a_report_is_of_the_result_it_is_written_to(
     shutil.copytree(small_result(), out)
     refused = []
 
-    def render(result: Result) -> str:
+    def render(result: Result, paper: str) -> str:
         line = [sys.executable, "-m", "rangesim", "run", PLANE, *TINY, "--out", str(out)]
         other = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
         refused.append(Done(other.returncode, other.stdout, other.stderr))
-        return render_report(result)
+        return render_report(result, paper)
 
     monkeypatch.setattr(rangesim.report, "render_report", render)
     assert command("report", out).returncode == 0

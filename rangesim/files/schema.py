@@ -88,13 +88,18 @@ def record_bytes(record: Record) -> bytes:
     try:
         content = msgspec.json.encode(record)
     except UnicodeEncodeError:  # a file name that is not UTF-8 has lone surrogates, which `json` escapes
-        content = json.dumps(msgspec.to_builtins(record)).encode()
+        return json_bytes(msgspec.to_builtins(record))
     return msgspec.json.format(content, indent=1) + b"\n"
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Write plain data as indented JSON."""
-    path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    path.write_bytes(json_bytes(data))
+
+
+def json_bytes(data: Mapping[str, Any]) -> bytes:
+    """The bytes of the file that `write_json` writes."""
+    return f"{json.dumps(data, indent=1)}\n".encode()
 
 
 def _plain(sentence: str) -> str:
