@@ -387,6 +387,7 @@ def test_the_slider_cuts_the_trees(tmp_path: Path, cut: str) -> None:
 
 
 @needs_browser
+@pytest.mark.validation
 def test_slider_mouse_and_wheel_work(tmp_path: Path) -> None:
     """The slider at its coarse end joins everything; a map reads out; dragging turns, the wheel zooms."""
     with browser(tmp_path) as page:
@@ -483,7 +484,7 @@ def test_it_prints_on_two_pages(count: int, paper: str, points: tuple[int, int])
 
 
 @needs_browser
-@pytest.mark.parametrize("width", [1280, *to_validate(400)])
+@pytest.mark.parametrize("width", to_validate(1280, 400))
 def test_nothing_is_cut_when_it_prints(tmp_path: Path, width: int) -> None:
     """Also in a narrow window, and in dark mode: what is printed does not depend on the window."""
     write_report(_with_long_names(5), tmp_path / "report.html")
@@ -549,6 +550,7 @@ def test_instruments_share_a_camera_where_it_stands_in_one_place() -> None:
 
 
 @needs_browser
+@pytest.mark.validation
 def test_two_cameras_are_drawn_side_by_side(tmp_path: Path) -> None:
     """Each cloud fills its canvas, and a map marks a pixel in the maps of its own camera alone."""
     write_report(result_of_two_cameras(), tmp_path / "report.html")

@@ -15,7 +15,7 @@ from fuzz.readers import READERS, Cases
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory and open files are watched through /proc")
 
-TRIES = 100
+TRIES = 60
 """Over all readers, besides what is made by hand; `make fuzz N=...` does more. Scenes and commands get fewer."""
 SEED = 1
 EVERY = 6
