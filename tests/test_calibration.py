@@ -172,6 +172,7 @@ def test_two_homographies_give_a_camera_without_skew(turns):
 @pytest.mark.filterwarnings("ignore:.*in a corner of its image")
 @pytest.mark.parametrize("count", [2, 3])
 @pytest.mark.parametrize("coefficients", [0, 2])
+@pytest.mark.validation
 def test_few_views_give_the_camera_to_its_deviations(count, coefficients):
     pinhole = replace(CAMERA, distortion=())
     errors = []
@@ -525,6 +526,7 @@ def test_a_capture_that_does_not_do_is_named(rendered):
         calibrate_rig(BOARD, [replace(captures[0], frames=frames, sensor=columns_only, rig=None)] * 3)
 
 
+@pytest.mark.validation
 def test_one_pose_of_a_real_board_allows_a_pose_and_no_more(real_data):
     """One view gives two of the conic's four equations: no calibration; with a known camera, where the board stands."""
     from rangesim.geometry import fit_camera_pose
@@ -614,6 +616,7 @@ def test_a_rig_for_opencv_is_read_back_and_decodes(rendered, tmp_path):
         assert np.allclose(z, expected, atol=1e-5, equal_nan=True)
 
 
+@pytest.mark.validation
 def test_a_calibration_for_opencv_may_be_in_any_unit(rendered, tmp_path):
     from rangesim.calibration.opencv_files import save_opencv
     from rangesim.cli import app

@@ -83,6 +83,7 @@ def test_a_surface_goes_on_straight_where_depth_is_missing_at_its_boundary() -> 
 
 
 @pytest.mark.parametrize("glass", [*to_validate("wall", "thin"), "two walls", *to_validate("solid")])
+@pytest.mark.validation
 def test_the_renderer_sees_the_front_surface_and_the_table(
     images: Images, rebuilt: Rebuilt, glass: str, tmp_path: Path
 ) -> None:
@@ -114,6 +115,7 @@ def test_depth_is_aligned_with_the_colour_camera() -> None:
     assert np.isnan(found[:, (x > column(60, 0.8)) & (x + 1 < column(60, 0.4))]).all()
 
 
+@pytest.mark.validation
 def test_a_real_scene(real_data: Path) -> None:
     """Of scene 080: the table and the wall, and four bottles whose surfaces agree with the measured depth to 1 mm."""
     if not (folder := real_data / "cleargrasp_d435").is_dir():

@@ -81,6 +81,7 @@ def test_an_older_scan_is_replaced_and_files_beside_it_stay(scanned: Path) -> No
     assert json.loads((scanned / "scan.json").read_text())["statistics"]["voxel_m"] == 0.02
 
 
+@pytest.mark.validation
 def test_settings_come_from_a_file_and_options_go_first(tmp_path: Path) -> None:
     (tmp_path / "scan.toml").write_text(
         'scene = "matte"\nwidth = 200\nspp = 4\nvoxel_m = 0.02\n'
@@ -164,6 +165,7 @@ def test_a_scan_beyond_the_memory_is_refused_before_the_work(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("width", "views"), [(80, 3), *to_validate((128, 2))])
+@pytest.mark.validation
 def test_the_cost_of_a_scan_is_as_counted(width: int, views: int, tmp_path: Path) -> None:
     options = ("matte", "--width", str(width), "--views", str(views), "--spp", "4")
     found = COST.fullmatch(run(*options, "--estimate").strip())
@@ -175,6 +177,7 @@ def test_the_cost_of_a_scan_is_as_counted(width: int, views: int, tmp_path: Path
     assert size / 2 < 1e6 * float(found["disk"][:-3]) < 2 * size
 
 
+@pytest.mark.validation
 def test_poses_that_see_nothing_are_said(tmp_path: Path) -> None:
     """Of a file without the key, and of poses that look at the wall over all things."""
     poses = tmp_path / "poses.json"

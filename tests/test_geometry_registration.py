@@ -74,6 +74,7 @@ def test_icp_finds_the_pose_from_a_near_one(noise: float) -> None:
     assert found.constraint > 0.05
 
 
+@pytest.mark.validation
 def test_icp_is_a_minimum_of_the_distances_to_the_surface() -> None:
     """Neither the truth nor a pose beside the result has a smaller root mean square distance to the tangent planes."""
     source, target = pair(part, 3e-4)
@@ -85,6 +86,7 @@ def test_icp_is_a_minimum_of_the_distances_to_the_surface() -> None:
         assert np.abs(again.T_target_source - best.T_target_source).max() < 1e-3
 
 
+@pytest.mark.validation
 def test_register_needs_no_first_guess_and_repeats() -> None:
     source, target = pair(part, 3e-4, n=2000)
     found = register(source, target)
@@ -166,6 +168,7 @@ def test_a_guess_off_by_one_stud_of_many_is_refused(
 
 
 @pytest.mark.parametrize("scale", [1.1, *to_validate(0.9)])
+@pytest.mark.validation
 def test_a_part_of_another_scale_is_refused(scale: float) -> None:
     source, target = pair(part, 3e-4, n=2000)
     with pytest.raises(ValueError, match="expected surfaces that lie on each other"):

@@ -373,6 +373,7 @@ def test_a_rotation_explains_what_one_saw_and_nothing_else(loss: str) -> None:
     assert np.isfinite(found.points).all()
 
 
+@pytest.mark.validation
 def test_a_narrow_lens_that_sees_no_shape_is_refused() -> None:
     """One degree of view over one degree of an arc: relief and turning are told apart by perspective alone."""
     random = np.random.default_rng(0)

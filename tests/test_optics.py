@@ -474,6 +474,7 @@ def test_the_camera_darkens_at_exposure_and_signals_stay_radiance(plane: rangesi
 @pytest.mark.parametrize(
     ("distortion", "vignetting", "focus"), [(BARREL, 4.0, 0.8), *to_validate(((-0.4,), 0.0, None), ((), 6.0, None))]
 )
+@pytest.mark.validation
 def test_photons_through_a_pane_that_does_nothing_bring_the_light_that_connections_bring(
     plane: rangesim.Scene, distortion: tuple[float, ...], vignetting: float, focus: float | None
 ) -> None:

@@ -154,6 +154,7 @@ def test_images_of_an_own_code_calibrate_a_rig_and_decode_with_it(tmp_path: Path
         assert np.nanmedian(image["z"]) == pytest.approx(at_board, rel=0.2)
 
 
+@pytest.mark.validation
 def test_options_of_bare_images_that_a_sensor_lacks_are_refused(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     for options, message in (

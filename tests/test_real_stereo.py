@@ -41,6 +41,7 @@ def decoded(images: np.ndarray, matching: DenseMatching) -> Disparities:
 
 
 @pytest.mark.parametrize("method", ["census", *to_validate("zncc")])
+@pytest.mark.validation
 def test_the_carpet_is_a_plane_and_things_stand_on_it(images: np.ndarray, method: Any) -> None:
     found = decoded(images, DenseMatching(method))
     assert found.valid.mean() > 0.8

@@ -436,6 +436,7 @@ def _clouds(folder: Path, options: tuple[str, ...], state: str) -> tuple[list[np
 
 @needs_browser
 @pytest.mark.parametrize("mode", ["error", *to_validate("intensity", "segments")])
+@pytest.mark.validation
 def test_without_webgl_the_clouds_are_still_pictures(tmp_path: Path, mode: str) -> None:
     """The same pictures as WebGL draws, with all captions, a sentence and no uncaught error."""
     still, said = _clouds(tmp_path / "without", WITHOUT_WEBGL, f"color={mode}")

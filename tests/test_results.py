@@ -100,6 +100,7 @@ def test_a_scan_is_read_back_as_it_was(scan_directory: tuple[Any, Path]) -> None
     assert (folder / "report.html").read_text() == render_scan_page(found)
 
 
+@pytest.mark.validation
 def test_the_page_of_a_scan_is_written_again_from_its_files(scan_directory: tuple[Any, Path], tmp_path: Path) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(scan_directory[1], folder)

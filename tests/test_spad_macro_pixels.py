@@ -144,6 +144,7 @@ def test_afterpulses_come_after_the_dead_time_and_decay() -> None:
 
 @pytest.mark.parametrize("rate_hz", [1e7, 1e8, 1e9])
 @pytest.mark.parametrize("window_s", [0.5e-9, 4e-9])
+@pytest.mark.validation
 def test_two_photons_within_a_window_make_a_count(rate_hz: float, window_s: float) -> None:
     """A count takes one photon, and further ones until a gap is short: 1 + 1 / p of them, p = 1 - exp(-rate window)."""
     settings = {"spads": 16, "coincidence": 2, "coincidence_window_s": window_s, "pile_up": False}

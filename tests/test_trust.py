@@ -211,6 +211,7 @@ def test_signals_end_a_command_in_one_line_at_any_moment(tmp_path: Path, package
         *to_validate(("rangesim", signal.SIGINT), ("rangesim", signal.SIGTERM), ("pcgraph", signal.SIGINT)),
     ],
 )
+@pytest.mark.validation
 def test_a_signal_after_the_last_line_is_one_line_too_or_comes_too_late(
     tmp_path: Path, package: str, number: signal.Signals
 ) -> None:
@@ -397,6 +398,7 @@ def test_verify_prints_a_line_for_each_file_whatever_its_name(command: Command, 
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+@pytest.mark.validation
 def test_pipes_in_a_result_are_not_waited_for(tmp_path: Path) -> None:
     names = ("lines/measurement.json", "lines/comparison.json", "lines/capture/capture.json")
     for number, name in enumerate(names):

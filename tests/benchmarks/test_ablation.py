@@ -86,6 +86,7 @@ def test_a_part_by_which_the_default_does_not_come_changes_nothing(sample):
         np.testing.assert_array_equal(pcgraph.segment(sample.points).labels, reference.result.labels)
 
 
+@pytest.mark.validation
 def test_a_table_has_gains_and_prices(sample):
     report = {"domains": {}, "times": {}}
     domain = Domain("boxes", ("wov", "oracle"), lambda: [sample, *sample.turned(2)[1:]], 10, (0.02,), 0.01)
