@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from rangesim.dataset.export_steps import box_of, grey_of, sensors_of
 from rangesim.dataset.sample_files import SampleRecord
 from rangesim.dataset.samples import Samples
 from rangesim.errors import FileFormatError
@@ -31,7 +32,6 @@ from rangesim.files.atomic_directories import DirectoryKind, new_directory
 from rangesim.files.image_files import write_grey
 from rangesim.files.schema import write_json
 from rangesim.rig import Intrinsics
-from rangesim.settings.config import nearest
 from rangesim.triangle_mesh import TriangleMesh
 
 KIND = DirectoryKind("rangesim-bop", "export.json", FileFormatError)
@@ -45,8 +45,6 @@ CENTRE_PX = 0.5
 ray of a depth pixel at its integer coordinates, and BlenderProc writes principal points so."""
 DEPTH_SCALES = (0.1, 1.0, 10.0, 100.0)
 """Millimetres per step of a depth image: an image has the first with which its depths fit into 16 bits."""
-WHITE_PERCENTILE = 99.5
-"""Percentile of the intensities that is white in grey images. The brightest 0.5 % are highlights."""
 
 
 def export_bop(
@@ -105,16 +103,11 @@ def chosen_sensors(samples: Samples, wanted: Sequence[str] | None) -> list[str]:
     ValueError
         A name that no sensor has, a camera that is no such pinhole, or no sensor.
     """
-    if not len(samples):
-        raise ValueError(f"expected a data set with scenes, but all of {samples.store.directory} failed.")
-    record, _ = samples.record(0)
-    there = [sensor.name for sensor in record.sensors]
+    there, (record, _) = sensors_of(samples, wanted), samples.record(0)
     for name in wanted or ():
-        if name not in there:
-            raise ValueError(f"expected sensors out of {', '.join(there)}, got {name!r}{nearest(name, there)}.")
         if not _is_ideal_pinhole(record, name):
             raise ValueError(f"expected a sensor whose camera is a pinhole without distortion, but {name} has another.")
-    names = list(wanted or (name for name in there if _is_ideal_pinhole(record, name)))
+    names = [name for name in there if _is_ideal_pinhole(record, name)]
     if not names:
         raise ValueError("expected a sensor whose camera is a pinhole without distortion, but no sensor has one.")
     return names
@@ -123,13 +116,6 @@ def chosen_sensors(samples: Samples, wanted: Sequence[str] | None) -> list[str]:
 def camera_of(record: SampleRecord, sensor: str) -> Any:
     """The camera of a sensor of a scene."""
     return _camera_record(record, sensor).of_record
-
-
-def grey_of(intensity: np.ndarray) -> np.ndarray:
-    """(h, w) uint8, an image of intensities (h, w)."""
-    values = np.nan_to_num(intensity.astype(np.float64))
-    white = np.percentile(values, WHITE_PERCENTILE)
-    return np.rint(255 * np.clip(values / max(white, 1e-30), 0, 1)).astype(np.uint8)
 
 
 def _camera_record(record: SampleRecord, sensor: str) -> Any:
@@ -190,15 +176,6 @@ def _info(whole: np.ndarray, visible: np.ndarray, measured: np.ndarray) -> dict[
         "px_count_visib": int(visible.sum()),
         "visib_fract": int(visible.sum()) / pixels if pixels else 0.0,
     }
-
-
-def box_of(mask: np.ndarray) -> list[int] | None:
-    """Left, top, width and height of the box around a mask, pixels; None if it is empty."""
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
-        return None
-    left, top = int(columns[0]), int(rows[0])
-    return [left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1]
 
 
 def _write_camera(path: Path, camera: Intrinsics, entry: dict[str, Any]) -> None:

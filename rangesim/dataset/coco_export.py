@@ -19,14 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from rangesim.dataset.bop_export import box_of, grey_of
+from rangesim.dataset.export_steps import box_of, grey_of, sensors_of
 from rangesim.dataset.sample_files import SampleRecord
 from rangesim.dataset.samples import Samples
 from rangesim.errors import FileFormatError
 from rangesim.files.atomic_directories import DirectoryKind, new_directory
 from rangesim.files.image_files import write_grey
 from rangesim.files.schema import write_json
-from rangesim.settings.config import nearest
 
 KIND = DirectoryKind("rangesim-coco", "export.json", FileFormatError)
 """Directories that hold an export to COCO."""
@@ -54,13 +53,7 @@ def export_coco(
         There is no such sensor, or no scene.
     """
     samples = Samples(directory)
-    if not len(samples):
-        raise ValueError(f"expected a data set with scenes, but all of {samples.store.directory} failed.")
-    there = [sensor.name for sensor in samples.record(0)[0].sensors]
-    for name in sensors or ():
-        if name not in there:
-            raise ValueError(f"expected sensors out of {', '.join(there)}, got {name!r}{nearest(name, there)}.")
-    names = list(sensors or there)
+    names = sensors_of(samples, sensors)
     categories = {name: i for i, name in enumerate(sorted({c for row in samples.rows for c in row.categories}), 1)}
     with new_directory(out, KIND, inputs=[directory]) as folder:
         listed: dict[str, dict[str, list[Any]]] = {name: {"images": [], "annotations": []} for name in names}

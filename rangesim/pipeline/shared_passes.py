@@ -19,19 +19,27 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
 
     A sensor of several cameras has its pass with all of them; the rig of a pass is that of the first camera.
 
-    The passes are in the order in which their first instruments appear. The renderer is monochrome, and no material
-    depends on the wavelength, so instruments of different wavelengths share their light; the rig of a pass states none.
-    If something moves, each instrument has a pass of its own, because each takes its frames at other times.
+    The passes are in the order in which their first instruments appear. Instruments of different wavelengths share
+    their light, see `rig_of_pass`. If something moves, each instrument has a pass of its own, because each takes its
+    frames at other times.
     """
     groups: list[tuple[Rig, list[Instrument]]] = []
     for instrument in experiment.instruments:
-        rig = replace(instrument.rig(scene, experiment.width, experiment.height), wavelength_m=None)
+        rig = rig_of_pass(instrument, scene, experiment.width, experiment.height)
         shared = None if experiment.motion is not None else first_that_agrees(groups, rig, instrument)
         if shared is None:
             groups.append((rig, [instrument]))
         else:
             groups[shared][1].append(instrument)
     return groups
+
+
+def rig_of_pass(instrument: Instrument, scene: Scene, width: int | None, height: int | None) -> Rig:
+    """Rig of an instrument's light-transport pass; parameters as of `Instrument.rig`.
+
+    It states no wavelength: the renderer is monochrome, and no material depends on the wavelength.
+    """
+    return replace(instrument.rig(scene, width, height), wavelength_m=None)
 
 
 def first_that_agrees(groups: list[tuple[Rig, list[Instrument]]], rig: Rig, instrument: Instrument) -> int | None:

@@ -32,6 +32,7 @@ from rangesim.evaluation.surface_rows import with_mean_over_objects
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
 from rangesim.pipeline.experiment_run import acquisition, labels_of, segmented, segmented_truth
+from rangesim.pipeline.shared_passes import rig_of_pass
 from rangesim.report import figures, palette
 from rangesim.report.panorama import panorama
 from rangesim.robust_scale import sigma_from_median
@@ -91,9 +92,9 @@ class _Pass:
         self.power_w = max(i.power_w for i in self.instruments)
 
     def rig(self) -> Rig:
-        """Rig of all instruments, at the power of the pass; as the renderer, it has no wavelength."""
+        """Rig of all instruments, at the power of the pass."""
         one, settings = replace(self.instruments[0], power_w=self.power_w), self.transport
-        return replace(one.rig(self.scene, settings.width, settings.height), wavelength_m=None)
+        return rig_of_pass(one, self.scene, settings.width, settings.height)
 
     def light_for(self, instrument: Instrument, signals: StillSignals | SignalSet) -> StillSignals | SignalSet:
         """Signals of the pass at the power and the wavelength of an instrument."""

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from rangesim.instrument.instrument import Instrument
 from rangesim.pipeline.cost import Cost, CostBesideTracing, estimate_cost
-from rangesim.pipeline.shared_passes import first_that_agrees
+from rangesim.pipeline.shared_passes import first_that_agrees, rig_of_pass
 from rangesim.rig import Rig
 from rangesim.settings.config import to_dict
 from rangesim.settings.seeds import derived_seed
@@ -166,8 +166,7 @@ def plan(sweep: Sweep) -> Plan:
         settings = point.experiment_settings
         for name in sweep.given:
             instrument = point.instrument(name)
-            rig = replace(instrument, power_w=1.0).rig(scene, settings.width, settings.height)
-            rig = replace(rig, wavelength_m=None)  # the renderer is monochrome
+            rig = rig_of_pass(replace(instrument, power_w=1.0), scene, settings.width, settings.height)
             index = first_that_agrees(of_place, rig, instrument)
             if index is None:
                 index = len(of_place)
