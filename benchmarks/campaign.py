@@ -6,7 +6,7 @@
 An item is a sample of the data set of `campaign_plan.py`: ten parts on a table, three sensors, 160 x 120 pixels.
 
 - speedup: one worker of one thread against two such workers, items per second once the workers are warm; the median of
-  three rounds, which alternate.
+  three rounds, which alternate. Two processes of Python's own pool against one show what the machine allows.
 - kills: a run that is killed at least 20 times over 200 items, by SIGKILL, against an undisturbed one, byte by byte.
   Half of it runs on an embedded cluster, where workers and driver are killed; half on a second scheduler process,
   reached by its address, which is killed, too. Some drivers are killed at a rename, before or after it.
@@ -22,6 +22,7 @@ import argparse
 import contextlib
 import itertools
 import json
+import multiprocessing
 import os
 import random
 import signal
@@ -41,6 +42,8 @@ import psutil
 from campaign_plan import TEN_PARTS
 
 from rangesim.campaign import ItemStore, Outcome, Workers, run_items, workers
+from rangesim.campaign.in_worker import THREAD_VARIABLES
+from rangesim.campaign.workers import BLAS_VARIABLES
 from rangesim.dataset import DatasetSpec, spec_from_dict
 from rangesim.dataset.sample import sample_bytes
 
@@ -104,19 +107,35 @@ def rate(count: int, function: Callable[[Any], bytes], items: dict[str, Any], wa
     return (len(ends) - warm) / (ends[-1] - ends[warm - 1])
 
 
+def rate_of_pool(count: int, function: Callable[[Any], bytes], items: dict[str, Any], warm: int) -> float:
+    """Items per second of `count` processes of Python's own pool, which only hands numbers out: the machine's limit."""
+    threads = dict.fromkeys((*BLAS_VARIABLES, *THREAD_VARIABLES), "1")
+    before = {name: os.environ.get(name) for name in threads}
+    os.environ.update(threads)
+    try:
+        with multiprocessing.get_context("spawn").Pool(count) as pool:
+            ends = [time.monotonic() for _ in pool.imap_unordered(function, items.values())]
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+    return (len(ends) - warm) / (ends[-1] - ends[warm - 1])
+
+
 def speedup(size: Size) -> dict[str, Any]:
-    """How much faster two workers are than one, and the scenes per hour of one."""
-    rates: dict[int, list[float]] = {1: [], 2: []}
+    """How much faster two workers are than one, the same of two bare processes, and the scenes per hour of one."""
+    rates: dict[str, dict[int, list[float]]] = {"dask": {1: [], 2: []}, "pool": {1: [], 2: []}}
     load = os.getloadavg()[0]
-    for _, count in itertools.product(range(size.rounds), (1, 2)):
-        rates[count].append(rate(count, samples(size), scenes(size.timed), warm=4))
-        print(f"{count} workers: {rates[count][-1]:.3f} scenes per second", file=sys.stderr)
-    one, two = (statistics.median(rates[count]) for count in (1, 2))
+    for _, count, way in itertools.product(range(size.rounds), (1, 2), rates):
+        of = rate if way == "dask" else rate_of_pool
+        rates[way][count].append(of(count, samples(size), scenes(size.timed), warm=4))
+        print(f"{count} workers, {way}: {rates[way][count][-1]:.3f} scenes per second", file=sys.stderr)
+    median = {way: {count: statistics.median(found) for count, found in by.items()} for way, by in rates.items()}
     return {
-        "speedup_2_workers": round(two / one, 3),
-        "scenes_per_hour_core": round(3600 * one),
+        "speedup_2_workers": round(median["dask"][2] / median["dask"][1], 3),
+        "speedup_2_processes": round(median["pool"][2] / median["pool"][1], 3),
+        "scenes_per_hour_core": round(3600 * median["dask"][1]),
         "load_before": load,
-        "rates": {count: [round(x, 4) for x in found] for count, found in rates.items()},
+        "rates": {way: {n: [round(x, 4) for x in found] for n, found in by.items()} for way, by in rates.items()},
     }
 
 
