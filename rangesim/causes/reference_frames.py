@@ -120,11 +120,11 @@ def _add(values: np.ndarray, response: Response, path: LightPath) -> None:
     radiance = 1 / len(path.u)
     if isinstance(response, SparseResponse):
         every = [np.broadcast_arrays(*pair, path.u)[:2] for pair in response.bin_weights(path, NumpyMath())]
-        pairs = [(bins.astype(np.intp), radiance * weight, bins < response.channels) for bins, weight in every]
+        pairs = [(bins.astype(np.intp), radiance * parts, bins < response.channels) for bins, parts in every]
         for n in range(len(path.u)):
-            for bins, weight, inside in pairs:
+            for bins, parts, inside in pairs:
                 (pixels,) = np.nonzero(inside[n])
-                values[bins[n, pixels], pixels] += weight[n, pixels]
+                values[bins[n, pixels], pixels] += parts[n, pixels]
         return
     assert isinstance(response, DenseResponse)
     weights = [np.broadcast_to(w, path.u.shape).astype(np.float32) for w in response.weights(path, NumpyMath())]
