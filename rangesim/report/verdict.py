@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rangesim.evaluation.surface_rows import MATERIAL, OBJECT, OBJECTS
+from rangesim.report.objects_section import objects_sentence
 from rangesim.report.tables import (
     Rows,
     automatic_exposures,
@@ -44,7 +45,7 @@ def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
     """Findings about a result: real sensors side by side, right readings and failures of each, automatic exposures."""
     names = titles(measurements)
     real = [m for m in measurements if not is_reference(m)] or list(measurements)
-    findings = [Finding(names[m.name], _right(m) + _worst(m.rows) + _reasons(m.rows) + _accuracy(m)) for m in real]
+    findings = [Finding(names[m.name], _of_one(m)) for m in real]
     if len(real) > 1:
         parts = [
             _most_right(real, names),
@@ -60,6 +61,12 @@ def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
 
 
 # ---- One sensor ----------------------------------------------------------------------------------------------------
+
+
+def _of_one(m: Measurement) -> str:
+    """Sentences about one sensor."""
+    about = [_right(m) + _worst(m.rows) + _reasons(m.rows) + _accuracy(m), objects_sentence(m)]
+    return " ".join(filter(None, about))
 
 
 def _right(measurement: Measurement) -> str:
