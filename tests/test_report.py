@@ -357,7 +357,7 @@ def _measured(
     for name, (right, wrong, median) in surfaces.items():
         row = {"right": right, "wrong": wrong, "missing": 1 - right - wrong, "completeness": right + wrong}
         row |= {"median_abs_m": median, "p95_abs_m": 3 * median}
-        row |= {column.key: None for column in tables.COLUMNS if column.key not in row}
+        row |= {column.key: None for column in tables.COLUMNS if column.key not in row} | {"invented_readings": None}
         causes = {"multipath": 0.8 * (1 - right), "low_signal": 0.2 * (1 - right)}
         rows.append({"kind": "all" if name == "all" else kind, "name": name, **row, "causes": causes})
     return SimpleNamespace(

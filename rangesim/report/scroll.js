@@ -5,7 +5,7 @@ function markScrolling() {
   for (const box of document.querySelectorAll(".scroll")) {
     const scrolls = box.scrollWidth > box.clientWidth;
     box.classList.toggle("scrolls", scrolls);
-    for (const [name, value] of [["tabindex", "0"], ["role", "region"], ["aria-label", "table, wider than the page"]]) {
+    for (const [name, value] of [["tabindex", "0"], ["role", "group"], ["aria-label", "table, wider than the page"]]) {
       if (scrolls) box.setAttribute(name, value); else box.removeAttribute(name);
     }
   }

@@ -171,6 +171,7 @@ class _Page:
                 within = _metres(self.sweep.tolerance_m)
                 yield f"Where {100 * RELIED:.0f} % of the readings are within {within}{at}: {'; '.join(reached)}."
         yield from self._ranking()
+        yield from self._invented()
         yield from self._objects()
         yield from self._theory()
         yield from self._exposure()
@@ -243,6 +244,18 @@ class _Page:
                     right = f"{name} ({100 * of[name]:.0f} %)"
                     best.append(f"{value}: {right if of[name] > tables.MOST else f'nobody on most, at best {right}'}")
             yield f"Most often right by {label_of(path)}: {'; '.join(best)}."
+
+    def _invented(self) -> Iterator[str]:
+        """Sentence about readings where there is no surface."""
+        clauses = []
+        for name in self.names:
+            rows = [r for r in self.result.summary if (r["sensor"], r["kind"]) == (name, ALL)]
+            most = max(rows, key=lambda r: r["invented_readings"], default=None)
+            if most is not None and most["invented_readings"]:
+                at = _values(self.sweep.points[most["point"]].values)
+                clauses.append(f"{name} {_number(most['invented_readings'])}{f' (at {at})' if at else ''}")
+        if clauses:
+            yield f"Most invented readings in a capture, of pixels that see no surface: {'; '.join(clauses)}."
 
     def _objects(self) -> Iterator[str]:
         """Sentences about what the failures of each sensor do to the objects."""

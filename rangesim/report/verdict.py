@@ -16,6 +16,7 @@ from rangesim.report.objects_section import objects_sentence
 from rangesim.report.tables import (
     Rows,
     automatic_exposures,
+    invented_readings,
     is_reference,
     is_reliable,
     millimetres,
@@ -55,6 +56,8 @@ def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
         ]
         if any(parts):  # ideal sensors alone may be equal in all of these
             findings.insert(0, Finding("Side by side", " ".join(filter(None, parts))))
+    if text := invented_readings({names[m.name]: m.rows for m in real}):
+        findings.append(Finding("Invented readings", text))
     if text := automatic_exposures({names[m.name]: m.metadata for m in real}):
         findings.append(Finding("Exposure", text))
     return findings
