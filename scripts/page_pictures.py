@@ -19,10 +19,8 @@ from browser import Page, browser
 from PIL import Image
 
 IMAGES = Path(__file__).parent.parent / "docs" / "images"
-WIDTH_PX = 1180
-"""Width of the window: that of the pages' text, so that no margin is empty."""
-COLORS = 128
-"""Colours of a picture; a page has few, and 128 leave no bands in the colour maps."""
+WIDTH_PX = 960
+"""Width of the window: three pictures fit side by side, and the pages' text has no empty margin."""
 
 
 def main() -> None:
@@ -33,8 +31,8 @@ def main() -> None:
     pages = parser.parse_args()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, browser(Path(folder)) as page:
         page.call("Emulation.setDeviceMetricsOverride", width=WIDTH_PX, height=1000, deviceScaleFactor=1, mobile=False)
-        _cut(page, pages.report, "h1", ".maps > .block:nth-child(3)", "report.png")
-        _cut(page, pages.scan, "h1", "#what-was-seen", "scan_page.png")
+        _cut(page, pages.report, ".maps h3", ".maps > .block:nth-child(3)", "report.png")
+        _cut(page, pages.scan, "h1", "#seen", "scan_page.png")
         _cut(page, pages.calibration, "h1", "#boards", "calibration_page.png")
 
 
@@ -46,8 +44,7 @@ def _cut(page: Page, path: Path, first: str, end: str, name: str) -> None:
     clip = {"x": 0, "y": top - 20, "width": WIDTH_PX, "height": bottom - top, "scale": 1}
     shot = page.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)["data"]
     with Image.open(io.BytesIO(base64.b64decode(shot))) as picture:
-        few = picture.convert("RGB").quantize(COLORS, dither=Image.Dither.NONE)
-        few.save(IMAGES / name, optimize=True)
+        picture.convert("RGB").save(IMAGES / name, optimize=True)
 
 
 if __name__ == "__main__":
