@@ -26,6 +26,7 @@ from rangesim.report.line_plots import (
     number_text,
     point_plot,
     stacked_bars,
+    style_of_curves,
 )
 from rangesim.report.template import render_page, text_of_file
 from rangesim.signals import ALL
@@ -79,7 +80,7 @@ class _Page:
             "title": sweep.title,
             "line": f"{_scene_name(sweep.scene)} · {len(sweep.points)} points · {len(self.names)} sensors · "
             f"{sweep.seeds} seeds · {len(result.plan.passes)} light-transport passes",
-            "plot_css": Markup(text_of_file("plots.css")),
+            "plot_css": Markup(text_of_file("plots.css") + style_of_curves()),
             "verdict": list(self._verdict()),
             "failed": [f"Pass {n + 1} failed: {error}" for n, error in (result.failed or {}).items()],
             "sensors": self._legend(self.names),
@@ -92,11 +93,7 @@ class _Page:
             "seeds": sweep.seeds,
             "tolerance": _metres(sweep.tolerance_m),
             "verdicts": self._bars(_outcome_stack),
-            "outcomes": [
-                {"name": "right", "color": "#2a9d5c"},
-                {"name": "wrong", "color": "#d64545"},
-                {"name": "missing", "color": "#9aa5b1"},
-            ],
+            "outcomes": [{"name": name, "color": color} for name, color in palette.READING_COLORS.items()],
             "shown": self._shown,
             "whose": "the objects, each with the same weight" if self.kind == OBJECTS else "all surfaces",
             "causes": self._bars(_cause_stack) if self._causes else [],
@@ -175,6 +172,7 @@ class _Page:
                 within = _metres(self.sweep.tolerance_m)
                 yield f"Where {100 * RELIED:.0f} % of the readings are within {within}{at}: {'; '.join(reached)}."
         yield from self._ranking()
+        yield from self._invented()
         yield from self._objects()
         yield from self._theory()
         yield from self._exposure()
@@ -244,8 +242,21 @@ class _Page:
                 of = {n: v for n, v in at.items() if v is not None}
                 if of:
                     name = max(of, key=lambda n: of[n])
-                    best.append(f"{value}: {name} ({100 * of[name]:.0f} %)")
+                    right = f"{name} ({100 * of[name]:.0f} %)"
+                    best.append(f"{value}: {right if of[name] > tables.MOST else f'nobody on most, at best {right}'}")
             yield f"Most often right by {label_of(path)}: {'; '.join(best)}."
+
+    def _invented(self) -> Iterator[str]:
+        """Sentence about readings where there is no surface."""
+        clauses = []
+        for name in self.names:
+            rows = [r for r in self.result.summary if (r["sensor"], r["kind"]) == (name, ALL)]
+            most = max(rows, key=lambda r: r["invented_readings"], default=None)
+            if most is not None and most["invented_readings"]:
+                at = _values(self.sweep.points[most["point"]].values)
+                clauses.append(f"{name} {_number(most['invented_readings'])}{f' (at {at})' if at else ''}")
+        if clauses:
+            yield f"Most invented readings in a capture, of pixels that see no surface: {'; '.join(clauses)}."
 
     def _objects(self) -> Iterator[str]:
         """Sentences about what the failures of each sensor do to the objects."""
@@ -460,8 +471,9 @@ class _Page:
     def _numbers(self) -> dict[str, Any]:
         """The table of means."""
         paths = list(self.sweep.vary)
-        columns = [*(label_of(p) for p in paths), "sensor", "right, %", "wrong, %", "missing, %", "error, mm"]
-        columns += ["theory, mm", "bias, mm", "95 % within, mm", "exposure"]
+        labels = [*(label_of(p) for p in paths), "sensor", "right, %", "wrong, %", "missing, %", "error, mm"]
+        labels += ["theory, mm", "bias, mm", "95 % within, mm", "exposure"]
+        columns = [label.partition(", ")[::2] for label in labels]
         rows = []
         for r in self.rows[:MAX_NUMBERS]:
             cells = [*(_label(r[p]) for p in paths), r["sensor"]]
@@ -568,7 +580,7 @@ def _mean_right(rows: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def _outcome_stack(row: Mapping[str, Any]) -> list[tuple[str, float]]:
-    return [(kind, row[kind].mean) for kind in ("right", "wrong", "missing")]
+    return [(color, row[kind].mean) for kind, color in palette.READING_COLORS.items()]
 
 
 def _cause_stack(row: Mapping[str, Any]) -> list[tuple[str, float]]:

@@ -361,6 +361,9 @@ class DirectToFDecoder(Decoder):
             return self._of_returns(capture, sensor)
         return self._of_peaks(capture, sensor)
 
+    def pixel_reader(self, sensor: Sensor) -> Callable[[Capture], PathLengths]:
+        return self.coordinates  # which checks nothing of the capture as a whole
+
     def _fits_pulses(self, sensor: DirectToF) -> bool:
         """Whether pulses are fitted, instead of taking the centroid of the highest peak."""
         return sensor.pulse is not None or self.max_returns > 1 or self.min_range_m > 0

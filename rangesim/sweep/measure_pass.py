@@ -11,7 +11,8 @@ import base64
 import json
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -150,15 +151,23 @@ def _measured(item: Mapping[str, Any]) -> dict[str, Any]:
     """The results of all measurements of a pass."""
     one = _Pass(item)
     rig = windowed(one.rig(), one.instruments[0].sensor, item["window_px"])
+    said: dict[str, None] = {}
+    with _warnings_kept(said):
+        signals = one.traced(rig, None)
+    jobs = []
+    for instrument, ambient, job in zip(one.instruments, one.ambients, item["jobs"], strict=True):
+        with _warnings_kept(said, f"{instrument.name}: "):
+            jobs.append(_measurements(instrument, one.light_for(instrument, signals), ambient, job["seeds"], item))
+    return {"jobs": jobs, "warnings": list(said)}
+
+
+@contextmanager
+def _warnings_kept(said: dict[str, None], whose: str = "") -> Iterator[None]:
+    """Add the texts of the package's warnings in the block to `said`, each once, with the words `whose` before them."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", RangesimWarning)
-        signals = one.traced(rig, None)
-        jobs = [
-            _measurements(instrument, one.light_for(instrument, signals), ambient, job["seeds"], item)
-            for instrument, ambient, job in zip(one.instruments, one.ambients, item["jobs"], strict=True)
-        ]
-    said = dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, RangesimWarning))
-    return {"jobs": jobs, "warnings": list(said)}
+        yield
+    said.update((f"{whose}{w.message}", None) for w in caught if issubclass(w.category, RangesimWarning))
 
 
 def _measurements(
