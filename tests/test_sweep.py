@@ -56,6 +56,7 @@ def wall(sensors: tuple[Any, ...] = ("amcw",), seeds: int = 2, **vary: Any) -> S
         ({"power_w": 1.0, "vary": {"power_w": [1.0, 2.0]}}, "expected power_w as one value or in vary, got both"),
         ({"vary": {"power_w": [1, 2.0, 1.0]}}, r"expected different values of vary\.power_w, got 1\.0 twice"),
         ({"vary": {key: [*range(1, 1001)] for key in ("power_w", "baseline_m", "exposure_s")}}, "at most 10000 combin"),
+        ({"ambient": 1}, "expected ambient as a table of settings, got 1"),
         ({"tolerence_m": 0.1}, "did you mean 'tolerance_m'"),
     ],
 )

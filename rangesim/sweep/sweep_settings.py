@@ -199,7 +199,10 @@ class Point:
         base: dict[str, Any] | None = dict(DARKNESS) if self.scene.is_of_package else None
         for path, value in self.settings.items():
             if path == "ambient":
-                base = {"illuminant": "sun", **to_dict(value)} if value is not None else None
+                stated = to_dict(value)
+                if not isinstance(stated, Mapping | None):
+                    raise ValueError(f"expected ambient as a table of settings, got {shown(value)}.")
+                base = None if stated is None else {"illuminant": "sun", **stated}
             elif path.startswith("ambient."):
                 base = {"illuminant": "sun"} if base is None else base
                 if path == "ambient.irradiance_w_m2":
