@@ -352,5 +352,5 @@ def test_a_folder_of_models_that_is_a_whole_disk_is_refused_soon(
     monkeypatch.setattr(files, "MAX_ENTRIES", 2)
     assert model_files(tmp_path) == (tmp_path / "deep" / "a.stl",)
     (tmp_path / "deep" / "b.txt").touch()
-    with pytest.raises(FileFormatError, match="at most 2 files and subfolders, .* has more"):
+    with pytest.raises(FileFormatError, match="at most 2 files and subfolders"):
         model_files(tmp_path)

@@ -106,8 +106,7 @@ class Sweep:
             raise ValueError(f"expected at most {MAX_POINTS} combinations of the values of vary, got {count}.")
         self._check_contradictions()
         for point in self.points:
-            point.scene  # noqa: B018  # refused here, and not in the middle of the work
-            point.experiment_settings  # noqa: B018
+            _ = point.scene, point.ambient, point.experiment_settings  # refused here, not in the middle of the work
             for name in self.sensor_names:
                 point.instrument(name)
 
