@@ -21,7 +21,7 @@ from rangesim.evaluation.closed_forms import error_by_theory
 from rangesim.instrument.instrument import Instrument
 from rangesim.presets import instrument
 from rangesim.sensors import StructuredLight
-from rangesim.sweep import Sweep, carry_out, load_sweep, plan, sweep_from_dict, write_sweep
+from rangesim.sweep import Sweep, carry_out, load_sweep, measure_pass, plan, sweep_from_dict, write_sweep
 from rangesim.sweep import sweep_run as running
 from rangesim.sweep.confidence_intervals import of_fraction, of_mean
 from rangesim.sweep.measure_pass import item_bytes
@@ -256,6 +256,26 @@ def test_the_page_and_the_tables_are_written(result: Any, tmp_path: Path) -> Non
     import pyarrow.parquet as pq
 
     assert pq.read_table(tmp_path / "rows.parquet").num_rows == len(rows)
+
+
+def test_theory_ends_with_the_range_of_a_sensor(tmp_path: Path) -> None:
+    """A wall at 4 m is read at 0.16 m by direct time of flight, whose histogram ends at 3.84 m."""
+    result = carry_out(wall(("direct-tof",), 3, scene__distance_m=(2.0, 3.0, 4.0)))
+    near, middle, far = (row for row in result.summary if row["kind"] == "all")
+    assert near["theory_m"] < middle["theory_m"] < 0.01
+    assert far["theory_m"] is None
+    assert far["error_m"].mean > 3.0
+    assert "m at 3 m (beyond its range at 4 m)" in write_sweep(result, tmp_path).read_text()
+
+
+def test_an_error_that_theory_expects_is_no_outlier() -> None:
+    """Windows of whole bins give readings of two places; of the rarer one, the robust deviation knows nothing."""
+    errors = np.append(np.linspace(0.9, 1.1, 90), np.full(10, -1.5)) * 1e-3
+    found = measure_pass._errors(np.append(errors, 0.5), np.full(101, 1e-3))
+    assert found["error_m"] == pytest.approx(np.sqrt(np.mean(errors**2)))
+    alone = measure_pass._errors(errors, None)
+    assert alone["theory_m"] is None
+    assert alone["error_m"] == pytest.approx(1e-3, rel=0.01)  # without the rarer readings
 
 
 # ---- Intervals -----------------------------------------------------------------------------------------------------

@@ -213,11 +213,15 @@ class _Page:
         axis = self.axis
         assert axis is not None
         rows = sorted(self._of(name, others), key=lambda row: row[axis])
-        known = [(float(r[axis]), float(r["error_m"].mean)) for r in rows if _reads(r) and r["error_m"].mean > 0]
+        read = [r for r in rows if _reads(r) and r["error_m"].mean > 0]
+        within = [r for r in read if r["theory_m"] is not None] or read  # theory ends with the sensor's range
+        known = [(float(r[axis]), float(r["error_m"].mean)) for r in within]
         if len(known) < 2:
             return None
         ends = [f"{_millimetres(error)} mm at {_number(at)}{_unit(axis)}" for at, error in (known[0], known[-1])]
         text = f"{name} {', '.join(ends)}"
+        if beyond := [f"{_number(float(r[axis]))}{_unit(axis)}" for r in read if r not in within]:
+            text += f" (beyond its range at {', '.join(beyond)})"
         if len(known) < MIN_FIT or known[0][0] <= 0:
             return text
         places, errors = np.log(known).T
