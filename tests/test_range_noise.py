@@ -51,9 +51,11 @@ def test_two_halves_have_every_sample_once_and_whole_pairs(first: int) -> None:
     for n in range(3, 70):
         count = np.array([n], np.uint32)
         taken = []
-        for half in SampleAllocation(np.arange(1), count, count + first, 1.0, first, part=3).halves():
-            k = np.arange(half.samples[0])
-            taken.append(half.first + (k >> 1) * half.stride + (k & 1))  # as `Lanes.number`
+        halves = SampleAllocation(np.arange(1), count, count + first, 1.0, first, part=3).in_halves()
+        assert list(halves.part) == [6, 7]
+        for of_half, samples in zip(halves.first, halves.samples, strict=True):
+            k = np.arange(samples)
+            taken.append(of_half + (k >> 1) * halves.stride + (k & 1))  # as `Lanes.number`
         assert np.array_equal(np.sort(np.concatenate(taken)), first + np.arange(n))
         assert abs(len(taken[0]) - len(taken[1])) <= 2
         for numbers in taken:
@@ -64,7 +66,7 @@ def test_two_halves_have_every_sample_once_and_whole_pairs(first: int) -> None:
 def test_the_drawn_error_of_halves_of_unequal_size_has_the_variance_of_the_mean() -> None:
     rng, p, q = np.random.default_rng(3), 5, 16
     a, b = (rng.normal(2 * n, np.sqrt(n), (1, 200, 300)).astype(np.float32) for n in (p, q))
-    mean, error = np.empty_like(a), np.empty_like(a)
+    mean, error = np.zeros_like(a), np.zeros_like(a)
     Halves([np.full((200, 300), n, np.uint32) for n in (p, q)]).mean_and_error((a, b), (mean, error))
     assert mean.mean() == pytest.approx(2, rel=0.01)
     assert mean.std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)
