@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
@@ -14,6 +15,7 @@ from rangesim.capture.exposure import auto_exposure_s, expose, mean_radiance
 from rangesim.decoding import decode
 from rangesim.decoding.disparities import ImageNoise
 from rangesim.electronics.ambient import Ambient
+from rangesim.errors import RangesimWarning
 from rangesim.evaluation.closed_forms import received_light
 from rangesim.evaluation.reference_readings import halves, sampling_draw
 from rangesim.instrument.instrument import Instrument
@@ -151,7 +153,9 @@ class AdaptiveSampling(Sampler):
         if theory_m is not None:
             brightest_e = radiance.max(axis=0) * detector.electron_rate_per_radiance(signals.rig) * exposure_s
             return np.where(brightest_e < detector.capacity_e, theory_m / TO_SIGMA, np.nan)
-        image = decode(expose(signals, sensor, detector, exposure_s, 0, self.ambient), decoder)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RangesimWarning)  # the measurement itself will warn
+            image = decode(expose(signals, sensor, detector, exposure_s, 0, self.ambient), decoder)
         return np.asarray(image.reading_m - clean_m)
 
     def _excess_of_frames(self, instrument: Instrument, signals: StillSignals, group: np.ndarray) -> np.ndarray:
