@@ -7,7 +7,7 @@ finer than a pixel matters. Random paths of the pass would mostly miss it. Three
 
 1. A pixel is chosen if there is a delta surface behind its centre or behind the centre of a neighbour.
 2. A few probing paths of each chosen pixel tell how near to the lens its paths come, and how far they spread.
-3. Pixels whose paths come near the lens get thousands of paths.
+3. Pixels whose paths come near the lens get more and more paths, up to thousands.
 
 The lens is not seen through a medium that scatters, because the boundary of the medium ends a path. The lens is seen
 through glass that absorbs.
@@ -62,11 +62,13 @@ MIN_PATHS_PER_PIXEL = 64
 MAX_PATHS_PER_PIXEL = 4096
 """Largest number of paths per pixel, however few pixels there are, so that a single highlight takes little time."""
 SCREENING = 8
-"""Ratio of all paths of a pixel to those that are sent first. The others are sent only if one of the first came close,
-so that pixels which do not see the lens cost little."""
+"""Ratio of all paths of a pixel to those that are sent first, a power of two. The number of paths then doubles as long
+as one of them came close, so that pixels which do not see the lens cost little."""
 CLOSE_RADII = 8.0
-"""Distance from the centre of the lens, in its radii, at which a path counts as close. If one path in 4000 hits the
-lens, 64 in 4000 come that close, so 8 of the first 512 do; all of them miss by chance once in 3000 times."""
+"""Distance from the centre of the lens, in its radii, at which one of the first paths counts as close. If one path in
+4000 hits the lens, 64 in 4000 come that close, so 8 of the first 512 do; all of them miss by chance once in 3000 times.
+With n times as many paths the distance is smaller by the square root of n, and as many are expected. Doubling takes
+0.69 of the paths that all at once would take, and loses 0.006 % of the light of 24 random scenes."""
 LANES = 8
 """Number of lanes that share the paths of a pixel, half of them for each half of the paths. Lanes of one pixel meet the
 same surfaces and take about as long, so a vector of lanes is rarely idle. With 16, `MIN_PATHS_PER_PIXEL` would have to
@@ -123,15 +125,20 @@ def trace_glint(
         return Glint(pixel, nothing, none, nothing, none)
     per_pixel = int(np.clip(MAX_PATHS // len(pixel), MIN_PATHS_PER_PIXEL, MAX_PATHS_PER_PIXEL))
     few = per_pixel // (LANES * SCREENING)  # of each lane
-    sums = _sums(view, rig, responses, pixel, radius_m, 0, few, SCREENING * few, report)
-    close = np.flatnonzero(sums.nearest < CLOSE_RADII)
-    counts = np.full(len(pixel), np.float32(few * LANES))
-    if len(close):
-        more = _sums(view, rig, responses, pixel[close], radius_m[close], few, SCREENING * few, SCREENING * few, report)
+    send = partial(_sums, view, rig, responses, of_lane=SCREENING * few, report=report)
+    sums, sent = send(pixel, radius_m, 0, few), np.full(len(pixel), few)
+    close = np.arange(len(pixel))
+    while (done := int(sent.max())) < SCREENING * few:
+        close = close[sums.nearest[close] < CLOSE_RADII * np.sqrt(few / done)]
+        if not len(close):
+            break
+        more = send(pixel[close], radius_m[close], done, 2 * done)
+        sums.nearest[close] = np.minimum(sums.nearest[close], more.nearest)
         sums.radiance[:, close] += more.radiance
         for response, values in sums.channels.items():
             values[:, :, close] += more.channels[response]
-        counts[close] = SCREENING * few * LANES
+        sent[close] = 2 * done
+    counts = np.float32(LANES) * sent.astype(np.float32)
     (a, b), of_halves = sums.radiance, sums.channels.items()
     return Glint(
         pixel,
@@ -167,7 +174,10 @@ def _sums(
     of_lane: int,
     report: Callable[[], None],
 ) -> GlintSums:
-    """Sums over the paths `begin` to `end` - 1 of the `of_lane` paths of each lane; each pixel has `LANES` lanes."""
+    """Sums over the paths `begin` to `end` - 1 of the `of_lane` paths of each lane; each pixel has `LANES` lanes.
+
+    Paths that begin at different numbers have independent random numbers.
+    """
     n, paths, projector, launches = len(pixel), end - begin, view.traced.projector, Launches()
     assert isinstance(projector, Device)
     nearest, total = np.zeros(n, np.float32), np.zeros((2, n), np.float32)
@@ -178,7 +188,7 @@ def _sums(
         some = np.repeat(np.arange(first, last), LANES)
         lens = LensDisc(projector, radius_m[some], radiance[some])
         lane = np.tile(np.arange(LANES), last - first)
-        lanes = GlintLanes(view, pixel[some], paths, lane * of_lane + begin, 2 * lane + (begin > 0))
+        lanes = GlintLanes(view, pixel[some], paths, lane * of_lane + begin, lane + LANES * begin)
         accumulators = Accumulators(responses, len(some))
         state = GlintState(
             chain=lanes.start(),
