@@ -15,7 +15,7 @@ from rangesim import IdealToF, decode, expose
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.evaluation.comparison import compare
-from rangesim.report import errors_markdown
+from rangesim.report import errors_markdown, tables
 from rangesim.signals import GroundTruth
 
 
@@ -112,6 +112,20 @@ def test_right_wrong_and_missing_add_up_and_follow_the_tolerance(scene: tuple[np
         before = right
     missing = np.isnan(measured[:10]).mean()
     assert (rows[-1].right, rows[-1].missing) == pytest.approx((1 - missing, missing))
+
+
+def test_readings_of_pixels_that_see_no_surface_are_counted_apart() -> None:
+    z = np.full((4, 5), 2.0)
+    z[1:3] = np.nan
+    measured = np.full(z.shape, 2.0)
+    measured[1, :2] = np.nan
+    instance = np.zeros(z.shape, np.int32)
+    result = compare(image_of(measured), truth_of(z, instance))
+    row = result.row("all")
+    assert (row.pixels, row.right, row.wrong, row.missing, row.invented_readings) == (10, 1, 0, 0, 8)
+    assert {other.invented_readings for other in result.table if other is not row} == {None}
+    said = tables.invented_readings({"a": result.rows(), "b": compare(image_of(z), truth_of(z, instance)).rows()})
+    assert "a 8. " in said
 
 
 def test_flying_pixels_lie_on_neither_side_of_an_edge() -> None:

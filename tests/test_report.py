@@ -19,6 +19,8 @@ import pytest
 from browser import OPTIONS, WITHOUT_WEBGL, browser
 from PIL import Image
 from scroll_hints import check_scroll_hints
+from skimage.color import deltaE_ciede2000, xyz2lab
+from skimage.color.colorconv import xyz_from_rgb
 from small_result import SCENES, SENSORS, result_of_two_cameras, small_result
 from tiers import to_validate
 from typer.testing import CliRunner
@@ -36,6 +38,7 @@ from rangesim.pipeline.experiment_run import carry_out
 from rangesim.report import palette, render_report, tables, write_report
 from rangesim.report.clouds_page import render_clouds_page
 from rangesim.report.experiment_page import by_camera
+from rangesim.report.line_plots import COLORS
 from rangesim.report.objects_section import objects_sentence, objects_table
 from rangesim.report.printing import pdf_of
 from rangesim.report.verdict import verdict
@@ -132,18 +135,40 @@ SIGHT = {
 }
 
 
-@pytest.mark.parametrize("sight", SIGHT)
-def test_causes_are_told_apart_without_red_or_green_cones(sight: str) -> None:
-    """CIE 1976 colour differences of all pairs of outcomes; 2.3 is just noticeable."""
-    fraction = palette.OUTCOME_COLORS / 255
+COMMON = [c for c in Cause if c <= Cause.RESOLUTION and c != Cause.MOTION]
+DARK = (21, 27, 36)
+"""Colour of the dark page."""
+
+
+def lab(colors: Any, sight: str) -> np.ndarray:
+    """(n, 3) CIELAB of colours 0..255, as they look to this sight."""
+    fraction = np.asarray(colors) / 255
     linear = np.where(fraction <= 0.04045, fraction / 12.92, ((fraction + 0.055) / 1.055) ** 2.4)
-    seen = np.clip(linear @ SIGHT[sight].T, 0, 1)
-    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-    xyz = seen @ to_xyz.T / [0.9505, 1.0, 1.089]
-    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
-    lab = np.stack([116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])], axis=-1)
-    distance = np.linalg.norm(lab[:, None] - lab, axis=-1)[np.triu_indices(len(lab), 1)]
-    assert distance.min() > 10
+    return np.asarray(xyz2lab(np.clip(linear @ SIGHT[sight].T, 0, 1) @ xyz_from_rgb.T))
+
+
+def least_difference(colors: Any, sight: str) -> float:
+    """Smallest CIEDE2000 of two of the colours; 1 is just noticeable."""
+    seen = lab(colors, sight)
+    a, b = np.triu_indices(len(seen), 1)
+    return float(deltaE_ciede2000(seen[a], seen[b]).min())
+
+
+def of_hexadecimal(color: str) -> list[int]:
+    return list(bytes.fromhex(color[1:]))
+
+
+@pytest.mark.parametrize("sight", SIGHT)
+def test_colours_are_told_apart_without_red_or_green_cones_and_on_the_dark_page(sight: str) -> None:
+    outcomes = palette.OUTCOME_COLORS
+    assert least_difference(outcomes[COMMON], sight) > 13
+    assert least_difference(outcomes[1:], sight) > 9.6
+    assert least_difference(outcomes, sight) > 7  # "right" and "nothing there", a light grey and a darker one
+    assert deltaE_ciede2000(lab(outcomes, sight), lab([DARK], sight)).min() > 18
+    curves = list(map(of_hexadecimal, COLORS))
+    assert least_difference(curves[:6], sight) > 17
+    assert least_difference(curves, sight) > 10
+    assert least_difference([of_hexadecimal(c) for c in palette.READING_COLORS.values()], sight) > 15
 
 
 def test_the_failures_of_a_surface_add_up() -> None:
@@ -195,27 +220,27 @@ def outcome(name: str, kind: Outcome = Outcome.FOUND, *merged_with: str, **rest:
 @pytest.mark.parametrize(
     ("objects", "invented", "sentence"),
     [
-        ([outcome("a"), outcome("b")], 0, "Of 2 objects it finds 2."),
-        ([outcome("a")], 1, "Of 1 object it finds 1; it invents 1."),
+        ([outcome("a"), outcome("b")], 0, "Segmentation finds 2 of 2 objects."),
+        ([outcome("a")], 1, "Segmentation finds 1 of 1 object; it invents 1."),
         (
             [outcome("cup"), outcome("bottle", Outcome.MERGED, "table"), outcome("glass", Outcome.MISSED)],
             2,
-            "Of 3 objects it finds 1, merges bottle with table, and misses glass; it invents 2.",
+            "Segmentation finds 1 of 3 objects, merges bottle with table, and misses glass; it invents 2.",
         ),
         (
             [outcome("a", Outcome.MERGED, "b"), outcome("b", Outcome.MERGED, "a"), outcome("c", displaced=True)],
             0,
-            "Of 3 objects it finds none, displaces c by over 10\u00a0mm, and merges a and b.",
+            "Segmentation finds none of 3 objects, displaces c by over 10\u00a0mm, and merges a and b.",
         ),
         (
             [*(outcome(n, Outcome.MISSED) for n in "abcde"), outcome("f", Outcome.SPLIT)],
             0,
-            "Of 6 objects it finds none, splits f, and misses a, b, c and 2 more.",
+            "Segmentation finds none of 6 objects, splits f, and misses a, b, c and 2 more.",
         ),
         (
             [outcome("a"), outcome("lid", Outcome.MERGED, "a", separable=False)],
             0,
-            "Of 2 objects it finds 1. Even in the true depth the segmentation does not find lid.",
+            "Segmentation finds 1 of 2 objects. Even in the true depth it does not find lid.",
         ),
         ([], 0, ""),
     ],
@@ -231,7 +256,7 @@ def test_a_sentence_says_what_becomes_of_the_objects(
 def test_the_table_of_objects_has_a_row_for_each_and_none_where_it_is_not_known(html: str) -> None:
     result = load_result(small_result())
     for m in result.measurements:
-        assert objects_sentence(m) in html
+        assert (objects_sentence(m) in html) == (not tables.is_reference(m))
     lines = objects_table(result.measurements)
     assert [line.name for line in lines] == list(result.measurements[0].truth.object_names)
     assert all(len(line.cells) == len(SENSORS) for line in lines)
@@ -332,11 +357,12 @@ def _measured(
     for name, (right, wrong, median) in surfaces.items():
         row = {"right": right, "wrong": wrong, "missing": 1 - right - wrong, "completeness": right + wrong}
         row |= {"median_abs_m": median, "p95_abs_m": 3 * median}
-        row |= {column.key: None for column in tables.COLUMNS if column.key not in row}
+        row |= {column.key: None for column in tables.COLUMNS if column.key not in row} | {"invented_readings": None}
         causes = {"multipath": 0.8 * (1 - right), "low_signal": 0.2 * (1 - right)}
         rows.append({"kind": "all" if name == "all" else kind, "name": name, **row, "causes": causes})
     return SimpleNamespace(
         name=sensor,
+        objects=None,
         capture=SimpleNamespace(sensor=SENSORS[sensor]),
         camera=Intrinsics.from_fov(4, 3, fov_x_deg=40.0),
         rows=with_mean_over_objects(rows),

@@ -38,7 +38,13 @@ def compare_command(
 
       rangesim compare out/tabletop --tolerance 2mm
     """
-    from rangesim.report.tables import automatic_exposures, comparison_markdown, comparison_tables, tolerance_line
+    from rangesim.report.tables import (
+        automatic_exposures,
+        comparison_markdown,
+        comparison_tables,
+        invented_readings,
+        tolerance_line,
+    )
     from rangesim.results.experiment_results import read_acquisition, read_comparison, read_settings
 
     found = {
@@ -62,6 +68,8 @@ def compare_command(
         for table in comparison_tables(tables, taken):
             _print(table)
     names = [name for name, _ in tables]
+    if said := invented_readings(dict(tables)):
+        typer.echo(f"rangesim: invented readings {said}", err=True)
     if said := automatic_exposures(dict(zip(names, taken, strict=True))):
         typer.echo(f"rangesim: the exposure {said}", err=True)
 

@@ -51,6 +51,8 @@ class ErrorStatistics:
     edge_pixels : int, number of pixels with a reading within `EDGE_RADIUS` pixels of a depth edge.
     flying_rate : fraction of the edge pixels that are flying pixels: their z differs by more than `tolerance_m` from
         every true depth in the window of 5 x 5 pixels, so that they lie on neither side of the edge.
+    invented_readings : int, number of pixels with a reading that see no surface of the scene, in the row "all"; None in
+        the others. `pixels` and the fractions are of pixels that see a surface, so they do not count these.
     """
 
     kind: str
@@ -67,6 +69,7 @@ class ErrorStatistics:
     p95_abs_m: float
     edge_pixels: int
     flying_rate: float
+    invented_readings: int | None = None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -156,6 +159,7 @@ def compare(image: RangeImage, truth: GroundTruth | Signals, tolerance_m: float 
         asdict(_statistics(surface, error, truth.projector_visible, edge, flying, tolerance_m))
         for surface in truth.surfaces()
     ]
+    rows[-1]["invented_readings"] = int((image.valid & ~np.isfinite(true_m)).sum())  # the last row is "all"
     table = tuple(ErrorStatistics(**row) for row in with_mean_over_objects(rows))
     return Comparison(table, error.astype(np.float32), flying, tolerance_m)
 

@@ -15,6 +15,7 @@ from rangesim.capture.exposure import auto_exposure_s, expose, mean_radiance, ra
 from rangesim.decoding import decode
 from rangesim.decoding.disparities import ImageNoise
 from rangesim.electronics.ambient import Ambient
+from rangesim.errors import without_warnings
 from rangesim.evaluation.closed_forms import light_of_exposure
 from rangesim.evaluation.reference_readings import halves, sampling_draw
 from rangesim.instrument.instrument import Instrument
@@ -222,7 +223,8 @@ class _Pixels:
         if theory_m is not None:
             brightest_e = radiance.max(axis=0) * detector.electron_rate_per_radiance(rig) * exposure_s
             return np.where(brightest_e < detector.capacity_e, theory_m / TO_SIGMA, np.nan)[0]
-        image = decode(expose(signals, sensor, detector, exposure_s, 0, self.ambient), self.decoder)
+        with without_warnings():  # the measurement itself will warn
+            image = decode(expose(signals, sensor, detector, exposure_s, 0, self.ambient), self.decoder)
         return np.asarray(image.reading_m[self.some] - clean_m)
 
 

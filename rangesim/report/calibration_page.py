@@ -208,7 +208,7 @@ def _verdict(
     lines.append(
         (
             "The baseline",
-            f"is {1e3 * found.baseline_m:.3f} mm, known to {1e6 * found.baseline_deviation_m:.2g} µm, if the size "
+            f"is {1e3 * found.baseline_m:.3f} mm, known to {1e3 * found.baseline_deviation_m:.2g} mm, if the size "
             "of the board is right: a relative error of its size is the same relative error of all lengths.",
         )
     )
@@ -217,7 +217,7 @@ def _verdict(
             lines.append(
                 (
                     f"The {said['name']}'s image",
-                    f"has corners in {100 * said['covered']:.0f} % of its parts: its distortion is unknown in the "
+                    f"has corners in {100 * said['covered']:.0f}\u00a0% of its parts: its distortion is unknown in the "
                     "others; show the board there.",
                 )
             )

@@ -13,7 +13,7 @@ from pcgraph.viewer.packing import pack
 from rangesim.errors import FileFormatError
 from rangesim.report import figures, palette, point_viewer, tables
 from rangesim.report.content_security import visible_text
-from rangesim.report.objects_section import objects_sentence, objects_table, totals
+from rangesim.report.objects_section import objects_table, totals
 from rangesim.report.template import render_page
 from rangesim.report.verdict import verdict
 from rangesim.results.experiment_results import Measurement, Result
@@ -78,7 +78,6 @@ def context(result: Result) -> dict[str, Any]:
         "outcomes": tables.outcome_table(measurements),
         "objects": objects_table(measurements),
         "object_totals": totals(measurements),
-        "object_sentences": [(names[m.name], objects_sentence(m)) for m in measurements],
         "noise": tables.noise_table(measurements),
         "tolerance_mm": f"{1e3 * measurements[0].causes.tolerance_m:g}",
         "definitions": tables.definitions(measurements),

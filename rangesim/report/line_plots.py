@@ -2,7 +2,7 @@
 """Plots of curves, points and stacked bars as inline SVG, which take the colours of the page around them.
 
 The content security policy of the pages allows no styles in attributes, so colours are classes of the style sheet
-(`k0` to `k9`, `.plot`) or presentation attributes. A plot is 440 units wide, so its text is legible on a telephone.
+(`style_of_curves`, `.plot`) or presentation attributes. A plot is 440 units wide, so text is legible on a telephone.
 """
 
 from __future__ import annotations
@@ -24,8 +24,12 @@ MAX_DOTS = 24
 """Points of a curve up to which each has a dot; more dots would be a line of their own."""
 CHARACTER = 7.0
 """Mean width of a character of the labels, in the units of the plot."""
-COLORS = ("#2f7fd6", "#d9661f", "#2a9d5c", "#c2458f", "#8a63d2", "#a98400", "#0f9aa8", "#d64545", "#7a8a99", "#5b7a1f")
-"""Colours of curves, legible on white and on dark grey; the style sheet has them as k0 to k9."""
+COLORS = ("#2d69d2", "#a55a00", "#00b4a5", "#b44b69", "#b4a500", "#00a5ff", "#d20096", "#5a964b", "#ff7878", "#ff4b96")
+"""Colours of curves, legible on white and on dark grey.
+
+The first six differ by a CIEDE2000 of 17 or more, all ten by 10, also without red or without green cones (simulated
+after Machado et al., see tests/test_report.py). They were found by exchange among colours of a lightness of 46 to 67.
+"""
 
 
 class PlotPoint(NamedTuple):
@@ -89,6 +93,14 @@ class Axis:
             ]
         inside = [v for v in values if self.low * (1 - 1e-9) <= v <= self.high * (1 + 1e-9)]
         return [(v, number_text(v)) for v in inside]
+
+
+def style_of_curves() -> str:
+    """Rules of the style sheet for the classes k0 to k9, the colours of curves."""
+    return "\n".join(
+        f".plot .k{i}.curve, .plot .k{i}.theory {{ stroke: {c}; }} .plot .k{i}.band, .plot .k{i}.dot {{ fill: {c}; }}"
+        for i, c in enumerate(COLORS)
+    )
 
 
 def axis_of(values: Sequence[float], label: str, is_logarithmic: bool | None = None) -> Axis:
@@ -163,7 +175,7 @@ def point_plot(points: Sequence[tuple[str, int, float, float]], x: Axis, y: Axis
 def stacked_bars(
     labels: Sequence[str], stacks: Sequence[Sequence[tuple[str, float]]], x_label: str, alt: str
 ) -> Markup:
-    """Bars side by side, each a stack of parts (colour as #rrggbb or class, fraction 0..1) from below."""
+    """Bars side by side, each a stack of parts (colour as #rrggbb, fraction 0..1) from below."""
     x = Axis(x_label, "even", -0.6, len(labels) - 0.4, labels)
     y = Axis("fraction of the pixels, %", "linear", 0.0, 100.0)
     place, parts = _placed(x, y), [_axes(x, y)]
@@ -171,9 +183,9 @@ def stacked_bars(
         below = 0.0
         for color, fraction in stack:
             (x0, y0), (x1, y1) = place(number - 0.4, 100 * below), place(number + 0.4, 100 * (below + fraction))
-            fill = f'fill="{color}"' if color.startswith("#") else f'class="{color}"'
             if fraction > 0:
-                parts.append(f'<rect x="{x0:.1f}" y="{y1:.1f}" width="{x1 - x0:.1f}" height="{y0 - y1:.1f}" {fill}/>')
+                size = f'width="{x1 - x0:.1f}" height="{y0 - y1:.1f}"'
+                parts.append(f'<rect x="{x0:.1f}" y="{y1:.1f}" {size} fill="{color}"/>')
             below += fraction
     return _svg(parts, alt)
 

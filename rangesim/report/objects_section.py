@@ -67,7 +67,7 @@ def objects_sentence(measurement: Measurement) -> str:
     `measurement` is one of `rangesim.results.experiment_results.Result.measurements`:
 
     >>> objects_sentence(measurement)  # doctest: +SKIP
-    'Of 9 objects it finds 6, merges bottle with table, and misses glass; it invents 2.'
+    'Segmentation finds 6 of 9 objects, merges bottle with table, and misses glass; it invents 2.'
     """
     objects = measurement.objects
     if objects is None or not objects.objects:
@@ -82,12 +82,12 @@ def objects_sentence(measurement: Measurement) -> str:
             failures.append(f"{verb} {_listed(names)}")
     count, found = len(objects.objects), len(objects.names(Outcome.FOUND)) - len(_displaced(objects))
     hard = [o.name for o in objects.objects if not o.separable and o.outcome != Outcome.FOUND]
-    whole = f"Of {count} object{'s' * (count != 1)} it "
-    sentence = whole + ", ".join([f"finds {found or 'none'}", *failures[:-1]])
+    whole = f"Segmentation finds {found or 'none'} of {count} object{'s' * (count != 1)}"
+    sentence = ", ".join([whole, *failures[:-1]])
     if failures:
         sentence += f", and {failures[-1]}"
     sentence += f"; it invents {objects.invented}." if objects.invented else "."
-    alone = f" Even in the true depth the segmentation does not find {_listed(hard)}." if hard else ""
+    alone = f" Even in the true depth it does not find {_listed(hard)}." if hard else ""
     return sentence + alone
 
 

@@ -26,6 +26,7 @@ from rangesim.report.line_plots import (
     number_text,
     point_plot,
     stacked_bars,
+    style_of_curves,
 )
 from rangesim.report.template import render_page, text_of_file
 from rangesim.signals import ALL
@@ -79,7 +80,7 @@ class _Page:
             "title": sweep.title,
             "line": f"{_scene_name(sweep.scene)} · {len(sweep.points)} points · {len(self.names)} sensors · "
             f"{sweep.seeds} seeds · {len(result.plan.passes)} light-transport passes",
-            "plot_css": Markup(text_of_file("plots.css")),
+            "plot_css": Markup(text_of_file("plots.css") + style_of_curves()),
             "verdict": list(self._verdict()),
             "failed": [f"Pass {n + 1} failed: {error}" for n, error in (result.failed or {}).items()],
             "sensors": self._legend(self.names),
@@ -87,15 +88,12 @@ class _Page:
             "bounds": ", ".join(bounds),
             "without": ", ".join(without),
             "outlier_sigmas": 6,
+            "enough": f"{100 * ENOUGH:.0f} %",
             "level": 95,
             "seeds": sweep.seeds,
             "tolerance": _metres(sweep.tolerance_m),
             "verdicts": self._bars(_outcome_stack),
-            "outcomes": [
-                {"name": "right", "color": "#2a9d5c"},
-                {"name": "wrong", "color": "#d64545"},
-                {"name": "missing", "color": "#9aa5b1"},
-            ],
+            "outcomes": [{"name": name, "color": color} for name, color in palette.READING_COLORS.items()],
             "shown": self._shown,
             "whose": "the objects, each with the same weight" if self.kind == OBJECTS else "all surfaces",
             "causes": self._bars(_cause_stack) if self._causes else [],
@@ -174,6 +172,7 @@ class _Page:
                 within = _metres(self.sweep.tolerance_m)
                 yield f"Where {100 * RELIED:.0f} % of the readings are within {within}{at}: {'; '.join(reached)}."
         yield from self._ranking()
+        yield from self._invented()
         yield from self._objects()
         yield from self._theory()
         yield from self._exposure()
@@ -243,8 +242,21 @@ class _Page:
                 of = {n: v for n, v in at.items() if v is not None}
                 if of:
                     name = max(of, key=lambda n: of[n])
-                    best.append(f"{value}: {name} ({100 * of[name]:.0f} %)")
+                    right = f"{name} ({100 * of[name]:.0f} %)"
+                    best.append(f"{value}: {right if of[name] > tables.MOST else f'nobody on most, at best {right}'}")
             yield f"Most often right by {label_of(path)}: {'; '.join(best)}."
+
+    def _invented(self) -> Iterator[str]:
+        """Sentence about readings where there is no surface."""
+        clauses = []
+        for name in self.names:
+            rows = [r for r in self.result.summary if (r["sensor"], r["kind"]) == (name, ALL)]
+            most = max(rows, key=lambda r: r["invented_readings"], default=None)
+            if most is not None and most["invented_readings"]:
+                at = _values(self.sweep.points[most["point"]].values)
+                clauses.append(f"{name} {_number(most['invented_readings'])}{f' (at {at})' if at else ''}")
+        if clauses:
+            yield f"Most invented readings in a capture, of pixels that see no surface: {'; '.join(clauses)}."
 
     def _objects(self) -> Iterator[str]:
         """Sentences about what the failures of each sensor do to the objects."""
@@ -274,8 +286,8 @@ class _Page:
             clauses.append(f"{name} {inside} of {len(rows)} (median ratio {ratio:.2f})")
         if clauses:
             yield (
-                f"Points at which the closed form lies in the 95 % interval of the error, of those with readings in "
-                f"{100 * ENOUGH:.0f} % of the pixels: {', '.join(clauses)}."
+                f"Points at which the closed form lies in the 95 % interval of the error, of those within the sensor's "
+                f"range and with readings in {100 * ENOUGH:.0f} % of the pixels: {', '.join(clauses)}."
             )
 
     def _exposure(self) -> Iterator[str]:
@@ -355,7 +367,7 @@ class _Page:
         if not shown:
             return []
         values = [1e3 * r["error_m"].mean for r in shown]
-        values += [1e3 * r["theory_m"] for r in shown if r["theory_m"]]
+        values += [1e3 * r["theory_m"] for r in shown if _has_theory(r)]
         y = axis_of([v for v in values if v > 0], "error, mm", is_logarithmic=True)
         plots = []
         for others in self.others:
@@ -363,7 +375,7 @@ class _Page:
             for name in self.names:
                 rows = sorted(self._of(name, others), key=lambda row: place[row[axis]])
                 points = [PlotPoint(place[r[axis]], *(1e3 * v for v in r["error_m"])) for r in rows]
-                theory = [PlotPoint(place[r[axis]], 1e3 * r["theory_m"]) for r in rows if r["theory_m"]]
+                theory = [PlotPoint(place[r[axis]], 1e3 * r["theory_m"]) for r in rows if _has_theory(r)]
                 curves.append(Curve(name, self.color[name], points, theory))
             svg = line_plot(curves, x, y, f"Error of {', '.join(self.names)}", 1e3 * self.sweep.tolerance_m)
             plots.append({"name": _values(others), "svg": svg})
@@ -459,8 +471,9 @@ class _Page:
     def _numbers(self) -> dict[str, Any]:
         """The table of means."""
         paths = list(self.sweep.vary)
-        columns = [*(label_of(p) for p in paths), "sensor", "right, %", "wrong, %", "missing, %", "error, mm"]
-        columns += ["theory, mm", "bias, mm", "95 % within, mm", "exposure"]
+        labels = [*(label_of(p) for p in paths), "sensor", "right, %", "wrong, %", "missing, %", "error, mm"]
+        labels += ["theory, mm", "bias, mm", "95 % within, mm", "exposure"]
+        columns = [label.partition(", ")[::2] for label in labels]
         rows = []
         for r in self.rows[:MAX_NUMBERS]:
             cells = [*(_label(r[p]) for p in paths), r["sensor"]]
@@ -546,10 +559,14 @@ def _reads(row: Mapping[str, Any]) -> bool:
     return bool(row["right"].mean + row["wrong"].mean >= HALF)
 
 
+def _has_theory(row: Mapping[str, Any]) -> bool:
+    """Whether a row has a closed form, and readings in nearly all pixels, for which the closed form holds."""
+    return row["theory_m"] is not None and row["right"].mean + row["wrong"].mean >= ENOUGH
+
+
 def _is_comparable(row: Mapping[str, Any]) -> bool:
-    """Whether a row has a closed form, an interval, and readings in nearly all pixels."""
-    has_both = row["theory_m"] is not None and math.isfinite(row["error_m"].low)
-    return bool(has_both and row["right"].mean + row["wrong"].mean >= ENOUGH)
+    """Whether a row has an error to compare with theory, with a confidence interval."""
+    return _has_theory(row) and math.isfinite(row["error_m"].low)
 
 
 def _crossing(before: Mapping[str, Any], after: Mapping[str, Any], path: str, tolerance_m: float) -> float:
@@ -563,7 +580,7 @@ def _mean_right(rows: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def _outcome_stack(row: Mapping[str, Any]) -> list[tuple[str, float]]:
-    return [(kind, row[kind].mean) for kind in ("right", "wrong", "missing")]
+    return [(color, row[kind].mean) for kind, color in palette.READING_COLORS.items()]
 
 
 def _cause_stack(row: Mapping[str, Any]) -> list[tuple[str, float]]:

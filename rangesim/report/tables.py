@@ -258,7 +258,7 @@ def errors_markdown(comparison: Comparison) -> str:
 
     >>> from rangesim import errors_markdown
     >>> print(errors_markdown(comparison).splitlines()[0])
-    | surface | pixels | lit | right | wrong | missing | completeness | ... | flying rate |
+    | surface | pixels | lit | right | wrong | missing | completeness | ... | invented readings |
     """
     names = [f.name for f in fields(ErrorStatistics) if f.name not in ("kind", "name")]
     heads = [name.removesuffix("_m") + " mm" if name.endswith("_m") else name for name in names]
@@ -271,7 +271,7 @@ def errors_markdown(comparison: Comparison) -> str:
 
 def _plain(name: str, value: Any) -> str:
     """A value of `ErrorStatistics` as text."""
-    if isinstance(value, float) and math.isnan(value):
+    if value is None or (isinstance(value, float) and math.isnan(value)):
         return "-"
     if name.endswith("_m"):
         return f"{1000 * value:.2f}"
@@ -377,6 +377,23 @@ def automatic_exposures(taken: Mapping[str, MeasurementRecord]) -> str:
     return (
         f"is automatic: {', '.join(chosen)} per frame. Another distance, material or light gets another exposure, and "
         "so another noise: state exposure_s to compare them."
+    )
+
+
+def invented_readings(rows: Mapping[str, Rows]) -> str:
+    """Sentences, after the words "invented readings", on readings where there is no surface; empty if there are none.
+
+    Parameters
+    ----------
+    rows : statistics of each measurement, by the name that the sentence gives it.
+    """
+    counts = {name: of_one[-1]["invented_readings"] for name, of_one in rows.items()}
+    found = [f"{name} {count}" for name, count in counts.items() if count]
+    if not found:
+        return ""
+    return (
+        f"are those of pixels that see no surface: {', '.join(found)}. Right, wrong and missing do not count them, "
+        "because they are fractions of the pixels that see one."
     )
 
 

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from rangesim.evaluation.surface_rows import MATERIAL, OBJECT, OBJECTS
+from rangesim.report.objects_section import objects_sentence
 from rangesim.report.tables import (
     Rows,
     automatic_exposures,
+    invented_readings,
     is_reference,
     is_reliable,
     millimetres,
@@ -44,7 +46,7 @@ def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
     """Findings about a result: real sensors side by side, right readings and failures of each, automatic exposures."""
     names = titles(measurements)
     real = [m for m in measurements if not is_reference(m)] or list(measurements)
-    findings = [Finding(names[m.name], _right(m) + _worst(m.rows) + _reasons(m.rows) + _accuracy(m)) for m in real]
+    findings = [Finding(names[m.name], _of_one(m)) for m in real]
     if len(real) > 1:
         parts = [
             _most_right(real, names),
@@ -54,12 +56,20 @@ def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
         ]
         if any(parts):  # ideal sensors alone may be equal in all of these
             findings.insert(0, Finding("Side by side", " ".join(filter(None, parts))))
+    if text := invented_readings({names[m.name]: m.rows for m in real}):
+        findings.append(Finding("Invented readings", text))
     if text := automatic_exposures({names[m.name]: m.metadata for m in real}):
         findings.append(Finding("Exposure", text))
     return findings
 
 
 # ---- One sensor ----------------------------------------------------------------------------------------------------
+
+
+def _of_one(m: Measurement) -> str:
+    """Sentences about one sensor."""
+    about = [_right(m) + _worst(m.rows) + _reasons(m.rows) + _accuracy(m), objects_sentence(m)]
+    return " ".join(filter(None, about))
 
 
 def _right(measurement: Measurement) -> str:

@@ -177,6 +177,7 @@ class RowRecord(Record, frozen=True, kw_only=True):
     detector_sigma_m: Metres | None = None
     sampling_sigma_m: Metres | None = None
     completeness_error: Fraction | None = None
+    invented_readings: Count | None = None
 
 
 class ComparisonRecord(Record, frozen=True, kw_only=True):

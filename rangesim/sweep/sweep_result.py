@@ -85,7 +85,8 @@ class SweepResult(ShortRepr):
     def summary(self) -> list[dict[str, Any]]:
         """One dict for each point, sensor and surface, with means and confidence intervals over the seeds.
 
-        Columns of `MEANS` and `FRACTIONS` hold an `Interval`; `theory_m` is a number or None; `causes` holds fractions.
+        Columns of `MEANS` and `FRACTIONS` hold an `Interval`; `theory_m` and `invented_readings` are numbers or None;
+        `causes` holds fractions.
         """
         groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
         for row in self.rows:
@@ -102,6 +103,7 @@ class SweepResult(ShortRepr):
         found["theory_m"] = _mean([row["theory_m"] for row in rows])
         found["sampling_sigma_m"] = cell.sampling_sigma_m.get((first["kind"], first["name"]))
         found |= {name: _fraction([row[name] for row in rows], pixels) for name in FRACTIONS}
+        found["invented_readings"] = _mean([row["invented_readings"] for row in rows])
         found["causes"] = cell.causes[first["kind"], first["name"]]
         if first["kind"] == ALL and cell.objects is not None:
             found |= {f"objects_{name}": count for name, count in cell.objects.items()}

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ def carry_out(
     run.carry_out(dict(items))
     failed = {n: run.failed[key] for n, (key, _) in enumerate(items) if key in run.failed}
     results = {n: run.read(key) for n, (key, _) in enumerate(items) if n not in failed}
-    warnings = dict.fromkeys(text for one in results.values() for text in one["warnings"])
+    warnings = _merged(text for one in results.values() for text in one["warnings"])
     rows, cells = [], {}
     for cell in planned.cells:
         if cell.light_pass in failed:
@@ -69,7 +70,18 @@ def carry_out(
         point = {"point": cell.point, **planned.sweep.points[cell.point].values}
         for seed, of_seed in enumerate(made["rows"]):
             rows += [{**point, "sensor": cell.sensor, "seed": seed, **row} for row in of_seed]
-    return SweepResult(planned, rows, cells, exposures, tuple(warnings), failed)
+    return SweepResult(planned, rows, cells, exposures, warnings, failed)
+
+
+def _merged(warnings: Iterable[str]) -> tuple[str, ...]:
+    """Warnings, each once; of those that differ in their numbers alone, the first, with the count of the others."""
+    alike: dict[str, list[str]] = {}
+    for text in dict.fromkeys(warnings):
+        alike.setdefault(re.sub(r"(?<![\w.-])[0-9.]+", "#", text), []).append(text)
+    return tuple(
+        first if not others else f"{first} The same with other numbers: {len(others)} more."
+        for first, *others in alike.values()
+    )
 
 
 class _Run:
