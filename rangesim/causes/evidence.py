@@ -221,18 +221,12 @@ class Evidence:
             edges = edges | (self.truth.farthest_m > across(self.truth.nearest_m, self.tolerance_m))
         return edges if not reach else binary_dilation(edges, np.ones((3, 3)), iterations=reach)
 
-    def merely_inclined(self, where: np.ndarray) -> np.ndarray:
-        """Whether pixels `where` (h, w) are only at the apparent edge of one steep surface, which the sensor would read
-        correctly over the whole pixel without the light that disturbs it. It is False for readings that reach beyond
-        the pixel, and so to a true edge."""
-        if self.readings.decoder.reach_px:
-            return np.zeros(where.shape, dtype=bool)
-        inclined = self.inclined(where & self._may_blur)
-        return inclined & ~self.blurred(inclined)
-
     def inclined(self, where: np.ndarray) -> np.ndarray:
         """Whether all neighbours of pixels `where` (h, w) lie on the tangent plane of the surface at the pixel's
-        centre: the pixel covers one surface, however steep."""
+        centre: the pixel covers one surface, however steep. It is False for readings that reach beyond the pixel, and
+        so to a true edge."""
+        if self.readings.decoder.reach_px:
+            return np.zeros(where.shape, dtype=bool)
         rig = self.signals.rig
         planes, (rows, columns) = TangentPlanes(rig, self.truth, self.true_m, where), self.pixels.around(where, 1)
         origins, rays = (x.reshape(*rows.shape, 3) for x in rig.camera.rays_at((rows.ravel(), columns.ravel())))
@@ -357,7 +351,7 @@ class Evidence:
     def blurred(self, where: np.ndarray) -> np.ndarray:
         """Whether the reading of straight paths to the whole area of pixels `where` (h, w), on their tangent planes,
         has half of the error or more, or is missing; it is looked at only where other light disturbs the pixel too."""
-        where = where & self._may_blur
+        where = where & self.may_blur
         if self.capture.sensor.compares_texture:
             return where & self.coarse(where)
         if self.readings.is_by_pixel:
@@ -365,7 +359,7 @@ class Evidence:
         return where & self._wrong_over_areas
 
     @cached_property
-    def _may_blur(self) -> np.ndarray:
+    def may_blur(self) -> np.ndarray:
         """Whether the pixel fails without noise, is disturbed by indirect light, and shows a lit surface that is
         neither a mirror nor glass."""
         lit = ~self.in_shadow & ~self.is_a("transparent", "mirror")
@@ -423,7 +417,7 @@ class Evidence:
         sensor = self.capture.sensor
 
         def frames_of(one: Signals) -> np.ndarray:
-            spread = np.isfinite(one.truth.z) if sensor.compares_texture else self._may_blur
+            spread = np.isfinite(one.truth.z) if sensor.compares_texture else self.may_blur
             return footprint_frames(sensor, one.rig, one.truth, spread)
 
         return self._wrong_in(frames_of)

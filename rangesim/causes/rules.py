@@ -137,11 +137,12 @@ def rules(e: Evidence, left: np.ndarray) -> Iterator[Rule]:
     yield e.coarse(left & e.optical), Cause.RESOLUTION
     # ---- The pixel covers more than one distance
     yield e.moving, Cause.MOTION
-    disturbed_edge = left & e.at_edge & disturbed
-    yield e.at_edge & ~(e.fails_off_edge(disturbed_edge) | e.merely_inclined(disturbed_edge)), Cause.DEPTH_EDGE
+    blurred, disturbed_edge = e.blurred(left & e.optical), left & e.at_edge & disturbed
+    merely_inclined = e.inclined(disturbed_edge & e.may_blur) & ~blurred
+    yield e.at_edge & ~(e.fails_off_edge(disturbed_edge) | merely_inclined), Cause.DEPTH_EDGE
     yield e.in_shadow, Cause.SHADOWED
     yield e.optical & ~disturbed & e.beside_shadow, Cause.SHADOWED
-    yield e.blurred(left & e.optical), Cause.RESOLUTION
+    yield blurred, Cause.RESOLUTION
     yield disturbed & e.mostly(CAUSTIC, OTHER), Cause.CAUSTIC
     yield disturbed & e.mostly(SPECULAR, OTHER), Cause.MIRRORED_GHOST
     yield disturbed & e.mostly(MULTIPATH, OTHER), Cause.MULTIPATH
