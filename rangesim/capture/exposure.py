@@ -20,7 +20,7 @@ from rangesim.settings.seeds import check_seed, derived_seed
 
 if TYPE_CHECKING:
     from rangesim.electronics.ambient import Ambient
-    from rangesim.signals import Signals, SignalSet, StillSignals
+    from rangesim.signals import Signals, SignalSet
 
 TARGET_FRACTION = 0.7
 """Fraction of the saturation capacity to which automatic exposure brings the bright pixels (`bright_level`).
@@ -260,25 +260,6 @@ def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:
         mean = frames.mean(axis=(1, 2), dtype=np.float64, keepdims=True)
         frames = ((1 - stray) * frames + stray * mean).astype(np.float32)
     return frames
-
-
-def radiance_of_pixels(
-    signals: StillSignals, where: np.ndarray, sensor: Sensor, transmission: float, sampling_errors: float = 0.0
-) -> np.ndarray:
-    """(k, 1, n) float32, W/m2/sr, mean radiance of the frames of some pixels alone, behind a lens without stray light.
-
-    The sensor is one that is read by pixel (`Decoder.pixel_reader`).
-
-    Parameters
-    ----------
-    where : (h, w) bool, the n pixels. transmission : factor (0..1) on the ambient light.
-    sampling_errors : as for `mean_radiance`.
-    """
-    frames, fraction = (
-        signals.frames_of_pixels(where, sensor, transmission, sampling_errors),
-        signals.rig.camera_illumination,
-    )
-    return frames if (fraction == 1).all() else np.asarray(frames * fraction[where])
 
 
 def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetector, rig: Rig) -> float:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.capture.exposure import auto_exposure_s, expose, mean_radiance, radiance_of_pixels
+from rangesim.capture.exposure import auto_exposure_s, expose, mean_radiance
 from rangesim.decoding import decode
 from rangesim.decoding.disparities import ImageNoise
 from rangesim.electronics.ambient import Ambient
@@ -193,11 +193,22 @@ class _Pixels:
         above, below = (self._read(sampling_errors) for sampling_errors in (1.0, -1.0))
         return above, below
 
+    @cached_property
+    def _row(self) -> tuple[StillSignals, np.ndarray]:
+        """The light of these pixels as an image of one row, and the relative illumination (1, n) of the pixels."""
+        row, illumination = self.signals.row_of_pixels(self.some, self.sensor), self.signals.rig.camera_illumination
+        return row, illumination[self.some][None]
+
+    def _radiance(self, transmission: float, sampling_errors: float = 0.0) -> np.ndarray:
+        """(k, 1, n) float32, W/m2/sr, frames of these pixels, for that fraction of the ambient light."""
+        row, illumination = self._row
+        frames = row.frames(self.sensor, transmission, sampling_errors)
+        return frames if (illumination == 1).all() else np.asarray(frames * illumination)
+
     def _read(self, sampling_errors: float) -> np.ndarray:
         """(n,) float64, metres, depths with so many draws of the sampling error, without noise."""
         assert self.reader is not None
-        transmission = 1.0 if self.ambient is None else self.ambient.scale
-        frames = radiance_of_pixels(self.signals, self.some, self.sensor, transmission, sampling_errors)
+        frames = self._radiance(1.0 if self.ambient is None else self.ambient.scale, sampling_errors)
         found = self.reader(Capture(frames, self.sensor)).spread(self.some)
         return self.decoder.placed(found, self.signals.rig).reading_m[self.some].astype(np.float64)
 
@@ -215,7 +226,7 @@ class _Pixels:
             radiance = mean_radiance(signals, sensor, detector, self.ambient)[:, self.some][:, None]
         else:
             passed = detector.ambient_fraction(sensor.gate, self.ambient)
-            radiance = radiance_of_pixels(signals, self.some, sensor, passed)
+            radiance = self._radiance(passed)
         if exposure_s is None:
             exposure_s = auto_exposure_s(radiance, sensor, detector, rig)
         light = light_of_exposure(signals, sensor, detector, exposure_s, self.ambient).of_pixels(self.some)

@@ -270,10 +270,9 @@ def measure(
     capture, photons = exposure.capture, exposure.photons_per_pulse()
     if instrument.exposure_s is None:
         exposure.warn_of_overexposure(instrument.name)
-    del exposure  # frees its radiance, which is as large as the frames
     with timed(times, "decode"):
         image = decode(capture, instrument.decoder)
-    noise, readings = None, ReferenceReadings(image, capture, signals)
+    noise, readings = None, ReferenceReadings(image, capture, signals, exposure.radiance)
     if sampling_error and signals.knows_sampling_error:
         with timed(times, "noise"):
             noise = noise_of(readings)
@@ -281,6 +280,7 @@ def measure(
     comparison = compare(image, signals.truth, tolerance_m)
     with timed(times, "causes"):
         causes = causes_of(readings, tolerance_m)
+    del readings, exposure  # frees the radiance, which is as large as the frames
     rows = [row | failures for row, failures in zip(comparison.rows(), causes.fractions(signals.truth), strict=True)]
     if noise is not None:
         rows = [row | sigmas for row, sigmas in zip(rows, noise.by_surface(signals.truth), strict=True)]

@@ -288,15 +288,13 @@ class StillSignals(Signals):
     def knows_sampling_error(self) -> bool:
         return self.sampling is not None
 
-    def frames_of_pixels(
-        self, where: np.ndarray, sensor: Sensor, ambient_transmission: float = 1.0, sampling_errors: float = 0.0
-    ) -> np.ndarray:
-        """(k, 1, n) float32, W/m2/sr, `frames` of some pixels alone, for a sensor that is read by pixel
-        (`Decoder.pixel_reader`).
+    def row_of_pixels(self, where: np.ndarray, sensor: Sensor) -> StillSignals:
+        """The light of some pixels alone as an image of one row, (1, n), for `frames` of a sensor that is read by pixel
+        (`Decoder.pixel_reader`). `rig` and `truth` are still those of the whole image.
 
         Parameters
         ----------
-        where : (h, w) bool, the n pixels.
+        where : (h, w) bool, the n pixels. sensor : the sensor whose channels are kept.
         """
         pixels = np.flatnonzero(where)
 
@@ -304,11 +302,10 @@ class StillSignals(Signals):
             return {r: channels[r].reshape(r.channels, -1).take(pixels, axis=1)[:, None] for r in sensor.responses()}
 
         energy = EnergySplit(*(getattr(self.energy, field.name)[where][None] for field in fields(self.energy)))
-        channels, sampling = row_of(self.channels), self.sampling
-        if sampling_errors and sampling is not None:
+        sampling = self.sampling
+        if sampling is not None:
             sampling = SamplingError(row_of(sampling.channels), sampling.projector[where][None])
-        row = replace(self, energy=energy, channels=channels, sampling=sampling)
-        return row.frames(sensor, ambient_transmission, sampling_errors)
+        return replace(self, energy=energy, channels=row_of(self.channels), sampling=sampling)
 
     def frames(self, sensor: Sensor, ambient_transmission: float = 1.0, sampling_errors: float = 0.0) -> np.ndarray:
         missing = [r for r in sensor.responses() if r not in self.channels]
