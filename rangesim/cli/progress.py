@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from rangesim.pipeline.cost import Cost
 
 
+HOW_TO_RETRY = "rangesim: the same command with --retry computes again what failed"
+"""Line at the end of a command some of whose items failed."""
+
+
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, float], None] | None]:
     """Show a progress bar while the block runs, if stderr is a terminal.
