@@ -133,7 +133,7 @@ def _begin(spec: DatasetSpec, folder: Path) -> None:
     if found.spec != wanted.spec:
         keys = [key for key in {**wanted.spec, **found.spec} if wanted.spec.get(key) != found.spec.get(key)]
         raise FileFormatError(
-            f"{folder} is a data set of another specification ({', '.join(keys)} differ); name another directory."
+            f"{folder} is a data set of another specification, different in {', '.join(keys)}; name another directory."
         )
     if found.versions != wanted.versions:
         other = [name for name in wanted.versions if found.versions.get(name) != wanted.versions[name]]
