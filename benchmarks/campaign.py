@@ -3,10 +3,10 @@
 
     python benchmarks/campaign.py [--only speedup] [--only kills] [--only memory] [--only overhead] [--quick]
 
-An item is a scene of 160 x 120 pixels, seen by a Gray code and by an AMCW camera, with its frames, depths and causes.
+An item is a sample of the data set of `campaign_plan.py`: ten parts on a table, three sensors, 160 x 120 pixels.
 
 - speedup: one worker of one thread against two such workers, items per second once the workers are warm; the median of
-  three rounds, which alternate.
+  three rounds, which alternate. Two processes of Python's own pool against one show what the machine allows.
 - kills: a run that is killed at least 20 times over 200 items, by SIGKILL, against an undisturbed one, byte by byte.
   Half of it runs on an embedded cluster, where workers and driver are killed; half on a second scheduler process,
   reached by its address, which is killed, too. Some drivers are killed at a rename, before or after it.
@@ -22,6 +22,7 @@ import argparse
 import contextlib
 import itertools
 import json
+import multiprocessing
 import os
 import random
 import signal
@@ -31,15 +32,20 @@ import sys
 import tempfile
 import threading
 import time
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import psutil
+from campaign_plan import TEN_PARTS
 
 from rangesim.campaign import ItemStore, Outcome, Workers, run_items, workers
+from rangesim.campaign.in_worker import THREAD_VARIABLES
+from rangesim.campaign.workers import BLAS_VARIABLES
+from rangesim.dataset import DatasetSpec, spec_from_dict
+from rangesim.dataset.sample import sample_bytes
 
 PORT = 18787
 """Port of the second scheduler, other than Dask's usual one."""
@@ -61,34 +67,26 @@ class Size(NamedTuple):
     empty: int
 
 
-FULL = Size(width=160, scenes=200, kills=20, timed=40, rounds=3, remembered=1000, empty=2000)
-QUICK = Size(width=48, scenes=24, kills=4, timed=8, rounds=1, remembered=30, empty=200)
+FULL = Size(width=160, scenes=200, kills=20, timed=60, rounds=3, remembered=1000, empty=2000)
+QUICK = Size(width=48, scenes=24, kills=4, timed=16, rounds=1, remembered=30, empty=200)
 
 
-def scene_bytes(task: tuple[int, int]) -> bytes:
-    """Frames, depths, states and causes of a scene of a seed and a width; no times."""
-    from rangesim.experiment import Experiment
-    from rangesim.pipeline.experiment_run import carry_out
-    from rangesim.presets import instrument
+def specification(size: Size) -> DatasetSpec:
+    """The data set whose samples are the items: ten parts on a table, three sensors."""
+    return spec_from_dict({"scenes": size.scenes, **TEN_PARTS, "width": size.width, "height": size.width * 3 // 4})
 
-    seed, width = task
-    instruments = (instrument("gray"), instrument("amcw"))
-    experiment = Experiment(
-        "tabletop", width=width, height=width * 3 // 4, spp=2, photons=0, seed=seed, instruments=instruments
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        result = carry_out(experiment)
-    arrays = [a for m in result.measurements for a in (m.capture.frames, m.image.z, m.image.status, m.causes.cause)]
-    return b"".join(array.tobytes() for array in arrays)
+
+def samples(size: Size) -> Callable[[int], bytes]:
+    """The function of an item: the bytes of the sample of a number."""
+    return partial(sample_bytes, specification(size))
 
 
 def nothing(_: int) -> bytes:
     return b""
 
 
-def scenes(size: Size, count: int) -> dict[str, Any]:
-    return {f"scene-{seed:04}": (seed, size.width) for seed in range(count)}
+def scenes(count: int) -> dict[str, int]:
+    return {f"scene-{number:04}": number for number in range(count)}
 
 
 @contextlib.contextmanager
@@ -109,19 +107,35 @@ def rate(count: int, function: Callable[[Any], bytes], items: dict[str, Any], wa
     return (len(ends) - warm) / (ends[-1] - ends[warm - 1])
 
 
+def rate_of_pool(count: int, function: Callable[[Any], bytes], items: dict[str, Any], warm: int) -> float:
+    """Items per second of `count` processes of Python's own pool, which only hands numbers out: the machine's limit."""
+    threads = dict.fromkeys((*BLAS_VARIABLES, *THREAD_VARIABLES), "1")
+    before = {name: os.environ.get(name) for name in threads}
+    os.environ.update(threads)
+    try:
+        with multiprocessing.get_context("spawn").Pool(count) as pool:
+            ends = [time.monotonic() for _ in pool.imap_unordered(function, items.values())]
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+    return (len(ends) - warm) / (ends[-1] - ends[warm - 1])
+
+
 def speedup(size: Size) -> dict[str, Any]:
-    """How much faster two workers are than one, and the scenes per hour of one."""
-    rates: dict[int, list[float]] = {1: [], 2: []}
+    """How much faster two workers are than one, the same of two bare processes, and the scenes per hour of one."""
+    rates: dict[str, dict[int, list[float]]] = {"dask": {1: [], 2: []}, "pool": {1: [], 2: []}}
     load = os.getloadavg()[0]
-    for _, count in itertools.product(range(size.rounds), (1, 2)):
-        rates[count].append(rate(count, scene_bytes, scenes(size, size.timed * count), warm=2 * count))
-        print(f"{count} workers: {rates[count][-1]:.3f} scenes per second", file=sys.stderr)
-    one, two = (statistics.median(rates[count]) for count in (1, 2))
+    for _, count, way in itertools.product(range(size.rounds), (1, 2), rates):
+        of = rate if way == "dask" else rate_of_pool
+        rates[way][count].append(of(count, samples(size), scenes(size.timed), warm=4))
+        print(f"{count} workers, {way}: {rates[way][count][-1]:.3f} scenes per second", file=sys.stderr)
+    median = {way: {count: statistics.median(found) for count, found in by.items()} for way, by in rates.items()}
     return {
-        "speedup_2_workers": round(two / one, 3),
-        "scenes_per_hour_core": round(3600 * one),
+        "speedup_2_workers": round(median["dask"][2] / median["dask"][1], 3),
+        "speedup_2_processes": round(median["pool"][2] / median["pool"][1], 3),
+        "scenes_per_hour_core": round(3600 * median["dask"][1]),
         "load_before": load,
-        "rates": {count: [round(x, 4) for x in found] for count, found in rates.items()},
+        "rates": {way: {n: [round(x, 4) for x in found] for n, found in by.items()} for way, by in rates.items()},
     }
 
 
@@ -141,7 +155,7 @@ def memory(size: Size) -> dict[str, Any]:
         resident.append(worker.memory_info().rss)
 
     with folder() as out:
-        outcome = run_items(scene_bytes, scenes(size, size.remembered), ItemStore(out), Workers(count=1), on_done=weigh)
+        outcome = run_items(samples(size), scenes(size.remembered), ItemStore(out), Workers(count=1), on_done=weigh)
     part = min(50, (size.remembered - 10) // 2)
     first, last = statistics.median(resident[10 : 10 + part]), statistics.median(resident[-part:])
     return {
@@ -228,7 +242,7 @@ def drive(out: str, width: str, count: str, scheduler: str, die_at: str) -> Outc
     os.replace = replace
     by = Workers(scheduler=scheduler) if scheduler else Workers(count=2)
     size = FULL._replace(width=int(width))
-    return run_items(scene_bytes, scenes(size, int(count)), ItemStore(out), by)
+    return run_items(samples(size), scenes(int(count)), ItemStore(out), by)
 
 
 def stored(out: Path) -> int:
@@ -277,8 +291,8 @@ def kills(size: Size) -> dict[str, Any]:
     """Bytes that differ between a run that is killed again and again and an undisturbed one."""
     with folder() as place:
         calm, shaken = place / "calm", place / "shaken"
-        items = scenes(size, size.scenes)
-        run_items(scene_bytes, items, ItemStore(calm), Workers(count=2))
+        items = scenes(size.scenes)
+        run_items(samples(size), items, ItemStore(calm), Workers(count=2))
         done = disturbed(shaken, size, size.scenes // 2, size.scenes, size.kills // 2, None)
         cluster = Cluster()
         try:

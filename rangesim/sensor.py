@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
 
@@ -401,8 +401,22 @@ class Decoder(Named, ABC):
             capture.sensor.check(capture.rig.projector.width, capture.rig.projector.height)
             if self.working_range is not None:
                 self.working_range.check(capture.rig.camera)
-        image = self.coordinates(capture).range_image(capture.rig)
+        return self.placed(self.coordinates(capture), capture.rig)
+
+    def placed(self, coordinates: Coordinates, rig: Rig | None) -> RangeImage:
+        """Range image of coordinates that this decoder has read, without those outside its working range."""
+        image = coordinates.range_image(rig)
         return image if self.working_range is None else self.working_range.applied_to(image)  # type: ignore[no-any-return]
+
+    def pixel_reader(self, sensor: Sensor) -> Callable[[Capture], Coordinates] | None:
+        """A function that reads simulated captures of a sensor as `coordinates` does, without checks of the capture as
+        a whole; None, the default, if frames or reading of a pixel depend on other pixels.
+
+        A capture is simulated here if it is noise-free, or if its detector is known. With such a function, some pixels
+        can be simulated and read without the others, as a capture of one row. Of the whole image, only the level of the
+        bright pixels (`rangesim.capture.bright_level`) may count.
+        """
+        return None
 
     @abstractmethod
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:

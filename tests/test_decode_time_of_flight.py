@@ -17,6 +17,7 @@ from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
+from rangesim.decoding.centroid_error import PulseCounts, centroid_error
 from rangesim.decoding.histogram import coates, find_peak, window_reach
 from rangesim.decoding.matched_filter import gaussian_filter
 from rangesim.decoding.path_length import range_from_path_length
@@ -292,6 +293,40 @@ def test_a_peak_is_where_brute_force_finds_it() -> None:
     inside = np.take_along_axis(histograms, np.concatenate([window[-reach:], window[: reach + 1]]), axis=0).sum(axis=0)
     np.testing.assert_allclose(height + background, inside, rtol=1e-12)
     np.testing.assert_allclose(background / width, 3.0, rtol=0.2)
+
+
+def drawn_histograms(counts: PulseCounts, bins: int, sigma_bins: float, drawn: int) -> np.ndarray:
+    """(bins, drawn) counts of a Gaussian pulse on an even background, with the noise of photons, without pile-up."""
+    rng, edges = np.random.default_rng(3), np.arange(bins + 1)
+    means = counts.pulse * np.diff(norm.cdf((edges - counts.place) / sigma_bins)) + counts.background
+    if np.isinf(counts.trials):
+        return rng.poisson(means[:, None], (bins, drawn)).astype(np.float64)
+    met = 1 - np.exp(-np.cumsum(means) / counts.trials)  # fraction of the pulses that have met a photon
+    firsts = rng.multinomial(int(counts.trials), np.append(np.diff(met, prepend=0.0), 1 - met[-1]), drawn)
+    return coates(np.ascontiguousarray(firsts.T[:-1]), int(counts.trials))
+
+
+@pytest.mark.parametrize("within_bin", [0.0, 0.25, 0.5])
+@pytest.mark.parametrize(
+    ("pulse", "background", "trials", "sigma_bins"),
+    [
+        (30, 0.0, np.inf, 4.25),
+        (300, 1.0, np.inf, 4.25),
+        (1000, 0.0, np.inf, 4.25),
+        (10000, 0.0, np.inf, 4.25),
+        (1000, 1.0, 1500, 4.25),
+        (300, 0.0, np.inf, 1.5),
+    ],
+)
+def test_the_error_of_a_peak_is_that_of_drawn_histograms(
+    pulse: float, background: float, trials: float, sigma_bins: float, within_bin: float
+) -> None:
+    """Whole bins, background and pile-up included; a pulse in the middle of its bin is read best."""
+    bins, place = 64, 30 + within_bin
+    counts = PulseCounts(np.array(place), np.array(float(pulse)), np.array(background), trials)
+    found, _, _ = find_peak(drawn_histograms(counts, bins, sigma_bins, 20_000), sigma_bins, is_cyclic=True)
+    error = float(centroid_error(counts, bins, sigma_bins, is_cyclic=True))
+    assert np.sqrt(np.mean((found - place) ** 2)) == pytest.approx(error, rel=0.02)  # four standard errors
 
 
 # ---- A laser that fires again and again -------------------------------------------------------------

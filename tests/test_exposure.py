@@ -15,6 +15,7 @@ from rangesim.capture.exposure import TARGET_FRACTION, expose, exposed
 from rangesim.electronics.detector import Detector, PhotoDetector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import RangesimWarning
+from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
 from rangesim.pipeline.experiment_run import measure
 from rangesim.response import SPEED_OF_LIGHT
@@ -115,7 +116,7 @@ def test_light_too_strong_for_the_shortest_exposure_is_said_with_its_share(
     with pytest.warns(
         RangesimWarning, match=r"near: the detector's shortest .* take less light .its power_w is 1."
     ) as said:
-        capture = measure(near, signals, 0, None).capture
+        capture = measure(Experiment("-", instruments=(near,)), near, signals, None).capture
     saturated = np.mean(capture.saturated(capture.frames)[lit])
     told = float(str(said[0].message).split("saturates ")[1].split(" %")[0])
     assert saturated > 0.5
@@ -127,7 +128,7 @@ def test_light_too_strong_for_the_shortest_exposure_is_said_with_its_share(
     ):
         with warnings.catch_warnings(record=True) as said_else:
             warnings.simplefilter("always")
-            measure(instrument, light, 0, None)
+            measure(Experiment("-", instruments=(instrument,)), instrument, light, None)
         assert not [w for w in said_else if "shortest exposure" in str(w.message)]
 
 

@@ -28,6 +28,7 @@ from rangesim import (
 from rangesim.causes import explain
 from rangesim.errors import RangesimWarning, SamplingWarning, warn
 from rangesim.evaluation.range_noise import Repeats, range_noise, robust_sigma, warn_of_sampling
+from rangesim.experiment import Experiment
 from rangesim.instrument.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
 from rangesim.instrument.instrument import Instrument
 from rangesim.light_transport.loop import SampleAllocation
@@ -121,7 +122,8 @@ def test_an_instrument_decodes_and_exposes_the_same_light_once(
 
     monkeypatch.setattr(decoder, "decode", noted)
     monkeypatch.setattr(StillSignals, "frames", frames)
-    measured = measure(Instrument("direct", sensor), signals, seed=1, true_segmentation=None)
+    one = Instrument("direct", sensor)
+    measured = measure(Experiment("-", instruments=(one,), seed=1), one, signals, None)
     assert measured.causes.failed.any()
     assert len(read) == len(set(read)) == decodings
     filtered = lit[0]

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -18,8 +17,8 @@ from rangesim.causes.light_budget import LightBudget, light_budget, white_radian
 from rangesim.causes.reference_frames import (
     TangentPlanes,
     footprint_frames,
+    frames_of_pixels,
     points_in_projector,
-    single_path_frames,
 )
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
@@ -124,7 +123,7 @@ class Evidence:
     def optical(self) -> np.ndarray:
         """Whether optics is to blame: even without noise, ambient light and saturation, the pixel fails or keeps at
         least half of its error."""
-        return self._wrong(self._of_failed_pixels(self.readings.emitter_alone))
+        return self._wrong(self.readings.emitter_alone)
 
     @cached_property
     def saturated(self) -> np.ndarray:
@@ -151,7 +150,7 @@ class Evidence:
         without = self.readings.without_glass
         if without is None:
             return np.zeros(self.true_m.shape, dtype=bool)
-        healed = ~self._wrong(self._of_failed_pixels(without))
+        healed = ~self._wrong(without)
         return np.asarray(self.optical & (healed | (self.image.status == Status.OUT_OF_RANGE)))
 
     @cached_property
@@ -160,7 +159,7 @@ class Evidence:
         error, but not the one without what the lens adds."""
         if not self.signals.rig.camera_lens.stray_light:
             return np.zeros(self.true_m.shape, dtype=bool)
-        return np.asarray(~self.optical & self._wrong(self._of_failed_pixels(self.readings.noise_free)))
+        return np.asarray(~self.optical & self._wrong(self.readings.noise_free))
 
     @cached_property
     def piled_up(self) -> np.ndarray:
@@ -234,7 +233,7 @@ class Evidence:
         """Whether all neighbours lie on the tangent plane of the surface at the pixel's centre: the pixel covers
         one surface, however steep."""
         rig, where = self.signals.rig, self.failed & self.at_edge
-        planes, (rows, columns) = TangentPlanes(rig, self.truth, where), self.pixels.around(where, 1)
+        planes, (rows, columns) = TangentPlanes(rig, self.truth, self.true_m, where), self.pixels.around(where, 1)
         origins, rays = (x.reshape(*rows.shape, 3) for x in rig.camera.rays_at((rows.ravel(), columns.ravel())))
         fits = np.ones(len(rows), dtype=bool)
         for n in range(rows.shape[1]):
@@ -331,7 +330,8 @@ class Evidence:
 
     @cached_property
     def coarse(self) -> np.ndarray:
-        """Whether the reading of the straight path alone is missing, or still has half of the error or more.
+        """Whether optics is to blame, and the reading of the straight path alone is missing, or still has half of the
+        error or more.
 
         A sensor that compares texture needs straight paths to the whole area of each pixel; beside a depth edge, the
         edge is to blame.
@@ -339,10 +339,10 @@ class Evidence:
         sensor = self.capture.sensor
         if not sensor.reads_emitter:
             return np.zeros(self.truth.z.shape, dtype=bool)
+        where = self.optical & np.isfinite(self.truth.z)
         if sensor.compares_texture:
-            spread = self._read(lambda one: footprint_frames(sensor, one.rig, one.truth, np.isfinite(one.truth.z)))
-            return self._wrong(spread) & ~self.at_edge
-        return self._wrong(self._read(lambda one: single_path_frames(sensor, one.rig, one.truth)))
+            return where & self._wrong_in_straight_light(where, is_spread=True) & ~self.at_edge
+        return where & self._wrong_in_straight_light(where)
 
     @cached_property
     def textureless(self) -> np.ndarray:
@@ -360,9 +360,7 @@ class Evidence:
         sensor, spread = self.capture.sensor, self._may_blur
         if sensor.compares_texture:
             return spread & self.coarse
-        if not spread.any():
-            return spread
-        return spread & self._wrong(self._read(lambda one: footprint_frames(sensor, one.rig, one.truth, spread)))
+        return spread & self._wrong_in_straight_light(spread, is_spread=True)
 
     @cached_property
     def _may_blur(self) -> np.ndarray:
@@ -400,19 +398,31 @@ class Evidence:
         """
         return np.asarray(np.where(self.missing, self.tolerance_m, np.abs(self.error) / 2))
 
-    def _read(self, frames_of: Callable[[Signals], np.ndarray]) -> np.ndarray:
-        """(n,) float64 depths in the failed pixels, metres, that the decoder reads from noise-free frames (k, h, w),
-        which a function makes for each camera."""
-        (z,) = self.readings.read([capture_of_frames(self.signals, self.capture.sensor, frames_of)])
-        return self._of_failed_pixels(z)
+    def _wrong_in_straight_light(self, where: np.ndarray, is_spread: bool = False) -> np.ndarray:
+        """(h, w) bool, whether failed pixels have half of their error or more, or no reading, in frames of straight
+        paths alone; undefined outside `where`.
 
-    def _of_failed_pixels(self, z: np.ndarray) -> np.ndarray:
-        """(n,) float64 depths of the failed pixels, out of depths (h, w) of all pixels, metres."""
-        return z[self.failed].astype(np.float64)
+        Parameters
+        ----------
+        where : (h, w) bool, some of the failed pixels. is_spread : whether the paths cover the area of these pixels.
+            If the decoder compares texture, they cover that of all pixels of all cameras.
+        """
+        sensor = self.capture.sensor
+        if not where.any():
+            return where
+        if self.readings.is_by_pixel:
+            frames = frames_of_pixels(sensor, self.signals.rig, self.truth, where, is_spread)
+            return self._wrong(self.readings.read_pixels(frames, where))
+
+        def frames_of(one: Signals) -> np.ndarray:
+            seen = np.isfinite(one.truth.z)
+            return footprint_frames(sensor, one.rig, one.truth, seen if sensor.compares_texture else where & is_spread)
+
+        return self._wrong(self.readings.read([capture_of_frames(self.signals, sensor, frames_of)])[0])
 
     def _wrong(self, z: np.ndarray) -> np.ndarray:
-        """(h, w) bool, whether depths z (n,) of the failed pixels have half of their error or more, or are NaN."""
-        error = np.abs(z - self.true_m[self.failed])
+        """(h, w) bool, whether failed pixels have half of their error or more in depths z (h, w), or NaN there."""
+        error = np.abs(z[self.failed].astype(np.float64) - self.true_m[self.failed])
         return self._of_failed(~(error <= self._half_of_error[self.failed]))
 
     def _of_failed(self, values: np.ndarray) -> np.ndarray:

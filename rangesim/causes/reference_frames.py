@@ -3,17 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
-from rangesim.response import DenseResponse, LightPath, NumpyMath, SparseResponse
+from rangesim.response import DenseResponse, LightPath, NumpyMath, Response, SparseResponse
 from rangesim.rig import Beam, Rig
 from rangesim.sensor import Sensor
 from rangesim.signals import GroundTruth
 
-_CHUNK_VALUES = 32_000_000
-"""Largest number of weights that are computed at once, so that they take at most 256 MB. It changes no result."""
+_CHUNK_VALUES = 4_000_000
+"""Largest number of weights that are computed at once, so that they take at most 32 MB. It changes no result."""
 FOOTPRINT_PATHS = 55
 """Number of light paths over the area of a pixel, on a Fibonacci lattice.
 
@@ -37,16 +37,17 @@ TEXTURE_STEP = 8
 `FOOTPRINT_STEP`."""
 
 
+Pixels = np.ndarray | tuple[np.ndarray, np.ndarray]
+"""Which n pixels of an image are meant: a mask (h, w), or their rows and columns (n,)."""
+
+
 def single_path_frames(sensor: Sensor, rig: Rig, truth: GroundTruth) -> np.ndarray:
     """(k, h, w) float32, W/m2/sr, frames of the straight path to the true point of each pixel, with a radiance of 1.
 
     Where a reading of these frames is wrong, no other light is to blame: the distance is beyond the range of the
     sensor, or the sensor's resolution is too coarse. Pixels without a surface get no light.
     """
-    where = np.isfinite(truth.z)
-    channels = _no_light(sensor, where.shape)
-    _add(channels, sensor, where, _straight_path(rig, truth, where))
-    return sensor.frames(channels, where.astype(np.float32), np.zeros(where.shape, dtype=np.float32))
+    return footprint_frames(sensor, rig, truth, np.zeros(truth.z.shape, dtype=bool))
 
 
 def footprint_frames(sensor: Sensor, rig: Rig, truth: GroundTruth, spread: np.ndarray) -> np.ndarray:
@@ -62,60 +63,78 @@ def footprint_frames(sensor: Sensor, rig: Rig, truth: GroundTruth, spread: np.nd
     spread : (h, w) bool, pixels that have a surface.
     """
     where = np.isfinite(truth.z)
-    channels, alone = _no_light(sensor, where.shape), where & ~spread
-    _add(channels, sensor, alone, _straight_path(rig, truth, alone))
-    paths, step = (TEXTURE_PATHS, TEXTURE_STEP) if sensor.compares_texture else (FOOTPRINT_PATHS, FOOTPRINT_STEP)
-    path_beside = _paths_beside(rig, truth, spread)
-    for n in range(paths):
-        offset = (n + 0.5) * np.array([1, step]) / paths % 1.0 - 0.5
-        _add(channels, sensor, spread, path_beside(offset), 1 / paths)
+    channels = [np.zeros((response.channels, *where.shape), dtype=np.float32) for response in sensor.responses()]
+    for some, is_spread in ((where & ~spread, False), (spread, True)):
+        if some.any():
+            for image, values in zip(channels, straight_light(sensor, rig, truth, some, is_spread), strict=True):
+                image[:, some] = values
     return sensor.frames(channels, where.astype(np.float32), np.zeros(where.shape, dtype=np.float32))
 
 
-def _no_light(sensor: Sensor, shape: tuple[int, ...]) -> list[np.ndarray]:
-    """Channels (c, h, w) of each response of a sensor, all 0; shape : h and w."""
-    return [np.zeros((response.channels, *shape), dtype=np.float32) for response in sensor.responses()]
+def frames_of_pixels(
+    sensor: Sensor, rig: Rig, truth: GroundTruth, where: np.ndarray, is_spread: bool = False
+) -> np.ndarray:
+    """(k, 1, n) float32, W/m2/sr, frames of n pixels alone, as `straight_light` lights them.
 
-
-def _add(
-    channels: Sequence[np.ndarray], sensor: Sensor, where: np.ndarray, path: LightPath, radiance: float = 1.0
-) -> None:
-    """Add one light path per pixel to the channels of the sensor's responses.
-
-    channels : one (c, h, w) float32 per response; they are changed.
-    where : (h, w) bool, the n pixels.
-    path : LightPath of n paths.
+    They are those of `single_path_frames`, or of `footprint_frames`, for a sensor that is read by pixel
+    (`Decoder.pixel_reader`).
     """
-    pixels = np.flatnonzero(where)
-    for response, image in zip(sensor.responses(), channels, strict=True):
-        values = image.reshape(response.channels, -1)
-        step = max(1, _CHUNK_VALUES // response.channels)
-        for begin in range(0, len(pixels), step):
-            part = slice(begin, begin + step)
-            some = LightPath(path.u[None, part], path.v[None, part], path.path_length_m[None, part], True)
-            if isinstance(response, SparseResponse):
-                _add_bins(values, pixels[part], response, some, radiance)
-            else:
-                assert isinstance(response, DenseResponse)
-                for row, weight in zip(values, response.weights(some, NumpyMath()), strict=True):
-                    row[pixels[part]] += radiance * np.asarray(np.broadcast_to(weight, some.u.shape)[0], np.float32)
+    light = straight_light(sensor, rig, truth, where, is_spread)
+    white = np.ones((1, np.count_nonzero(where)), dtype=np.float32)
+    return sensor.frames([values[:, None] for values in light], white, np.zeros_like(white))
 
 
-def _add_bins(
-    values: np.ndarray, pixels: np.ndarray, response: SparseResponse, path: LightPath, radiance: float
-) -> None:
-    """Add light paths to the bins of a response.
+def straight_light(
+    sensor: Sensor, rig: Rig, truth: GroundTruth, where: np.ndarray, is_spread: bool
+) -> list[np.ndarray]:
+    """Channels (c, n) float32, W/m2/sr, of each response of a sensor: straight paths to n pixels, of radiance 1.
 
-    values : (c, h * w) float32; they are changed. pixels : (n,) int, index of each path's pixel. path : (1, n) paths.
+    Parameters
+    ----------
+    where : (h, w) bool, the n pixels, which have a surface.
+    is_spread : whether the paths cover the whole area of each pixel. If not, there is one, through its centre.
     """
-    for index, weight in response.bin_weights(path, NumpyMath()):
-        index, weight = (np.broadcast_to(x, path.u.shape)[0] for x in (index, weight))
-        inside = index < response.channels
-        values[index[inside].astype(np.intp), pixels[inside]] += radiance * weight[inside]
+    paths, step = (TEXTURE_PATHS, TEXTURE_STEP) if sensor.compares_texture else (FOOTPRINT_PATHS, FOOTPRINT_STEP)
+    reading, n = rig.camera.reading(truth), np.arange(paths)[:, None]
+    offsets = (n + 0.5) * np.array([1, step]) / paths % 1.0 - 0.5
+    rows, columns = np.nonzero(where)
+    light = [np.zeros((response.channels, len(rows)), dtype=np.float32) for response in sensor.responses()]
+    most = sum(response.channels for response in sensor.responses()) * (paths if is_spread else 1)
+    together = max(1, _CHUNK_VALUES // max(most, 1))
+    for begin in range(0, len(rows), together):
+        part = slice(begin, begin + together)
+        at = rows[part], columns[part]
+        path = _paths_beside(rig, truth, reading, at, offsets) if is_spread else _straight_path(rig, truth, reading, at)
+        for response, values in zip(sensor.responses(), light, strict=True):
+            _add(values[:, part], response, path)
+    return light
 
 
-def points_in_projector(rig: Rig, reading: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """(n, 3) float64 points at these readings (h, w) of the n pixels `where`, in projector coordinates, metres.
+def _add(values: np.ndarray, response: Response, path: LightPath) -> None:
+    """Add the mean over m light paths to each of n pixels to the channels of a response.
+
+    Parameters
+    ----------
+    values : (c, n) float32; they are changed. path : LightPath of (m, n) paths.
+    """
+    radiance = 1 / len(path.u)
+    if isinstance(response, SparseResponse):
+        every = [np.broadcast_arrays(*pair, path.u)[:2] for pair in response.bin_weights(path, NumpyMath())]
+        pairs = [(bins.astype(np.intp), radiance * parts, bins < response.channels) for bins, parts in every]
+        for n in range(len(path.u)):
+            for bins, parts, inside in pairs:
+                (pixels,) = np.nonzero(inside[n])
+                values[bins[n, pixels], pixels] += parts[n, pixels]
+        return
+    assert isinstance(response, DenseResponse)
+    weights = [np.broadcast_to(w, path.u.shape).astype(np.float32) for w in response.weights(path, NumpyMath())]
+    for n in range(len(path.u)):  # one after the other, so that the sum does not depend on the number of pixels
+        for row, weight in zip(values, weights, strict=True):
+            row += radiance * weight[n]
+
+
+def points_in_projector(rig: Rig, reading: np.ndarray, where: Pixels) -> np.ndarray:
+    """(n, 3) float64 points at these readings (h, w) of n pixels, in projector coordinates, metres.
 
     Coordinates of a beam are those of the camera, from the emitter of each ray.
     """
@@ -124,10 +143,10 @@ def points_in_projector(rig: Rig, reading: np.ndarray, where: np.ndarray) -> np.
     return _to_projector(rig, where, origins)(points)
 
 
-def _to_projector(rig: Rig, where: np.ndarray, origins: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Function from points (n, 3) in camera coordinates to those in projector coordinates, metres.
+def _to_projector(rig: Rig, where: Pixels, origins: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Function from points (..., n, 3) in camera coordinates to those in projector coordinates, metres.
 
-    where : (h, w) bool, the n pixels of the points. origins : (n, 3), origins of the rays through their centres.
+    where : the n pixels of the points. origins : (n, 3), origins of the rays through their centres.
     """
     if isinstance(rig.projector, Beam):
         emitters = rig.emitter_offsets[where]
@@ -135,25 +154,21 @@ def _to_projector(rig: Rig, where: np.ndarray, origins: np.ndarray) -> Callable[
     return lambda points: np.asarray((points - rig.T_camera_projector[:3, 3]) @ rig.T_camera_projector[:3, :3])
 
 
-def _straight_path(rig: Rig, truth: GroundTruth, where: np.ndarray) -> LightPath:
-    """Direct path to the true point of each of the n pixels `where`; a point outside the projector's image is clamped
-    to the nearest place in it."""
-    return _path(rig, points_in_projector(rig, rig.camera.reading(truth), where), truth.range_m[where])
+def _straight_path(rig: Rig, truth: GroundTruth, reading: np.ndarray, where: Pixels) -> LightPath:
+    """Direct path to the true point of each of n pixels, as (1, n) paths; a point outside the projector's image is
+    clamped to the nearest place in it."""
+    return _path(rig, points_in_projector(rig, reading, where)[None], truth.range_m[where][None])
 
 
-def _paths_beside(rig: Rig, truth: GroundTruth, where: np.ndarray) -> Callable[[np.ndarray], LightPath]:
-    """Function from offsets (2,), pixels, to light paths as in `_straight_path`, but to the tangent planes, and so far
-    beside the centres."""
-    planes, rays_beside = TangentPlanes(rig, truth, where), rig.camera.rays_beside(where)
-    to_projector = _to_projector(rig, where, planes.origins)
-
-    def path(offset: np.ndarray) -> LightPath:
-        origins, rays = rays_beside(offset)
-        readings = planes.readings(origins, rays)
-        along = rays * np.where(np.isfinite(readings), readings, planes.at_centres)[:, None]
-        return _path(rig, to_projector(origins + along), np.linalg.norm(along, axis=-1))
-
-    return path
+def _paths_beside(rig: Rig, truth: GroundTruth, reading: np.ndarray, where: Pixels, offsets: np.ndarray) -> LightPath:
+    """(m, n) light paths as in `_straight_path`, but to the tangent planes, at m offsets (m, 2), pixels, beside the
+    centres."""
+    planes = TangentPlanes(rig, truth, reading, where)
+    origins, rays = rig.camera.rays_beside(where)(offsets[:, None])
+    readings = planes.readings(origins, rays)
+    along = rays * np.where(np.isfinite(readings), readings, planes.at_centres)[..., None]
+    points = _to_projector(rig, where, planes.origins)(origins + along)
+    return _path(rig, points, np.linalg.norm(along, axis=-1))
 
 
 class TangentPlanes:
@@ -161,7 +176,7 @@ class TangentPlanes:
 
     Parameters
     ----------
-    where : (h, w) bool, the n pixels.
+    reading : (h, w) float32, metres, true readings. where : the n pixels.
 
     Attributes
     ----------
@@ -169,16 +184,16 @@ class TangentPlanes:
     at_centres : (n,) float32, metres, readings along these rays.
     """
 
-    def __init__(self, rig: Rig, truth: GroundTruth, where: np.ndarray) -> None:
+    def __init__(self, rig: Rig, truth: GroundTruth, reading: np.ndarray, where: Pixels) -> None:
         self.origins, rays = rig.camera.rays_at(where)
-        self.at_centres = rig.camera.reading(truth)[where]
+        self.at_centres = reading[where]
         self._normals = truth.normal[where].astype(np.float64) @ rig.T_world_camera[:3, :3]
         self._heights = self.at_centres * np.sum(self._normals * rays, axis=-1)
 
     def readings(self, origins: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        """(n,) float64 readings, in metres, where rays meet the planes; NaN behind the camera, or where they never do.
+        """(..., n) float64 readings, metres, where rays meet the planes; NaN behind the camera, or where they never do.
 
-        origins, rays : (n, 3) float, camera coordinates, as `Camera.rays_at` returns them.
+        origins, rays : (..., n, 3) float, camera coordinates, as `Camera.rays_at` returns them.
         """
         approach = np.sum(self._normals * rays, axis=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -187,10 +202,11 @@ class TangentPlanes:
 
 
 def _path(rig: Rig, point: np.ndarray, range_m: np.ndarray) -> LightPath:
-    """Light paths to points (n, 3), metres, in projector coordinates, at distances `range_m` (n,) from the camera."""
+    """Light paths to points (m, n, 3), metres, in projector coordinates, at distances `range_m` (m, n) from the
+    camera."""
     if isinstance(rig.projector, Beam):
-        middle = np.full(len(point), 0.5)
+        middle = np.full(range_m.shape, 0.5)
         return LightPath(middle, middle, range_m + np.linalg.norm(point, axis=-1), True)
     uv = np.nan_to_num(rig.image_projector.project(point))
-    u, v = np.clip(uv[:, 0], 0, rig.projector.width), np.clip(uv[:, 1], 0, rig.projector.height)
+    u, v = np.clip(uv[..., 0], 0, rig.projector.width), np.clip(uv[..., 1], 0, rig.projector.height)
     return LightPath(u, v, range_m + np.linalg.norm(point, axis=-1), True)

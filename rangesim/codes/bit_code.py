@@ -6,6 +6,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 
@@ -48,6 +49,8 @@ class BitCode(Code):
     """
 
     cell_px: int
+
+    is_by_pixel: ClassVar[bool] = True
 
     @property
     @abstractmethod

@@ -60,6 +60,9 @@ class Code(Named, ABC):
     tells_direction: ClassVar[bool] = True
     """Whether frames that are read in the wrong direction contradict each other. Fringes alone do not: if they move the
     other way, they agree on mirrored places."""
+    is_by_pixel: ClassVar[bool] = False
+    """Whether the place of a pixel depends on its own frames alone, if the response of the devices is linear and their
+    noise is known. A decoder learns both from the whole image where they are not."""
 
     # ---- Patterns ----------------------------------------------------------------------------------------------------
 

@@ -32,6 +32,7 @@ class FringeCode(Code):
     """
 
     tells_direction: ClassVar[bool] = False
+    is_by_pixel: ClassVar[bool] = True
 
     @abstractmethod
     def stack(self, size: int) -> FringeStack:

@@ -63,6 +63,7 @@ class GrayPhase(Code):
 
     type_name: ClassVar[str] = "gray-phase"
     title: ClassVar[str] = "Structured light"
+    is_by_pixel: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -9,7 +9,7 @@ takes the first step alone, because it has yet to find the rig.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +19,8 @@ from rangesim.decoding.status import Status
 from rangesim.settings.config import ShortRepr
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from rangesim.rig import Rig
 
 
@@ -57,6 +59,23 @@ class Coordinates(ShortRepr, ABC):
         ----------
         rig : Rig that took the capture; None: z is NaN everywhere.
         """
+
+    def spread(self, where: np.ndarray) -> Self:
+        """These coordinates of one row (1, n) as those of an image whose n pixels they are; the image has no other
+        readings.
+
+        Parameters
+        ----------
+        where : (h, w) bool, the n pixels.
+        """
+        images = {}
+        for field in fields(self):
+            values = getattr(self, field.name)
+            if isinstance(values, np.ndarray):
+                rest = Status.LOW_SIGNAL if field.name == "status" else 0
+                images[field.name] = np.full(where.shape, rest, values.dtype)
+                images[field.name][where] = values[0]
+        return replace(self, **images)
 
     def _image(self, rig: Rig | None, z: np.ndarray, range_m: np.ndarray, status: np.ndarray) -> RangeImage:
         """Range image with these depths, and with the confidence and the intensity of the coordinates."""

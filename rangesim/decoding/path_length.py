@@ -141,6 +141,10 @@ class PathLengths(Coordinates):
         self._keep_valid("length_m", np.float64)
         self._keep_valid("sigma_m", np.float32)
 
+    def spread(self, where: np.ndarray) -> PathLengths:
+        """As `Coordinates.spread`, without `returns`."""
+        return super(PathLengths, replace(self, returns=None)).spread(where)
+
     def range_image(self, rig: Rig | None) -> RangeImage:
         """Range image of these path lengths.
 

@@ -93,6 +93,7 @@ class ProjectorCoordinates(Coordinates):
     doubts : sentences with which the decoder has warned that the capture contradicts its code. If there are any, the
         cause of rays that meet behind a device is known, and `range_image` does not warn of them.
     notes : sentences on what the decoder found in the capture and has corrected.
+    is_checked : whether `range_image` looks for contradictions between coordinates and rig.
 
     Examples
     --------
@@ -114,6 +115,7 @@ class ProjectorCoordinates(Coordinates):
     limits: TriangulationLimits = field(default_factory=TriangulationLimits)
     doubts: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    is_checked: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -125,7 +127,7 @@ class ProjectorCoordinates(Coordinates):
 
         It warns (`DoubtWarning`) if the map from camera to projector pixels contradicts what is known: if the images
         seem to be mirrored or turned, the pose inverted, or if many rays meet behind a device. It does not if there are
-        `doubts` already.
+        `doubts` already, or if the coordinates are not to be checked (`is_checked`).
 
         Parameters
         ----------
@@ -134,7 +136,8 @@ class ProjectorCoordinates(Coordinates):
         column, row, status, decoded = self.column, self.row, self.status.copy(), self.valid
         z = np.full(status.shape, np.nan, dtype=np.float32)
         range_m = z.copy()
-        doubt = None if self.doubts else orientation_contradiction(column, row, rig)
+        is_silent = bool(self.doubts) or not self.is_checked
+        doubt = None if is_silent else orientation_contradiction(column, row, rig)
         if rig is not None:
             behind_px = []
             for rows in bands(len(status)):
@@ -154,7 +157,7 @@ class ProjectorCoordinates(Coordinates):
                 depth = np.where(outcome == Status.OK, found.z, np.nan)
                 status[rows][y, x], z[rows][y, x] = outcome, depth
                 range_m[rows][y, x] = depth * np.linalg.norm(directions, axis=-1)
-            if not (self.doubts or doubt):
+            if not (is_silent or doubt):
                 doubt = (
                     self._pose_contradiction(rig)
                     or behind_contradiction(np.concatenate(behind_px))

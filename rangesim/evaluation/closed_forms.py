@@ -29,6 +29,8 @@ float64, and far below the curvature of either."""
 def error_by_theory(signals: Signals, captured: Captured, decoder: Decoder) -> np.ndarray | None:
     """(h, w) float64, metres, root mean square error of correct readings by a closed form; None if there is none.
 
+    It is NaN where the surface is beyond the sensor's range, because no reading there is correct.
+
     Parameters
     ----------
     signals : Signals that the capture was exposed from.
@@ -46,7 +48,9 @@ def error_by_theory(signals: Signals, captured: Captured, decoder: Decoder) -> n
     """
     if captured.reference.detector is None or not captured.reference.is_digital:
         return None
-    return decoder.depth_error_m(captured.sensor, received_light(signals, captured))
+    light, sensor = received_light(signals, captured), captured.sensor
+    error_m = decoder.depth_error_m(sensor, light)
+    return None if error_m is None else np.where(sensor.is_beyond_range(light.path_length_m), np.nan, error_m)
 
 
 def received_light(signals: Signals, captured: Captured) -> ReceivedLight:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rangesim.capture import Captured
+from rangesim.capture import Capture, Captured
 from rangesim.capture.exposure import capture_of_frames, noise_free_capture
 from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
@@ -49,6 +49,23 @@ class ReferenceReadings:
     def read(self, captures: Sequence[Captured]) -> list[np.ndarray]:
         """Depths of captures, read by the decoder of the range image."""
         return read(captures, self.decoder)
+
+    @property
+    def is_by_pixel(self) -> bool:
+        """Whether some pixels can be read without the others, see `Decoder.pixel_reader`."""
+        return self.decoder.pixel_reader(self.capture.sensor) is not None
+
+    def read_pixels(self, frames: np.ndarray, where: np.ndarray) -> np.ndarray:
+        """Depths of some pixels, NaN in the others, if `is_by_pixel`.
+
+        Parameters
+        ----------
+        frames : (k, 1, n) float32, W/m2/sr, noise-free frames of these pixels. where : (h, w) bool, the n pixels.
+        """
+        reader = self.decoder.pixel_reader(self.capture.sensor)
+        assert reader is not None
+        coordinates = reader(Capture(frames, self.capture.sensor)).spread(where)
+        return self.decoder.placed(coordinates, self.signals.rig).reading_m
 
     @cached_property
     def noise_free(self) -> np.ndarray:
@@ -99,7 +116,15 @@ class ReferenceReadings:
 def read(captures: Sequence[Captured], decoder: Decoder) -> list[np.ndarray]:
     """Depths of captures, (h, w) float32 each, metres. The decoder does not warn."""
     with without_warnings():
-        return [decode(capture, decoder).reading_m for capture in captures]
+        return [_read(capture, decoder) for capture in captures]
+
+
+def _read(capture: Captured, decoder: Decoder) -> np.ndarray:
+    """Depths of a capture, without checks of the capture as a whole, which could only find what the simulation did."""
+    reader = decoder.pixel_reader(capture.sensor)
+    if reader is None or not isinstance(capture, Capture):
+        return decode(capture, decoder).reading_m
+    return decoder.placed(reader(capture), capture.rig).reading_m
 
 
 def halves(

@@ -21,8 +21,8 @@ from rangesim.causes.range_limits import fraction_beyond_range, warn_of_range
 from rangesim.causes.rules import causes_of
 from rangesim.decoding import decode
 from rangesim.errors import warn
-from rangesim.evaluation.comparison import TOLERANCE_M, compare
-from rangesim.evaluation.object_segmentation import object_segmentation
+from rangesim.evaluation.comparison import Comparison, compare
+from rangesim.evaluation.object_segmentation import ObjectSegmentation, object_segmentation
 from rangesim.evaluation.range_noise import noise_of, warn_of_sampling
 from rangesim.evaluation.reference_readings import ReferenceReadings
 from rangesim.experiment import Experiment
@@ -48,7 +48,7 @@ from rangesim.rig import Beam
 from rangesim.settings.seeds import derived_seed
 
 if TYPE_CHECKING:
-    from rangesim.electronics.ambient import Ambient
+    from rangesim.decoding.range_image import RangeImage
     from rangesim.electronics.detector import PhotoDetector
     from rangesim.motion import Timing
     from rangesim.point_cloud import PointCloud
@@ -217,16 +217,9 @@ def _computed(
                 of_truth[view] = segmented_truth(signals.rig.camera, signals.truth)
         for instrument in instruments:
             tell(f"Measuring with {instrument.name}", end)
-            seed, light = noise_seed(experiment, instrument), signals.at_wavelength(instrument.emitter_wavelength_m)
+            light = signals.at_wavelength(instrument.emitter_wavelength_m)
             measurements[instrument.name] = measure(
-                instrument,
-                light,
-                seed,
-                of_truth[view],
-                experiment.ambient,
-                number,
-                tolerance_m=experiment.tolerance_m,
-                sampling_error=sampling_error,
+                experiment, instrument, light, of_truth[view], number, sampling_error
             )
     info = provenance(experiment, scene, groups, mi.variant(), times)
     return Result(experiment, tuple(measurements[i.name] for i in experiment.instruments), tuple(passes), info)
@@ -251,27 +244,24 @@ def _warn(result: Result) -> None:
 
 
 def measure(
+    experiment: Experiment,
     instrument: Instrument,
     signals: Signals,
-    seed: int,
     true_segmentation: Segmentation | None,
-    ambient: Ambient | None = None,
     light_pass: int = 1,
-    tolerance_m: float = TOLERANCE_M,
     sampling_error: bool = True,
 ) -> Measurement:
     """The measurement of one instrument, with its capture, range image, errors, causes and segmentation.
 
     Parameters
     ----------
+    instrument : one of the experiment.
     signals : Signals of the light-transport pass that the instrument shares.
-    seed : seed of the detector's noise.
     true_segmentation : Segmentation of the true depth, as `segmented_truth` returns it.
-    ambient : as for `rangesim.expose`.
     light_pass : number of the pass, counted from 1.
-    tolerance_m : largest error of a right reading, metres.
     sampling_error : as for `carry_out`.
     """
+    seed, ambient, tolerance_m = noise_seed(experiment, instrument), experiment.ambient, experiment.tolerance_m
     times: dict[str, float] = {}
     moves = signals.motion_m is not None
     with timed(times, "exposure"):
@@ -298,8 +288,6 @@ def measure(
         cloud = image.to_point_cloud()
     with timed(times, "segmentation"):
         segmentation = segmented(cloud)
-    labels, true_labels = (labels_of(one, image.z.shape) for one in (segmentation, true_segmentation))
-    wrong = image.valid & ~(np.abs(comparison.error_m) <= comparison.tolerance_m)
     return Measurement(
         name=instrument.name,
         capture=capture,
@@ -308,7 +296,7 @@ def measure(
         causes=causes,
         rows=complete_rows(rows),
         segmentation=segmentation,
-        objects=object_segmentation(labels, signals.truth, wrong, true_labels),
+        objects=objects_of(segmentation, true_segmentation, image, comparison, signals.truth),
         metadata=acquisition(capture.reference, photons, instrument.timing, moves, int(cloud.valid.sum()), times),
         light_pass=light_pass,
     )
@@ -341,9 +329,21 @@ def segmented_truth(camera: Camera, truth: GroundTruth) -> Segmentation | None:
     return segmented(PointCloud(camera.points(truth).astype(np.float32)))
 
 
-def labels_of(segmentation: Segmentation | None, shape: tuple[int, ...]) -> np.ndarray:
-    """(h, w) int32, objects of a segmentation; -1 where there is none, and everywhere if there is no segmentation."""
-    return np.full(shape, -1, dtype=np.int32) if segmentation is None else segmentation.labels
+def objects_of(
+    segmentation: Segmentation | None,
+    true_segmentation: Segmentation | None,
+    image: RangeImage,
+    comparison: Comparison,
+    truth: GroundTruth,
+) -> ObjectSegmentation:
+    """What becomes of the true objects when a range image is segmented.
+
+    comparison : Comparison of the range image with the truth.
+    """
+    both = segmentation, true_segmentation
+    labels, true_labels = (np.full(truth.z.shape, -1, dtype=np.int32) if s is None else s.labels for s in both)
+    wrong = image.valid & ~(np.abs(comparison.error_m) <= comparison.tolerance_m)
+    return object_segmentation(labels, truth, wrong, true_labels)
 
 
 def noise_seed(experiment: Experiment, instrument: Instrument) -> int:

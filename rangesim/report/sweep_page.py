@@ -88,6 +88,7 @@ class _Page:
             "bounds": ", ".join(bounds),
             "without": ", ".join(without),
             "outlier_sigmas": 6,
+            "enough": f"{100 * ENOUGH:.0f} %",
             "level": 95,
             "seeds": sweep.seeds,
             "tolerance": _metres(sweep.tolerance_m),
@@ -285,8 +286,8 @@ class _Page:
             clauses.append(f"{name} {inside} of {len(rows)} (median ratio {ratio:.2f})")
         if clauses:
             yield (
-                f"Points at which the closed form lies in the 95 % interval of the error, of those with readings in "
-                f"{100 * ENOUGH:.0f} % of the pixels: {', '.join(clauses)}."
+                f"Points at which the closed form lies in the 95 % interval of the error, of those within the sensor's "
+                f"range and with readings in {100 * ENOUGH:.0f} % of the pixels: {', '.join(clauses)}."
             )
 
     def _exposure(self) -> Iterator[str]:
@@ -366,7 +367,7 @@ class _Page:
         if not shown:
             return []
         values = [1e3 * r["error_m"].mean for r in shown]
-        values += [1e3 * r["theory_m"] for r in shown if r["theory_m"]]
+        values += [1e3 * r["theory_m"] for r in shown if _has_theory(r)]
         y = axis_of([v for v in values if v > 0], "error, mm", is_logarithmic=True)
         plots = []
         for others in self.others:
@@ -374,7 +375,7 @@ class _Page:
             for name in self.names:
                 rows = sorted(self._of(name, others), key=lambda row: place[row[axis]])
                 points = [PlotPoint(place[r[axis]], *(1e3 * v for v in r["error_m"])) for r in rows]
-                theory = [PlotPoint(place[r[axis]], 1e3 * r["theory_m"]) for r in rows if r["theory_m"]]
+                theory = [PlotPoint(place[r[axis]], 1e3 * r["theory_m"]) for r in rows if _has_theory(r)]
                 curves.append(Curve(name, self.color[name], points, theory))
             svg = line_plot(curves, x, y, f"Error of {', '.join(self.names)}", 1e3 * self.sweep.tolerance_m)
             plots.append({"name": _values(others), "svg": svg})
@@ -558,10 +559,14 @@ def _reads(row: Mapping[str, Any]) -> bool:
     return bool(row["right"].mean + row["wrong"].mean >= HALF)
 
 
+def _has_theory(row: Mapping[str, Any]) -> bool:
+    """Whether a row has a closed form, and readings in nearly all pixels, for which the closed form holds."""
+    return row["theory_m"] is not None and row["right"].mean + row["wrong"].mean >= ENOUGH
+
+
 def _is_comparable(row: Mapping[str, Any]) -> bool:
-    """Whether a row has a closed form, an interval, and readings in nearly all pixels."""
-    has_both = row["theory_m"] is not None and math.isfinite(row["error_m"].low)
-    return bool(has_both and row["right"].mean + row["wrong"].mean >= ENOUGH)
+    """Whether a row has an error to compare with theory, with a confidence interval."""
+    return _has_theory(row) and math.isfinite(row["error_m"].low)
 
 
 def _crossing(before: Mapping[str, Any], after: Mapping[str, Any], path: str, tolerance_m: float) -> float:

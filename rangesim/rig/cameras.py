@@ -210,13 +210,16 @@ class Camera(Optics):
         return self.rays_beside(at)(offset)
 
     def rays_beside(self, at: Any) -> Callable[[ArrayLike], tuple[Array, Array]]:
-        """Function from offsets (2,), pixels, to the rays of `rays_at`, for callers that ask for many offsets."""
+        """Function from offsets (2,), pixels, to the rays of `rays_at`, for callers that ask for many offsets.
+
+        Of offsets (m, 1, 2) it makes (m, n, 3) rays; the origins may be (n, 3), if they are the same.
+        """
         rays = self.rays
         origins, directions, steps = rays.origins[at], rays.directions[at], rays.steps[at]
         origin_steps = None if rays.origin_steps is None else rays.origin_steps[at]
 
         def through(offset: ArrayLike) -> tuple[Array, Array]:
-            x, y = np.asarray(offset, dtype=np.float64)
+            x, y = np.moveaxis(np.asarray(offset, dtype=np.float64), -1, 0)[..., None]
             moved = directions + steps[:, 0] * x + steps[:, 1] * y
             start = origins
             if origin_steps is not None:

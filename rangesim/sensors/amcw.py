@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar, Literal
 
@@ -355,6 +355,18 @@ class AmcwDecoder(Decoder):
 
         `RangesimWarning` if the taps contradict each other as a whole.
         """
+        lengths, amplitude = self._lengths(capture)
+        sensor = of_type(capture.sensor, AmcwToF)
+        doubt = self._contradiction(sensor, capture, lengths.status, lengths.length_m, amplitude)
+        if doubt:
+            warn(doubt, DoubtWarning)
+        return replace(lengths, doubts=(doubt,) if doubt else ())
+
+    def pixel_reader(self, sensor: Sensor) -> Callable[[Capture], PathLengths]:
+        return lambda capture: self._lengths(capture)[0]
+
+    def _lengths(self, capture: Capture) -> tuple[PathLengths, np.ndarray]:
+        """The path lengths, and the modulation (h, w) float32 averaged over the frequencies."""
         self.check(capture.sensor)
         sensor = of_type(capture.sensor, AmcwToF)
         groups = np.split(capture.frames, len(sensor.modulation_hz))
@@ -384,17 +396,14 @@ class AmcwDecoder(Decoder):
                 _separate(sensor, phases, sigmas, length[rows], None if sigma_m is None else sigma_m[rows])
             amplitude[rows] = np.mean([p.modulation for p in phases], axis=0)
             mean[rows] = np.mean([p.mean for p in phases], axis=0)
-        doubt = self._contradiction(sensor, capture, status, length, amplitude)
-        if doubt:
-            warn(doubt, DoubtWarning)
-        return PathLengths(
+        lengths = PathLengths(
             length_m=length,
             sigma_m=sigma_m,
             status=status,
             confidence=2 * amplitude / capture.full_scale,
             intensity=mean - capture.black_level,
-            doubts=(doubt,) if doubt else (),
         )
+        return lengths, amplitude
 
     def depth_error_m(self, sensor: Sensor, light: ReceivedLight) -> np.ndarray | None:
         """The noise of the phases by shot noise and read noise, averaged over the frequencies by their precision, and

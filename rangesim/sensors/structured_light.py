@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Annotated, ClassVar, Literal
@@ -276,19 +276,38 @@ class StructuredLightDecoder(Decoder):
         `DoubtWarning` if frames and code contradict each other as a whole, or if two frames are the same.
         """
         sensor = of_type(capture.sensor, StructuredLight)
-        codes: dict[str, AxisCode] = {}
-        contradictions: list[str] = []
-        axes = self.axis_frames(capture)
+        axes, codes = self._codes(capture, sensor)
+        found = [sensor.code.contradiction(seen, codes[seen.axis]) for seen in axes]
+        contradictions = [text for text in found if text]
+        if not contradictions:  # they name the cause better than what follows
+            doubt = _orientation(codes) or _beyond_projector(sensor, codes) or _repeated_frames(capture)
+            contradictions += [doubt] if doubt else []
+        return self._joined(capture, axes, codes, checked(capture, axes[0].contrast, contradictions))
+
+    def pixel_reader(self, sensor: Sensor) -> Callable[[Capture], ProjectorCoordinates] | None:
+        """As `Decoder.pixel_reader`, for codes that are read by pixel and fringes without a gamma to be corrected."""
+        shown = of_type(sensor, StructuredLight)
+
+        def unchecked(capture: Capture) -> ProjectorCoordinates:
+            axes, codes = self._codes(capture, shown)
+            return replace(self._joined(capture, axes, codes, []), is_checked=False)
+
+        return unchecked if shown.code.is_by_pixel and shown.projector_gamma == 1 else None
+
+    def _codes(self, capture: Capture, sensor: StructuredLight) -> tuple[list[AxisFrames], dict[str, AxisCode]]:
+        """The frames of each axis, and their code by the name of the axis."""
+        axes, codes = self.axis_frames(capture), {}
         for seen in axes:
             code = sensor.code.decode(seen, self.thresholds)
             outside = (code.coordinate < -0.5) | (code.coordinate > seen.size + 0.5)
             code.status[outside & (code.status == Status.OK)] = Status.CODE_ERROR
             codes[seen.axis] = code
-            if contradiction := sensor.code.contradiction(seen, code):
-                contradictions.append(contradiction)
-        if not contradictions:  # they name the cause better than what follows
-            doubt = _orientation(codes) or _beyond_projector(sensor, codes) or _repeated_frames(capture)
-            contradictions += [doubt] if doubt else []
+        return axes, codes
+
+    def _joined(
+        self, capture: Capture, axes: list[AxisFrames], codes: dict[str, AxisCode], contradictions: list[str]
+    ) -> ProjectorCoordinates:
+        """The coordinates along all axes as one result, with the contrast as confidence."""
         contrast = axes[0].contrast
         confidence = contrast.values / np.float32(capture.full_scale)
         return joined_axes(capture, codes, contrast, confidence, self.triangulation, contradictions)
@@ -426,6 +445,18 @@ def _with_defaults(cls: type[StructuredLight], kind: type[Code]) -> StructuredLi
     return cls(code=kind())
 
 
+def checked(capture: Capture, contrast: Contrast, contradictions: list[str]) -> list[str]:
+    """The contradictions of a capture; if there is none, whether its black frame is brighter than white.
+
+    It issues a `DoubtWarning` of each.
+    """
+    if not contradictions and (exchanged := _exchanged_ends(capture, contrast)):  # a wrong order has other signs, too
+        contradictions = [exchanged]
+    for contradiction in contradictions:
+        warn(contradiction, DoubtWarning)
+    return contradictions
+
+
 def joined_axes(
     capture: Capture,
     codes: dict[str, AxisCode],
@@ -436,16 +467,11 @@ def joined_axes(
 ) -> ProjectorCoordinates:
     """The coordinates along all axes as one result.
 
-    `DoubtWarning` of each contradiction; if there is none, of a black frame that is brighter than white.
-
     Parameters
     ----------
     codes : AxisCode by the name of its axis. contrast : Contrast of the capture. confidence : (h, w) float32.
+    contradictions : those of `checked`.
     """
-    if not contradictions and (exchanged := _exchanged_ends(capture, contrast)):  # a wrong order has other signs, too
-        contradictions = [exchanged]
-    for contradiction in contradictions:
-        warn(contradiction, DoubtWarning)
     coordinate = {axis: code.coordinate for axis, code in codes.items()}
     sigma_px = {axis: code.sigma_px for axis, code in codes.items()}
     return ProjectorCoordinates(

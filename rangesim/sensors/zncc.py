@@ -16,7 +16,7 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.triangulation import ProjectorCoordinates, TriangulationLimits
 from rangesim.decoding.working_range import WorkingRange
 from rangesim.sensor import Background, Decoder, Sensor, of_type
-from rangesim.sensors.structured_light import StructuredLight, StructuredLightDecoder, joined_axes
+from rangesim.sensors.structured_light import StructuredLight, StructuredLightDecoder, checked, joined_axes
 from rangesim.settings.bounds import check_fields
 
 
@@ -85,7 +85,9 @@ class ZnccDecoder(Decoder):
                 contradictions.append(contradiction)
         codes = {axis: one.code for axis, one in found.items()}
         confidence = np.minimum.reduce([one.distance for one in found.values()])
-        return joined_axes(capture, codes, axes[0].contrast, confidence, self.triangulation, contradictions)
+        contrast = axes[0].contrast
+        doubts = checked(capture, contrast, contradictions)
+        return joined_axes(capture, codes, contrast, confidence, self.triangulation, doubts)
 
     @property
     def _by_code(self) -> StructuredLightDecoder:

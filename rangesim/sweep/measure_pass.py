@@ -26,13 +26,13 @@ from rangesim.electronics.ambient import Ambient
 from rangesim.errors import RangesimWarning
 from rangesim.evaluation.closed_forms import error_by_theory
 from rangesim.evaluation.comparison import compare
-from rangesim.evaluation.object_segmentation import Outcome, object_segmentation
+from rangesim.evaluation.object_segmentation import Outcome
 from rangesim.evaluation.range_noise import robust_sigma, sampling_errors
 from rangesim.evaluation.reference_readings import ReferenceReadings
 from rangesim.evaluation.surface_rows import with_mean_over_objects
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
-from rangesim.pipeline.experiment_run import acquisition, labels_of, segmented, segmented_truth
+from rangesim.pipeline.experiment_run import acquisition, objects_of, segmented, segmented_truth
 from rangesim.pipeline.shared_passes import rig_of_pass
 from rangesim.report import figures, palette
 from rangesim.report.panorama import panorama
@@ -52,8 +52,8 @@ if TYPE_CHECKING:
     from rangesim.signals import GroundTruth
 
 OUTLIER_SIGMAS = 6.0
-"""Robust standard deviations from the median beyond which a reading does not belong to the noise: a wrong match, a
-wrong wrap. Of a normal distribution, 2e-9 lie beyond."""
+"""Standard deviations from the median, robust ones and those of theory, beyond which a reading does not belong to the
+noise: a wrong match, a wrong wrap. Of a normal distribution, 2e-9 lie beyond."""
 CONFIDENCES = tuple(float(f"{10 ** (k / 16 - 4):.4g}") for k in range(65))
 """Edges of the classes of confidence in which readings are counted, from 1e-4 to 1: sixteen for each factor of ten, so
 that a class is 15 % wide."""
@@ -241,23 +241,26 @@ def _objects(image: RangeImage, comparison: Comparison, signals: StillSignals | 
     if not signals.truth.object_names:
         return None
     both = segmented(image.to_point_cloud()), segmented_truth(signals.rig.camera, signals.truth)
-    labels, true_labels = (labels_of(one, image.z.shape) for one in both)
-    wrong = image.valid & ~(np.abs(comparison.error_m) <= comparison.tolerance_m)
-    found = object_segmentation(labels, signals.truth, wrong, true_labels)
+    found = objects_of(*both, image, comparison, signals.truth)
     counts = {outcome.value: len(found.names(outcome)) for outcome in Outcome}
     return {**counts, "displaced": sum(o.displaced for o in found.objects), "invented": found.invented}
 
 
 def _errors(error_m: np.ndarray, theory_m: np.ndarray | None) -> dict[str, float | None]:
-    """Root mean square error, metres, of the readings (n,) without outliers, and that of theory for the same ones."""
+    """Root mean square error, metres, of the readings (n,) without outliers, and that of theory for the same ones.
+
+    Errors of whole bins have two values, of which the rarer ones may lie beyond robust standard deviations. So an
+    error that theory expects is no outlier.
+    """
     known = np.isfinite(error_m)
     errors = error_m[known].astype(np.float64)
     if not len(errors):
         return {"error_m": None, "theory_m": None}
+    theory = np.full(errors.shape, np.nan) if theory_m is None else theory_m[known]
     middle = float(np.median(errors))
-    kept = np.abs(errors - middle) <= OUTLIER_SIGMAS * max(sigma_from_median(errors, middle), 1e-9)
-    theory = None if theory_m is None else _rms(theory_m[known][kept])
-    return {"error_m": _rms(errors[kept]), "theory_m": _finite(theory)}
+    scale = np.fmax(max(sigma_from_median(errors, middle), 1e-9), theory)
+    kept = np.abs(errors - middle) <= OUTLIER_SIGMAS * scale
+    return {"error_m": _rms(errors[kept]), "theory_m": _finite(_rms(theory[kept]))}
 
 
 def _rms(values: np.ndarray) -> float:

@@ -29,7 +29,7 @@ from rangesim.sweep.sweep_settings import OF_TRANSPORT, Point, Sweep
 if TYPE_CHECKING:
     from rangesim.scene import Scene
 
-VERSION = 1
+VERSION = 2
 """Version of the results of a pass. An item of another version is computed again."""
 SEED_S = 2e-5
 """Seconds per pixel of each capture beside the light: exposure, decoding, causes and rows. Measured at 1.2e-5 to 3e-5
