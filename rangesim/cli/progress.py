@@ -23,6 +23,8 @@ LINE_EACH = 0.1
 """Fraction of the work after which a campaign prints its next line: ten lines for each campaign, however long."""
 LINE_EACH_S = 10.0
 """Least seconds between two such lines, so that short campaigns print none."""
+HOW_TO_RETRY = "rangesim: the same command with --retry computes again what failed"
+"""Line at the end of a command some of whose items failed."""
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -62,6 +62,22 @@ def _entries(folder: Path) -> Iterator[Path]:
         yield from (Path(parent, file) for file in files)
 
 
+def category_of(path: Path, files: Sequence[Path]) -> str:
+    """Category of a model among the files of its group: the name of the file, without its suffix, or of a folder.
+
+    Where the files lie in several folders, it is the name of the folder below the one that all of them share.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> flat, deep = [Path("parts/nut.stl"), Path("parts/bolt.stl")], [Path("parts/nuts/m4.stl"), Path("parts/cup.stl")]
+    >>> [category_of(path, flat) for path in flat], [category_of(path, deep) for path in deep]
+    (['nut', 'bolt'], ['nuts', 'cup'])
+    """
+    below = path.relative_to(os.path.commonpath([file.parent for file in files])).parts
+    return below[0] if len(below) > 1 else path.stem
+
+
 @lru_cache(maxsize=MAX_MODELS)
 def read_model(path: Path, unit_m: float) -> SolidModel:
     """The model in a file, in the file's own coordinates, which it multiplies with `unit_m` metres per unit.
@@ -95,4 +111,4 @@ def read_model(path: Path, unit_m: float) -> SolidModel:
     if volume_m3 < 0:
         mesh = TriangleMesh(mesh.vertices, mesh.faces[:, ::-1])
     digest = hashlib.sha256(b"".join(read_file(file, FileFormatError) for file in files)).hexdigest()
-    return SolidModel(path.stem, path.parent.name, split_at_creases(mesh), None, digest)
+    return SolidModel(path.stem, split_at_creases(mesh), None, digest)
