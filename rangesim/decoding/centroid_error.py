@@ -66,7 +66,7 @@ def centroid_error(counts: PulseCounts, bins: int, sigma_bins: float, is_cyclic:
 
     >>> counts = PulseCounts(np.array([100.5, 101.0]), np.full(2, 1000.0), np.zeros(2))
     >>> centroid_error(counts, bins=256, sigma_bins=4.2466, is_cyclic=True).round(3)
-    array([0.128, 0.187])
+    array([0.127, 0.188])
     """
     reach = window_reach(bins, sigma_bins, is_cyclic)
     end = (reach + 0.5) / sigma_bins
