@@ -71,7 +71,8 @@ def centroid_error(counts: PulseCounts, bins: int, sigma_bins: float, is_cyclic:
     reach = window_reach(bins, sigma_bins, is_cyclic)
     end = (reach + 0.5) / sigma_bins
     inside = math.erf(end / math.sqrt(2))
-    outside = (1 - inside) * (2 * reach + 1) / (bins - 2 * reach - 1)  # flanks, which are taken for background
+    width = 2 * reach + 1
+    outside = (1 - inside) * width / max(bins - width, 1)  # flanks, which are taken for background
     moment = inside - 2 * end * math.exp(-(end**2) / 2) / math.sqrt(2 * math.pi)
     taken = inside - outside
     with np.errstate(divide="ignore", invalid="ignore"):
