@@ -329,6 +329,14 @@ def test_the_error_of_a_peak_is_that_of_drawn_histograms(
     assert np.sqrt(np.mean((found - place) ** 2)) == pytest.approx(error, rel=0.02)  # four standard errors
 
 
+@pytest.mark.parametrize("bins", [3, 5, 6])
+def test_the_error_of_a_peak_is_finite_where_its_window_holds_all_bins(bins: int) -> None:
+    counts = PulseCounts(np.array([bins / 2, 1.0]), np.array([500.0, 0.0]), np.zeros(2))
+    lit, dark = centroid_error(counts, bins, sigma_bins=bins / 5, is_cyclic=True)
+    assert 0 < lit < 1
+    assert np.isnan(dark)
+
+
 # ---- A laser that fires again and again -------------------------------------------------------------
 
 
