@@ -59,9 +59,11 @@ def test_two_halves_have_every_sample_once_and_whole_pairs(first: int) -> None:
     for n in range(3, 70):
         count = np.array([n], np.uint32)
         taken = []
-        for half in SampleAllocation(np.arange(1), count, count + first, 1.0, first, part=3).halves():
-            k = np.arange(half.samples[0])
-            taken.append(half.first + (k >> 1) * half.stride + (k & 1))  # as `Lanes.number`
+        halves = SampleAllocation(np.arange(1), count, count + first, 1.0, first, part=3).in_halves()
+        assert list(halves.part) == [6, 7]
+        for of_half, samples in zip(halves.first, halves.samples, strict=True):
+            k = np.arange(samples)
+            taken.append(of_half + (k >> 1) * halves.stride + (k & 1))  # as `Lanes.number`
         assert np.array_equal(np.sort(np.concatenate(taken)), first + np.arange(n))
         assert abs(len(taken[0]) - len(taken[1])) <= 2
         for numbers in taken:
@@ -72,7 +74,7 @@ def test_two_halves_have_every_sample_once_and_whole_pairs(first: int) -> None:
 def test_the_drawn_error_of_halves_of_unequal_size_has_the_variance_of_the_mean() -> None:
     rng, p, q = np.random.default_rng(3), 5, 16
     a, b = (rng.normal(2 * n, np.sqrt(n), (1, 200, 300)).astype(np.float32) for n in (p, q))
-    mean, error = np.empty_like(a), np.empty_like(a)
+    mean, error = np.zeros_like(a), np.zeros_like(a)
     Halves([np.full((200, 300), n, np.uint32) for n in (p, q)]).mean_and_error((a, b), (mean, error))
     assert mean.mean() == pytest.approx(2, rel=0.01)
     assert mean.std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)
@@ -195,7 +197,10 @@ def test_two_samples_know_nothing_of_their_error(matte: Scene) -> None:
 def test_the_detectors_sigma_is_that_between_captures_of_one_render(
     name: str, sensor: Any, spp: Any, seed: int
 ) -> None:
-    """Against the mean of the two halves it was up to twice as large, where these are far from linear: on glass."""
+    """Against the mean of the two halves it was up to twice as large, where these are far from linear: on glass.
+
+    The ratio varies from seed to seed: on the glass of the tabletop from 0.92 to 1.18 over 12 seeds, sigma 0.08.
+    """
     scene, one = load_scene(name), Instrument("one", sensor)
     signals = transport(scene, one.rig(scene, **SMALL_IMAGE), [sensor], spp=spp, seed=seed, photons=500_000)
     captures = [expose(signals, sensor, one.detector, seed=n) for n in range(16)]
@@ -208,7 +213,7 @@ def test_the_detectors_sigma_is_that_between_captures_of_one_render(
     for material, of_class in signals.truth.classes().items():
         if (mask := of_class & always).sum() >= 150:
             estimated, true = (robust_sigma(np.array(x)[:, mask]) for x in (some, spread))
-            assert estimated == pytest.approx(true, rel=0.1), material
+            assert estimated == pytest.approx(true, rel=0.2), material
             checked.append(material)
     assert {"matte", "transparent"} <= set(checked)
 
