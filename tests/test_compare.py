@@ -125,7 +125,7 @@ def test_readings_of_pixels_that_see_no_surface_are_counted_apart() -> None:
     assert (row.pixels, row.right, row.wrong, row.missing, row.invented_readings) == (10, 1, 0, 0, 8)
     assert {other.invented_readings for other in result.table if other is not row} == {None}
     said = tables.invented_readings({"a": result.rows(), "b": compare(image_of(z), truth_of(z, instance)).rows()})
-    assert "a 8. " in said
+    assert "8 of a. " in said
 
 
 def test_flying_pixels_lie_on_neither_side_of_an_edge() -> None:

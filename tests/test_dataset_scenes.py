@@ -12,8 +12,9 @@ import pytest
 
 import rangesim
 from rangesim.dataset import DatasetSpec, RandomScene, load_spec, piles, random_scene, spec_from_dict, spec_to_dict
+from rangesim.dataset import model_files as files
 from rangesim.dataset.convex_pieces import convex_pieces
-from rangesim.dataset.model_files import read_model
+from rangesim.dataset.model_files import model_files, read_model
 from rangesim.dataset.piles import GAP_M
 from rangesim.dataset.random_primitives import PRIMITIVES, primitive
 from rangesim.errors import FileFormatError
@@ -146,6 +147,12 @@ def test_models_of_a_folder_have_their_units_and_categories(tmp_path: Path) -> N
         assert 0.5 <= one.scale <= 1
         assert len(one.source_sha256) == 64
         assert "." not in one.name
+    for extents, name in (((10, 10, 60), "pin"), ((50, 50, 5), "plate")):
+        trimesh.creation.box(extents).export(tmp_path / f"{name}.stl")
+    flat = {**group, "model": ["pin.stl", "plate.stl", "box"]}
+    spec = spec_from_dict({"objects": [flat], "instrument": [{"sensor": "ideal-tof"}]}, tmp_path)
+    for one in random_scene(spec, 0).objects:
+        assert one.category == one.model
 
 
 def test_a_urdf_file_has_its_links_where_the_joints_put_them(tmp_path: Path) -> None:
@@ -167,7 +174,6 @@ def test_a_urdf_file_has_its_links_where_the_joints_put_them(tmp_path: Path) -> 
         solid.mesh.vertices.max(axis=0), [0.1, 0.05, 0.11], atol=1e-9
     )  # the turned z points to x
     assert solid.mesh.volume_m3 == pytest.approx(0.1 * 0.1 * 0.02 + 0.02**3)
-    assert solid.category == "arm"
 
 
 def test_an_open_mesh_is_refused_by_name_and_one_inside_out_is_turned(tmp_path: Path) -> None:
@@ -340,3 +346,16 @@ def different_pixels(scene: RandomScene) -> int:
 def test_masks_are_first_hits() -> None:
     scene = random_scene(spec_of(), 1)
     assert different_pixels(scene) == 0
+
+
+def test_a_folder_of_models_that_is_a_whole_disk_is_refused_soon(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A specification with the model "/" listed all files of the machine; found by fuzzing."""
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "a.stl").touch()
+    monkeypatch.setattr(files, "MAX_ENTRIES", 2)
+    assert model_files(tmp_path) == (tmp_path / "deep" / "a.stl",)
+    (tmp_path / "deep" / "b.txt").touch()
+    with pytest.raises(FileFormatError, match="at most 2 files and subfolders"):
+        model_files(tmp_path)

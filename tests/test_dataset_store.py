@@ -70,9 +70,13 @@ def sample(spec: DatasetSpec) -> Callable[[int], bytes]:
     return cache(lambda number: sample_bytes(spec, number))
 
 
-def inline(function: Any, items: Any, store: Any, workers: Any, tell: Any, on_done: Any) -> Outcome:
+def inline(
+    function: Any, items: Any, store: Any, workers: Any, tell: Any, on_done: Any, retry: bool = False
+) -> Outcome:
     """`rangesim.campaign.run_items` in this process, one item after the other."""
     for key in items:
+        if retry and store.is_quarantined(key):
+            store.discard(key)
         if key not in store and not store.is_quarantined(key):
             content = function(items[key])
             store.write(key, content, items[key])
@@ -234,11 +238,7 @@ def test_a_run_that_is_killed_at_any_write_ends_with_the_same_bytes(
 def test_scenes_that_fail_are_listed_with_their_error(
     spec: DatasetSpec, tmp_path: Path, quick: pytest.MonkeyPatch
 ) -> None:
-    def failing(function: Any, items: Any, store: Any, workers: Any, tell: Any, on_done: Any) -> Outcome:
-        store.quarantine(QuarantinedItem("000001", "ValueError: no light", {}, "Traceback ..."))
-        return inline(function, items, store, workers, tell, on_done)
-
-    quick.setattr(production, "run_items", failing)
+    quick.setattr(production, "run_items", failing_on("000001"))
     outcome = make_dataset(spec, tmp_path / "set")
     assert outcome.exit_status == 1
     rows = Store(tmp_path / "set").rows
@@ -248,6 +248,52 @@ def test_scenes_that_fail_are_listed_with_their_error(
     findings = verify_dataset(tmp_path / "set")
     assert (findings.failed, findings.problems) == (1, ())
     assert "1 scenes failed" in str(findings)
+
+
+def failing_on(*keys: str) -> Any:
+    """`inline`, which fails on these items."""
+
+    def failing(function: Any, items: Any, store: Any, *rest: Any) -> Outcome:
+        for key in keys:
+            store.quarantine(QuarantinedItem(key, "ValueError: no light", {}, "Traceback ..."))
+        return inline(function, items, store, *rest)
+
+    return failing
+
+
+@pytest.mark.parametrize("failed", [("000000",), ("000001",), ("000002",), ("000000", "000001", "000002")])
+def test_scenes_that_failed_are_computed_again_and_leave_no_trace(
+    failed: tuple[str, ...], spec: DatasetSpec, store: Path, tmp_path: Path, quick: pytest.MonkeyPatch
+) -> None:
+    """Also if it is killed at any write."""
+
+    class Killed(BaseException):
+        pass
+
+    def dying(*args: Any, **settings: Any) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise Killed
+        write(*args, **settings)
+
+    quick.setattr(production, "run_items", failing_on(*failed))
+    make_dataset(spec, tmp_path / "set")
+    quick.setattr(production, "run_items", inline)
+    assert make_dataset(spec, tmp_path / "set").exit_status == 1  # without `retry` nothing is computed
+    write, allowed = production.write_file, 0
+    quick.setattr(production, "write_file", dying)
+    while True:
+        left = allowed
+        try:
+            outcome = make_dataset(spec, tmp_path / "set", retry=True)
+        except Killed:
+            allowed += 1
+            continue
+        break
+    assert allowed >= 4
+    assert (outcome.exit_status, outcome.quarantined) == (0, ())
+    assert contents(tmp_path / "set") == contents(store)
 
 
 def test_a_store_of_another_specification_is_refused(spec: DatasetSpec, store: Path, tmp_path: Path) -> None:

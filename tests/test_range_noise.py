@@ -29,7 +29,14 @@ from rangesim.causes import explain
 from rangesim.errors import RangesimWarning, SamplingWarning, warn
 from rangesim.evaluation.range_noise import Repeats, range_noise, robust_sigma, warn_of_sampling
 from rangesim.experiment import Experiment
-from rangesim.instrument.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
+from rangesim.instrument.adaptive_sampling import (
+    ENOUGH_PIXELS,
+    FIRST_SPP,
+    AdaptiveSampling,
+    few_of_each,
+    group_sigma,
+    groups,
+)
 from rangesim.instrument.instrument import Instrument
 from rangesim.light_transport.loop import SampleAllocation
 from rangesim.light_transport.sampling_error import Halves
@@ -84,6 +91,7 @@ def test_what_is_decoded_again_for_comparison_does_not_warn_again(matte: Scene, 
     noise, causes = range_noise(image, capture, signals), explain(image, capture, signals)
     assert causes.failed.any()
     decoder, quiet = type(sensor.default_decoder), type(sensor.default_decoder).decode
+    monkeypatch.setattr(decoder, "pixel_reader", lambda self, sensor: None)  # such a reader checks and warns of nothing
 
     def loud(self: Any, capture: Any) -> Any:
         warn("frames and code contradict each other.")
@@ -103,15 +111,16 @@ def test_what_is_decoded_again_for_comparison_does_not_warn_again(matte: Scene, 
 def test_an_instrument_decodes_and_exposes_the_same_light_once(
     matte: Scene, monkeypatch: Any, ambient: float, decodings: int
 ) -> None:
-    """Its own capture, both halves, all samples without noise, three with other noise, and three parts of the light:
-    the projector's alone (only where there is other light), the straight path, and paths over a pixel's area."""
+    """Its own capture, both halves, all samples without noise, three with other noise, and parts of the light: the
+    projector's alone (only where there is other light), the straight path to some failed pixels, and paths over the
+    area of some."""
     sensor, rig = DirectToF(bins=64, bin_s=400e-12), matte.rig(0.03, width=48, height=36)
     signals = transport(matte, rig, [sensor], spp=4)
     energy = replace(signals.energy, ambient=np.full_like(signals.energy.ambient, ambient))
     signals = replace(signals, energy=energy)
     read: list[bytes] = []
     lit: list[tuple[float, float]] = []
-    decoder, undisturbed = type(sensor.default_decoder), type(sensor.default_decoder).decode
+    decoder, undisturbed = type(sensor.default_decoder), type(sensor.default_decoder).coordinates
     frames_of = StillSignals.frames
 
     def noted(self: Any, capture: Any) -> Any:
@@ -122,7 +131,7 @@ def test_an_instrument_decodes_and_exposes_the_same_light_once(
         lit.append((ambient_transmission, sampling_errors))
         return frames_of(self, sensor, ambient_transmission, sampling_errors)
 
-    monkeypatch.setattr(decoder, "decode", noted)
+    monkeypatch.setattr(decoder, "coordinates", noted)
     monkeypatch.setattr(StillSignals, "frames", frames)
     one = Instrument("direct", sensor)
     measured = measure(Experiment("-", instruments=(one,), seed=1), one, signals, None)
@@ -299,6 +308,16 @@ def test_groups_are_the_pixels_of_an_instance_in_a_square_and_their_sigma_is_tha
         assert sigma[number] == (pytest.approx(1.4826 * finite[len(finite) // 2]) if finite.size else 0)
     assert not group_sigma(np.full((40, 50), np.nan), group).any()
     assert (group_sigma(np.full((40, 50), np.inf), group) == np.inf).all()
+
+
+def test_few_pixels_tell_the_noise_of_each_group() -> None:
+    """Of large groups a quarter is read, of small ones all, and no group is left out."""
+    instance = np.random.default_rng(1).choice([0, 1, 2], (64, 80), p=[0.9, 0.09, 0.01])
+    instance[:16, :16] = 0
+    group = groups(instance)
+    few, all_pixels = np.bincount(group[few_of_each(group)]), np.bincount(group.ravel())
+    assert few[group[0, 0]] == 64
+    assert ((few >= ENOUGH_PIXELS) | (few == all_pixels)).all()
 
 
 @pytest.mark.validation

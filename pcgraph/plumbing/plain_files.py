@@ -27,6 +27,8 @@ DISK = {errno.ENOSPC: "no space left on the device", errno.EDQUOT: "the disk quo
         errno.EFBIG: "the file would be larger than allowed", errno.EROFS: "the file system is read-only",
         errno.EIO: "the device fails"}  # fmt: skip
 """Reasons why a disk takes no more data, by error number."""
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Numbers of the errors after which the same path works again once there is room."""
 _MAX_NAME = 255
 """Most bytes of a file's name, from the limit of common file systems. If the name of a temporary file would be longer,
 it has a digest in place of the name."""
@@ -165,7 +167,8 @@ def write_files(
         done = True
     except OSError as problem:
         reason = "a file is in the way" if isinstance(problem, (FileExistsError, NotADirectoryError)) else why(problem)
-        raise error(f"cannot write {path}: {reason}; choose another path.") from problem
+        advice = "make room there and run it again" if problem.errno in FULL else "choose another path"
+        raise error(f"cannot write {path}: {reason}; {advice}.") from problem
     finally:
         for part in reversed(parts):
             part.remove(and_directories=not done)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from rangesim.cli.progress import progress_bar
+from rangesim.cli.progress import HOW_TO_RETRY, progress_bar
 
 StoreArgument = Annotated[Path, typer.Argument(help="Directory of the data set.", show_default=False)]
 
@@ -40,10 +40,12 @@ def make_command(
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler whose workers do the work, tcp://HOST:8786.")
     ] = None,
+    retry: Annotated[bool, typer.Option("--retry", help="Compute scenes again that failed in an earlier run.")] = False,
 ) -> None:
     """Draw and measure all scenes of a specification, and write them to a directory.
 
-    Scenes that fail are listed in the index with their error; the exit status is then 1.
+    Scenes that fail are listed in the index with their error; the exit status is then 1. The same command with --retry
+    computes them again.
 
     Examples:
 
@@ -54,9 +56,11 @@ def make_command(
     from rangesim.campaign import Workers
     from rangesim.dataset import load_spec, make_dataset
 
-    with progress_bar() as progress:
-        outcome = make_dataset(load_spec(spec), out, Workers(workers, scheduler), progress)
+    with progress_bar(is_campaign=True) as progress:
+        outcome = make_dataset(load_spec(spec), out, Workers(workers, scheduler), progress, retry)
     typer.echo(outcome)
+    if outcome.quarantined:
+        typer.echo(HOW_TO_RETRY, err=True)
     raise typer.Exit(outcome.exit_status)
 
 

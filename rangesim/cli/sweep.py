@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from rangesim.cli.progress import progress_bar
+from rangesim.cli.progress import HOW_TO_RETRY, progress_bar
 from rangesim.errors import one_line
 
 
@@ -27,10 +27,12 @@ def sweep_command(
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler whose workers do the work, tcp://HOST:PORT.")
     ] = None,
+    retry: Annotated[bool, typer.Option("--retry", help="Compute passes again that failed in an earlier run.")] = False,
 ) -> None:
     """Measure sensors at all combinations of settings, and write rows.csv, rows.parquet, summary.csv and sweep.html.
 
     The same command goes on where an interrupted one ended. A changed file computes only the passes that are new.
+    Passes that fail are named at the end; the exit status is then 1. The same command with --retry computes them again.
 
     Examples:
 
@@ -48,8 +50,8 @@ def sweep_command(
     typer.echo(f"{'' if estimate else 'rangesim: '}{planned}", err=not estimate)
     if estimate or out is None:
         return
-    with progress_bar() as progress:
-        result = carry_out(planned, out, chosen, progress)
+    with progress_bar(is_campaign=True) as progress:
+        result = carry_out(planned, out, chosen, progress, retry)
     for text in result.warnings:
         typer.echo(f"rangesim: {one_line(text)}", err=True)
     page = write_sweep(result, out)
@@ -57,4 +59,5 @@ def sweep_command(
     if result.failed:
         for number, error in result.failed.items():
             typer.echo(f"rangesim: pass {number + 1} failed: {one_line(error)}", err=True)
+        typer.echo(HOW_TO_RETRY, err=True)
         raise typer.Exit(1)

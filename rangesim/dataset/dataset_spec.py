@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import numpy as np
 
-from rangesim.dataset.model_files import model_files
+from rangesim.dataset.model_files import category_of, model_files
 from rangesim.dataset.random_primitives import PRIMITIVES
 from rangesim.dataset.supports import Support, Table
 from rangesim.dataset.view_poses import Shell, View
@@ -64,7 +64,7 @@ class ObjectGroup:
         their file.
     scale : factor on the size.
     material : material of the catalogue, or of the specification's `materials`.
-    category : category of the objects. None: the name of the folder of a mesh, or of the primitive.
+    category : category of the objects. None: the name of the primitive, or as `model_files.category_of` says.
     unit_m : metres per unit of the mesh files, 0.001 for millimetres.
 
     Raises
@@ -89,6 +89,13 @@ class ObjectGroup:
                 f"expected category as a name of 1 to {MAX_CATEGORY} characters, got {shown(self.category)}."
             )
         object.__setattr__(self, "model", _with_files(self.model))
+
+    def category_of(self, model: str) -> str:
+        """Category of an object of this model, the name of a primitive or the path of a file."""
+        if self.category is not None or model in PRIMITIVES:
+            return self.category or model
+        names = (leaf.values[0] for leaf in self.model.leaves())
+        return category_of(Path(model), [Path(name) for name in names if name not in PRIMITIVES])
 
 
 def _with_files(model: Draw) -> Draw:

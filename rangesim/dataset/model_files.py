@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import hashlib
+import os
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,6 +19,9 @@ from rangesim.triangle_mesh import TriangleMesh
 
 MODEL_SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".ply", ".off", ".urdf")
 """Suffixes of the files that are taken for models."""
+MAX_ENTRIES = 200_000
+"""Largest number of files and subfolders of a folder of models. To list them takes half a second; the folder may have
+been "/" by mistake."""
 MAX_MODELS = 256
 """Largest number of models that a process keeps in memory: 256 models of 20 000 faces take about 0.3 GB."""
 
@@ -37,11 +42,40 @@ def model_files(path: Path) -> tuple[Path, ...]:
         return (path,)
     if not path.is_dir():
         raise FileFormatError(f"expected a model or a folder of models, but {path} does not exist.")
-    found = sorted(p for p in path.rglob("*") if p.suffix.lower() in MODEL_SUFFIXES and p.is_file())
+    found = sorted(p for p in _entries(path) if p.suffix.lower() in MODEL_SUFFIXES and p.is_file())
     if not found:
         raise FileFormatError(f"expected models ({', '.join(MODEL_SUFFIXES)}) in {path}, found none.")
     urdfs = [p for p in found if p.suffix.lower() == ".urdf"]
     return tuple(urdfs or found)
+
+
+def _entries(folder: Path) -> Iterator[Path]:
+    """Paths of all files in a folder and its subfolders; FileFormatError if there are more than `MAX_ENTRIES`."""
+    count = 0
+    for parent, folders, files in os.walk(folder):
+        count += len(folders) + len(files)
+        if count > MAX_ENTRIES:
+            raise FileFormatError(
+                f"expected a folder of models with at most {MAX_ENTRIES} files and subfolders, {folder} has more; "
+                "choose a smaller one."
+            )
+        yield from (Path(parent, file) for file in files)
+
+
+def category_of(path: Path, files: Sequence[Path]) -> str:
+    """Category of a model among the files of its group: the name of the file, without its suffix, or of a folder.
+
+    Where the files lie in several folders, it is the name of the folder below the one that all of them share.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> flat, deep = [Path("parts/nut.stl"), Path("parts/bolt.stl")], [Path("parts/nuts/m4.stl"), Path("parts/cup.stl")]
+    >>> [category_of(path, flat) for path in flat], [category_of(path, deep) for path in deep]
+    (['nut', 'bolt'], ['nuts', 'cup'])
+    """
+    below = path.relative_to(os.path.commonpath([file.parent for file in files])).parts
+    return below[0] if len(below) > 1 else path.stem
 
 
 @lru_cache(maxsize=MAX_MODELS)
@@ -77,4 +111,4 @@ def read_model(path: Path, unit_m: float) -> SolidModel:
     if volume_m3 < 0:
         mesh = TriangleMesh(mesh.vertices, mesh.faces[:, ::-1])
     digest = hashlib.sha256(b"".join(read_file(file, FileFormatError) for file in files)).hexdigest()
-    return SolidModel(path.stem, path.parent.name, split_at_creases(mesh), None, digest)
+    return SolidModel(path.stem, split_at_creases(mesh), None, digest)

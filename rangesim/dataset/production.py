@@ -47,7 +47,11 @@ stores; the shard that is being packed lies in memory. Larger ones leave a loade
 
 
 def make_dataset(
-    spec: DatasetSpec, directory: str | Path, workers: Workers | None = None, tell: Progress | None = None
+    spec: DatasetSpec,
+    directory: str | Path,
+    workers: Workers | None = None,
+    tell: Progress | None = None,
+    retry: bool = False,
 ) -> Outcome:
     """Make a data set, or go on with one that was begun.
 
@@ -57,6 +61,7 @@ def make_dataset(
     directory : folder of the data set, new, empty or begun with the same specification.
     workers : processes that compute the scenes; None: one for each core.
     tell : is called with what is done and with the fraction that is done, 0..1.
+    retry : compute the scenes again that failed in an earlier run.
 
     Returns
     -------
@@ -78,12 +83,14 @@ def make_dataset(
     with ItemStore(folder).claimed():
         _begin(spec, folder)
         packing = _Packing(spec, folder)
+        if retry:
+            packing.reopen()
         computed = 0
         if not Store(folder).is_complete:
             packing.advance()
             left = _Items(spec, packing.items.packed)
             computed = run_items(
-                _scene_bytes, left, packing.items, workers, tell, lambda key: packing.advance()
+                _scene_bytes, left, packing.items, workers, tell, lambda key: packing.advance(), retry
             ).computed
             packing.finish()
         packing.clear()
@@ -126,7 +133,7 @@ def _begin(spec: DatasetSpec, folder: Path) -> None:
     if found.spec != wanted.spec:
         keys = [key for key in {**wanted.spec, **found.spec} if wanted.spec.get(key) != found.spec.get(key)]
         raise FileFormatError(
-            f"{folder} is a data set of another specification ({', '.join(keys)} differ); name another directory."
+            f"{folder} is a data set of another specification, different in {', '.join(keys)}; name another directory."
         )
     if found.versions != wanted.versions:
         other = [name for name in wanted.versions if found.versions.get(name) != wanted.versions[name]]
@@ -165,13 +172,56 @@ class _Packing:
         self.parts = folder / "parts"
         self.shards = 0
         while self._part(self.shards).exists():
-            rows = read_rows(read_file(self._part(self.shards), FileFormatError), str(self._part(self.shards)))
+            rows = self._rows(self.shards)
             self._discard(rows)  # a run may have been killed before it did
             self.shards, self.items.packed = self.shards + 1, rows[-1].scene + 1
         self._start_shard()
 
     def _part(self, shard: int) -> Path:
         return self.parts / f"{shard:06d}.parquet"
+
+    def _rows(self, shard: int) -> list[IndexRow]:
+        """The rows of a complete shard."""
+        return read_rows(read_file(self._part(shard), FileFormatError), str(self._part(shard)))
+
+    def reopen(self) -> None:
+        """Take scenes out of their shards, from the first shard on that has one that failed.
+
+        They are items of the campaign then, and the next shards are made of them and of the scenes that are computed
+        again. A run that is killed in between goes on with the shards that are left.
+        """
+        if Store(self.folder).is_complete:
+            self._restore_parts()
+        have_failed = [any(row.error is not None for row in self._rows(shard)) for shard in range(self.shards)]
+        if True not in have_failed:
+            return
+        (self.folder / CHECKSUMS).unlink(missing_ok=True)
+        arguments = _Items(self.spec, 0)
+        while self.shards > have_failed.index(True):
+            self.shards -= 1
+            rows = self._rows(self.shards)
+            for row in rows:
+                if row.error is None:
+                    key = scene_key(row.scene)
+                    self.items.write(key, Store(self.folder).segment(row), arguments[key])
+            self._part(self.shards).unlink()
+            shard_path(self.folder, self.shards).unlink()
+            self.items.packed = rows[0].scene
+        self._start_shard()
+
+    def _restore_parts(self) -> None:
+        """Write the parts of a complete data set, of which the index was made."""
+        store = Store(self.folder)
+        sums = {name: sha256 for name, sha256 in store.checksums.items() if name.startswith("shards/")}
+        of_shard: list[list[IndexRow]] = [[] for _ in sums]
+        shard = len(sums) - 1
+        for row in reversed(store.rows):  # one that failed belongs to the shard of the scene after it
+            shard = shard if row.shard is None else row.shard
+            of_shard[shard].insert(0, row)
+        for shard, name in enumerate(sorted(sums)):
+            part = parquet_bytes(of_shard[shard], {"shard_sha256": sums[name]})
+            write_file(self._part(shard), part, FileFormatError, make_parents=True)
+        self.shards, self.items.packed = len(sums), self.spec.scenes
 
     def _start_shard(self) -> None:
         self.next = self.items.packed
@@ -234,7 +284,7 @@ class _Packing:
     def _read_packed(self, number: int) -> bytes:
         """The bytes of a scene that is in a shard."""
         for shard in range(self.shards):
-            for row in read_rows(read_file(self._part(shard), FileFormatError), str(self._part(shard))):
+            for row in self._rows(shard):
                 if row.scene == number and row.error is None:
                     return Store(self.folder).segment(row)
         raise KeyError(scene_key(number))

@@ -46,7 +46,7 @@ def primitive(name: str, size_m: float, random: np.random.Generator) -> SolidMod
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     centre, scale = (low + high) / 2, size_m / float((high - low).max())
     mesh = TriangleMesh((mesh.vertices - centre) * scale, mesh.faces)
-    return SolidModel(name, name, split_at_creases(mesh), tuple((piece - centre) * scale for piece in pieces))
+    return SolidModel(name, split_at_creases(mesh), tuple((piece - centre) * scale for piece in pieces))
 
 
 _Made = tuple[TriangleMesh, list[np.ndarray]]

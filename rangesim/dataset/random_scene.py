@@ -209,7 +209,7 @@ def _draw_objects(spec: DatasetSpec, random: np.random.Generator) -> list[_Drawn
             else:
                 solid = read_model(Path(values["model"]), group.unit_m)
                 scale *= 1.0 if size_m is None else size_m / solid.size_m
-            things.append(_Drawn(solid, scale, group.category or solid.category, values["material"]))
+            things.append(_Drawn(solid, scale, group.category_of(values["model"]), values["material"]))
     return things
 
 

@@ -23,14 +23,13 @@ turn a face of 1 mm by 0.1 degrees."""
 class SolidModel:
     """A solid in part coordinates.
 
-    name : of the primitive or of the file. category : what kind of thing it is, such as the name of the file's folder.
+    name : of the primitive or of the file.
     mesh : closed, metres, part coordinates; vertices are shared across smooth edges only, see `split_at_creases`.
     pieces : convex hulls of these points (k, 3), metres, cover the solid; None: to be found from the mesh.
     source_sha256 : of the file, with the meshes that a URDF file names; "" for a primitive.
     """
 
     name: str
-    category: str
     mesh: TriangleMesh
     pieces: tuple[np.ndarray, ...] | None = None
     source_sha256: str = ""

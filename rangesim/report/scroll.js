@@ -5,9 +5,8 @@ function markScrolling() {
   for (const box of document.querySelectorAll(".scroll")) {
     const scrolls = box.scrollWidth > box.clientWidth;
     box.classList.toggle("scrolls", scrolls);
-    for (const [name, value] of [["tabindex", "0"], ["role", "group"], ["aria-label", "table, wider than the page"]]) {
-      if (scrolls) box.setAttribute(name, value); else box.removeAttribute(name);
-    }
+    if (scrolls) Object.assign(box, { tabIndex: 0, role: "group", ariaLabel: "table, wider than the page" });
+    else for (const name of ["tabindex", "role", "aria-label"]) box.removeAttribute(name);
   }
 }
 window.addEventListener("resize", markScrolling);

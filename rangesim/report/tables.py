@@ -388,7 +388,7 @@ def invented_readings(rows: Mapping[str, Rows]) -> str:
     rows : statistics of each measurement, by the name that the sentence gives it.
     """
     counts = {name: of_one[-1]["invented_readings"] for name, of_one in rows.items()}
-    found = [f"{name} {count}" for name, count in counts.items() if count]
+    found = [f"{count} of {name}" for name, count in counts.items() if count]
     if not found:
         return ""
     return (

@@ -27,6 +27,7 @@ def carry_out(
     out: str | Path | None = None,
     workers: Workers | None = None,
     tell: Progress | None = None,
+    retry: bool = False,
 ) -> SweepResult:
     """The result of a sweep. Tables and page are written by `rangesim.sweep.write_sweep`.
 
@@ -37,6 +38,7 @@ def carry_out(
         are not kept, and this process carries them out one after the other.
     workers : processes that carry out the passes; None: as many as there are cores.
     tell : is called with what is done and with the fraction that is done, 0..1.
+    retry : compute the passes again that failed in an earlier run with this `out`.
 
     Raises
     ------
@@ -44,7 +46,7 @@ def carry_out(
         As `plan` and `rangesim.campaign.run_items`; without `out` also what a pass raises.
     """
     planned = sweep if isinstance(sweep, Plan) else plan(sweep)
-    run = _Run(None if out is None else ItemStore(out, KIND), workers, tell or unwatched)
+    run = _Run(None if out is None else ItemStore(out, KIND), workers, tell or unwatched, retry)
     run.carry_out(planned.probes())
     exposures = _exposures(planned, run)
     items = planned.items({name: one.exposure_s for name, one in exposures.items()})
@@ -87,15 +89,15 @@ def _merged(warnings: Iterable[str]) -> tuple[str, ...]:
 class _Run:
     """Items that are carried out, by workers with a store, or here without one."""
 
-    def __init__(self, store: ItemStore | None, workers: Workers | None, tell: Progress) -> None:
-        self.store, self.workers, self.tell = store, workers, tell
+    def __init__(self, store: ItemStore | None, workers: Workers | None, tell: Progress, retry: bool) -> None:
+        self.store, self.workers, self.tell, self.retry = store, workers, tell, retry
         self.kept: dict[str, bytes] = {}
         self.failed: dict[str, str] = {}
 
     def carry_out(self, items: Mapping[str, Any]) -> None:
         if self.store is not None:
             if items:
-                outcome = run_items(item_bytes, items, self.store, self.workers, self.tell, retry=True)
+                outcome = run_items(item_bytes, items, self.store, self.workers, self.tell, retry=self.retry)
                 self.failed |= {one.key: one.error for one in outcome.quarantined}
             return
         for number, (key, item) in enumerate(items.items()):

@@ -93,7 +93,7 @@ def test_files_that_belong_together_come_together_or_not_at_all(
         return real(*arguments, **options)
 
     monkeypatch.setattr(os, failing, full)
-    with pytest.raises(Refused, match="no space left on the device"):
+    with pytest.raises(Refused, match="no space left on the device; make room there"):
         write_files({tmp_path / "a" / "x": b"1", tmp_path / "a" / "b" / "y": b"2"}, Refused, make_parents=True)
     assert list(tmp_path.iterdir()) == []
 
