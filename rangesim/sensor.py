@@ -459,6 +459,20 @@ class Decoder(Named, ABC):
         return None
 
 
+def pixel_reader_of(decoder: Decoder, sensor: Sensor) -> Callable[[Capture], Coordinates] | None:
+    """`Decoder.pixel_reader`; None also where a subclass of sensor or decoder makes or reads frames in a way of its
+    own, and inherits the reader of another class."""
+    is_changed = any(not is_told_by(type(decoder), "pixel_reader", how) for how in ("coordinates", "decode", "placed"))
+    is_changed |= any(getattr(type(sensor), how) is not getattr(decoder.reads, how) for how in ("frames", "at_pixels"))
+    return None if is_changed else decoder.pixel_reader(sensor)
+
+
+def is_told_by(kind: type, claim: str, method: str) -> bool:
+    """Whether a class makes a claim where it defines a method, or in a subclass of that, and does not inherit it."""
+    of_claim, of_method = (next(each for each in kind.__mro__ if name in vars(each)) for name in (claim, method))
+    return issubclass(of_claim, of_method)
+
+
 def of_type(sensor: Sensor, kind: type[S]) -> S:
     """The sensor, which has to be of that type; ValueError if it is not.
 

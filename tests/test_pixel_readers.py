@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +12,11 @@ from synthetic import plane_signals, stereo_rig
 
 from rangesim import AmcwToF, Capture, DirectToF, IdealToF, Sensor, StructuredLight, decode, expose
 from rangesim.causes.reference_frames import footprint_frames, frames_of_pixels, single_path_frames
-from rangesim.codes import Code
+from rangesim.codes import Code, GrayCode
+from rangesim.decoding.path_length import PathLengths
 from rangesim.rig import Rig
+from rangesim.sensor import Decoder, pixel_reader_of
+from rangesim.sensors.amcw import AmcwDecoder
 from rangesim.settings.config import has_defaults
 
 KINDS = {name: kind for name, kind in Code.known.items() if has_defaults(kind)}
@@ -76,3 +80,32 @@ def test_straight_light_of_some_pixels_is_that_of_the_whole_image(sensor: Sensor
     whole = footprint_frames(sensor, rig, truth, some)
     assert spread.tobytes() == whole[:, some].tobytes()
     assert whole[:, ~some].tobytes() == single_path_frames(sensor, rig, truth)[:, ~some].tobytes()
+
+
+def test_a_subclass_that_reads_otherwise_does_not_inherit_the_reader(monkeypatch: pytest.MonkeyPatch) -> None:
+    for family in (Sensor, Decoder, Code):
+        monkeypatch.setattr(family, "known", dict(family.known))  # the classes of this test leave with it
+
+    class OtherFrames(AmcwToF):
+        type_name = "amcw-of-a-test"
+
+        def frames(self, channels: Any, white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+            return super().frames(channels, white, ambient)
+
+    class OtherReadings(AmcwDecoder):
+        type_name = "amcw-decoder-of-a-test"
+
+        def coordinates(self, capture: Capture) -> PathLengths:
+            return super().coordinates(capture)
+
+    class OtherCode(GrayCode):
+        type_name = "gray-of-a-test"
+
+        def decode(self, seen: Any, thresholds: Any) -> Any:
+            return super().decode(seen, thresholds)
+
+    assert pixel_reader_of(AmcwDecoder(), AmcwToF()) is not None
+    assert pixel_reader_of(AmcwDecoder(), OtherFrames()) is None
+    assert pixel_reader_of(OtherReadings(), AmcwToF()) is None
+    coded = StructuredLight(code=OtherCode())
+    assert pixel_reader_of(coded.default_decoder, coded) is None

@@ -65,8 +65,8 @@ def centroid_error(counts: PulseCounts, bins: int, sigma_bins: float, is_cyclic:
     A thousand photons, with the pulse in the middle of a bin and between two bins:
 
     >>> counts = PulseCounts(np.array([100.5, 101.0]), np.full(2, 1000.0), np.zeros(2))
-    >>> centroid_error(counts, bins=256, sigma_bins=4.2466, is_cyclic=True).round(3)
-    array([0.127, 0.188])
+    >>> centroid_error(counts, bins=256, sigma_bins=4.2466, is_cyclic=True).round(2)
+    array([0.13, 0.19])
     """
     reach = window_reach(bins, sigma_bins, is_cyclic)
     end = (reach + 0.5) / sigma_bins

@@ -15,7 +15,7 @@ from rangesim.capture.exposure import capture_of_frames, noise_free_capture
 from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import without_warnings
-from rangesim.sensor import Decoder, Sensor
+from rangesim.sensor import Decoder, Sensor, pixel_reader_of
 
 if TYPE_CHECKING:
     from rangesim.electronics.ambient import Ambient
@@ -55,7 +55,7 @@ class ReferenceReadings:
     @property
     def is_by_pixel(self) -> bool:
         """Whether some pixels can be read without the others, see `Decoder.pixel_reader`."""
-        return self.decoder.pixel_reader(self.capture.sensor) is not None
+        return pixel_reader_of(self.decoder, self.capture.sensor) is not None
 
     def read_pixels(self, frames: np.ndarray, where: np.ndarray) -> np.ndarray:
         """Depths of some pixels, NaN in the others, if `is_by_pixel`.
@@ -64,7 +64,7 @@ class ReferenceReadings:
         ----------
         frames : (k, 1, n) float32, W/m2/sr, noise-free frames of these pixels. where : (h, w) bool, the n pixels.
         """
-        reader = self.decoder.pixel_reader(self.capture.sensor)
+        reader = pixel_reader_of(self.decoder, self.capture.sensor)
         assert reader is not None
         coordinates = reader(Capture(frames, self.capture.sensor)).spread(where)
         return self.decoder.placed(coordinates, self.signals.rig).reading_m
@@ -127,7 +127,7 @@ def read(captures: Sequence[Captured], decoder: Decoder) -> list[np.ndarray]:
 
 def _read(capture: Captured, decoder: Decoder) -> np.ndarray:
     """Depths of a capture, without checks of the capture as a whole, which could only find what the simulation did."""
-    reader = decoder.pixel_reader(capture.sensor)
+    reader = pixel_reader_of(decoder, capture.sensor)
     if reader is None or not isinstance(capture, Capture):
         return decode(capture, decoder).reading_m
     return decoder.placed(reader(capture), capture.rig).reading_m

@@ -21,7 +21,7 @@ from rangesim.evaluation.reference_readings import halves, sampling_draw
 from rangesim.instrument.instrument import Instrument
 from rangesim.light_transport.samples_per_pixel import Sampler
 from rangesim.robust_scale import TO_SIGMA
-from rangesim.sensor import Decoder, Sensor
+from rangesim.sensor import Decoder, Sensor, pixel_reader_of
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ class _Pixels:
     def reader(self) -> Callable[[Capture], Coordinates] | None:
         """The function that reads these pixels without the others; None if the whole image is needed."""
         is_veiled = self.signals.rig.camera_lens.stray_light > 0
-        return None if is_veiled else self.decoder.pixel_reader(self.sensor)
+        return None if is_veiled else pixel_reader_of(self.decoder, self.sensor)
 
     def halves(self) -> tuple[np.ndarray, np.ndarray]:
         """Depths of each half of the samples, without noise, (n,) float64 each, metres."""

@@ -68,7 +68,7 @@ CLOSE_RADII = 8.0
 """Distance from the centre of the lens, in its radii, at which one of the first paths counts as close. If one path in
 4000 hits the lens, 64 in 4000 come that close, so 8 of the first 512 do; all of them miss by chance once in 3000 times.
 With n times as many paths the distance is smaller by the square root of n, and as many are expected. Doubling takes
-0.69 of the paths that all at once would take, and loses 0.006 % of the light of 24 random scenes."""
+0.69 of the paths that all at once would take, and loses 0.006 % of the light of 30 random scenes."""
 LANES = 8
 """Number of lanes that share the paths of a pixel, half of them for each half of the paths. Lanes of one pixel meet the
 same surfaces and take about as long, so a vector of lanes is rarely idle. With 16, `MIN_PATHS_PER_PIXEL` would have to

@@ -34,7 +34,7 @@ from rangesim.decoding.working_range import WorkingRange
 from rangesim.errors import DoubtWarning, warn
 from rangesim.response import DenseResponse
 from rangesim.rig import Rig
-from rangesim.sensor import Background, Decoder, Emitter, ReceivedLight, Sensor, of_type
+from rangesim.sensor import Background, Decoder, Emitter, ReceivedLight, Sensor, is_told_by, of_type
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, check_fields, whole
 from rangesim.settings.config import has_defaults, nearest, shown
@@ -292,7 +292,8 @@ class StructuredLightDecoder(Decoder):
             axes, codes = self._codes(capture, shown)
             return replace(self._joined(capture, axes, codes, []), is_checked=False)
 
-        return unchecked if shown.code.is_by_pixel and shown.projector_gamma == 1 else None
+        is_by_pixel = shown.code.is_by_pixel and is_told_by(type(shown.code), "is_by_pixel", "decode")
+        return unchecked if is_by_pixel and shown.projector_gamma == 1 else None
 
     def _codes(self, capture: Capture, sensor: StructuredLight) -> tuple[list[AxisFrames], dict[str, AxisCode]]:
         """The frames of each axis, and their code by the name of the axis."""
