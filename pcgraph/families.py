@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from pcgraph.errors import PcgraphError
-from pcgraph.plumbing.python_files import run_python_file
+from pcgraph.plumbing.python_files import place_of_failure, run_python_file
 
 _SEPARATOR = ".py:"
 _HOMES = {"Linkage": "pcgraph.tree.linkage", "SupervoxelMethod": "pcgraph.supervoxels.method"}
@@ -100,7 +100,9 @@ def _module(path: Path) -> ModuleType:
     try:
         return run_python_file(path, "pcgraph")
     except (Exception, SystemExit) as error:
-        raise PcgraphError(f"{path} fails: {type(error).__name__}: {_brief(error)}") from error
+        raise PcgraphError(
+            f"{place_of_failure(error) or path} fails: {type(error).__name__}: {_brief(error)}"
+        ) from error
 
 
 def _brief(thing: object) -> str:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -333,6 +333,11 @@ class ReceivedLight:
     focal_px: float
     trials: float = math.inf
 
+    def of_pixels(self, where: np.ndarray) -> ReceivedLight:
+        """The light of some pixels (h, w) bool alone, as of an image of one row."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: x[where][None] for name, x in values.items() if isinstance(x, np.ndarray)})
+
 
 class FrameContent(NamedTuple):
     """Light and dark current in the frame, or group of frames, that decides about a reading.
@@ -410,7 +415,7 @@ class Decoder(Named, ABC):
 
     def pixel_reader(self, sensor: Sensor) -> Callable[[Capture], Coordinates] | None:
         """A function that reads simulated captures of a sensor as `coordinates` does, without checks of the capture as
-        a whole; None, the default, if frames or reading of a pixel depend on other pixels.
+        a whole; None, the default, if frames or reading of a pixel depend on its place or on other pixels.
 
         A capture is simulated here if it is noise-free, or if its detector is known. With such a function, some pixels
         can be simulated and read without the others, as a capture of one row. Of the whole image, only the level of the

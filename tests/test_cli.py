@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import shutil
@@ -362,6 +363,23 @@ def test_progress_shows_on_a_terminal_alone(
     text = capsys.readouterr()
     assert text.out == ""
     assert "Tracing light" in text.err
+
+
+def test_a_campaign_writes_a_line_into_a_log_at_times(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ten lines at most, and none of a short campaign. The exposures come first, as a stage of their own."""
+    clock = itertools.count(0.0, 0.3)
+    monkeypatch.setattr("rangesim.cli.progress.time.monotonic", lambda: next(clock))
+    with progress_bar(is_campaign=True) as progress:
+        assert progress is not None
+        for _ in range(2):
+            for k in range(101):
+                progress(f"{k} of 100 items, 1 min left", k / 100)
+            lines = capsys.readouterr().err.splitlines()
+            assert 2 <= len(lines) <= 3
+            assert lines[0].startswith("rangesim: ")
+            assert lines[0].endswith(" of 100 items, 1 min left")
 
 
 def test_version_and_help(command: Command) -> None:

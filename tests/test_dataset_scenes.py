@@ -12,8 +12,9 @@ import pytest
 
 import rangesim
 from rangesim.dataset import DatasetSpec, RandomScene, load_spec, piles, random_scene, spec_from_dict, spec_to_dict
+from rangesim.dataset import model_files as files
 from rangesim.dataset.convex_pieces import convex_pieces
-from rangesim.dataset.model_files import read_model
+from rangesim.dataset.model_files import model_files, read_model
 from rangesim.dataset.piles import GAP_M
 from rangesim.dataset.random_primitives import PRIMITIVES, primitive
 from rangesim.errors import FileFormatError
@@ -358,3 +359,16 @@ def different_pixels(scene: RandomScene) -> int:
 def test_masks_are_first_hits() -> None:
     scene = random_scene(spec_of(), 1)
     assert different_pixels(scene) == 0
+
+
+def test_a_folder_of_models_that_is_a_whole_disk_is_refused_soon(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A specification with the model "/" listed all files of the machine; found by fuzzing."""
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "a.stl").touch()
+    monkeypatch.setattr(files, "MAX_ENTRIES", 2)
+    assert model_files(tmp_path) == (tmp_path / "deep" / "a.stl",)
+    (tmp_path / "deep" / "b.txt").touch()
+    with pytest.raises(FileFormatError, match="at most 2 files and subfolders"):
+        model_files(tmp_path)

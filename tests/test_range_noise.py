@@ -29,7 +29,14 @@ from rangesim.causes import explain
 from rangesim.errors import RangesimWarning, SamplingWarning, warn
 from rangesim.evaluation.range_noise import Repeats, range_noise, robust_sigma, warn_of_sampling
 from rangesim.experiment import Experiment
-from rangesim.instrument.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
+from rangesim.instrument.adaptive_sampling import (
+    ENOUGH_PIXELS,
+    FIRST_SPP,
+    AdaptiveSampling,
+    few_of_each,
+    group_sigma,
+    groups,
+)
 from rangesim.instrument.instrument import Instrument
 from rangesim.light_transport.loop import SampleAllocation
 from rangesim.light_transport.sampling_error import Halves
@@ -52,9 +59,11 @@ def test_two_halves_have_every_sample_once_and_whole_pairs(first: int) -> None:
     for n in range(3, 70):
         count = np.array([n], np.uint32)
         taken = []
-        for half in SampleAllocation(np.arange(1), count, count + first, 1.0, first, part=3).halves():
-            k = np.arange(half.samples[0])
-            taken.append(half.first + (k >> 1) * half.stride + (k & 1))  # as `Lanes.number`
+        halves = SampleAllocation(np.arange(1), count, count + first, 1.0, first, part=3).in_halves()
+        assert list(halves.part) == [6, 7]
+        for of_half, samples in zip(halves.first, halves.samples, strict=True):
+            k = np.arange(samples)
+            taken.append(of_half + (k >> 1) * halves.stride + (k & 1))  # as `Lanes.number`
         assert np.array_equal(np.sort(np.concatenate(taken)), first + np.arange(n))
         assert abs(len(taken[0]) - len(taken[1])) <= 2
         for numbers in taken:
@@ -65,7 +74,7 @@ def test_two_halves_have_every_sample_once_and_whole_pairs(first: int) -> None:
 def test_the_drawn_error_of_halves_of_unequal_size_has_the_variance_of_the_mean() -> None:
     rng, p, q = np.random.default_rng(3), 5, 16
     a, b = (rng.normal(2 * n, np.sqrt(n), (1, 200, 300)).astype(np.float32) for n in (p, q))
-    mean, error = np.empty_like(a), np.empty_like(a)
+    mean, error = np.zeros_like(a), np.zeros_like(a)
     Halves([np.full((200, 300), n, np.uint32) for n in (p, q)]).mean_and_error((a, b), (mean, error))
     assert mean.mean() == pytest.approx(2, rel=0.01)
     assert mean.std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)
@@ -82,6 +91,7 @@ def test_what_is_decoded_again_for_comparison_does_not_warn_again(matte: Scene, 
     noise, causes = range_noise(image, capture, signals), explain(image, capture, signals)
     assert causes.failed.any()
     decoder, quiet = type(sensor.default_decoder), type(sensor.default_decoder).decode
+    monkeypatch.setattr(decoder, "pixel_reader", lambda self, sensor: None)  # such a reader checks and warns of nothing
 
     def loud(self: Any, capture: Any) -> Any:
         warn("frames and code contradict each other.")
@@ -101,15 +111,16 @@ def test_what_is_decoded_again_for_comparison_does_not_warn_again(matte: Scene, 
 def test_an_instrument_decodes_and_exposes_the_same_light_once(
     matte: Scene, monkeypatch: Any, ambient: float, decodings: int
 ) -> None:
-    """Its own capture, both halves, all samples without noise, three with other noise, and three parts of the light:
-    the projector's alone (only where there is other light), the straight path, and paths over a pixel's area."""
+    """Its own capture, both halves, all samples without noise, three with other noise, and parts of the light: the
+    projector's alone (only where there is other light), the straight path to some failed pixels, and paths over the
+    area of some."""
     sensor, rig = DirectToF(bins=64, bin_s=400e-12), matte.rig(0.03, width=48, height=36)
     signals = transport(matte, rig, [sensor], spp=4)
     energy = replace(signals.energy, ambient=np.full_like(signals.energy.ambient, ambient))
     signals = replace(signals, energy=energy)
     read: list[bytes] = []
     lit: list[tuple[float, float]] = []
-    decoder, undisturbed = type(sensor.default_decoder), type(sensor.default_decoder).decode
+    decoder, undisturbed = type(sensor.default_decoder), type(sensor.default_decoder).coordinates
     frames_of = StillSignals.frames
 
     def noted(self: Any, capture: Any) -> Any:
@@ -120,7 +131,7 @@ def test_an_instrument_decodes_and_exposes_the_same_light_once(
         lit.append((ambient_transmission, sampling_errors))
         return frames_of(self, sensor, ambient_transmission, sampling_errors)
 
-    monkeypatch.setattr(decoder, "decode", noted)
+    monkeypatch.setattr(decoder, "coordinates", noted)
     monkeypatch.setattr(StillSignals, "frames", frames)
     one = Instrument("direct", sensor)
     measured = measure(Experiment("-", instruments=(one,), seed=1), one, signals, None)
@@ -186,7 +197,10 @@ def test_two_samples_know_nothing_of_their_error(matte: Scene) -> None:
 def test_the_detectors_sigma_is_that_between_captures_of_one_render(
     name: str, sensor: Any, spp: Any, seed: int
 ) -> None:
-    """Against the mean of the two halves it was up to twice as large, where these are far from linear: on glass."""
+    """Against the mean of the two halves it was up to twice as large, where these are far from linear: on glass.
+
+    The ratio varies from seed to seed: on the glass of the tabletop from 0.92 to 1.18 over 12 seeds, sigma 0.08.
+    """
     scene, one = load_scene(name), Instrument("one", sensor)
     signals = transport(scene, one.rig(scene, **SMALL_IMAGE), [sensor], spp=spp, seed=seed, photons=500_000)
     captures = [expose(signals, sensor, one.detector, seed=n) for n in range(16)]
@@ -199,7 +213,7 @@ def test_the_detectors_sigma_is_that_between_captures_of_one_render(
     for material, of_class in signals.truth.classes().items():
         if (mask := of_class & always).sum() >= 150:
             estimated, true = (robust_sigma(np.array(x)[:, mask]) for x in (some, spread))
-            assert estimated == pytest.approx(true, rel=0.1), material
+            assert estimated == pytest.approx(true, rel=0.2), material
             checked.append(material)
     assert {"matte", "transparent"} <= set(checked)
 
@@ -294,6 +308,16 @@ def test_groups_are_the_pixels_of_an_instance_in_a_square_and_their_sigma_is_tha
         assert sigma[number] == (pytest.approx(1.4826 * finite[len(finite) // 2]) if finite.size else 0)
     assert not group_sigma(np.full((40, 50), np.nan), group).any()
     assert (group_sigma(np.full((40, 50), np.inf), group) == np.inf).all()
+
+
+def test_few_pixels_tell_the_noise_of_each_group() -> None:
+    """Of large groups a quarter is read, of small ones all, and no group is left out."""
+    instance = np.random.default_rng(1).choice([0, 1, 2], (64, 80), p=[0.9, 0.09, 0.01])
+    instance[:16, :16] = 0
+    group = groups(instance)
+    few, all_pixels = np.bincount(group[few_of_each(group)]), np.bincount(group.ravel())
+    assert few[group[0, 0]] == 64
+    assert ((few >= ENOUGH_PIXELS) | (few == all_pixels)).all()
 
 
 @pytest.mark.validation

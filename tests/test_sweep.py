@@ -56,6 +56,7 @@ def wall(sensors: tuple[Any, ...] = ("amcw",), seeds: int = 2, **vary: Any) -> S
         ({"power_w": 1.0, "vary": {"power_w": [1.0, 2.0]}}, "expected power_w as one value or in vary, got both"),
         ({"vary": {"power_w": [1, 2.0, 1.0]}}, r"expected different values of vary\.power_w, got 1\.0 twice"),
         ({"vary": {key: [*range(1, 1001)] for key in ("power_w", "baseline_m", "exposure_s")}}, "at most 10000 combin"),
+        ({"ambient": 1}, "expected ambient as a table of settings, got 1"),
         ({"tolerence_m": 0.1}, "did you mean 'tolerance_m'"),
     ],
 )
@@ -128,6 +129,19 @@ def test_projectors_stay_where_they_are_while_the_scene_moves() -> None:
     planned = plan(wall(("gray",), scene__distance_m=(0.5, 1.0, 4.0)))
     assert planned.working_distance_m == pytest.approx(1.0, abs=0.01)
     assert len({one.rig.T_camera_projector.tobytes() for one in planned.passes}) == 1
+
+
+def test_only_points_that_differ_in_the_light_transport_alone_share_their_noise() -> None:
+    def seeds_of_passes(**vary: Any) -> list[set[int]]:
+        return [{s for job in one.jobs for s in job["seeds"]} for one in plan(wall(("amcw",), 3, **vary)).passes]
+
+    fine, coarse = seeds_of_passes(max_depth=(2, 3))
+    assert fine == coarse
+    for vary in ({"scene__distance_m": (1.0, 2.0)}, {"seed": (0, 1)}):
+        one, other = seeds_of_passes(**vary)
+        assert not one & other
+    (both,) = seeds_of_passes(power_w=(1.0, 2.0))
+    assert len(both) == 6
 
 
 # ---- Results -------------------------------------------------------------------------------------------------------
@@ -205,6 +219,24 @@ def test_a_scene_of_a_file_of_the_user_has_its_parameters(tmp_path: Path) -> Non
     before = planned.items({})[0][0]
     (tmp_path / "own.py").write_text((tmp_path / "own.py").read_text() + "# changed\n")
     assert plan(sweep_from_dict(table, tmp_path)).items({})[0][0] != before
+
+
+@pytest.mark.parametrize(
+    ("body", "sentence"),
+    [
+        ("    return 1 / (distance_m - 1.0)", "own.py, line 3, fails: ZeroDivisionError"),
+        ("    import sys; sys.exit(0)", "own.py, line 3, fails: SystemExit: 0"),
+        ("    return {'type': 'no scene'}", "own.py fails: "),
+        ("    return (", "own.py, line 3, fails: SyntaxError"),
+    ],
+)
+def test_a_scene_function_that_fails_ends_in_a_sentence_with_file_and_line(
+    tmp_path: Path, body: str, sentence: str
+) -> None:
+    (tmp_path / "own.py").write_text(f"\ndef own(distance_m=2.0):\n{body}\n")
+    table = {"scene": "own.py:own", "sensors": ["amcw"], "vary": {"scene": {"distance_m": [1.0, 2.0]}}}
+    with pytest.raises(FileFormatError, match=f"^.*{sentence}"):
+        plan(sweep_from_dict(table, tmp_path))
 
 
 def test_the_page_and_the_tables_are_written(result: Any, tmp_path: Path) -> None:

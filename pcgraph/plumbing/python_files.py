@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import traceback
 from collections.abc import Sequence
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -72,6 +73,17 @@ def run_python_file(path: Path, package: str) -> ModuleType:
             _CHANGED[Path(neighbour.__file__)] = Path(neighbour.__file__).stat().st_mtime_ns
     _RUN[name] = module, changed
     return module
+
+
+def place_of_failure(error: BaseException) -> str:
+    """Words that say where in a user's Python file an exception arose: "FILE.py, line 3,"; empty if it was in none."""
+    steps = traceback.walk_tb(error.__traceback__)
+    own = [
+        f"{f.f_code.co_filename}, line {n}," for f, n in steps if ".user_modules.x" in f.f_globals.get("__name__", "")
+    ]
+    if not own and isinstance(error, SyntaxError):  # the file has not begun to run
+        return f"{error.filename}, line {error.lineno},"
+    return own[-1] if own else ""
 
 
 def _name_of(path: Path, package: str) -> str:

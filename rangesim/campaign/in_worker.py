@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from pcgraph.plumbing.python_files import place_of_failure
 from rangesim.environment.versions import source_digest, versions
 from rangesim.errors import sentence
 
@@ -109,7 +110,7 @@ def carry_out(job: Job) -> Reply:
             else:
                 error = f"expected bytes of the function, got {type(result).__name__}"
         except BaseException as problem:  # noqa: BLE001  # an item that calls sys.exit has failed, too
-            error = sentence(f"{type(problem).__name__}: {problem}")
+            error = sentence(" ".join((place_of_failure(problem), f"{type(problem).__name__}: {problem}")).strip())
             trace = "".join(traceback.format_exception(problem))
     warned = tuple(dict.fromkeys((one.category.__name__, sentence(str(one.message))) for one in caught))
     seconds = time.monotonic() - start

@@ -253,9 +253,8 @@ def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:
     The lens scatters stray light over each frame alike, so no light is lost: it has the phase, the code and the path
     length of the image's mean.
     """
-    if not (rig.camera.is_pinhole and not rig.camera_lens.vignetting):
-        fraction = rig.camera_illumination
-        frames = frames if (fraction == 1).all() else frames * fraction
+    fraction = rig.camera_illumination
+    frames = frames if (fraction == 1).all() else frames * fraction
     if rig.camera_lens.stray_light:
         stray = rig.camera_lens.stray_light
         mean = frames.mean(axis=(1, 2), dtype=np.float64, keepdims=True)

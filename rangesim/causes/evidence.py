@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -19,6 +20,7 @@ from rangesim.causes.reference_frames import (
     footprint_frames,
     frames_of_pixels,
     points_in_projector,
+    single_path_frames,
 )
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
@@ -219,20 +221,13 @@ class Evidence:
             edges = edges | (self.truth.farthest_m > across(self.truth.nearest_m, self.tolerance_m))
         return edges if not reach else binary_dilation(edges, np.ones((3, 3)), iterations=reach)
 
-    @cached_property
-    def merely_inclined(self) -> np.ndarray:
-        """Whether the apparent edge is one steep surface, which the sensor would read correctly over the whole pixel
-        without the light that disturbs it. It is False for readings that reach beyond the pixel, and so to a true
-        edge."""
+    def inclined(self, where: np.ndarray) -> np.ndarray:
+        """Whether all neighbours of pixels `where` (h, w) lie on the tangent plane of the surface at the pixel's
+        centre: the pixel covers one surface, however steep. It is False for readings that reach beyond the pixel, and
+        so to a true edge."""
         if self.readings.decoder.reach_px:
-            return np.zeros(self.failed.shape, dtype=bool)
-        return self.inclined & self._may_blur & ~self.blurred
-
-    @cached_property
-    def inclined(self) -> np.ndarray:
-        """Whether all neighbours lie on the tangent plane of the surface at the pixel's centre: the pixel covers
-        one surface, however steep."""
-        rig, where = self.signals.rig, self.failed & self.at_edge
+            return np.zeros(where.shape, dtype=bool)
+        rig = self.signals.rig
         planes, (rows, columns) = TangentPlanes(rig, self.truth, self.true_m, where), self.pixels.around(where, 1)
         origins, rays = (x.reshape(*rows.shape, 3) for x in rig.camera.rays_at((rows.ravel(), columns.ravel())))
         fits = np.ones(len(rows), dtype=bool)
@@ -244,13 +239,13 @@ class Evidence:
         result[where] = fits
         return result
 
-    @cached_property
-    def fails_off_edge(self) -> np.ndarray:
-        """Whether pixels nearby on the same surface, but off the edge, have at least half of the error: then the edge
-        is not to blame. It is False for readings that reach beyond the pixel, whose neighbours share their edge."""
+    def fails_off_edge(self, where: np.ndarray) -> np.ndarray:
+        """Whether pixels near pixels `where` (h, w), on the same surface, but off the edge, have at least half of the
+        error: then the edge is not to blame. It is False for readings that reach beyond the pixel, whose neighbours
+        share their edge."""
+        result = np.zeros(where.shape, dtype=bool)
         if self.readings.decoder.reach_px:
-            return np.zeros(self.failed.shape, dtype=bool)
-        result, where = np.zeros(self.failed.shape, dtype=bool), self.failed & self.at_edge
+            return result
         error = np.where(self.missing, np.inf, np.abs(self.error))
         surfaces = self.true_m, self.truth.instance
         around = error_off_edge(where, error, self.at_edge, *surfaces, self.tolerance_m, self.pixels)
@@ -328,9 +323,8 @@ class Evidence:
 
     # ---- The range of the sensor ---------------------------------------------------------------------
 
-    @cached_property
-    def coarse(self) -> np.ndarray:
-        """Whether optics is to blame, and the reading of the straight path alone is missing, or still has half of the
+    def coarse(self, where: np.ndarray) -> np.ndarray:
+        """Whether the reading of the straight path alone to pixels `where` (h, w) is missing, or still has half of the
         error or more.
 
         A sensor that compares texture needs straight paths to the whole area of each pixel; beside a depth edge, the
@@ -338,11 +332,12 @@ class Evidence:
         """
         sensor = self.capture.sensor
         if not sensor.reads_emitter:
-            return np.zeros(self.truth.z.shape, dtype=bool)
-        where = self.optical & np.isfinite(self.truth.z)
+            return np.zeros(where.shape, dtype=bool)
         if sensor.compares_texture:
-            return where & self._wrong_in_straight_light(where, is_spread=True) & ~self.at_edge
-        return where & self._wrong_in_straight_light(where)
+            return where & self._wrong_over_areas & ~self.at_edge
+        if self.readings.is_by_pixel:
+            return self._wrong_alone(where, is_spread=False)
+        return where & self._wrong_at_centres
 
     @cached_property
     def textureless(self) -> np.ndarray:
@@ -353,17 +348,18 @@ class Evidence:
             return np.zeros(self.missing.shape, dtype=bool)
         return self.missing & ((self.image.status == Status.LOW_SIGNAL) | (not sensor.reads_emitter))
 
-    @cached_property
-    def blurred(self) -> np.ndarray:
-        """Whether the reading of straight paths to the whole area of the pixel, on its tangent plane, has half of the
-        error or more, or is missing; it is computed only where other light disturbs the pixel too."""
-        sensor, spread = self.capture.sensor, self._may_blur
-        if sensor.compares_texture:
-            return spread & self.coarse
-        return spread & self._wrong_in_straight_light(spread, is_spread=True)
+    def blurred(self, where: np.ndarray) -> np.ndarray:
+        """Whether the reading of straight paths to the whole area of pixels `where` (h, w), on their tangent planes,
+        has half of the error or more, or is missing; it is looked at only where other light disturbs the pixel too."""
+        where = where & self.may_blur
+        if self.capture.sensor.compares_texture:
+            return where & self.coarse(where)
+        if self.readings.is_by_pixel:
+            return self._wrong_alone(where, is_spread=True)
+        return where & self._wrong_over_areas
 
     @cached_property
-    def _may_blur(self) -> np.ndarray:
+    def may_blur(self) -> np.ndarray:
         """Whether the pixel fails without noise, is disturbed by indirect light, and shows a lit surface that is
         neither a mirror nor glass."""
         lit = ~self.in_shadow & ~self.is_a("transparent", "mirror")
@@ -398,27 +394,37 @@ class Evidence:
         """
         return np.asarray(np.where(self.missing, self.tolerance_m, np.abs(self.error) / 2))
 
-    def _wrong_in_straight_light(self, where: np.ndarray, is_spread: bool = False) -> np.ndarray:
-        """(h, w) bool, whether failed pixels have half of their error or more, or no reading, in frames of straight
-        paths alone; undefined outside `where`.
+    def _wrong_alone(self, where: np.ndarray, is_spread: bool) -> np.ndarray:
+        """(h, w) bool, whether failed pixels `where` have half of their error or more, or no reading, in frames of
+        straight paths to these pixels alone; False elsewhere.
 
-        Parameters
-        ----------
-        where : (h, w) bool, some of the failed pixels. is_spread : whether the paths cover the area of these pixels.
-            If the decoder compares texture, they cover that of all pixels of all cameras.
+        is_spread : whether the paths cover the area of each pixel. If not, there is one, to its centre.
         """
-        sensor = self.capture.sensor
         if not where.any():
             return where
-        if self.readings.is_by_pixel:
-            frames = frames_of_pixels(sensor, self.signals.rig, self.truth, where, is_spread)
-            return self._wrong(self.readings.read_pixels(frames, where))
+        frames = frames_of_pixels(self.capture.sensor, self.signals.rig, self.truth, where, is_spread)
+        return where & self._wrong(self.readings.read_pixels(frames, where))
+
+    @cached_property
+    def _wrong_at_centres(self) -> np.ndarray:
+        """As `_wrong_alone`, for a decoder that reads whole images alone, in straight paths to all pixels' centres."""
+        return self._wrong_in(lambda one: single_path_frames(self.capture.sensor, one.rig, one.truth))
+
+    @cached_property
+    def _wrong_over_areas(self) -> np.ndarray:
+        """The same in straight paths that cover the area of the pixels that may be blurred; if the decoder compares
+        texture, the area of all pixels of all cameras."""
+        sensor = self.capture.sensor
 
         def frames_of(one: Signals) -> np.ndarray:
-            seen = np.isfinite(one.truth.z)
-            return footprint_frames(sensor, one.rig, one.truth, seen if sensor.compares_texture else where & is_spread)
+            spread = np.isfinite(one.truth.z) if sensor.compares_texture else self.may_blur
+            return footprint_frames(sensor, one.rig, one.truth, spread)
 
-        return self._wrong(self.readings.read([capture_of_frames(self.signals, sensor, frames_of)])[0])
+        return self._wrong_in(frames_of)
+
+    def _wrong_in(self, frames_of: Callable[[Signals], np.ndarray]) -> np.ndarray:
+        """(h, w) bool, `_wrong` in noise-free frames (k, h, w), which a function makes for each camera."""
+        return self._wrong(self.readings.read([capture_of_frames(self.signals, self.capture.sensor, frames_of)])[0])
 
     def _wrong(self, z: np.ndarray) -> np.ndarray:
         """(h, w) bool, whether failed pixels have half of their error or more in depths z (h, w), or NaN there."""

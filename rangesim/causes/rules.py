@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,68 +80,76 @@ def causes_of(readings: ReferenceReadings, tolerance_m: float) -> CauseMap:
         raise ValueError("expected a capture that was exposed from these signals, got that of a camera elsewhere.")
     if not tolerance_m > 0:
         raise ValueError(f"expected a positive tolerance_m in metres, got {tolerance_m}.")
-    evidence = Evidence(readings, tolerance_m)
-    if not evidence.failed.any():
-        return CauseMap(np.zeros(shape, dtype=np.uint8), tolerance_m)
-    masks, causes = zip(*rules(evidence), strict=True)
-    cause = np.select(masks, causes)
-    return CauseMap(np.where(evidence.failed, cause, Cause.NONE).astype(np.uint8), tolerance_m)
+    evidence, cause = Evidence(readings, tolerance_m), np.full(shape, Cause.NONE, dtype=np.uint8)
+    left = evidence.failed.copy()
+    if left.any():
+        for holds, found in rules(evidence, left):
+            cause[left & holds] = found
+            left &= ~holds
+            if not left.any():
+                break
+    return CauseMap(cause, tolerance_m)
 
 
-def rules(e: Evidence) -> list[Rule]:
+def rules(e: Evidence, left: np.ndarray) -> Iterator[Rule]:
     """Causes in the order in which they are tried; the first one that holds is the cause of a failed pixel.
 
     The order follows the light from the emitter to the decoder. Saturation comes first, because it hides everything
     else. The last rule always holds, so that every failed pixel has a cause: if there is enough light, nothing disturbs
     it, and the reading without noise is correct, the noise is to blame.
+
+    Parameters
+    ----------
+    left : (h, w) bool, failed pixels without a cause so far, which the caller updates. Evidence that takes time is
+        looked for in these alone.
     """
     too_dark, disturbed = ~e.enough, e.optical & e.disturbed
     dim = e.is_a("glossy") & e.faint & ~e.enough_direct  # its direct light alone would be too dark
-    return [
-        # ---- The detector is saturated
-        (e.saturated & e.mostly_ambient & ~e.mostly(GLINT), Cause.AMBIENT),
-        (e.saturated & e.piled_up & ~e.mostly(GLINT), Cause.PILE_UP),
-        (e.saturated | e.mostly(GLINT), Cause.GLINT),
-        # ---- The device refuses what is nearer or farther than it promises to read
-        (e.out_of_range, Cause.OUT_OF_RANGE),
-        # ---- Surfaces that reflect or transmit the light: it does not matter whether they are lit. Direct light in
-        # such a pixel comes from a neighbouring surface
-        (e.is_a("transparent", "mirror") & e.at_edge & e.enough & e.mostly(DIRECT), Cause.DEPTH_EDGE),
-        (e.is_a("transparent") | (e.is_a("translucent") & too_dark), Cause.SEEN_THROUGH),
-        (e.is_a("mirror") & (~e.missing | e.enough), Cause.MIRRORED_GHOST),
-        (e.is_a("mirror"), Cause.SPECULAR_AWAY),
-        # ---- There is no straight path from the emitter
-        (e.unlit & e.enough & e.mostly(CAUSTIC), Cause.CAUSTIC),
-        (e.unlit & e.enough & e.mostly(SPECULAR), Cause.MIRRORED_GHOST),
-        (e.unlit, Cause.SHADOWED),
-        # ---- A camera of a pair does not see the point
-        (e.hidden, Cause.OCCLUDED),
-        # ---- Too little of the emitter's light comes back
-        (e.is_a("glossy") & e.faint & ~e.optical, Cause.SPECULAR_AWAY),
-        (dim & (too_dark | e.missing), Cause.SPECULAR_AWAY),
-        (dim, Cause.MIRRORED_GHOST),
-        (too_dark & e.swamped, Cause.AMBIENT),
-        (too_dark, Cause.LOW_SIGNAL),
-        # ---- The distance itself
-        (e.beyond_range, Cause.RANGE_AMBIGUITY),
-        (e.off_glass, Cause.COVER_GLASS),
-        (e.veiled, Cause.STRAY_LIGHT),
-        (e.optical & e.textureless, Cause.NO_TEXTURE),
-        (e.optical & e.coarse, Cause.RESOLUTION),
-        # ---- The pixel covers more than one distance
-        (e.moving, Cause.MOTION),
-        (e.at_edge & ~(disturbed & (e.fails_off_edge | e.merely_inclined)), Cause.DEPTH_EDGE),
-        (e.in_shadow, Cause.SHADOWED),
-        (e.optical & ~disturbed & e.beside_shadow, Cause.SHADOWED),
-        (e.optical & e.blurred, Cause.RESOLUTION),
-        (disturbed & e.mostly(CAUSTIC, OTHER), Cause.CAUSTIC),
-        (disturbed & e.mostly(SPECULAR, OTHER), Cause.MIRRORED_GHOST),
-        (disturbed & e.mostly(MULTIPATH, OTHER), Cause.MULTIPATH),
-        (disturbed, Cause.GLINT),
-        # ---- The decoder, and noise
-        (e.wrong_period, Cause.RANGE_AMBIGUITY),
-        (e.optical, Cause.RESOLUTION),
-        (e.swamped, Cause.AMBIENT),
-        (e.piled_up, Cause.PILE_UP),
-        (np.ones_like(too_dark), Cause.LOW_SIGNAL),
-    ]
+    # ---- The detector is saturated
+    yield e.saturated & e.mostly_ambient & ~e.mostly(GLINT), Cause.AMBIENT
+    yield e.saturated & e.piled_up & ~e.mostly(GLINT), Cause.PILE_UP
+    yield e.saturated | e.mostly(GLINT), Cause.GLINT
+    # ---- The device refuses what is nearer or farther than it promises to read
+    yield e.out_of_range, Cause.OUT_OF_RANGE
+    # ---- Surfaces that reflect or transmit the light: it does not matter whether they are lit. Direct light in
+    # such a pixel comes from a neighbouring surface
+    yield e.is_a("transparent", "mirror") & e.at_edge & e.enough & e.mostly(DIRECT), Cause.DEPTH_EDGE
+    yield e.is_a("transparent") | (e.is_a("translucent") & too_dark), Cause.SEEN_THROUGH
+    yield e.is_a("mirror") & (~e.missing | e.enough), Cause.MIRRORED_GHOST
+    yield e.is_a("mirror"), Cause.SPECULAR_AWAY
+    # ---- There is no straight path from the emitter
+    yield e.unlit & e.enough & e.mostly(CAUSTIC), Cause.CAUSTIC
+    yield e.unlit & e.enough & e.mostly(SPECULAR), Cause.MIRRORED_GHOST
+    yield e.unlit, Cause.SHADOWED
+    # ---- A camera of a pair does not see the point
+    yield e.hidden, Cause.OCCLUDED
+    # ---- Too little of the emitter's light comes back
+    yield e.is_a("glossy") & e.faint & ~e.optical, Cause.SPECULAR_AWAY
+    yield dim & (too_dark | e.missing), Cause.SPECULAR_AWAY
+    yield dim, Cause.MIRRORED_GHOST
+    yield too_dark & e.swamped, Cause.AMBIENT
+    yield too_dark, Cause.LOW_SIGNAL
+    # ---- The distance itself
+    yield e.beyond_range, Cause.RANGE_AMBIGUITY
+    yield e.off_glass, Cause.COVER_GLASS
+    yield e.veiled, Cause.STRAY_LIGHT
+    yield e.optical & e.textureless, Cause.NO_TEXTURE
+    yield e.coarse(left & e.optical), Cause.RESOLUTION
+    # ---- The pixel covers more than one distance
+    yield e.moving, Cause.MOTION
+    blurred, disturbed_edge = e.blurred(left & e.optical), left & e.at_edge & disturbed
+    merely_inclined = e.inclined(disturbed_edge & e.may_blur) & ~blurred
+    yield e.at_edge & ~(e.fails_off_edge(disturbed_edge) | merely_inclined), Cause.DEPTH_EDGE
+    yield e.in_shadow, Cause.SHADOWED
+    yield e.optical & ~disturbed & e.beside_shadow, Cause.SHADOWED
+    yield blurred, Cause.RESOLUTION
+    yield disturbed & e.mostly(CAUSTIC, OTHER), Cause.CAUSTIC
+    yield disturbed & e.mostly(SPECULAR, OTHER), Cause.MIRRORED_GHOST
+    yield disturbed & e.mostly(MULTIPATH, OTHER), Cause.MULTIPATH
+    yield disturbed, Cause.GLINT
+    # ---- The decoder, and noise
+    yield e.wrong_period, Cause.RANGE_AMBIGUITY
+    yield e.optical, Cause.RESOLUTION
+    yield e.swamped, Cause.AMBIENT
+    yield e.piled_up, Cause.PILE_UP
+    yield np.ones_like(too_dark), Cause.LOW_SIGNAL

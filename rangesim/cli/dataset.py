@@ -56,7 +56,7 @@ def make_command(
     from rangesim.campaign import Workers
     from rangesim.dataset import load_spec, make_dataset
 
-    with progress_bar() as progress:
+    with progress_bar(is_campaign=True) as progress:
         outcome = make_dataset(load_spec(spec), out, Workers(workers, scheduler), progress, retry)
     typer.echo(outcome)
     if outcome.quarantined:

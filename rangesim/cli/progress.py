@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,18 +19,24 @@ if TYPE_CHECKING:
     from rangesim.pipeline.cost import Cost
 
 
+LINE_EACH = 0.1
+"""Fraction of the work after which a campaign prints its next line: ten lines for each campaign, however long."""
+LINE_EACH_S = 10.0
+"""Least seconds between two such lines, so that short campaigns print none."""
 HOW_TO_RETRY = "rangesim: the same command with --retry computes again what failed"
 """Line at the end of a command some of whose items failed."""
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[str, float], None] | None]:
+def progress_bar(is_campaign: bool = False) -> Iterator[Callable[[str, float], None] | None]:
     """Show a progress bar while the block runs, if stderr is a terminal.
 
     Yields a callable that takes the name of the stage and the fraction done, 0..1; None if stderr is no terminal.
+
+    is_campaign : whether the work may take hours. Then it prints lines if stderr is no terminal, but a log.
     """
     if not sys.stderr.isatty():
-        yield None
+        yield progress_lines() if is_campaign else None
         return
     from rich.console import Console
     from rich.markup import escape
@@ -44,6 +51,20 @@ def progress_bar() -> Iterator[Callable[[str, float], None] | None]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("Starting", total=1.0)
         yield lambda stage, fraction: bar.update(task, description=escape(one_line(stage)), completed=fraction)
+
+
+def progress_lines() -> Callable[[str, float], None]:
+    """A function of the stage and the fraction done, 0..1, that prints a line on stderr now and then."""
+    told, told_s = 0.0, time.monotonic()
+
+    def tell(stage: str, fraction: float) -> None:
+        nonlocal told, told_s
+        told, now_s = min(told, fraction), time.monotonic()  # the next stage begins at 0
+        if fraction - told >= LINE_EACH and now_s - told_s >= LINE_EACH_S:
+            typer.echo(f"rangesim: {100 * fraction:.0f} %, {one_line(stage)}", err=True)
+            told, told_s = fraction, now_s
+
+    return tell
 
 
 def announce_cost(cost: Cost) -> None:

@@ -50,7 +50,7 @@ def sweep_command(
     typer.echo(f"{'' if estimate else 'rangesim: '}{planned}", err=not estimate)
     if estimate or out is None:
         return
-    with progress_bar() as progress:
+    with progress_bar(is_campaign=True) as progress:
         result = carry_out(planned, out, chosen, progress, retry)
     for text in result.warnings:
         typer.echo(f"rangesim: {one_line(text)}", err=True)

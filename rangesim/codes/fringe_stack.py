@@ -111,7 +111,8 @@ class FringeStack:
         """(h, w) float64, projector pixels, standard deviation of a place: of each period P / (2 pi) sqrt(2 / N) sigma
         / B, and the places of precise periods are averaged.
 
-        The modulation B is half of the emitter's light, less what a camera's pixel averages over the fringe.
+        The modulation B is half of the emitter's light, less what a camera's pixel averages over the fringe. A phase of
+        the standard deviation s by the linear law has the variance s^2 + s^4, because an arc tangent is no line.
 
         Parameters
         ----------
@@ -123,15 +124,18 @@ class FringeStack:
         """
         noise = np.sqrt(light.emitter / 2 + light.ambient + light.own_variance)
         across_px = (light.pixel_columns, light.pixel_rows)[axis]
+        rates = 2 * np.pi / np.array(self.periods_px)[:, None, None]  # radians per pixel
         precisions = np.array(
             [
-                steps / 2 * (2 * np.pi / period * VISIBILITY * light.emitter * np.sinc(across_px / period) / noise) ** 2
-                for period, steps in zip(self.periods_px, self.steps, strict=True)
+                steps / 2 * (rate * VISIBILITY * light.emitter * np.sinc(across_px / period) / noise) ** 2
+                for rate, period, steps in zip(rates, self.periods_px, self.steps, strict=True)
             ]
         )
         precise = precisions >= MIN_PRECISION * precisions.max(axis=0)
         with np.errstate(divide="ignore"):
-            return np.asarray(1 / np.sqrt((precisions * precise).sum(axis=0)))
+            return np.asarray(
+                np.sqrt((precise * (precisions + rates**2)).sum(axis=0)) / (precisions * precise).sum(axis=0)
+            )
 
     def of_period(self, frames: np.ndarray, i: int) -> np.ndarray:
         """The frames (N, ...) of period i, a view."""

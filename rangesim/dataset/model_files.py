@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -19,6 +19,9 @@ from rangesim.triangle_mesh import TriangleMesh
 
 MODEL_SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".ply", ".off", ".urdf")
 """Suffixes of the files that are taken for models."""
+MAX_ENTRIES = 200_000
+"""Largest number of files and subfolders of a folder of models. To list them takes half a second; the folder may have
+been "/" by mistake."""
 MAX_MODELS = 256
 """Largest number of models that a process keeps in memory: 256 models of 20 000 faces take about 0.3 GB."""
 
@@ -39,11 +42,24 @@ def model_files(path: Path) -> tuple[Path, ...]:
         return (path,)
     if not path.is_dir():
         raise FileFormatError(f"expected a model or a folder of models, but {path} does not exist.")
-    found = sorted(p for p in path.rglob("*") if p.suffix.lower() in MODEL_SUFFIXES and p.is_file())
+    found = sorted(p for p in _entries(path) if p.suffix.lower() in MODEL_SUFFIXES and p.is_file())
     if not found:
         raise FileFormatError(f"expected models ({', '.join(MODEL_SUFFIXES)}) in {path}, found none.")
     urdfs = [p for p in found if p.suffix.lower() == ".urdf"]
     return tuple(urdfs or found)
+
+
+def _entries(folder: Path) -> Iterator[Path]:
+    """Paths of all files in a folder and its subfolders; FileFormatError if there are more than `MAX_ENTRIES`."""
+    count = 0
+    for parent, folders, files in os.walk(folder):
+        count += len(folders) + len(files)
+        if count > MAX_ENTRIES:
+            raise FileFormatError(
+                f"expected a folder of models with at most {MAX_ENTRIES} files and subfolders, {folder} has more; "
+                "choose a smaller one."
+            )
+        yield from (Path(parent, file) for file in files)
 
 
 def category_of(path: Path, files: Sequence[Path]) -> str:

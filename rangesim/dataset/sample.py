@@ -26,7 +26,7 @@ from rangesim.dataset.sample_files import (
 )
 from rangesim.errors import RangesimWarning
 from rangesim.files.array_files import arrays_to_bytes
-from rangesim.pipeline.experiment_run import carry_out, segmented_truth
+from rangesim.pipeline.experiment_run import TrueSegmentations, carry_out
 from rangesim.results.experiment_results import Measurement, RowRecord, Segmentation, objects_record
 from rangesim.rig import Rig
 from rangesim.settings.config import to_dict
@@ -48,9 +48,11 @@ def bytes_of(drawn: RandomScene, number: int, keeps_frames: bool = False) -> byt
     from rangesim.light_transport.hidden_shapes import shapes_on_rays
     from rangesim.scene import load_scene
 
+    true_segmentations = TrueSegmentations()
     with _collected_warnings() as sentences:
         scene = load_scene(drawn.scene).with_objects([each.name for each in drawn.objects])
-        measurements = carry_out(drawn.experiment, scene=scene, sampling_error=False).measurements
+        result = carry_out(drawn.experiment, scene=scene, sampling_error=False, true_segmentations=true_segmentations)
+    measurements = result.measurements
     shape_of = {instance.name: i for i, instance in enumerate(scene.instances)}
     objects = [shape_of[each.name] for each in drawn.objects]
     members: dict[str, bytes] = {}
@@ -61,7 +63,8 @@ def bytes_of(drawn: RandomScene, number: int, keeps_frames: bool = False) -> byt
         camera = _camera(rig)
         if camera not in [known for known, _ in cameras]:
             suffix = f"camera.{len(cameras) + 1}.npz"
-            members[suffix] = arrays_to_bytes(_truth(one, shapes_on_rays(scene, rig)[objects]))
+            segments = _segments(true_segmentations.of(one.camera, one.truth))
+            members[suffix] = arrays_to_bytes(_truth(one, shapes_on_rays(scene, rig)[objects]) | segments)
             cameras.append((camera, suffix))
         number_of_camera = 1 + [known for known, _ in cameras].index(camera)
         members[f"sensor.{one.name}.npz"] = arrays_to_bytes(_readings(one))
@@ -119,7 +122,7 @@ def _camera(rig: Rig) -> CameraRecord:
 
 
 def _truth(one: Measurement, amodal: np.ndarray) -> dict[str, np.ndarray]:
-    """Arrays of a camera, see `rangesim.dataset.sample_files.CAMERA_ARRAYS`."""
+    """Arrays of a camera but its segments, see `rangesim.dataset.sample_files.CAMERA_ARRAYS`."""
     truth = one.truth
     arrays = {
         "true_m": one.true_m,
@@ -130,9 +133,7 @@ def _truth(one: Measurement, amodal: np.ndarray) -> dict[str, np.ndarray]:
         "nearest_m": truth.nearest_m,
         "farthest_m": truth.farthest_m,
     }
-    return {name: array for name, array in arrays.items() if array is not None} | _segments(
-        segmented_truth(one.camera, one.truth)
-    )
+    return {name: array for name, array in arrays.items() if array is not None}
 
 
 def _segments(segmentation: Segmentation | None) -> dict[str, np.ndarray]:

@@ -161,8 +161,7 @@ class PathLengths(Coordinates):
                 along_ray = self.length_m[rows] / 2
                 z = np.full(along_ray.shape, np.nan)
             else:
-                along_ray = _ranges(self.length_m[rows], rows, rig)
-                z = rig.camera.z_of(along_ray, rows)
+                along_ray, z = _ranges(self.length_m[rows], rows, rig)
             in_front = np.nan_to_num(along_ray, nan=-1.0) > 0
             status[rows][(status[rows] == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
             ok = status[rows] == Status.OK
@@ -171,9 +170,12 @@ class PathLengths(Coordinates):
         return image if self.returns is None else replace(image, returns=self.returns.ranges(rig))
 
 
-def _ranges(length_m: np.ndarray, rows: slice, rig: Rig) -> np.ndarray:
-    """(..., rows, w) float64, metres, ranges along the rays of some rows, from their path lengths."""
+def _ranges(length_m: np.ndarray, rows: slice, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges (rows, w) float64, metres, along the rays of some rows, from their path lengths; and their depths z."""
     if isinstance(rig.camera, Intrinsics):
-        directions = rig.camera.directions(rig.camera.pixel_centres(rows))
-        return range_from_path_length(length_m, directions, rig)
-    return range_along_ray(length_m, rig.camera.rays.directions[rows], rig.emitter_offsets[rows])
+        directions, b = rig.camera.directions(rig.camera.pixel_centres(rows)), rig.T_camera_projector[:3, 3]
+        per_z = np.linalg.norm(directions, axis=-1)
+        along_ray = _on_ellipsoid(length_m, b @ b, directions / per_z[..., None] @ b)
+        return along_ray, along_ray / per_z
+    along_ray = range_along_ray(length_m, rig.camera.rays.directions[rows], rig.emitter_offsets[rows])
+    return along_ray, rig.camera.z_of(along_ray, rows)

@@ -15,9 +15,11 @@ import numpy as np
 
 from rangesim.capture import Captured
 from rangesim.rig import Intrinsics
-from rangesim.sensor import Decoder, ReceivedLight
+from rangesim.sensor import Decoder, ReceivedLight, Sensor
 
 if TYPE_CHECKING:
+    from rangesim.electronics.ambient import Ambient
+    from rangesim.electronics.detector import PhotoDetector
     from rangesim.rig import Rig
     from rangesim.signals import Signals
 
@@ -61,16 +63,23 @@ def received_light(signals: Signals, captured: Captured) -> ReceivedLight:
     ValueError
         The capture has no detector.
     """
-    capture, rig, energy = captured.reference, signals.rig, signals.energy
-    detector, gate = capture.detector, capture.sensor.gate
-    if detector is None:
+    capture = captured.reference
+    if capture.detector is None:
         raise ValueError("expected a capture with a detector, got a noise-free one.")
+    return light_of_exposure(signals, capture.sensor, capture.detector, capture.exposure_s, capture.ambient)
+
+
+def light_of_exposure(
+    signals: Signals, sensor: Sensor, detector: PhotoDetector, exposure_s: float, ambient: Ambient | None
+) -> ReceivedLight:
+    """The light that the pixels of the reference camera receive in one exposure, seconds."""
+    rig, energy, gate = signals.rig, signals.energy, sensor.gate
     illumination = rig.camera_illumination.astype(np.float64)
-    passed = detector.ambient_fraction(gate, capture.ambient)
+    passed = detector.ambient_fraction(gate, ambient)
 
     def electrons(radiance: np.ndarray) -> np.ndarray:
         lit = illumination * radiance.astype(np.float64)
-        return detector.mean_electrons(lit, gate, rig, capture.exposure_s) - dark_e
+        return detector.mean_electrons(lit, gate, rig, exposure_s) - dark_e
 
     dark_e = 0.0
     dark_e = float(electrons(np.zeros((1, 1)))[0, 0])
@@ -80,7 +89,7 @@ def received_light(signals: Signals, captured: Captured) -> ReceivedLight:
     with np.errstate(divide="ignore", invalid="ignore"):
         per_column, per_row = np.moveaxis(change_m[..., None] / (far_px - near_px), -1, 0)
         per_length = change_m / (far_m - near_m)
-    blind = capture.blindness
+    blind = detector.blindness(gate, exposure_s)
     return ReceivedLight(
         emitter=electrons(energy.projector),
         ambient=electrons(passed * energy.ambient),

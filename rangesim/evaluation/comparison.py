@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -90,7 +90,7 @@ class Comparison(ShortRepr):
     def rows(self) -> list[dict[str, Any]]:
         """One dict per row of the table, as JSON can hold it: None in place of NaN."""
         return [
-            {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(row).items()}
+            {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in vars(row).items()}
             for row in self.table
         ]
 
@@ -156,7 +156,7 @@ def compare(image: RangeImage, truth: GroundTruth | Signals, tolerance_m: float 
     error = np.where(image.valid, image.reading_m.astype(np.float64) - true_m, np.nan)
     edge, flying = _flying(image.reading_m, true_m, tolerance_m, neighbourhood(image.camera))
     rows = [
-        asdict(_statistics(surface, error, truth.projector_visible, edge, flying, tolerance_m))
+        dict(vars(_statistics(surface, error, truth.projector_visible, edge, flying, tolerance_m)))
         for surface in truth.surfaces()
     ]
     rows[-1]["invented_readings"] = int((image.valid & ~np.isfinite(true_m)).sum())  # the last row is "all"
@@ -173,34 +173,37 @@ def _statistics(
     tolerance_m: float,
 ) -> ErrorStatistics:
     """Statistics of the pixels of a surface."""
-    mask = surface.mask
-    measured = mask & np.isfinite(error)
-    lit, at_edge = mask & visible, measured & edge
-    e = error[measured]
+    error, lit, edge, flying = (image[surface.mask] for image in (error, visible, edge, flying))
+    measured = np.isfinite(error)
+    at_edge, e = measured & edge, error[measured]
     absolute = np.abs(e)
     median, p95 = np.percentile(absolute, [50, 95]) if e.size else (np.nan, np.nan)
     return ErrorStatistics(
         kind=surface.kind,
         name=surface.name,
-        pixels=int(mask.sum()),
-        lit=int(lit.sum()),
-        right=_fraction(mask & (np.abs(error) <= tolerance_m), mask),
-        wrong=_fraction(mask & (np.abs(error) > tolerance_m), mask),
-        missing=_fraction(mask & ~measured, mask),
-        completeness=_fraction(measured & visible, lit),
+        pixels=error.size,
+        lit=_count(lit),
+        right=_fraction(_count(absolute <= tolerance_m), error.size),
+        wrong=_fraction(_count(absolute > tolerance_m), error.size),
+        missing=_fraction(error.size - e.size, error.size),
+        completeness=_fraction(_count(measured & lit), _count(lit)),
         bias_m=float(e.mean()) if e.size else math.nan,
         median_abs_m=float(median),
         rmse_m=float(np.sqrt(np.mean(e**2))) if e.size else math.nan,
         p95_abs_m=float(p95),
-        edge_pixels=int(at_edge.sum()),
-        flying_rate=_fraction(at_edge & flying, at_edge),
+        edge_pixels=_count(at_edge),
+        flying_rate=_fraction(_count(at_edge & flying), _count(at_edge)),
     )
 
 
-def _fraction(part: np.ndarray, whole: np.ndarray) -> float:
-    """Number of pixels of one mask over that of another; NaN if the second is empty."""
-    total = int(whole.sum())
-    return float(part.sum() / total) if total else math.nan
+def _count(mask: np.ndarray) -> int:
+    """Number of pixels of a mask."""
+    return int(np.count_nonzero(mask))
+
+
+def _fraction(part: int, whole: int) -> float:
+    """One number of pixels over another; NaN if the second is 0."""
+    return part / whole if whole else math.nan
 
 
 def _flying(

@@ -16,9 +16,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, csr_array
 
 from rangesim.settings.config import ShortRepr
 from rangesim.signals import GroundTruth
@@ -164,9 +165,9 @@ def _outcome(index: int, surfaces: _Surfaces, pairs: _Pairs, in_wrong: _Pairs, s
     outcome, segment, covering, overlap = pairs.outcome(index)
     displaced, partners = False, []
     if outcome == Outcome.FOUND:
-        displaced = in_wrong.common[segment, index] > HALF * pairs.common[segment, index]
+        displaced = in_wrong.in_both(segment, index) > HALF * pairs.in_both(segment, index)
     elif outcome == Outcome.MERGED:
-        inside = pairs.common.tocsr()[[segment]].toarray()[0]
+        inside = pairs.inside(segment)
         inside[index] = 0
         order = np.argsort(-inside, kind="stable")
         enough = max(1, min(MIN_PARTNER * pairs.of_segment[segment], inside.max()))
@@ -218,20 +219,42 @@ class _Pairs:
         of_segment = np.bincount(labels[labels >= 0], minlength=segments)
         return cls(common, of_segment, np.bincount(index[index >= 0], minlength=surfaces))
 
+    def _holding(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """The segments (k,) that hold some of a surface, in ascending order, and how many of its pixels each holds."""
+        column = slice(*self.common.indptr[index : index + 2])
+        return self.common.indices[column], self.common.data[column]
+
+    def in_both(self, segment: int, index: int) -> int:
+        """Number of pixels that a segment and a surface have in common."""
+        segments, held = self._holding(index)
+        return int(held[segments == segment].sum())
+
+    def inside(self, segment: int) -> np.ndarray:
+        """(surfaces,) int64, number of pixels of each surface in a segment."""
+        row = slice(*self._by_segment.indptr[segment : segment + 2])
+        result = np.zeros(len(self.of_surface), dtype=np.int64)
+        result[self._by_segment.indices[row]] = self._by_segment.data[row]
+        return result
+
+    @cached_property
+    def _by_segment(self) -> csr_array:
+        """`common`, stored by segments."""
+        return self.common.tocsr()
+
     def outcome(self, index: int) -> tuple[Outcome, int, float, float]:
         """Fate of a surface: the outcome, the segment that holds most of it, its covering and its overlap."""
-        held = self.common[:, [index]].toarray()[:, 0]
+        segments, held = self._holding(index)
         if not held.any():
             return Outcome.MISSED, -1, 0.0, 0.0
-        segment, size = int(held.argmax()), self.of_surface[index]
-        covering = held[segment] / size
-        overlap = held[segment] / (size + self.of_segment[segment] - held[segment])
+        most, size = held.max(), self.of_surface[index]
+        segment = int(segments[held.argmax()])
+        covering, overlap = most / size, most / (size + self.of_segment[segment] - most)
         if overlap > HALF:
             outcome = Outcome.FOUND
         elif covering > HALF:
             outcome = Outcome.MERGED
         else:
-            own = held > HALF * self.of_segment
+            own = held > HALF * self.of_segment[segments]
             outcome = Outcome.SPLIT if held[own].sum() > HALF * size else Outcome.MISSED
         return outcome, segment, float(covering), float(overlap)
 

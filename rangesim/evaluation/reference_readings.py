@@ -35,11 +35,13 @@ class ReferenceReadings:
     image : RangeImage, decoded from `capture`.
     capture : Capture or CaptureSet, as `rangesim.expose` made it from `signals`.
     signals : Signals of the pass.
+    radiance : (k, h, w) float32, W/m2/sr, as `rangesim.capture.exposure.Exposure` has it, if it is still known.
     """
 
     image: RangeImage
     capture: Captured
     signals: Signals
+    radiance: np.ndarray | None = None
 
     @property
     def decoder(self) -> Decoder:
@@ -70,7 +72,11 @@ class ReferenceReadings:
     @cached_property
     def noise_free(self) -> np.ndarray:
         """Depths without the noise and the limits of the detector, in the ambient light of the capture."""
-        return self.read([noise_free_capture(self.signals, self.capture.sensor, self.capture.reference.ambient)])[0]
+        signals, sensor, radiance = self.signals, self.capture.sensor, self.radiance
+        is_still = signals.motion_m is None and sensor.n_cameras == 1
+        if radiance is None or not is_still or signals.energy.ambient.any():  # the detector's filter passed less of it
+            return self.read([noise_free_capture(signals, sensor, self.capture.reference.ambient)])[0]
+        return self.read([capture_of_frames(signals, sensor, lambda one: radiance)])[0]
 
     @cached_property
     def halves(self) -> tuple[np.ndarray, np.ndarray]:

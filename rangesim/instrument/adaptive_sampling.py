@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -15,8 +15,8 @@ from rangesim.capture.exposure import auto_exposure_s, expose, mean_radiance
 from rangesim.decoding import decode
 from rangesim.decoding.disparities import ImageNoise
 from rangesim.electronics.ambient import Ambient
-from rangesim.errors import RangesimWarning
-from rangesim.evaluation.closed_forms import received_light
+from rangesim.errors import without_warnings
+from rangesim.evaluation.closed_forms import light_of_exposure
 from rangesim.evaluation.reference_readings import halves, sampling_draw
 from rangesim.instrument.instrument import Instrument
 from rangesim.light_transport.samples_per_pixel import Sampler
@@ -25,6 +25,8 @@ from rangesim.sensor import Decoder, Sensor
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 if TYPE_CHECKING:
+    from rangesim.decoding.coordinates import Coordinates
+    from rangesim.electronics.detector import PhotoDetector
     from rangesim.response import Response
     from rangesim.signals import GroundTruth, StillSignals
 
@@ -43,6 +45,12 @@ enough, for sensors of several cameras. It is the noise that their decoder assum
 BLOCK_PX = 16
 """Edge in pixels of the squares in which the noise of an instance is estimated. In larger squares the estimate uses
 more pixels; in smaller ones it follows changes of the noise better."""
+ENOUGH_PIXELS = 16
+"""Number of pixels that tell the noise of a group to a third of itself, so that a quarter of them need not be read.
+
+With it, 25 to 30 % of the pixels are read. In 6 passes over random scenes, the number of samples of a pass changed by
+2.5 % against reading all pixels (with another seed: 3.2 %), that of a pixel by 5 % (12 %).
+"""
 SPP_STEP = 4
 """The number of samples is a multiple of this, because the samples come in two halves, each of antithetic pairs."""
 
@@ -110,53 +118,30 @@ class AdaptiveSampling(Sampler):
 
     def samples(self, truth: GroundTruth, signals_of: Callable[[Sequence[Response]], StillSignals]) -> np.ndarray:
         group = groups(truth.instance)
+        some = few_of_each(group)
         excess = np.zeros(group.max() + 1)  # ratio of the variance by sampling to the largest one allowed, per group
         for instrument in self.instruments:
             signals = signals_of(instrument.sensor.responses())
             if instrument.sensor.n_cameras > 1:  # a reading needs the signals of all cameras
                 excess = np.fmax(excess, self._excess_of_frames(instrument, signals, group))
                 continue
-            true_m = signals.rig.camera.reading(truth)[np.isfinite(truth.z)]
-            negligible = NEGLIGIBLE * float(np.median(true_m)) if true_m.size else 0.0
+            true_m, seen = signals.rig.camera.reading(truth), np.isfinite(truth.z)
+            negligible = NEGLIGIBLE * float(np.median(true_m[seen])) if seen.any() else 0.0
             decoder = instrument.decoder or instrument.sensor.default_decoder
-            above, below = halves(signals, instrument.sensor, decoder, self.ambient)
+            pixels = _Pixels(signals, instrument.sensor, decoder, some, self.ambient)
+            above, below = pixels.halves()
             draw, enough = sampling_draw(above, below), np.full(len(excess), negligible)
             if instrument.detector_in_use is not None and not instrument.sensor.is_ideal:
-                errors = self._detector_errors(instrument, decoder, signals, (above + below) / 2)
+                errors = pixels.detector_errors(instrument.detector_in_use, instrument.exposure_s, (above + below) / 2)
                 errors[np.isnan(draw)] = np.nan
+                draw[errors > true_m[some]] = np.nan  # more noise than distance: there is no reading to be spoilt
                 # A group without any reading needs no further samples: its limit is infinite
-                enough = np.maximum(enough, self.fraction * group_sigma(errors, group, where_unknown=np.inf))
+                enough = np.maximum(enough, self.fraction * group_sigma(errors, group[some], where_unknown=np.inf))
             with np.errstate(divide="ignore", invalid="ignore"):
-                excess = np.fmax(excess, (group_sigma(draw, group) / enough) ** 2)
+                excess = np.fmax(excess, (group_sigma(draw, group[some]) / enough) ** 2)
         wanted = SPP_STEP * np.ceil(self.first_spp * np.minimum(excess, self.max_spp) / SPP_STEP)
         most = max(self.first_spp, self.max_spp // SPP_STEP * SPP_STEP)
         return np.clip(wanted, self.first_spp, most).astype(np.int64)[group]
-
-    def _detector_errors(
-        self, instrument: Instrument, decoder: Decoder, signals: StillSignals, clean_m: np.ndarray
-    ) -> np.ndarray:
-        """(h, w) float64, metres, errors that the detector's noise makes, for `group_sigma`; NaN without a reading.
-
-        They are the typical ones by the decoder's closed form. If there is none, they are those of a capture.
-
-        Parameters
-        ----------
-        clean_m : (h, w) float64, metres, readings without the detector's noise.
-        """
-        sensor, detector = instrument.sensor, instrument.detector_in_use
-        assert detector is not None
-        radiance, exposure_s = mean_radiance(signals, sensor, detector, self.ambient), instrument.exposure_s
-        if exposure_s is None:
-            exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
-        mean = Capture(radiance, sensor, signals.rig, detector, exposure_s, self.ambient)
-        theory_m = decoder.depth_error_m(sensor, received_light(signals, mean))
-        if theory_m is not None:
-            brightest_e = radiance.max(axis=0) * detector.electron_rate_per_radiance(signals.rig) * exposure_s
-            return np.where(brightest_e < detector.capacity_e, theory_m / TO_SIGMA, np.nan)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RangesimWarning)  # the measurement itself will warn
-            image = decode(expose(signals, sensor, detector, exposure_s, 0, self.ambient), decoder)
-        return np.asarray(image.reading_m - clean_m)
 
     def _excess_of_frames(self, instrument: Instrument, signals: StillSignals, group: np.ndarray) -> np.ndarray:
         """Ratio of the sampling variance of the frames of one camera to the largest one allowed, per group.
@@ -179,6 +164,91 @@ class AdaptiveSampling(Sampler):
         with np.errstate(divide="ignore", invalid="ignore"):
             ratios = [group_sigma((e / n).astype(np.float32), group) ** 2 for e, n in zip(error, noise, strict=True)]
         return np.asarray(np.max(ratios, axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Pixels:
+    """Some pixels of one sensor, with what is known of the errors of their readings.
+
+    signals : StillSignals of the whole image. some : (h, w) bool, the n pixels. ambient : as for `AdaptiveSampling`.
+    """
+
+    signals: StillSignals
+    sensor: Sensor
+    decoder: Decoder
+    some: np.ndarray
+    ambient: Ambient | None
+
+    @cached_property
+    def reader(self) -> Callable[[Capture], Coordinates] | None:
+        """The function that reads these pixels without the others; None if the whole image is needed."""
+        is_veiled = self.signals.rig.camera_lens.stray_light > 0
+        return None if is_veiled else self.decoder.pixel_reader(self.sensor)
+
+    def halves(self) -> tuple[np.ndarray, np.ndarray]:
+        """Depths of each half of the samples, without noise, (n,) float64 each, metres."""
+        if self.reader is None:
+            above, below = halves(self.signals, self.sensor, self.decoder, self.ambient)
+            return above[self.some], below[self.some]
+        above, below = (self._read(sampling_errors) for sampling_errors in (1.0, -1.0))
+        return above, below
+
+    @cached_property
+    def _row(self) -> tuple[StillSignals, np.ndarray]:
+        """The light of these pixels as an image of one row, and the relative illumination (1, n) of the pixels."""
+        row, illumination = self.signals.row_of_pixels(self.some, self.sensor), self.signals.rig.camera_illumination
+        return row, illumination[self.some][None]
+
+    def _radiance(self, transmission: float, sampling_errors: float = 0.0) -> np.ndarray:
+        """(k, 1, n) float32, W/m2/sr, frames of these pixels, for that fraction of the ambient light."""
+        row, illumination = self._row
+        frames = row.frames(self.sensor, transmission, sampling_errors)
+        return frames if (illumination == 1).all() else np.asarray(frames * illumination)
+
+    def _read(self, sampling_errors: float) -> np.ndarray:
+        """(n,) float64, metres, depths with so many draws of the sampling error, without noise."""
+        assert self.reader is not None
+        frames = self._radiance(1.0 if self.ambient is None else self.ambient.scale, sampling_errors)
+        found = self.reader(Capture(frames, self.sensor)).spread(self.some)
+        return self.decoder.placed(found, self.signals.rig).reading_m[self.some].astype(np.float64)
+
+    def detector_errors(self, detector: PhotoDetector, exposure_s: float | None, clean_m: np.ndarray) -> np.ndarray:
+        """(n,) float64, metres, errors that the detector's noise makes, for `group_sigma`; NaN without a reading.
+
+        They are the typical ones by the decoder's closed form. If there is none, they are those of a capture.
+
+        Parameters
+        ----------
+        exposure_s : float, seconds; None: automatic. clean_m : (n,) float64, metres, readings without noise.
+        """
+        signals, sensor, rig = self.signals, self.sensor, self.signals.rig
+        if self.reader is None:
+            radiance = mean_radiance(signals, sensor, detector, self.ambient)[:, self.some][:, None]
+        else:
+            passed = detector.ambient_fraction(sensor.gate, self.ambient)
+            radiance = self._radiance(passed)
+        if exposure_s is None:
+            exposure_s = auto_exposure_s(radiance, sensor, detector, rig)
+        light = light_of_exposure(signals, sensor, detector, exposure_s, self.ambient).of_pixels(self.some)
+        theory_m = self.decoder.depth_error_m(sensor, light)
+        if theory_m is not None:
+            brightest_e = radiance.max(axis=0) * detector.electron_rate_per_radiance(rig) * exposure_s
+            return np.where(brightest_e < detector.capacity_e, theory_m / TO_SIGMA, np.nan)[0]
+        with without_warnings():  # the measurement itself will warn
+            image = decode(expose(signals, sensor, detector, exposure_s, 0, self.ambient), self.decoder)
+        return np.asarray(image.reading_m[self.some] - clean_m)
+
+
+def few_of_each(group: np.ndarray) -> np.ndarray:
+    """(h, w) bool, pixels that tell the noise of each group: a quarter of them all, evenly spread, and all pixels of
+    groups that have less than `ENOUGH_PIXELS` of these.
+
+    group : (h, w) int, number of the group of each pixel.
+    """
+    quarter = np.zeros(group.shape, dtype=bool)
+    quarter[::2, ::2] = True
+    n = np.bincount(group[quarter], minlength=int(group.max()) + 1)
+    return quarter | (n < ENOUGH_PIXELS)[group]
 
 
 def groups(instance: np.ndarray) -> np.ndarray:
@@ -204,7 +274,7 @@ def group_sigma(errors: np.ndarray, group: np.ndarray, where_unknown: float = 0.
 
     It is the median of the absolute values times `TO_SIGMA`, so that a few large errors have little influence.
 
-    errors : (h, w) with mean 0; NaN where there is none. group : (h, w) int, number of the group.
+    errors : (n,) or (h, w) with mean 0; NaN where there is none. group : int of that shape, number of the group.
     where_unknown : value for a group without any error.
     """
     known = ~np.isnan(errors)

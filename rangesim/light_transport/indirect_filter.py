@@ -115,14 +115,15 @@ class LightFilter:
         """Filter an image (c, h, w) float32 in place. Channels without any light are left as they are."""
         for begin in range(0, len(image), CHANNELS_AT_ONCE):
             some = image[begin : begin + CHANNELS_AT_ONCE]
-            if not some.any():
+            lit = np.flatnonzero(some.any(axis=(1, 2)))
+            if not len(lit):
                 continue
             before, after = some, self.scratch[: len(some)]
             for level, weights in enumerate(self.weights):
-                in_blocks(_apply, image.shape[1], weights, 3**level, before, after, smallest=MIN_ROWS)
+                in_blocks(_apply, image.shape[1], weights, 3**level, lit, before, after, smallest=MIN_ROWS)
                 before, after = after, before
             if before is not some:
-                some[:] = before
+                some[lit] = before[lit]
 
 
 def mixed_pixels(guides: Guides) -> NDArray[np.bool_]:
@@ -221,10 +222,10 @@ def _of_radiance(first: NDArray[np.float32], last: NDArray[np.float32], reflecta
 
 
 @cached_njit(nogil=True)
-def _apply(start, stop, weights, step, image, out):  # type: ignore[no-untyped-def]
-    channels, h, _ = image.shape
+def _apply(start, stop, weights, step, channels, image, out):  # type: ignore[no-untyped-def]
+    h = image.shape[1]
     for first in range(start, stop, ROWS_AT_ONCE):  # the weights of these rows stay in the cache
-        for c in range(channels):
+        for c in channels:
             for y in range(first, min(first + ROWS_AT_ONCE, stop)):
                 # Beyond the borders weights are 0, so any pixel will do
                 above, below = image[c, max(y - step, 0)], image[c, min(y + step, h - 1)]

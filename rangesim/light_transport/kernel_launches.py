@@ -31,7 +31,7 @@ handles signals by ending the process."""
 MAX_OVERRUN = 1.5
 """Largest ratio of the iterations of a launch to those that fit into its duration. Lanes that have not finished then go
 on in the next launch, so that one slow lane cannot make a launch long."""
-FIRST_UNITS = 1 << 21
+FIRST_UNITS = 1 << 22
 """Work of a first launch, in iterations of a loop, rays or photons, for which no time has been measured yet. If it is
 too large for a slow machine, Ctrl-C waits longer, but only once."""
 MAX_STRETCH = 2.0

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The path loop: one pass of light paths serves every pattern, frequency and bin.
 
-One lane owns one pixel and traces its samples one after the other. Where a path ends, the lane starts the next sample
-in the same iteration of the loop. This has three advantages. No lane waits while its neighbours finish. Every channel
-is a number in a register instead of an image in memory. Each sum is made by one thread in one order, so the same seed
-gives the same bytes, whatever the number of threads.
+One lane owns one half of a pixel's samples, or all of them where no sampling error is estimated, and traces them one
+after the other. Where a path ends, the lane starts the next sample in the same iteration of the loop. This has three
+advantages. No lane waits while its neighbours finish. Every channel is a number in a register instead of an image in
+memory. Each sum is made by one thread in one order, so the same seed gives the same bytes, whatever the number of
+threads.
 
 The loop runs in launches of bounded time (`rangesim.light_transport.kernel_launches`). A launch takes some of the lanes
 and moves each of them on by a bounded number of iterations. `LaneState` holds everything that a lane has done, so
@@ -25,7 +26,7 @@ and the gathering of caustic photons. `rangesim.light_transport.strategies` says
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Generic, NamedTuple, TypeVar
 
@@ -114,36 +115,36 @@ class SampleAllocation:
     samples : (n,) uint32, number of samples to be taken of each pixel.
     total : (n,) uint32, number of all samples of each pixel, including those that are taken at other times.
     irradiance : W/m2, irradiance that the projector makes at z = 1 m.
-    first : int, number of the first of the samples among all samples of a pixel.
+    first : number of the first of the samples among all samples of a pixel, one number or (n,) int.
     stride : int, difference between the numbers of successive pairs of samples.
-    part : int, number of the part of a pass. Parts have independent random numbers.
+    part : number of the part of a pass, one number or (n,) int. Parts have independent random numbers.
     """
 
     pixels: np.ndarray
     samples: np.ndarray
     total: np.ndarray
     irradiance: float
-    first: int = 0
+    first: int | np.ndarray = 0
     stride: int = 2
-    part: int = 0
+    part: int | np.ndarray = 0
 
-    def of(self, some: slice) -> SampleAllocation:
-        """The allocation of some of the pixels."""
-        return replace(self, pixels=self.pixels[some], samples=self.samples[some], total=self.total[some])
+    def in_halves(self) -> SampleAllocation:
+        """The same samples of the n pixels as 2 n entries: the first half of each pixel, then the second half of each.
 
-    def halves(self) -> list[SampleAllocation]:
-        """Two allocations. Each has every second pair of samples, so that both fill the pixel evenly."""
-        pairs, odd = (self.samples + 1) >> 1, self.samples & 1
-        return [
-            replace(
-                self,
-                samples=2 * (pairs + 1 - half >> 1) - odd * ((pairs - 1 & 1) == half),
-                first=self.first + 2 * half,
-                stride=2 * self.stride,
-                part=2 * self.part + half,
-            )
-            for half in (0, 1)
-        ]
+        Each half has every second pair of samples, so that both fill the pixel evenly.
+        """
+        twice, half = partial(np.tile, reps=2), np.repeat(np.arange(2, dtype=np.uint32), len(self.pixels))
+        samples = twice(self.samples)
+        pairs, odd = (samples + 1) >> 1, samples & 1
+        return SampleAllocation(
+            pixels=twice(self.pixels),
+            samples=2 * (pairs + 1 - half >> 1) - odd * ((pairs - 1 & 1) == half),
+            total=twice(self.total),
+            irradiance=self.irradiance,
+            first=self.first + 2 * half,
+            stride=2 * self.stride,
+            part=2 * self.part + half,
+        )
 
 
 @dataclass
@@ -165,7 +166,7 @@ class Radiance(Generic[Array]):
 
 
 class PathSums(NamedTuple):
-    """Sums over the samples of each pixel, besides channels.
+    """Sums over the samples of each entry of an allocation, besides channels.
 
     radiance : (7, n) float32, in the order of the fields of `Radiance`.
     tally : (6, n) float32, in the order of the fields of `Tally`.
@@ -268,7 +269,7 @@ def trace(
 
     Parameters
     ----------
-    accumulators : Accumulators, of the pixels of the allocation in the same order.
+    accumulators : Accumulators, of the entries of the allocation in the same order.
     launches : Launches, which remember how much work fits into a launch.
     report : called with the fraction done after each launch.
     """
@@ -321,8 +322,8 @@ class Lanes:
     Parameters
     ----------
     view, settings, allocation : View, PathSettings and SampleAllocation.
-    places : (lanes,) int, indices of the pixels in the allocation and in the accumulators. Random numbers do not depend
-        on them, but on the flat index of a pixel in the whole image, the part and the seed.
+    places : (lanes,) int, indices of the entries in the allocation and in the accumulators. Random numbers do not
+        depend on them, but on the flat index of a pixel in the whole image, the part and the seed.
     """
 
     def __init__(self, view: View, settings: PathSettings, allocation: SampleAllocation, places: np.ndarray) -> None:
@@ -330,8 +331,10 @@ class Lanes:
         self.pixel = mi.UInt32(aligned(allocation.pixels[places], np.uint32))
         self.samples = mi.UInt32(aligned(allocation.samples[places], np.uint32))
         self.total = mi.UInt32(aligned(allocation.total[places], np.uint32))
-        self.first, self.stride, self.part = (
-            dr.opaque(mi.UInt32, n) for n in (allocation.first, allocation.stride, allocation.part)
+        self.stride = dr.opaque(mi.UInt32, allocation.stride)
+        self.first, self.part = (
+            mi.UInt32(aligned(np.broadcast_to(x, len(allocation.pixels))[places], np.uint32))
+            for x in (allocation.first, allocation.part)
         )
         self.irradiance = dr.opaque(mi.Float, allocation.irradiance)
         width = mi.UInt32(view.traced.camera.size.x)

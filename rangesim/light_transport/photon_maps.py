@@ -26,6 +26,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.photon_kernels import mark, sorted_by
 from rangesim.light_transport.photons import Photons
 from rangesim.light_transport.sampling import aligned
 
@@ -129,8 +130,9 @@ class GatheringRadius:
     def at(self, position: np.ndarray) -> np.ndarray:
         """(n,) float, metres, the radius at positions (n, 3)."""
         a, b, c, d = self.bounds()
-        from_camera = np.linalg.norm(position - self.camera_at, axis=1)
-        return np.clip(a + b * np.linalg.norm(position - self.projector_at, axis=1), c * from_camera, d * from_camera)
+        from_camera = np.sqrt(_squared_distance(position, self.camera_at))
+        from_projector = np.sqrt(_squared_distance(position, self.projector_at))
+        return np.clip(a + b * from_projector, c * from_camera, d * from_camera)
 
     @property
     def steepness(self) -> float:
@@ -196,7 +198,7 @@ class PhotonMaps:
         maps = photons.maps
         at_photons = np.maximum(radius.at(photons.position), MIN_M)
         # One decision for each level; else light would count as smooth on one side of a line and not on the other
-        from_camera = np.linalg.norm(photons.position - radius.camera_at, axis=1)
+        from_camera = np.sqrt(_squared_distance(photons.position, radius.camera_at))
         typical = float(np.quantile(at_photons / np.maximum(from_camera, MIN_M), TYPICAL_QUANTILE))
         self.is_wide = [typical * one.radius >= wide for one in LEVELS]
         self.maps = dr.opaque(mi.UInt32, maps)
@@ -206,15 +208,14 @@ class PhotonMaps:
         shrinkage = radii_of_maps(1.0, maps)
         copies, kind = _in_classes(at_photons / unit, radius.steepness * factors[level])
         position, level, of_map = photons.position[copies], level[copies], photons.map[copies]
-        origin = position.min(axis=0)
+        origin = np.array([column.min() for column in position.T])
         edge = 2 * unit * 2 ** (kind / CLASSES_PER_OCTAVE) * factors[level]
         rows = 1 << int(np.ceil(np.log2(max(16, len(photons.flux) / maps))))
         cell = _cells(position - origin, edge * shrinkage[of_map])
         stride = rows + FOLD + 1
         key = (level * maps + of_map) * stride + _row(cell[:, 1], cell[:, 2], kind, rows - 1) + _column(cell[:, 0])
-        order = np.argsort(key, kind="stable")
         starts = np.cumsum(np.bincount(key + 1, minlength=len(LEVELS) * maps * stride + 1))
-        order = copies[order]
+        order = copies[sorted_by(key, starts)]
         points = np.column_stack([photons.position, photons.flux])
         padding = np.zeros(len(points), np.float32)
         columns = [photons.direction, photons.u, photons.v, photons.length_m, photons.cosine, padding]
@@ -350,7 +351,7 @@ def levels_of(
     cell_m = 4 * radius_m.min() * (1 + ROUNDING) * 2.0**octave
     key = _hash(*_cells(photons.position, cell_m).T) + octave * CLASS_PRIME & (OCCUPANCY_CELLS - 1)
     power = np.bincount(key, photons.flux, OCCUPANCY_CELLS)[key] / maps
-    direct = irradiance / np.maximum(np.sum((photons.position - radius.projector_at) ** 2, axis=1), MIN_M)
+    direct = irradiance / np.maximum(_squared_distance(photons.position, radius.projector_at), MIN_M)
     fraction = power / (direct * cell_m**2)
     return np.count_nonzero([fraction < one.brightest for one in LEVELS], axis=0) - 1
 
@@ -380,6 +381,12 @@ def _cells(position: np.ndarray, edge: np.ndarray) -> np.ndarray:
     return np.floor(position / np.asarray(edge, np.float32)[:, None]).astype(np.int64)
 
 
+def _squared_distance(position: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """(n,) float64, square metres, of positions (n, 3) from a place (3,)."""
+    x, y, z = (column - at for column, at in zip(position.T, place, strict=True))
+    return np.asarray(x * x + y * y + z * z)
+
+
 def _hash(x: Whole, y: Whole, z: Whole) -> Whole:
     """Hash of integer cell coordinates. Integers of NumPy and UInt32 of Dr.Jit give the same low 32 bits."""
     return x * PRIMES[0] + y * PRIMES[1] + z * PRIMES[2]
@@ -404,10 +411,6 @@ def _occupancy(position: np.ndarray, of_map: np.ndarray, kind: np.ndarray, edge:
 
     The bit is set if some point in such a cell has a photon of that map within the radius, which is half an edge.
     """
-    from rangesim.light_transport.photon_kernels import mark
-
     occupied = np.zeros((OCCUPANCY_CELLS, words), np.uint32)
-    low, high = (_cells(position + offset * edge[:, None], edge) for offset in (-0.5, 0.5))
-    factors = np.array(PRIMES)
-    mark(low * factors, high * factors, kind * CLASS_PRIME, of_map, occupied)
+    mark(position, edge, np.array(PRIMES), kind * CLASS_PRIME, of_map, occupied)
     return occupied.ravel()

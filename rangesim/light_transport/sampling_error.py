@@ -8,11 +8,13 @@ all samples.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 
 import numpy as np
 
+from pcgraph.kernel_cache import cached_njit
+from pcgraph.parallel import in_blocks
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.indirect_filter import CHANNELS_AT_ONCE, LightFilter
 from rangesim.light_transport.kernel_launches import Launches, Report, report_part
@@ -45,23 +47,36 @@ class Sums:
         self.smooth: dict[Response, np.ndarray] = {}
         self.radiance = np.zeros((len(fields(Radiance)), h, w), np.float32)
 
-    def add(self, pixels: np.ndarray, traced: PathSums, accumulators: Accumulators) -> None:
-        """Add sums of the pixels with these flat indices (n,), which are in ascending order."""
-        some: slice | np.ndarray = pixels
-        if pixels[-1] - pixels[0] + 1 == len(pixels):
-            some = slice(pixels[0], pixels[-1] + 1)
+    def add(self, pixels: np.ndarray, columns: slice, traced: PathSums, accumulators: Accumulators) -> None:
+        """Add these columns (n) of the traced sums to the pixels with these flat indices (n,), in ascending order.
+
+        The first sums of a whole image are not copied: they stay views of the accumulators' memory.
+        """
         is_whole = len(pixels) == self.shape[0] * self.shape[1]
+        runs = np.flatnonzero(np.diff(pixels, prepend=-2, append=-2) != 1)
         for response, values in zip(accumulators.responses, accumulators.images(), strict=True):
             for part, of_part in zip((self.channels, self.smooth), values, strict=False):
-                if response not in part and is_whole:  # a copy only if a view would keep the other part in memory
-                    is_own = of_part.base is None or (len(values) == 1 and of_part.flags.writeable)
-                    whole = of_part if is_own else of_part.copy()
-                    part[response] = whole.reshape(-1, *self.shape)
+                if response not in part and is_whole and of_part.flags.writeable:
+                    part[response] = of_part[:, columns].reshape(-1, *self.shape)
                     continue
                 if response not in part:
                     part[response] = np.zeros((response.channels, *self.shape), np.float32)
-                part[response].reshape(response.channels, -1)[:, some] += of_part
-        self.radiance.reshape(len(self.radiance), -1)[:, some] += traced.radiance
+                image = part[response].reshape(response.channels, -1)
+                in_blocks(_add, len(image), of_part[:, columns], pixels, runs, image, smallest=1)
+        self.radiance.reshape(len(self.radiance), -1)[:, pixels] += traced.radiance[:, columns]
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _add(start, stop, values, pixels, runs, image):  # type: ignore[no-untyped-def]
+    """Add `values` (c, n) to the pixels (n,) of an image (c, h w); `runs` (k + 1,) are bounds of successive pixels."""
+    for c in range(start, stop):
+        row, into = values[c], image[c]
+        for i in range(len(runs) - 1):
+            begin, end = runs[i], runs[i + 1]
+            there = into[pixels[begin] : pixels[begin] + end - begin]
+            here = row[begin:end]
+            for k in range(end - begin):
+                there[k] += here[k]
 
 
 class Halves:
@@ -96,16 +111,30 @@ class Halves:
     def mean_and_error(self, sums: Sequence[np.ndarray], out: Sequence[np.ndarray]) -> None:
         """Write the mean over all samples to `out[0]`, and a draw of its error to `out[1]`.
 
-        `sums` are those of the halves, (c, h, w) each; `out` may be the same arrays.
+        `sums` are those of the halves, (c, h, w) each; `out` are the same arrays, or arrays of zeros.
         """
         if len(sums) == 1:
             np.divide(sums[0], self.total, out=out[0])
             return
-        for a, b, mean, error in zip(*sums, *out, strict=True):
-            drawn = a * self.of_a - b * self.of_b
-            np.add(a, b, out=mean)
-            mean /= self.total
-            error[:] = drawn
+        flat = [x.reshape(len(x), -1) for x in (*sums, *out)]
+        factors = self.of_a.ravel(), self.of_b.ravel(), self.total.ravel()
+        in_blocks(_write_mean_and_error, len(flat[0]), *flat, *factors, smallest=1)
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _write_mean_and_error(start, stop, a, b, mean, error, of_a, of_b, total):  # type: ignore[no-untyped-def]
+    """The means and drawn errors of `Halves`; sums (c, n), factors (n,). Channels without any light are left out."""
+    n = a.shape[1]
+    for c in range(start, stop):
+        first, second, whole, drawn = a[c], b[c], mean[c], error[c]
+        lit = 0
+        while lit < n and first[lit] == 0 and second[lit] == 0:
+            lit += 1
+        if lit < n:
+            for i in range(n):
+                x, y = first[i], second[i]
+                whole[i] = (x + y) / total[i]
+                drawn[i] = x * of_a[i] - y * of_b[i]
 
 
 class Estimate:
@@ -152,20 +181,23 @@ class Estimate:
         """
         first = int(sum(taken.ravel()[pixels[0]] for taken in self.samples))
         samples = samples.astype(np.uint32)
-        whole = SampleAllocation(pixels, samples, samples + np.uint32(first), self.irradiance, first, part=self.rounds)
-        parts = whole.halves() if len(self.halves) == 2 else [whole]
         total, done = int(samples.sum(dtype=np.int64)), 0
         for begin, end in self._tiles(len(pixels)):
-            for part, sums, taken in zip(parts, self.halves, self.samples, strict=True):
-                allocation = part.of(slice(begin, end))
-                of_tile = int(allocation.samples.sum(dtype=np.int64))
-                accumulators = Accumulators(self.responses, end - begin, self.keeps_apart)
-                so_far = partial(report_part, report, done / total, of_tile / total)
-                traced = trace(self.view, self.settings, allocation, accumulators, self.launches, so_far)
-                sums.add(allocation.pixels, traced, accumulators)
-                taken.ravel()[allocation.pixels] += allocation.samples
-                self.tally.reshape(len(self.tally), -1)[:, allocation.pixels] += traced.tally
-                done += of_tile
+            some, of_tile = pixels[begin:end], samples[begin:end]
+            allocation = SampleAllocation(some, of_tile, of_tile + np.uint32(first), self.irradiance, first)
+            allocation = replace(allocation, part=self.rounds)
+            if len(self.halves) == 2:
+                allocation = allocation.in_halves()
+            accumulators = Accumulators(self.responses, len(allocation.pixels), self.keeps_apart)
+            now = int(of_tile.sum(dtype=np.int64))
+            so_far = partial(report_part, report, done / total, now / total)
+            traced = trace(self.view, self.settings, allocation, accumulators, self.launches, so_far)
+            for half, sums in enumerate(self.halves):
+                columns = slice(half * len(some), (half + 1) * len(some))
+                sums.add(some, columns, traced, accumulators)
+                self.samples[half].ravel()[some] += allocation.samples[columns]
+                self.tally.reshape(len(self.tally), -1)[:, some] += traced.tally[:, columns]
+            done += now
         self.rounds += 1
 
     def mean_tally(self) -> np.ndarray:
@@ -186,13 +218,14 @@ class Estimate:
         channels, errors, halves = {}, {}, Halves(self.samples)
         for r in self.responses if responses is None else responses:
             sums = [half.channels[r] for half in self.halves]
-            out = sums if responses is None else [np.empty_like(x) for x in sums]
+            # In place if no samples follow; but views would keep all memory of the accumulators
+            out = [x if responses is None and x.flags.owndata else np.zeros(x.shape, x.dtype) for x in sums]
             for begin in range(0, r.channels, CHANNELS_AT_ONCE):
                 some = slice(begin, begin + CHANNELS_AT_ONCE)
                 halves.mean_and_error([x[some] for x in sums], [x[some] for x in out])
                 if shared:
                     smooth = [half.smooth[r][some] for half in self.halves]
-                    parts = [np.empty_like(x) for x in smooth]
+                    parts = [np.zeros(x.shape, x.dtype) for x in smooth]
                     halves.mean_and_error(smooth, parts)
                     for x, part in zip(out, parts, strict=True):
                         shared.apply(part)
@@ -201,9 +234,10 @@ class Estimate:
             errors[r] = out[-1]
             if responses is None:
                 for half in self.halves:
+                    del half.channels[r]
                     half.smooth.pop(r, None)
         sums = [half.radiance for half in self.halves]
-        out = [np.empty_like(x) for x in sums]
+        out = [np.zeros_like(x) for x in sums]
         halves.mean_and_error(sums, out)
         if shared:
             for x in out:
@@ -215,7 +249,9 @@ class Estimate:
 
     def _tiles(self, pixels: int) -> Iterator[tuple[int, int]]:
         """Ranges of pixels, of about equal size, whose arrays fit into the memory."""
-        bytes_per_pixel = BYTES_PER_LANE + 4 * (1 + self.keeps_apart) * sum(r.channels for r in self.responses)
+        bytes_per_pixel = len(self.halves) * (
+            BYTES_PER_LANE + 4 * (1 + self.keeps_apart) * sum(r.channels for r in self.responses)
+        )
         if self.memory_bytes < bytes_per_pixel:
             raise ValueError(f"expected a memory budget of at least {bytes_per_pixel} bytes, got {self.memory_bytes}.")
         tiles = -(-pixels * bytes_per_pixel // self.memory_bytes)

@@ -115,6 +115,7 @@ def carry_out(
     scene: Scene | None = None,
     announce: Callable[[Cost], None] | None = None,
     sampling_error: bool = True,
+    true_segmentations: TrueSegmentations | None = None,
 ) -> Result:
     """The result of an experiment. Nothing is written.
 
@@ -128,6 +129,7 @@ def carry_out(
     sampling_error : whether the noise of the readings is split into that of the detector and that of the renderer, and
         the renderer's is warned of. This decodes five more captures of each instrument, which takes a third of the time
         of a small image. Readings are the same without it.
+    true_segmentations : where the segmentations of the true depths are kept for the caller; None: nowhere.
 
     Raises
     ------
@@ -148,7 +150,7 @@ def carry_out(
     >>> result = carry_out(Experiment("matte", width=160, height=120))  # doctest: +SKIP
     >>> result.measurements[0].image.valid.mean()  # fraction of pixels with a reading  # doctest: +SKIP
     """
-    result = _computed(experiment, progress or unwatched, scene, announce, sampling_error)
+    result = _computed(experiment, progress or unwatched, scene, announce, sampling_error, true_segmentations)
     _warn(result)
     return result
 
@@ -175,6 +177,7 @@ def _computed(
     scene: Scene | None,
     announce: Callable[[Cost], None] | None,
     sampling_error: bool = True,
+    true_segmentations: TrueSegmentations | None = None,
 ) -> Result:
     """The result of an experiment, without the warnings of `carry_out`.
 
@@ -201,8 +204,7 @@ def _computed(
         announce(cost)
     with timed(times, "compile_segmentation"):  # kernels compile once per machine; no sensor's time includes it
         compile_kernels()
-    passes, measurements = [], {}
-    of_truth: dict[bytes, Segmentation | None] = {}
+    passes, measurements, of_truth = [], {}, true_segmentations or TrueSegmentations()
     for number, (rig, instruments) in enumerate(groups, 1):
         stage = f"Tracing light, pass {number} of {len(groups)} ({', '.join(i.name for i in instruments)})"
         begin, end = (_fraction(number, len(groups), of_pass) for of_pass in (0.0, 1.0))
@@ -211,15 +213,13 @@ def _computed(
         with timed(times, f"transport_{number}"):
             signals = _trace(experiment, scene, rig, instruments, told)
         passes.append(LightPass.of(signals))
-        view = signals.rig.camera.points(signals.truth).tobytes()  # passes of different emitters often share it
-        if view not in of_truth:
-            with timed(times, f"segmentation_of_truth_{number}"):
-                of_truth[view] = segmented_truth(signals.rig.camera, signals.truth)
+        with timed(times, f"segmentation_of_truth_{number}"):
+            true_segmentation = of_truth.of(signals.rig.camera, signals.truth)
         for instrument in instruments:
             tell(f"Measuring with {instrument.name}", end)
             light = signals.at_wavelength(instrument.emitter_wavelength_m)
             measurements[instrument.name] = measure(
-                experiment, instrument, light, of_truth[view], number, sampling_error
+                experiment, instrument, light, true_segmentation, number, sampling_error
             )
     info = provenance(experiment, scene, groups, mi.variant(), times)
     return Result(experiment, tuple(measurements[i.name] for i in experiment.instruments), tuple(passes), info)
@@ -257,7 +257,7 @@ def measure(
     ----------
     instrument : one of the experiment.
     signals : Signals of the light-transport pass that the instrument shares.
-    true_segmentation : Segmentation of the true depth, as `segmented_truth` returns it.
+    true_segmentation : Segmentation of the true depth, see `TrueSegmentations`.
     light_pass : number of the pass, counted from 1.
     sampling_error : as for `carry_out`.
     """
@@ -270,10 +270,9 @@ def measure(
     capture, photons = exposure.capture, exposure.photons_per_pulse()
     if instrument.exposure_s is None:
         exposure.warn_of_overexposure(instrument.name)
-    del exposure  # frees its radiance, which is as large as the frames
     with timed(times, "decode"):
         image = decode(capture, instrument.decoder)
-    noise, readings = None, ReferenceReadings(image, capture, signals)
+    noise, readings = None, ReferenceReadings(image, capture, signals, exposure.radiance)
     if sampling_error and signals.knows_sampling_error:
         with timed(times, "noise"):
             noise = noise_of(readings)
@@ -281,6 +280,7 @@ def measure(
     comparison = compare(image, signals.truth, tolerance_m)
     with timed(times, "causes"):
         causes = causes_of(readings, tolerance_m)
+    del readings, exposure  # frees the radiance, which is as large as the frames
     rows = [row | failures for row, failures in zip(comparison.rows(), causes.fractions(signals.truth), strict=True)]
     if noise is not None:
         rows = [row | sigmas for row, sigmas in zip(rows, noise.by_surface(signals.truth), strict=True)]
@@ -322,11 +322,25 @@ def segmented(cloud: PointCloud) -> Segmentation | None:
     return Segmentation(result.supervoxels, result.labels, result.tree.parents, result.tree.altitudes)
 
 
-def segmented_truth(camera: Camera, truth: GroundTruth) -> Segmentation | None:
-    """The cloud of the true depth, segmented as a sensor's cloud is."""
-    from rangesim.point_cloud import PointCloud
+class TrueSegmentations:
+    """The segmentations of clouds of true depths, each computed when it is first asked for.
 
-    return segmented(PointCloud(camera.points(truth).astype(np.float32)))
+    Passes of different emitters often share a view. Who hands an object of this class to `carry_out` can ask it for
+    the segmentations afterwards.
+    """
+
+    def __init__(self) -> None:
+        self._of_cloud: dict[bytes, Segmentation | None] = {}
+
+    def of(self, camera: Camera, truth: GroundTruth) -> Segmentation | None:
+        """The cloud of the true depth, segmented as a sensor's cloud is; None below `MIN_POINTS`."""
+        from rangesim.point_cloud import PointCloud
+
+        points = camera.points(truth).astype(np.float32)
+        key = points.tobytes()
+        if key not in self._of_cloud:
+            self._of_cloud[key] = segmented(PointCloud(points))
+        return self._of_cloud[key]
 
 
 def objects_of(

@@ -207,10 +207,12 @@ class Rig:
     @cached_property
     def emitter_offsets(self) -> Array:
         """(h, w, 3) float64, metres, camera coordinates, from the origin of each ray of the camera to its emitter."""
-        rays = self.camera.rays
         if isinstance(self.projector, Beam):
-            return self.projector.frames(rays).offsets
-        return np.asarray(self.T_camera_projector[:3, 3] - rays.origins)
+            return self.projector.frames(self.camera.rays).offsets
+        to_projector = self.T_camera_projector[:3, 3]
+        if self.camera.is_pinhole:
+            return np.broadcast_to(to_projector, (self.camera.height, self.camera.width, 3))
+        return np.asarray(to_projector - self.camera.rays.origins)
 
     def __getstate__(self) -> dict[str, Any]:
         """Fields by name: what is computed from them is not pickled."""
@@ -290,6 +292,8 @@ class Rig:
             shape, solid_angle = (self.camera.height, self.camera.width), self.camera.solid_angle_sr()
             relative = np.nan_to_num(solid_angle / np.nanmax(solid_angle), nan=0.0)
             return np.broadcast_to(relative, shape).astype(np.float32)
+        if not self.camera_lens.vignetting:
+            return np.ones((self.camera.height, self.camera.width), dtype=np.float32)
         rays = self.camera.directions(self.camera.pixel_centres())
         fraction = np.linalg.norm(rays, axis=-1) ** -self.camera_lens.vignetting
         return np.nan_to_num(fraction, nan=0.0).astype(np.float32)

@@ -188,7 +188,7 @@ def _instantiate(
     advises : whether to warn of settings that probably are mistakes.
     """
     config = mi.parser.ParserConfig(mi.variant())
-    config.merge_meshes = config.merge_equivalent = False  # merged shapes would lose their instance ids
+    config.merge_meshes = False  # merged shapes would lose their ids; equal materials are made once
 
     def parsed(names: Utf8Names, advises: bool) -> tuple[Any, _Stated]:
         state = _parse(config, source, material, unit_m, names, advises)

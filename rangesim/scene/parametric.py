@@ -131,9 +131,9 @@ def surface_of(material: str, reflectance: float) -> dict[str, Any]:
     check_number("reflectance", reflectance, _REFLECTANCE)
     if material == "matte":
         return {"bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": float(reflectance)}}}
-    if material in MESH_MATERIALS:
+    if isinstance(material, str) and material in MESH_MATERIALS:
         return {"bsdf": MESH_MATERIALS[material]}
-    if material in material_names():
+    if isinstance(material, str) and material in material_names():
         return surface(material)
     known = (*MESH_MATERIALS, *material_names())
     raise ValueError(

@@ -362,8 +362,9 @@ class AmcwDecoder(Decoder):
             warn(doubt, DoubtWarning)
         return replace(lengths, doubts=(doubt,) if doubt else ())
 
-    def pixel_reader(self, sensor: Sensor) -> Callable[[Capture], PathLengths]:
-        return lambda capture: self._lengths(capture)[0]
+    def pixel_reader(self, sensor: Sensor) -> Callable[[Capture], PathLengths] | None:
+        """As `Decoder.pixel_reader`, for cameras without delays that depend on the place of a pixel."""
+        return None if of_type(sensor, AmcwToF).pixel_delay_s else lambda capture: self._lengths(capture)[0]
 
     def _lengths(self, capture: Capture) -> tuple[PathLengths, np.ndarray]:
         """The path lengths, and the modulation (h, w) float32 averaged over the frequencies."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pcgraph.plumbing.python_files import module_of_file
+from pcgraph.plumbing.python_files import module_of_file, place_of_failure
 from rangesim.codes import Code
 from rangesim.errors import FileFormatError
 from rangesim.sensor import Decoder, Sensor
@@ -194,4 +194,6 @@ def _module(path: Path) -> ModuleType:
         for family, known in before:
             family.known.clear()
             family.known.update(known)
-        raise FileFormatError(f"{path} fails: {type(error).__name__}: {brief(error)}") from error
+        raise FileFormatError(
+            f"{place_of_failure(error) or path} fails: {type(error).__name__}: {brief(error)}"
+        ) from error

@@ -123,12 +123,13 @@ def check_fields(setting: Any) -> None:
     NumPy scalars are replaced by Python numbers, and lists by tuples where the field holds a tuple; this works for
     frozen dataclasses too. Fields that hold arrays or mappings are not checked: the class does that itself.
     """
-    for field in dataclasses.fields(setting):
-        if field.init:
-            value = getattr(setting, field.name)
-            checked = _checked(_hints(type(setting))[field.name], value, field.name)  # type: ignore[arg-type]
-            if checked is not value:
-                object.__setattr__(setting, field.name, checked)
+    for name, hint, kind, bounds in _fields(type(setting)):  # type: ignore[arg-type]
+        value = getattr(setting, name)
+        if type(value) is kind and value in bounds:  # most fields are such numbers, and settings are made often
+            continue
+        checked = _checked(hint, value, name)
+        if checked is not value:
+            object.__setattr__(setting, name, checked)
 
 
 def check_number(name: str, value: Any, bounds: Bounds) -> None:
@@ -140,8 +141,17 @@ def check_number(name: str, value: Any, bounds: Bounds) -> None:
 
 
 @lru_cache(maxsize=256)
-def _hints(cls: type) -> dict[str, Any]:
-    return get_type_hints(cls, include_extras=True)
+def _fields(cls: type) -> list[tuple[str, Any, type | None, Any]]:
+    """Name and type of each field of a dataclass that is to be checked; and kind and bounds, if any value of that kind
+    within these bounds is right as it is. If not, kind and bounds are None and ()."""
+    hints, found = get_type_hints(cls, include_extras=True), []
+    for field in dataclasses.fields(cls):
+        if field.init:
+            hint = hints[field.name]
+            kind, bounds = get_args(hint)[:2] if get_origin(hint) is Annotated else (None, None)
+            is_plain = kind in (int, float) and isinstance(bounds, Bounds) and not bounds.limit
+            found.append((field.name, hint, *((kind, bounds) if is_plain else (None, ()))))
+    return found
 
 
 def _checked(hint: Any, value: Any, name: str) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple, overload
 
 import numpy as np
@@ -287,6 +287,25 @@ class StillSignals(Signals):
     @property
     def knows_sampling_error(self) -> bool:
         return self.sampling is not None
+
+    def row_of_pixels(self, where: np.ndarray, sensor: Sensor) -> StillSignals:
+        """The light of some pixels alone as an image of one row, (1, n), for `frames` of a sensor that is read by pixel
+        (`Decoder.pixel_reader`). `rig` and `truth` are still those of the whole image.
+
+        Parameters
+        ----------
+        where : (h, w) bool, the n pixels. sensor : the sensor whose channels are kept.
+        """
+        pixels = np.flatnonzero(where)
+
+        def row_of(channels: dict[Response, np.ndarray]) -> dict[Response, np.ndarray]:
+            return {r: channels[r].reshape(r.channels, -1).take(pixels, axis=1)[:, None] for r in sensor.responses()}
+
+        energy = EnergySplit(*(getattr(self.energy, field.name)[where][None] for field in fields(self.energy)))
+        sampling = self.sampling
+        if sampling is not None:
+            sampling = SamplingError(row_of(sampling.channels), sampling.projector[where][None])
+        return replace(self, energy=energy, channels=row_of(self.channels), sampling=sampling)
 
     def frames(self, sensor: Sensor, ambient_transmission: float = 1.0, sampling_errors: float = 0.0) -> np.ndarray:
         missing = [r for r in sensor.responses() if r not in self.channels]

@@ -32,7 +32,7 @@ from rangesim.evaluation.reference_readings import ReferenceReadings
 from rangesim.evaluation.surface_rows import with_mean_over_objects
 from rangesim.experiment import Experiment
 from rangesim.instrument.instrument import Instrument
-from rangesim.pipeline.experiment_run import acquisition, objects_of, segmented, segmented_truth
+from rangesim.pipeline.experiment_run import TrueSegmentations, acquisition, objects_of, segmented
 from rangesim.pipeline.shared_passes import rig_of_pass
 from rangesim.report import figures, palette
 from rangesim.report.panorama import panorama
@@ -240,7 +240,7 @@ def _objects(image: RangeImage, comparison: Comparison, signals: StillSignals | 
     the objects that it invents; None for a scene without objects."""
     if not signals.truth.object_names:
         return None
-    both = segmented(image.to_point_cloud()), segmented_truth(signals.rig.camera, signals.truth)
+    both = segmented(image.to_point_cloud()), TrueSegmentations().of(signals.rig.camera, signals.truth)
     found = objects_of(*both, image, comparison, signals.truth)
     counts = {outcome.value: len(found.names(outcome)) for outcome in Outcome}
     return {**counts, "displaced": sum(o.displaced for o in found.objects), "invented": found.invented}

@@ -52,6 +52,7 @@ class PlannedPass:
 
     point : a point with its scene and its settings of the transport. rig : Rig at 1 W. instruments : one for each
     measurement. jobs : plain data of each measurement. points : number of the first point of each measurement.
+    numbers : number of each measurement, by its plain data as text.
     """
 
     point: Point
@@ -59,6 +60,7 @@ class PlannedPass:
     instruments: list[Instrument] = field(default_factory=list)
     jobs: list[dict[str, Any]] = field(default_factory=list)
     points: list[int] = field(default_factory=list)
+    numbers: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,24 +182,28 @@ def plan(sweep: Sweep) -> Plan:
 
 
 def _job(one: PlannedPass, point: Point, instrument: Instrument, scene_key: str) -> int:
-    """Number of the measurement of an instrument in a pass, which is added unless the pass has an equal one."""
+    """Number of the measurement of an instrument in a pass, which is added unless the pass has an equal one.
+
+    Its noise depends on the seed, the scene and the instrument, and not on the other settings of the light transport:
+    points that differ in these alone have the same noise, so that their difference is the transport's.
+    """
     sweep = point.sweep
     job = {
         "sensor": to_dict(sweep.sensors[list(sweep.given).index(instrument.name)]),
         "settings": {path: to_dict(value) for path, value in point.instrument_settings(instrument.name).items()},
         "ambient": to_dict(point.ambient),
     }
-    for number, other in enumerate(one.jobs):
-        if {key: other[key] for key in job} == job:
-            return number
-    has_noise = instrument.noise and not instrument.sensor.is_ideal
-    stream = zlib.crc32(f"{scene_key}{_text(job)}".encode())
-    one.jobs.append(
-        {**job, "seeds": [derived_seed(sweep.seed, stream, k) for k in range(sweep.seeds * has_noise or 1)]}
-    )
-    one.instruments.append(instrument)
-    one.points.append(point.number)
-    return len(one.jobs) - 1
+    key = _text(job)
+    if key not in one.numbers:
+        has_noise = instrument.noise and not instrument.sensor.is_ideal
+        stream = zlib.crc32(f"{scene_key}{key}".encode())
+        seed = point.experiment_settings.seed
+        seeds = [derived_seed(seed, stream, k) for k in range(sweep.seeds * has_noise or 1)]
+        one.numbers[key] = len(one.jobs)
+        one.jobs.append({**job, "seeds": seeds})
+        one.instruments.append(instrument)
+        one.points.append(point.number)
+    return one.numbers[key]
 
 
 def _transport_key(point: Point) -> dict[str, Any]:

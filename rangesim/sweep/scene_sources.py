@@ -5,15 +5,16 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pcgraph.plumbing.python_files import module_of_file
+from pcgraph.plumbing.python_files import module_of_file, place_of_failure
 from rangesim.errors import FileFormatError
 from rangesim.files.bundled_scenes import scene_file, scene_names
-from rangesim.settings.config import check_keys, nearest, shown
+from rangesim.settings.config import brief, check_keys, nearest, shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -62,7 +63,7 @@ class SceneSource:
         Raises
         ------
         ValueError, FileFormatError
-            As `rangesim.load_scene`, and what the function raises.
+            As `rangesim.load_scene`; or the function of the user fails. The message names file, line and error.
         """
         from rangesim.environment.backend import select_variant
         from rangesim.scene import load_scene
@@ -70,7 +71,9 @@ class SceneSource:
         if self.kind == "file":
             return load_scene(self.name, **self.values)
         select_variant(None)
-        return replace(load_scene(_function(self.name, self.kind)(**self.values)), name=_short(self.name))
+        function = _function(self.name, self.kind)
+        with _failures_of(Path(self.name.rpartition(":")[0])) if self.kind == "own" else nullcontext():
+            return replace(load_scene(function(**self.values)), name=_short(self.name))
 
 
 def scene_of_dict(data: Mapping[str, Any]) -> SceneSource:
@@ -127,10 +130,23 @@ def _function(name: str, kind: str) -> Callable[..., Any]:
     file, _, function = name.rpartition(":")
     if not Path(file).is_file():
         raise FileFormatError(f"{file} does not exist; expected a Python file with the function {function}.")
-    made = getattr(module_of_file(Path(file), "rangesim"), function, None)
+    with _failures_of(Path(file)):
+        module = module_of_file(Path(file), "rangesim")
+    made = getattr(module, function, None)
     if not callable(made):
         raise FileFormatError(f"expected a function {function} in {file}, got {shown(made)}.")
     return made  # type: ignore[no-any-return]
+
+
+@contextmanager
+def _failures_of(file: Path) -> Iterator[None]:
+    """Raise FileFormatError, with file, line and error, if a file of the user fails or ends the process."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        raise FileFormatError(
+            f"{place_of_failure(error) or file} fails: {type(error).__name__}: {brief(error)}"
+        ) from error
 
 
 def _parameters(function: Callable[..., Any]) -> tuple[str, ...]:

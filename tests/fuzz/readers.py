@@ -192,6 +192,18 @@ def _experiment(path: Path, _: Arguments) -> Any:
     return load_experiment(path)
 
 
+def _sweep(path: Path, _: Arguments) -> Any:
+    from rangesim.sweep import load_sweep
+
+    return load_sweep(path)
+
+
+def _dataset_spec(path: Path, _: Arguments) -> Any:
+    from rangesim.dataset import load_spec
+
+    return load_spec(path)
+
+
 def _device(path: Path, _: Arguments) -> Any:
     from rangesim import presets
 
@@ -652,6 +664,10 @@ READERS = {
         Reader("capture", _capture, seeds.captures, ("*.json", "*.json", "*/00*.*"), (_sidecar_trees,)),
         Reader("capture-decoded", _decoded, seeds.captures, ("*.json",), (_sidecar_trees,), share=0.5),
         Reader("experiment", _experiment, seeds.experiments, by_hand=(hostile.toml_files,)),
+        Reader("sweep", _sweep, seeds.sweeps, by_hand=(hostile.toml_files,), share=0.5, renames=False),
+        Reader(
+            "dataset-spec", _dataset_spec, seeds.dataset_specs, by_hand=(hostile.toml_files,), share=0.5, renames=False
+        ),
         Reader("device", _device, seeds.devices, share=0.5),
         Reader("calibration-json", _calibration, seeds.rig_files, by_hand=(hostile.json_trees,), check=_rig_is_finite),
         Reader(

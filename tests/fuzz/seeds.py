@@ -185,6 +185,33 @@ sensor = "ideal-tof"
     return seeds | {"every sensor": of_file("experiment.toml", (every + SPAD).encode())}
 
 
+def sweeps() -> Seeds:
+    """The example of a sweep over ambient light, and one with every kind of setting and few points."""
+    sun = (ROOT / "examples" / "sweep_sun.toml").read_bytes()
+    every = b"""title = "All"
+scene = { name = "wall", reflectance = 0.5, tilt_deg = 10.0 }
+sensors = ["gray-phase", { sensor = "amcw", name = "weak", power_w = 0.1 }, "l515"]
+seeds = 3
+seed = 7
+exposure = 0.001
+tolerance_m = 0.002
+window_px = 32
+photons = 1000
+ambient.illuminant = "sun"
+[vary]
+scene.distance_m = [0.5, 1.0]
+weak.detector.read_noise_e = [1.0, 7.5]
+ambient.illuminance_lux = [0.0, 1e4]
+max_depth = [2, 5]
+"""
+    return {"sun": of_file("sweep.toml", sun), "every": of_file("sweep.toml", every)}
+
+
+def dataset_specs() -> Seeds:
+    """The example of a data set."""
+    return {"bin": of_file("dataset.toml", (ROOT / "examples" / "dataset_bin.toml").read_bytes())}
+
+
 def devices() -> Seeds:
     """Files of devices, one of each kind of sensor."""
     from rangesim import presets
