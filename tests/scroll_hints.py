@@ -16,7 +16,8 @@ BOXES = """[...document.querySelectorAll(".scroll")].map((box) => {
     const { left, top, width } = box.getBoundingClientRect();
     const height = box.querySelector("table").getBoundingClientRect().top - top;
     const hint = getComputedStyle(box, "::before").content, wider = box.scrollWidth > box.clientWidth;
-    return { left: left + scrollX, top: top + scrollY, width, height, hint, wider }; })"""
+    const focus = box.tabIndex === 0;
+    return { left: left + scrollX, top: top + scrollY, width, height, hint, wider, focus }; })"""
 
 
 def check_scroll_hints(page: Page, path: Path) -> None:
@@ -26,7 +27,7 @@ def check_scroll_hints(page: Page, path: Path) -> None:
     boxes = page.evaluate(BOXES)
     assert any(box["wider"] for box in boxes)
     for number, box in enumerate(boxes):
-        assert ("scroll it sideways" in box["hint"]) == box["wider"]
+        assert ("scroll it sideways" in box["hint"]) == box["wider"] == box["focus"]
         seen = _ink(page, box)
         page.evaluate(f"document.querySelectorAll('.scroll')[{number}].scrollLeft = 10")  # text at whole pixels
         np.testing.assert_array_equal(_ink(page, box), seen)

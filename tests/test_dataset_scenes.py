@@ -155,6 +155,19 @@ def test_models_of_a_folder_have_their_units_and_categories(tmp_path: Path) -> N
         assert one.category == one.model
 
 
+def test_a_file_in_millimetres_that_is_read_as_metres_is_refused(tmp_path: Path) -> None:
+    import trimesh
+
+    trimesh.creation.box((50, 50, 20)).export(tmp_path / "part.stl")
+    data = {"objects": [{"model": "part.stl"}], "instrument": [{"sensor": "ideal-tof"}]}
+    for unit_m in (1.0, 1e-6):
+        data["objects"][0]["unit_m"] = unit_m
+        with pytest.raises(ValueError, match=r"0\.85 m, got part of .*: state unit_m"):
+            random_scene(spec_from_dict(data, tmp_path), 0)
+    data["objects"][0]["size_m"] = 0.05
+    assert len(random_scene(spec_from_dict(data, tmp_path), 0).objects) == 1
+
+
 def test_a_urdf_file_has_its_links_where_the_joints_put_them(tmp_path: Path) -> None:
     import trimesh
 

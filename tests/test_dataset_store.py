@@ -39,7 +39,7 @@ from rangesim.dataset.contact_sheet import contact_sheet
 from rangesim.dataset.sample import sample_bytes
 from rangesim.dataset.sample_files import END_OF_TAR, SCENE_MEMBER, arrays_of, members_of, record_of, tar_segment
 from rangesim.dataset.store import IndexRow, parquet_bytes, read_rows
-from rangesim.errors import FileFormatError
+from rangesim.errors import FileFormatError, RangesimWarning
 
 SCENES = 3
 
@@ -294,6 +294,14 @@ def test_scenes_that_failed_are_computed_again_and_leave_no_trace(
     assert allowed >= 4
     assert (outcome.exit_status, outcome.quarantined) == (0, ())
     assert contents(tmp_path / "set") == contents(store)
+
+
+def test_scenes_without_an_object_are_said(tmp_path: Path, quick: pytest.MonkeyPatch) -> None:
+    instrument, group = {"sensor": "ideal-tof"}, {"model": "box", "size_m": 1.0}
+    spec = spec_from_dict({"scenes": 1, "objects": [group], "instrument": [instrument], "width": 8, "height": 6})
+    quick.setattr(production, "sample_bytes", sample_bytes)
+    with pytest.warns(RangesimWarning, match="1 of 1 scenes have no object"):
+        make_dataset(spec, tmp_path / "set")
 
 
 def test_a_store_of_another_specification_is_refused(spec: DatasetSpec, store: Path, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,7 @@ from rangesim.dataset.store import (
     shard_path,
 )
 from rangesim.environment.versions import versions
-from rangesim.errors import FileFormatError
+from rangesim.errors import FileFormatError, RangesimWarning
 from rangesim.files.schema import record_bytes
 from rangesim.pipeline.stages import Progress
 
@@ -94,7 +95,14 @@ def make_dataset(
             ).computed
             packing.finish()
         packing.clear()
-        failed = [row for row in Store(folder).rows if row.error is not None]
+        rows = Store(folder).rows
+        failed = [row for row in rows if row.error is not None]
+        if empty := sum(row.objects == 0 for row in rows):
+            warnings.warn(
+                f"{empty} of {spec.scenes} scenes have no object; left_out in their records says why.",
+                RangesimWarning,
+                stacklevel=2,
+            )
         quarantined = [
             QuarantinedItem(scene_key(row.scene), str(row.error), None, row.traceback or "") for row in failed
         ]

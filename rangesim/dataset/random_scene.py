@@ -28,6 +28,12 @@ STREAMS = ("objects", "support", "arrangement", "materials", "view", "light", "i
 last, because their places in this list are part of the seeds."""
 OF_EXPERIMENT = ("width", "height", "tolerance_m", "spp", "max_spp", "max_depth", "photons", "glint")
 """Settings that the experiment of each scene takes over from the specification."""
+MAX_OF_SUPPORT = 3.0
+"""Largest size of an object from a file over the diagonal of its support. A longer one cannot lie there, and a part of
+a tenth of the support is four times as long as it if inches are read as metres."""
+MIN_OF_SUPPORT = 1e-4
+"""Smallest size of an object from a file over the diagonal of its support: where a camera sees the whole support, a
+smaller one is no tenth of a pixel wide."""
 MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 """(4, 4) transform from coordinates of a camera here (x right, y down) to those of Mitsuba (x left, y up)."""
 
@@ -131,7 +137,8 @@ def random_scene(spec: DatasetSpec, index: int) -> RandomScene:
     Raises
     ------
     ValueError
-        The number is not one of the specification's scenes, or no camera pose sees an object.
+        The number is not one of the specification's scenes, the unit of a mesh file is wrong by the look of its size,
+        or no camera pose sees an object.
     FileFormatError
         The mesh of a model is broken or open.
 
@@ -146,7 +153,7 @@ def random_scene(spec: DatasetSpec, index: int) -> RandomScene:
         raise ValueError(f"expected the number of a scene, 0 to {spec.scenes - 1}, got {shown(index)}.")
     streams = {name: _generator(spec.seed, index, place) for place, name in enumerate(STREAMS)}
     support = spec.support.draw(streams["support"])
-    things = _draw_objects(spec, streams["objects"])
+    things = _draw_objects(spec, streams["objects"], float(np.linalg.norm(np.ptp(support.area_m, axis=0))))
     arrange = settled if spec.arrangement == "pile" else scattered
     arrangement = arrange([(one.solid, one.scale) for one in things], support, streams["arrangement"])
     objects: list[tuple[PlacedObject, bool, dict[str, Any]]] = []
@@ -197,7 +204,8 @@ def _generator(seed: int, index: int, stream: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
 
 
-def _draw_objects(spec: DatasetSpec, random: np.random.Generator) -> list[_Drawn]:
+def _draw_objects(spec: DatasetSpec, random: np.random.Generator, support_m: float) -> list[_Drawn]:
+    """Objects that are drawn for a support of this diagonal, metres."""
     things = []
     for group in spec.objects:
         for _ in range(drawn_count(group, random)):
@@ -208,9 +216,22 @@ def _draw_objects(spec: DatasetSpec, random: np.random.Generator) -> list[_Drawn
                 solid = primitive(values["model"], size_m, random)
             else:
                 solid = read_model(Path(values["model"]), group.unit_m)
-                scale *= 1.0 if size_m is None else size_m / solid.size_m
+                if size_m is None:
+                    _check_unit(solid, scale, support_m)
+                else:
+                    scale *= size_m / solid.size_m
             things.append(_Drawn(solid, scale, group.category_of(values["model"]), values["material"]))
     return things
+
+
+def _check_unit(solid: SolidModel, scale: float, support_m: float) -> None:
+    """Raise ValueError if a mesh, as large as its file says, is far too large or too small for the support."""
+    size_m = scale * solid.size_m
+    if not MIN_OF_SUPPORT <= size_m / support_m <= MAX_OF_SUPPORT:
+        raise ValueError(
+            f"expected objects for a support of {support_m:.2g} m, got {solid.name} of {size_m:.3g} m: state unit_m, "
+            "the metres per unit of its file (0.001 for millimetres), or size_m."
+        )
 
 
 def drawn_count(group: Any, random: np.random.Generator) -> int:
