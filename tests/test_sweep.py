@@ -266,6 +266,8 @@ def test_theory_ends_with_the_range_of_a_sensor(tmp_path: Path) -> None:
     assert far["theory_m"] is None
     assert far["error_m"].mean > 3.0
     assert "m at 3 m (beyond its range at 4 m)" in write_sweep(result, tmp_path).read_text()
+    middle["theory_m"], far["causes"] = None, {"shadowed": 1.0}  # no theory for other reasons: within its range
+    assert "beyond its range" not in write_sweep(result, tmp_path).read_text()
 
 
 def test_an_error_that_theory_expects_is_no_outlier() -> None:

@@ -46,7 +46,7 @@ ENOUGH = 0.9
 """Fraction of pixels with a reading from which the readings are compared with theory: of fewer, the lucky ones are
 left, whose errors are smaller."""
 HALF = 0.5
-"""Fraction of pixels with a reading from which a sensor counts as reading a scene at all."""
+"""Fraction of the pixels from which a sensor counts as reading a scene at all, or a scene as beyond its range."""
 RELIED = 0.95
 """Fraction of the readings whose error the verdict asks to be within the tolerance: rows have this percentile."""
 MIN_FIT = 3
@@ -214,7 +214,7 @@ class _Page:
         assert axis is not None
         rows = sorted(self._of(name, others), key=lambda row: row[axis])
         read = [r for r in rows if _reads(r) and r["error_m"].mean > 0]
-        within = [r for r in read if r["theory_m"] is not None] or read  # theory ends with the sensor's range
+        within = [r for r in read if not _is_beyond_range(r)]
         known = [(float(r[axis]), float(r["error_m"].mean)) for r in within]
         if len(known) < 2:
             return None
@@ -561,6 +561,12 @@ def _is_within(row: Mapping[str, Any], tolerance_m: float) -> bool:
 def _reads(row: Mapping[str, Any]) -> bool:
     """Whether a sensor reads at least half of the pixels."""
     return bool(row["right"].mean + row["wrong"].mean >= HALF)
+
+
+def _is_beyond_range(row: Mapping[str, Any]) -> bool:
+    """Whether at least half of the pixels fail because the surface lies outside of the sensor's range."""
+    causes = (Cause.RANGE_AMBIGUITY, Cause.OUT_OF_RANGE)
+    return bool(sum(row["causes"].get(cause.name.lower(), 0.0) for cause in causes) >= HALF)
 
 
 def _has_theory(row: Mapping[str, Any]) -> bool:
