@@ -112,7 +112,7 @@ def _packing_s(spec: DatasetSpec, samples: list[bytes], folder: Path) -> float:
     """Processor seconds for a scene that is packed into a shard."""
     run, bytes_of = production.run_items, production.sample_bytes
 
-    def inline(function: Any, items: Any, store: ItemStore, workers: Any, tell: Any, on_done: Any) -> Outcome:
+    def inline(function: Any, items: Any, store: ItemStore, workers: Any, tell: Any, on_done: Any, *_: Any) -> Outcome:
         for key in items:
             store.write(key, function(items[key]), items[key])
             on_done(key)
