@@ -184,8 +184,8 @@ def _local_cluster(count: int) -> Iterator[LocalCluster]:
         def __init__(self, *args: Any, **kwargs: Any) -> None:
             super().__init__(*args, **kwargs)
             self.pre_spawn_env |= threads  # the libraries read them when they are loaded
-            # Dask lets malloc hand all free memory back at once, and with it each larger array: a scene takes 1.2 times
-            # as long, and after 1000 scenes a worker is no smaller.
+            # Dask lets malloc hand free memory back at once, and each larger array with it: a scene takes 1.2 times as
+            # long, and after 1000 scenes a worker is 3 % smaller.
             self.pre_spawn_env.pop("MALLOC_TRIM_THRESHOLD_", None)
 
     settings = {

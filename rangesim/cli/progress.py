@@ -31,9 +31,10 @@ HOW_TO_RETRY = "rangesim: the same command with --retry computes again what fail
 def progress_bar(is_campaign: bool = False) -> Iterator[Callable[[str, float], None] | None]:
     """Show a progress bar while the block runs, if stderr is a terminal.
 
-    Yields a callable that takes the name of the stage and the fraction done, 0..1; None if stderr is no terminal.
+    Yields a callable that takes the name of the stage and the fraction done, 0..1. If stderr is no terminal, it is None,
+    or `progress_lines` of a campaign.
 
-    is_campaign : whether the work may take hours. Then it prints lines if stderr is no terminal, but a log.
+    is_campaign : whether the work may take hours.
     """
     if not sys.stderr.isatty():
         yield progress_lines() if is_campaign else None
