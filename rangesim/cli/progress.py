@@ -31,8 +31,8 @@ HOW_TO_RETRY = "rangesim: the same command with --retry computes again what fail
 def progress_bar(is_campaign: bool = False) -> Iterator[Callable[[str, float], None] | None]:
     """Show a progress bar while the block runs, if stderr is a terminal.
 
-    Yields a callable that takes the name of the stage and the fraction done, 0..1. If stderr is no terminal, it is None,
-    or `progress_lines` of a campaign.
+    Yields a callable that takes the name of the stage and the fraction done, 0..1. If stderr is no terminal, it yields
+    `progress_lines` for a campaign, and else None.
 
     is_campaign : whether the work may take hours.
     """
