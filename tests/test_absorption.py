@@ -171,7 +171,7 @@ def test_caustics_behind_a_slab_are_as_bright_as_the_photons_that_land() -> None
     for sigma_a in (0.0, SIGMA_A):
         scene = scene_of(slab=filled(slab(), sigma_a), wall=wall(1.0, matte()))
         rig = rig_of(Intrinsics.from_fov(64, 48, 20), PROJECTOR, camera_at=(0.0, 0.0, 0.6))
-        images.append(transport(scene, rig, [], spp=16, max_depth=2).energy.caustic)
+        images.append(transport(scene, rig, [], spp=16, max_depth=2, photons=1_000_000).energy.caustic)
     path = SlabPath(1.0, D)
     t = path.tangent(0.4 * np.linalg.norm(rig.camera.normalise(rig.camera.pixel_centres()), axis=-1))
     expected = of_slab(t)[0] / of_slab(t, 0.0)[0]

@@ -225,6 +225,7 @@ def facing_y() -> Any:
     return mi.ScalarTransform4d().rotate([1, 0, 0], 90).scale(20)
 
 
+@pytest.mark.filterwarnings("ignore:the 4 taps of a frequency lie on no cosine")  # each sees another place
 @pytest.mark.validation
 def test_what_moves_moves_in_the_world(tmp_path: Path) -> None:
     """A ball on an arc about a place in the world, a mesh on a straight line, seen from a rig that turns."""
