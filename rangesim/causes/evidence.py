@@ -407,7 +407,10 @@ class Evidence:
 
     @cached_property
     def _wrong_at_centres(self) -> np.ndarray:
-        """As `_wrong_alone`, for a decoder that reads whole images alone, in straight paths to all pixels' centres."""
+        """(h, w) bool, whether failed pixels are still wrong in straight paths to the centres of all pixels.
+
+        It stands for `_wrong_alone` where the decoder reads whole images only.
+        """
         return self._wrong_in(lambda one: single_path_frames(self.capture.sensor, one.rig, one.truth))
 
     @cached_property

@@ -61,8 +61,7 @@ class Coordinates(ShortRepr, ABC):
         """
 
     def spread(self, where: np.ndarray) -> Self:
-        """These coordinates of one row (1, n) as those of an image whose n pixels they are; the image has no other
-        readings.
+        """Coordinates of an image (h, w), of which n pixels have those of this row (1, n), and the others no reading.
 
         Parameters
         ----------

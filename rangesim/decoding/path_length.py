@@ -142,7 +142,7 @@ class PathLengths(Coordinates):
         self._keep_valid("sigma_m", np.float32)
 
     def spread(self, where: np.ndarray) -> PathLengths:
-        """As `Coordinates.spread`, without `returns`."""
+        """Path lengths of an image, see `Coordinates.spread`, without `returns`."""
         return super(PathLengths, replace(self, returns=None)).spread(where)
 
     def range_image(self, rig: Rig | None) -> RangeImage:

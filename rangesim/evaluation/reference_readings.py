@@ -19,6 +19,7 @@ from rangesim.sensor import Decoder, Sensor, pixel_reader_of
 
 if TYPE_CHECKING:
     from rangesim.electronics.ambient import Ambient
+    from rangesim.rig import Rig
     from rangesim.signals import Signals
 
 
@@ -58,16 +59,8 @@ class ReferenceReadings:
         return pixel_reader_of(self.decoder, self.capture.sensor) is not None
 
     def read_pixels(self, frames: np.ndarray, where: np.ndarray) -> np.ndarray:
-        """Depths of some pixels, NaN in the others, if `is_by_pixel`.
-
-        Parameters
-        ----------
-        frames : (k, 1, n) float32, W/m2/sr, noise-free frames of these pixels. where : (h, w) bool, the n pixels.
-        """
-        reader = pixel_reader_of(self.decoder, self.capture.sensor)
-        assert reader is not None
-        coordinates = reader(Capture(frames, self.capture.sensor)).spread(where)
-        return self.decoder.placed(coordinates, self.signals.rig).reading_m
+        """Depths of some pixels, NaN in the others, if `is_by_pixel`: see `read_pixels`."""
+        return read_pixels(frames, where, self.capture.sensor, self.decoder, self.signals.rig)
 
     @cached_property
     def noise_free(self) -> np.ndarray:
@@ -131,6 +124,18 @@ def _read(capture: Captured, decoder: Decoder) -> np.ndarray:
     if reader is None or not isinstance(capture, Capture):
         return decode(capture, decoder).reading_m
     return decoder.placed(reader(capture), capture.rig).reading_m
+
+
+def read_pixels(frames: np.ndarray, where: np.ndarray, sensor: Sensor, decoder: Decoder, rig: Rig) -> np.ndarray:
+    """Depths of some pixels, (h, w) float32, metres, NaN in the others, for a decoder that reads by pixel.
+
+    Parameters
+    ----------
+    frames : (k, 1, n) float32, W/m2/sr, noise-free frames of these pixels. where : (h, w) bool, the n pixels.
+    """
+    reader = pixel_reader_of(decoder, sensor)
+    assert reader is not None
+    return decoder.placed(reader(Capture(frames, sensor)).spread(where), rig).reading_m
 
 
 def halves(

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from rangesim.capture import Capture, bright_level
+from rangesim.capture import bright_level
 from rangesim.capture.exposure import auto_exposure_s, expose, mean_radiance
 from rangesim.decoding import decode
 from rangesim.decoding.disparities import ImageNoise
 from rangesim.electronics.ambient import Ambient
 from rangesim.errors import without_warnings
 from rangesim.evaluation.closed_forms import light_of_exposure
-from rangesim.evaluation.reference_readings import halves, sampling_draw
+from rangesim.evaluation.reference_readings import halves, read_pixels, sampling_draw
 from rangesim.instrument.instrument import Instrument
 from rangesim.light_transport.samples_per_pixel import Sampler
 from rangesim.robust_scale import TO_SIGMA
@@ -25,7 +25,6 @@ from rangesim.sensor import Decoder, Sensor, pixel_reader_of
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 if TYPE_CHECKING:
-    from rangesim.decoding.coordinates import Coordinates
     from rangesim.electronics.detector import PhotoDetector
     from rangesim.response import Response
     from rangesim.signals import GroundTruth, StillSignals
@@ -180,14 +179,14 @@ class _Pixels:
     ambient: Ambient | None
 
     @cached_property
-    def reader(self) -> Callable[[Capture], Coordinates] | None:
-        """The function that reads these pixels without the others; None if the whole image is needed."""
+    def is_by_pixel(self) -> bool:
+        """Whether these pixels can be read without the others."""
         is_veiled = self.signals.rig.camera_lens.stray_light > 0
-        return None if is_veiled else pixel_reader_of(self.decoder, self.sensor)
+        return not is_veiled and pixel_reader_of(self.decoder, self.sensor) is not None
 
     def halves(self) -> tuple[np.ndarray, np.ndarray]:
         """Depths of each half of the samples, without noise, (n,) float64 each, metres."""
-        if self.reader is None:
+        if not self.is_by_pixel:
             above, below = halves(self.signals, self.sensor, self.decoder, self.ambient)
             return above[self.some], below[self.some]
         above, below = (self._read(sampling_errors) for sampling_errors in (1.0, -1.0))
@@ -207,10 +206,9 @@ class _Pixels:
 
     def _read(self, sampling_errors: float) -> np.ndarray:
         """(n,) float64, metres, depths with so many draws of the sampling error, without noise."""
-        assert self.reader is not None
         frames = self._radiance(1.0 if self.ambient is None else self.ambient.scale, sampling_errors)
-        found = self.reader(Capture(frames, self.sensor)).spread(self.some)
-        return self.decoder.placed(found, self.signals.rig).reading_m[self.some].astype(np.float64)
+        found = read_pixels(frames, self.some, self.sensor, self.decoder, self.signals.rig)
+        return found[self.some].astype(np.float64)
 
     def detector_errors(self, detector: PhotoDetector, exposure_s: float | None, clean_m: np.ndarray) -> np.ndarray:
         """(n,) float64, metres, errors that the detector's noise makes, for `group_sigma`; NaN without a reading.
@@ -222,7 +220,7 @@ class _Pixels:
         exposure_s : float, seconds; None: automatic. clean_m : (n,) float64, metres, readings without noise.
         """
         signals, sensor, rig = self.signals, self.sensor, self.signals.rig
-        if self.reader is None:
+        if not self.is_by_pixel:
             radiance = mean_radiance(signals, sensor, detector, self.ambient)[:, self.some][:, None]
         else:
             passed = detector.ambient_fraction(sensor.gate, self.ambient)

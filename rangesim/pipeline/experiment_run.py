@@ -350,7 +350,7 @@ def objects_of(
     comparison: Comparison,
     truth: GroundTruth,
 ) -> ObjectSegmentation:
-    """What becomes of the true objects when a range image is segmented.
+    """Outcomes of the true objects in the segmentation of a range image.
 
     comparison : Comparison of the range image with the truth.
     """

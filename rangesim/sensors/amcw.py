@@ -363,7 +363,7 @@ class AmcwDecoder(Decoder):
         return replace(lengths, doubts=(doubt,) if doubt else ())
 
     def pixel_reader(self, sensor: Sensor) -> Callable[[Capture], PathLengths] | None:
-        """As `Decoder.pixel_reader`, for cameras without delays that depend on the place of a pixel."""
+        """A reader of pixels, see `Decoder.pixel_reader`; None if delays depend on the place of a pixel."""
         return None if of_type(sensor, AmcwToF).pixel_delay_s else lambda capture: self._lengths(capture)[0]
 
     def _lengths(self, capture: Capture) -> tuple[PathLengths, np.ndarray]:

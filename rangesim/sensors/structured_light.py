@@ -285,7 +285,7 @@ class StructuredLightDecoder(Decoder):
         return self._joined(capture, axes, codes, checked(capture, axes[0].contrast, contradictions))
 
     def pixel_reader(self, sensor: Sensor) -> Callable[[Capture], ProjectorCoordinates] | None:
-        """As `Decoder.pixel_reader`, for codes that are read by pixel and fringes without a gamma to be corrected."""
+        """A reader of pixels, see `Decoder.pixel_reader`; None if the code needs neighbours or a gamma is corrected."""
         shown = of_type(sensor, StructuredLight)
 
         def unchecked(capture: Capture) -> ProjectorCoordinates:
