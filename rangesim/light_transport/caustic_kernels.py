@@ -236,9 +236,7 @@ def smooth_chains(blocks, grid, landings, rule, meets, taken, used):  # type: ig
                     if r[p] >= 0:
                         found += 1
                         part += landings.part[r[p]] / 9
-                if found < 9:
-                    wish += part
-                elif not _is_smooth(r, landings, blocks.pixels, rule.angle, rule.tolerance, rule.faint):
+                if found < 9 or not _is_smooth(r, landings, blocks.pixels, rule.angle, rule.tolerance, rule.faint):
                     wish += part
                 else:
                     triangles, flux = _longer(triangles, n + 8), _longer(flux, n + 8)

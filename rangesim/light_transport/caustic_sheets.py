@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -26,15 +25,14 @@ from scipy.ndimage import maximum_filter
 from rangesim.light_transport.camera_rays import CellGrid, Device
 from rangesim.light_transport.caustic_kernels import (
     cells_of,
-    irradiance_of,
     larger,
     linked,
     new_points,
     sides_of_photons,
     smooth_chains,
 )
+from rangesim.light_transport.delta_surfaces import meets_delta
 from rangesim.light_transport.kernel_launches import Launches
-from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.sampling import Seed, aligned, random_stream
 from rangesim.light_transport.specular_tree import Landings, SpecularTree
 from rangesim.light_transport.traced_scene import TracedScene

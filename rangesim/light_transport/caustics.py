@@ -16,7 +16,7 @@ import mitsuba as mi
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.beams import BeamDevice
 from rangesim.light_transport.caustic_sheets import Sheets, trace_sheets
-from rangesim.light_transport.photons import has_delta
+from rangesim.light_transport.delta_surfaces import has_delta
 from rangesim.light_transport.sheet_scene import SheetScene
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.surfaces import number_of

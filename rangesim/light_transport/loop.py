@@ -38,8 +38,8 @@ from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.ambient_light import ambient_on_ray, sampled_ambient, sampled_ambient_through_media
 from rangesim.light_transport.beams import BeamDevice, Pencil, Spot
 from rangesim.light_transport.caustics import Vertex, caustic_light
+from rangesim.light_transport.delta_surfaces import has_delta
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
-from rangesim.light_transport.photons import has_delta
 from rangesim.light_transport.sampling import (
     Continued,
     Seed,

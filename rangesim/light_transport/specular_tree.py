@@ -12,6 +12,7 @@ A launch follows every ray along its stronger part. The weaker parts are stored,
 from __future__ import annotations
 
 from dataclasses import fields
+from itertools import count
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -31,6 +32,9 @@ from rangesim.light_transport.traced_scene import TracedScene
 PARTS = 6
 """Largest number of weaker parts that a ray stores in a launch. Light through three panes meets six faces. A part that
 finds no room is dropped by a point of the grid; a photon then follows one of the two parts by chance."""
+MAX_LAUNCHES = 4
+"""Largest number of launches for points of the grid; what is stored after them is dropped. Light that was the weaker
+part four times carries little."""
 HASH_STEP = 0x9E3779B1
 """Odd factor of the hash that names chains: 2^32 divided by the golden ratio, rounded to a prime."""
 NORMAL_STEPS = 1000.0
@@ -130,25 +134,29 @@ class SpecularTree:
         parts = Parts(dr.arange(mi.UInt32, n), part, origin, primary.direction, state, none, mi.UInt32(none),
                       None if random is None else mi.UInt64(random.state))  # fmt: skip
         # All parts share an increment; their states differ
-        chance, least = None if random is None else Continued(mi.PCG32(1)), dr.opaque(mi.Float, fewest)
+        chance = None if random is None else Continued(mi.PCG32(1))
+        self.fewest = dr.opaque(mi.Float, fewest)
         dropped, found = dr.zeros(mi.Float, n), []
-        while True:
-            lanes = dr.width(parts.part)
+        for launch in count():
             leaves = _leaves(parts)
             dr.make_opaque(leaves)
-            parts = _rebuilt(parts, leaves)
-            stored = [dr.zeros(type(x), PARTS * lanes) for x in _leaves(parts)]
-            landing, lost = _strongest(self, parts, least, dr.opaque(mi.UInt32, lanes), stored, chance)
+            parts = _rebuilt(parts, list(leaves))
+            lanes = dr.width(parts.part)
+            stored = _Stored(leaves, lanes)
+            landing, lost = _strongest(self, parts, stored, chance)
             dr.scatter_add(dropped, lost, parts.point)
-            self.launches.evaluate([list(landing), stored, dropped], lanes)
+            self.launches.evaluate([list(landing), stored.leaves, dropped], lanes)
             landed = dr.compress(landing.part > 0)
             columns = [dr.gather(type(x), x, landed) for x in (parts.point, *_leaves(landing))]
             dr.eval(columns)
             found.append([x.numpy() for x in columns])
-            rest = dr.compress(stored[PART_LEAF] > 0)
+            rest = dr.compress(stored.part > 0)
             if not len(rest):
                 break
-            parts = _rebuilt(parts, [dr.gather(type(x), x, rest) for x in stored])
+            parts = _rebuilt(parts, [dr.gather(type(x), x, rest) for x in stored.leaves])
+            if random is None and launch + 1 == MAX_LAUNCHES:
+                dr.scatter_add(dropped, parts.part, parts.point)
+                break
         numbers = [np.concatenate(column) for column in zip(*found, strict=True)]
         vectors = [np.column_stack(numbers[k : k + 3]) for k in (5, 8, 11)]
         return Landings(*numbers[:5], *vectors), dropped.numpy()
@@ -166,12 +174,38 @@ class _Landing(NamedTuple):
     direction: mi.Vector3f
 
 
+class _Stored:
+    """Room for the weaker parts of each lane. Dr.Jit does not look into this class, so loops do not carry the arrays.
+
+    Parameters
+    ----------
+    like : leaves of `Parts`.
+    lanes : int.
+    """
+
+    def __init__(self, like: list[Any], lanes: int) -> None:
+        self.lane, self.lanes = dr.arange(mi.UInt32, lanes), dr.opaque(mi.UInt32, lanes)
+        self.leaves = [dr.empty(type(x), PARTS * lanes) for x in like]
+        self.leaves[PART_LEAF] = dr.zeros(mi.Float, PARTS * lanes)
+
+    @property
+    def part(self) -> mi.Float:
+        """Fraction of the light of each part that was stored; 0 where there is none."""
+        return self.leaves[PART_LEAF]
+
+    def add(self, parts: Parts, number: mi.UInt32, active: mi.Bool) -> None:
+        """Store a part of each lane, after `number` that the lane stored before."""
+        place = dr.fma(number, self.lanes, self.lane)
+        for target, value in zip(self.leaves, _leaves(parts), strict=True):
+            dr.scatter(target, value, place, active)
+
+
 PART_LEAF = 1
 """Place of `part` among the leaves of `Parts`."""
 
 
 @dr.syntax
-def _strongest(tree, parts, fewest, lanes, stored, numbers):  # type: ignore[no-untyped-def]
+def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
     """Follow every part along the stronger of the two parts into which surfaces split it.
 
     Returns
@@ -186,11 +220,10 @@ def _strongest(tree, parts, fewest, lanes, stored, numbers):  # type: ignore[no-
     reflects.type_mask = mi.BSDFFlags.DeltaReflection
     transmits.type_mask = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Null
     any_lobe.type_mask = mi.BSDFFlags.Delta
-    half = mi.Point2f(0.5, 0.5)
 
     origin, direction, state = parts.origin, parts.direction, parts.state
     part, key, chain, random = parts.part, parts.key, parts.chain, parts.random
-    lane, count = dr.arange(mi.UInt32, n), dr.zeros(mi.UInt32, n)  # number of parts stored
+    number = dr.zeros(mi.UInt32, n)  # of parts stored
     lost, left = dr.zeros(mi.Float, n), tree.max_chain + dr.zeros(mi.UInt32, n)
     none, vector = dr.zeros(mi.UInt32, n), dr.zeros(mi.Vector3f, n)
     landing = [none, mi.UInt32(none), dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.zeros(mi.Point3f, n), vector,
@@ -221,8 +254,8 @@ def _strongest(tree, parts, fewest, lanes, stored, numbers):  # type: ignore[no-
         face = [mi.UInt32(mi.Int32(x)) for x in (face.x, face.y, face.z)]
         place = shape + dr.select(dr.gather(mi.Bool, tree.is_flat, shape, hit), _mixed(face), 0)
         splits = mirrors & (dr.gather(mi.Bool, tree.is_exact, shape, hit) | crosses)
-        bs_r, weight_r = bsdf.sample(reflects, si, mi.Float(0.5), half, splits)
-        bs_t, weight_t = bsdf.sample(transmits, si, mi.Float(0.5), half, splits)
+        bs_r, weight_r = bsdf.sample(reflects, si, mi.Float(0.5), mi.Point2f(0.5, 0.5), splits)
+        bs_t, weight_t = bsdf.sample(transmits, si, mi.Float(0.5), mi.Point2f(0.5, 0.5), splits)
         part_r, part_t = (dr.select(splits, part * mono(w), 0) for w in (weight_r, weight_t))
         if dr.hint(numbers is not None, mode="scalar"):
             rng = numbers.at(random)
@@ -248,25 +281,24 @@ def _strongest(tree, parts, fewest, lanes, stored, numbers):  # type: ignore[no-
         weaker, stronger = dr.minimum(part_r, part_t), dr.maximum(part_r, part_t)
         if dr.hint(numbers is not None, mode="scalar"):
             rng = numbers.at(random)
-            kept = dr.select(rng.next_float32() * fewest < weaker, dr.maximum(weaker, fewest), 0)
-            stronger = dr.select(rng.next_float32() * fewest < stronger, dr.maximum(stronger, fewest), 0)
+            kept = dr.select(rng.next_float32() * tree.fewest < weaker, dr.maximum(weaker, tree.fewest), 0)
+            stronger = dr.select(rng.next_float32() * tree.fewest < stronger, dr.maximum(stronger, tree.fewest), 0)
             # Without room for both, one of them stands for both
-            is_full = (kept > 0) & (count >= PARTS)
+            is_full = (kept > 0) & (number >= PARTS)
             swaps = is_full & (rng.next_float32() * (kept + stronger) < kept)
             turns ^= swaps
             stronger = dr.select(is_full, kept + stronger, stronger)
             kept = dr.select(is_full, 0, kept)
             random = rng.state
         else:
-            kept = dr.select((weaker >= fewest) & (count < PARTS), weaker, 0)
+            kept = dr.select((weaker >= tree.fewest) & (number < PARTS), weaker, 0)
             lost += weaker - kept
-            lost += dr.select(stronger < fewest, stronger, 0)
-            stronger = dr.select(stronger < fewest, 0, stronger)
+            lost += dr.select(stronger < tree.fewest, stronger, 0)
+            stronger = dr.select(stronger < tree.fewest, 0, stronger)
         aside = Parts(parts.point, kept, dr.select(turns, o_t, o_r), dr.select(turns, d_t, d_r),
                       dr.select(turns, after_t, after_r), dr.select(turns, key_t, key_r), chain, random)  # fmt: skip
-        place = dr.fma(count, lanes, lane)
-        _scatter(stored, _leaves(aside), place, kept > 0)
-        count += dr.select(kept > 0, mi.UInt32(1), mi.UInt32(0))
+        stored.add(aside, number, kept > 0)
+        number += dr.select(kept > 0, mi.UInt32(1), mi.UInt32(0))
         part, key = stronger, dr.select(turns, key_r, key_t)
         origin, direction = dr.select(turns, o_r, o_t), dr.select(turns, d_r, d_t)
         state = dr.select(turns, after_r, after_t)
@@ -279,12 +311,6 @@ def _strongest(tree, parts, fewest, lanes, stored, numbers):  # type: ignore[no-
 def _selected(where: mi.Bool, these: list[Any], others: list[Any]) -> list[Any]:
     """These arrays on the lanes of the mask `where`, the others elsewhere."""
     return [dr.select(where, a, b) for a, b in zip(these, others, strict=True)]
-
-
-def _scatter(targets: list[Any], values: list[Any], place: mi.UInt32, active: mi.Bool) -> None:
-    """Write each of the values to a place of its target."""
-    for target, value in zip(targets, values, strict=True):
-        dr.scatter(target, value, place, active)
 
 
 def _mixed(numbers: list[mi.UInt32]) -> mi.UInt32:

@@ -179,7 +179,7 @@ def estimate_cost(
     places : number of places that each pass is traced from, such as the views of a scan.
     beside : cost of the work with the signals; None: that of a run.
     """
-    from rangesim.light_transport.photons import has_delta
+    from rangesim.light_transport.delta_surfaces import has_delta
 
     largest = max(rig.traced.camera.width * rig.traced.camera.height for rig, _ in passes)
     photons = experiment.transport_settings(()).photons_for(largest) if has_delta(scene.mitsuba) else 0
