@@ -83,6 +83,7 @@ def caustic_light(
     sample: mi.UInt32,
     is_later: mi.Bool,
     place: mi.UInt32,
+    random: mi.UInt32,
     active: mi.Bool,
 ) -> tuple[list[list[mi.Float]], mi.Float]:
     """Add the light of all triangles that cover a vertex; returns the channels and the radiance (W/m2/sr) at the
@@ -93,6 +94,7 @@ def caustic_light(
     sample : UInt32, number of the sample in its pixel, which chooses the group of faint triangles.
     is_later : Bool, whether the vertex is not the first of its path.
     place : UInt32, index of the lane's pixel among those of the accumulators.
+    random : UInt32, a random number of the pixel.
     """
     n = dr.width(place)
     si, bsdf = vertex.si, vertex.bsdf
@@ -100,13 +102,14 @@ def caustic_light(
     seen = dr.dot(si.to_world(si.wi), si.n)
     radiance, way, which = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n)
     last, total, chosen = dr.full(mi.UInt32, NONE, n), dr.zeros(mi.Float, n), Place.none(n)
-    pick = mi.sample_tea_float32(place, sample)  # uniform in 0..1, apart from the random numbers of paths
+    pick = mi.sample_tea_float32(random, sample)  # uniform in 0..1, apart from the random numbers of paths
     # Later vertices bring little each, so they look in some samples alone, which count for all
     looks = sheets.may_light(shape, active & (~is_later | sheets.is_turn(sample, 1)))
     weight = vertex.throughput * dr.select(is_later, mi.Float(sheets.every), 1)
     while looks:
         # ---- The next triangle: each bright one counts, and one of the faint ones stands for all of them -----
-        found = sheets.next(sheets.start(si.p, normal, sample, which), normal, way, looks)
+        ray, step = sheets.ray(si.p, normal, sample, which, way)
+        found = sheets.next(ray, looks)
         hit = looks & found.is_valid()
         is_new = hit & (found.prim_index != last)
         irradiance, is_here = sheets.irradiance(found, shape, normal, is_new)
@@ -131,7 +134,7 @@ def caustic_light(
             channels = accumulators.add(channels, path, brought, place, on_one_side, is_later)
         total = dr.select(counts, 0, total)
         last = dr.select(hit, found.prim_index, last)
-        way = dr.select(hit, way + found.t + 1e-7, 0)
+        way = dr.select(hit, way + found.t + step, 0)
         which = dr.select(hit, which, which + 1)
         looks &= (which == 0) | ((which == 1) & sheets.is_turn(sample, 0))
     return channels, radiance

@@ -326,6 +326,7 @@ class Lanes:
         on_lens = view.traced.camera.has_lens
         self.lens_shift = mi.Point2f(rng.next_float32(), rng.next_float32()) if on_lens else None
         self.random = Continued(of_part(rng, self.part))
+        self.number_of_pixel = mi.sample_tea_32(self.pixel, settings.seed.low ^ settings.seed.high)[0]
 
     def number(self, taken: mi.UInt32) -> mi.UInt32:
         """Number of the next sample among all samples of its pixel, after `taken` of the allocated ones."""
@@ -556,7 +557,8 @@ def walk(
         if dr.hint(sheets is not None, mode="scalar"):
             vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, path.is_first & ~link.lit)
             state.channels, light = caustic_light(
-                sheets, accumulators, state.channels, vertex, number, is_later, lanes.place, is_vertex & ~scatters
+                sheets, accumulators, state.channels, vertex, number, is_later, lanes.place, lanes.number_of_pixel,
+                is_vertex & ~scatters,
             )
             radiance.caustic += dr.select(is_later, 0, light)
             radiance.smooth_caustic += dr.select(is_later, light, 0)
