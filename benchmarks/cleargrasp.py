@@ -305,7 +305,7 @@ def light_of(real: RealScene, rebuilt: Rebuilt, trial: Trial, width: int, spp: i
         )
         return transport(
             load_scene(description), rigs_of(device, real.camera, width), [device.sensor], spp=spp, max_depth=3,
-            photons=PHOTONS, caustic_radius_m=DOT_RADIUS_M, sampling_error=False, seed=seed,
+            photons=PHOTONS, sampling_error=False, seed=seed,
         )  # fmt: skip
 
 
@@ -430,7 +430,7 @@ def depth_behind(rig: Rig) -> np.ndarray:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "empty.xml"
         tree.write(path)
-        return transport(load_scene(path), rig, [], spp=1, photons=0).truth.z
+        return transport(load_scene(path), rig, [], spp=1, caustics=False).truth.z
 
 
 def show(label: str, on_glass: Figures, background: Figures) -> None:
@@ -456,7 +456,7 @@ def report_sensors(args: argparse.Namespace) -> dict[str, Any]:
     scene = load_scene(SCENE)
     rig = scene.rig(BASELINE_M, width=args.width or 320)
     behind = depth_behind(rig)
-    for light, settings in (("all light", {}), ("no light beyond glass", {"photons": 0, "glint": False})):
+    for light, settings in (("all light", {}), ("no light beyond glass", {"caustics": False, "glint": False})):
         signals = transport(scene, rig, list(SENSORS.values()), spp=args.spp, max_depth=12, **settings)
         truth = signals.truth
         mask = truth.material == truth.material_names.index("transparent")

@@ -77,7 +77,7 @@ def test_the_length_of_light_through_a_slab_is_that_of_snell_s_law() -> None:
     camera_at, limit_m = 0.6, 1.5
     scene = scene_of(slab=slab(NEAR, FAR), wall=wall(PLANE, matte()))
     rig = rig_of(CAMERA, Intrinsics.from_fov(160, 120, 12), camera_at=(0.0, 0.0, camera_at))
-    signals = transport(scene, rig, [ShortPaths(limit_m)], spp=64, max_depth=2, photons=500_000, caustic_radius_m=4e-3)
+    signals = transport(scene, rig, [ShortPaths(limit_m)], spp=64, max_depth=2)
     across = across_of_pixels(CAMERA, PLANE - camera_at)
     path = SlabPath(PLANE, FAR - NEAR)
     light, optical = path.irradiance(across), path.length(path.tangent(across)) + np.hypot(across, PLANE - camera_at)
@@ -179,7 +179,7 @@ def check_image_source(scene: Scene, rig: Rig, factor: Any, off_px: float = 0.01
     """The caustic is `factor` (of the direction in which light left) times that of the image source."""
     coordinates = ProjectorCoordinates()
     irradiance, uv, direction = image_source(rig)
-    options = {"spp": 64, "max_depth": 2, "caustic_radius_m": 4e-3, "indirect": "raw"}
+    options = {"spp": 64, "max_depth": 2, "indirect": "raw"}
     seeds = [transport(scene, rig, [coordinates], seed=s, **options) for s in range(4)]
     caustic = np.mean([s.energy.caustic for s in seeds], axis=0)
     ratio = caustic * np.pi / 0.5 / (irradiance * factor(direction))
@@ -226,7 +226,7 @@ def before_the_projector(**parts: dict[str, Any]) -> rangesim.Signals:
     """A plane lit through what is put before the projector; the camera sees it straight."""
     rig = rig_of(CAMERA, PROJECTOR, (0.3, 0.0, 0.0), (0.0, 0.0, 1.0))
     scene = scene_of(wall=wall(PLANE, matte()), **parts)
-    return transport(scene, rig, [ProjectorCoordinates()], spp=64, max_depth=2, caustic_radius_m=4e-3)
+    return transport(scene, rig, [ProjectorCoordinates()], spp=64, max_depth=2)
 
 
 @pytest.mark.validation
@@ -291,7 +291,7 @@ def test_photons_meet_shading_normals_as_direct_light_does(
     free, dimmed = ({"wall": part}, {"wall": part, "pane": wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3)})
     rig = rig_of(CAMERA, PROJECTOR, (0.3, 0.0, 0.0), (0.0, 0.0, 1.0))
     direct, caustic = (
-        transport(scene_of(**parts), rig, [], spp=64, max_depth=2, caustic_radius_m=4e-3).energy
+        transport(scene_of(**parts), rig, [], spp=64, max_depth=2).energy
         for parts in (free, dimmed)
     )
     points = points_on_the_plane(rig) - [0.3, 0.0, 0.0]
@@ -312,7 +312,7 @@ def test_a_coarse_smooth_ball_has_no_facets_behind_a_pane(tmp_path: Path) -> Non
     part = mesh(tmp_path / "ball.obj", np.add(ball.vertices, [0, 0, PLANE]), ball.vertices / 0.2, ball.faces, matte())
     pane = wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3)
     rig = rig_of(Intrinsics.from_fov(64, 48, 16), PROJECTOR, (0.3, 0.0, 0.0), (0.0, 0.0, 1.0))
-    options: dict[str, Any] = {"spp": 64, "max_depth": 2, "caustic_radius_m": 4e-3, "photons": 2_000_000}
+    options: dict[str, Any] = {"spp": 64, "max_depth": 2}
     free = transport(scene_of(ball=part), rig, [], **options).energy.direct
     dimmed = transport(scene_of(ball=part, pane=pane), rig, [], **options).energy.caustic
     blocks = [x.reshape(12, 4, 16, 4).mean(axis=(1, 3)) for x in (free, dimmed)]
@@ -462,7 +462,7 @@ def test_levels_change_the_noise_and_not_the_mean(monkeypatch: pytest.MonkeyPatc
     scene, rig = ball_over_a_plane()
 
     def render(seed: int) -> np.ndarray:
-        energy = transport(scene, rig, [], spp=32, max_depth=2, photons=200_000, seed=seed).energy
+        energy = transport(scene, rig, [], spp=32, max_depth=2, seed=seed).energy
         return energy.caustic.reshape(4, 16, 4, 16).mean(axis=(1, 3))
 
     with_levels = np.stack([render(s) for s in range(6)])
@@ -513,7 +513,7 @@ def test_more_photons_make_less_noise() -> None:
     for photons in (20_000, 320_000):
         images = [
             transport(
-                scene, rig, [], spp=16, max_depth=2, photons=photons, caustic_radius_m=2e-3, seed=s
+                scene, rig, [], spp=16, max_depth=2, photons=photons, seed=s
             ).energy.caustic
             for s in range(3)
         ]
@@ -608,7 +608,7 @@ def test_without_glass_and_mirrors_photons_and_glint_change_nothing() -> None:
     scene = rangesim.load_scene(SCENES / "matte.xml")
     rig = scene.rig(width=64, height=48)
     on = transport(scene, rig, all_sensors(), spp=4)
-    off = transport(scene, rig, all_sensors(), spp=4, photons=0, glint=False)
+    off = transport(scene, rig, all_sensors(), spp=4, caustics=False, glint=False)
     assert not on.energy.caustic.any()
     for response, values in on.channels.items():
         np.testing.assert_array_equal(values, off.channels[response])
@@ -623,7 +623,7 @@ def test_chunks_of_photons_and_tiles_change_no_byte() -> None:
     for name in ("position", "direction", "flux", "u", "v", "length_m", "map"):
         np.testing.assert_array_equal(getattr(large, name), getattr(small, name))
     images = [
-        transport(scene, rig, all_sensors(), spp=4, photons=50_000, memory_bytes=memory)
+        transport(scene, rig, all_sensors(), spp=4, memory_bytes=memory)
         for memory in (2 << 30, 999_937)
     ]
     for response, values in images[0].channels.items():
@@ -639,7 +639,7 @@ def test_threads_change_no_byte() -> None:
     images = []
     for threads in (1, 2):
         dr.set_thread_count(threads)
-        images.append(transport(scene, rig, all_sensors(), spp=4, photons=50_000))
+        images.append(transport(scene, rig, all_sensors(), spp=4))
     dr.set_thread_count(before)
     for response, values in images[0].channels.items():
         np.testing.assert_array_equal(values, images[1].channels[response])

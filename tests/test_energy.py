@@ -125,7 +125,7 @@ def test_what_a_plane_receives_behind_a_slab_is_what_the_slab_passes() -> None:
     scene = scene_of(slab=slab(0.2, 0.25), wall=wall(1.0, matte(0.5)))
     camera = Intrinsics.from_fov(96, 72, 80)
     rig = rig_of(camera, PROJECTOR, camera_at=(0.0, 0.0, 0.5), projector_power_w=POWER_W)
-    seeds = [transport(scene, rig, [], spp=64, max_depth=2, caustic_radius_m=0.01, seed=s).energy for s in range(4)]
+    seeds = [transport(scene, rig, [], spp=64, max_depth=2, seed=s).energy for s in range(4)]
     area_of_pixel = (0.5 / camera.fx) ** 2
     irradiance = np.mean([e.caustic for e in seeds], axis=0) * np.pi / 0.5
     received = irradiance.sum(dtype=float) * area_of_pixel
@@ -158,7 +158,7 @@ def integrating_sphere(*parts: dict[str, Any], albedo: float) -> float:
         T_world_camera = look_at((0, 0, 0), ahead, up)
         rig = Rig(camera, Intrinsics.from_fov(64, 64, 30), T_world_camera,
                   np.linalg.inv(T_world_camera) @ T_world_projector, projector_power_w=POWER_W)  # fmt: skip
-        signals = transport(scene, rig, [], spp=96, max_depth=40, rr_depth=40, glint=False, caustic_radius_m=0.15)
+        signals = transport(scene, rig, [], spp=96, max_depth=40, rr_depth=40, glint=False)
         wall_seen = signals.truth.instance == 0
         radiance = signals.energy.projector
         received += float((radiance * solid_angle)[wall_seen].sum()) * np.pi / albedo * radius**2

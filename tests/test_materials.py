@@ -114,7 +114,7 @@ def test_a_body_of_a_clear_material_is_filled_by_its_interior(tmp_path: Path, na
         body = f'<include filename="materials/{name}.xml"/><shape type="cube"><ref id="{name}"/>{interior}'
         body += '<transform name="to_world"><scale x="5" y="0.5" z="5"/></transform></shape>'
         scene = load(tmp_path, VIEW.format(fov=8) + body)
-        signals = rangesim.transport(scene, scene.rig(baseline_m=0.1, width=16), [], spp=32, glint=False, photons=0)
+        signals = rangesim.transport(scene, scene.rig(baseline_m=0.1, width=16), [], spp=32, glint=False, caustics=False)
         seen.append(signals.energy.ambient.mean())
     assert seen[1] < seen[0] - 0.5 * (1 - np.exp(-numbers(name)["sigma_t"]))
 
@@ -402,7 +402,7 @@ def corner(paint: dict[str, object], turn_deg: float = 0.0, slab: bool = False) 
 def said_of(scene: rangesim.Scene) -> list[str]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        rangesim.transport(scene, scene.rig(), [], spp=1, photons=0, glint=False)
+        rangesim.transport(scene, scene.rig(), [], spp=1, caustics=False, glint=False)
     return [str(warning.message) for warning in caught if "narrow lobes" in str(warning.message)]
 
 

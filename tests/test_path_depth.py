@@ -38,7 +38,7 @@ def panes(n: int, kind: str) -> dict[str, dict[str, Any]]:
 def test_panes_weaken_light_and_do_not_use_up_the_depth(n: int, kind: str) -> None:
     """n panes pass (1 - R) / (1 + (2 n - 1) R) (Stokes 1862), once for the projector and once for the camera."""
     rig = rig_of(CAMERA, PROJECTOR, (0.05, 0.0, 0.0))
-    options = {"spp": 64, "max_depth": 2, "glint": False, "photons": 1_000_000}
+    options = {"spp": 64, "max_depth": 2, "glint": False}
     plain, covered = (
         transport(scene_of(wall=wall(1.0, matte()), **glass), rig, [], **options).energy.projector.mean(dtype=float)
         for glass in ({}, panes(n, kind))
@@ -64,7 +64,7 @@ def test_what_is_seen_through_a_hollow_ball_is_that_of_a_deep_path_tracer() -> N
     scene, rig = hollow_ball(), rig_of(CAMERA, Intrinsics.from_fov(64, 64, 90), (0.0, 0.0, 0.75))
     deep = mi.load_dict({"type": "path", "max_depth": 200, "rr_depth": 200})
     reference = render(plain_scene(scene, rig, {"type": "hdrfilm", "pixel_format": "luminance"}), deep, 1024, seed=1)
-    energy = transport(scene, rig, [], spp=1024, photons=0, glint=False).energy
+    energy = transport(scene, rig, [], spp=1024, caustics=False, glint=False).energy
     assert energy.projector.mean() == pytest.approx(reference.mean(), rel=3e-3)
     assert abs(z_score(energy.projector, reference)) < 5
     straight = transport(scene_of(wall=wall(1.0, matte())), rig, [], spp=16).energy.projector.mean()
@@ -83,7 +83,7 @@ def test_light_off_coats_and_through_holes_counts_the_scattering_surface_alone()
     lamp = {"at": (0.3, 0.0, 0.5), "looks_at": (1.0, 0.0, 0.5)}
     rig = rig_of(CAMERA, Intrinsics.from_fov(64, 64, 90), **lamp)
     seen, deep = (
-        transport(scene_of(tilted=tilted, wall=beside), rig, [], spp=64, max_depth=n, photons=0).energy.projector
+        transport(scene_of(tilted=tilted, wall=beside), rig, [], spp=64, max_depth=n, caustics=False).energy.projector
         for n in (2, 7)
     )
     # Where the sight line leaves the coat at 45 degrees
@@ -95,7 +95,7 @@ def test_light_off_coats_and_through_holes_counts_the_scattering_surface_alone()
     holes = {f"hole_{i}": wall(0.2 + 0.1 * i, hole, 0.3) for i in range(6)}
     rig = rig_of(CAMERA, Intrinsics.from_fov(64, 64, 90), (0.0, 0.0, 0.75))
     plain, through = (
-        transport(scene_of(wall=wall(1.0, matte()), **parts), rig, [], spp=16, max_depth=2, photons=0).energy.direct
+        transport(scene_of(wall=wall(1.0, matte()), **parts), rig, [], spp=16, max_depth=2, caustics=False).energy.direct
         for parts in ({}, holes)
     )
     np.testing.assert_allclose(through, plain, rtol=1e-4)
@@ -188,7 +188,7 @@ def test_what_a_closed_room_loses_is_estimated_and_warned_about() -> None:
             assert signals.truncation is not None
             assert signals.truncation.depth == pytest.approx(lost, rel=1 / 3)  # at 5: 13 % and 34 %
             assert [w.filename for w in warned] == [__file__]
-            assert signals.truncation.chains == signals.truncation.photons == 0
+            assert signals.truncation.chains == signals.truncation.caustics == 0
 
 
 @pytest.mark.parametrize("name", ["plane", "matte", "corner", *to_validate("tabletop", "glassware")])
@@ -212,7 +212,7 @@ def test_what_cut_chains_lose_is_estimated(monkeypatch: pytest.MonkeyPatch) -> N
     """A hollow ball covers part of an evenly lit wall; after three faces nothing is seen through it any more."""
     wide = Intrinsics.from_fov(64, 48, 60)
     scene, rig = hollow_ball(), rig_of(wide, Intrinsics.from_fov(64, 64, 120), (0.0, 0.0, 0.75))
-    options = {"spp": 32, "max_depth": 4, "photons": 0}
+    options = {"spp": 32, "max_depth": 4, "caustics": False}
     all_of_it = transport(scene, rig, [], **options).energy.projector.sum(dtype=float)
     monkeypatch.setattr(loop, "MAX_CHAIN", 3)
     with pytest.warns(TruncationWarning, match="more than 128 surfaces of glass"):
@@ -227,11 +227,11 @@ def test_what_cut_photons_lose_is_estimated(tmp_path: Path, monkeypatch: pytest.
     box = {"type": "cube", "to_world": transform().scale(2.5), "bsdf": matte()}
     scene = scene_of(gem=gem(tmp_path, {"type": "dielectric", "int_ior": 2.4, "ext_ior": 1.0}), box=box)
     rig = rig_of(Intrinsics.from_fov(64, 64, 130), PROJECTOR, camera_at=(0.0, 0.0, -2.4))
-    options = {"spp": 32, "glint": False, "max_depth": 9, "caustic_radius_m": 0.1}
+    options = {"spp": 32, "glint": False, "max_depth": 9, }
     whole = transport(scene, rig, [], **options)
     monkeypatch.setattr(photon_flight, "MAX_CHAIN", 8)
     with pytest.warns(TruncationWarning, match="more than 128 surfaces of glass"):
         signals = transport(scene, rig, [], **options)
     lost = 1 - signals.energy.projector.sum(dtype=float) / whole.energy.projector.sum(dtype=float)
     assert signals.truncation is not None
-    assert signals.truncation.photons == pytest.approx(lost, rel=1 / 3)
+    assert signals.truncation.caustics == pytest.approx(lost, rel=1 / 3)

@@ -47,7 +47,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def signals(scene: Scene) -> rangesim.Signals:
-    return transport(scene, scene.rig(width=16, height=12), [AmcwToF(), DirectToF(bins=32)], spp=2, photons=0)
+    return transport(scene, scene.rig(width=16, height=12), [AmcwToF(), DirectToF(bins=32)], spp=2, caustics=False)
 
 
 def digest(*arrays: np.ndarray) -> str:
@@ -59,7 +59,7 @@ def digest(*arrays: np.ndarray) -> str:
 
 def path_loop(scene: Scene, seed: int) -> list[np.ndarray]:
     rig = scene.rig(width=16, height=12)
-    return [transport(scene, rig, [], spp=2, photons=0, glint=False, seed=seed).energy.direct]
+    return [transport(scene, rig, [], spp=2, caustics=False, glint=False, seed=seed).energy.direct]
 
 
 def photons(scene: Scene, seed: int) -> list[np.ndarray]:
@@ -68,7 +68,7 @@ def photons(scene: Scene, seed: int) -> list[np.ndarray]:
 
 def caustics(scene: Scene, seed: int) -> list[np.ndarray]:
     rig = scene.rig(width=16, height=12)
-    return [transport(scene, rig, [], spp=2, photons=20_000, glint=False, seed=seed).energy.caustic]
+    return [transport(scene, rig, [], spp=2, glint=False, seed=seed).energy.caustic]
 
 
 def glint(scene: Scene, seed: int) -> list[np.ndarray]:
@@ -83,7 +83,7 @@ def a_moving_scan(scene: Scene, seed: int) -> list[np.ndarray]:
     sensor, motion = AmcwToF(), Motion({"ball": ConstantTwist((1.0, 0.0, 0.0))})
     timing = Timing(line_period_s=1e-4, bands=2)
     rig = scene.rig(width=8, height=8)
-    options: dict[str, Any] = {"spp": 2, "photons": 0, "glint": False}
+    options: dict[str, Any] = {"spp": 2, "caustics": False, "glint": False}
     return [transport_moving(scene, rig, {sensor: timing}, motion, seed=seed, **options)[sensor].lit[:, 4:]]
 
 
@@ -164,11 +164,11 @@ def test_no_seed_makes_a_new_kernel(scene: Scene) -> None:
     import drjit as dr
 
     rig = scene.rig(width=16, height=12)
-    transport(scene, rig, [], spp=2, photons=1000, seed=0)
+    transport(scene, rig, [], spp=2, seed=0)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         for seed in SEEDS[-8:]:
-            transport(scene, rig, [], spp=2, photons=1000, seed=seed)
+            transport(scene, rig, [], spp=2, seed=seed)
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     assert len(kernels) >= 24
     assert sum(not k["cache_hit"] for k in kernels) < 8

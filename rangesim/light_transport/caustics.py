@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The projector's light beyond glass and mirrors, as camera paths gather it.
 
-This module chooses the number of photons and the radius within which they are gathered, and computes the light that
-they bring to a vertex of a camera path.
+This module has the triangles of light made for a pass, and computes the light that they bring to a vertex of a camera
+path.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from rangesim.response import CAUSTIC, LightPath
 from rangesim.rig import Rig
 
 MAX_COSINE_RATIO = 4.0
-"""Largest ratio of two cosines of a photon's direction: that to the facet at the vertex, and that to the facet on which
-the photon landed. Radiance is divided by the second cosine, so without this bound, a facet that photons meet edge-on
-would bring any amount of light. A smaller bound would darken caustics beside edges where facets meet at an angle."""
+"""Largest ratio of two cosines of the light's direction: that to the facet at the vertex, and that to the facet on which
+it landed. Radiance is divided by the second cosine, so without this bound, a facet that light meets edge-on would bring
+any amount of light. A smaller bound would darken caustics beside edges where facets meet at an angle."""
 
 
 def caustic_sheets(
@@ -39,7 +39,7 @@ def caustic_sheets(
 
     `report` is called after each kernel launch.
     """
-    if settings.photons == 0 or not has_delta(traced.scene) or isinstance(traced.projector, BeamDevice):
+    if not settings.caustics or not has_delta(traced.scene) or isinstance(traced.projector, BeamDevice):
         return None
     return trace_sheets(traced, rig.projector_power_w, settings.seed, report)
 
@@ -57,7 +57,7 @@ class Vertex(NamedTuple):
     si, bsdf : SurfaceInteraction3f and BSDFPtr, the surface.
     throughput : Float, radiance at the camera per radiance that leaves the vertex towards it.
     length : Float, metres, optical length from the camera.
-    is_first : Bool, whether photons there are the first return: the vertex is the first of the path, and the projector
+    is_first : Bool, whether this light is the first return: the vertex is the first of the path, and the projector
         does not light it straight.
     """
 

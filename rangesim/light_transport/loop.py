@@ -20,7 +20,7 @@ that absorbs, a segment of length d keeps the fraction exp(-sigma_a d) of the li
 (`rangesim.light_transport.absorption`).
 
 The loop carries out two of the three strategies that bring the projector's light to the camera: next-event estimation,
-and the gathering of caustic photons. `rangesim.light_transport.strategies` says which paths belong to which strategy.
+and caustics. `rangesim.light_transport.strategies` says which paths belong to which strategy.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ class Radiance(Generic[Array]):
     caustic: Array
     ambient: Array
     smooth_caustic: Array
-    """Caustics that were gathered over wide circles and are therefore smooth; `caustic` has the others."""
+    """Caustics at later vertices of a path, which change slowly over the image; `caustic` has those at the first."""
     glint: Array
     """Glint of a beam, whose emitter the paths of its own pixel meet; that of a projector is traced in `glint.py`."""
 
