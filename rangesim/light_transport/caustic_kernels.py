@@ -370,17 +370,18 @@ def sides_of_photons(cells, step, photons, columns, coarsest, landings, taken): 
 
 @cached_njit(nogil=True, error_model="numpy")
 def irradiance_of(triangles, flux, position, vertices):  # type: ignore[no-untyped-def]
-    """Irradiance at the vertices, (vertices,) float64, and over the triangles, (t,) float64.
+    """Irradiance at the vertices (vertices,) float64, what it is to be multiplied by within each triangle (t,) float64,
+    and the area of each triangle (t,) float64, m2.
 
-    A vertex has the flux of its triangles over their area. The light of a triangle is interpolated between those of its
-    vertices, times the number that is returned, so that it carries its flux.
+    A vertex has the flux of its triangles over their area. The irradiance within a triangle is interpolated between its
+    vertices and multiplied by a number, so that the triangle carries exactly its flux.
     """
     at_vertex, area_of = np.zeros(vertices), np.zeros(vertices)
-    scale = np.empty(len(triangles))
+    scale, areas = np.empty(len(triangles)), np.empty(len(triangles))
     for t in range(len(triangles)):
         a, b, c = triangles[t]
         area = triangle_area(position, a, b, c)
-        scale[t] = area
+        areas[t] = area
         for k in range(3):
             at_vertex[triangles[t, k]] += flux[t]
             area_of[triangles[t, k]] += area
@@ -389,7 +390,48 @@ def irradiance_of(triangles, flux, position, vertices):  # type: ignore[no-untyp
     for t in range(len(triangles)):
         a, b, c = triangles[t]
         mean = (at_vertex[a] + at_vertex[b] + at_vertex[c]) / 3
-        scale[t] = flux[t] / (scale[t] * mean) if scale[t] * mean > 0 else 0.0
-    return at_vertex, scale
+        scale[t] = flux[t] / (areas[t] * mean) if areas[t] * mean > 0 else 0.0
+    return at_vertex, scale, areas
 
 
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def lifted(sheets, scale, level, groups, every, faint, lift, offsets, drawn):  # type: ignore[no-untyped-def]
+    """The triangles of light as a scene of their own, see `sheet_scene`.
+
+    Parameters
+    ----------
+    sheets : Sheets, as a tuple of position, normal, triangles, shape and key.
+    level : (t,) float64, ratio of the irradiance to direct light.
+    lift : metres, largest distance off the surface. offsets : (groups + 1, 2) float64, metres.
+    drawn : (t,) float64, uniform in 0..1.
+
+    Returns
+    -------
+    corners : (3 k, 3) float32, metres. names : (k, 4) uint32, vertices and shape. factor : (k,) float32.
+    """
+    position, normal, triangles, shape, key = sheets
+    corners, names = np.empty((3 * len(triangles), 3), np.float32), np.empty((len(triangles), 4), np.uint32)
+    factor, n = np.empty(len(triangles), np.float32), 0
+    for t in range(len(triangles)):
+        group, weight = 0, 1.0
+        if level[t] < faint:
+            # The faintest are drawn by lot, and count for those that are not
+            chance = min(level[t] * groups * every / faint, 1.0)
+            if drawn[t] >= chance:
+                continue
+            group, weight = 1 + (key[t] >> 8) % groups, groups * every / chance
+        if not (scale[t] > 0 and np.isfinite(level[t])):
+            continue
+        height = lift * (t * 0.6180339887498949 % 1.0)
+        for k in range(3):
+            v = triangles[t, k]
+            names[n, k] = v
+            for axis in range(3):
+                corners[3 * n + k, axis] = position[v, axis] + height * normal[v, axis]
+                if axis < 2:
+                    corners[3 * n + k, axis] += offsets[group, axis]
+        names[n, 3], factor[n] = shape[t], scale[t] * weight
+        n += 1
+    return corners[: 3 * n], names[:n], factor[:n]

@@ -15,7 +15,7 @@ light is counted twice and none is left out.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import mitsuba as mi
@@ -24,6 +24,7 @@ from scipy.ndimage import maximum_filter
 
 from rangesim.light_transport.camera_rays import CellGrid, Device
 from rangesim.light_transport.caustic_kernels import (
+    EMPTY,
     cells_of,
     larger,
     linked,
@@ -33,29 +34,42 @@ from rangesim.light_transport.caustic_kernels import (
 )
 from rangesim.light_transport.delta_surfaces import meets_delta
 from rangesim.light_transport.kernel_launches import Launches
-from rangesim.light_transport.sampling import Seed, aligned, random_stream
+from rangesim.light_transport.sampling import R2, aligned
 from rangesim.light_transport.specular_tree import Landings, SpecularTree
 from rangesim.light_transport.traced_scene import TracedScene
 
 BLOCK_PX = 8.0
-"""Edge of the largest blocks, in pixels of the projector; a block has two cells along each edge."""
-LEVELS = 2
-"""Number of times that blocks may be divided. With two, the smallest cells have the size of a pixel."""
+"""Edge of the largest blocks, in pixels of the projector; a block has two cells along each edge. Rays that find glass
+are closer together, so smaller glass is not passed by."""
+MAX_LEVELS = 2
+"""Largest number of times that blocks are divided. With two, the smallest cells have the size of a pixel; with three, a
+third of the light that is left to photons would move to triangles, for three times the time."""
+CAMERA_CELL = 0.5
+"""Edge of the smallest cells in pixels of the camera, if these are larger than two of the projector: nobody sees what
+is finer."""
 TOLERANCE_PX = 0.15
 """Largest error of the place of a triangle, in pixels of the projector."""
 FAINT = 0.05
 """Ratio of the irradiance to direct light below which a triangle is faint. Blocks are not divided for faint light, and
 each sample sees one group of faint triangles alone."""
-SIGNIFICANT = 0.03
+SIGNIFICANT = 0.05
 """Fraction of the light of a block whose chains are not smooth, above which it is divided."""
-FEWEST_GRID, FEWEST_PHOTON = 4e-3, 2e-2
-"""Fractions of the light of a point below which a part is dropped by the grid, and by Russian roulette of photons."""
-LEFT = 0.02
-"""Fraction of the light of a cell that is left to photons, above which the cell gets a photon for certain."""
+FEWEST = 0.01
+"""Fraction of the light of a point below which the grid drops a part and leaves it to photons. Light that was reflected
+twice inside glass has 0.0016."""
+FEWEST_OF_PHOTONS = 0.1
+"""Fraction of the light of a photon below which Russian roulette decides about a part. If it were smaller, most of the
+time would go into parts that carry little."""
+LEFT = 0.1
+"""Fraction of the light of a cell that is left to photons, above which it gets one for certain; the others are drawn by
+lot. If it were smaller, many photons would carry little light."""
 STEP_PX = 0.02
-"""Distance of the points beside a photon that tell how its light spreads, in pixels of the projector."""
-GROUPS = 16
-"""Largest number of groups of faint triangles."""
+"""Distance of the points beside a photon that tell how its light spreads, in pixels of the projector. Closer points
+would land within the rounding of single precision; farther ones would miss narrow chains."""
+LENS_POINTS = 8
+"""Number of points of a lens of finite size, each of which has a grid of its own, at the lowest level."""
+MAX_AT_ONCE = 1 << 18
+"""Largest number of points of a launch, so that the weaker parts that it stores take 100 MB at most."""
 
 
 class Blocks(NamedTuple):
@@ -136,165 +150,245 @@ class Sheets(NamedTuple):
     in_triangles: float
 
 
-class _Grid:
-    """The grid over the projector's image, and its landings so far."""
+def trace_sheets(
+    traced: TracedScene,
+    power_w: float,
+    seed: int,
+    pixel_rad: float = 0.0,
+    report: Callable[[], None] = lambda: None,
+) -> Sheets | None:
+    """The projector's light through glass and off mirrors, on the surfaces where it lands; None if there is none.
 
-    def __init__(self, traced: TracedScene, launches: Launches) -> None:
-        assert isinstance(traced.projector, Device)
-        self.device = traced.projector
-        width, height = (int(n[0]) for n in self.device.size)
-        self.columns, self.rows = (int(np.ceil(n / BLOCK_PX)) for n in (width, height))
-        self.finest = 1 << LEVELS  # distance of the points of the largest blocks on the lattice
-        self.step_px = np.array([width / self.columns, height / self.rows]) / (2 * self.finest)
-        self.lattice_columns = self.columns * 2 * self.finest + 1
-        self.tree = SpecularTree(traced, launches)
-        self.launches = launches
-
-    def pixels_of(self, point: np.ndarray) -> np.ndarray:
-        """(n, 2) float, pixel coordinates of lattice points."""
-        return np.column_stack([point % self.lattice_columns, point // self.lattice_columns]) * self.step_px
-
-    def rays(self, pixels: np.ndarray):
-        return self.device.centre_ray(mi.Point2f(*(mi.Float(aligned(x, np.float32)) for x in pixels.T)))
-
-
-def trace_sheets(traced: TracedScene, power_w: float, seed: int, report: Callable[[], None] = lambda: None) -> Sheets:
-    """Trace the projector's light through glass and off mirrors to where it lands."""
-    scene, launches = traced.scene, Launches()
-    grid = _Grid(traced, launches)
-    device = grid.device
-    angle = 1 / float(np.sqrt(device.f.x[0] * device.f.y[0]))
-    rule = Rule(angle, TOLERANCE_PX, FAINT, SIGNIFICANT)
-    cells = CellGrid.of(device)
-    meets, _ = meets_delta(scene, cells.columns * cells.rows, lambda a, b: device.centre_ray(cells.probes(a, b)))
-    delta = _Delta(maximum_filter(meets.reshape(cells.rows, cells.columns), 3), grid)
-
-    table, value = np.full(1 << 12, -1, np.int64), np.empty(1 << 12, np.int64)
-    lattice, dropped = np.empty(0, np.int64), np.empty(0, np.float32)
-    taken, used = np.full(1 << 14, -1, np.int64), 0
-    landings: Landings | None = None
-    x, y = (a.ravel().astype(np.int64) * 2 * grid.finest for a in np.meshgrid(np.arange(grid.columns), np.arange(grid.rows)))
-    near = delta.within(x, y, 2 * grid.finest)
-    x, y = x[near], y[near]
-    made, left, at, edge = [], [], [], []
-    step = grid.finest
-    while len(x):
-        needed = 2 * (len(lattice) + 9 * len(x))
-        if needed > len(table):
-            table, value = larger(table, value, 1 << int(np.ceil(np.log2(needed))))
-        new = new_points(table, value, x, y, step, grid.lattice_columns, len(lattice))
-        found, lost = grid.tree.follow(grid.rays(grid.pixels_of(new)), FEWEST_GRID)
-        report()
-        found = found._replace(point=found.point.astype(np.int64) + len(lattice))
-        lattice, dropped = np.concatenate([lattice, new]), np.concatenate([dropped, lost])
-        landings = found if landings is None else Landings(*map(np.concatenate, zip(landings, found, strict=True)))
-        head, after = linked(landings.point, len(lattice))
-        points = Lattice(table, value, head, after, grid.lattice_columns, grid.finest)
-        chains = Chains(landings.key, landings.part, landings.length, landings.position, landings.normal)
-        pixels = float(np.sqrt(np.prod(grid.step_px))) * 2 * step
-        blocks = Blocks(x, y, step, pixels)
-        triangles, flux, divides, taken, used = smooth_chains(
-            blocks, points, chains, rule, delta.within(x, y, 2 * step), taken, used
-        )
-        made.append((triangles, flux))
-        if step == 1:
-            divides[:] = False
-        leaf = Blocks(x[~divides], y[~divides], step, pixels)
-        cell = np.column_stack([(one[:, None] + offset * step).ravel() for one, offset in (
-            (leaf.x, np.array([0, 1, 0, 1])), (leaf.y, np.array([0, 0, 1, 1])))])
-        triangles, flux, rest, taken, used = cells_of(
-            leaf, points, chains, dropped, delta.within(cell[:, 0], cell[:, 1], step), taken, used
-        )
-        made.append((triangles, flux))
-        at.append(cell[rest > 0])
-        left.append(rest[rest > 0])
-        edge.append(np.full(len(at[-1]), step))
-        x, y = x[divides], y[divides]
-        step //= 2
-        x, y = np.concatenate([x, x + 2 * step, x, x + 2 * step]), np.concatenate([y, y, y + 2 * step, y + 2 * step])
-    if landings is None:
-        return None
-    triangles, flux = (np.concatenate(c) for c in zip(*made, strict=True))
-    flux = flux[:, 0]
-    watts = power_w / device.pixels
-    uv = grid.pixels_of(lattice)[landings.point]
-    cosine = np.einsum("ij,ij->i", landings.direction, landings.normal)
-    first = [landings.position, landings.direction, cosine, landings.length, uv[:, 0], uv[:, 1], landings.normal]
-    of = triangles[:, 0]
-    sheet = [triangles, flux * watts, landings.shape[of], landings.key[of]]
-
-    # ---- Photons -----------------------------------------------------------------------------------------
-    cells_left, edges, rest = np.concatenate(at), np.concatenate(edge), np.concatenate(left)
+    Parameters
+    ----------
+    power_w : watts, power of the projector while it shows white.
+    seed : int, 0 to 2^64 - 1, decides about photons.
+    pixel_rad : radians, smallest angle of a camera's pixel; what is finer than half of it is not resolved.
+    report : called after each kernel launch.
+    """
+    assert isinstance(traced.projector, Device)  # beams need no sheets
     rng = np.random.default_rng(seed)
-    chance = np.minimum(rest / LEFT, 1)
-    chosen = rng.random(len(rest)) < chance
-    cells_left, edges, chance = cells_left[chosen], edges[chosen], chance[chosen]
-    size = edges[:, None] * grid.step_px
-    place = cells_left * grid.step_px + rng.random((len(edges), 2)) * size
-    beside = np.repeat(place, 3, axis=0)
-    beside[1::3, 0] += STEP_PX
-    beside[2::3, 1] += STEP_PX
-    cut = 0.0
-    if len(beside):
-        number = mi.UInt32(aligned(np.repeat(np.arange(len(place)), 3), np.uint32))
-        random = random_stream(Seed.of(seed), number ^ 0x9E3779B9)
-        found, lost = grid.tree.follow(grid.rays(beside), FEWEST_PHOTON, random)
-        report()
+    points = [None]
+    if traced.projector.has_lens:
+        points = list(np.mod(np.arange(LENS_POINTS)[:, None] * R2 + rng.random(2), 1))
+    tracing = _Tracing(traced, pixel_rad, report)
+    return joined([tracing.sheets(power_w / len(points), rng, lens) for lens in points])
+
+
+def joined(sheets: Sequence[Sheets]) -> Sheets | None:
+    """Several sheets as one; None if they are all empty."""
+    sheets = [one for one in sheets if len(one.flux)]
+    if len(sheets) < 2:
+        return sheets[0] if sheets else None
+    first = np.cumsum([0, *(len(one.u) for one in sheets)])
+    moved = [one._replace(triangles=one.triangles + begin) for one, begin in zip(sheets, first, strict=False)]
+    columns = [np.concatenate(c) for c in list(zip(*moved, strict=True))[:-2]]
+    flux = np.array([one.flux.sum() for one in sheets])
+    means = (float(np.average([getattr(one, name) for one in sheets], weights=flux)) for name in ("cut", "in_triangles"))
+    return Sheets(*columns, *means)
+
+
+class _Points:
+    """Points of a lattice over the image that were traced, and where their light landed.
+
+    Parameters
+    ----------
+    columns : int, number of lattice points in a row.
+    coarsest : int, distance of the points of the largest blocks.
+    """
+
+    def __init__(self, columns: int, coarsest: int) -> None:
+        self.columns, self.coarsest = columns, coarsest
+        self.table, self.value = np.full(1 << 12, EMPTY, np.int64), np.empty(1 << 12, np.int64)
+        self.numbers, self.dropped = np.empty(0, np.int64), np.empty(0, np.float32)
+        self.landings: list[Landings] = []
+
+    def new(self, blocks: Blocks) -> np.ndarray:
+        """Lattice numbers of the points of these blocks that were not traced yet."""
+        needed = 2 * (len(self.numbers) + 9 * len(blocks.x))
+        if needed > len(self.table):
+            self.table, self.value = larger(self.table, self.value, 1 << int(np.ceil(np.log2(needed))))
+        return new_points(self.table, self.value, *blocks[:3], self.columns, len(self.numbers))
+
+    def add(self, numbers: np.ndarray, landings: Landings, dropped: np.ndarray) -> tuple[Lattice, Landings]:
+        """Keep the landings of new points; returns all of them."""
+        point = landings.point.astype(np.int64) + len(self.numbers)
+        self.landings = [Landings(*map(np.concatenate, zip(*self.landings, landings._replace(point=point), strict=True)))]
+        self.numbers, self.dropped = np.concatenate([self.numbers, numbers]), np.concatenate([self.dropped, dropped])
+        lists = linked(self.landings[0].point, len(self.numbers))
+        return Lattice(self.table, self.value, *lists, self.columns, self.coarsest), self.landings[0]
+
+
+class _Tracing:
+    """Traces sheets of a projector.
+
+    Parameters
+    ----------
+    traced, pixel_rad, report : as for `trace_sheets`.
+    """
+
+    def __init__(self, traced: TracedScene, pixel_rad: float, report: Callable[[], None]) -> None:
+        assert isinstance(traced.projector, Device)
+        self.device, self.report = traced.projector, report
+        self.tree = SpecularTree(traced, Launches())
+        width, height = (int(n[0]) for n in self.device.size)
+        self.angle = 1 / float(np.sqrt(self.device.f.x[0] * self.device.f.y[0]))
+        levels = int(np.log2(0.5 * BLOCK_PX / max(CAMERA_CELL * pixel_rad / self.angle, 1)))
+        self.levels = 0 if self.device.has_lens else min(max(levels, 0), MAX_LEVELS)
+        self.blocks = tuple(int(np.ceil(n / BLOCK_PX)) for n in (width, height))
+        self.coarsest = 1 << self.levels
+        self.step_px = np.array([width, height]) / (2 * self.coarsest * np.array(self.blocks))
+        self.columns = 2 * self.coarsest * self.blocks[0] + 1
+        cells = CellGrid.of(self.device)
+        meets, _ = meets_delta(
+            traced.scene, cells.columns * cells.rows, lambda a, b: self.device.centre_ray(cells.probes(a, b))
+        )
+        self.delta = _Delta(maximum_filter(meets.reshape(cells.rows, cells.columns), 3), 2 * self.coarsest * np.array(self.blocks))
+
+    def sheets(self, power_w: float, rng: np.random.Generator, lens: np.ndarray | None) -> Sheets:
+        """Sheets of the light through a point of the lens, uniform coordinates in the unit square (2,); None: its
+        centre."""
+        points = _Points(self.columns, self.coarsest)
+        x, y = (c.ravel().astype(np.int64) for c in np.meshgrid(*(2 * self.coarsest * np.arange(n) for n in self.blocks)))
+        taken, used, step = np.full(1 << 14, EMPTY, np.int64), 0, self.coarsest
+        near = self.delta.within(x, y, 2 * step)
+        x, y = x[near], y[near]
+        made, left = [], []
+        rule = Rule(self.angle, TOLERANCE_PX, FAINT, SIGNIFICANT)
+        watts = power_w / self.device.pixels
+        pixels = np.sqrt(self.step_px.prod())
+        landings = _no_landings()
+        while step and len(x):
+            blocks = Blocks(x, y, step, 2 * step * pixels)
+            new = points.new(blocks)
+            place = np.column_stack([new % self.columns, new // self.columns]) * self.step_px
+            lattice, landings = points.add(new, *self._follow(place, lens, FEWEST))
+            chains = Chains(*(getattr(landings, name) for name in Chains._fields))
+            meets = self.delta.within(x, y, 2 * step)
+            triangles, flux, divides, taken, used = smooth_chains(blocks, lattice, chains, rule, meets, taken, used)
+            made.append((triangles, flux))
+            divides &= step > 1
+            whole = Blocks(x[~divides], y[~divides], *blocks[2:])
+            cells = np.column_stack([np.add.outer(c, step * offset).ravel() for c, offset in (
+                (whole.x, np.array([0, 1, 0, 1])), (whole.y, np.array([0, 0, 1, 1])))])  # fmt: skip
+            meets = self.delta.within(*cells.T, step)
+            triangles, flux, rest, taken, used = cells_of(whole, lattice, chains, points.dropped, meets, taken, used)
+            made.append((triangles, flux))
+            left.append(np.column_stack([cells, np.full(len(cells), step), rest])[rest > 0])
+            x, y, step = x[divides], y[divides], step // 2
+            x, y = np.concatenate([x, x + 2 * step, x, x + 2 * step]), np.concatenate([y, y, y + 2 * step, y + 2 * step])
+        if not made:
+            return _sheets(landings, np.empty((0, 2)), np.empty((0, 3), np.int64), np.empty(0), 0.0)
+        triangles, flux = (np.concatenate(c) for c in zip(*made, strict=True))
+        uv = np.column_stack([points.numbers % self.columns, points.numbers // self.columns]) * self.step_px
+        of_grid = _sheets(landings, uv[landings.point], triangles, watts * flux[:, 0], 0.0)
+        both = joined([of_grid, self._photons(np.concatenate(left), taken, watts, rng, lens)])
+        if both is None:
+            return of_grid
+        return both._replace(in_triangles=float(of_grid.flux.sum() / both.flux.sum()))
+
+    def _photons(
+        self, cells: np.ndarray, taken: np.ndarray, watts: float, rng: np.random.Generator, lens: np.ndarray | None
+    ) -> Sheets:
+        """Sheets of photons: the light of cells that is in no triangle.
+
+        cells : (n, 4) float64, lattice coordinates and edge of cells, and fraction of their light that is left.
+        taken : set of the cells and chains that have triangles. watts : W, power of a pixel.
+        """
+        chance = np.minimum(cells[:, 3] / LEFT, 1)
+        chosen = rng.random(len(cells)) < chance
+        cells, chance = cells[chosen], chance[chosen]
+        size = cells[:, 2:3] * self.step_px
+        place = cells[:, :2] * self.step_px + rng.random((len(cells), 2)) * size
+        beside = np.repeat(place, 3, axis=0)
+        beside[1::3, 0] += STEP_PX
+        beside[2::3, 1] += STEP_PX
+        # The three points of a photon share their random numbers, and so their chains
+        states = np.repeat(rng.integers(0, 1 << 63, len(cells), dtype=np.uint64), 3)
+        found, lost = self._follow(beside, lens, FEWEST_OF_PHOTONS, states)
         lists = Lists(*linked(found.point.astype(np.int64), len(beside)))
-        chains = Chains(found.key, found.part, found.length, found.position, found.normal)
-        which = sides_of_photons(cells_left, edges, lists, grid.lattice_columns, grid.finest, chains, taken)
-        more, patches = _parallelograms(found, which, size, beside, chance, angle, watts, len(landings.key))
-        first = [np.concatenate(c) for c in zip(first, more, strict=True)]
-        sheet = [np.concatenate(c) for c in zip(sheet, patches, strict=True)]
-        cut = float(lost[::3].sum()) / max(len(place), 1)
-    total = float(sheet[1].sum())
-    f32 = [np.asarray(c, np.float32) for c in first]
-    return Sheets(*f32, *sheet, cut, float(flux.sum()) * watts / total if total else 0.0)
+        chains = Chains(*(getattr(found, name) for name in Chains._fields))
+        corners, edges = cells[:, :2].astype(np.int64), cells[:, 2].astype(np.int64)
+        which = sides_of_photons(corners, edges, lists, self.columns, self.coarsest, chains, taken)
+        power = watts * size.prod(axis=1) / chance
+        made = _parallelograms(found, which, size, place, power, self.angle)
+        return made._replace(cut=float((lost[::3] * power).sum() / made.flux.sum()) if len(made.flux) else 0.0)
+
+    def _follow(
+        self, pixels: np.ndarray, lens: np.ndarray | None, fewest: float, states: np.ndarray | None = None
+    ) -> tuple[Landings, np.ndarray]:
+        """Follow the light of points of the image (n, 2), as `SpecularTree.follow`."""
+        found, lost = [_no_landings()], [np.empty(0, np.float32)]
+        for begin in range(0, len(pixels), MAX_AT_ONCE):
+            some = slice(begin, begin + MAX_AT_ONCE)
+            place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in pixels[some].T))
+            rays = self.device.sample_ray(place, None if lens is None else mi.Point2f(*map(float, lens)))
+            random = None if states is None else mi.UInt64(aligned(states[some], np.uint64))
+            landings, dropped = self.tree.follow(rays, fewest, random)
+            self.report()
+            found.append(landings._replace(point=landings.point + np.uint32(begin)))
+            lost.append(dropped)
+        return Landings(*map(np.concatenate, zip(*found, strict=True))), np.concatenate(lost)
 
 
-def _parallelograms(found, which, size, beside, chance, angle, watts, start):
-    """The parallelograms of photons, two triangles each."""
+def _no_landings() -> Landings:
+    """No landing at all."""
+    whole, real, vector = np.empty(0, np.uint32), np.empty(0, np.float32), np.empty((0, 3), np.float32)
+    return Landings(whole, whole, whole, real, real, vector, vector, vector)
+
+
+def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.ndarray, cut: float) -> Sheets:
+    """Sheets whose vertices are these landings; `uv` (n, 2) are pixel coordinates."""
+    cosine = np.einsum("ij,ij->i", landings.direction, landings.normal)
+    u, v = np.asarray(uv, np.float32).T
+    of = triangles[:, 0]
+    vertices = landings.position, landings.direction, cosine, landings.length, u, v, landings.normal
+    return Sheets(*vertices, triangles, flux, landings.shape[of], landings.key[of], cut, 0.0)
+
+
+def _parallelograms(
+    found: Landings, which: np.ndarray, size: np.ndarray, place: np.ndarray, power: np.ndarray, angle: float
+) -> Sheets:
+    """Sheets of photons, two triangles each.
+
+    Parameters
+    ----------
+    found : Landings of the three points of each photon. which : (m, 3) int64, see `sides_of_photons`.
+    size, place : (n, 2) float64, pixels, sizes of the photons' cells and places of the photons.
+    power : (n,) float64, watts, power that a photon stands for. angle : radians, of a pixel.
+    """
     this = which[:, 0]
     photon = found.point[this] // 3
-    edge = size[photon]
-    place = found.position[this].astype(np.float64)
+    edges, centre = size[photon], found.position[this].astype(np.float64)
     normal = found.normal[this].astype(np.float64)
-    plain = angle * found.length[this]
-    # Where no chain of the same name is beside it, light spreads as without glass
-    helper = np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    across = np.cross(normal, helper)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    sides = [across * (plain * edge[:, 0])[:, None], np.cross(normal, across) * (plain * edge[:, 1])[:, None]]
-    known = (which[:, 1:] >= 0).all(axis=1)
-    for k in (0, 1):
-        beside_it = found.position[which[:, 1 + k]].astype(np.float64)
-        side = (beside_it - place) / STEP_PX * edge[:, k : k + 1]
-        sides[k] = np.where(known[:, None], side, sides[k])
-    corners, uv = [], []
-    centre = beside[3 * photon]
-    for a, b in ((-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)):
-        corners.append(place + a * sides[0] + b * sides[1])
-        uv.append(centre + edge * [a, b])
-    m = len(this)
-    stack = lambda four: np.stack(four, axis=1).reshape(4 * m, -1)  # noqa: E731
-    uv = stack(uv)
-    cosine = np.einsum("ij,ij->i", found.direction[this], found.normal[this])
-    four = lambda one: np.repeat(one, 4, axis=0)  # noqa: E731
-    vertices = [stack(corners), four(found.direction[this]), four(cosine), four(found.length[this]), uv[:, 0], uv[:, 1], four(normal)]
-    base = start + 4 * np.arange(m)[:, None, None]
-    triangles = (base + np.array([[0, 1, 3], [0, 3, 2]])).reshape(-1, 3)
-    flux = np.repeat(0.5 * watts * found.part[this] * edge.prod(axis=1) / chance[photon], 2)
-    return vertices, [triangles, flux, np.repeat(found.shape[this], 2), np.repeat(found.key[this], 2)]
+    # Where no chain of the same name lies beside a photon, its light spreads as without glass
+    across = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]]))
+    across *= (angle * found.length[this] / np.linalg.norm(across, axis=1))[:, None]
+    plain = np.stack([across, np.cross(normal, across)], axis=1)
+    known = (which[:, 1:] >= 0).all(axis=1)[:, None, None]
+    sides = np.where(known, (found.position[which[:, 1:]] - centre[:, None]) / STEP_PX, plain) * edges[:, :, None]
+    ends = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
+    corners = centre[:, None] + ends @ sides
+    uv = place[photon][:, None] + ends * edges[:, None]
+    four = Landings(*(np.repeat(column[this], 4, axis=0) for column in found))
+    triangles = (4 * np.arange(len(this))[:, None, None] + np.array([[0, 1, 3], [0, 3, 2]])).reshape(-1, 3)
+    flux = np.repeat(0.5 * found.part[this] * power[photon], 2)
+    four = four._replace(position=corners.reshape(-1, 3).astype(np.float32))
+    return _sheets(four, uv.reshape(-1, 2), triangles, flux, 0.0)
 
 
 class _Delta:
-    """Where rays through the image meet a delta surface first."""
+    """Where rays through the image meet a delta surface first.
 
-    def __init__(self, meets: np.ndarray, grid: _Grid) -> None:
+    Parameters
+    ----------
+    meets : (rows, columns) bool, by cell of the image. lattice : (2,) int, size of the lattice over the image.
+    """
+
+    def __init__(self, meets: np.ndarray, lattice: np.ndarray) -> None:
         rows, columns = meets.shape
         self.sums = np.zeros((rows + 1, columns + 1), np.int64)
         self.sums[1:, 1:] = meets.cumsum(0).cumsum(1)
-        lattice = 2 * grid.finest * np.array([grid.columns, grid.rows])
         self.scale = np.array([columns, rows]) / lattice
 
     def within(self, x: np.ndarray, y: np.ndarray, edge: int) -> np.ndarray:

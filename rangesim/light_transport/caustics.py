@@ -7,7 +7,7 @@ path.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import drjit as dr
@@ -17,7 +17,7 @@ from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.beams import BeamDevice
 from rangesim.light_transport.caustic_sheets import Sheets, trace_sheets
 from rangesim.light_transport.delta_surfaces import has_delta
-from rangesim.light_transport.sheet_scene import SheetScene
+from rangesim.light_transport.sheet_scene import Place, SheetScene
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.surfaces import number_of
 from rangesim.light_transport.traced_scene import TracedScene
@@ -25,6 +25,8 @@ from rangesim.light_transport.transport_settings import TransportSettings
 from rangesim.response import CAUSTIC, LightPath
 from rangesim.rig import Rig
 
+NONE = 0xFFFFFFFF
+"""Index of no triangle."""
 MAX_COSINE_RATIO = 4.0
 """Largest ratio of two cosines of the light's direction: that to the facet at the vertex, and that to the facet on which
 it landed. Radiance is divided by the second cosine, so without this bound, a facet that light meets edge-on would bring
@@ -32,16 +34,20 @@ any amount of light. A smaller bound would darken caustics beside edges where fa
 
 
 def caustic_sheets(
-    traced: TracedScene, rig: Rig, settings: TransportSettings, report: Callable[[], None] = lambda: None
+    traced: TracedScene, rigs: Sequence[Rig], settings: TransportSettings, report: Callable[[], None] = lambda: None
 ) -> Sheets | None:
     """Triangles of light for a pass of any camera; None if the caller wants none, no surface has a delta interaction,
     or no light landed. A beam needs none, see `rangesim.light_transport.beams`.
 
-    `report` is called after each kernel launch.
+    Parameters
+    ----------
+    rigs : rigs of the pass, which share their emitter.
+    report : called after each kernel launch.
     """
     if not settings.caustics or not has_delta(traced.scene) or isinstance(traced.projector, BeamDevice):
         return None
-    return trace_sheets(traced, rig.projector_power_w, settings.seed, report)
+    pixel_rad = min(rig.camera.angle_of(1) for rig in rigs)
+    return trace_sheets(traced, rigs[0].projector_power_w, settings.seed, pixel_rad, report)
 
 
 def sheet_scene(sheets: Sheets | None, rig: Rig, samples: int) -> SheetScene | None:
@@ -92,27 +98,40 @@ def caustic_light(
     si, bsdf = vertex.si, vertex.bsdf
     shape, normal = number_of(si.shape), mi.Normal3f(si.n)
     seen = dr.dot(si.to_world(si.wi), si.n)
-    radiance, which, way = dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.Float, n)
-    last = dr.full(mi.UInt32, 0xFFFFFFFF, n)
-    looks = sheets.may_light(shape, active)
+    radiance, way, which = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n)
+    last, total, chosen = dr.full(mi.UInt32, NONE, n), dr.zeros(mi.Float, n), Place.none(n)
+    pick = mi.sample_tea_float32(place, sample)  # uniform in 0..1, apart from the random numbers of paths
+    # Later vertices bring little each, so they look in some samples alone, which count for all
+    looks = sheets.may_light(shape, active & (~is_later | sheets.is_turn(sample, 1)))
+    weight = vertex.throughput * dr.select(is_later, mi.Float(sheets.every), 1)
     while looks:
+        # ---- The next triangle: each bright one counts, and one of the faint ones stands for all of them -----
         found = sheets.next(sheets.start(si.p, normal, sample, which), normal, way, looks)
         hit = looks & found.is_valid()
-        light, is_here = sheets.covering(found, shape, normal, hit & (found.prim_index != last))
-        if is_here:
+        is_new = hit & (found.prim_index != last)
+        irradiance, is_here = sheets.irradiance(found, shape, normal, is_new)
+        total += irradiance
+        fraction = dr.select(is_here, irradiance / total, 0)
+        taken = is_here & ((which == 0) | (pick < fraction))
+        pick = dr.select(which == 0, pick, dr.select(taken, pick / fraction, (pick - fraction) / (1 - fraction)))
+        chosen = chosen.replaced(taken, found)
+        counts = (total > 0) & dr.select(which == 0, is_here, ~hit)
+        if counts:
+            light = sheets.light(chosen, counts)
             wo = si.to_local(-light.direction)
-            value = bsdf.eval(mi.BSDFContext(), si, wo, is_here)
+            value = bsdf.eval(mi.BSDFContext(), si, wo, counts)
             # Triangles count flux per area, which contains the geometric cosine already; the value of the BSDF contains
             # the cosine to the shading normal (Veach 1997, 5.3)
             lit = -dr.dot(light.direction, si.n)
             cosine = dr.maximum(dr.abs(light.cosine), dr.abs(lit) / MAX_COSINE_RATIO)
-            on_one_side = is_here & (seen * lit * si.wi.z * wo.z > 0)  # for both normals, or for neither
-            brought = dr.select(on_one_side, vertex.throughput * light.irradiance * mono(value) / cosine, 0)
+            on_one_side = counts & (seen * lit * si.wi.z * wo.z > 0)  # for both normals, or for neither
+            brought = dr.select(on_one_side, weight * total * mono(value) / cosine, 0)
             radiance += brought
             path = LightPath(light.u, light.v, vertex.length + light.length, vertex.is_first, mi.UInt32(CAUSTIC))
             channels = accumulators.add(channels, path, brought, place, on_one_side, is_later)
+        total = dr.select(counts, 0, total)
         last = dr.select(hit, found.prim_index, last)
         way = dr.select(hit, way + found.t + 1e-7, 0)
         which = dr.select(hit, which, which + 1)
-        looks &= which < 2
+        looks &= (which == 0) | ((which == 1) & sheets.is_turn(sample, 0))
     return channels, radiance

@@ -89,7 +89,7 @@ def trace_light(
     traced = TracedScene.of(scene.mitsuba, scene.in_renderer(rigs[0]))
     warn_of_narrow_lobes(traced, [instance.name for instance in scene.instances])
     views = [_CameraPass(scene, traced, one, settings, number) for number, one in enumerate(rigs)]
-    sheets = caustic_sheets(traced, scene.in_renderer(rigs[0]), settings, partial(report, 0.0))
+    sheets = caustic_sheets(traced, [view.rig for view in views], settings, partial(report, 0.0))
     signals = []
     for number, view in enumerate(views):
         part = partial(report_part, report, number / len(views), 1 / len(views))

@@ -11,14 +11,16 @@ sample of a pixel looks into one group, whose light counts for all. The samples 
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.caustic_kernels import irradiance_of
-from rangesim.light_transport.caustic_sheets import FAINT, GROUPS, Sheets
+from rangesim.light_transport.caustic_kernels import irradiance_of, lifted
+from rangesim.light_transport.caustic_sheets import FAINT, Sheets
 from rangesim.light_transport.sampling import aligned
 
 LIFT = 1e-3
@@ -28,19 +30,54 @@ find triangles beside thin parts."""
 SAG = 0.5
 """Depth below a surface to which triangles are looked for, as a fraction of `LIFT`, because triangles cut the corner of
 curved surfaces."""
-GOLDEN = 0.6180339887498949
+PERIOD, EVERY = 16, 4
+"""Number of samples after which a pixel has looked into all groups of faint triangles, and the distance of two samples
+that look into one at all. With a longer period, faint light would be noisy in passes of few samples; if every sample
+looked, a pass would take a fifth longer."""
+SPACING = 1.5
+"""Distance between groups of faint triangles, as a multiple of the size of the lit part of the scene, so that groups do
+not touch."""
+MIN_SIZE_M = 1e-6
+"""Metres that are added to the size of the lit part of the scene, which may be a point."""
 MAX_COSINE_DIFFERENCE = 0.35
 """Largest difference between the cosines of a direction to the normal of a triangle and to that of a point that it may
 light, so that a triangle on one side of a thin part does not light the other side."""
 
 
-class Covering(NamedTuple):
-    """A triangle that covers a point.
+@dataclass
+class Place:
+    """A place on a triangle. Loops of Dr.Jit carry it, so it is not frozen.
 
-    irradiance : Float, W/m2. direction : Vector3f, unit. u, v : Float. length : Float, metres. cosine : Float.
+    triangle : UInt32, index. b1, b2 : Float, barycentric coordinates.
     """
 
-    irradiance: mi.Float
+    triangle: mi.UInt32
+    b1: mi.Float
+    b2: mi.Float
+
+    @classmethod
+    def none(cls, lanes: int) -> Place:
+        """The first corner of the first triangle."""
+        return cls(dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes))
+
+    def replaced(self, where: mi.Bool, found: mi.PreliminaryIntersection3f) -> Place:
+        """The place that a ray found, on the lanes of the mask `where`."""
+        return Place(
+            dr.select(where, found.prim_index, self.triangle),
+            dr.select(where, found.prim_uv.x, self.b1),
+            dr.select(where, found.prim_uv.y, self.b2),
+        )
+
+
+class Light(NamedTuple):
+    """Light of a triangle at a place.
+
+    direction : Vector3f, unit, world, direction of flight.
+    u, v : Float, projector pixel coordinates.
+    length : Float, metres, optical length from the projector.
+    cosine : Float, cosine between direction and geometric normal where it landed.
+    """
+
     direction: mi.Vector3f
     u: mi.Float
     v: mi.Float
@@ -60,55 +97,47 @@ class SheetScene:
     """
 
     def __init__(self, sheets: Sheets, projector_at: np.ndarray, irradiance: float, samples: int) -> None:
-        groups = 1 << int(np.log2(max(1, min(samples, GROUPS))))
-        corners = sheets.position[sheets.triangles].astype(np.float64)
-        area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        direct = irradiance / np.maximum(((corners.mean(axis=1) - projector_at) ** 2).sum(axis=1), 1e-18)
-        with np.errstate(divide="ignore"):
-            level = sheets.flux / area / direct
-        is_faint = level < FAINT
-        # The faintest are drawn by lot, and count for those that are not
-        chance = np.where(is_faint, np.minimum(level * groups / FAINT, 1), 1)
-        number = np.arange(len(area)) * GOLDEN % 1
-        kept = np.flatnonzero((np.random.default_rng(0).random(len(area)) < chance) & (area > 0))
-        at_vertex, scale = irradiance_of(sheets.triangles, sheets.flux, sheets.position, len(sheets.u))
-        scale = scale / chance * np.where(is_faint, groups, 1)
-        group = np.where(is_faint, (sheets.key[:] >> 8) % groups + 1, 0)
+        period = 1 << int(np.log2(max(1, min(samples, PERIOD))))
+        every = min(period, EVERY)
+        groups = period // every
+        at_vertex, scale, area = irradiance_of(sheets.triangles, sheets.flux, sheets.position, len(sheets.u))
+        first = sheets.position[sheets.triangles[:, 0]]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            level = sheets.flux / area * ((first - projector_at) ** 2).sum(axis=1) / irradiance
 
-        low, high = sheets.position.min(axis=0), sheets.position.max(axis=0)
-        size = float((high - low).max()) + 1e-6
-        self.lift = LIFT * size
-        across = 1 << ((groups.bit_length() + 1) // 2)  # groups lie in a square grid
-        offsets = np.array([[0.0, 0.0], *([(g % across + 1) * 1.5 * size, g // across * 1.5 * size] for g in range(groups))])
-        points = corners[kept] + (self.lift * number[kept])[:, None, None] * sheets.normal[sheets.triangles[kept]]
-        points[:, :, :2] += offsets[group[kept]][:, None]
-        mesh = mi.Mesh("light", 3 * len(kept), len(kept))
+        size = float(np.ptp(sheets.position, axis=0).max()) + MIN_SIZE_M
+        across = math.isqrt(groups - 1) + 1  # groups lie in a square
+        offsets = np.array([[0, 0], *([1 + g % across, g // across] for g in range(groups))]) * (SPACING * size)
+        columns = (sheets.position, sheets.normal, sheets.triangles, sheets.shape, sheets.key)
+        drawn = np.random.default_rng(0).random(len(area))
+        corners, names, factor = lifted(columns, scale, level, groups, every, FAINT, LIFT * size, offsets, drawn)
+        mesh = mi.Mesh("light", len(corners), len(names))
         parameters = mi.traverse(mesh)
-        parameters["vertex_positions"] = mi.Float(aligned(points, np.float32))
-        parameters["faces"] = mi.UInt32(aligned(np.arange(3 * len(kept)), np.uint32))
+        parameters["vertex_positions"] = mi.Float(aligned(corners, np.float32))
+        parameters["faces"] = mi.UInt32(aligned(np.arange(len(corners)), np.uint32))
         parameters.update()
         self.scene = mi.load_dict({"type": "scene", "light": mesh})
         looks = np.column_stack([sheets.direction, sheets.length, sheets.u, sheets.v, at_vertex, sheets.cosine])
-        self.looks = mi.Float(aligned(looks, np.float32))
-        corner = np.column_stack([sheets.triangles, sheets.shape])[kept]
-        self.corner = mi.UInt32(aligned(corner, np.uint32))
-        self.scale = mi.Float(aligned(scale[kept], np.float32))
-        self.offsets = mi.Float(aligned(offsets, np.float32))
-        self.groups = dr.opaque(mi.UInt32, groups)
-        self.height = dr.opaque(mi.Float, self.lift)
-        lit = np.zeros(int(sheets.shape.max()) + 1, np.bool_)
-        lit[np.unique(sheets.shape[kept])] = True
-        self.lit, self.shapes = mi.Bool(lit), dr.opaque(mi.UInt32, len(lit))
-        dr.eval(self.looks, self.corner, self.scale, self.offsets)
+        self.looks, self.names = mi.Float(aligned(looks, np.float32)), mi.UInt32(aligned(names, np.uint32))
+        self.factor, self.offsets = mi.Float(aligned(factor, np.float32)), mi.Float(aligned(offsets, np.float32))
+        self.groups, self.every = dr.opaque(mi.UInt32, groups), dr.opaque(mi.UInt32, every)
+        self.height = dr.opaque(mi.Float, LIFT * size)
+        is_lit = np.zeros(int(sheets.shape.max()) + 1, np.bool_)
+        is_lit[names[:, 3]] = True
+        self.is_lit, self.shapes = mi.Bool(is_lit), dr.opaque(mi.UInt32, len(is_lit))
 
     def may_light(self, shape: mi.UInt32, active: mi.Bool) -> mi.Bool:
         """Whether any triangle lies on a shape."""
         known = active & (shape < self.shapes)
-        return known & dr.gather(mi.Bool, self.lit, shape, known)
+        return known & dr.gather(mi.Bool, self.is_lit, shape, known)
+
+    def is_turn(self, sample: mi.UInt32, turn: int) -> mi.Bool:
+        """Whether it is the turn of a sample; each turn comes once in `every` samples."""
+        return sample % self.every == mi.UInt32(turn) % self.every
 
     def start(self, point: mi.Point3f, normal: mi.Normal3f, sample: mi.UInt32, which: mi.UInt32) -> mi.Point3f:
         """Start of the ray through bright triangles (`which` 0), or through those of the sample's group (1)."""
-        offset = dr.gather(mi.Vector2f, self.offsets, dr.select(which == 0, 0, sample % self.groups + 1))
+        offset = dr.gather(mi.Vector2f, self.offsets, dr.select(which == 0, 0, sample // self.every % self.groups + 1))
         return point + mi.Vector3f(normal) * (1.01 * self.height) + mi.Vector3f(offset.x, offset.y, 0)
 
     def next(self, origin: mi.Point3f, normal: mi.Normal3f, way: mi.Float, active: mi.Bool):
@@ -117,15 +146,29 @@ class SheetScene:
         ray.maxt = (1.01 + SAG) * self.height - way
         return self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
-    def covering(self, found: mi.PreliminaryIntersection3f, shape: mi.UInt32, normal: mi.Normal3f, active: mi.Bool):
-        """The light of a triangle that was found, and whether it lies on this side of this shape."""
-        corner = dr.gather(mi.Vector4u, self.corner, found.prim_index, active)
+    def irradiance(
+        self, found: mi.PreliminaryIntersection3f, shape: mi.UInt32, normal: mi.Normal3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Bool]:
+        """Irradiance (W/m2) of a triangle that was found, and whether it lies on this side of this shape."""
+        names = dr.gather(mi.Vector4u, self.names, found.prim_index, active)
+        is_here = active & (names.w == shape)
         b1, b2 = found.prim_uv.x, found.prim_uv.y
+        total, cosine = mi.Float(0), mi.Float(0)
+        direction = mi.Vector3f(0)
+        for index, weight in zip((names.x, names.y, names.z), (1 - b1 - b2, b1, b2), strict=True):
+            total += weight * dr.gather(mi.Float, self.looks, 8 * index + 6, is_here)
+            cosine += weight * dr.gather(mi.Float, self.looks, 8 * index + 7, is_here)
+        direction = dr.gather(mi.Vector4f, self.looks, 2 * names.x, is_here).xyz
+        is_here &= dr.abs(dr.dot(direction, normal) - cosine) < MAX_COSINE_DIFFERENCE
+        total *= dr.gather(mi.Float, self.factor, found.prim_index, is_here)
+        return dr.select(is_here, total, 0), is_here & (total > 0)
+
+    def light(self, place: Place, active: mi.Bool) -> Light:
+        """The light of a triangle at a place."""
+        names = dr.gather(mi.Vector4u, self.names, place.triangle, active)
+        weights = (1 - place.b1 - place.b2, place.b1, place.b2)
         first, second = mi.Vector4f(0), mi.Vector4f(0)
-        for index, weight in zip((corner.x, corner.y, corner.z), (1 - b1 - b2, b1, b2), strict=True):
+        for index, weight in zip((names.x, names.y, names.z), weights, strict=True):
             first += weight * dr.gather(mi.Vector4f, self.looks, 2 * index, active)
             second += weight * dr.gather(mi.Vector4f, self.looks, 2 * index + 1, active)
-        direction = dr.normalize(first.xyz)
-        irradiance = second.z * dr.gather(mi.Float, self.scale, found.prim_index, active)
-        is_here = active & (corner.w == shape) & (dr.abs(dr.dot(direction, normal) - second.w) < MAX_COSINE_DIFFERENCE)
-        return Covering(irradiance, direction, second.x, second.y, first.w, second.w), is_here
+        return Light(dr.normalize(first.xyz), second.x, second.y, first.w, second.w)

@@ -12,7 +12,6 @@ A launch follows every ray along its stronger part. The weaker parts are stored,
 from __future__ import annotations
 
 from dataclasses import fields
-from itertools import count
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -33,8 +32,8 @@ PARTS = 6
 """Largest number of weaker parts that a ray stores in a launch. Light through three panes meets six faces. A part that
 finds no room is dropped by a point of the grid; a photon then follows one of the two parts by chance."""
 MAX_LAUNCHES = 4
-"""Largest number of launches for points of the grid; what is stored after them is dropped. Light that was the weaker
-part four times carries little."""
+"""Largest number of launches. In the last one nothing is stored: points of the grid drop weaker parts, and photons choose
+one part by chance. Light that was the weaker part three times carries little."""
 HASH_STEP = 0x9E3779B1
 """Odd factor of the hash that names chains: 2^32 divided by the golden ratio, rounded to a prime."""
 NORMAL_STEPS = 1000.0
@@ -105,7 +104,7 @@ class SpecularTree:
         self.max_chain = dr.opaque(mi.UInt32, MAX_CHAIN)
 
     def follow(
-        self, primary: PrimaryRay, fewest: float, random: mi.PCG32 | None = None
+        self, primary: PrimaryRay, fewest: float, random: mi.UInt64 | None = None
     ) -> tuple[Landings, np.ndarray]:
         """Follow the light of points of the image to where it lands.
 
@@ -114,7 +113,7 @@ class SpecularTree:
         primary : PrimaryRay, n rays.
         fewest : fraction of a point's light below which a part is dropped. Photons keep some of these parts by Russian
             roulette, so that none is left out in the mean.
-        random : random numbers of photons; None for points of the grid, which drop parts and are stopped by surfaces
+        random : UInt64, states of the random numbers of photons; None for points of the grid, which drop parts and are stopped by surfaces
             whose lobes cannot be asked for one by one.
 
         Returns
@@ -132,12 +131,13 @@ class SpecularTree:
         origin = mi.Point3f(primary.origin) + dr.zeros(mi.Point3f, n)
         none = dr.zeros(mi.UInt32, n)
         parts = Parts(dr.arange(mi.UInt32, n), part, origin, primary.direction, state, none, mi.UInt32(none),
-                      None if random is None else mi.UInt64(random.state))  # fmt: skip
+                      random)  # fmt: skip
         # All parts share an increment; their states differ
         chance = None if random is None else Continued(mi.PCG32(1))
         self.fewest = dr.opaque(mi.Float, fewest)
         dropped, found = dr.zeros(mi.Float, n), []
-        for launch in count():
+        self.room = dr.opaque(mi.UInt32, PARTS)
+        for launch in range(MAX_LAUNCHES):
             leaves = _leaves(parts)
             dr.make_opaque(leaves)
             parts = _rebuilt(parts, list(leaves))
@@ -154,9 +154,8 @@ class SpecularTree:
             if not len(rest):
                 break
             parts = _rebuilt(parts, [dr.gather(type(x), x, rest) for x in stored.leaves])
-            if random is None and launch + 1 == MAX_LAUNCHES:
-                dr.scatter_add(dropped, parts.part, parts.point)
-                break
+            if launch + 2 == MAX_LAUNCHES:
+                self.room = dr.opaque(mi.UInt32, 0)
         numbers = [np.concatenate(column) for column in zip(*found, strict=True)]
         vectors = [np.column_stack(numbers[k : k + 3]) for k in (5, 8, 11)]
         return Landings(*numbers[:5], *vectors), dropped.numpy()
@@ -284,14 +283,14 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
             kept = dr.select(rng.next_float32() * tree.fewest < weaker, dr.maximum(weaker, tree.fewest), 0)
             stronger = dr.select(rng.next_float32() * tree.fewest < stronger, dr.maximum(stronger, tree.fewest), 0)
             # Without room for both, one of them stands for both
-            is_full = (kept > 0) & (number >= PARTS)
+            is_full = (kept > 0) & (number >= tree.room)
             swaps = is_full & (rng.next_float32() * (kept + stronger) < kept)
             turns ^= swaps
             stronger = dr.select(is_full, kept + stronger, stronger)
             kept = dr.select(is_full, 0, kept)
             random = rng.state
         else:
-            kept = dr.select((weaker >= tree.fewest) & (number < PARTS), weaker, 0)
+            kept = dr.select((weaker >= tree.fewest) & (number < tree.room), weaker, 0)
             lost += weaker - kept
             lost += dr.select(stronger < tree.fewest, stronger, 0)
             stronger = dr.select(stronger < tree.fewest, 0, stronger)
