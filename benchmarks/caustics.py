@@ -72,7 +72,11 @@ def main() -> None:
     rig = scene.rig(width=args.width, height=args.height)
     sensors = [StructuredLight(rig.projector.width, rig.projector.height), AmcwToF(), IdealToF()]
     render = partial(transport, scene, rig, sensors, spp=args.spp)
-    sides = {"caustics": render, "without": partial(render, caustics=False), "dark": partial(render, caustics=False, glint=False)}
+    sides = {
+        "caustics": render,
+        "without": partial(render, caustics=False),
+        "dark": partial(render, caustics=False, glint=False),
+    }
     for side in sides.values():
         side(seed=99)  # warm-up
     seconds: dict[str, list[np.ndarray]] = {name: [] for name in sides}

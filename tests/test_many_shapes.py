@@ -14,7 +14,7 @@ from synthetic import counted_return
 
 from rangesim import Scene, load_scene, transport
 from rangesim.light_transport.camera_rays import Device
-from rangesim.light_transport.photons import meets_delta
+from rangesim.light_transport.delta_surfaces import meets_delta
 from rangesim.light_transport.surfaces import Surfaces, surfaces_of
 
 MANY = 3000
@@ -58,7 +58,9 @@ def test_loops_are_traced_once(materials: str) -> None:
     scene = load_scene(balls(20, materials))
     rig = scene.rig(width=16, height=12)
     transport(scene, rig, [counted], spp=1, glint=False)
-    assert len(traces) == {"one": 1, "glass": 2}[materials]  # at the vertices of paths, and where photons are gathered
+    assert (
+        len(traces) == {"one": 1, "glass": 2}[materials]
+    )  # at the vertices of paths, and where caustics are looked up
 
 
 def test_the_pixels_before_glass_are_those_of_the_shapes_that_are_glass() -> None:

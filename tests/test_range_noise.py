@@ -374,7 +374,9 @@ def test_rounds_have_the_same_bytes_whatever_the_memory_budget(matte: Scene) -> 
 def test_any_largest_number_of_samples_will_do_and_none_exceeds_it(most: int) -> None:
     scene, sensor = load_scene("glassware"), AmcwToF()
     adaptive = AdaptiveSampling((Instrument("one", sensor),), most, fraction=1e-3)
-    signals = transport(scene, scene.rig(0.03, width=32, height=24), [sensor], spp=adaptive, caustics=False, glint=False)
+    signals = transport(
+        scene, scene.rig(0.03, width=32, height=24), [sensor], spp=adaptive, caustics=False, glint=False
+    )
     assert signals.energy.projector.any()
     assert signals.knows_sampling_error == (most > 2)
 

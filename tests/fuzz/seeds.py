@@ -67,9 +67,7 @@ def result_files() -> dict[str, bytes]:
         Instrument("amcw", AmcwToF()),
         Instrument("ideal", IdealToF()),
     )
-    experiment = Experiment(
-        str(SCENES / "plane.xml"), width=32, height=24, spp=1, instruments=instruments
-    )
+    experiment = Experiment(str(SCENES / "plane.xml"), width=32, height=24, spp=1, instruments=instruments)
     with tempfile.TemporaryDirectory() as folder, mock.patch("time.monotonic", itertools.count(0.0, 0.01).__next__):
         run(experiment, Path(folder) / "result")  # times of a clock of our own: the same bytes at every call
         return directory(Path(folder) / "result", "result")
