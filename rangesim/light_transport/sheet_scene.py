@@ -153,12 +153,11 @@ class SheetScene:
         names = dr.gather(mi.Vector4u, self.names, found.prim_index, active)
         is_here = active & (names.w == shape)
         b1, b2 = found.prim_uv.x, found.prim_uv.y
-        total, cosine = mi.Float(0), mi.Float(0)
-        direction = mi.Vector3f(0)
+        total = mi.Float(0)
         for index, weight in zip((names.x, names.y, names.z), (1 - b1 - b2, b1, b2), strict=True):
             total += weight * dr.gather(mi.Float, self.looks, 8 * index + 6, is_here)
-            cosine += weight * dr.gather(mi.Float, self.looks, 8 * index + 7, is_here)
         direction = dr.gather(mi.Vector4f, self.looks, 2 * names.x, is_here).xyz
+        cosine = dr.gather(mi.Float, self.looks, 8 * names.x + 7, is_here)
         is_here &= dr.abs(dr.dot(direction, normal) - cosine) < MAX_COSINE_DIFFERENCE
         total *= dr.gather(mi.Float, self.factor, found.prim_index, is_here)
         return dr.select(is_here, total, 0), is_here & (total > 0)
