@@ -23,7 +23,7 @@ from plain_mitsuba import plain_scene, render, z_score
 from synthetic import counted_return
 from tiers import to_validate
 
-from rangesim import Intrinsics, Scene, load_scene, transport
+from rangesim import Intrinsics, load_scene, transport
 from rangesim.errors import FileFormatError
 from rangesim.light_transport import surfaces
 from rangesim.light_transport.absorption import absorbers_of
@@ -331,9 +331,13 @@ def test_a_body_that_moves_takes_its_medium_along() -> None:
     T[0, 3] = -0.6
     moved = MovingScene(scene, ("ball",)).at({"ball": T})
     images = [transport(s, rig_of(CAMERA, PROJECTOR), [], spp=16, glint=False).energy for s in (moved, there)]
-    for name, tolerance in (("ambient", 2e-3), ("caustic", 0.03), ("specular", 0.03)):
+    for name, tolerance in (("ambient", 2e-3), ("specular", 0.03)):
         a, b = (getattr(energy, name) for energy in images)
         assert a.sum() == pytest.approx(b.sum(), rel=tolerance)
+    # The scene is symmetric, and so are the chances of photons
+    assert thrown_w(moved, rig_of(CAMERA, PROJECTOR)) == pytest.approx(
+        thrown_w(there, rig_of(CAMERA, PROJECTOR)), rel=1e-3
+    )
 
 
 def test_the_same_seed_gives_the_same_bytes_in_tiles_and_for_joint_shapes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -154,7 +154,7 @@ def test_durations_are_readable(seconds: float, text: str) -> None:
     assert str(Cost(20_000_000, 5, 1, 1_100_000_000, seconds)) == (
         f"about 20 M light paths of up to 5 segments in 1 pass, 1.1 GB, {text}"
     )
-    assert str(Cost(2, 5, 0, 1, 10**8, 9.0, "2 idle cores")).endswith(", 0.1 GB, 9 s on 2 idle cores")
+    assert str(Cost(2, 5, 1, 10**8, 9.0, "2 idle cores")).endswith(", 0.1 GB, 9 s on 2 idle cores")
 
 
 class BusyClock:

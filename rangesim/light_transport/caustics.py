@@ -28,7 +28,7 @@ from rangesim.rig import Rig
 NONE = 0xFFFFFFFF
 """Index of no triangle."""
 MAX_COSINE_RATIO = 4.0
-"""Largest ratio of two cosines of the light's direction: that to the facet at the vertex, and that to the facet on which
+"""Largest ratio of two cosines of the light's direction: that to the facet at the vertex, and that to the facet where
 it landed. Radiance is divided by the second cosine, so without this bound, a facet that light meets edge-on would bring
 any amount of light. A smaller bound would darken caustics beside edges where facets meet at an angle."""
 
@@ -81,6 +81,7 @@ def caustic_light(
     channels: list[list[mi.Float]],
     vertex: Vertex,
     sample: mi.UInt32,
+    pick: mi.Float,
     is_later: mi.Bool,
     place: mi.UInt32,
     active: mi.Bool,
@@ -91,6 +92,7 @@ def caustic_light(
     Parameters
     ----------
     sample : UInt32, number of the sample in its pixel, which chooses the group of faint triangles.
+    pick : Float, uniform number in 0..1 that chooses one of the faint triangles.
     is_later : Bool, whether the vertex is not the first of its path.
     place : UInt32, index of the lane's pixel among those of the accumulators.
     """
@@ -100,11 +102,11 @@ def caustic_light(
     seen = dr.dot(si.to_world(si.wi), si.n)
     radiance, way, which = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n)
     last, total, chosen = dr.full(mi.UInt32, NONE, n), dr.zeros(mi.Float, n), Place.none(n)
-    pick = mi.sample_tea_float32(place, sample)  # uniform in 0..1, apart from the random numbers of paths
     # Later vertices bring little each, so they look in some samples alone, which count for all
     looks = sheets.may_light(shape, active & (~is_later | sheets.is_turn(sample, 1)))
     weight = vertex.throughput * dr.select(is_later, mi.Float(sheets.every), 1)
-    while looks:
+    # What the loop only reads is excluded: Dr.Jit traces a loop twice that carries something without changing it
+    while dr.hint(looks, exclude=[si, bsdf, vertex, shape, normal, seen, sample, is_later, place, weight]):
         # ---- The next triangle: each bright one counts, and one of the faint ones stands for all of them -----
         found = sheets.next(sheets.start(si.p, normal, sample, which), normal, way, looks)
         hit = looks & found.is_valid()
@@ -116,7 +118,7 @@ def caustic_light(
         pick = dr.select(which == 0, pick, dr.select(taken, pick / fraction, (pick - fraction) / (1 - fraction)))
         chosen = chosen.replaced(taken, found)
         counts = (total > 0) & dr.select(which == 0, is_here, ~hit)
-        if counts:
+        if dr.hint(counts, exclude=[si, bsdf, vertex, seen, is_later, place, weight]):
             light = sheets.light(chosen, counts)
             wo = si.to_local(-light.direction)
             value = bsdf.eval(mi.BSDFContext(), si, wo, counts)

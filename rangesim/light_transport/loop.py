@@ -331,6 +331,13 @@ class Lanes:
         """Number of the next sample among all samples of its pixel, after `taken` of the allocated ones."""
         return self.first + (taken >> 1) * self.stride + (taken & 1)
 
+    def pick(self, number: mi.UInt32) -> mi.Float:
+        """A uniform number in 0..1 for a sample of this number, apart from the random numbers of its path.
+
+        It depends on the pixel and the seed, as the shift does.
+        """
+        return mi.sample_tea_float32(dr.reinterpret_array(mi.UInt32, self.shift.x), number)
+
 
 def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes: Lanes) -> LaneState:
     """The state of lanes that have done nothing yet."""
@@ -556,7 +563,15 @@ def walk(
         if dr.hint(sheets is not None, mode="scalar"):
             vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, path.is_first & ~link.lit)
             state.channels, light = caustic_light(
-                sheets, accumulators, state.channels, vertex, number, is_later, lanes.place, is_vertex & ~scatters
+                sheets,
+                accumulators,
+                state.channels,
+                vertex,
+                number,
+                lanes.pick(number),
+                is_later,
+                lanes.place,
+                is_vertex & ~scatters,
             )
             radiance.caustic += dr.select(is_later, 0, light)
             radiance.smooth_caustic += dr.select(is_later, light, 0)
