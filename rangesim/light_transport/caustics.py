@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The projector's light beyond glass and mirrors, as camera paths gather it.
 
-This module chooses the number of photons and the radius within which they are gathered, and computes the light that
-they bring to a vertex of a camera path.
+This module has the triangles of light made for a pass, and computes the light that they bring to a vertex of a camera
+path.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from rangesim.rig import Rig
 NONE = 0xFFFFFFFF
 """Index of no triangle."""
 MAX_COSINE_RATIO = 4.0
-"""Largest ratio of two cosines of a photon's direction: that to the facet at the vertex, and that to the facet on which
-the photon landed. Radiance is divided by the second cosine, so without this bound, a facet that photons meet edge-on
-would bring any amount of light. A smaller bound would darken caustics beside edges where facets meet at an angle."""
+"""Largest ratio of two cosines of the light's direction: that to the facet at the vertex, and that to the facet where
+it landed. Radiance is divided by the second cosine, so without this bound, a facet that light meets edge-on would bring
+any amount of light. A smaller bound would darken caustics beside edges where facets meet at an angle."""
 
 
 def caustic_sheets(
@@ -44,7 +44,7 @@ def caustic_sheets(
     rigs : rigs of the pass, which share their emitter.
     report : called after each kernel launch.
     """
-    if settings.photons == 0 or not has_delta(traced.scene) or isinstance(traced.projector, BeamDevice):
+    if not settings.caustics or not has_delta(traced.scene) or isinstance(traced.projector, BeamDevice):
         return None
     pixel_rad = min(rig.camera.angle_of(1) for rig in rigs)
     return trace_sheets(traced, rigs[0].projector_power_w, settings.seed, pixel_rad, report)
@@ -63,7 +63,7 @@ class Vertex(NamedTuple):
     si, bsdf : SurfaceInteraction3f and BSDFPtr, the surface.
     throughput : Float, radiance at the camera per radiance that leaves the vertex towards it.
     length : Float, metres, optical length from the camera.
-    is_first : Bool, whether photons there are the first return: the vertex is the first of the path, and the projector
+    is_first : Bool, whether this light is the first return: the vertex is the first of the path, and the projector
         does not light it straight.
     """
 
@@ -81,9 +81,9 @@ def caustic_light(
     channels: list[list[mi.Float]],
     vertex: Vertex,
     sample: mi.UInt32,
+    pick: mi.Float,
     is_later: mi.Bool,
     place: mi.UInt32,
-    random: mi.UInt32,
     active: mi.Bool,
 ) -> tuple[list[list[mi.Float]], mi.Float]:
     """Add the light of all triangles that cover a vertex; returns the channels and the radiance (W/m2/sr) at the
@@ -92,9 +92,9 @@ def caustic_light(
     Parameters
     ----------
     sample : UInt32, number of the sample in its pixel, which chooses the group of faint triangles.
+    pick : Float, uniform number in 0..1 that chooses one of the faint triangles.
     is_later : Bool, whether the vertex is not the first of its path.
     place : UInt32, index of the lane's pixel among those of the accumulators.
-    random : UInt32, a random number of the pixel.
     """
     n = dr.width(place)
     si, bsdf = vertex.si, vertex.bsdf
@@ -102,11 +102,11 @@ def caustic_light(
     seen = dr.dot(si.to_world(si.wi), si.n)
     radiance, way, which = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n)
     last, total, chosen = dr.full(mi.UInt32, NONE, n), dr.zeros(mi.Float, n), Place.none(n)
-    pick = mi.sample_tea_float32(random, sample)  # uniform in 0..1, apart from the random numbers of paths
     # Later vertices bring little each, so they look in some samples alone, which count for all
     looks = sheets.may_light(shape, active & (~is_later | sheets.is_turn(sample, 1)))
     weight = vertex.throughput * dr.select(is_later, mi.Float(sheets.every), 1)
-    while looks:
+    # What the loop only reads is excluded: Dr.Jit traces a loop twice that carries something without changing it
+    while dr.hint(looks, exclude=[si, bsdf, vertex, shape, normal, seen, sample, is_later, place, weight]):
         # ---- The next triangle: each bright one counts, and one of the faint ones stands for all of them -----
         ray, step = sheets.ray(si.p, normal, sample, which, way)
         found = sheets.next(ray, looks)
@@ -119,7 +119,7 @@ def caustic_light(
         pick = dr.select(which == 0, pick, dr.select(taken, pick / fraction, (pick - fraction) / (1 - fraction)))
         chosen = chosen.replaced(taken, found)
         counts = (total > 0) & dr.select(which == 0, is_here, ~hit)
-        if counts:
+        if dr.hint(counts, exclude=[si, bsdf, vertex, seen, is_later, place, weight]):
             light = sheets.light(chosen, counts)
             wo = si.to_local(-light.direction)
             value = bsdf.eval(mi.BSDFContext(), si, wo, counts)

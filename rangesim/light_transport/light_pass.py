@@ -70,7 +70,7 @@ def trace_light(
 
     Parameters
     ----------
-    rigs : rigs with the same emitter and different cameras. The photons are traced once for all cameras.
+    rigs : rigs with the same emitter and different cameras. The triangles of caustics are made once for all cameras.
     sensors : sensors, or bare responses. Equal responses share their channels.
     settings : TransportSettings. spp "auto" means `MATTE_SPP` samples where pixels share their indirect light, and
         `OTHER_SPP` elsewhere.

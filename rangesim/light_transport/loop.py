@@ -20,7 +20,7 @@ that absorbs, a segment of length d keeps the fraction exp(-sigma_a d) of the li
 (`rangesim.light_transport.absorption`).
 
 The loop carries out two of the three strategies that bring the projector's light to the camera: next-event estimation,
-and the gathering of caustic photons. `rangesim.light_transport.strategies` says which paths belong to which strategy.
+and caustics. `rangesim.light_transport.strategies` says which paths belong to which strategy.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ class Radiance(Generic[Array]):
     caustic: Array
     ambient: Array
     smooth_caustic: Array
-    """Caustics that were gathered over wide circles and are therefore smooth; `caustic` has the others."""
+    """Caustics at later vertices of a path, which change slowly over the image; `caustic` has those at the first."""
     glint: Array
     """Glint of a beam, whose emitter the paths of its own pixel meet; that of a projector is traced in `glint.py`."""
 
@@ -326,11 +326,17 @@ class Lanes:
         on_lens = view.traced.camera.has_lens
         self.lens_shift = mi.Point2f(rng.next_float32(), rng.next_float32()) if on_lens else None
         self.random = Continued(of_part(rng, self.part))
-        self.number_of_pixel = mi.sample_tea_32(self.pixel, settings.seed.low ^ settings.seed.high)[0]
 
     def number(self, taken: mi.UInt32) -> mi.UInt32:
         """Number of the next sample among all samples of its pixel, after `taken` of the allocated ones."""
         return self.first + (taken >> 1) * self.stride + (taken & 1)
+
+    def pick(self, number: mi.UInt32) -> mi.Float:
+        """A uniform number in 0..1 for a sample of this number, apart from the random numbers of its path.
+
+        It depends on the pixel and the seed, as the shift does.
+        """
+        return mi.sample_tea_float32(dr.reinterpret_array(mi.UInt32, self.shift.x), number)
 
 
 def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes: Lanes) -> LaneState:
@@ -557,7 +563,14 @@ def walk(
         if dr.hint(sheets is not None, mode="scalar"):
             vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, path.is_first & ~link.lit)
             state.channels, light = caustic_light(
-                sheets, accumulators, state.channels, vertex, number, is_later, lanes.place, lanes.number_of_pixel,
+                sheets,
+                accumulators,
+                state.channels,
+                vertex,
+                number,
+                lanes.pick(number),
+                is_later,
+                lanes.place,
                 is_vertex & ~scatters,
             )
             radiance.caustic += dr.select(is_later, 0, light)
