@@ -14,7 +14,7 @@ two are compared with each other. The last line of `compare` is JSON:
     max_region_error        largest relative error of the mean radiance of white over the marked regions and references
     min_stripe_correlation  smallest correlation of a stripe image with its reference within a marked region
 
-Usage: python benchmarks/caustic_references.py [make | compare] [--spp 2048] [--photons N]
+Usage: python benchmarks/caustic_references.py [make | compare] [--spp N] [--photons N]; without N, those of `transport`
 """
 
 from __future__ import annotations
@@ -144,15 +144,13 @@ def _file(case_name: str, name: str) -> Path:
     return HERE / f"{case_name.replace(', ', '_').replace(' ', '_')}-{name}.npz"
 
 
-def compare(spp: int, photons: int) -> dict[str, float]:
-    """Print the table and return the figures of the last line."""
+def compare(options: dict[str, int]) -> dict[str, float]:
+    """Print the table and return the figures of the last line; `options` are those of `transport`."""
     light, frames = stripes()
     errors, correlations = [], []
     print(f"{'case':<22} {'region':<30} {'reference':<9} {'error':>7} {'+-':>6}  correlation: white, columns, rows")
     for case_name, case in cases().items():
-        signals = transport(
-            case.scene, case.rig, [light], spp=spp, max_depth=MAX_DEPTH, glint=False, photons=photons,
-        )  # fmt: skip
+        signals = transport(case.scene, case.rig, [light], max_depth=MAX_DEPTH, glint=False, **options)
         ours = signals.frames(light)[frames]
         references = {name: load(case_name, name) for name in METHODS}
         for name, reference in references.items():
@@ -185,15 +183,15 @@ def _references_agree(case_name: str, case: Case, references: dict[str, Referenc
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="?", choices=("make", "compare"), default="compare")
-    parser.add_argument("--spp", type=int, default=2048)
-    parser.add_argument("--photons", type=int, default=8_000_000)
+    for name in ("spp", "photons"):
+        parser.add_argument(f"--{name}", type=int, default=argparse.SUPPRESS)
     parser.add_argument("--scale", type=float, default=1.0, help="of the samples of `make`")
     parser.add_argument("--case", help="of `make`, alone")
     args = parser.parse_args()
     if args.what == "make":
         make(args.scale, args.case)
     else:
-        print(json.dumps(compare(args.spp, args.photons)))
+        print(json.dumps(compare({k: v for k, v in vars(args).items() if k in ("spp", "photons")})))
 
 
 if __name__ == "__main__":
