@@ -52,7 +52,7 @@ EDGE_SEEDS = 4
 """Passes over which an edge is averaged."""
 EDGE_REACH_PX, EDGE_ROWS_PX = 40, 70
 """How far from the middle of the image an edge is measured, camera pixels to the left and right, above and below."""
-EDGE_BIN_PX = 0.25
+EDGE_BIN_PX = 0.125
 """Camera pixels between the places at which an edge is known. It is slanted, so its pixels lie at all fractions."""
 WIDTH_OF_GAUSSIAN = 2.5631
 """Distance from 10 to 90 % of an error function, in standard deviations."""
