@@ -124,17 +124,17 @@ class _CameraPass:
         self.scene, self.rig, self.here = scene, rig, scene.in_renderer(rig)
         self.settings = replace(settings, seed=derived_seed(settings.seed, number)) if number else settings
         self.traced = traced._replace(camera=camera_device(self.here))
-        self.truth, self.guides = ground_truth(scene, self.traced, rig)
         # The indirect light of beams changes from pixel to pixel, because each has a spot of its own
         can_share = rig.camera.has_neighbours and not isinstance(rig.projector, Beam)
         self.is_filtered = settings.indirect == "filtered" and can_share
+        self.truth, self.guides = ground_truth(scene, self.traced, rig, self.is_filtered)
         spp, pixels = settings.spp, rig.camera.height * rig.camera.width
         if isinstance(spp, Sampler):
             self.samples = np.full(pixels, spp.first_spp)
         elif isinstance(spp, int):
             self.samples = np.full(pixels, spp)
         else:
-            is_shared = self.is_filtered & (self.guides.instance.ravel() >= 0)
+            is_shared = np.zeros(pixels, bool) if self.guides is None else self.guides.instance.ravel() >= 0
             self.samples = np.where(is_shared, MATTE_SPP, OTHER_SPP)
 
     def trace(
@@ -158,16 +158,17 @@ class _CameraPass:
         fewest = int(self.samples.min())
         maps = caustic_maps(photons, self.here, settings.caustic_radius_m)
         view, of_paths = View(self.traced, maps), PathSettings.of(self.scene, settings)
-        keeps_apart = self.is_filtered
-        if keeps_apart and self.scene.has_matte_textures:
+        if guides is not None and self.scene.has_matte_textures:
             few = min(fewest, TEXTURE_SAMPLES)
             guides = guides.with_reflectance(mean_reflectance(view, of_paths, rig, self.scene.has_cutouts, few))
-        shared = LightFilter(guides) if keeps_apart else None
+        shared = LightFilter(guides) if guides is not None else None
         at_work = partial(report, 0.0)
         sees_glint = settings.glint and not isinstance(rig.projector, Beam)
         glints = trace_glint(self.traced, self.here, responses, settings.seed, at_work) if sees_glint else None
         has_halves = settings.sampling_error and fewest >= MIN_FOR_HALVES
-        estimate = Estimate(view, of_paths, rig, responses, keeps_apart, has_halves, settings.memory_bytes, launches)
+        estimate = Estimate(
+            view, of_paths, rig, responses, self.is_filtered, has_halves, settings.memory_bytes, launches
+        )
 
         def signals_of(some: Sequence[Response] | None) -> StillSignals:
             channels, radiance, error = estimate.means(shared, some)

@@ -34,7 +34,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.accumulators import Accumulators
+from rangesim.light_transport.accumulators import Accumulators, Runs
 from rangesim.light_transport.ambient_light import ambient_on_ray, sampled_ambient, sampled_ambient_through_media
 from rangesim.light_transport.beams import BeamDevice, Pencil, Spot
 from rangesim.light_transport.caustics import Vertex, caustic_light, gather
@@ -279,7 +279,7 @@ def trace(
     """
     pixels, runs = accumulators.pixels, _dealt(-(-accumulators.pixels // NEIGHBOURS))
     traced = PathSums(
-        np.empty((len(fields(Radiance)), pixels), np.float32), np.empty((len(fields(Tally)), pixels), np.float32)
+        np.zeros((len(fields(Radiance)), pixels), np.float32), np.zeros((len(fields(Tally)), pixels), np.float32)
     )
     samples = allocation.samples
     total, begin, finished, iterations = int(samples.sum(dtype=np.int64)), 0, 0, 0
@@ -292,23 +292,23 @@ def trace(
         most = max(min_lanes(), int(launches.units / (per_sample * total / pixels))) // NEIGHBOURS
         left = len(runs) - begin
         end = begin + -(-left // -(-left // most))  # launches of even size
-        places = (np.sort(runs[begin:end])[:, None] * NEIGHBOURS + np.arange(NEIGHBOURS)).ravel()
-        places = places[places < pixels]
+        chosen = Runs(np.sort(runs[begin:end]), NEIGHBOURS, pixels)
+        places = chosen.places()
         lanes = Lanes(view, settings, allocation, places)
         loop, state = partial(walk, view, settings, accumulators, lanes), start(view, settings, accumulators, lanes)
         state, taken = launches.run(loop, state, len(places), accumulators.pending, tell)
-        accumulators.store(state.channels, places)
-        _store(state.radiance, traced.radiance, places)
-        _store(state.tally, traced.tally, places)
+        accumulators.store(state.channels, chosen)
+        _store(state.radiance, traced.radiance, chosen)
+        _store(state.tally, traced.tally, chosen)
         begin, finished, iterations = end, finished + int(samples[places].sum(dtype=np.int64)), iterations + taken
     return traced
 
 
-def _store(sums: Radiance[mi.Float] | Tally[mi.Float], images: np.ndarray, places: np.ndarray) -> None:
-    """Write the evaluated sums of lanes to `images` (k, n) at these places; 0 where there are none."""
+def _store(sums: Radiance[mi.Float] | Tally[mi.Float], images: np.ndarray, runs: Runs) -> None:
+    """Write the evaluated sums of lanes to `images` (k, n), which are 0 where there are none."""
     for image, field in zip(images, fields(sums), strict=True):
-        values = getattr(sums, field.name)
-        image[places] = 0 if values is None else values.numpy()
+        if (values := getattr(sums, field.name)) is not None:
+            runs.write(values.numpy(), image)
 
 
 def _dealt(n: int) -> np.ndarray:
