@@ -24,12 +24,18 @@ from rangesim.scene.media import is_boundary
 from rangesim.signals import GroundTruth
 
 
-def ground_truth(
-    scene: Scene, traced: TracedScene, rig: Rig, has_guides: bool = True
-) -> tuple[GroundTruth, Guides | None]:
-    """The ground truth of the camera's image, and the guides of the filter of indirect light where they are wanted.
+PIXELS_PER_ITERATION = 3
+"""Number of pixels whose ground truth takes as long as an iteration of the path loop: 2.2 to 3 on matte, tabletop and
+glassware, with photons and without. It decides on the size of the first launch of the loop, and nothing else."""
 
-    Both describe the first surface on the ray through each pixel's centre; see `rangesim.signals.GroundTruth`.
+
+def ground_truth(
+    scene: Scene, traced: TracedScene, rig: Rig, has_guides: bool, of_paths: Launches
+) -> tuple[GroundTruth, Guides | None]:
+    """The ground truth of the camera's image, and the guides of the filter of indirect light if it `has_guides`.
+
+    Both describe the first surface on the ray through each pixel's centre; see `rangesim.signals.GroundTruth`. The launches
+    `of_paths`, of the path loop, learn how fast the machine traces rays in this scene.
     """
     h, w = rig.camera.height, rig.camera.width
     launches, shapes = Launches(), scene.mitsuba.shapes()
@@ -39,7 +45,7 @@ def ground_truth(
     parts = []
     for begin, end in launches.ranges(h * w):
         part = _first_surfaces(traced, scene.has_cutouts, index_of, transmits_of, begin, end, has_guides)
-        launches.evaluate(part, end - begin)
+        of_paths.learn((end - begin) // PIXELS_PER_ITERATION, launches.evaluate(part, end - begin))
         parts.append(part)
 
     def image(name: str) -> np.ndarray:

@@ -88,7 +88,7 @@ def trace_light(
         settings.spp.check(responses)
     traced = TracedScene.of(scene.mitsuba, scene.in_renderer(rigs[0]))
     warn_of_narrow_lobes(traced, [instance.name for instance in scene.instances])
-    views = [_CameraPass(scene, traced, one, settings, number) for number, one in enumerate(rigs)]
+    views = [_CameraPass(scene, traced, one, settings, number, launches) for number, one in enumerate(rigs)]
     fewest = min(int(view.samples.min()) for view in views)
     at_work = partial(report, 0.0)
     pixels = max(len(view.samples) for view in views)
@@ -109,6 +109,7 @@ class _CameraPass:
     traced : TracedScene with the emitter of the pass; its camera is replaced.
     rig : Rig of this camera.
     number : index of the camera, from 0. Each camera has random numbers of its own.
+    launches : Launches of the path loop.
     """
 
     def __init__(
@@ -118,6 +119,7 @@ class _CameraPass:
         rig: Rig,
         settings: TransportSettings,
         number: int,
+        launches: Launches,
     ) -> None:
         self.zones = ZoneSums(rig, rig.camera.matrix) if isinstance(rig.camera, Zones) else None
         rig = rig.traced
@@ -127,7 +129,7 @@ class _CameraPass:
         # The indirect light of beams changes from pixel to pixel, because each has a spot of its own
         can_share = rig.camera.has_neighbours and not isinstance(rig.projector, Beam)
         self.is_filtered = settings.indirect == "filtered" and can_share
-        self.truth, self.guides = ground_truth(scene, self.traced, rig, self.is_filtered)
+        self.truth, self.guides = ground_truth(scene, self.traced, rig, self.is_filtered, launches)
         spp, pixels = settings.spp, rig.camera.height * rig.camera.width
         if isinstance(spp, Sampler):
             self.samples = np.full(pixels, spp.first_spp)

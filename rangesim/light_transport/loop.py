@@ -337,7 +337,7 @@ class Lanes:
         self.total = mi.UInt32(aligned(allocation.total[places], np.uint32))
         self.stride = dr.opaque(mi.UInt32, allocation.stride)
         self.first, self.part = (
-            mi.UInt32(aligned(np.broadcast_to(x, len(allocation.pixels))[places], np.uint32))
+            mi.UInt32(aligned(x[places], np.uint32)) if isinstance(x, np.ndarray) else dr.opaque(mi.UInt32, x)
             for x in (allocation.first, allocation.part)
         )
         self.irradiance = dr.opaque(mi.Float, allocation.irradiance)
