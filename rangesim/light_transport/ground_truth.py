@@ -23,7 +23,6 @@ from rangesim.scene.materials import MATERIAL_CLASSES, is_matte, transmits
 from rangesim.scene.media import is_boundary
 from rangesim.signals import GroundTruth
 
-
 PIXELS_PER_ITERATION = 3
 """Number of pixels whose ground truth takes as long as an iteration of the path loop: 2.2 to 3 on matte, tabletop and
 glassware, with photons and without. It decides on the size of the first launch of the loop, and nothing else."""
@@ -34,8 +33,8 @@ def ground_truth(
 ) -> tuple[GroundTruth, Guides | None]:
     """The ground truth of the camera's image, and the guides of the filter of indirect light if it `has_guides`.
 
-    Both describe the first surface on the ray through each pixel's centre; see `rangesim.signals.GroundTruth`. The launches
-    `of_paths`, of the path loop, learn how fast the machine traces rays in this scene.
+    Both describe the first surface on the ray through each pixel's centre; see `rangesim.signals.GroundTruth`. `of_paths`,
+    the launches of the path loop, learn how fast the machine traces rays in this scene.
     """
     h, w = rig.camera.height, rig.camera.width
     launches, shapes = Launches(), scene.mitsuba.shapes()
