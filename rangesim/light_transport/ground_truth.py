@@ -33,8 +33,8 @@ def ground_truth(
 ) -> tuple[GroundTruth, Guides | None]:
     """The ground truth of the camera's image, and the guides of the filter of indirect light if it `has_guides`.
 
-    Both describe the first surface on the ray through each pixel's centre; see `rangesim.signals.GroundTruth`. `of_paths`,
-    the launches of the path loop, learn how fast the machine traces rays in this scene.
+    Both describe the first surface on the ray through each pixel's centre; see `rangesim.signals.GroundTruth`.
+    `of_paths`, the launches of the path loop, learn how fast the machine traces rays in this scene.
     """
     h, w = rig.camera.height, rig.camera.width
     launches, shapes = Launches(), scene.mitsuba.shapes()
