@@ -113,6 +113,19 @@ def _cosine(normal, a, b):  # type: ignore[no-untyped-def]
 
 
 @cached_njit(nogil=True, error_model="numpy")
+def _is_even(a, b, landings, rule):  # type: ignore[no-untyped-def]
+    """Whether a receiver is so even between two landings that it is hardly higher than the line between them.
+
+    Its height is the length of the line times the angle between the normals over 8.
+    """
+    cosine, line, distance = _cosine(landings.normal, a, b), 0.0, 0.0
+    for k in range(3):
+        line += (landings.position[a, k] - landings.position[b, k]) ** 2
+        distance += (landings.position[a, k] - rule.projector_at[k]) ** 2
+    return cosine >= MIN_NORMAL_COSINE and line * (2 - 2 * cosine) <= 64 * rule.sag * rule.sag * distance
+
+
+@cached_njit(nogil=True, error_model="numpy")
 def _off_middle(position, m, a, b):  # type: ignore[no-untyped-def]
     """Squared distance of landing m from the middle between a and b."""
     total = 0.0
@@ -123,31 +136,29 @@ def _off_middle(position, m, a, b):  # type: ignore[no-untyped-def]
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def _is_smooth(r, landings, pixels, angle, tolerance, faint):  # type: ignore[no-untyped-def]
+def _is_smooth(r, landings, pixels, rule):  # type: ignore[no-untyped-def]
     """Whether light of one chain is so even over a block that triangles between its nine points describe it.
 
     r : (9,) int64, landings of the points, row by row.
-    pixels : edge of the block in pixels. angle : radians of a pixel.
-    tolerance : largest error of a triangle's place, in pixels where it lands.
-    faint : ratio of the irradiance to direct light below which light only has to land on an even receiver.
+    pixels : edge of the block in pixels. rule : Rule. Faint light only has to land on an even receiver.
     """
     position, normal, length = landings.position, landings.normal, landings.length
     for k in (0, 2, 6, 8):
-        if _cosine(normal, r[k], r[4]) < MIN_NORMAL_COSINE:
+        if not _is_even(r[k], r[4], landings, rule):
             return False
     total, low, high = 0.0, np.inf, 0.0
     for q in (0, 1, 3, 4):
         size = triangle_area(position, r[q], r[q + 1], r[q + 4]) + triangle_area(position, r[q], r[q + 4], r[q + 3])
         total += size
         low, high = min(low, size), max(high, size)
-    plain = angle * length[r[4]]
+    plain = rule.angle * length[r[4]]
     off = 0.0
     for m, a, b in ((1, 0, 2), (3, 0, 6), (5, 2, 8), (7, 6, 8), (4, 0, 8), (4, 2, 6)):
         off = max(off, _off_middle(position, r[m], r[a], r[b]))
-    if landings.part[r[4]] * plain * plain * pixels * pixels < faint * total:
+    if landings.part[r[4]] * plain * plain * pixels * pixels < rule.faint * total:
         return np.sqrt(off) < 0.25 * np.sqrt(total)
     footprint = min(max(np.sqrt(total) / pixels, MIN_FOOTPRINT * plain), plain)
-    return high <= MAX_SPREAD * low and np.sqrt(off) <= 4 * tolerance * footprint  # cells are half a block
+    return high <= MAX_SPREAD * low and np.sqrt(off) <= 4 * rule.tolerance * footprint  # cells are half a block
 
 
 @cached_njit(nogil=True, error_model="numpy")
@@ -236,7 +247,7 @@ def smooth_chains(blocks, grid, landings, rule, meets, taken, used):  # type: ig
                     if r[p] >= 0:
                         found += 1
                         part += landings.part[r[p]] / 9
-                if found < 9 or not _is_smooth(r, landings, blocks.pixels, rule.angle, rule.tolerance, rule.faint):
+                if found < 9 or not _is_smooth(r, landings, blocks.pixels, rule):
                     wish += part
                 else:
                     triangles, flux = _longer(triangles, n + 8), _longer(flux, n + 8)
@@ -256,7 +267,7 @@ def smooth_chains(blocks, grid, landings, rule, meets, taken, used):  # type: ig
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def cells_of(blocks, grid, landings, dropped, meets, taken, used):  # type: ignore[no-untyped-def]
+def cells_of(blocks, grid, landings, rule, dropped, meets, taken, used):  # type: ignore[no-untyped-def]
     """Make triangles of what is left in the cells of blocks that are not divided.
 
     dropped : (points,) float32, fraction of the light of each point that was not followed.
@@ -294,7 +305,7 @@ def cells_of(blocks, grid, landings, dropped, meets, taken, used):  # type: igno
                     for p in range(4):
                         r[p] = _with_key(grid.head, grid.after, landings.key, corners[p], key)
                         is_whole &= r[p] >= 0
-                    if is_whole and _lies_flat(r, landings):
+                    if is_whole and _lies_flat(r, landings, rule):
                         triangles, flux = _longer(triangles, n + 2), _longer(flux, n + 2)
                         for c, d in ((1, 3), (3, 2)):
                             triangles[n, 0], triangles[n, 1], triangles[n, 2] = r[0], r[c], r[d]
@@ -312,11 +323,11 @@ def cells_of(blocks, grid, landings, dropped, meets, taken, used):  # type: igno
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def _lies_flat(r, landings):  # type: ignore[no-untyped-def]
+def _lies_flat(r, landings, rule):  # type: ignore[no-untyped-def]
     """Whether the two triangles of the corners of a cell lie on the receiver."""
     position, normal = landings.position, landings.normal
     for k in (1, 2, 3):
-        if _cosine(normal, r[0], r[k]) < MIN_NORMAL_COSINE:
+        if not _is_even(r[0], r[k], landings, rule):
             return False
     for c, d in ((1, 3), (3, 2)):
         ux, uy, uz = position[r[c]] - position[r[0]]
@@ -404,7 +415,7 @@ def lifted(sheets, scale, level, groups, every, faint, lift, offsets, drawn):  #
     ----------
     sheets : Sheets, as a tuple of position, normal, triangles, shape and key.
     level : (t,) float64, ratio of the irradiance to direct light.
-    lift : metres, largest distance off the surface. offsets : (groups + 1, 2) float64, metres.
+    lift : (t,) float64, metres, largest distance off the surface. offsets : (groups + 1, 2) float64, metres.
     drawn : (t,) float64, uniform in 0..1.
 
     Returns
@@ -424,7 +435,7 @@ def lifted(sheets, scale, level, groups, every, faint, lift, offsets, drawn):  #
             group, weight = 1 + (key[t] >> 8) % groups, groups * every / chance
         if not (scale[t] > 0 and np.isfinite(level[t])):
             continue
-        height = lift * (t * 0.6180339887498949 % 1.0)
+        height = lift[t] * (t * 0.6180339887498949 % 1.0)
         for k in range(3):
             v = triangles[t, k]
             names[n, k] = v

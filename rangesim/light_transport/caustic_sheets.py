@@ -67,9 +67,16 @@ PHOTONS, MAX_PARTS = 1 << 13, 8
 """Number of photons of a pass, as far as cells that are left can be divided into parts of their own, and the largest
 number of parts along an edge. Cells that are more than so many have a photon each. With twice as many photons, their
 noise would be smaller by a third."""
-MAX_SIDE = 0.2
+MAX_SAG = 1e-3
+"""Largest height of a curved receiver over a triangle, as a fraction of its distance from the projector; rays that look
+for triangles (`sheet_scene`) reach as far."""
+MAX_SIDE = 0.06
 """Longest side of the parallelogram of a photon, as a fraction of its way from the projector. Light that spreads
 farther does not do so evenly."""
+SHIFT_PX = np.array([0.0137, 0.0071])
+"""Largest shift of the lattice against the edges of pixels, in pixels: more than rounding, less than anything seen."""
+MIN_SIDE_M = 1e-12
+"""Smallest length in metres by which another is divided, because light may land in a point."""
 STEP_PX = 0.02
 """Distance of the points beside a photon that tell how its light spreads, in pixels of the projector. Closer points
 would land within the rounding of single precision; farther ones would miss narrow chains."""
@@ -111,9 +118,11 @@ class Lists(NamedTuple):
 
 class Rule(NamedTuple):
     """What decides whether a block is divided, see `TOLERANCE_PX`, `FAINT` and `SIGNIFICANT`; `angle` is that of a
-    pixel in radians."""
+    pixel in radians, `projector_at` the place of the projector (3,) and `sag` is `MAX_SAG`."""
 
     angle: float
+    projector_at: np.ndarray
+    sag: float
     tolerance: float
     faint: float
     significant: float
@@ -242,6 +251,8 @@ class _Tracing:
         self.angle = 1 / float(np.sqrt(self.device.f.x[0] * self.device.f.y[0]))
         levels = int(np.log2(0.5 * BLOCK_PX / max(CAMERA_CELL * pixel_rad / self.angle, 1)))
         self.levels = 0 if self.device.has_lens else min(max(levels, 0), MAX_LEVELS)
+        self.at = np.array([float(c[0]) for c in self.device.centre])
+        self.size_px = np.array([width, height])
         self.blocks = tuple(int(np.ceil(n / BLOCK_PX)) for n in (width, height))
         self.coarsest = 1 << self.levels
         self.step_px = np.array([width, height]) / (2 * self.coarsest * np.array(self.blocks))
@@ -261,15 +272,14 @@ class _Tracing:
         near = self.delta.within(x, y, 2 * step)
         x, y = x[near], y[near]
         made, left = [], []
-        rule = Rule(self.angle, TOLERANCE_PX, FAINT, SIGNIFICANT)
+        rule = Rule(self.angle, self.at, MAX_SAG, TOLERANCE_PX, FAINT, SIGNIFICANT)
         watts = power_w / self.device.pixels
         pixels = np.sqrt(self.step_px.prod())
         landings = _no_landings()
         while step and len(x):
             blocks = Blocks(x, y, step, 2 * step * pixels)
             new = points.new(blocks)
-            place = np.column_stack([new % self.columns, new // self.columns]) * self.step_px
-            lattice, landings = points.add(new, *self._follow(place, lens, FEWEST))
+            lattice, landings = points.add(new, *self._follow(self._pixels(new), lens, FEWEST))
             chains = Chains(*(getattr(landings, name) for name in Chains._fields))
             meets = self.delta.within(x, y, 2 * step)
             triangles, flux, divides, taken, used = smooth_chains(blocks, lattice, chains, rule, meets, taken, used)
@@ -279,7 +289,7 @@ class _Tracing:
             cells = np.column_stack([np.add.outer(c, step * offset).ravel() for c, offset in (
                 (whole.x, np.array([0, 1, 0, 1])), (whole.y, np.array([0, 0, 1, 1])))])  # fmt: skip
             meets = self.delta.within(*cells.T, step)
-            triangles, flux, rest, taken, used = cells_of(whole, lattice, chains, points.dropped, meets, taken, used)
+            triangles, flux, rest, taken, used = cells_of(whole, lattice, chains, rule, points.dropped, meets, taken, used)
             made.append((triangles, flux))
             left.append(np.column_stack([cells, np.full(len(cells), step), rest])[rest > 0])
             x, y, step = x[divides], y[divides], step // 2
@@ -287,12 +297,20 @@ class _Tracing:
         if not made:
             return _sheets(landings, np.empty((0, 2)), np.empty((0, 3), np.int64), np.empty(0), 0.0)
         triangles, flux = (np.concatenate(c) for c in zip(*made, strict=True))
-        uv = np.column_stack([points.numbers % self.columns, points.numbers // self.columns]) * self.step_px
-        of_grid = _sheets(landings, uv[landings.point], triangles, watts * flux[:, 0], 0.0)
+        of_grid = _sheets(landings, self._pixels(points.numbers)[landings.point], triangles, watts * flux[:, 0], 0.0)
         both = joined([of_grid, self._photons(np.concatenate(left), taken, watts, rng, lens)])
         if both is None:
             return of_grid
         return both._replace(in_triangles=float(of_grid.flux.sum() / both.flux.sum()))
+
+    def _pixels(self, number: np.ndarray) -> np.ndarray:
+        """(n, 2) float64, pixel coordinates of lattice points.
+
+        They are moved a little, by less towards the borders of the image, so that none lies exactly on an edge of a
+        scene that is aligned with the projector.
+        """
+        regular = np.column_stack([number % self.columns, number // self.columns]) * self.step_px
+        return regular + SHIFT_PX * np.sin(np.pi * regular / self.size_px)
 
     def _photons(
         self, cells: np.ndarray, taken: np.ndarray, watts: float, rng: np.random.Generator, lens: np.ndarray | None
@@ -323,7 +341,7 @@ class _Tracing:
         corners, edges = cells[:, :2].astype(np.int64), cells[:, 2].astype(np.int64)
         which = sides_of_photons(corners, edges, lists, self.columns, self.coarsest, chains, taken)
         power = watts * size.prod(axis=1) / chance
-        made = _parallelograms(found, which, size, place, power, self.angle)
+        made = _parallelograms(found, which, size, place, power, self.angle, self.at)
         return made._replace(cut=float((lost[::3] * power).sum() / made.flux.sum()) if len(made.flux) else 0.0)
 
     def _follow(
@@ -359,7 +377,8 @@ def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.
 
 
 def _parallelograms(
-    found: Landings, which: np.ndarray, size: np.ndarray, place: np.ndarray, power: np.ndarray, angle: float
+    found: Landings, which: np.ndarray, size: np.ndarray, place: np.ndarray, power: np.ndarray, angle: float,
+    projector_at: np.ndarray,
 ) -> Sheets:
     """Sheets of photons, two triangles each.
 
@@ -367,7 +386,7 @@ def _parallelograms(
     ----------
     found : Landings of the three points of each photon. which : (m, 3) int64, see `sides_of_photons`.
     size, place : (n, 2) float64, pixels, sizes of the photons' cells and places of the photons.
-    power : (n,) float64, watts, power that a photon stands for. angle : radians, of a pixel.
+    power : (n,) float64, watts, power that a photon stands for. angle : radians, of a pixel. projector_at : (3,).
     """
     this = which[:, 0]
     photon = found.point[this] // 3
@@ -379,8 +398,12 @@ def _parallelograms(
     plain = np.stack([across, np.cross(normal, across)], axis=1)
     known = (which[:, 1:] >= 0).all(axis=1)[:, None, None]
     sides = np.where(known, (found.position[which[:, 1:]] - centre[:, None]) / STEP_PX, plain) * edges[:, :, None]
-    longest = MAX_SIDE * found.length[this, None, None]
-    sides *= np.minimum(longest / np.maximum(np.linalg.norm(sides, axis=2, keepdims=True), 1e-12), 1)
+    longest = MAX_SIDE * found.length[this, None]
+    turn = np.linalg.norm(found.normal[which[:, 1:]] - normal[:, None], axis=2) / STEP_PX * edges  # radians over a side
+    length = np.maximum(np.linalg.norm(sides, axis=2), MIN_SIDE_M)
+    sag = MAX_SAG * np.linalg.norm(centre - projector_at, axis=1)[:, None]
+    flat = np.sqrt(8 * sag / np.maximum(np.where(known[..., 0], turn, 0) * length, MIN_SIDE_M))
+    sides *= np.minimum(np.minimum(longest / length, flat), 1)[..., None]
     ends = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
     corners = centre[:, None] + ends @ sides
     uv = place[photon][:, None] + ends * edges[:, None]

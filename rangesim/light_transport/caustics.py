@@ -108,7 +108,8 @@ def caustic_light(
     # What the loop only reads is excluded: Dr.Jit traces a loop twice that carries something without changing it
     while dr.hint(looks, exclude=[si, bsdf, vertex, shape, normal, seen, sample, is_later, place, weight]):
         # ---- The next triangle: each bright one counts, and one of the faint ones stands for all of them -----
-        found = sheets.next(sheets.start(si.p, normal, sample, which), normal, way, looks)
+        ray, step = sheets.ray(si.p, normal, sample, which, way)
+        found = sheets.next(ray, looks)
         hit = looks & found.is_valid()
         is_new = hit & (found.prim_index != last)
         irradiance, is_here = sheets.irradiance(found, shape, normal, is_new)
@@ -133,7 +134,7 @@ def caustic_light(
             channels = accumulators.add(channels, path, brought, place, on_one_side, is_later)
         total = dr.select(counts, 0, total)
         last = dr.select(hit, found.prim_index, last)
-        way = dr.select(hit, way + found.t + 1e-7, 0)
+        way = dr.select(hit, way + found.t + step, 0)
         which = dr.select(hit, which, which + 1)
         looks &= (which == 0) | ((which == 1) & sheets.is_turn(sample, 0))
     return channels, radiance

@@ -20,16 +20,18 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.caustic_kernels import irradiance_of, lifted
-from rangesim.light_transport.caustic_sheets import FAINT, Sheets
+from rangesim.light_transport.caustic_sheets import FAINT, MAX_SAG, Sheets
 from rangesim.light_transport.sampling import aligned
 
-LIFT = 1e-3
-"""Largest distance by which a triangle is lifted off its surface, as a fraction of the size of the lit part of the
-scene. If it were smaller, single precision could not tell all triangles apart that cover a point; a larger one would
-find triangles beside thin parts."""
-SAG = 0.5
-"""Depth below a surface to which triangles are looked for, as a fraction of `LIFT`, because triangles cut the corner of
-curved surfaces."""
+LIFT = 2e-4
+"""Largest distance by which a triangle is lifted off its surface, as a fraction of its distance from the projector: a
+thousand times the rounding of single precision, which has to tell all triangles apart that cover a point. A larger
+distance would make triangles on curved surfaces too large."""
+STEP = 1e-7
+"""Step behind a triangle, as a fraction of the coordinates: the rounding of single precision. With a smaller step, a
+ray could meet the same triangle for ever; a larger one would pass triangles by."""
+MARGIN = 1.01
+"""Ratio of the start of a ray over a surface to the greatest height of a triangle, because both are rounded."""
 PERIOD, EVERY = 16, 4
 """Number of samples after which a pixel has looked into all groups of faint triangles, and the distance of two samples
 that look into one at all. With a longer period, faint light would be noisy in passes of few samples; if every sample
@@ -103,14 +105,16 @@ class SheetScene:
         at_vertex, scale, area = irradiance_of(sheets.triangles, sheets.flux, sheets.position, len(sheets.u))
         first = sheets.position[sheets.triangles[:, 0]]
         with np.errstate(divide="ignore", invalid="ignore"):
-            level = sheets.flux / area * ((first - projector_at) ** 2).sum(axis=1) / irradiance
+            distance = np.linalg.norm(first - projector_at, axis=1)
+            level = sheets.flux / area * distance**2 / irradiance
 
         size = float(np.ptp(sheets.position, axis=0).max()) + MIN_SIZE_M
         across = math.isqrt(groups - 1) + 1  # groups lie in a square
         offsets = np.array([[0, 0], *([1 + g % across, g // across] for g in range(groups))]) * (SPACING * size)
         columns = (sheets.position, sheets.normal, sheets.triangles, sheets.shape, sheets.key)
+        lift = LIFT * distance
         drawn = np.random.default_rng(0).random(len(area))
-        corners, names, factor = lifted(columns, scale, level, groups, every, FAINT, LIFT * size, offsets, drawn)
+        corners, names, factor = lifted(columns, scale, level, groups, every, FAINT, lift, offsets, drawn)
         mesh = mi.Mesh("light", len(corners), len(names))
         parameters = mi.traverse(mesh)
         parameters["vertex_positions"] = mi.Float(aligned(corners, np.float32))
@@ -121,7 +125,7 @@ class SheetScene:
         self.looks, self.names = mi.Float(aligned(looks, np.float32)), mi.UInt32(aligned(names, np.uint32))
         self.factor, self.offsets = mi.Float(aligned(factor, np.float32)), mi.Float(aligned(offsets, np.float32))
         self.groups, self.every = dr.opaque(mi.UInt32, groups), dr.opaque(mi.UInt32, every)
-        self.height = dr.opaque(mi.Float, LIFT * size)
+        self.projector_at = mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in projector_at))
         is_lit = np.zeros(int(sheets.shape.max()) + 1, np.bool_)
         is_lit[names[:, 3]] = True
         self.is_lit, self.shapes = mi.Bool(is_lit), dr.opaque(mi.UInt32, len(is_lit))
@@ -135,15 +139,30 @@ class SheetScene:
         """Whether it is the turn of a sample; each turn comes once in `every` samples."""
         return sample % self.every == mi.UInt32(turn) % self.every
 
-    def start(self, point: mi.Point3f, normal: mi.Normal3f, sample: mi.UInt32, which: mi.UInt32) -> mi.Point3f:
-        """Start of the ray through bright triangles (`which` 0), or through those of the sample's group (1)."""
-        offset = dr.gather(mi.Vector2f, self.offsets, dr.select(which == 0, 0, sample // self.every % self.groups + 1))
-        return point + mi.Vector3f(normal) * (1.01 * self.height) + mi.Vector3f(offset.x, offset.y, 0)
+    def ray(
+        self,
+        point: mi.Point3f,
+        normal: mi.Normal3f,
+        sample: mi.UInt32,
+        which: mi.UInt32,
+        way: mi.Float,
+    ) -> tuple[mi.Ray3f, mi.Float]:
+        """The rest of the ray through the triangles that may cover a point, after a way in metres; and the step in
+        metres from a triangle that it meets to where the next one is looked for.
 
-    def next(self, origin: mi.Point3f, normal: mi.Normal3f, way: mi.Float, active: mi.Bool):
-        """The next triangle on the ray."""
-        ray = mi.Ray3f(origin - mi.Vector3f(normal) * way, -mi.Vector3f(normal))
-        ray.maxt = (1.01 + SAG) * self.height - way
+        which : UInt32; 0: through bright triangles, 1: through those of the sample's group of faint ones.
+        """
+        distance = dr.norm(mi.Vector3f(point) - self.projector_at)
+        above = MARGIN * (LIFT + MAX_SAG) * distance
+        group = dr.select(which == 0, 0, sample // self.every % self.groups + 1)
+        offset = dr.gather(mi.Vector2f, self.offsets, group)
+        origin = point + mi.Vector3f(normal) * (above - way) + mi.Vector3f(offset.x, offset.y, 0)
+        ray = mi.Ray3f(origin, -mi.Vector3f(normal))
+        ray.maxt = above + MAX_SAG * distance - way
+        return ray, STEP * (distance + dr.norm(mi.Vector3f(point)) + offset.x + offset.y)
+
+    def next(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
+        """The next triangle on a ray."""
         return self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
     def irradiance(

@@ -144,7 +144,7 @@ class SpecularTree:
             lanes = dr.width(parts.part)
             stored = _Stored(leaves, lanes)
             landing, lost = _strongest(self, parts, stored, chance)
-            dr.scatter_add(dropped, lost, parts.point)
+            dr.scatter_add(dropped, lost, parts.point, mode=dr.ReduceMode.Direct)
             self.launches.evaluate([list(landing), stored.leaves, dropped], lanes)
             landed = dr.compress(landing.part > 0)
             columns = [dr.gather(type(x), x, landed) for x in (parts.point, *_leaves(landing))]
