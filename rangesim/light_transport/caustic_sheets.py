@@ -70,7 +70,7 @@ noise would be smaller by a third."""
 MAX_SAG = 1e-3
 """Largest height of a curved receiver over a triangle, as a fraction of its distance from the projector; rays that look
 for triangles (`sheet_scene`) reach as far."""
-MAX_SIDE = 0.06
+MAX_SIDE = 0.025
 """Longest side of the parallelogram of a photon, as a fraction of its way from the projector. Light that spreads
 farther does not do so evenly."""
 SHIFT_PX = np.array([0.0137, 0.0071])

@@ -103,23 +103,25 @@ def caustic_light(
     radiance, way, which = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n)
     last, total, chosen = dr.full(mi.UInt32, NONE, n), dr.zeros(mi.Float, n), Place.none(n)
     # Later vertices bring little each, so they look in some samples alone, which count for all
-    looks = sheets.may_light(shape, active & (~is_later | sheets.is_turn(sample, 1)))
-    weight = vertex.throughput * dr.select(is_later, mi.Float(sheets.every), 1)
+    is_turn = sheets.is_turn(sample, dr.select(is_later, mi.UInt32(1), 0))
+    looks = sheets.may_light(shape, active & (~is_later | is_turn))
+    weight_of_bright = dr.select(is_later, mi.Float(sheets.every), 1)
     # What the loop only reads is excluded: Dr.Jit traces a loop twice that carries something without changing it
-    while dr.hint(looks, exclude=[si, bsdf, vertex, shape, normal, seen, sample, is_later, place, weight]):
+    while dr.hint(looks, exclude=[si, bsdf, vertex, shape, normal, seen, sample, is_later, place, is_turn, weight_of_bright]):
         # ---- The next triangle: each bright one counts, and one of the faint ones stands for all of them -----
         ray, step = sheets.ray(si.p, normal, sample, which, way)
         found = sheets.next(ray, looks)
         hit = looks & found.is_valid()
         is_new = hit & (found.prim_index != last)
         irradiance, is_here = sheets.irradiance(found, shape, normal, is_new)
+        irradiance *= dr.select(which == 0, weight_of_bright, 1)
         total += irradiance
         fraction = dr.select(is_here, irradiance / total, 0)
         taken = is_here & ((which == 0) | (pick < fraction))
         pick = dr.select(which == 0, pick, dr.select(taken, pick / fraction, (pick - fraction) / (1 - fraction)))
         chosen = chosen.replaced(taken, found)
         counts = (total > 0) & dr.select(which == 0, is_here, ~hit)
-        if dr.hint(counts, exclude=[si, bsdf, vertex, seen, is_later, place, weight]):
+        if dr.hint(counts, exclude=[si, bsdf, vertex, seen, is_later, place, is_turn, weight_of_bright]):
             light = sheets.light(chosen, counts)
             wo = si.to_local(-light.direction)
             value = bsdf.eval(mi.BSDFContext(), si, wo, counts)
@@ -128,7 +130,7 @@ def caustic_light(
             lit = -dr.dot(light.direction, si.n)
             cosine = dr.maximum(dr.abs(light.cosine), dr.abs(lit) / MAX_COSINE_RATIO)
             on_one_side = counts & (seen * lit * si.wi.z * wo.z > 0)  # for both normals, or for neither
-            brought = dr.select(on_one_side, weight * total * mono(value) / cosine, 0)
+            brought = dr.select(on_one_side, vertex.throughput * total * mono(value) / cosine, 0)
             radiance += brought
             path = LightPath(light.u, light.v, vertex.length + light.length, vertex.is_first, mi.UInt32(CAUSTIC))
             channels = accumulators.add(channels, path, brought, place, on_one_side, is_later)
@@ -136,5 +138,5 @@ def caustic_light(
         last = dr.select(hit, found.prim_index, last)
         way = dr.select(hit, way + found.t + step, 0)
         which = dr.select(hit, which, which + 1)
-        looks &= (which == 0) | ((which == 1) & sheets.is_turn(sample, 0))
+        looks &= (which == 0) | ((which == 1) & is_turn)
     return channels, radiance

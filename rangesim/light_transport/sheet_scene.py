@@ -135,9 +135,9 @@ class SheetScene:
         known = active & (shape < self.shapes)
         return known & dr.gather(mi.Bool, self.is_lit, shape, known)
 
-    def is_turn(self, sample: mi.UInt32, turn: int) -> mi.Bool:
+    def is_turn(self, sample: mi.UInt32, turn: mi.UInt32) -> mi.Bool:
         """Whether it is the turn of a sample; each turn comes once in `every` samples."""
-        return sample % self.every == mi.UInt32(turn) % self.every
+        return sample % self.every == turn % self.every
 
     def ray(
         self,

@@ -31,9 +31,9 @@ from rangesim.light_transport.traced_scene import TracedScene
 PARTS = 6
 """Largest number of weaker parts that a ray stores in a launch. Light through three panes meets six faces. A part that
 finds no room is dropped by a point of the grid; a photon then follows one of the two parts by chance."""
-MAX_LAUNCHES = 4
-"""Largest number of launches. In the last one nothing is stored: points of the grid drop weaker parts, and photons choose
-one part by chance. Light that was the weaker part three times carries little."""
+LAUNCHES, LAUNCHES_OF_PHOTONS = 3, 2
+"""Largest numbers of launches. In the last one nothing is stored: points of the grid drop weaker parts, and photons choose
+one part by chance. Light that was the weaker part twice carries little."""
 HASH_STEP = 0x9E3779B1
 """Odd factor of the hash that names chains: 2^32 divided by the golden ratio, rounded to a prime."""
 NORMAL_STEPS = 1000.0
@@ -136,8 +136,9 @@ class SpecularTree:
         chance = None if random is None else Continued(mi.PCG32(1))
         self.fewest = dr.opaque(mi.Float, fewest)
         dropped, found = dr.zeros(mi.Float, n), []
-        self.room = dr.opaque(mi.UInt32, PARTS)
-        for launch in range(MAX_LAUNCHES):
+        launches = LAUNCHES if random is None else LAUNCHES_OF_PHOTONS
+        for left in reversed(range(launches)):
+            self.room = dr.opaque(mi.UInt32, PARTS if left else 0)
             leaves = _leaves(parts)
             dr.make_opaque(leaves)
             parts = _rebuilt(parts, list(leaves))
@@ -154,8 +155,6 @@ class SpecularTree:
             if not len(rest):
                 break
             parts = _rebuilt(parts, [dr.gather(type(x), x, rest) for x in stored.leaves])
-            if launch + 2 == MAX_LAUNCHES:
-                self.room = dr.opaque(mi.UInt32, 0)
         numbers = [np.concatenate(column) for column in zip(*found, strict=True)]
         vectors = [np.column_stack(numbers[k : k + 3]) for k in (5, 8, 11)]
         return Landings(*numbers[:5], *vectors), dropped.numpy()
