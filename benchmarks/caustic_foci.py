@@ -125,7 +125,7 @@ def noise(seeds: int) -> dict[str, float]:
           f"ptracer {seconds['ptracer']:.2f} s; {seeds} seeds")  # fmt: skip
 
     expected = stacks["ptracer"].mean(axis=0)
-    bare = transport(scene, rig, [white], photons=0).energy.direct
+    bare = transport(scene, rig, [white], caustics=False).energy.direct
     lit = np.median(bare[bare > 0])
     brightest = expected >= np.sort(expected.ravel())[-FOCUS_PIXELS]
     # Where no light arrives straight, behind the ball

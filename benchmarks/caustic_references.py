@@ -14,7 +14,7 @@ two are compared with each other. The last line of `compare` is JSON:
     max_region_error        largest relative error of the mean radiance of white over the marked regions and references
     min_stripe_correlation  smallest correlation of a stripe image with its reference within a marked region
 
-Usage: python benchmarks/caustic_references.py [make | compare] [--spp N] [--photons N]; without N, those of `transport`
+Usage: python benchmarks/caustic_references.py [make | compare] [--spp N]; without N, those of `transport`
 """
 
 from __future__ import annotations
@@ -179,8 +179,7 @@ def _references_agree(case_name: str, case: Case, references: dict[str, Referenc
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="?", choices=("make", "compare"), default="compare")
-    for name in ("spp", "photons"):
-        parser.add_argument(f"--{name}", type=int, default=argparse.SUPPRESS)
+    parser.add_argument("--spp", type=int, default=argparse.SUPPRESS)
     parser.add_argument("--scale", type=float, default=1.0, help="of the samples of `make`")
     parser.add_argument("--case", choices=(names := list(cases())), help="of `make`, alone")
     parser.add_argument("--method", choices=METHODS, help="of `make`, alone")
@@ -188,7 +187,7 @@ def main() -> None:
     if args.what == "make":
         make(args.scale, [args.case] if args.case else names, [args.method] if args.method else list(METHODS))
     else:
-        print(json.dumps(compare({k: v for k, v in vars(args).items() if k in ("spp", "photons")})))
+        print(json.dumps(compare({k: v for k, v in vars(args).items() if k == "spp"})))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 """Fringes on a board behind glass, with a wall far behind that fills most of the image.
 
 A board at 0.6 m, a thin pane at 0.5 m before it, a wall at 0.9, 2 or 6 m; two panes; a hollow glass ball, which bends
-the light. 320 x 240 pixels, fringes of 16 projector pixels, samples and photons by default. Two references: the same
+the light. 320 x 240 pixels, fringes of 16 projector pixels, samples by default. Two references: the same
 board without any glass, for contrast and depth where glass shifts nothing; and a path tracer that shares no
 code with the pass (`finite_aperture.py`), for means, and for the contrast behind the ball. The last line is JSON:
 
@@ -11,7 +11,7 @@ code with the pass (`finite_aperture.py`), for means, and for the contrast behin
     max_z_mm            largest median |z error| of Gray code and phase shift behind panes
     max_mean_error      largest relative error of a region's mean radiance of white against the path tracer
 
-Usage: python benchmarks/glass.py [--spp N] [--photons N] [--reference-samples 16000000]
+Usage: python benchmarks/glass.py [--spp N] [--reference-samples 16000000]
 """
 
 from __future__ import annotations
@@ -134,14 +134,13 @@ def traced(scene: Scene, rig: Rig, region: np.ndarray, samples: int) -> Seen:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name in ("spp", "photons"):
-        parser.add_argument(f"--{name}", type=int, default=argparse.SUPPRESS)
+    parser.add_argument("--spp", type=int, default=argparse.SUPPRESS)
     parser.add_argument("--reference-samples", type=int, default=16_000_000)
     args = parser.parse_args()
 
     select_variant()
     rig = rig_of()
-    options = {k: v for k, v in vars(args).items() if k in ("spp", "photons")}
+    options = {k: v for k, v in vars(args).items() if k == "spp"}
     render = partial(transport, rig=rig, sensors=[SENSOR], max_depth=MAX_DEPTH, glint=False, **options)
     contrasts, off, depths, means = [], [], [], []
     without: dict[float | None, Signals] = {}
