@@ -12,7 +12,7 @@ one for each wall and one for each number of delta interactions. The last line o
     max_flux_error      largest relative error of the flux on all walls
     max_receiver_error  largest error of the flux on one wall, as a fraction of that on all walls
 
-Usage: python benchmarks/caustic_energy.py [make | compare] [--rays 32000000] 
+Usage: python benchmarks/caustic_energy.py [make | compare] [--rays 32000000]
 """
 
 from __future__ import annotations
@@ -415,7 +415,8 @@ def compare() -> dict[str, float]:
             worst = max(off, key=lambda k: abs(off[k]))
             walls.append(off[worst])
             print(f"{name:<20} {sum(ours.values()):>9.6f} {totals[-1]:>+8.3%} {expected.standard_error:>7.3%}   "
-                  f"{worst:<10} {walls[-1]:>+8.3%} {expected.receiver_error:>7.3%}   {in_triangles:.2%} in triangles", flush=True)  # fmt: skip
+                  f"{worst:<10} {walls[-1]:>+8.3%} {expected.receiver_error:>7.3%}   "
+                  f"{in_triangles:.2%} in triangles", flush=True)  # fmt: skip
     return {"max_flux_error": round(max(map(abs, totals)), 5), "max_receiver_error": round(max(map(abs, walls)), 5)}
 
 

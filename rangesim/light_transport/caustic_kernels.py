@@ -142,7 +142,7 @@ def _is_smooth(r, landings, pixels, rule):  # type: ignore[no-untyped-def]
     r : (9,) int64, landings of the points, row by row.
     pixels : edge of the block in pixels. rule : Rule. Faint light only has to land on an even receiver.
     """
-    position, normal, length = landings.position, landings.normal, landings.length
+    position, length = landings.position, landings.length
     for k in (0, 2, 6, 8):
         if not _is_even(r[k], r[4], landings, rule):
             return False
@@ -218,7 +218,8 @@ def smooth_chains(blocks, grid, landings, rule, meets, taken, used):  # type: ig
 
     Returns
     -------
-    triangles : (t, 3) int64, landings. flux : (t, 1) float64, pixels of the projector. divides : (n,) bool. taken, used.
+    triangles : (t, 3) int64, landings. flux : (t, 1) float64, pixels of the projector.
+    divides : (n,) bool. taken, used : the new set.
     """
     x, y, step = blocks.x, blocks.y, blocks.step
     triangles, flux = np.empty((1024, 3), np.int64), np.empty((1024, 1), np.float64)
@@ -403,8 +404,6 @@ def irradiance_of(triangles, flux, position, vertices):  # type: ignore[no-untyp
         mean = (at_vertex[a] + at_vertex[b] + at_vertex[c]) / 3
         scale[t] = flux[t] / (areas[t] * mean) if areas[t] * mean > 0 else 0.0
     return at_vertex, scale, areas
-
-
 
 
 @cached_njit(nogil=True, error_model="numpy")

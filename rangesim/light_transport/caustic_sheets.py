@@ -16,7 +16,7 @@ light is counted twice and none is left out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -199,9 +199,11 @@ def joined(sheets: Sequence[Sheets]) -> Sheets | None:
         return sheets[0] if sheets else None
     first = np.cumsum([0, *(len(one.u) for one in sheets)])
     moved = [one._replace(triangles=one.triangles + begin) for one, begin in zip(sheets, first, strict=False)]
-    columns = [np.concatenate(c) for c in list(zip(*moved, strict=True))[:-2]]
+    columns: list[Any] = [np.concatenate(c) for c in list(zip(*moved, strict=True))[:-2]]
     flux = np.array([one.flux.sum() for one in sheets])
-    means = (float(np.average([getattr(one, name) for one in sheets], weights=flux)) for name in ("cut", "in_triangles"))
+    means = (
+        float(np.average([getattr(one, name) for one in sheets], weights=flux)) for name in ("cut", "in_triangles")
+    )
     return Sheets(*columns, *means)
 
 
@@ -230,10 +232,12 @@ class _Points:
     def add(self, numbers: np.ndarray, landings: Landings, dropped: np.ndarray) -> tuple[Lattice, Landings]:
         """Keep the landings of new points; returns all of them."""
         point = landings.point.astype(np.int64) + len(self.numbers)
-        self.landings = [Landings(*map(np.concatenate, zip(*self.landings, landings._replace(point=point), strict=True)))]
+        self.landings = [
+            Landings(*map(np.concatenate, zip(*self.landings, landings._replace(point=point), strict=True)))
+        ]
         self.numbers, self.dropped = np.concatenate([self.numbers, numbers]), np.concatenate([self.dropped, dropped])
-        lists = linked(self.landings[0].point, len(self.numbers))
-        return Lattice(self.table, self.value, *lists, self.columns, self.coarsest), self.landings[0]
+        head, after = linked(self.landings[0].point, len(self.numbers))
+        return Lattice(self.table, self.value, head, after, self.columns, self.coarsest), self.landings[0]
 
 
 class _Tracing:
@@ -262,13 +266,17 @@ class _Tracing:
         meets, _ = meets_delta(
             traced.scene, cells.columns * cells.rows, lambda a, b: self.device.centre_ray(cells.probes(a, b))
         )
-        self.delta = _Delta(maximum_filter(meets.reshape(cells.rows, cells.columns), 3), 2 * self.coarsest * np.array(self.blocks))
+        self.delta = _Delta(
+            maximum_filter(meets.reshape(cells.rows, cells.columns), 3), 2 * self.coarsest * np.array(self.blocks)
+        )
 
     def sheets(self, power_w: float, rng: np.random.Generator, lens: np.ndarray | None) -> Sheets:
         """Sheets of the light through a point of the lens, uniform coordinates in the unit square (2,); None: its
         centre."""
         points = _Points(self.columns, self.coarsest)
-        x, y = (c.ravel().astype(np.int64) for c in np.meshgrid(*(2 * self.coarsest * np.arange(n) for n in self.blocks)))
+        x, y = (
+            c.ravel().astype(np.int64) for c in np.meshgrid(*(2 * self.coarsest * np.arange(n) for n in self.blocks))
+        )
         taken, used, step = np.full(1 << 14, EMPTY, np.int64), 0, self.coarsest
         near = self.delta.within(x, y, 2 * step)
         x, y = x[near], y[near]
@@ -289,12 +297,17 @@ class _Tracing:
             whole = Blocks(x[~divides], y[~divides], *blocks[2:])
             cells = np.column_stack([np.add.outer(c, step * offset).ravel() for c, offset in (
                 (whole.x, np.array([0, 1, 0, 1])), (whole.y, np.array([0, 0, 1, 1])))])  # fmt: skip
-            meets = self.delta.within(*cells.T, step)
-            triangles, flux, rest, taken, used = cells_of(whole, lattice, chains, rule, points.dropped, meets, taken, used)
+            meets = self.delta.within(cells[:, 0], cells[:, 1], step)
+            triangles, flux, rest, taken, used = cells_of(
+                whole, lattice, chains, rule, points.dropped, meets, taken, used
+            )
             made.append((triangles, flux))
             left.append(np.column_stack([cells, np.full(len(cells), step), rest])[rest > 0])
             x, y, step = x[divides], y[divides], step // 2
-            x, y = np.concatenate([x, x + 2 * step, x, x + 2 * step]), np.concatenate([y, y, y + 2 * step, y + 2 * step])
+            x, y = (
+                np.concatenate([x, x + 2 * step, x, x + 2 * step]),
+                np.concatenate([y, y, y + 2 * step, y + 2 * step]),
+            )
         if not made:
             return _sheets(landings, np.empty((0, 2)), np.empty((0, 3), np.int64), np.empty(0), 0.0)
         triangles, flux = (np.concatenate(c) for c in zip(*made, strict=True))
@@ -379,7 +392,12 @@ def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.
 
 
 def _parallelograms(
-    found: Landings, which: np.ndarray, size: np.ndarray, place: np.ndarray, power: np.ndarray, angle: float,
+    found: Landings,
+    which: np.ndarray,
+    size: np.ndarray,
+    place: np.ndarray,
+    power: np.ndarray,
+    angle: float,
     projector_at: np.ndarray,
 ) -> Sheets:
     """Sheets of photons, two triangles each.
@@ -398,23 +416,28 @@ def _parallelograms(
     across = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]]))
     across *= (angle * found.length[this] / np.linalg.norm(across, axis=1))[:, None]
     plain = np.stack([across, np.cross(normal, across)], axis=1)
-    known = (which[:, 1:] >= 0).all(axis=1)[:, None, None]
-    sides = np.where(known, (found.position[which[:, 1:]] - centre[:, None]) / STEP_PX, plain) * edges[:, :, None]
+    known = np.all(which[:, 1:] >= 0, axis=1, keepdims=True)
+    sides = (
+        np.where(known[..., None], (found.position[which[:, 1:]] - centre[:, None]) / STEP_PX, plain)
+        * edges[:, :, None]
+    )
     longest = MAX_SIDE * found.length[this, None]
     turn = np.linalg.norm(found.normal[which[:, 1:]] - normal[:, None], axis=2) / STEP_PX * edges  # radians over a side
     length = np.maximum(np.linalg.norm(sides, axis=2), MIN_SIDE_M)
     sag = MAX_SAG * np.linalg.norm(centre - projector_at, axis=1)[:, None]
-    flat = np.sqrt(8 * sag / np.maximum(np.where(known[..., 0], turn, 0) * length, MIN_SIDE_M))
-    sides *= np.minimum(np.minimum(longest / length, flat), 1)[..., None]
+    flat = np.sqrt(4 * sag / np.maximum(np.where(known, turn, 0) * length, MIN_SIDE_M))  # half for each side
+    shrinks = np.minimum(np.minimum(longest / length, flat), 1)
+    sides *= shrinks[..., None]
     ends = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
     corners = centre[:, None] + ends @ sides
-    uv = place[photon][:, None] + ends * edges[:, None]
+    uv = place[photon][:, None] + ends * (edges * shrinks)[:, None]
     four = Landings(*(np.repeat(column[this], 4, axis=0) for column in found))
     triangles = (4 * np.arange(len(this))[:, None, None] + np.array([[0, 1, 3], [0, 3, 2]])).reshape(-1, 3)
     flux = np.repeat(0.5 * found.part[this] * power[photon], 2)
     # The direction of flight is the gradient of the optical length
     further = np.einsum("mij,mj->mi", ends @ sides, found.ior[this, None] * found.direction[this]).ravel()
-    four = four._replace(position=np.float32(corners.reshape(-1, 3)), length=np.float32(four.length + further))
+    moved = np.asarray(corners.reshape(-1, 3), np.float32)
+    four = four._replace(position=moved, length=np.asarray(four.length + further, np.float32))
     return _sheets(four, uv.reshape(-1, 2), triangles, flux, 0.0)
 
 

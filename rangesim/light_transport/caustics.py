@@ -107,7 +107,9 @@ def caustic_light(
     looks = sheets.may_light(shape, active & (~is_later | is_turn))
     weight_of_bright = dr.select(is_later, mi.Float(sheets.every), 1)
     # What the loop only reads is excluded: Dr.Jit traces a loop twice that carries something without changing it
-    while dr.hint(looks, exclude=[si, bsdf, vertex, shape, normal, seen, sample, is_later, place, is_turn, weight_of_bright]):
+    while dr.hint(
+        looks, exclude=[si, bsdf, vertex, shape, normal, seen, sample, is_later, place, is_turn, weight_of_bright]
+    ):
         # ---- The next triangle: each bright one counts, and one of the faint ones stands for all of them -----
         ray, step = sheets.ray(si.p, normal, sample, which, way)
         found = sheets.next(ray, looks)

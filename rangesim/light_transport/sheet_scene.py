@@ -30,8 +30,9 @@ distance would make triangles on curved surfaces too large."""
 STEP = 1e-7
 """Step behind a triangle, as a fraction of the coordinates: the rounding of single precision. With a smaller step, a
 ray could meet the same triangle for ever; a larger one would pass triangles by."""
-MARGIN = 1.01
-"""Ratio of the start of a ray over a surface to the greatest height of a triangle, because both are rounded."""
+MARGIN = 1.4
+"""Ratio of the height from which a ray looks, and the depth to which it does, to those of the edges of triangles: the
+middle of a triangle is 4 / 3 times as far from a curved surface as its edges."""
 PERIOD, EVERY = 16, 4
 """Number of samples after which a pixel has looked into all groups of faint triangles, and the distance of two samples
 that look into one at all. With a longer period, faint light would be noisy in passes of few samples; if every sample
@@ -124,7 +125,9 @@ class SheetScene:
         # Between vertices the length is interpolated with its gradient, which is exact for a quadratic function: the
         # mean of the values at the vertices and of the tangent planes there
         along = np.einsum("ij,ij->i", sheets.slowness, sheets.position - projector_at)
-        looks = np.column_stack([sheets.slowness, sheets.length - 0.5 * along, sheets.u, sheets.v, at_vertex, sheets.cosine])
+        looks = np.column_stack(
+            [sheets.slowness, sheets.length - 0.5 * along, sheets.u, sheets.v, at_vertex, sheets.cosine]
+        )
         self.looks, self.names = mi.Float(aligned(looks, np.float32)), mi.UInt32(aligned(names, np.uint32))
         self.factor, self.offsets = mi.Float(aligned(factor, np.float32)), mi.Float(aligned(offsets, np.float32))
         self.groups, self.every = dr.opaque(mi.UInt32, groups), dr.opaque(mi.UInt32, every)
@@ -161,7 +164,7 @@ class SheetScene:
         offset = dr.gather(mi.Vector2f, self.offsets, group)
         origin = point + mi.Vector3f(normal) * (above - way) + mi.Vector3f(offset.x, offset.y, 0)
         ray = mi.Ray3f(origin, -mi.Vector3f(normal))
-        ray.maxt = above + MAX_SAG * distance - way
+        ray.maxt = above + MARGIN * MAX_SAG * distance - way
         return ray, STEP * (distance + dr.norm(mi.Vector3f(point)) + offset.x + offset.y)
 
     def next(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.camera_rays import PrimaryRay
+from rangesim.light_transport.camera_rays import Device, PrimaryRay
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import Continued
 from rangesim.light_transport.scattering import Medium
@@ -32,8 +32,8 @@ PARTS = 6
 """Largest number of weaker parts that a ray stores in a launch. Light through three panes meets six faces. A part that
 finds no room is dropped by a point of the grid; a photon then follows one of the two parts by chance."""
 LAUNCHES, LAUNCHES_OF_PHOTONS = 3, 2
-"""Largest numbers of launches. In the last one nothing is stored: points of the grid drop weaker parts, and photons choose
-one part by chance. Light that was the weaker part twice carries little."""
+"""Largest numbers of launches. In the last one nothing is stored: points of the grid drop weaker parts, and photons
+choose one part by chance. Light that was the weaker part twice carries little."""
 HASH_STEP = 0x9E3779B1
 """Odd factor of the hash that names chains: 2^32 divided by the golden ratio, rounded to a prime."""
 NORMAL_STEPS = 1000.0
@@ -115,8 +115,8 @@ class SpecularTree:
         primary : PrimaryRay, n rays.
         fewest : fraction of a point's light below which a part is dropped. Photons keep some of these parts by Russian
             roulette, so that none is left out in the mean.
-        random : UInt64, states of the random numbers of photons; None for points of the grid, which drop parts and are stopped by surfaces
-            whose lobes cannot be asked for one by one.
+        random : UInt64, states of the random numbers of photons; None for points of the grid, which drop parts and are
+            stopped by surfaces whose lobes cannot be asked for one by one.
 
         Returns
         -------
@@ -124,6 +124,7 @@ class SpecularTree:
         dropped : (n,) float64, fraction of each point's light in parts that were dropped.
         """
         traced = self.traced
+        assert isinstance(traced.projector, Device)
         n = dr.width(primary.direction)
         one = dr.ones(mi.Float, n)
         state = RayState.start(traced, n).restarted(True, primary.origin, primary.path_offset + dr.zeros(mi.Float, n))
