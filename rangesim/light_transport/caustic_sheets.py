@@ -49,7 +49,7 @@ CAMERA_CELL = 0.5
 is finer."""
 TOLERANCE_PX = 0.15
 """Largest error of the place of a triangle, in pixels of the projector."""
-FAINT = 0.05
+FAINT = 0.02
 """Ratio of the irradiance to direct light below which a triangle is faint. Blocks are not divided for faint light, and
 each sample sees one group of faint triangles alone."""
 SIGNIFICANT = 0.05
@@ -141,7 +141,8 @@ class Chains(NamedTuple):
 class Sheets(NamedTuple):
     """Triangles of light.
 
-    position, direction : (n, 3) float32, vertices: place where light lands, and its direction of flight; world.
+    position, slowness : (n, 3) float32, vertices: place where light lands, and its direction of flight times the
+        refractive index there, which is the gradient of the optical length; world.
     cosine, length, u, v : (n,) float32, vertices: cosine of the direction to the normal (negative from in front),
         optical length in metres, pixel coordinates of the projector.
     normal : (n, 3) float32, geometric normals.
@@ -152,7 +153,7 @@ class Sheets(NamedTuple):
     """
 
     position: np.ndarray
-    direction: np.ndarray
+    slowness: np.ndarray
     cosine: np.ndarray
     length: np.ndarray
     u: np.ndarray
@@ -216,7 +217,7 @@ class _Points:
     def __init__(self, columns: int, coarsest: int) -> None:
         self.columns, self.coarsest = columns, coarsest
         self.table, self.value = np.full(1 << 12, EMPTY, np.int64), np.empty(1 << 12, np.int64)
-        self.numbers, self.dropped = np.empty(0, np.int64), np.empty(0, np.float32)
+        self.numbers, self.dropped = np.empty(0, np.int64), np.empty(0)
         self.landings: list[Landings] = []
 
     def new(self, blocks: Blocks) -> np.ndarray:
@@ -348,7 +349,7 @@ class _Tracing:
         self, pixels: np.ndarray, lens: np.ndarray | None, fewest: float, states: np.ndarray | None = None
     ) -> tuple[Landings, np.ndarray]:
         """Follow the light of points of the image (n, 2), as `SpecularTree.follow`."""
-        found, lost = [_no_landings()], [np.empty(0, np.float32)]
+        found, lost = [_no_landings()], [np.empty(0)]
         for begin in range(0, len(pixels), MAX_AT_ONCE):
             some = slice(begin, begin + MAX_AT_ONCE)
             place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in pixels[some].T))
@@ -364,7 +365,7 @@ class _Tracing:
 def _no_landings() -> Landings:
     """No landing at all."""
     whole, real, vector = np.empty(0, np.uint32), np.empty(0, np.float32), np.empty((0, 3), np.float32)
-    return Landings(whole, whole, whole, real, real, vector, vector, vector)
+    return Landings(whole, whole, whole, real, real, real, vector, vector, vector)
 
 
 def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.ndarray, cut: float) -> Sheets:
@@ -372,7 +373,8 @@ def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.
     cosine = np.einsum("ij,ij->i", landings.direction, landings.normal)
     u, v = np.asarray(uv, np.float32).T
     of = triangles[:, 0]
-    vertices = landings.position, landings.direction, cosine, landings.length, u, v, landings.normal
+    slowness = landings.ior[:, None] * landings.direction
+    vertices = landings.position, slowness, cosine, landings.length, u, v, landings.normal
     return Sheets(*vertices, triangles, flux, landings.shape[of], landings.key[of], cut, 0.0)
 
 
@@ -410,7 +412,9 @@ def _parallelograms(
     four = Landings(*(np.repeat(column[this], 4, axis=0) for column in found))
     triangles = (4 * np.arange(len(this))[:, None, None] + np.array([[0, 1, 3], [0, 3, 2]])).reshape(-1, 3)
     flux = np.repeat(0.5 * found.part[this] * power[photon], 2)
-    four = four._replace(position=corners.reshape(-1, 3).astype(np.float32))
+    # The direction of flight is the gradient of the optical length
+    further = np.einsum("mij,mj->mi", ends @ sides, found.ior[this, None] * found.direction[this]).ravel()
+    four = four._replace(position=np.float32(corners.reshape(-1, 3)), length=np.float32(four.length + further))
     return _sheets(four, uv.reshape(-1, 2), triangles, flux, 0.0)
 
 

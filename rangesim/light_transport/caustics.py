@@ -122,7 +122,7 @@ def caustic_light(
         chosen = chosen.replaced(taken, found)
         counts = (total > 0) & dr.select(which == 0, is_here, ~hit)
         if dr.hint(counts, exclude=[si, bsdf, vertex, seen, is_later, place, is_turn, weight_of_bright]):
-            light = sheets.light(chosen, counts)
+            light = sheets.light(chosen, si.p, counts)
             wo = si.to_local(-light.direction)
             value = bsdf.eval(mi.BSDFContext(), si, wo, counts)
             # Triangles count flux per area, which contains the geometric cosine already; the value of the BSDF contains

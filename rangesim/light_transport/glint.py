@@ -200,7 +200,7 @@ def _sums(
         )
         loop = partial(_paths_to_the_lens, lanes, lens, accumulators)
         state, _ = launches.run(loop, state, len(some), accumulators.pending, lambda state: report())
-        accumulators.store(state.channels, slice(None))
+        accumulators.store(state.channels)
         of_range = slice(first, last)
         nearest[of_range] = state.nearest.numpy().reshape(-1, LANES).min(axis=1)
         total[:, of_range] = _of_halves(state.radiance.numpy())

@@ -80,9 +80,11 @@ class Launches:
         self.launch_s = LAUNCH_S if is_watched or not interrupts.handled else UNWATCHED_LAUNCH_S
         self.units = int(FIRST_UNITS * self.launch_s / LAUNCH_S)
 
-    def evaluate(self, arrays: object, units: int) -> None:
-        """Compute Dr.Jit arrays, wait for them, and learn from the time that these units of work took."""
-        self.learn(units, evaluate(arrays))
+    def evaluate(self, arrays: object, units: int) -> float:
+        """Compute Dr.Jit arrays, wait for them, and learn from the time that these units of work took; returns it."""
+        seconds = evaluate(arrays)
+        self.learn(units, seconds)
+        return seconds
 
     def learn(self, units: int, seconds: float, prepared_s: float = 0.0) -> None:
         """Fit the size of the next launch to the time that these units took, and to the time to make the kernel."""

@@ -88,7 +88,7 @@ def trace_light(
         settings.spp.check(responses)
     traced = TracedScene.of(scene.mitsuba, scene.in_renderer(rigs[0]))
     warn_of_narrow_lobes(traced, [instance.name for instance in scene.instances])
-    views = [_CameraPass(scene, traced, one, settings, number) for number, one in enumerate(rigs)]
+    views = [_CameraPass(scene, traced, one, settings, number, launches) for number, one in enumerate(rigs)]
     sheets = caustic_sheets(traced, [view.rig for view in views], settings, partial(report, 0.0))
     signals = []
     for number, view in enumerate(views):
@@ -106,6 +106,7 @@ class _CameraPass:
     traced : TracedScene with the emitter of the pass; its camera is replaced.
     rig : Rig of this camera.
     number : index of the camera, from 0. Each camera has random numbers of its own.
+    launches : Launches of the path loop.
     """
 
     def __init__(
@@ -115,23 +116,24 @@ class _CameraPass:
         rig: Rig,
         settings: TransportSettings,
         number: int,
+        launches: Launches,
     ) -> None:
         self.zones = ZoneSums(rig, rig.camera.matrix) if isinstance(rig.camera, Zones) else None
         rig = rig.traced
         self.scene, self.rig, self.here = scene, rig, scene.in_renderer(rig)
         self.settings = replace(settings, seed=derived_seed(settings.seed, number)) if number else settings
         self.traced = traced._replace(camera=camera_device(self.here))
-        self.truth, self.guides = ground_truth(scene, self.traced, rig)
         # The indirect light of beams changes from pixel to pixel, because each has a spot of its own
         can_share = rig.camera.has_neighbours and not isinstance(rig.projector, Beam)
         self.is_filtered = settings.indirect == "filtered" and can_share
+        self.truth, self.guides = ground_truth(scene, self.traced, rig, self.is_filtered, launches)
         spp, pixels = settings.spp, rig.camera.height * rig.camera.width
         if isinstance(spp, Sampler):
             self.samples = np.full(pixels, spp.first_spp)
         elif isinstance(spp, int):
             self.samples = np.full(pixels, spp)
         else:
-            is_shared = self.is_filtered & (self.guides.instance.ravel() >= 0)
+            is_shared = np.zeros(pixels, bool) if self.guides is None else self.guides.instance.ravel() >= 0
             self.samples = np.where(is_shared, MATTE_SPP, OTHER_SPP)
 
     def trace(
@@ -155,16 +157,17 @@ class _CameraPass:
         fewest = int(self.samples.min())
         view = View(self.traced, sheet_scene(sheets, self.here, fewest))
         of_paths = PathSettings.of(self.scene, settings)
-        keeps_apart = self.is_filtered
-        if keeps_apart and self.scene.has_matte_textures:
+        if guides is not None and self.scene.has_matte_textures:
             few = min(fewest, TEXTURE_SAMPLES)
             guides = guides.with_reflectance(mean_reflectance(view, of_paths, rig, self.scene.has_cutouts, few))
-        shared = LightFilter(guides) if keeps_apart else None
+        shared = LightFilter(guides) if guides is not None else None
         at_work = partial(report, 0.0)
         sees_glint = settings.glint and not isinstance(rig.projector, Beam)
         glints = trace_glint(self.traced, self.here, responses, settings.seed, at_work) if sees_glint else None
         has_halves = settings.sampling_error and fewest >= MIN_FOR_HALVES
-        estimate = Estimate(view, of_paths, rig, responses, keeps_apart, has_halves, settings.memory_bytes, launches)
+        estimate = Estimate(
+            view, of_paths, rig, responses, self.is_filtered, has_halves, settings.memory_bytes, launches
+        )
 
         def signals_of(some: Sequence[Response] | None) -> StillSignals:
             channels, radiance, error = estimate.means(shared, some)

@@ -34,7 +34,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.accumulators import Accumulators
+from rangesim.light_transport.accumulators import Accumulators, Runs
 from rangesim.light_transport.ambient_light import ambient_on_ray, sampled_ambient, sampled_ambient_through_media
 from rangesim.light_transport.beams import BeamDevice, Pencil, Spot
 from rangesim.light_transport.caustics import Vertex, caustic_light
@@ -81,6 +81,8 @@ class PathSettings(NamedTuple):
     ambient : whether the scene has light of its own.
     samples_ambient : whether directions to that light are sampled. For uniform surroundings, samples of the BSDF alone
         are best.
+    refracts : whether light passes through some surface of the scene, so that the refractive index along a path may
+        change.
     """
 
     seed: Seed
@@ -90,6 +92,7 @@ class PathSettings(NamedTuple):
     glint: bool
     ambient: bool
     samples_ambient: bool
+    refracts: bool
 
     @classmethod
     def of(cls, scene: Scene, settings: TransportSettings) -> PathSettings:
@@ -102,6 +105,7 @@ class PathSettings(NamedTuple):
             glint=settings.glint,
             ambient=scene.has_ambient,
             samples_ambient=scene.has_lamps,
+            refracts=any(mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in scene.mitsuba.shapes()),
         )
 
 
@@ -257,7 +261,7 @@ def trace(
     """
     pixels, runs = accumulators.pixels, _dealt(-(-accumulators.pixels // NEIGHBOURS))
     traced = PathSums(
-        np.empty((len(fields(Radiance)), pixels), np.float32), np.empty((len(fields(Tally)), pixels), np.float32)
+        np.zeros((len(fields(Radiance)), pixels), np.float32), np.zeros((len(fields(Tally)), pixels), np.float32)
     )
     samples = allocation.samples
     total, begin, finished, iterations = int(samples.sum(dtype=np.int64)), 0, 0, 0
@@ -270,23 +274,23 @@ def trace(
         most = max(min_lanes(), int(launches.units / (per_sample * total / pixels))) // NEIGHBOURS
         left = len(runs) - begin
         end = begin + -(-left // -(-left // most))  # launches of even size
-        places = (np.sort(runs[begin:end])[:, None] * NEIGHBOURS + np.arange(NEIGHBOURS)).ravel()
-        places = places[places < pixels]
+        chosen = Runs(np.sort(runs[begin:end]), NEIGHBOURS, pixels)
+        places = chosen.places()
         lanes = Lanes(view, settings, allocation, places)
         loop, state = partial(walk, view, settings, accumulators, lanes), start(view, settings, accumulators, lanes)
         state, taken = launches.run(loop, state, len(places), accumulators.pending, tell)
-        accumulators.store(state.channels, places)
-        _store(state.radiance, traced.radiance, places)
-        _store(state.tally, traced.tally, places)
+        accumulators.store(state.channels, chosen)
+        _store(state.radiance, traced.radiance, chosen)
+        _store(state.tally, traced.tally, chosen)
         begin, finished, iterations = end, finished + int(samples[places].sum(dtype=np.int64)), iterations + taken
     return traced
 
 
-def _store(sums: Radiance[mi.Float] | Tally[mi.Float], images: np.ndarray, places: np.ndarray) -> None:
-    """Write the evaluated sums of lanes to `images` (k, n) at these places; 0 where there are none."""
+def _store(sums: Radiance[mi.Float] | Tally[mi.Float], images: np.ndarray, runs: Runs) -> None:
+    """Write the evaluated sums of lanes to `images` (k, n), which are 0 where there are none."""
     for image, field in zip(images, fields(sums), strict=True):
-        values = getattr(sums, field.name)
-        image[places] = 0 if values is None else values.numpy()
+        if (values := getattr(sums, field.name)) is not None:
+            runs.write(values.numpy(), image)
 
 
 def _dealt(n: int) -> np.ndarray:
@@ -315,7 +319,7 @@ class Lanes:
         self.total = mi.UInt32(aligned(allocation.total[places], np.uint32))
         self.stride = dr.opaque(mi.UInt32, allocation.stride)
         self.first, self.part = (
-            mi.UInt32(aligned(np.broadcast_to(x, len(allocation.pixels))[places], np.uint32))
+            mi.UInt32(aligned(x[places], np.uint32)) if isinstance(x, np.ndarray) else dr.opaque(mi.UInt32, x)
             for x in (allocation.first, allocation.part)
         )
         self.irradiance = dr.opaque(mi.Float, allocation.irradiance)
@@ -342,7 +346,7 @@ class Lanes:
 def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes: Lanes) -> LaneState:
     """The state of lanes that have done nothing yet."""
     n, gathers, in_media = dr.width(lanes.pixel), view.sheets is not None, view.traced.media is not None
-    is_beam = isinstance(view.traced.projector, BeamDevice)
+    is_beam, meets_delta = isinstance(view.traced.projector, BeamDevice), settings.delta or in_media
 
     def zeros(exist: bool = True) -> mi.Float:
         return dr.zeros(mi.Float, n) if exist else None
@@ -356,12 +360,12 @@ def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes:
             origin=dr.zeros(mi.Point3f, n),
             direction=dr.zeros(mi.Vector3f, n),
             throughput=dr.ones(mi.Float, n),
-            ray_state=RayState.start(view.traced, n),
+            ray_state=RayState.start(view.traced, n, settings.refracts),
             is_first=dr.full(mi.Bool, True, n),
-            via_delta=dr.full(mi.Bool, False, n),
-            left_delta=dr.full(mi.Bool, False, n),
-            unsampled=dr.full(mi.Bool, True, n),
-            pdf=dr.zeros(mi.Float, n),
+            via_delta=dr.full(mi.Bool, False, n) if meets_delta else None,
+            left_delta=dr.full(mi.Bool, False, n) if meets_delta else None,
+            unsampled=dr.full(mi.Bool, True, n) if settings.ambient else None,
+            pdf=zeros(settings.ambient),
             events=dr.zeros(mi.UInt32, n) if in_media else None,
             scattered_inside=dr.full(mi.Bool, False, n) if in_media else None,
             spot=Spot.none(n) if is_beam and not in_media else None,
@@ -371,7 +375,7 @@ def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes:
         radiance=Radiance(
             direct=zeros(),
             multipath=zeros(),
-            specular=zeros(),
+            specular=zeros(meets_delta),
             caustic=zeros(gathers),
             ambient=zeros(settings.ambient),
             smooth_caustic=zeros(gathers),
@@ -403,7 +407,7 @@ def walk(
     n = dr.width(state.sample)
     is_beam = isinstance(projector, BeamDevice)
     has_spot, has_pencil = state.path.spot is not None, state.path.pencil is not None
-    sees_glint = state.radiance.glint is not None
+    sees_glint, meets_delta = state.radiance.glint is not None, state.path.left_delta is not None
     flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if has_pencil else mi.RayFlags.All
     left = max_iterations + dr.zeros(mi.UInt32, n)  # iterations
     active = (state.sample < lanes.samples) & (left > 0)
@@ -444,7 +448,8 @@ def walk(
         si = surfaces.ray_intersect(ray, flags, coherent=False, active=active)
         hit = si.is_valid() & active
         met = mi.Point3f(si.p)
-        si.p = dr.select(path.left_delta, corrected_point(si, path.ray_state.previous, ray.d), met)
+        if dr.hint(meets_delta, mode="scalar"):
+            si.p = dr.select(path.left_delta, corrected_point(si, path.ray_state.previous, ray.d), met)
         if dr.hint(media is not None, mode="scalar"):
             assert media is not None
             assert path.ray_state.inside is not None
@@ -477,7 +482,8 @@ def walk(
             facing = dr.select(scatters, ray.d, si.n)
             path.pencil = path.pencil.arrived(ray.d, dr.norm(si.p - path.ray_state.previous), facing)
         bsdf = si.bsdf(ray)
-        is_vertex = hit & (path.depth < settings.max_depth) & (scatters | can_be_vertex(bsdf))
+        is_rough = can_be_vertex(bsdf)
+        is_vertex = hit & (path.depth < settings.max_depth) & (scatters | is_rough)
 
         # ---- The ray meets the emitter of its own beam ------------------------------------------------
         if dr.hint(sees_glint, mode="scalar"):
@@ -505,7 +511,7 @@ def walk(
         is_connected = owner(is_vertex, delta_interactions=0).next_event
         if dr.hint(is_beam, mode="scalar"):
             # The boundaries of media, which nothing bends at, may lie between a mirror and the vertex
-            via_delta = path.chain > 0 if settings.delta else path.left_delta
+            via_delta = path.chain > 0 if settings.delta else mi.Bool(False) if media is None else path.left_delta
             is_connected &= beam_connects((path.depth == 1) & is_own, via_delta, has_spot)
         link = projector.connect(scene, si, is_connected, lanes.pixel, media, path.ray_state.inside)
         if dr.hint(has_pencil, mode="scalar"):
@@ -534,11 +540,12 @@ def walk(
         u, v, path_length = (
             dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, path.ray_state.length + link.distance)
         )
-        kind = next_event_kind(path.is_first, path.via_delta)
+        kind = next_event_kind(path.is_first, path.via_delta if meets_delta else mi.Bool(False))
         light_path = LightPath(u, v, path_length, path.is_first, kind, link.blur_px)
         state.channels = accumulators.add(state.channels, light_path, light, lanes.place, link.lit, kind == MULTIPATH)
         radiance.direct += dr.select(kind == DIRECT, light, 0)
-        radiance.specular += dr.select(kind == SPECULAR, light, 0)
+        if dr.hint(meets_delta, mode="scalar"):
+            radiance.specular += dr.select(kind == SPECULAR, light, 0)
         radiance.multipath += dr.select(kind == MULTIPATH, light, 0)
         tally.indirect += dr.select(is_later, light, 0)
 
@@ -605,11 +612,12 @@ def walk(
             path.pencil = path.pencil.replaced(bends, turned)
         path.throughput *= bs_weight
         path.ray_state = path.ray_state.refracted(bs, at_surface)
-        path.left_delta = goes_delta & ~crosses
+        if dr.hint(meets_delta, mode="scalar"):
+            path.left_delta = goes_delta & ~crosses
         if dr.hint(settings.delta, mode="scalar"):
             path.depth -= dr.select(path.left_delta, mi.UInt32(1), mi.UInt32(0))
             path.chain = dr.select(crosses, path.chain, dr.select(path.left_delta, path.chain + 1, 0))
-        fraction = path.throughput * dr.square(path.ray_state.ior)  # this fraction of the light is left on the path
+        fraction = path.ray_state.power(path.throughput)  # this fraction of the light is left on the path
         chance = dr.select(path.depth > settings.rr_depth, dr.minimum(fraction, 0.95), 1)
         if dr.hint(settings.delta, mode="scalar"):
             chance = dr.minimum(chance, survival(path.chain, fraction))
@@ -622,13 +630,15 @@ def walk(
         if dr.hint(cutouts is not None, mode="scalar"):
             assert cutouts is not None
             passes = cutouts.passed(si, bs, at_surface)
-        path.is_first &= ~scatters & (passes | ~can_be_vertex(bsdf))
-        path.via_delta |= goes_delta & ~passes
+        path.is_first &= ~scatters & (passes | ~is_rough)
         path.ray_state = path.ray_state.restarted(True, si.p, path.ray_state.length)
-        path.pdf = mi.Float(bs.pdf)
-        path.unsampled = goes_delta | scatters
+        if dr.hint(settings.ambient, mode="scalar"):
+            path.pdf = mi.Float(bs.pdf)
+            path.unsampled = goes_delta | scatters
         ray = si.spawn_ray(wo)
-        ray.o = dr.select(path.left_delta, spawn_specular_ray(si, met, wo).o, ray.o)
+        if dr.hint(meets_delta, mode="scalar"):
+            path.via_delta |= goes_delta & ~passes
+            ray.o = dr.select(path.left_delta, spawn_specular_ray(si, met, wo).o, ray.o)
         if dr.hint(media is not None, mode="scalar"):
             path.events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))
             path.scattered_inside = scatters | (path.scattered_inside & ~crosses)
@@ -643,7 +653,7 @@ def walk(
         goes_on &= hit & survives & (path.throughput > 0)
         if dr.hint(settings.delta, mode="scalar"):
             too_long = goes_on & (path.chain >= MAX_CHAIN)
-            tally.cut += dr.select(too_long, path.throughput * dr.square(path.ray_state.ior), 0)
+            tally.cut += dr.select(too_long, path.ray_state.power(path.throughput), 0)
             goes_on &= path.chain < MAX_CHAIN
         ends = ~goes_on
         state.sample = dr.select(ends, state.sample + 1, state.sample)
@@ -653,9 +663,11 @@ def walk(
         path.throughput = dr.select(ends, 1, path.throughput)
         path.ray_state = path.ray_state.reset(traced, ends)
         path.is_first |= ends
-        path.via_delta &= ~ends
-        path.unsampled |= ends
-        path.left_delta &= ~ends
+        if dr.hint(meets_delta, mode="scalar"):
+            path.via_delta &= ~ends
+            path.left_delta &= ~ends
+        if dr.hint(settings.ambient, mode="scalar"):
+            path.unsampled |= ends
         if dr.hint(media is not None, mode="scalar"):
             path.events = dr.select(ends, 0, path.events)
             path.scattered_inside &= ~ends

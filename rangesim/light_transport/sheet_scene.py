@@ -121,7 +121,10 @@ class SheetScene:
         parameters["faces"] = mi.UInt32(aligned(np.arange(len(corners)), np.uint32))
         parameters.update()
         self.scene = mi.load_dict({"type": "scene", "light": mesh})
-        looks = np.column_stack([sheets.direction, sheets.length, sheets.u, sheets.v, at_vertex, sheets.cosine])
+        # Between vertices the length is interpolated with its gradient, which is exact for a quadratic function: the
+        # mean of the values at the vertices and of the tangent planes there
+        along = np.einsum("ij,ij->i", sheets.slowness, sheets.position - projector_at)
+        looks = np.column_stack([sheets.slowness, sheets.length - 0.5 * along, sheets.u, sheets.v, at_vertex, sheets.cosine])
         self.looks, self.names = mi.Float(aligned(looks, np.float32)), mi.UInt32(aligned(names, np.uint32))
         self.factor, self.offsets = mi.Float(aligned(factor, np.float32)), mi.Float(aligned(offsets, np.float32))
         self.groups, self.every = dr.opaque(mi.UInt32, groups), dr.opaque(mi.UInt32, every)
@@ -177,16 +180,17 @@ class SheetScene:
             total += weight * dr.gather(mi.Float, self.looks, 8 * index + 6, is_here)
         direction = dr.gather(mi.Vector4f, self.looks, 2 * names.x, is_here).xyz
         cosine = dr.gather(mi.Float, self.looks, 8 * names.x + 7, is_here)
-        is_here &= dr.abs(dr.dot(direction, normal) - cosine) < MAX_COSINE_DIFFERENCE
+        is_here &= dr.abs(dr.dot(dr.normalize(direction), normal) - cosine) < MAX_COSINE_DIFFERENCE
         total *= dr.gather(mi.Float, self.factor, found.prim_index, is_here)
         return dr.select(is_here, total, 0), is_here & (total > 0)
 
-    def light(self, place: Place, active: mi.Bool) -> Light:
-        """The light of a triangle at a place."""
+    def light(self, place: Place, point: mi.Point3f, active: mi.Bool) -> Light:
+        """The light of a triangle at a place, which is `point` in the world."""
         names = dr.gather(mi.Vector4u, self.names, place.triangle, active)
         weights = (1 - place.b1 - place.b2, place.b1, place.b2)
         first, second = mi.Vector4f(0), mi.Vector4f(0)
         for index, weight in zip((names.x, names.y, names.z), weights, strict=True):
             first += weight * dr.gather(mi.Vector4f, self.looks, 2 * index, active)
             second += weight * dr.gather(mi.Vector4f, self.looks, 2 * index + 1, active)
-        return Light(dr.normalize(first.xyz), second.x, second.y, first.w, second.w)
+        length = first.w + 0.5 * dr.dot(first.xyz, mi.Vector3f(point) - self.projector_at)
+        return Light(dr.normalize(first.xyz), second.x, second.y, length, second.w)

@@ -74,6 +74,7 @@ class Landings(NamedTuple):
     shape : (m,) uint32, number of that shape (`surfaces.number_of`).
     part : (m,) float32, fraction of the light of the point.
     length : (m,) float32, metres, optical length.
+    ior : (m,) float32, refractive index in front of the surface.
     position, normal, direction : (m, 3) float32, world; metres, geometric normal, and direction of flight.
     """
 
@@ -82,6 +83,7 @@ class Landings(NamedTuple):
     shape: np.ndarray
     part: np.ndarray
     length: np.ndarray
+    ior: np.ndarray
     position: np.ndarray
     normal: np.ndarray
     direction: np.ndarray
@@ -119,7 +121,7 @@ class SpecularTree:
         Returns
         -------
         landings : Landings.
-        dropped : (n,) float32, fraction of each point's light in parts that were dropped.
+        dropped : (n,) float64, fraction of each point's light in parts that were dropped.
         """
         traced = self.traced
         n = dr.width(primary.direction)
@@ -135,7 +137,7 @@ class SpecularTree:
         # All parts share an increment; their states differ
         chance = None if random is None else Continued(mi.PCG32(1))
         self.fewest = dr.opaque(mi.Float, fewest)
-        dropped, found = dr.zeros(mi.Float, n), []
+        dropped, found = np.zeros(n), []
         launches = LAUNCHES if random is None else LAUNCHES_OF_PHOTONS
         for left in reversed(range(launches)):
             self.room = dr.opaque(mi.UInt32, PARTS if left else 0)
@@ -145,8 +147,8 @@ class SpecularTree:
             lanes = dr.width(parts.part)
             stored = _Stored(leaves, lanes)
             landing, lost = _strongest(self, parts, stored, chance)
-            dr.scatter_add(dropped, lost, parts.point, mode=dr.ReduceMode.Direct)
-            self.launches.evaluate([list(landing), stored.leaves, dropped], lanes)
+            self.launches.evaluate([list(landing), stored.leaves, lost], lanes)
+            dropped += np.bincount(parts.point.numpy(), lost.numpy(), n)  # in the same order on any machine
             landed = dr.compress(landing.part > 0)
             columns = [dr.gather(type(x), x, landed) for x in (parts.point, *_leaves(landing))]
             dr.eval(columns)
@@ -156,8 +158,8 @@ class SpecularTree:
                 break
             parts = _rebuilt(parts, [dr.gather(type(x), x, rest) for x in stored.leaves])
         numbers = [np.concatenate(column) for column in zip(*found, strict=True)]
-        vectors = [np.column_stack(numbers[k : k + 3]) for k in (5, 8, 11)]
-        return Landings(*numbers[:5], *vectors), dropped.numpy()
+        vectors = [np.column_stack(numbers[k : k + 3]) for k in (6, 9, 12)]
+        return Landings(*numbers[:6], *vectors), dropped
 
 
 class _Landing(NamedTuple):
@@ -167,6 +169,7 @@ class _Landing(NamedTuple):
     shape: mi.UInt32
     part: mi.Float
     length: mi.Float
+    ior: mi.Float
     position: mi.Point3f
     normal: mi.Vector3f
     direction: mi.Vector3f
@@ -224,7 +227,7 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
     number = dr.zeros(mi.UInt32, n)  # of parts stored
     lost, left = dr.zeros(mi.Float, n), tree.max_chain + dr.zeros(mi.UInt32, n)
     none, vector = dr.zeros(mi.UInt32, n), dr.zeros(mi.Vector3f, n)
-    landing = [none, mi.UInt32(none), dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.zeros(mi.Point3f, n), vector,
+    landing = [none, mi.UInt32(none), *(dr.zeros(mi.Float, n) for _ in range(3)), dr.zeros(mi.Point3f, n), vector,
                mi.Vector3f(vector)]  # fmt: skip
     active = part > 0
     while active:
@@ -244,7 +247,7 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
 
         # ---- Light that the surface scatters lands here ------------------------------------------------
         lands = hit & can_be_vertex(bsdf) & (chain > 0)
-        here = [(key ^ shape) * HASH_STEP, shape, part, state.length, point, mi.Vector3f(si.n), ray.d]
+        here = [(key ^ shape) * HASH_STEP, shape, part, state.length, state.ior, point, mi.Vector3f(si.n), ray.d]
         landing = _selected(lands, here, landing)
 
         # ---- The rest splits into a reflected and a refracted part -------------------------------------
