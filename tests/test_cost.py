@@ -125,6 +125,18 @@ def test_an_estimate_writes_nothing(
     assert "expected --out DIRECTORY" in err
 
 
+def test_no_caustics_reaches_the_experiment(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It makes the run of a scene with glass cheaper."""
+    small = ("tabletop", "--width", "64", "--height", "48", "--spp", "4", "--estimate")
+    (_, with_them, _), (_, without, _) = (
+        command(capsys, monkeypatch, *small, *more) for more in ((), ("--no-caustics",))
+    )
+    assert with_them != without
+    assert with_them.split(",")[0] == without.split(",")[0]
+
+
 def test_sizes_without_measure_are_one_sentence_at_once(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
