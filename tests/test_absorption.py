@@ -156,7 +156,7 @@ def test_light_keeps_its_way_and_length_and_loses_by_the_way_inside() -> None:
     places = [(one.position[one.triangles[i]], one.length[one.triangles[i]]) for one, i in ((clear, a), (dim, b))]
     np.testing.assert_array_equal(*(position for position, _ in places))
     np.testing.assert_array_equal(*(length for _, length in places))
-    cosine = clear.direction[clear.triangles[a], 2].astype(float)
+    cosine = clear.slowness[clear.triangles[a], 2].astype(float)
     inside = np.sqrt(1 - (1 - cosine**2) / 1.5**2)
     passes = (places[0][1] - (1.0 - D) / cosine) / (1.5 * D / inside)
     np.testing.assert_allclose(passes, np.round(passes), atol=1e-3)

@@ -66,7 +66,7 @@ def test_light_behind_a_slab_lands_where_snell_s_law_puts_it() -> None:
                 sheets.length,
                 *sheets.position[:, :2].T,
                 sheets.cosine,
-                sheets.direction[:, 2],
+                sheets.slowness[:, 2],
             )
         )
         tangent = np.linalg.norm(PROJECTOR.normalise(np.column_stack([u, v])), axis=1)
