@@ -68,6 +68,9 @@ ITERATIONS_PER_SAMPLE = 2
 """Number of iterations of the loop per sample that is assumed before any were counted. It need not be exact, because
 only the size of the first launch depends on it; the size of later ones depends on the count."""
 
+TURNS = 1 << 16
+"""Number of different starts in the order in which pixels look for faint triangles; any large number would do."""
+
 Array = TypeVar("Array")
 
 
@@ -342,6 +345,12 @@ class Lanes:
         """
         return mi.sample_tea_float32(dr.reinterpret_array(mi.UInt32, self.shift.x), number)
 
+    def turn(self, number: mi.UInt32) -> mi.UInt32:
+        """Number of a sample among those of its half of the pixel, after a start that differs from pixel to pixel; it
+        decides which faint triangles of light the sample looks for."""
+        in_half = ((number >> 2) << 1) + (number & 1)  # pairs of samples belong to the halves in turn
+        return in_half + (dr.reinterpret_array(mi.UInt32, self.shift.y) >> 4) % TURNS
+
 
 def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes: Lanes) -> LaneState:
     """The state of lanes that have done nothing yet."""
@@ -574,7 +583,7 @@ def walk(
                 accumulators,
                 state.channels,
                 vertex,
-                number,
+                lanes.turn(number),
                 lanes.pick(number),
                 is_later,
                 lanes.place,
