@@ -27,8 +27,8 @@ from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.camera_rays import Device
+from rangesim.light_transport.delta_surfaces import meets_delta
 from rangesim.light_transport.kernel_launches import Launches, min_lanes
-from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.sampling import Continued, Seed, aligned, of_part, random_stream, stratified
 from rangesim.light_transport.scattering import bounded
 from rangesim.light_transport.spectrum import mono

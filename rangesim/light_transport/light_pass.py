@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from rangesim.light_transport.caustics import caustic_maps, caustic_photons
+from rangesim.light_transport.caustic_sheets import Sheets
+from rangesim.light_transport.caustics import caustic_sheets, sheet_scene
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
 from rangesim.light_transport.indirect_filter import LightFilter
 from rangesim.light_transport.kernel_launches import Launches, Progress, Report, raised_as_it_is, report_part
 from rangesim.light_transport.loop import PathSettings, Radiance, View
 from rangesim.light_transport.narrow_lobes import warn_of_narrow_lobes
-from rangesim.light_transport.photons import Photons
 from rangesim.light_transport.ray_tables import camera_device
 from rangesim.light_transport.samples_per_pixel import Sampler
 from rangesim.light_transport.sampling_error import MIN_FOR_HALVES, Estimate
@@ -70,7 +70,7 @@ def trace_light(
 
     Parameters
     ----------
-    rigs : rigs with the same emitter and different cameras. The photons are traced once for all cameras.
+    rigs : rigs with the same emitter and different cameras. The triangles of caustics are made once for all cameras.
     sensors : sensors, or bare responses. Equal responses share their channels.
     settings : TransportSettings. spp "auto" means `MATTE_SPP` samples where pixels share their indirect light, and
         `OTHER_SPP` elsewhere.
@@ -89,14 +89,11 @@ def trace_light(
     traced = TracedScene.of(scene.mitsuba, scene.in_renderer(rigs[0]))
     warn_of_narrow_lobes(traced, [instance.name for instance in scene.instances])
     views = [_CameraPass(scene, traced, one, settings, number, launches) for number, one in enumerate(rigs)]
-    fewest = min(int(view.samples.min()) for view in views)
-    at_work = partial(report, 0.0)
-    pixels = max(len(view.samples) for view in views)
-    photons = caustic_photons(traced, rigs[0], settings, pixels, fewest, at_work)
+    sheets = caustic_sheets(traced, [view.rig for view in views], settings, partial(report, 0.0))
     signals = []
     for number, view in enumerate(views):
         part = partial(report_part, report, number / len(views), 1 / len(views))
-        signals.append(view.trace(responses, photons, launches, part))
+        signals.append(view.trace(responses, sheets, launches, part))
     return signals
 
 
@@ -142,7 +139,7 @@ class _CameraPass:
     def trace(
         self,
         responses: Sequence[Response],
-        photons: Photons | None,
+        sheets: Sheets | None,
         launches: Launches,
         report: Report,
     ) -> StillSignals:
@@ -151,15 +148,15 @@ class _CameraPass:
         Parameters
         ----------
         responses : responses whose channels are accumulated.
-        photons : Photons of the emitter; None: there are none.
+        sheets : Sheets of the emitter; None: there are none.
         launches : size of the kernel launches.
         report : function that is called with the fraction of this camera's work that is done, 0..1.
         """
         settings, rig, guides = self.settings, self.rig, self.guides
         sampler = settings.spp if isinstance(settings.spp, Sampler) else None
         fewest = int(self.samples.min())
-        maps = caustic_maps(photons, self.here, settings.caustic_radius_m)
-        view, of_paths = View(self.traced, maps), PathSettings.of(self.scene, settings)
+        view = View(self.traced, sheet_scene(sheets, self.here, fewest))
+        of_paths = PathSettings.of(self.scene, settings)
         if guides is not None and self.scene.has_matte_textures:
             few = min(fewest, TEXTURE_SAMPLES)
             guides = guides.with_reflectance(mean_reflectance(view, of_paths, rig, self.scene.has_cutouts, few))
@@ -191,7 +188,7 @@ class _CameraPass:
                 estimate.sample(pixels, more[pixels], partial(report_part, report, PATHS_FRACTION - left, left))
         signals = signals_of(None)
         report(1.0)
-        cut = photons.energy.cut if photons else 0.0
+        cut = sheets.cut if sheets else 0.0
         truncation = estimate_truncation(estimate.mean_tally(), signals.energy, settings.max_depth, cut)
         signals = replace(signals, truncation=truncation)
         return signals if self.zones is None else self.zones.signals(signals)

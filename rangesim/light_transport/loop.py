@@ -20,7 +20,7 @@ that absorbs, a segment of length d keeps the fraction exp(-sigma_a d) of the li
 (`rangesim.light_transport.absorption`).
 
 The loop carries out two of the three strategies that bring the projector's light to the camera: next-event estimation,
-and the gathering of caustic photons. `rangesim.light_transport.strategies` says which paths belong to which strategy.
+and caustics. `rangesim.light_transport.strategies` says which paths belong to which strategy.
 """
 
 from __future__ import annotations
@@ -37,21 +37,19 @@ import numpy as np
 from rangesim.light_transport.accumulators import Accumulators, Runs
 from rangesim.light_transport.ambient_light import ambient_on_ray, sampled_ambient, sampled_ambient_through_media
 from rangesim.light_transport.beams import BeamDevice, Pencil, Spot
-from rangesim.light_transport.caustics import Vertex, caustic_light, gather
+from rangesim.light_transport.caustics import Vertex, caustic_light
+from rangesim.light_transport.delta_surfaces import has_delta
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
-from rangesim.light_transport.photon_maps import PhotonMaps
-from rangesim.light_transport.photons import has_delta
 from rangesim.light_transport.sampling import (
-    GOLDEN_STEP,
     Continued,
     Seed,
-    Stream,
     aligned,
     in_pairs,
     of_part,
     random_stream,
 )
 from rangesim.light_transport.scattering import MAX_EVENTS, ROULETTE_BELOW
+from rangesim.light_transport.sheet_scene import SheetScene
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray, survival
 from rangesim.light_transport.spots import connect_to_spot, lit_spot
@@ -164,7 +162,7 @@ class Radiance(Generic[Array]):
     caustic: Array
     ambient: Array
     smooth_caustic: Array
-    """Caustics that were gathered over wide circles and are therefore smooth; `caustic` has the others."""
+    """Caustics at later vertices of a path, which change slowly over the image; `caustic` has those at the first."""
     glint: Array
     """Glint of a beam, whose emitter the paths of its own pixel meet; that of a projector is traced in `glint.py`."""
 
@@ -178,22 +176,6 @@ class PathSums(NamedTuple):
 
     radiance: np.ndarray
     tally: np.ndarray
-
-
-@dataclass
-class RandomStates:
-    """States of the random numbers of the lanes.
-
-    path : UInt64, of the stream that makes the light path.
-    photon : UInt64, of the stream that chooses photons. It is a stream of its own, so that photons change no byte of
-        any other light. None without photon maps.
-    level : UInt32, a fraction of 2^32 that decides which levels of photons are gathered. 16 neighbours start with the
-        same fraction, so that they skip a level together. None without photon maps.
-    """
-
-    path: mi.UInt64
-    photon: mi.UInt64
-    level: mi.UInt32
 
 
 @dataclass
@@ -247,7 +229,7 @@ class LaneState:
     """
 
     sample: mi.UInt32
-    random: RandomStates
+    random: mi.UInt64
     path: PathState
     channels: list[list[mi.Float]]
     radiance: Radiance[mi.Float]
@@ -255,10 +237,10 @@ class LaneState:
 
 
 class View(NamedTuple):
-    """Everything that the lanes read: the scene with its devices, and the photon maps (None: no photons)."""
+    """Everything that the lanes read: the scene with its devices, and the triangles of light (None: there are none)."""
 
     traced: TracedScene
-    maps: PhotonMaps | None = None
+    sheets: SheetScene | None = None
 
 
 def trace(
@@ -348,29 +330,30 @@ class Lanes:
         on_lens = view.traced.camera.has_lens
         self.lens_shift = mi.Point2f(rng.next_float32(), rng.next_float32()) if on_lens else None
         self.random = Continued(of_part(rng, self.part))
-        self.photon = Continued(of_part(random_stream(settings.seed, self.pixel, Stream.SECOND), self.part))
 
     def number(self, taken: mi.UInt32) -> mi.UInt32:
         """Number of the next sample among all samples of its pixel, after `taken` of the allocated ones."""
         return self.first + (taken >> 1) * self.stride + (taken & 1)
 
+    def pick(self, number: mi.UInt32) -> mi.Float:
+        """A uniform number in 0..1 for a sample of this number, apart from the random numbers of its path.
+
+        It depends on the pixel and the seed, as the shift does.
+        """
+        return mi.sample_tea_float32(dr.reinterpret_array(mi.UInt32, self.shift.x), number)
+
 
 def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes: Lanes) -> LaneState:
     """The state of lanes that have done nothing yet."""
-    n, gathers, in_media = dr.width(lanes.pixel), view.maps is not None, view.traced.media is not None
+    n, gathers, in_media = dr.width(lanes.pixel), view.sheets is not None, view.traced.media is not None
     is_beam, meets_delta = isinstance(view.traced.projector, BeamDevice), settings.delta or in_media
 
     def zeros(exist: bool = True) -> mi.Float:
         return dr.zeros(mi.Float, n) if exist else None
 
-    level = of_part(random_stream(settings.seed, lanes.pixel >> 4, Stream.THIRD), lanes.part).next_uint32()
     return LaneState(
         sample=dr.zeros(mi.UInt32, n),
-        random=RandomStates(
-            path=mi.UInt64(lanes.random.rng.state),
-            photon=mi.UInt64(lanes.photon.rng.state) if gathers else None,
-            level=level if gathers else None,
-        ),
+        random=mi.UInt64(lanes.random.rng.state),
         path=PathState(
             depth=dr.zeros(mi.UInt32, n),
             chain=dr.zeros(mi.UInt32, n) if settings.delta else None,
@@ -419,7 +402,7 @@ def walk(
     max_iterations: mi.UInt32,
 ) -> tuple[LaneState, mi.UInt32]:
     """The state of the lanes after at most `max_iterations` of the loop, and the number of iterations of each lane."""
-    traced, maps = view
+    traced, sheets = view
     scene, surfaces, camera, projector, media, cutouts, absorbers = traced
     n = dr.width(state.sample)
     is_beam = isinstance(projector, BeamDevice)
@@ -431,7 +414,7 @@ def walk(
 
     while active:
         path, radiance, tally = state.path, state.radiance, state.tally  # parts of the state, changed in place
-        rng = lanes.random.at(state.random.path)
+        rng = lanes.random.at(state.random)
         # In this iteration: an event inside a medium, or the boundary of one
         scatters, crosses = mi.Bool(False), mi.Bool(False)
 
@@ -583,18 +566,22 @@ def walk(
             radiance.multipath += light
             tally.indirect += light
 
-        # ---- Caustic photons: light that reached this point through glass or off mirrors -------------
-        if dr.hint(maps is not None, mode="scalar"):
+        # ---- Caustics: light that reached this point through glass or off mirrors --------------------
+        if dr.hint(sheets is not None, mode="scalar"):
             vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, path.is_first & ~link.lit)
-            chosen = lanes.photon.at(state.random.photon)
-            xi = [chosen.next_float32() for _ in range(3)]
-            state.random.photon = chosen.state
-            state.random.level += GOLDEN_STEP
-            chance = mi.Float(state.random.level >> 8) * 2**-24
-            brought = gather(maps, vertex, number, xi, chance, is_vertex & ~scatters)
-            state.channels, light = caustic_light(maps, accumulators, state.channels, vertex, brought, lanes.place)
-            radiance.caustic += dr.select(brought.is_wide, 0, light)
-            radiance.smooth_caustic += dr.select(brought.is_wide, light, 0)
+            state.channels, light = caustic_light(
+                sheets,
+                accumulators,
+                state.channels,
+                vertex,
+                number,
+                lanes.pick(number),
+                is_later,
+                lanes.place,
+                is_vertex & ~scatters,
+            )
+            radiance.caustic += dr.select(is_later, 0, light)
+            radiance.smooth_caustic += dr.select(is_later, light, 0)
             tally.indirect += dr.select(is_later, light, 0)
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
@@ -684,7 +671,7 @@ def walk(
         if dr.hint(media is not None, mode="scalar"):
             path.events = dr.select(ends, 0, path.events)
             path.scattered_inside &= ~ends
-        state.random.path, path.origin, path.direction = rng.state, ray.o, ray.d
+        state.random, path.origin, path.direction = rng.state, ray.o, ray.d
         left -= 1
         active = (state.sample < lanes.samples) & (left > 0)
 

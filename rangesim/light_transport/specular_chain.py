@@ -2,7 +2,7 @@
 """Specular chains: light on its way through glass, off mirrors, through thin panes, coats and holes.
 
 Delta interactions scatter nothing, so they do not count towards `max_depth`. They have a limit of their own, a number
-of surfaces in a row. Photons, camera paths and glint share the limit, and walk with the same `RayState`.
+of surfaces in a row. The light of caustics, camera paths and glint share the limit, and walk with the same `RayState`.
 
 Mitsuba's `spawn_ray` starts rays a little off a surface, along its normal: about 0.1 mm at 1 m. So an oblique ray runs
 beside its true line, at a distance of a twentieth of a projector pixel or more, and mirrors and glass pass the error
