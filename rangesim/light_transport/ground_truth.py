@@ -49,27 +49,19 @@ def ground_truth(
 
     def image(name: str) -> np.ndarray:
         """A field of the surfaces as an image, (h, w) or (h, w, components)."""
-        column = np.concatenate([np.asarray(getattr(part, name).numpy()) for part in parts], axis=-1)
-        if column.ndim == 1:
-            return column.reshape(h, w)
-        return np.ascontiguousarray(np.moveaxis(column.reshape(-1, h, w), 0, -1))
+        values = [getattr(part, name) for part in parts]
+        components = values[0].shape[:-1]
+        return np.concatenate([dr.ravel(value).numpy() for value in values]).reshape(h, w, *components)
 
-    hit = image("hit")
-
-    def where_hit(name: str) -> np.ndarray:
-        """The same as `image`, but NaN in pixels that see no surface."""
-        values = image(name)
-        return np.where(hit if values.ndim == 2 else hit[..., None], values, np.float32(np.nan))
-
-    instance = np.where(hit, image("index"), -1).astype(np.int32)
+    instance = image("index")
     materials = np.array([MATERIAL_CLASSES.index(i.material) for i in scene.instances], dtype=np.int32)
     truth = GroundTruth(
-        z=where_hit("z"),
-        range_m=where_hit("range_m"),
-        normal=where_hit("normal"),
+        z=image("z"),
+        range_m=image("range_m"),
+        normal=image("normal"),
         instance=instance,
         material=np.where(instance >= 0, materials[instance], -1).astype(np.int32),
-        projector_uv=where_hit("uv"),
+        projector_uv=image("uv"),
         projector_visible=image("visible"),
         instance_names=tuple(i.name for i in scene.instances),
         material_names=MATERIAL_CLASSES,
@@ -115,8 +107,8 @@ class FirstSurfaces:
     """The first surface behind the centre of each of n pixels. It is a dataclass, because Dr.Jit does not evaluate
     named tuples.
 
-    hit : Bool, whether there is such a surface. The other fields are valid only there.
-    index : Int32, index of its shape in the scene.
+    index : Int32, index of its shape in the scene; -1 if there is no such surface, in which case z, range_m, uv and
+        normal are NaN, and the other fields mean nothing.
     z, range_m : Float, metres, depth, and distance from the camera.
     visible : Bool, whether the projector lights the side that the camera sees.
     uv : Point2f, projector pixel coordinates.
@@ -126,7 +118,6 @@ class FirstSurfaces:
     reflectance : Float, diffuse reflectance.
     """
 
-    hit: mi.Bool
     index: mi.Int32
     z: mi.Float
     range_m: mi.Float
@@ -162,13 +153,12 @@ def _first_surfaces(
     shape = number_of(si.shape)
     through = dr.gather(mi.Bool, transmits_of, shape, hit)
     return FirstSurfaces(
-        hit=hit,
-        index=dr.gather(mi.Int32, index_of, shape, hit),
-        z=dr.dot(mi.Vector3f(si.p) - camera.centre, camera.z),
-        range_m=dr.norm(to_camera),
+        index=dr.select(hit, dr.gather(mi.Int32, index_of, shape, hit), -1),
+        z=dr.select(hit, dr.dot(mi.Vector3f(si.p) - camera.centre, camera.z), dr.nan),
+        range_m=dr.select(hit, dr.norm(to_camera), dr.nan),
         visible=link.lit & (through | (dr.dot(normal, link.direction) > 0)),
-        uv=link.uv,
-        normal=mi.Vector3f(normal),
+        uv=dr.select(hit, link.uv, dr.nan),
+        normal=mi.Vector3f(dr.select(hit, normal, dr.nan)),
         position=-to_camera if has_guides else None,
         shading_normal=mi.Vector3f(dr.normalize(si.sh_frame.n)) if has_guides else None,
         reflectance=mono(si.bsdf().eval_diffuse_reflectance(si, hit)) if has_guides else None,

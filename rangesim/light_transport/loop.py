@@ -501,7 +501,7 @@ def walk(
             seen = projector.glint(ray, lanes.pixel, si, comes_back)
             light = dr.select(seen.meets, path.throughput * seen.radiance * lanes.irradiance, 0)
             u, v = (dr.select(seen.meets, x, 0) for x in (seen.uv.x, seen.uv.y))
-            path_length = dr.select(seen.meets, dr.fma(path.ray_state.ior, seen.distance, started), 0)
+            path_length = dr.select(seen.meets, path.ray_state.further(seen.distance, started), 0)
             light_path = LightPath(u, v, path_length, mi.Bool(False), mi.UInt32(GLINT))
             state.channels = accumulators.add(
                 state.channels, light_path, light, lanes.place, seen.meets, mi.Bool(False)
