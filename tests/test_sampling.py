@@ -80,7 +80,8 @@ def plane_guides(h: int = 40, w: int = 50, **changes: Any) -> Guides:
     y, x = np.mgrid[:h, :w].astype(np.float32)
     position = np.stack([x / 500, y / 500, np.ones_like(x)], -1)
     normal = np.broadcast_to(np.float32([0, 0, -1]), (h, w, 3)).copy()
-    guides = Guides(np.zeros((h, w), np.int32), position, normal, np.full((h, w), 0.5, np.float32))
+    reflectance, cosine = np.full((h, w), 0.5, np.float32), np.zeros((h, w), np.float32)
+    guides = Guides(np.zeros((h, w), np.int32), position, normal, reflectance, position, cosine)
     return guides._replace(**changes)
 
 

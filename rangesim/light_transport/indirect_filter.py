@@ -42,6 +42,8 @@ MIN_JUMP = 0.02
 """Distance of a neighbour from a pixel's tangent plane, as a fraction of the distance from the camera, above which the
 pixel counts as mixed: it sees an edge and something behind, and lends no light to others. With a smaller value, pixels
 on curved surfaces would share no light; with a larger one, light would spread across edges."""
+FIRST_CHAIN = 1 << 30
+"""Smallest number that stands for a specular chain and the instance beyond it; smaller ones are indices of shapes."""
 RIDGE = 0.05
 """Fraction of the weight times the squared step that is added to the second moments of the regression, because a window
 of a single row or column would divide by zero otherwise. A larger fraction makes the result of one-sided windows more
@@ -56,16 +58,20 @@ class Guides(NamedTuple):
     """Properties of the pixels that decide which of them share light.
 
     instance : (h, w) int32, index of the instance; -1 for pixels that share no light, such as those that see no matte
-        surface.
+        surface. Numbers from `FIRST_CHAIN` on stand for a specular chain and the instance beyond it.
     position : (h, w, 3) float32, metres, from the camera's centre.
     normal : (h, w, 3) float32, unit.
     reflectance : (h, w) float32, of the matte surface.
+    first : (h, w, 3) float32, metres, from the camera's centre, of the first surface.
+    cosine : (h, w) float32, smallest cosine between the pixel's normal and that of a neighbour that shares light.
     """
 
     instance: NDArray[np.int32]
     position: NDArray[np.float32]
     normal: NDArray[np.float32]
     reflectance: NDArray[np.float32]
+    first: NDArray[np.float32]
+    cosine: NDArray[np.float32]
 
     def with_reflectance(self, reflectance: NDArray[np.float32]) -> Guides:
         """The same guides with another reflectance (h, w).
@@ -86,7 +92,8 @@ class LightFilter:
     >>> plane = np.zeros((9, 9, 3), np.float32)
     >>> plane[..., :2], plane[..., 2] = np.moveaxis(np.indices((9, 9)), 0, -1), 100
     >>> normal = np.broadcast_to(np.float32([0, 0, -1]), plane.shape)
-    >>> guides = Guides(np.zeros((9, 9), np.int32), plane, normal, np.ones((9, 9), np.float32))
+    >>> ones = np.ones((9, 9), np.float32)
+    >>> guides = Guides(np.zeros((9, 9), np.int32), plane, normal, reflectance=ones, first=plane, cosine=0 * ones)
     >>> light = np.zeros((1, 9, 9), np.float32)
     >>> light[0, 4, 4] = 81
     >>> LightFilter(guides).apply(light)
@@ -129,7 +136,8 @@ class LightFilter:
 def mixed_pixels(guides: Guides) -> NDArray[np.bool_]:
     """(h, w) bool, whether a pixel sees an edge and something behind it."""
     mixed = np.zeros(guides.instance.shape, np.bool_)
-    in_blocks(_find_mixed, len(mixed), guides.instance, guides.position, guides.normal, mixed, smallest=MIN_ROWS)
+    of_surfaces = guides.instance, guides.position, guides.normal, guides.first
+    in_blocks(_find_mixed, len(mixed), *of_surfaces, mixed, smallest=MIN_ROWS)
     return mixed
 
 
@@ -137,12 +145,13 @@ def level_weights(guides: Guides, mixed: NDArray[np.bool_], step: int) -> NDArra
     """(h, 9, w) float32 weights of the 3 x 3 pixels `step` apart, row by row; they add up to 1."""
     h, w = guides.instance.shape
     weights = np.zeros((h, 9, w), np.float32)
-    in_blocks(_weigh, h, step, guides.instance, guides.position, guides.normal, mixed, weights, smallest=MIN_ROWS)
+    of_surfaces = guides.instance, guides.position, guides.normal, guides.cosine
+    in_blocks(_weigh, h, step, *of_surfaces, mixed, weights, smallest=MIN_ROWS)
     return weights
 
 
 @cached_njit(nogil=True)
-def _find_mixed(start, stop, instance, position, normal, mixed):  # type: ignore[no-untyped-def]
+def _find_mixed(start, stop, instance, position, normal, first, mixed):  # type: ignore[no-untyped-def]
     h, w = instance.shape
     for y in range(start, stop):
         for x in range(w):
@@ -152,16 +161,20 @@ def _find_mixed(start, stop, instance, position, normal, mixed):  # type: ignore
                 yk, xk = y + k // 3 - 1, x + k % 3 - 1
                 if not (0 <= yk < h and 0 <= xk < w):
                     continue
+                is_beyond = instance[y, x] >= FIRST_CHAIN
                 off = distance = 0.0
                 for i in range(3):
-                    off += (position[yk, xk, i] - position[y, x, i]) * normal[y, x, i]
+                    there = position[yk, xk, i] if is_beyond else first[yk, xk, i]
+                    off += (there - position[y, x, i]) * normal[y, x, i]
                     distance += position[y, x, i] * position[y, x, i]
+                if is_beyond and instance[yk, xk] != instance[y, x]:
+                    mixed[y, x] = True
                 if not off * off < MIN_JUMP * MIN_JUMP * distance:
                     mixed[y, x] = True
 
 
 @cached_njit(nogil=True)
-def _weigh(start, stop, step, instance, position, normal, mixed, weights):  # type: ignore[no-untyped-def]
+def _weigh(start, stop, step, instance, position, normal, narrowest, mixed, weights):  # type: ignore[no-untyped-def]
     h, w = instance.shape
     for y in range(start, stop):
         for x in range(w):
@@ -184,7 +197,9 @@ def _weigh(start, stop, step, instance, position, normal, mixed, weights):  # ty
                         cosine += normal[yk, xk, i] * normal[y, x, i]
                         off += d * normal[y, x, i]
                         distance += d * d
-                    if cosine < MIN_NORMAL_COSINE or off * off > MAX_PLANE_SINE * MAX_PLANE_SINE * distance:
+                    if cosine < MIN_NORMAL_COSINE or cosine < narrowest[y, x]:
+                        continue
+                    if off * off > MAX_PLANE_SINE * MAX_PLANE_SINE * distance:
                         continue
                 is_shared[k] = True
                 n += 1
