@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """What caustics cost, and how noisy they are.
 
-Default transport (640 x 480, 64 spp, default sensors) with and without photons, glint on both sides, in this process,
+Default transport (640 x 480, 64 spp, default sensors) with and without caustics, glint on both sides, in this process,
 after warm-up, in turns. A third turn goes without glint. The last line is JSON:
 
-    cost_ratio        median time with photons over that without
+    cost_ratio        median time with caustics over that without
     cpu_ratio         the same in processor time, which other load on the machine disturbs less
-    glint_cpu_ratio   median processor time with glint over that without, both without photons
-    photons_landed    of those sent out
-    photons_s         to trace them (median)
-    maps_s            to build the maps (median)
+    glint_cpu_ratio   median processor time with glint over that without, both without caustics
+    triangles         of light
+    in_triangles      fraction of the light that triangles of the grid carry; photons carry the rest
+    trace_s           to trace them (median)
+    build_s           to build the scene in which they are found (median)
     noise             standard deviation over seeds of pixels where caustics outshine all else, over their mean (median)
     noisy_pixels      how many these are
 
@@ -42,23 +43,19 @@ def timed(task: Callable[[], Any]) -> tuple[Any, np.ndarray]:
     return result, np.array([time.perf_counter() - before, after.user + after.system - cpu.user - cpu.system])
 
 
-def photon_times(scene: Any, rig: Any, spp: int, repeats: int) -> tuple[int, np.ndarray]:
-    """Photons that landed, and (repeats, 2) seconds to trace them and to build their maps."""
-    from rangesim.light_transport.caustics import gathering_radius
-    from rangesim.light_transport.photon_maps import MAX_MAPS, PhotonMaps
-    from rangesim.light_transport.photons import trace_photons
+def triangle_times(scene: Any, rig: Any, spp: int, repeats: int) -> tuple[Any, np.ndarray]:
+    """The triangles of light, and (repeats, 2) seconds to trace them and to build the scene in which they are found."""
+    from rangesim.light_transport.caustics import caustic_sheets, sheet_scene
     from rangesim.light_transport.traced_scene import TracedScene
-    from rangesim.light_transport.transport_settings import MOST_PHOTONS as PHOTONS
+    from rangesim.light_transport.transport_settings import TransportSettings
 
-    maps = min(spp, MAX_MAPS)
-    trace = partial(trace_photons, TracedScene.of(scene.mitsuba, rig), rig.projector_power_w, PHOTONS, maps)
-    seconds = []
+    here, seconds = scene.in_renderer(rig), []
+    traced = TracedScene.of(scene.mitsuba, here)
     for seed in range(repeats + 1):
-        landed, tracing = timed(partial(trace, seed=seed, memory_bytes=2 << 30))
-        radius = gathering_radius(rig, landed.per_pixel)
-        _, building = timed(partial(PhotonMaps, landed, radius, rig.projector_irradiance))
+        sheets, tracing = timed(partial(caustic_sheets, traced, [here], TransportSettings(seed=seed)))
+        _, building = timed(partial(sheet_scene, sheets, here, spp))
         seconds.append([tracing[0], building[0]])
-    return len(landed.flux), np.array(seconds[1:])
+    return sheets, np.array(seconds[1:])
 
 
 def main() -> None:
@@ -72,7 +69,11 @@ def main() -> None:
     rig = scene.rig(width=args.width, height=args.height)
     sensors = [StructuredLight(rig.projector.width, rig.projector.height), AmcwToF(), IdealToF()]
     render = partial(transport, scene, rig, sensors, spp=args.spp)
-    sides = {"caustics": render, "without": partial(render, photons=0), "dark": partial(render, photons=0, glint=False)}
+    sides = {
+        "caustics": render,
+        "without": partial(render, caustics=False),
+        "dark": partial(render, caustics=False, glint=False),
+    }
     for side in sides.values():
         side(seed=99)  # warm-up
     seconds: dict[str, list[np.ndarray]] = {name: [] for name in sides}
@@ -88,16 +89,17 @@ def main() -> None:
     caustic = np.stack([e.caustic for e in images])
     mean = caustic.mean(axis=0)
     bright = mean > np.mean([e.projector - e.caustic for e in images], axis=0)
-    landed, photon_s = photon_times(scene, rig, args.spp, args.repeats)
+    sheets, triangle_s = triangle_times(scene, rig, args.spp, args.repeats)
     median = {name: np.median(spent, axis=0) for name, spent in seconds.items()}
     ratio, glint = median["caustics"] / median["without"], median["without"] / median["dark"]
     result = {
         "cost_ratio": round(float(ratio[0]), 3),
         "cpu_ratio": round(float(ratio[1]), 3),
         "glint_cpu_ratio": round(float(glint[1]), 3),
-        "photons_landed": landed,
-        "photons_s": round(float(np.median(photon_s[:, 0])), 3),
-        "maps_s": round(float(np.median(photon_s[:, 1])), 3),
+        "triangles": len(sheets.flux),
+        "in_triangles": round(sheets.in_triangles, 4),
+        "trace_s": round(float(np.median(triangle_s[:, 0])), 3),
+        "build_s": round(float(np.median(triangle_s[:, 1])), 3),
         "noise": round(float(np.median(caustic.std(axis=0, ddof=1)[bright] / mean[bright])), 3),
         "noisy_pixels": int(bright.sum()),
     }

@@ -4,7 +4,7 @@
 Real: scenes of the ClearGrasp data set (Sajjan et al. 2020; RealSense D435), whose transparent objects were measured as
 they are and again sprayed opaque. Simulated, with `--scene N`: scene N, rebuilt from its own data (`rebuilt_scene.py`),
 and measured by a simulated D435. Without `--scene`: both scenes of the folder beside `scenes/glassware.xml`, which
-structured light and time of flight measure with the same intrinsics at the same distance, with and without photons
+structured light and time of flight measure with the same intrinsics at the same distance, with and without caustics
 beyond glass. Figures on the objects, and on the background:
 
     lost       fraction of the pixels (whose true depth is known) without a measurement
@@ -113,10 +113,6 @@ NOISE_PX = 0.08
 """Standard deviation of a disparity of a D435, pixels of an image of 1280."""
 NOISE_Q = NOISE_PX / (D435.camera.fx * 1280 / D435.camera.width * BASELINE_M)
 """Standard deviation of 1 / z, per metre."""
-DOT_RADIUS_M = 1e-3
-"""Radius over which light beyond glass is gathered, metres: that of a dot at 0.6 m. Wider, dots beyond glass blur."""
-PHOTONS = 4_000_000
-"""Photons for this radius: some 15 to a pixel of the projector behind which there is glass."""
 
 
 @dataclass(frozen=True)
@@ -305,7 +301,7 @@ def light_of(real: RealScene, rebuilt: Rebuilt, trial: Trial, width: int, spp: i
         )
         return transport(
             load_scene(description), rigs_of(device, real.camera, width), [device.sensor], spp=spp, max_depth=3,
-            photons=PHOTONS, caustic_radius_m=DOT_RADIUS_M, sampling_error=False, seed=seed,
+            sampling_error=False, seed=seed,
         )  # fmt: skip
 
 
@@ -430,7 +426,7 @@ def depth_behind(rig: Rig) -> np.ndarray:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "empty.xml"
         tree.write(path)
-        return transport(load_scene(path), rig, [], spp=1, photons=0).truth.z
+        return transport(load_scene(path), rig, [], spp=1, caustics=False).truth.z
 
 
 def show(label: str, on_glass: Figures, background: Figures) -> None:
@@ -456,7 +452,7 @@ def report_sensors(args: argparse.Namespace) -> dict[str, Any]:
     scene = load_scene(SCENE)
     rig = scene.rig(BASELINE_M, width=args.width or 320)
     behind = depth_behind(rig)
-    for light, settings in (("all light", {}), ("no light beyond glass", {"photons": 0, "glint": False})):
+    for light, settings in (("all light", {}), ("no light beyond glass", {"caustics": False, "glint": False})):
         signals = transport(scene, rig, list(SENSORS.values()), spp=args.spp, max_depth=12, **settings)
         truth = signals.truth
         mask = truth.material == truth.material_names.index("transparent")

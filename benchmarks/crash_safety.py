@@ -33,7 +33,7 @@ from rangesim.results.experiment_results import RESULT, read_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 RUN = ["run", str(ROOT / "scenes" / "plane.xml"), "--sensor", "gray", "--sensor", "ideal-tof", "--width", "48",
-       "--height", "36", "--spp", "1", "--photons", "0"]  # fmt: skip
+       "--height", "36", "--spp", "1", "--no-caustics"]  # fmt: skip
 KILL_AT_CALL = """
 import os, signal, sys
 from pathlib import Path

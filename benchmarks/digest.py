@@ -32,7 +32,7 @@ from rangesim.motion import Motion, PoseTrack, Timing, transport_moving
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 NAMES = ("plane", "corner", "matte", "tabletop", "glassware")
-WIDTH, HEIGHT, SPP, PHOTONS, SEED = 120, 90, 5, 60_000, 7
+WIDTH, HEIGHT, SPP, SEED = 120, 90, 5, 7
 PROJECTOR = (256, 160)
 SENSORS: dict[str, Sensor] = {
     "gray": StructuredLight(*PROJECTOR, code="gray", axes=("columns", "rows")),
@@ -91,7 +91,7 @@ def of_scene(name: str) -> Iterator[tuple[str, Any]]:
     for key, sensor in SENSORS.items():
         one = Instrument(key, sensor, power_w=0.02)
         rig = one.rig(scene, WIDTH, HEIGHT)
-        signals = rangesim.transport(scene, rig, [sensor], spp=SPP, photons=PHOTONS, seed=SEED)
+        signals = rangesim.transport(scene, rig, [sensor], spp=SPP, seed=SEED)
         yield from ((f"{name}/{key}/{k}", v) for k, v in of_signals(signals, sensor))
         for noise in (True, False):
             kind = "noisy" if noise else "noise-free"
@@ -117,7 +117,7 @@ def of_media() -> Iterator[tuple[str, Any]]:
     for key in ("gray-phase", "direct"):
         one = Instrument(key, SENSORS[key], power_w=0.02)
         rig = one.rig(scene, WIDTH, HEIGHT)
-        signals = rangesim.transport(scene, rig, [one.sensor], spp=SPP, photons=PHOTONS, seed=SEED)
+        signals = rangesim.transport(scene, rig, [one.sensor], spp=SPP, seed=SEED)
         yield from ((f"media/{key}/{k}", v) for k, v in of_signals(signals, one.sensor))
 
 

@@ -56,7 +56,7 @@ def main() -> None:
     # Forward, which is the scanner's azimuth 0
     moving = moving_scanner(still, ConstantTwist(velocity_m_s=tuple((args.speed * pose[:3, 2]).tolist())))
     pinhole = scene.rig(0.03, (256, 256), camera=Intrinsics.from_fov(COLUMNS, RINGS, 90.0))
-    options: dict[str, Any] = {"spp": args.spp, "max_depth": 5, "glint": False, "photons": 0}
+    options: dict[str, Any] = {"spp": args.spp, "max_depth": 5, "glint": False, "caustics": False}
 
     took: dict[str, list[float]] = {"turn": [], "pinhole": []}
     for number in range(args.rounds + 1):

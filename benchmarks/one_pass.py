@@ -49,7 +49,7 @@ def main() -> None:
     plain = plain_scene(scene, rig, {"type": "hdrfilm", "pixel_format": "luminance"})
     integrator = mi.load_dict({"type": "path", "max_depth": args.max_depth, "rr_depth": 5})
     # Mitsuba's path integrator finds no projector light through glass
-    one_pass = partial(transport, scene, rig, spp=args.spp, max_depth=args.max_depth, photons=0, glint=False)
+    one_pass = partial(transport, scene, rig, spp=args.spp, max_depth=args.max_depth, caustics=False, glint=False)
     default, one_pass = one_pass, partial(one_pass, indirect="raw", sampling_error=False)
 
     frames = one_pass([light], seed=1).frames(light)

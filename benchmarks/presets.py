@@ -306,7 +306,7 @@ def bright_wall(instrument: Instrument, distance_m: float, reflectance: float, d
         light = {"type": "spectrum", "value": daylight_w_m2 / np.pi}
         parts["sky"] = {"type": "constant", "radiance": light}
     scene = load_scene({"type": "scene", **parts})
-    return transport(scene, rig_of(instrument), [instrument.sensor], spp=SPP, max_depth=2, photons=0, glint=False)
+    return transport(scene, rig_of(instrument), [instrument.sensor], spp=SPP, max_depth=2, caustics=False, glint=False)
 
 
 def traced_wall(instrument: Instrument, distance_m: float, reflectance: float, daylight_w_m2: float) -> StillSignals:

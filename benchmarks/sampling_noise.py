@@ -6,7 +6,7 @@ samples per pixel whose indirect light is not filtered: what is left is sampling
 of the reference, half the difference of its two readings, is subtracted in quadrature. And a reading of the reference
 through the detector, against that without: the sensor's own noise. All as 1.4826 times the median of |difference|, over
 the pixels of a material class that are valid in both. For structured light, AMCW and direct time of flight. With
-`--photons 0`, all passes leave caustics out: what is left is the noise of camera paths.
+`--no-caustics`, all passes leave caustics out: what is left is the noise of camera paths.
 
 The last line is JSON:
 
@@ -15,7 +15,7 @@ The last line is JSON:
                             null without it
 
 Usage: python benchmarks/sampling_noise.py [--scenes plane matte tabletop] [--spp N] [--reference-spp 512]
-           [--width W --height H] [--seeds 2] [--photons N] [--before REVISION]
+           [--width W --height H] [--seeds 2] [--no-caustics] [--before REVISION]
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def main() -> None:
     parser.add_argument("--width", type=int)
     parser.add_argument("--height", type=int)
     parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--photons", type=int)
+    parser.add_argument("--no-caustics", action="store_true")
     parser.add_argument("--before")
     args = parser.parse_args()
 
@@ -74,7 +74,7 @@ def worst_ratios(name: str, args: argparse.Namespace) -> dict[str, float]:
         sensors = [one.sensor for one in group]
 
         def traced(seed: int, spp: int, rig: Any = rig, sensors: Any = sensors, **options: Any) -> Signals:
-            options |= {"max_depth": experiment.max_depth, "photons": args.photons}
+            options |= {"max_depth": experiment.max_depth, "caustics": not args.no_caustics}
             return transport(scene, rig, sensors, spp=spp, seed=seed, **options)
 
         references = [traced(10_000 + i, args.reference_spp, indirect="raw") for i in range(2)]

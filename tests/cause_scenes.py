@@ -188,7 +188,7 @@ def mirrored_ghost() -> Case:
     scene = room(wall=board(0, 0, 1.5, 0.6), mirror=mirror)
     sensor = AmcwToF()
     signals = transport(scene, scene.rig(0.03, **SIZE), [sensor], spp=64)
-    plain = transport(scene, scene.rig(0.03, **SIZE), [sensor], spp=64, photons=0)
+    plain = transport(scene, scene.rig(0.03, **SIZE), [sensor], spp=64, caustics=False)
     detector = Detector.time_of_flight()
     healed = right(measure(plain, sensor, detector)[1], plain)
     known = [(healed, Cause.CAUSTIC), *mirror_by_energy(signals)]
@@ -217,7 +217,7 @@ def seen_through() -> Case:
     scene = room(wall=board(0, 0, 1.5, 2), pane=pane)
     sensor = AmcwToF()
     # Photons are gathered over a disc, and fewer of them over a larger one, which blurs the edges of the caustic.
-    signals = transport(scene, scene.rig(0.03, **SIZE), [sensor], spp=64, photons=500_000)
+    signals = transport(scene, scene.rig(0.03, **SIZE), [sensor], spp=64)
     e = signals.energy
     on_pane = is_instance(signals, "pane") & (e.direct < 0.5 * e.projector)
     known = [(on_pane, Cause.SEEN_THROUGH), (e.caustic > 0.5 * e.projector, Cause.CAUSTIC), (True, Cause.DEPTH_EDGE)]
@@ -245,7 +245,7 @@ def caustic() -> Case:
     sensor, detector = AmcwToF(), Detector.time_of_flight()
     options = {"spp": 64, "max_depth": 4}
     signals = transport(scene, scene.rig(0.03, **SIZE), [sensor], **options)
-    plain = transport(scene, scene.rig(0.03, **SIZE), [sensor], photons=0, **options)
+    plain = transport(scene, scene.rig(0.03, **SIZE), [sensor], caustics=False, **options)
     healed = right(measure(plain, sensor, None)[1], plain)
     known = [(is_instance(signals, "wall") & healed, Cause.CAUSTIC), *mirror_by_energy(signals)]
     return case(signals, sensor, detector, lambda c, i: known)
@@ -352,7 +352,7 @@ def no_texture() -> Case:
     sensor = ActiveStereo(None, baseline_m=0.2)
     scenes = room(wall=board(0, 0, 1.0, 2), room=lamp), room(wall=board(0, 0, 1.0, 2, painted), room=lamp)
     signals, on_texture = (
-        transport(s, sensor.rigs(rig_of(s, 0.1)), [sensor], spp=64, max_depth=2, photons=0) for s in scenes
+        transport(s, sensor.rigs(rig_of(s, 0.1)), [sensor], spp=64, max_depth=2, caustics=False) for s in scenes
     )
     healed = right(measure(on_texture, sensor, Detector())[1], on_texture)
     second = signals[1].rig

@@ -10,6 +10,10 @@ import numpy as np
 
 from rangesim import Intrinsics, Rig, Scene, load_scene, look_at
 from rangesim.environment.backend import select_variant
+from rangesim.light_transport.caustic_sheets import Sheets
+from rangesim.light_transport.caustics import caustic_sheets
+from rangesim.light_transport.traced_scene import TracedScene
+from rangesim.light_transport.transport_settings import TransportSettings
 from rangesim.response import DenseResponse, LightPath
 
 SILVER = (0.04, 5.8)
@@ -68,6 +72,18 @@ def rig_of(
     T_world_camera = look_at(camera_at, camera_looks_at or ahead(camera_at), DOWN)
     T_world_projector = look_at(at, looks_at or ahead(at), DOWN)
     return Rig(camera, projector, T_world_camera, np.linalg.inv(T_world_camera) @ T_world_projector, **more)
+
+
+def sheets_of(scene: Scene, rig: Rig, seed: int = 0) -> Sheets | None:
+    """The triangles of light of a pass; None if no light lands beyond glass or mirrors."""
+    here = scene.in_renderer(rig)
+    return caustic_sheets(TracedScene.of(scene.mitsuba, here), [here], TransportSettings(seed=seed))
+
+
+def thrown_w(scene: Scene, rig: Rig, seeds: int = 1) -> float:
+    """Watts that land on surfaces beyond glass and mirrors, mean over seeds."""
+    found = [sheets_of(scene, rig, seed) for seed in range(seeds)]
+    return float(np.mean([0.0 if one is None else one.flux.sum() for one in found]))
 
 
 @dataclass(frozen=True)

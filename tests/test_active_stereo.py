@@ -271,7 +271,7 @@ SENSOR = ActiveStereo(SMALL, baseline_m=0.06)
 def both() -> SignalSet:
     scene = rangesim.load_scene(SCENES / "plane.xml")
     rigs = Instrument("stereo", SENSOR).rigs(scene, 96, 72)
-    return transport(scene, rigs, [SENSOR, ActiveStereo(None, 0.06)], spp=32, max_depth=2, photons=0)
+    return transport(scene, rigs, [SENSOR, ActiveStereo(None, 0.06)], spp=32, max_depth=2, caustics=False)
 
 
 def test_signals_of_several_cameras_are_a_set(both: SignalSet) -> None:
@@ -299,7 +299,7 @@ def test_signals_are_saved_camera_by_camera(both: SignalSet, tmp_path: Path) -> 
 def test_the_first_camera_of_two_keeps_its_bytes(both: SignalSet) -> None:
     scene = rangesim.load_scene(SCENES / "plane.xml")
     sensors = [SENSOR, ActiveStereo(None, 0.06)]
-    alone = transport(scene, both.rig, sensors, spp=32, max_depth=2, photons=0)
+    alone = transport(scene, both.rig, sensors, spp=32, max_depth=2, caustics=False)
     assert all_bytes(alone) == all_bytes(both[0])
     detector = SENSOR.default_detector
     pair, single = expose(both, SENSOR, detector, seed=5), expose(alone, SENSOR, detector, seed=5)
@@ -369,14 +369,14 @@ def test_an_experiment_with_two_cameras_is_written_and_read_back(tmp_path: Path)
 def test_the_number_of_samples_may_follow_the_noise_of_the_frames() -> None:
     scene = rangesim.load_scene(SCENES / "plane.xml")
     rigs = Instrument("stereo", SENSOR).rigs(scene, 32, 24)
-    signals = transport(scene, rigs, [SENSOR], max_depth=2, photons=0)
+    signals = transport(scene, rigs, [SENSOR], max_depth=2, caustics=False)
     assert signals.knows_sampling_error
 
 
 def test_a_scan_takes_both_cameras_along() -> None:
     scene = rangesim.load_scene(SCENES / "plane.xml")
     rig = Instrument("stereo", SENSOR).rig(scene, 48, 36)
-    settings = TransportSettings(spp=8, max_depth=2, photons=0)
+    settings = TransportSettings(spp=8, max_depth=2, caustics=False)
     views = rangesim.scan(scene, rig, SENSOR, np.stack([rig.T_world_camera] * 2), settings)
     assert all(image.valid.mean() > 0.3 for image in views.images)
 
@@ -387,7 +387,7 @@ def test_both_cameras_see_an_object_at_one_moment() -> None:
     rig = Instrument("stereo", SENSOR).rig(scene, 48, 36)
     still = {SENSOR: Timing(), StructuredLight(160, 120): Timing(frame_period_s=0.01)}
     found = transport_moving(
-        scene, rig, still, Motion({name: ConstantTwist(velocity_m_s=(0, 0.2, 0))}), spp=4, max_depth=2, photons=0
+        scene, rig, still, Motion({name: ConstantTwist(velocity_m_s=(0, 0.2, 0))}), spp=4, max_depth=2, caustics=False
     )
     signals = found[SENSOR]
     assert isinstance(signals, SignalSet)

@@ -112,7 +112,7 @@ def test_what_other_light_spoils_on_the_tabletop_is_better_without_it() -> None:
     scene = rangesim.load_scene(ROOT / "scenes" / "tabletop.xml")
     rig = scene.rig(0.03, width=96, height=72)
     signals = rangesim.transport(scene, rig, [sensor], spp=64)
-    plain = rangesim.transport(scene, rig, [sensor], spp=64, max_depth=2, photons=0, glint=False)
+    plain = rangesim.transport(scene, rig, [sensor], spp=64, max_depth=2, caustics=False, glint=False)
     capture = expose(signals, sensor, detector)
     image = decode(capture)
     cause = explain(image, capture, signals).cause
@@ -150,7 +150,7 @@ def test_a_steep_wall_is_no_depth_edge_where_other_light_spoils_the_reading(name
     scene = cause_scenes.room(wall=board(0, 0, 1.2, 1.0), side=board(-0.25, 0, 0.9, 0.35, turn_deg=turn_deg))
     rig = scene.rig(0.01, width=40, height=30)
     signals, direct = (
-        rangesim.transport(scene, rig, [sensor], spp=256, max_depth=max_depth, photons=0) for max_depth in (6, 2)
+        rangesim.transport(scene, rig, [sensor], spp=256, max_depth=max_depth, caustics=False) for max_depth in (6, 2)
     )
     capture = expose(signals, sensor, detector)
     found = explain(decode(capture), capture, signals)
@@ -171,7 +171,7 @@ def test_stripes_finer_than_a_pixel_are_too_coarse_and_not_multipath(width: int,
     )
     rig = scene.rig(0.2, width=width, height=3 * width // 4)
     signals, direct = (
-        rangesim.transport(scene, rig, [sensor], spp=512, max_depth=max_depth, photons=0) for max_depth in (6, 2)
+        rangesim.transport(scene, rig, [sensor], spp=512, max_depth=max_depth, caustics=False) for max_depth in (6, 2)
     )
     capture = expose(signals, sensor, detector)
     found = explain(decode(capture), capture, signals)

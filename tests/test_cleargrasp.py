@@ -90,7 +90,7 @@ def test_the_renderer_sees_the_front_surface_and_the_table(
     z, table, mask = images
     reflectance = reflectances(np.full(mask.shape, 128.0), mask)
     scene = load_scene(scene_dictionary(rebuilt, reflectance, tmp_path, glass=glass))  # type: ignore[arg-type]
-    truth = transport(scene, scene.rig(width=320), [], spp=1, photons=0).truth
+    truth = transport(scene, scene.rig(width=320), [], spp=1, caustics=False).truth
     is_glass = truth.material == truth.material_names.index("transparent")
     assert (is_glass != mask).mean() < 0.02
     np.testing.assert_allclose(np.median(np.abs(truth.z - z)[is_glass & mask]), 0, atol=1e-3)

@@ -35,9 +35,15 @@ def of(experiment: Experiment, trial: bool = False) -> Cost:
 def test_light_paths_are_pixels_times_samples_times_passes() -> None:
     usual = Experiment(MATTE, width=64, height=48, spp=4, max_depth=7)
     found = of(usual)
-    assert (found.light_paths, found.passes, found.segments, found.photons) == (2 * 64 * 48 * 4, 2, 7, 0)
-    glass = replace(usual, scene=str(ROOT / "scenes" / "tabletop.xml"), photons=1000)
-    assert of(glass).photons == 2000
+    assert (found.light_paths, found.passes, found.segments) == (2 * 64 * 48 * 4, 2, 7)
+
+
+def test_caustics_cost_time_and_memory_in_scenes_with_glass_alone() -> None:
+    for scene, has_glass in (("tabletop", True), ("matte", False)):
+        usual = Experiment(str(ROOT / "scenes" / f"{scene}.xml"), width=64, height=48, spp=4)
+        on, off = of(usual), of(replace(usual, caustics=False))
+        assert on.seconds - off.seconds == pytest.approx(has_glass * on.passes * cost.CAUSTICS_S)
+        assert on.memory_bytes - off.memory_bytes == has_glass * cost.CAUSTICS_BYTES
 
 
 def test_each_frame_of_a_scene_that_moves_is_a_pass() -> None:
@@ -73,7 +79,7 @@ def test_the_memory_that_a_run_may_take_can_be_set(tmp_path: Path) -> None:
     with limits.raised(memory=10**6), pytest.raises(ValueError, match=r"within the 0\.0 GB"):
         experiment_run.run(small, tmp_path / "out")
     with limits.raised(memory=10**15):
-        Cost(1, 1, 1, 1, 10**14, 1.0).check_memory()
+        Cost(1, 1, 1, 10**14, 1.0).check_memory()
 
 
 def test_where_the_memory_is_unknown_nothing_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,6 +125,18 @@ def test_an_estimate_writes_nothing(
     assert "expected --out DIRECTORY" in err
 
 
+def test_no_caustics_reaches_the_experiment(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It makes the run of a scene with glass cheaper."""
+    small = ("tabletop", "--width", "64", "--height", "48", "--spp", "4", "--estimate")
+    (_, with_them, _), (_, without, _) = (
+        command(capsys, monkeypatch, *small, *more) for more in ((), ("--no-caustics",))
+    )
+    assert with_them != without
+    assert with_them.split(",")[0] == without.split(",")[0]
+
+
 def test_sizes_without_measure_are_one_sentence_at_once(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -126,7 +144,7 @@ def test_sizes_without_measure_are_one_sentence_at_once(
     for size in (
         ("--width", "1000000", "--height", "1000000"),
         ("--spp", "1" + "0" * 30),
-        ("--photons", "1" + "0" * 18),
+        ("--max-depth", "1" + "0" * 18),
     ):
         code, out, err = command(capsys, monkeypatch, MATTE, *size, "--out", str(tmp_path / "out"))
         assert (code, out) == (1, "")
@@ -136,19 +154,19 @@ def test_sizes_without_measure_are_one_sentence_at_once(
 
 
 def test_only_long_or_large_runs_are_announced() -> None:
-    assert not Cost(1, 1, 1, 1, 10**8, 10.0).is_large
-    assert Cost(1, 1, 1, 1, 10**8, 100.0).is_large
-    assert Cost(1, 1, 1, 1, 10**10, 1.0).is_large
+    assert not Cost(1, 1, 1, 10**8, 10.0).is_large
+    assert Cost(1, 1, 1, 10**8, 100.0).is_large
+    assert Cost(1, 1, 1, 10**10, 1.0).is_large
 
 
 @pytest.mark.parametrize(
     ("seconds", "text"), [(0.2, "1 s"), (42.4, "42 s"), (150, "2.5 min"), (7200, "2 h"), (864000, "10 d")]
 )
 def test_durations_are_readable(seconds: float, text: str) -> None:
-    assert str(Cost(20_000_000, 5, 0, 1, 1_100_000_000, seconds)) == (
+    assert str(Cost(20_000_000, 5, 1, 1_100_000_000, seconds)) == (
         f"about 20 M light paths of up to 5 segments in 1 pass, 1.1 GB, {text}"
     )
-    assert str(Cost(2, 5, 0, 1, 10**8, 9.0, "2 idle cores")).endswith(", 0.1 GB, 9 s on 2 idle cores")
+    assert str(Cost(2, 5, 1, 10**8, 9.0, "2 idle cores")).endswith(", 0.1 GB, 9 s on 2 idle cores")
 
 
 class BusyClock:

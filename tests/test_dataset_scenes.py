@@ -343,7 +343,7 @@ def different_pixels(scene: RandomScene) -> int:
     loaded = rangesim.load_scene(scene.scene)
     one = scene.experiment.instruments[0]
     rig = one.rig(loaded, scene.experiment.width, scene.experiment.height)
-    settings = TransportSettings(1, 2, photons=0, glint=False)
+    settings = TransportSettings(1, 2, caustics=False, glint=False)
     truth = rangesim.transport(loaded, rig, [one.sensor], settings=settings).truth
     world, names = o3d.t.geometry.RaycastingScene(), []
     for name, mesh in meshes_of(scene).items():

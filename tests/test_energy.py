@@ -17,23 +17,18 @@ from delta_scenes import (
     rig_of,
     scene_of,
     slab,
+    thrown_w,
     transform,
     wall,
 )
 from tiers import to_validate
 
-from rangesim import Intrinsics, Rig, Scene, look_at, transport
-from rangesim.light_transport.photons import Photons, trace_photons
-from rangesim.light_transport.traced_scene import TracedScene
+from rangesim import Intrinsics, Rig, look_at, transport
 from rangesim.response import FirstReturn
 
 POWER_W = 2.0
 PROJECTOR = Intrinsics.from_fov(160, 120, 40)
 CAMERA = Intrinsics.from_fov(64, 48, 40)
-
-
-def photons_of(scene: Scene, rig: Rig, photons: int = 200_000, maps: int = 4, seed: int = 1) -> Photons:
-    return trace_photons(TracedScene.of(scene.mitsuba, rig), rig.projector_power_w, photons, maps, seed, 2 << 30)
 
 
 def mean_over_the_field(function: Any) -> float:
@@ -42,78 +37,56 @@ def mean_over_the_field(function: Any) -> float:
     return float(function(np.linalg.norm(rays, axis=-1)).mean())
 
 
-def check_identity(photons: Photons, maps: int = 4) -> None:
-    b = photons.energy
-    assert b.direct + b.stored + b.absorbed + b.escaped + b.truncated == pytest.approx(b.emitted, rel=1e-6)
-    assert b.emitted == pytest.approx(POWER_W, rel=2e-3)
-    assert photons.flux.sum(dtype=float) / maps == pytest.approx(b.stored, rel=1e-5)
+def passed_by_a_pane(t: Any) -> Any:
+    """Transmittance of both faces, with all reflections between them; of the tangent to the axis."""
+    r = fresnel_dielectric(t / np.hypot(1, t))
+    return (1 - r) / (1 + r)
 
 
-# ---- Balance of the photons -------------------------------------------------------------------------
+# ---- Balance of the light beyond glass and mirrors --------------------------------------------------
 
 
-def test_a_mirror_absorbs_one_minus_its_reflectance() -> None:
-    """It covers the half x > 0 of the field; what it reflects escapes, what passes it lands directly."""
-    scene = scene_of(mirror=wall(1.0, MIRROR, 5.0, x=5.0), wall=wall(2.0, matte()))
+def test_a_mirror_throws_its_reflectance_of_the_light() -> None:
+    """It covers the half x > 0 of the field, and throws light back to a wall behind the projector."""
+    behind = {"type": "rectangle", "to_world": transform().translate([0, 0, -1]).scale(20), "bsdf": matte()}
     rig = rig_of(CAMERA, PROJECTOR, projector_power_w=POWER_W)
-    photons = photons_of(scene, rig)
-    check_identity(photons)
+    parts = {"mirror": wall(1.0, MIRROR, 5.0, x=5.0), "wall": wall(2.0, matte())}
     reflected = mean_over_the_field(lambda t: fresnel_conductor(1 / np.hypot(1, t)))
-    assert photons.energy.absorbed == pytest.approx(POWER_W / 2 * (1 - reflected), rel=0.01)
-    assert photons.energy.direct == pytest.approx(POWER_W / 2, rel=0.01)
-    # The wall is 10 m wide, so none of the reflected light comes back
-    assert photons.energy.escaped == pytest.approx(POWER_W / 2 * reflected, rel=0.01)
-    assert photons.energy.stored == 0
+    assert thrown_w(scene_of(behind=behind, **parts), rig) == pytest.approx(POWER_W / 2 * reflected, rel=3e-3)
+    # Without the wall behind, all of it escapes
+    assert thrown_w(scene_of(**parts), rig) == 0
 
 
 @pytest.mark.parametrize("kind", ["dielectric", "thindielectric"])
 def test_a_slab_passes_one_minus_r_over_one_plus_r(kind: str) -> None:
     pane = slab(0.3, 0.35) if kind == "dielectric" else wall(0.3, {**GLASS, "type": "thindielectric"})
     scene = scene_of(pane=pane, wall=wall(1.0, matte()))
-    photons = photons_of(scene, rig_of(CAMERA, PROJECTOR, projector_power_w=POWER_W))
-    check_identity(photons)
-
-    def passed(t: Any) -> Any:
-        r = fresnel_dielectric(t / np.hypot(1, t))
-        return (1 - r) / (1 + r)
-
-    expected = mean_over_the_field(passed)
-    assert photons.energy.stored == pytest.approx(POWER_W * expected, rel=2e-3)
-    assert photons.energy.escaped == pytest.approx(POWER_W * (1 - expected), rel=0.02)
-    assert photons.energy.absorbed == pytest.approx(0, abs=1e-6 * POWER_W)
-    assert photons.energy.direct == 0
+    expected = POWER_W * mean_over_the_field(passed_by_a_pane)
+    thrown = thrown_w(scene, rig_of(CAMERA, PROJECTOR, projector_power_w=POWER_W), seeds=8)
+    assert thrown == pytest.approx(expected, rel=4e-3)
 
 
-def test_polished_plastic_scatters_what_it_does_not_mirror() -> None:
-    """Its coat sends F away; the rest is next-event estimation's, which the balance counts as absorbed."""
+def test_polished_plastic_throws_what_its_coat_reflects() -> None:
     plastic = {
         "type": "plastic",
         "int_ior": 1.5,
         "ext_ior": 1.0,
         "diffuse_reflectance": {"type": "spectrum", "value": 0.6},
     }
-    scene = scene_of(wall=wall(1.0, plastic))
-    photons = photons_of(scene, rig_of(CAMERA, PROJECTOR, projector_power_w=POWER_W))
-    check_identity(photons)
+    behind = {"type": "rectangle", "to_world": transform().translate([0, 0, -1]).scale(20), "bsdf": matte()}
+    scene = scene_of(wall=wall(1.0, plastic), behind=behind)
+    thrown = thrown_w(scene, rig_of(CAMERA, PROJECTOR, projector_power_w=POWER_W))
     mirrored = mean_over_the_field(lambda t: fresnel_dielectric(t / np.hypot(1, t)))
-    assert photons.energy.escaped == pytest.approx(POWER_W * mirrored, rel=0.01)
-    assert photons.energy.stored == photons.energy.direct == 0
+    assert thrown == pytest.approx(POWER_W * mirrored, rel=3e-3)
 
 
-def test_in_a_closed_box_all_light_lands_or_is_absorbed() -> None:
+def test_in_a_closed_box_all_light_that_meets_glass_lands() -> None:
     box = {"type": "cube", "to_world": transform().scale(2.0), "bsdf": matte()}
     ball = {"type": "sphere", "center": [0.0, 0.0, 1.0], "radius": 0.2, "bsdf": GLASS}
-    scene = scene_of(box=box, ball=ball)
-    photons = photons_of(scene, rig_of(CAMERA, PROJECTOR, projector_power_w=POWER_W))
-    check_identity(photons)
-    assert photons.energy.escaped == 0
-    assert photons.energy.absorbed == pytest.approx(0, abs=1e-6 * POWER_W)
-    rays = PROJECTOR.directions(PROJECTOR.pixel_centres())
-    meets = (
-        np.linalg.norm(rays[..., :2], axis=-1) / np.linalg.norm(rays, axis=-1) < 0.2
-    )  # sine of the ball's half angle
-    assert photons.energy.stored + photons.energy.truncated == pytest.approx(POWER_W * meets.mean(), rel=0.005)
-    assert photons.energy.truncated < 1e-4 * POWER_W
+    rig = rig_of(CAMERA, PROJECTOR, projector_power_w=POWER_W)
+    radius_px = PROJECTOR.fx * 0.2 / np.sqrt(1 - 0.2**2)  # the ball's half angle has the sine 0.2
+    meets = np.pi * radius_px**2 / (160 * 120)
+    assert thrown_w(scene_of(box=box, ball=ball), rig, seeds=8) == pytest.approx(POWER_W * meets, rel=4e-3)
 
 
 # ---- Closed boxes and white furnaces ----------------------------------------------------------------
@@ -125,16 +98,11 @@ def test_what_a_plane_receives_behind_a_slab_is_what_the_slab_passes() -> None:
     scene = scene_of(slab=slab(0.2, 0.25), wall=wall(1.0, matte(0.5)))
     camera = Intrinsics.from_fov(96, 72, 80)
     rig = rig_of(camera, PROJECTOR, camera_at=(0.0, 0.0, 0.5), projector_power_w=POWER_W)
-    seeds = [transport(scene, rig, [], spp=64, max_depth=2, caustic_radius_m=0.01, seed=s).energy for s in range(4)]
+    seeds = [transport(scene, rig, [], spp=64, max_depth=2, seed=s).energy for s in range(4)]
     area_of_pixel = (0.5 / camera.fx) ** 2
     irradiance = np.mean([e.caustic for e in seeds], axis=0) * np.pi / 0.5
     received = irradiance.sum(dtype=float) * area_of_pixel
-
-    def passed(t: Any) -> Any:
-        r = fresnel_dielectric(t / np.hypot(1, t))
-        return (1 - r) / (1 + r)
-
-    assert received == pytest.approx(POWER_W * mean_over_the_field(passed), rel=0.01)
+    assert received == pytest.approx(POWER_W * mean_over_the_field(passed_by_a_pane), rel=0.01)
     assert not seeds[0].direct.any()
     # ...and where it lands is given by Snell's law
     points = rig.camera.normalise(rig.camera.pixel_centres()) * 0.5
@@ -158,7 +126,7 @@ def integrating_sphere(*parts: dict[str, Any], albedo: float) -> float:
         T_world_camera = look_at((0, 0, 0), ahead, up)
         rig = Rig(camera, Intrinsics.from_fov(64, 64, 30), T_world_camera,
                   np.linalg.inv(T_world_camera) @ T_world_projector, projector_power_w=POWER_W)  # fmt: skip
-        signals = transport(scene, rig, [], spp=96, max_depth=40, rr_depth=40, glint=False, caustic_radius_m=0.15)
+        signals = transport(scene, rig, [], spp=96, max_depth=40, rr_depth=40, glint=False)
         wall_seen = signals.truth.instance == 0
         radiance = signals.energy.projector
         received += float((radiance * solid_angle)[wall_seen].sum()) * np.pi / albedo * radius**2
@@ -206,9 +174,11 @@ def test_thin_glass_keeps_both_faces(thickness_m: float) -> None:
     """A foil passes as much as a pane, and delays the light by (n - 1) d."""
     response = FirstReturn()
     scenes = (scene_of(wall=wall(1.0, matte(0.5))), scene_of(wall=wall(1.0, matte(0.5)), foil=foil(thickness_m)))
-    plain, covered = (transport(s, rig_of(CAMERA, PROJECTOR), [response], spp=32, seed=1) for s in scenes)
+    rig = rig_of(CAMERA, Intrinsics.from_fov(640, 480, 40))
+    plain, covered = (transport(s, rig, [response], spp=32, seed=1) for s in scenes)
     fraction = covered.energy.caustic.sum() / plain.energy.direct.sum()
-    assert fraction == pytest.approx(0.85, abs=0.01)  # 0.923 for each way
+    # 0.925 for each way; the wall is lit as from a place that is nearer by the third of the thickness
+    assert fraction == pytest.approx(0.925**2 / (1 - thickness_m / 3) ** 2, rel=5e-3)
     lit = (plain.channels[response][0] > 0) & (covered.channels[response][0] > 0)
     lengths = (c.channels[response][1][lit] / c.channels[response][0][lit] for c in (plain, covered))
     before, after = lengths

@@ -217,7 +217,7 @@ def test_a_result_says_how_many_photons_a_pulse_brings(
     (tmp_path / "wall.xml").write_text(wall.replace('scale x="1.5" y="1.5"', 'scale x="6" y="6"'))
     detector = SpadDetector(bits=16, dark_counts_hz=0.0)
     direct = Instrument("direct", DirectToF(), detector, power_w=power_w, exposure_s=1e-3)
-    size = {"width": width, "height": width * 3 // 4, "spp": 4, "photons": 0, "max_depth": 2}
+    size = {"width": width, "height": width * 3 // 4, "spp": 4, "caustics": False, "max_depth": 2}
     run(Experiment(str(tmp_path / "wall.xml"), instruments=(direct, instrument("gray")), **size), tmp_path / "out")
     counting, integrating = load_result(tmp_path / "out").measurements
     rig, found = counting.capture.rig, counting.metadata.photons_per_pulse
@@ -244,10 +244,10 @@ def test_an_experiment_states_its_ambient_light() -> None:
     assert experiment_from_dict(experiment_to_dict(experiment)) == experiment
 
 
-def test_optics_photons_and_glint_reach_the_pass() -> None:
+def test_optics_caustics_and_glint_reach_the_pass() -> None:
     settings = {
         "scene": "x.xml",
-        "photons": 0,
+        "caustics": False,
         "glint": False,
         "instrument": [{"sensor": "gray", "projector_lens": {"focus_m": 0.8}, "camera_lens": {"vignetting": 4.0}}],
     }
@@ -258,8 +258,10 @@ def test_optics_photons_and_glint_reach_the_pass() -> None:
     scene = rangesim.load_scene(ROOT / "scenes" / "plane.xml")
     rig = experiment.instruments[0].rig(scene)
     assert {name: getattr(rig, name) for name in lenses} == lenses
-    with pytest.raises(ValueError, match="expected photons to be a whole number of at least 0, got -1"):
-        Experiment("x.xml", photons=-1)
+    passed = experiment.transport_settings(experiment.instruments)
+    assert (passed.caustics, passed.glint) == (False, False)
+    with pytest.raises(ValueError, match="expected caustics to be true or false, got 1"):
+        Experiment("x.xml", caustics=1)
 
 
 def test_a_detector_table_changes_the_usual_detector_of_the_sensor() -> None:

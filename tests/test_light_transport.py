@@ -141,7 +141,7 @@ def test_white_and_ambient_agree_with_mitsuba_s_path_integrator(name: str, max_d
     plain = plain_scene(scene, rig, {"type": "hdrfilm", "pixel_format": "luminance"})
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 3})
     reference = render(plain, integrator, spp=256, seed=1)
-    options = {"spp": 256, "max_depth": max_depth, "rr_depth": 3, "photons": 0, "glint": False}
+    options = {"spp": 256, "max_depth": max_depth, "rr_depth": 3, "caustics": False, "glint": False}
     energy = transport(scene, rig, [], seed=2, **options).energy
     assert abs(z_score(energy.projector + energy.ambient, reference)) < 5
     assert (energy.ambient.max() > 0) == scene.has_ambient
@@ -236,7 +236,7 @@ def test_a_second_pass_compiles_nothing_wherever_its_arrays_lie(tabletop: ranges
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         for seed in range(6):
             held += [np.empty(n, np.uint8) for n in range(16, 4000, 48 + 16 * seed)]
-            transport(tabletop, rig, [StructuredLight()], spp=4, photons=5000, seed=seed)
+            transport(tabletop, rig, [StructuredLight()], spp=4, seed=seed)
             compiled.append({kernel["hash"] for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT})
     assert all(kernels <= compiled[0] for kernels in compiled[1:])
 
@@ -339,7 +339,7 @@ def test_the_holes_of_a_mask_are_as_if_nothing_were_there_whatever_it_is_cut_fro
     rig = rig_of(Intrinsics.from_fov(8, 8, 40), Intrinsics.from_fov(64, 64, 60), (0.5, 0.0, 0.0), (0.0, 0.0, 2.0))
     response = FirstReturn()
     free, through = (
-        transport(scene_of(**parts, wall=wall(2.0, matte())), rig, [response], spp=16, max_depth=3, photons=0)
+        transport(scene_of(**parts, wall=wall(2.0, matte())), rig, [response], spp=16, max_depth=3, caustics=False)
         for parts in ({}, {"sheet": sheet})
     )
     holes = np.kron([[False, True], [True, False]], np.ones((4, 4), dtype=bool))

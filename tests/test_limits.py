@@ -32,7 +32,6 @@ TOO_LARGE: dict[str, tuple[str, Callable[[], Any]]] = {
     "experiment": ("pixels", lambda: Experiment("a.xml", width=10**6, height=10**6)),
     "spp": ("spp", lambda: Experiment("a.xml", spp=10**30)),
     "depth": ("depth", lambda: Experiment("a.xml", max_depth=1 << 63)),
-    "photons": ("photons", lambda: Experiment("a.xml", photons=10**12)),
     "frequencies": ("frequencies", lambda: AmcwToF(tuple(1e6 + i for i in range(1000)))),
     "a kilohertz apart": ("wraps", lambda: AmcwToF((1e12, 1e12 - 1e3))),
     "bands": ("passes", lambda: Timing(bands=10**9)),

@@ -14,7 +14,7 @@ from synthetic import counted_return
 
 from rangesim import Scene, load_scene, transport
 from rangesim.light_transport.camera_rays import Device
-from rangesim.light_transport.photons import meets_delta
+from rangesim.light_transport.delta_surfaces import meets_delta
 from rangesim.light_transport.surfaces import Surfaces, surfaces_of
 
 MANY = 3000
@@ -57,8 +57,10 @@ def test_loops_are_traced_once(materials: str) -> None:
     counted, traces = counted_return()
     scene = load_scene(balls(20, materials))
     rig = scene.rig(width=16, height=12)
-    transport(scene, rig, [counted], spp=1, photons=20_000, glint=False)
-    assert len(traces) == {"one": 1, "glass": 2}[materials]  # at the vertices of paths, and where photons are gathered
+    transport(scene, rig, [counted], spp=1, glint=False)
+    assert (
+        len(traces) == {"one": 1, "glass": 2}[materials]
+    )  # at the vertices of paths, and where caustics are looked up
 
 
 def test_the_pixels_before_glass_are_those_of_the_shapes_that_are_glass() -> None:
@@ -66,7 +68,7 @@ def test_the_pixels_before_glass_are_those_of_the_shapes_that_are_glass() -> Non
     rig = scene.rig(width=64, height=48)
     camera = Device.camera(rig)
     meets, exists = meets_delta(scene.mitsuba, camera.pixels, camera.centre_rays)
-    truth = transport(scene, rig, [], spp=1, photons=0, glint=False).truth
+    truth = transport(scene, rig, [], spp=1, caustics=False, glint=False).truth
     glass = [scene.instances[i].material == "transparent" if i >= 0 else False for i in truth.instance.ravel()]
     assert exists.all()
     assert 0.005 < np.mean(glass) < 0.5

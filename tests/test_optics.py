@@ -475,10 +475,10 @@ def test_the_camera_darkens_at_exposure_and_signals_stay_radiance(plane: rangesi
     ("distortion", "vignetting", "focus"), [(BARREL, 4.0, 0.8), *to_validate(((-0.4,), 0.0, None), ((), 6.0, None))]
 )
 @pytest.mark.validation
-def test_photons_through_a_pane_that_does_nothing_bring_the_light_that_connections_bring(
+def test_caustics_through_a_pane_that_does_nothing_bring_the_light_that_connections_bring(
     plane: rangesim.Scene, distortion: tuple[float, ...], vignetting: float, focus: float | None
 ) -> None:
-    """Photons are even over the projector's pixels, connections carry the density of pixels: two ways to one image."""
+    """Caustics are even over the projector's pixels, connections carry the density of pixels: two ways to one image."""
     import mitsuba as mi
 
     select_variant()
@@ -509,13 +509,13 @@ def test_photons_through_a_pane_that_does_nothing_bring_the_light_that_connectio
         projector_lens=Lens(2e-3, focus, vignetting),
     )
     fringes = Fringes(0, 32.0)
-    by_connection, by_photons = (transport(s, rig, [fringes], spp=64, photons=1_000_000) for s in (clear, behind))
+    by_connection, by_caustics = (transport(s, rig, [fringes], spp=64) for s in (clear, behind))
     inner = binary_erosion(by_connection.energy.direct > 0, iterations=2)
-    expected, caustic = by_connection.energy.direct[inner], by_photons.energy.caustic[inner]
-    assert not by_photons.energy.direct.any()
+    expected, caustic = by_connection.energy.direct[inner], by_caustics.energy.caustic[inner]
+    assert not by_caustics.energy.direct.any()
     assert caustic.mean() == pytest.approx(expected.mean(), rel=0.01)
     assert abs(np.polyfit(expected / expected.mean(), caustic / expected - 1, 1)[0]) < 0.05  # as even or uneven
-    a, b = (s.channels[fringes][0][inner] for s in (by_connection, by_photons))
+    a, b = (s.channels[fringes][0][inner] for s in (by_connection, by_caustics))
     assert np.corrcoef(a, b)[0, 1] > 0.98
     assert (a @ b) / (a @ a) == pytest.approx(1, abs=0.02)
 

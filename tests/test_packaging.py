@@ -81,7 +81,7 @@ def test_an_installed_wheel_measures_its_own_scenes(built: Path, tmp_path: Path)
     code = "import rangesim; print(rangesim.__file__, rangesim.load_scene('plane').source)"
     for path in run(["-c", code], tmp_path, PYTHONPATH=str(site)).split():
         assert Path(path).is_relative_to(site)
-    small = "run glassware --sensor ideal-tof --spp 1 --width 32 --height 24 --photons 0 --out x"
+    small = "run glassware --sensor ideal-tof --spp 1 --width 32 --height 24 --no-caustics --out x"
     code = "from rangesim.cli import main; main()"
     run(["-c", code, *small.split()], tmp_path, PYTHONPATH=str(site), NUMBA_DISABLE_JIT="1")
     assert (tmp_path / "x" / "report.html").stat().st_size > 50_000

@@ -199,7 +199,7 @@ def test_a_scanner_reads_a_wall_in_its_beams(name: str) -> None:
         camera = replace(camera, width=8, height=8, cx=4.0, cy=4.0)
     scene = scene_of(wall=wall(distance_m, matte(0.6)))
     rig = replace(instrument, camera=camera).rig(scene)
-    signals = transport(scene, rig, [instrument.sensor], spp=8, max_depth=2, photons=0, glint=False)
+    signals = transport(scene, rig, [instrument.sensor], spp=8, max_depth=2, caustics=False, glint=False)
     capture = expose(signals, instrument.sensor, instrument.detector, instrument.exposure_s)
     image = decode(capture, instrument.decoder)
     assert image.valid.mean() > 0.9
@@ -218,7 +218,7 @@ def test_zones_tile_the_angles_of_the_sheet_and_read_a_wall(name: str) -> None:
     distance_m = math.sqrt(preset.sheet.range_m[0] * preset.sheet.range_m[1])
     scene = scene_of(wall=wall(distance_m, matte(0.6)))
     rig = preset.instrument.rig(scene)
-    signals = transport(scene, rig, [preset.instrument.sensor], spp=4, max_depth=2, photons=0, glint=False)
+    signals = transport(scene, rig, [preset.instrument.sensor], spp=4, max_depth=2, caustics=False, glint=False)
     image = decode(
         expose(signals, preset.instrument.sensor, preset.instrument.detector, preset.instrument.exposure_s),
         preset.instrument.decoder,
@@ -238,7 +238,7 @@ def test_a_stereo_device_reads_a_wall_by_its_dots(name: str) -> None:
     scene = scene_of(wall=wall(1.0, matte(0.6)))
     rigs = small.rigs(scene)
     rig_or_rigs: Any = rigs if len(rigs) > 1 else rigs[0]
-    signals = transport(scene, rig_or_rigs, [small.sensor], spp=16, max_depth=2, photons=0, glint=False)
+    signals = transport(scene, rig_or_rigs, [small.sensor], spp=16, max_depth=2, caustics=False, glint=False)
     image = decode(expose(signals, small.sensor, small.detector, small.exposure_s), small.decoder)
     assert isinstance(small.sensor, (ActiveStereo, ReferencePatternStereo))
     disparity_px = camera.fx * small.sensor.baseline_m

@@ -166,7 +166,7 @@ def test_light_through_glass_knows_the_noise_of_its_photons() -> None:
     """All pixels of a pass share its photons, but no photon serves both halves."""
     scene = load_scene("glassware")
     rig, sensor = scene.rig(0.03, **SMALL_IMAGE), AmcwToF()
-    signals = [transport(scene, rig, [sensor], spp=8, seed=seed, photons=50_000, glint=False) for seed in range(8)]
+    signals = [transport(scene, rig, [sensor], spp=8, seed=seed, glint=False) for seed in range(8)]
     caustic = np.array([s.energy.caustic for s in signals])
     lit = caustic.mean(axis=0) > 0.1 * signals[0].energy.direct.mean()
     assert lit.sum() > 100
@@ -202,7 +202,7 @@ def test_the_detectors_sigma_is_that_between_captures_of_one_render(
     The ratio varies from seed to seed: on the glass of the tabletop from 0.92 to 1.18 over 12 seeds, sigma 0.08.
     """
     scene, one = load_scene(name), Instrument("one", sensor)
-    signals = transport(scene, one.rig(scene, **SMALL_IMAGE), [sensor], spp=spp, seed=seed, photons=500_000)
+    signals = transport(scene, one.rig(scene, **SMALL_IMAGE), [sensor], spp=spp, seed=seed)
     captures = [expose(signals, sensor, one.detector, seed=n) for n in range(16)]
     images = [decode(capture) for capture in captures]
     z = np.array([image.z for image in images], np.float64)
@@ -227,7 +227,7 @@ def test_the_detectors_sigma_is_that_between_captures_of_one_render(
         *to_validate(
             ("tabletop", StructuredLight(), 0, 96, 0.03),
             ("tabletop", StructuredLight(), 1, 96, 0.02),
-            ("glassware", StructuredLight(), 1, 64, 0.08),
+            ("glassware", StructuredLight(), 1, 64, 0.05),
             ("tabletop", AmcwToF(), 1, 96, 0.006),
         ),
     ],
@@ -243,7 +243,7 @@ def test_the_error_bar_of_completeness_covers_what_many_samples_read(
     rig = one.rig(scene, width=width, height=width * 3 // 4)
 
     def completeness(spp: Any) -> tuple[dict[str, float], dict[str, float]]:
-        signals = transport(scene, rig, [sensor], spp=spp, photons=300_000, seed=seed)
+        signals = transport(scene, rig, [sensor], spp=spp, seed=seed)
         capture = expose(signals, sensor, one.detector, seed=seed)
         image = decode(capture)
         table, noise = compare(image, signals).table, range_noise(image, capture, signals).by_surface(signals.truth)
@@ -374,7 +374,9 @@ def test_rounds_have_the_same_bytes_whatever_the_memory_budget(matte: Scene) -> 
 def test_any_largest_number_of_samples_will_do_and_none_exceeds_it(most: int) -> None:
     scene, sensor = load_scene("glassware"), AmcwToF()
     adaptive = AdaptiveSampling((Instrument("one", sensor),), most, fraction=1e-3)
-    signals = transport(scene, scene.rig(0.03, width=32, height=24), [sensor], spp=adaptive, photons=0, glint=False)
+    signals = transport(
+        scene, scene.rig(0.03, width=32, height=24), [sensor], spp=adaptive, caustics=False, glint=False
+    )
     assert signals.energy.projector.any()
     assert signals.knows_sampling_error == (most > 2)
 
@@ -392,7 +394,7 @@ def test_settings_of_adaptive_sampling_out_of_range_are_refused(matte: Scene) ->
 def test_where_nothing_can_be_read_no_samples_are_wasted() -> None:
     scene = load_scene("glassware")
     sensor = AmcwToF()
-    signals = transport(scene, scene.rig(0.03, **SMALL_IMAGE), [sensor], spp=16, photons=0, glint=False)
+    signals = transport(scene, scene.rig(0.03, **SMALL_IMAGE), [sensor], spp=16, caustics=False, glint=False)
     signals_of = {tuple(sensor.responses()): signals}.__getitem__
     for exposure_s in (1e-12, 10.0):
         one = Instrument("one", sensor, exposure_s=exposure_s)

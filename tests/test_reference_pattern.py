@@ -88,7 +88,7 @@ def plane() -> Scene:
 def test_a_rendered_plane_is_compared_and_explained(plane: Scene) -> None:
     sensor = ReferencePatternStereo(Dots(160, 120, spacing_px=5.0))
     rig = Instrument("kinect", sensor).rig(plane, 96, 72)
-    signals = transport(plane, rig, [sensor], spp=32, max_depth=2, photons=0)
+    signals = transport(plane, rig, [sensor], spp=32, max_depth=2, caustics=False)
     capture = expose(signals, sensor, sensor.default_detector)
     image = decode(capture)
     row = compare(image, signals).row("all")

@@ -113,7 +113,7 @@ def test_reflection_and_refraction_are_chosen_evenly_over_the_samples() -> None:
     )
     rig = scene.rig(width=64, height=48, baseline_m=0.2)  # the projector lights the wall beside the pane
     first, second = (
-        transport(scene, rig, [], spp=64, seed=seed, photons=0, max_depth=2).energy.specular[18:30, 24:40]
+        transport(scene, rig, [], spp=64, seed=seed, caustics=False, max_depth=2).energy.specular[18:30, 24:40]
         for seed in range(2)
     )
     scatter = np.std(first - second) / np.sqrt(2) / np.mean(first)
@@ -218,7 +218,7 @@ def test_what_is_seen_in_mirrors_through_glass_and_on_gloss_has_less_noise_and_h
     rig = scene.rig(width=160, height=120)
 
     def multipath(**options: Any) -> np.ndarray:
-        signals = transport(scene, rig, [], photons=0, glint=False, sampling_error=False, **options)
+        signals = transport(scene, rig, [], caustics=False, glint=False, sampling_error=False, **options)
         classes.update(signals.truth.classes())
         return signals.energy.multipath
 

@@ -30,7 +30,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )  # fmt: skip
     out = tmp_path_factory.mktemp("scanner") / "result"
     flash = Instrument("flash", sensor, SpadDetector(bits=16), width=16, height=12, power_w=1e3)
-    run(Experiment("street", spp=2, photons=0, max_depth=2, instruments=(lidar, flash)), out)
+    run(Experiment("street", spp=2, caustics=False, max_depth=2, instruments=(lidar, flash)), out)
     return out
 
 

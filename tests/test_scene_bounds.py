@@ -657,7 +657,7 @@ def test_a_device_inside_a_medium_is_refused(
     loaded = load_scene(wall_behind(**bodies))
     rig = loaded.rig(baseline_m=0.6, width=8)  # at x = -0.6: Mitsuba's x is to the left
     if not who:
-        assert rangesim.transport(loaded, rig, [], spp=1, photons=0).energy.ambient.max() > 0
+        assert rangesim.transport(loaded, rig, [], spp=1, caustics=False).energy.ambient.max() > 0
         return
     with pytest.raises(ValueError, match=f"expected the {who} to stand in air, .* medium of shape 'fog'"):
         rangesim.transport(loaded, rig, [], spp=1)
@@ -682,7 +682,7 @@ def test_a_body_whose_normals_point_inwards_is_refused(kind: str, medium: dict[s
         loaded = load_scene(wall_behind(**{name: body | more}))
         rig = loaded.rig(width=8)
         if is_right:
-            rangesim.transport(loaded, rig, [], spp=1, photons=0)
+            rangesim.transport(loaded, rig, [], spp=1, caustics=False)
             continue
         with pytest.raises(ValueError, match=r"normals of shape 'turned' to point out of .* the camera sees them"):
             rangesim.transport(loaded, rig, [], spp=1)
@@ -698,7 +698,7 @@ def test_an_exterior_medium_that_no_body_holds_is_refused() -> None:
     around = {"type": "sphere", "radius": 1.0, "center": [0, 0, 3], "bsdf": {"type": "dielectric"}, "interior": SMOKE}
     for side in ({"exterior": SMOKE}, {"interior": SMOKE, "flip_normals": True}):
         loaded = load_scene(wall_behind(around=around, bubble=bubble | side))
-        rangesim.transport(loaded, loaded.rig(width=8), [], spp=1, photons=0)
+        rangesim.transport(loaded, loaded.rig(width=8), [], spp=1, caustics=False)
 
 
 # ---- Pipes and devices ---------------------------------------------------------------------------------------------

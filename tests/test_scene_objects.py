@@ -166,7 +166,7 @@ def test_objects_of_the_scenes_of_the_package(name: str, background: set[str], c
 def test_parts_of_one_thing_are_one_object_and_files_survive(tmp_path: Path) -> None:
     parts = {"mug": post(0.05, [0, 0, 0], 0.12), "lid": ball(0.05, [0, 0, 0.12]) | {"part_of": "mug"}, **PARTS}
     loaded = scene({**TABLE, **parts})
-    signals = rangesim.transport(loaded, loaded.rig(), [rangesim.IdealToF()], spp=1, photons=0, glint=False)
+    signals = rangesim.transport(loaded, loaded.rig(), [rangesim.IdealToF()], spp=1, caustics=False, glint=False)
     truth = signals.truth
     assert truth.object_names == ("mug", "bar", "nut")
     mug = truth.objects()["mug"]

@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from delta_scenes import GLASS, matte, scene_of, wall
+from delta_scenes import GLASS, matte, scene_of, sheets_of, wall
 
 import rangesim
 from rangesim import AmcwToF, Detector, DirectToF, Lens, Scene, SpadDetector, expose, transport
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
 from rangesim.light_transport.glint import trace_glint
-from rangesim.light_transport.photons import trace_photons
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.motion import ConstantTwist, Motion, Timing, transport_moving
 from rangesim.pipeline.experiment_run import noise_seed
@@ -47,7 +46,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def signals(scene: Scene) -> rangesim.Signals:
-    return transport(scene, scene.rig(width=16, height=12), [AmcwToF(), DirectToF(bins=32)], spp=2, photons=0)
+    return transport(scene, scene.rig(width=16, height=12), [AmcwToF(), DirectToF(bins=32)], spp=2, caustics=False)
 
 
 def digest(*arrays: np.ndarray) -> str:
@@ -59,16 +58,19 @@ def digest(*arrays: np.ndarray) -> str:
 
 def path_loop(scene: Scene, seed: int) -> list[np.ndarray]:
     rig = scene.rig(width=16, height=12)
-    return [transport(scene, rig, [], spp=2, photons=0, glint=False, seed=seed).energy.direct]
+    return [transport(scene, rig, [], spp=2, caustics=False, glint=False, seed=seed).energy.direct]
 
 
-def photons(scene: Scene, seed: int) -> list[np.ndarray]:
-    return [trace_photons(TracedScene.of(scene.mitsuba, scene.rig()), 1.0, 500, 2, seed, 1 << 30).position]
+def sheets(scene: Scene, seed: int) -> list[np.ndarray]:
+    """Photons along the silhouette of the ball are drawn by the seed."""
+    found = sheets_of(scene, scene.rig(), seed)
+    assert found is not None
+    return [found.position, found.flux]
 
 
 def caustics(scene: Scene, seed: int) -> list[np.ndarray]:
     rig = scene.rig(width=16, height=12)
-    return [transport(scene, rig, [], spp=2, photons=20_000, glint=False, seed=seed).energy.caustic]
+    return [transport(scene, rig, [], spp=2, glint=False, seed=seed).energy.caustic]
 
 
 def glint(scene: Scene, seed: int) -> list[np.ndarray]:
@@ -83,7 +85,7 @@ def a_moving_scan(scene: Scene, seed: int) -> list[np.ndarray]:
     sensor, motion = AmcwToF(), Motion({"ball": ConstantTwist((1.0, 0.0, 0.0))})
     timing = Timing(line_period_s=1e-4, bands=2)
     rig = scene.rig(width=8, height=8)
-    options: dict[str, Any] = {"spp": 2, "photons": 0, "glint": False}
+    options: dict[str, Any] = {"spp": 2, "caustics": False, "glint": False}
     return [transport_moving(scene, rig, {sensor: timing}, motion, seed=seed, **options)[sensor].lit[:, 4:]]
 
 
@@ -91,7 +93,7 @@ def a_moving_scan(scene: Scene, seed: int) -> list[np.ndarray]:
     ("trace", "seeds"),
     [
         (path_loop, SEEDS),
-        (photons, FEW_SEEDS),
+        (sheets, FEW_SEEDS),
         (caustics, FEW_SEEDS),
         (glint, FEW_SEEDS),
         (a_moving_scan, FEW_SEEDS),
@@ -157,18 +159,18 @@ def test_seeds_of_32_bits_give_the_noise_they_always_gave(scene: Scene) -> None:
 
 
 def test_no_seed_makes_a_new_kernel(scene: Scene) -> None:
-    """The path loop's, the photons', the probes': three kernels for each seed, were it a literal in them.
+    """The path loop's, the caustics', the probes': three kernels for each seed, were it a literal in them.
 
     Dr.Jit now and then compiles a kernel anew without any reason, also for one and the same seed.
     """
     import drjit as dr
 
     rig = scene.rig(width=16, height=12)
-    transport(scene, rig, [], spp=2, photons=1000, seed=0)
+    transport(scene, rig, [], spp=2, seed=0)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         for seed in SEEDS[-8:]:
-            transport(scene, rig, [], spp=2, photons=1000, seed=seed)
+            transport(scene, rig, [], spp=2, seed=seed)
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     assert len(kernels) >= 24
     assert sum(not k["cache_hit"] for k in kernels) < 8

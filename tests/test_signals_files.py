@@ -213,7 +213,7 @@ def test_signals_of_a_scanner_come_back_with_depths_behind_it(tmp_path: Path) ->
     head = Spinning(elevations_deg=(1.0, -3.0), columns=8)
     rig = Rig(head, Beam((3e-3, 3e-3)), scene.T_world_camera)
     sensor = DirectToF(bins=512, bin_s=1e-9, pulse_fwhm_s=4e-9, laser="single-shot")
-    signals = rangesim.transport(scene, rig, [sensor], spp=1, max_depth=2, photons=0)
+    signals = rangesim.transport(scene, rig, [sensor], spp=1, max_depth=2, caustics=False)
     assert (signals.truth.z < 0.0).any()
     save_signals(signals, tmp_path / "signals.npz")
     loaded = load_signals(tmp_path / "signals.npz")

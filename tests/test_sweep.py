@@ -28,7 +28,7 @@ from rangesim.sweep.measure_pass import item_bytes
 from rangesim.sweep.sweep_tables import rows_table
 
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("sweep_*.toml"))
-TINY = {"width": 32, "height": 24, "photons": 0, "spp": 4}
+TINY = {"width": 32, "height": 24, "caustics": False, "spp": 4}
 
 
 def wall(sensors: tuple[Any, ...] = ("amcw",), seeds: int = 2, **vary: Any) -> Sweep:

@@ -32,7 +32,7 @@ from rangesim.results.captures import SIDECAR
 from rangesim.results.experiment_results import Result
 
 PLANE = str(ROOT / "scenes" / "plane.xml")
-TINY = ("--sensor", "ideal-tof", "--width", "32", "--height", "24", "--spp", "1", "--photons", "0")
+TINY = ("--sensor", "ideal-tof", "--width", "32", "--height", "24", "--spp", "1", "--no-caustics")
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,7 @@ def test_images_whose_own_names_are_no_utf8(folder: Path) -> None:
 
 def test_an_experiment_there_ends_well_and_says_its_scene(folder: Path) -> None:
     source = write_scene(folder)
-    run(Experiment(scene=str(source), spp=1, photons=0, instruments=(instrument("ideal-tof"),)), folder / "out")
+    run(Experiment(scene=str(source), spp=1, caustics=False, instruments=(instrument("ideal-tof"),)), folder / "out")
     result = load_result(folder / "out")
     assert result.experiment.scene == str(source)
     assert np.isfinite(result.measurements[0].image.z).any()

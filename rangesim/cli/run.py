@@ -62,13 +62,6 @@ def run_command(
             "not count. 2 means direct light only. (default: 5)"
         ),
     ] = None,
-    photons: Annotated[
-        int | None,
-        typer.Option(
-            help="Number of photons for the projector's light through glass and off mirrors. 0 leaves this light out. "
-            "(default: 8 per pixel, 100000 to 500000)"
-        ),
-    ] = None,
     seed: Annotated[
         int | None, typer.Option(help="Seed of the random numbers. The same seed gives the same bytes. (default: 0)")
     ] = None,
@@ -98,6 +91,12 @@ def run_command(
         float | None,
         typer.Option(help="Metres per unit of a bare mesh: 0.001 if it is in millimetres. (default: 1)"),
     ] = None,
+    no_caustics: Annotated[
+        bool,
+        typer.Option(
+            "--no-caustics", help="Leave out the projector's light that reaches surfaces through glass and off mirrors."
+        ),
+    ] = False,
     noise_free: Annotated[
         bool, typer.Option("--noise-free", help="Simulate ideal electronics, without noise and quantisation.")
     ] = False,
@@ -125,12 +124,14 @@ def run_command(
         "max_depth": max_depth,
         "seed": seed,
     }
-    given |= {"material": material, "unit_m": unit_m, "photons": photons, "tolerance_m": tolerance}
+    given |= {"material": material, "unit_m": unit_m, "tolerance_m": tolerance}
     experiment = _experiment(scene, config, {k: v for k, v in given.items() if v is not None}, sensor)
     if baseline is not None:
         experiment = replace(
             experiment, instruments=tuple(replace(i, baseline_m=baseline) for i in experiment.instruments)
         )
+    if no_caustics:
+        experiment = replace(experiment, caustics=False)
     if noise_free:
         experiment = replace(experiment, instruments=tuple(replace(i, noise=False) for i in experiment.instruments))
     from rangesim.files.atomic_directories import check_directory

@@ -166,7 +166,7 @@ class DatasetSpec:
         several values. A list is a choice too where an instrument holds a single value.
     tolerance_m : largest error of a right reading, metres.
     frames : whether the sensors' frames are kept, too; they take more space than all else together.
-    spp, max_spp, max_depth, photons, glint : as of `rangesim.experiment.Experiment`.
+    spp, max_spp, max_depth, caustics, glint : as of `rangesim.experiment.Experiment`.
 
     Raises
     ------
@@ -197,7 +197,7 @@ class DatasetSpec:
     spp: Annotated[int, whole(1, "spp")] | None = None
     max_spp: Annotated[int, whole(1, "spp")] = 64
     max_depth: Annotated[int, whole(1, "depth")] = 5
-    photons: Annotated[int, whole(0, "photons")] | None = None
+    caustics: bool = True
     glint: bool = True
 
     def __post_init__(self) -> None:

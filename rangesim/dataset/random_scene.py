@@ -26,7 +26,7 @@ from rangesim.triangle_mesh import TriangleMesh
 STREAMS = ("objects", "support", "arrangement", "materials", "view", "light", "instruments", "experiment")
 """What is drawn, each from random numbers of its own: another light leaves the objects where they are. New streams come
 last, because their places in this list are part of the seeds."""
-OF_EXPERIMENT = ("width", "height", "tolerance_m", "spp", "max_spp", "max_depth", "photons", "glint")
+OF_EXPERIMENT = ("width", "height", "tolerance_m", "spp", "max_spp", "max_depth", "caustics", "glint")
 """Settings that the experiment of each scene takes over from the specification."""
 MAX_OF_SUPPORT = 3.0
 """Largest size of an object from a file over the diagonal of its support. A longer one cannot lie there, and a part of

@@ -42,8 +42,7 @@ class Experiment:
     max_spp : largest number of light paths per pixel where `spp` is None.
     max_depth : largest number of segments of a path between surfaces that scatter it, the last segment to the light
         included. 2 means direct light only. Glass and mirrors do not count.
-    photons : number of caustic photons of each pass. 0: no light through glass or off mirrors. None: the default of
-        `transport`.
+    caustics : whether the projector's light reaches surfaces through glass and off mirrors.
     glint : whether the camera sees the projector's lens in mirrors.
     tolerance_m : largest error of a right reading in metres, which the task sets: what the gripper can bear. Tables and
         causes count readings that are off by more as wrong.
@@ -78,7 +77,7 @@ class Experiment:
     spp: Annotated[int, whole(1, "spp")] | None = None
     max_spp: Annotated[int, whole(1, "spp")] = 64
     max_depth: Annotated[int, whole(1, "depth")] = 5
-    photons: Annotated[int, whole(0, "photons")] | None = None
+    caustics: bool = True
     glint: bool = True
     tolerance_m: Metres = TOLERANCE_M
     seed: int = 0
@@ -117,7 +116,7 @@ class Experiment:
             spp = self.spp
         elif self.motion is None:
             spp = AdaptiveSampling(tuple(instruments), self.max_spp, ambient=self.ambient)
-        return TransportSettings(spp, self.max_depth, seed=self.seed, photons=self.photons, glint=self.glint)
+        return TransportSettings(spp, self.max_depth, seed=self.seed, caustics=self.caustics, glint=self.glint)
 
 
 def load_experiment(path: str | Path) -> Experiment:

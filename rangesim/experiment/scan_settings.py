@@ -33,7 +33,7 @@ class ScanSettings:
 
     Parameters
     ----------
-    scene, material, unit_m, width, height, max_depth, photons, glint, seed, ambient : as for
+    scene, material, unit_m, width, height, max_depth, caustics, glint, seed, ambient : as for
         `rangesim.experiment.Experiment`.
     spp : light paths per pixel; None: the default of `rangesim.transport`.
     instrument : Instrument, whose camera and emitter move together.
@@ -64,7 +64,7 @@ class ScanSettings:
     height: Annotated[int, whole(1, "pixels")] | None = None
     spp: Annotated[int, whole(1, "spp")] | None = None
     max_depth: Annotated[int, whole(1, "depth")] = 5
-    photons: Annotated[int, whole(0, "photons")] | None = None
+    caustics: bool = True
     glint: bool = True
     seed: int = 0
     ambient: Ambient | None = None
@@ -88,7 +88,7 @@ class ScanSettings:
         from rangesim.light_transport.transport_settings import TransportSettings
 
         return TransportSettings(
-            "auto" if self.spp is None else self.spp, self.max_depth, photons=self.photons, glint=self.glint
+            "auto" if self.spp is None else self.spp, self.max_depth, caustics=self.caustics, glint=self.glint
         )
 
 

@@ -57,7 +57,7 @@ def transport(
     ----------
     scene : Scene, as `rangesim.load_scene` returns.
     rig : Rig, or a list of rigs that have the same emitter and different cameras, as in active stereo (see
-        `Rig.with_camera`). The photons are then traced once for all cameras.
+        `Rig.with_camera`). The triangles of caustics are then made once for all cameras.
     sensors : sensors, or bare responses. An empty list gives the energy split and the ground truth only.
     settings : TransportSettings, how the light is sampled; None: the defaults.
     progress : function that is called with the fraction done, 0..1, after each kernel launch, at most ten times a

@@ -30,7 +30,7 @@ MAX_RADIUS2 = 1e30
 
 MAX_CELLS = 1 << 18
 """Largest number of cells of a projector's image. More cells find the light that meets glass more exactly, and take
-longer: a million rays take as long as 150 000 photons. At 1280 x 800 pixels a cell has 2 x 2 of them."""
+longer. At 1280 x 800 pixels a cell has 2 x 2 of them."""
 
 
 class PrimaryRay(NamedTuple):

@@ -27,8 +27,8 @@ from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.camera_rays import Device
+from rangesim.light_transport.delta_surfaces import meets_delta
 from rangesim.light_transport.kernel_launches import Launches, min_lanes
-from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.sampling import Continued, Seed, aligned, of_part, random_stream, stratified
 from rangesim.light_transport.scattering import bounded
 from rangesim.light_transport.spectrum import mono
@@ -200,7 +200,7 @@ def _sums(
         )
         loop = partial(_paths_to_the_lens, lanes, lens, accumulators)
         state, _ = launches.run(loop, state, len(some), accumulators.pending, lambda state: report())
-        accumulators.store(state.channels, slice(None))
+        accumulators.store(state.channels)
         of_range = slice(first, last)
         nearest[of_range] = state.nearest.numpy().reshape(-1, LANES).min(axis=1)
         total[:, of_range] = _of_halves(state.radiance.numpy())

@@ -23,11 +23,18 @@ from rangesim.scene.materials import MATERIAL_CLASSES, transmits
 from rangesim.scene.media import is_boundary
 from rangesim.signals import GroundTruth
 
+PIXELS_PER_ITERATION = 3
+"""Number of pixels whose ground truth takes as long as an iteration of the path loop: 2.2 to 3 on matte, tabletop and
+glassware, with photons and without. It decides on the size of the first launch of the loop, and nothing else."""
 
-def ground_truth(scene: Scene, traced: TracedScene, rig: Rig) -> tuple[GroundTruth, Guides]:
-    """The ground truth of the camera's image, and the guides of the filter of indirect light.
+
+def ground_truth(
+    scene: Scene, traced: TracedScene, rig: Rig, has_guides: bool, of_paths: Launches
+) -> tuple[GroundTruth, Guides | None]:
+    """The ground truth of the camera's image, and the guides of the filter of indirect light if it `has_guides`.
 
     Both describe the first surface on the ray through each pixel's centre; see `rangesim.signals.GroundTruth`.
+    `of_paths`, the launches of the path loop, learn how fast the machine traces rays in this scene.
     """
     h, w = rig.camera.height, rig.camera.width
     launches, shapes = Launches(), scene.mitsuba.shapes()
@@ -35,8 +42,8 @@ def ground_truth(scene: Scene, traced: TracedScene, rig: Rig) -> tuple[GroundTru
     transmits_of = mi.Bool(table_of(scene.mitsuba, [is_boundary(s) or transmits(s.bsdf()) for s in shapes]))
     parts = []
     for begin, end in launches.ranges(h * w):
-        part = _first_surfaces(traced, scene.has_cutouts, scatterers, transmits_of, begin, end)
-        launches.evaluate(part, end - begin)
+        part = _first_surfaces(traced, scene.has_cutouts, scatterers, transmits_of, begin, end, has_guides)
+        of_paths.learn((end - begin) // PIXELS_PER_ITERATION, launches.evaluate(part, end - begin))
         parts.append(part)
 
     def image(name: str) -> np.ndarray:
@@ -46,7 +53,7 @@ def ground_truth(scene: Scene, traced: TracedScene, rig: Rig) -> tuple[GroundTru
             return column.reshape(h, w)
         return np.ascontiguousarray(np.moveaxis(column.reshape(-1, h, w), 0, -1))
 
-    hit, reflectance = image("hit"), image("reflectance")
+    hit = image("hit")
 
     def where_hit(name: str) -> np.ndarray:
         """The same as `image`, but NaN in pixels that see no surface."""
@@ -67,6 +74,9 @@ def ground_truth(scene: Scene, traced: TracedScene, rig: Rig) -> tuple[GroundTru
         material_names=MATERIAL_CLASSES,
         instance_objects=tuple(i.object_name for i in scene.instances),
     )
+    if not has_guides:
+        return truth, None
+    reflectance = image("reflectance")
     first, cosine, number = image("position"), scatterers.cosines[image("scatterer")], image("scatterer")
     if scatterers.has_chains:
         chain = image("chain")
@@ -116,7 +126,7 @@ class FirstSurfaces:
     visible : Bool, whether the projector lights the side that the camera sees.
     uv : Point2f, projector pixel coordinates.
     normal : Vector3f, unit, world, geometric normal on the side of the camera.
-    position : Vector3f, metres, from the camera's centre, along the axes of the world.
+    position : Vector3f, metres, from the camera's centre, along the axes of the world; None without guides, as below.
     scatterer : Int32, index of the shape that scatters first, behind glass and mirrors; -1 for none. The fields that
         follow describe it.
     chain : UInt32, number of the chain up to it, see `Scatterer`.
@@ -132,12 +142,12 @@ class FirstSurfaces:
     visible: mi.Bool
     uv: mi.Point2f
     normal: mi.Vector3f
-    position: mi.Vector3f
-    scatterer: mi.Int32
-    chain: mi.UInt32
-    scatterer_position: mi.Vector3f
-    shading_normal: mi.Vector3f
-    reflectance: mi.Float
+    position: mi.Vector3f | None
+    scatterer: mi.Int32 | None
+    chain: mi.UInt32 | None
+    scatterer_position: mi.Vector3f | None
+    shading_normal: mi.Vector3f | None
+    reflectance: mi.Float | None
 
 
 def _first_surfaces(
@@ -147,6 +157,7 @@ def _first_surfaces(
     transmits_of: mi.Bool,
     begin: int,
     end: int,
+    has_guides: bool,
 ) -> FirstSurfaces:
     """The first surfaces behind the centres of the pixels `begin` to `end` - 1, row by row.
 
@@ -161,7 +172,7 @@ def _first_surfaces(
     pixel = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin)
     link = traced.projector.connect(traced.scene, si, hit, pixel)
     through = dr.gather(mi.Bool, transmits_of, number_of(si.shape), hit)
-    seen = scatterers.behind(si, hit)
+    seen = scatterers.behind(si, hit)  # traced only if its fields are asked for
     return FirstSurfaces(
         hit=hit,
         index=scatterers.index(si, hit),
@@ -170,10 +181,10 @@ def _first_surfaces(
         visible=link.lit & (through | (dr.dot(normal, link.direction) > 0)),
         uv=link.uv,
         normal=mi.Vector3f(normal),
-        position=-to_camera,
-        scatterer=seen.index,
-        chain=seen.chain,
-        scatterer_position=mi.Vector3f(seen.si.p) - mi.Vector3f(ray.origin),
-        shading_normal=mi.Vector3f(dr.normalize(seen.si.sh_frame.n)),
-        reflectance=scatterers.reflectance(seen.si, seen.index >= 0),
+        position=-to_camera if has_guides else None,
+        scatterer=seen.index if has_guides else None,
+        chain=seen.chain if has_guides else None,
+        scatterer_position=mi.Vector3f(seen.si.p) - mi.Vector3f(ray.origin) if has_guides else None,
+        shading_normal=mi.Vector3f(dr.normalize(seen.si.sh_frame.n)) if has_guides else None,
+        reflectance=scatterers.reflectance(seen.si, seen.index >= 0) if has_guides else None,
     )

@@ -32,7 +32,7 @@ MAX_OVERRUN = 1.5
 """Largest ratio of the iterations of a launch to those that fit into its duration. Lanes that have not finished then go
 on in the next launch, so that one slow lane cannot make a launch long."""
 FIRST_UNITS = 1 << 22
-"""Work of a first launch, in iterations of a loop, rays or photons, for which no time has been measured yet. If it is
+"""Work of a first launch, in iterations of a loop or rays, for which no time has been measured yet. If it is
 too large for a slow machine, Ctrl-C waits longer, but only once."""
 MAX_STRETCH = 2.0
 """Largest ratio by which launches become longer if it takes long to make the kernel (thousands of shapes), because each
@@ -80,9 +80,11 @@ class Launches:
         self.launch_s = LAUNCH_S if is_watched or not interrupts.handled else UNWATCHED_LAUNCH_S
         self.units = int(FIRST_UNITS * self.launch_s / LAUNCH_S)
 
-    def evaluate(self, arrays: object, units: int) -> None:
-        """Compute Dr.Jit arrays, wait for them, and learn from the time that these units of work took."""
-        self.learn(units, evaluate(arrays))
+    def evaluate(self, arrays: object, units: int) -> float:
+        """Compute Dr.Jit arrays, wait for them, and learn from the time that these units of work took; returns it."""
+        seconds = evaluate(arrays)
+        self.learn(units, seconds)
+        return seconds
 
     def learn(self, units: int, seconds: float, prepared_s: float = 0.0) -> None:
         """Fit the size of the next launch to the time that these units took, and to the time to make the kernel."""

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from rangesim.light_transport.caustics import caustic_maps, caustic_photons
+from rangesim.light_transport.caustic_sheets import Sheets
+from rangesim.light_transport.caustics import caustic_sheets, sheet_scene
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
 from rangesim.light_transport.indirect_filter import LightFilter
 from rangesim.light_transport.kernel_launches import Launches, Progress, Report, raised_as_it_is, report_part
 from rangesim.light_transport.loop import PathSettings, Radiance, View
 from rangesim.light_transport.narrow_lobes import warn_of_narrow_lobes
-from rangesim.light_transport.photons import Photons
 from rangesim.light_transport.ray_tables import camera_device
 from rangesim.light_transport.samples_per_pixel import Sampler
 from rangesim.light_transport.sampling_error import MIN_FOR_HALVES, Estimate
@@ -71,7 +71,7 @@ def trace_light(
 
     Parameters
     ----------
-    rigs : rigs with the same emitter and different cameras. The photons are traced once for all cameras.
+    rigs : rigs with the same emitter and different cameras. The triangles of caustics are made once for all cameras.
     sensors : sensors, or bare responses. Equal responses share their channels.
     settings : TransportSettings. spp "auto" means `MATTE_SPP` samples where matte pixels share their indirect light,
         and `OTHER_SPP` elsewhere.
@@ -89,15 +89,12 @@ def trace_light(
         settings.spp.check(responses)
     traced = TracedScene.of(scene.mitsuba, scene.in_renderer(rigs[0]))
     warn_of_narrow_lobes(traced, [instance.name for instance in scene.instances])
-    views = [_CameraPass(scene, traced, one, settings, number) for number, one in enumerate(rigs)]
-    fewest = min(int(view.samples.min()) for view in views)
-    at_work = partial(report, 0.0)
-    pixels = max(len(view.samples) for view in views)
-    photons = caustic_photons(traced, rigs[0], settings, pixels, fewest, at_work)
+    views = [_CameraPass(scene, traced, one, settings, number, launches) for number, one in enumerate(rigs)]
+    sheets = caustic_sheets(traced, [view.rig for view in views], settings, partial(report, 0.0))
     signals = []
     for number, view in enumerate(views):
         part = partial(report_part, report, number / len(views), 1 / len(views))
-        signals.append(view.trace(responses, photons, launches, part))
+        signals.append(view.trace(responses, sheets, launches, part))
     return signals
 
 
@@ -110,6 +107,7 @@ class _CameraPass:
     traced : TracedScene with the emitter of the pass; its camera is replaced.
     rig : Rig of this camera.
     number : index of the camera, from 0. Each camera has random numbers of its own.
+    launches : Launches of the path loop.
     """
 
     def __init__(
@@ -119,30 +117,33 @@ class _CameraPass:
         rig: Rig,
         settings: TransportSettings,
         number: int,
+        launches: Launches,
     ) -> None:
         self.zones = ZoneSums(rig, rig.camera.matrix) if isinstance(rig.camera, Zones) else None
         rig = rig.traced
         self.scene, self.rig, self.here = scene, rig, scene.in_renderer(rig)
         self.settings = replace(settings, seed=derived_seed(settings.seed, number)) if number else settings
         self.traced = traced._replace(camera=camera_device(self.here))
-        self.truth, self.guides = ground_truth(scene, self.traced, rig)
         # The indirect light of beams changes from pixel to pixel, because each has a spot of its own
         can_share = rig.camera.has_neighbours and not isinstance(rig.projector, Beam)
         self.is_filtered = settings.indirect == "filtered" and can_share
+        self.truth, self.guides = ground_truth(scene, self.traced, rig, self.is_filtered, launches)
         spp, pixels = settings.spp, rig.camera.height * rig.camera.width
         if isinstance(spp, Sampler):
             self.samples = np.full(pixels, spp.first_spp)
         elif isinstance(spp, int):
             self.samples = np.full(pixels, spp)
         else:
-            is_matte = self.truth.material == MATERIAL_CLASSES.index("matte")
-            is_shared = self.is_filtered & is_matte & (self.guides.instance >= 0)
-            self.samples = np.where(is_shared.ravel(), MATTE_SPP, OTHER_SPP)
+            is_shared = np.zeros(pixels, bool)
+            if self.guides is not None:
+                is_matte = self.truth.material == MATERIAL_CLASSES.index("matte")
+                is_shared = (is_matte & (self.guides.instance >= 0)).ravel()
+            self.samples = np.where(is_shared, MATTE_SPP, OTHER_SPP)
 
     def trace(
         self,
         responses: Sequence[Response],
-        photons: Photons | None,
+        sheets: Sheets | None,
         launches: Launches,
         report: Report,
     ) -> StillSignals:
@@ -151,25 +152,26 @@ class _CameraPass:
         Parameters
         ----------
         responses : responses whose channels are accumulated.
-        photons : Photons of the emitter; None: there are none.
+        sheets : Sheets of the emitter; None: there are none.
         launches : size of the kernel launches.
         report : function that is called with the fraction of this camera's work that is done, 0..1.
         """
         settings, rig, guides = self.settings, self.rig, self.guides
         sampler = settings.spp if isinstance(settings.spp, Sampler) else None
         fewest = int(self.samples.min())
-        maps = caustic_maps(photons, self.here, settings.caustic_radius_m)
-        view, of_paths = View(self.traced, maps), PathSettings.of(self.scene, settings)
-        keeps_apart = self.is_filtered
-        if keeps_apart and self.scene.has_matte_textures:
+        view = View(self.traced, sheet_scene(sheets, self.here, fewest))
+        of_paths = PathSettings.of(self.scene, settings)
+        if guides is not None and self.scene.has_matte_textures:
             few = min(fewest, TEXTURE_SAMPLES)
             guides = guides.with_reflectance(mean_reflectance(view, of_paths, rig, self.scene.has_cutouts, few))
-        shared = LightFilter(guides) if keeps_apart else None
+        shared = LightFilter(guides) if guides is not None else None
         at_work = partial(report, 0.0)
         sees_glint = settings.glint and not isinstance(rig.projector, Beam)
         glints = trace_glint(self.traced, self.here, responses, settings.seed, at_work) if sees_glint else None
         has_halves = settings.sampling_error and fewest >= MIN_FOR_HALVES
-        estimate = Estimate(view, of_paths, rig, responses, keeps_apart, has_halves, settings.memory_bytes, launches)
+        estimate = Estimate(
+            view, of_paths, rig, responses, self.is_filtered, has_halves, settings.memory_bytes, launches
+        )
 
         def signals_of(some: Sequence[Response] | None) -> StillSignals:
             channels, radiance, error = estimate.means(shared, some)
@@ -190,7 +192,7 @@ class _CameraPass:
                 estimate.sample(pixels, more[pixels], partial(report_part, report, PATHS_FRACTION - left, left))
         signals = signals_of(None)
         report(1.0)
-        cut = photons.energy.cut if photons else 0.0
+        cut = sheets.cut if sheets else 0.0
         truncation = estimate_truncation(estimate.mean_tally(), signals.energy, settings.max_depth, cut)
         signals = replace(signals, truncation=truncation)
         return signals if self.zones is None else self.zones.signals(signals)

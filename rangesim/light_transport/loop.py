@@ -20,7 +20,7 @@ that absorbs, a segment of length d keeps the fraction exp(-sigma_a d) of the li
 (`rangesim.light_transport.absorption`).
 
 The loop carries out two of the three strategies that bring the projector's light to the camera: next-event estimation,
-and the gathering of caustic photons. `rangesim.light_transport.strategies` says which paths belong to which strategy.
+and caustics. `rangesim.light_transport.strategies` says which paths belong to which strategy.
 """
 
 from __future__ import annotations
@@ -34,15 +34,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.accumulators import Accumulators
+from rangesim.light_transport.accumulators import Accumulators, Runs
 from rangesim.light_transport.ambient_light import ambient_on_ray, sampled_ambient, sampled_ambient_through_media
 from rangesim.light_transport.beams import BeamDevice, Pencil, Spot
-from rangesim.light_transport.caustics import Vertex, caustic_light, gather
+from rangesim.light_transport.caustics import Vertex, caustic_light
+from rangesim.light_transport.delta_surfaces import has_delta
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
-from rangesim.light_transport.photon_maps import PhotonMaps
-from rangesim.light_transport.photons import has_delta
 from rangesim.light_transport.sampling import (
-    GOLDEN_STEP,
     Continued,
     Seed,
     Stream,
@@ -54,6 +52,7 @@ from rangesim.light_transport.sampling import (
     used_up,
 )
 from rangesim.light_transport.scattering import MAX_EVENTS, ROULETTE_BELOW
+from rangesim.light_transport.sheet_scene import SheetScene
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray, survival
 from rangesim.light_transport.spots import connect_to_spot, lit_spot
@@ -85,6 +84,8 @@ class PathSettings(NamedTuple):
     ambient : whether the scene has light of its own.
     samples_ambient : whether directions to that light are sampled. For uniform surroundings, samples of the BSDF alone
         are best.
+    refracts : whether light passes through some surface of the scene, so that the refractive index along a path may
+        change.
     """
 
     seed: Seed
@@ -94,6 +95,7 @@ class PathSettings(NamedTuple):
     glint: bool
     ambient: bool
     samples_ambient: bool
+    refracts: bool
 
     @classmethod
     def of(cls, scene: Scene, settings: TransportSettings) -> PathSettings:
@@ -106,6 +108,7 @@ class PathSettings(NamedTuple):
             glint=settings.glint,
             ambient=scene.has_ambient,
             samples_ambient=scene.has_lamps,
+            refracts=any(mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in scene.mitsuba.shapes()),
         )
 
 
@@ -162,7 +165,7 @@ class Radiance(Generic[Array]):
     caustic: Array
     ambient: Array
     smooth_caustic: Array
-    """Caustics that were gathered over wide circles and are therefore smooth; `caustic` has the others."""
+    """Caustics at later vertices of a path, which change slowly over the image; `caustic` has those at the first."""
     glint: Array
     """Glint of a beam, whose emitter the paths of its own pixel meet; that of a projector is traced in `glint.py`."""
 
@@ -176,22 +179,6 @@ class PathSums(NamedTuple):
 
     radiance: np.ndarray
     tally: np.ndarray
-
-
-@dataclass
-class RandomStates:
-    """States of the random numbers of the lanes.
-
-    path : UInt64, of the stream that makes the light path.
-    photon : UInt64, of the stream that chooses photons. It is a stream of its own, so that photons change no byte of
-        any other light. None without photon maps.
-    level : UInt32, a fraction of 2^32 that decides which levels of photons are gathered. 16 neighbours start with the
-        same fraction, so that they skip a level together. None without photon maps.
-    """
-
-    path: mi.UInt64
-    photon: mi.UInt64
-    level: mi.UInt32
 
 
 @dataclass
@@ -248,7 +235,7 @@ class LaneState:
     """
 
     sample: mi.UInt32
-    random: RandomStates
+    random: mi.UInt64
     path: PathState
     channels: list[list[mi.Float]]
     radiance: Radiance[mi.Float]
@@ -256,10 +243,10 @@ class LaneState:
 
 
 class View(NamedTuple):
-    """Everything that the lanes read: the scene with its devices, and the photon maps (None: no photons)."""
+    """Everything that the lanes read: the scene with its devices, and the triangles of light (None: there are none)."""
 
     traced: TracedScene
-    maps: PhotonMaps | None = None
+    sheets: SheetScene | None = None
 
 
 def trace(
@@ -280,7 +267,7 @@ def trace(
     """
     pixels, runs = accumulators.pixels, _dealt(-(-accumulators.pixels // NEIGHBOURS))
     traced = PathSums(
-        np.empty((len(fields(Radiance)), pixels), np.float32), np.empty((len(fields(Tally)), pixels), np.float32)
+        np.zeros((len(fields(Radiance)), pixels), np.float32), np.zeros((len(fields(Tally)), pixels), np.float32)
     )
     samples = allocation.samples
     total, begin, finished, iterations = int(samples.sum(dtype=np.int64)), 0, 0, 0
@@ -293,23 +280,23 @@ def trace(
         most = max(min_lanes(), int(launches.units / (per_sample * total / pixels))) // NEIGHBOURS
         left = len(runs) - begin
         end = begin + -(-left // -(-left // most))  # launches of even size
-        places = (np.sort(runs[begin:end])[:, None] * NEIGHBOURS + np.arange(NEIGHBOURS)).ravel()
-        places = places[places < pixels]
+        chosen = Runs(np.sort(runs[begin:end]), NEIGHBOURS, pixels)
+        places = chosen.places()
         lanes = Lanes(view, settings, allocation, places)
         loop, state = partial(walk, view, settings, accumulators, lanes), start(view, settings, accumulators, lanes)
         state, taken = launches.run(loop, state, len(places), accumulators.pending, tell)
-        accumulators.store(state.channels, places)
-        _store(state.radiance, traced.radiance, places)
-        _store(state.tally, traced.tally, places)
+        accumulators.store(state.channels, chosen)
+        _store(state.radiance, traced.radiance, chosen)
+        _store(state.tally, traced.tally, chosen)
         begin, finished, iterations = end, finished + int(samples[places].sum(dtype=np.int64)), iterations + taken
     return traced
 
 
-def _store(sums: Radiance[mi.Float] | Tally[mi.Float], images: np.ndarray, places: np.ndarray) -> None:
-    """Write the evaluated sums of lanes to `images` (k, n) at these places; 0 where there are none."""
+def _store(sums: Radiance[mi.Float] | Tally[mi.Float], images: np.ndarray, runs: Runs) -> None:
+    """Write the evaluated sums of lanes to `images` (k, n), which are 0 where there are none."""
     for image, field in zip(images, fields(sums), strict=True):
-        values = getattr(sums, field.name)
-        image[places] = 0 if values is None else values.numpy()
+        if (values := getattr(sums, field.name)) is not None:
+            runs.write(values.numpy(), image)
 
 
 def _dealt(n: int) -> np.ndarray:
@@ -338,7 +325,7 @@ class Lanes:
         self.total = mi.UInt32(aligned(allocation.total[places], np.uint32))
         self.stride = dr.opaque(mi.UInt32, allocation.stride)
         self.first, self.part = (
-            mi.UInt32(aligned(np.broadcast_to(x, len(allocation.pixels))[places], np.uint32))
+            mi.UInt32(aligned(x[places], np.uint32)) if isinstance(x, np.ndarray) else dr.opaque(mi.UInt32, x)
             for x in (allocation.first, allocation.part)
         )
         self.irradiance = dr.opaque(mi.Float, allocation.irradiance)
@@ -348,43 +335,44 @@ class Lanes:
         self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())  # of the places of samples within the pixel
         on_lens = view.traced.camera.has_lens
         self.lens_shift = mi.Point2f(rng.next_float32(), rng.next_float32()) if on_lens else None
-        self.choice_shift = random_stream(settings.seed, self.pixel, Stream.FOURTH).next_uint32()
+        self.choice_shift = random_stream(settings.seed, self.pixel, Stream.SECOND).next_uint32()
         self.random = Continued(of_part(rng, self.part))
-        self.photon = Continued(of_part(random_stream(settings.seed, self.pixel, Stream.SECOND), self.part))
 
     def number(self, taken: mi.UInt32) -> mi.UInt32:
         """Number of the next sample among all samples of its pixel, after `taken` of the allocated ones."""
         return self.first + (taken >> 1) * self.stride + (taken & 1)
 
+    def pick(self, number: mi.UInt32) -> mi.Float:
+        """A uniform number in 0..1 for a sample of this number, apart from the random numbers of its path.
+
+        It depends on the pixel and the seed, as the shift does.
+        """
+        return mi.sample_tea_float32(dr.reinterpret_array(mi.UInt32, self.shift.x), number)
+
 
 def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes: Lanes) -> LaneState:
     """The state of lanes that have done nothing yet."""
-    n, gathers, in_media = dr.width(lanes.pixel), view.maps is not None, view.traced.media is not None
-    is_beam = isinstance(view.traced.projector, BeamDevice)
+    n, gathers, in_media = dr.width(lanes.pixel), view.sheets is not None, view.traced.media is not None
+    is_beam, meets_delta = isinstance(view.traced.projector, BeamDevice), settings.delta or in_media
 
     def zeros(exist: bool = True) -> mi.Float:
         return dr.zeros(mi.Float, n) if exist else None
 
-    level = of_part(random_stream(settings.seed, lanes.pixel >> 4, Stream.THIRD), lanes.part).next_uint32()
     return LaneState(
         sample=dr.zeros(mi.UInt32, n),
-        random=RandomStates(
-            path=mi.UInt64(lanes.random.rng.state),
-            photon=mi.UInt64(lanes.photon.rng.state) if gathers else None,
-            level=level if gathers else None,
-        ),
+        random=mi.UInt64(lanes.random.rng.state),
         path=PathState(
             depth=dr.zeros(mi.UInt32, n),
             chain=dr.zeros(mi.UInt32, n) if settings.delta else None,
             origin=dr.zeros(mi.Point3f, n),
             direction=dr.zeros(mi.Vector3f, n),
             throughput=dr.ones(mi.Float, n),
-            ray_state=RayState.start(view.traced, n),
+            ray_state=RayState.start(view.traced, n, settings.refracts),
             is_first=dr.full(mi.Bool, True, n),
-            via_delta=dr.full(mi.Bool, False, n),
-            left_delta=dr.full(mi.Bool, False, n),
-            unsampled=dr.full(mi.Bool, True, n),
-            pdf=dr.zeros(mi.Float, n),
+            via_delta=dr.full(mi.Bool, False, n) if meets_delta else None,
+            left_delta=dr.full(mi.Bool, False, n) if meets_delta else None,
+            unsampled=dr.full(mi.Bool, True, n) if settings.ambient else None,
+            pdf=zeros(settings.ambient),
             events=dr.zeros(mi.UInt32, n) if in_media else None,
             scattered_inside=dr.full(mi.Bool, False, n) if in_media else None,
             choice=dr.zeros(mi.Float, n) if settings.delta else None,
@@ -395,7 +383,7 @@ def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes:
         radiance=Radiance(
             direct=zeros(),
             multipath=zeros(),
-            specular=zeros(),
+            specular=zeros(meets_delta),
             caustic=zeros(gathers),
             ambient=zeros(settings.ambient),
             smooth_caustic=zeros(gathers),
@@ -422,19 +410,19 @@ def walk(
     max_iterations: mi.UInt32,
 ) -> tuple[LaneState, mi.UInt32]:
     """The state of the lanes after at most `max_iterations` of the loop, and the number of iterations of each lane."""
-    traced, maps = view
+    traced, sheets = view
     scene, surfaces, camera, projector, media, cutouts, absorbers = traced
     n = dr.width(state.sample)
     is_beam = isinstance(projector, BeamDevice)
     has_spot, has_pencil = state.path.spot is not None, state.path.pencil is not None
-    sees_glint = state.radiance.glint is not None
+    sees_glint, meets_delta = state.radiance.glint is not None, state.path.left_delta is not None
     flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if has_pencil else mi.RayFlags.All
     left = max_iterations + dr.zeros(mi.UInt32, n)  # iterations
     active = (state.sample < lanes.samples) & (left > 0)
 
     while active:
         path, radiance, tally = state.path, state.radiance, state.tally  # parts of the state, changed in place
-        rng = lanes.random.at(state.random.path)
+        rng = lanes.random.at(state.random)
         # In this iteration: an event inside a medium, or the boundary of one
         scatters, crosses = mi.Bool(False), mi.Bool(False)
 
@@ -470,7 +458,8 @@ def walk(
         si = surfaces.ray_intersect(ray, flags, coherent=False, active=active)
         hit = si.is_valid() & active
         met = mi.Point3f(si.p)
-        si.p = dr.select(path.left_delta, corrected_point(si, path.ray_state.previous, ray.d), met)
+        if dr.hint(meets_delta, mode="scalar"):
+            si.p = dr.select(path.left_delta, corrected_point(si, path.ray_state.previous, ray.d), met)
         if dr.hint(media is not None, mode="scalar"):
             assert media is not None
             assert path.ray_state.inside is not None
@@ -503,7 +492,8 @@ def walk(
             facing = dr.select(scatters, ray.d, si.n)
             path.pencil = path.pencil.arrived(ray.d, dr.norm(si.p - path.ray_state.previous), facing)
         bsdf = si.bsdf(ray)
-        is_vertex = hit & (path.depth < settings.max_depth) & (scatters | can_be_vertex(bsdf))
+        is_rough = can_be_vertex(bsdf)
+        is_vertex = hit & (path.depth < settings.max_depth) & (scatters | is_rough)
 
         # ---- The ray meets the emitter of its own beam ------------------------------------------------
         if dr.hint(sees_glint, mode="scalar"):
@@ -531,7 +521,7 @@ def walk(
         is_connected = owner(is_vertex, delta_interactions=0).next_event
         if dr.hint(is_beam, mode="scalar"):
             # The boundaries of media, which nothing bends at, may lie between a mirror and the vertex
-            via_delta = path.chain > 0 if settings.delta else path.left_delta
+            via_delta = path.chain > 0 if settings.delta else mi.Bool(False) if media is None else path.left_delta
             is_connected &= beam_connects((path.depth == 1) & is_own, via_delta, has_spot)
         link = projector.connect(scene, si, is_connected, lanes.pixel, media, path.ray_state.inside)
         if dr.hint(has_pencil, mode="scalar"):
@@ -563,11 +553,12 @@ def walk(
         u, v, path_length = (
             dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, path.ray_state.length + link.distance)
         )
-        kind = next_event_kind(path.is_first, path.via_delta)
+        kind = next_event_kind(path.is_first, path.via_delta if meets_delta else mi.Bool(False))
         light_path = LightPath(u, v, path_length, path.is_first, kind, link.blur_px)
         state.channels = accumulators.add(state.channels, light_path, light, lanes.place, link.lit, kind == MULTIPATH)
         radiance.direct += dr.select(kind == DIRECT, light, 0)
-        radiance.specular += dr.select(kind == SPECULAR, light, 0)
+        if dr.hint(meets_delta, mode="scalar"):
+            radiance.specular += dr.select(kind == SPECULAR, light, 0)
         radiance.multipath += dr.select(kind == MULTIPATH, light, 0)
         tally.indirect += dr.select(is_later, light, 0)
 
@@ -588,18 +579,22 @@ def walk(
             radiance.multipath += light
             tally.indirect += light
 
-        # ---- Caustic photons: light that reached this point through glass or off mirrors -------------
-        if dr.hint(maps is not None, mode="scalar"):
+        # ---- Caustics: light that reached this point through glass or off mirrors --------------------
+        if dr.hint(sheets is not None, mode="scalar"):
             vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, path.is_first & ~link.lit)
-            chosen = lanes.photon.at(state.random.photon)
-            xi = [chosen.next_float32() for _ in range(3)]
-            state.random.photon = chosen.state
-            state.random.level += GOLDEN_STEP
-            chance = mi.Float(state.random.level >> 8) * 2**-24
-            brought = gather(maps, vertex, number, xi, chance, is_vertex & ~scatters)
-            state.channels, light = caustic_light(maps, accumulators, state.channels, vertex, brought, lanes.place)
-            radiance.caustic += dr.select(brought.is_wide, 0, light)
-            radiance.smooth_caustic += dr.select(brought.is_wide, light, 0)
+            state.channels, light = caustic_light(
+                sheets,
+                accumulators,
+                state.channels,
+                vertex,
+                number,
+                lanes.pick(number),
+                is_later,
+                lanes.place,
+                is_vertex & ~scatters,
+            )
+            radiance.caustic += dr.select(is_later, 0, light)
+            radiance.smooth_caustic += dr.select(is_later, light, 0)
             tally.indirect += dr.select(is_later, light, 0)
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
@@ -634,11 +629,12 @@ def walk(
             path.choice = dr.select(decided, used_up(path.choice, bs.pdf), fresh)
         path.throughput *= bs_weight
         path.ray_state = path.ray_state.refracted(bs, at_surface)
-        path.left_delta = goes_delta & ~crosses
+        if dr.hint(meets_delta, mode="scalar"):
+            path.left_delta = goes_delta & ~crosses
         if dr.hint(settings.delta, mode="scalar"):
             path.depth -= dr.select(path.left_delta, mi.UInt32(1), mi.UInt32(0))
             path.chain = dr.select(crosses, path.chain, dr.select(path.left_delta, path.chain + 1, 0))
-        fraction = path.throughput * dr.square(path.ray_state.ior)  # this fraction of the light is left on the path
+        fraction = path.ray_state.power(path.throughput)  # this fraction of the light is left on the path
         chance = dr.select(path.depth > settings.rr_depth, dr.minimum(fraction, 0.95), 1)
         if dr.hint(settings.delta, mode="scalar"):
             chance = dr.minimum(chance, survival(path.chain, fraction))
@@ -651,13 +647,15 @@ def walk(
         if dr.hint(cutouts is not None, mode="scalar"):
             assert cutouts is not None
             passes = cutouts.passed(si, bs, at_surface)
-        path.is_first &= ~scatters & (passes | ~can_be_vertex(bsdf))
-        path.via_delta |= goes_delta & ~passes
+        path.is_first &= ~scatters & (passes | ~is_rough)
         path.ray_state = path.ray_state.restarted(True, si.p, path.ray_state.length)
-        path.pdf = mi.Float(bs.pdf)
-        path.unsampled = goes_delta | scatters
+        if dr.hint(settings.ambient, mode="scalar"):
+            path.pdf = mi.Float(bs.pdf)
+            path.unsampled = goes_delta | scatters
         ray = si.spawn_ray(wo)
-        ray.o = dr.select(path.left_delta, spawn_specular_ray(si, met, wo).o, ray.o)
+        if dr.hint(meets_delta, mode="scalar"):
+            path.via_delta |= goes_delta & ~passes
+            ray.o = dr.select(path.left_delta, spawn_specular_ray(si, met, wo).o, ray.o)
         if dr.hint(media is not None, mode="scalar"):
             path.events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))
             path.scattered_inside = scatters | (path.scattered_inside & ~crosses)
@@ -672,7 +670,7 @@ def walk(
         goes_on &= hit & survives & (path.throughput > 0)
         if dr.hint(settings.delta, mode="scalar"):
             too_long = goes_on & (path.chain >= MAX_CHAIN)
-            tally.cut += dr.select(too_long, path.throughput * dr.square(path.ray_state.ior), 0)
+            tally.cut += dr.select(too_long, path.ray_state.power(path.throughput), 0)
             goes_on &= path.chain < MAX_CHAIN
         ends = ~goes_on
         state.sample = dr.select(ends, state.sample + 1, state.sample)
@@ -682,13 +680,15 @@ def walk(
         path.throughput = dr.select(ends, 1, path.throughput)
         path.ray_state = path.ray_state.reset(traced, ends)
         path.is_first |= ends
-        path.via_delta &= ~ends
-        path.unsampled |= ends
-        path.left_delta &= ~ends
+        if dr.hint(meets_delta, mode="scalar"):
+            path.via_delta &= ~ends
+            path.left_delta &= ~ends
+        if dr.hint(settings.ambient, mode="scalar"):
+            path.unsampled |= ends
         if dr.hint(media is not None, mode="scalar"):
             path.events = dr.select(ends, 0, path.events)
             path.scattered_inside &= ~ends
-        state.random.path, path.origin, path.direction = rng.state, ray.o, ray.d
+        state.random, path.origin, path.direction = rng.state, ray.o, ray.d
         left -= 1
         active = (state.sample < lanes.samples) & (left > 0)
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A warning: narrow lobes throw light onto other surfaces, where light paths rarely find it.
 
-A mirror is a delta interaction, and photons carry its light. A rough metal with an alpha of 0.01 is no delta
+A mirror is a delta interaction, and caustics carry its light. A rough metal with an alpha of 0.01 is no delta
 interaction. A polished `principled` BSDF is no delta interaction either, at any roughness. A path from the lit wall
 meets such a lobe by chance once in ten thousand times, and the sampling error does not contain light that no sample
 found. So rays of the projector are followed here, through lobes and delta interactions, to the surfaces that scatter

@@ -40,8 +40,6 @@ class Stream(Enum):
 
     FIRST = "first"
     SECOND = "second"
-    THIRD = "third"
-    FOURTH = "fourth"
 
 
 def random_stream(seed: Seed, number: mi.UInt32, stream: Stream = Stream.FIRST) -> mi.PCG32:
@@ -51,13 +49,11 @@ def random_stream(seed: Seed, number: mi.UInt32, stream: Stream = Stream.FIRST) 
     algorithm, HPG 2010). TEA maps no two inputs to the same output. A seed of more than 32 bits goes through TEA twice,
     and the upper half of the seed is added in between, so that no two seeds give the same numbers.
     """
-    pair = (number, seed.low) if stream in (Stream.THIRD, Stream.FOURTH) else (seed.low, number)
-    once = [mi.UInt32(x) for x in mi.sample_tea_32(*pair)]
+    once = [mi.UInt32(x) for x in mi.sample_tea_32(seed.low, number)]
     twice = mi.sample_tea_32(once[0] + seed.high, once[1])
     states = [mi.UInt64(dr.select(seed.high == 0, a, b)) for a, b in zip(once, twice, strict=True)]
-    return mi.PCG32(
-        1, *(reversed(states) if stream in (Stream.SECOND, Stream.FOURTH) else states)
-    )  # 1: no lane number mixed in
+    # 1: no lane number mixed in
+    return mi.PCG32(1, *(reversed(states) if stream is Stream.SECOND else states))
 
 
 def of_part(rng: mi.PCG32, part: mi.UInt32) -> mi.PCG32:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.indirect_filter import CHANNELS_AT_ONCE, LightFilter
 from rangesim.light_transport.kernel_launches import Launches, Report, report_part
 from rangesim.light_transport.loop import PathSettings, PathSums, Radiance, SampleAllocation, View, trace
-from rangesim.light_transport.truncation import Tally
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.signals import SamplingError
@@ -45,25 +44,45 @@ class Sums:
         self.shape = h, w
         self.channels: dict[Response, np.ndarray] = {}
         self.smooth: dict[Response, np.ndarray] = {}
-        self.radiance = np.zeros((len(fields(Radiance)), h, w), np.float32)
+        self.radiance: np.ndarray | None = None
 
-    def add(self, pixels: np.ndarray, columns: slice, traced: PathSums, accumulators: Accumulators) -> None:
-        """Add these columns (n) of the traced sums to the pixels with these flat indices (n,), in ascending order.
-
-        The first sums of a whole image are not copied: they stay views of the accumulators' memory.
-        """
-        is_whole = len(pixels) == self.shape[0] * self.shape[1]
-        runs = np.flatnonzero(np.diff(pixels, prepend=-2, append=-2) != 1)
+    def add(self, some: Pixels, columns: slice, traced: PathSums, accumulators: Accumulators) -> None:
+        """Add these columns (n) of the traced sums to some pixels (n,)."""
         for response, values in zip(accumulators.responses, accumulators.images(), strict=True):
             for part, of_part in zip((self.channels, self.smooth), values, strict=False):
-                if response not in part and is_whole and of_part.flags.writeable:
-                    part[response] = of_part[:, columns].reshape(-1, *self.shape)
-                    continue
-                if response not in part:
-                    part[response] = np.zeros((response.channels, *self.shape), np.float32)
-                image = part[response].reshape(response.channels, -1)
-                in_blocks(_add, len(image), of_part[:, columns], pixels, runs, image, smallest=1)
-        self.radiance.reshape(len(self.radiance), -1)[:, pixels] += traced.radiance[:, columns]
+                part[response] = some.added(of_part[:, columns], part.get(response))
+        self.radiance = some.added(traced.radiance[:, columns], self.radiance)
+
+
+class Pixels:
+    """Some pixels of an image, to which sums are added.
+
+    Parameters
+    ----------
+    flat : (n,) int, their flat indices, ascending.
+    shape : (h, w) of the image.
+    """
+
+    def __init__(self, flat: np.ndarray, shape: tuple[int, int]) -> None:
+        self.flat, self.shape = flat, shape
+        self.are_all = len(flat) == shape[0] * shape[1]
+
+    @cached_property
+    def _runs(self) -> np.ndarray:
+        """(k + 1,) int, bounds of successive pixels."""
+        return np.flatnonzero(np.diff(self.flat, prepend=-2, append=-2) != 1)
+
+    def added(self, values: np.ndarray, images: np.ndarray | None) -> np.ndarray:
+        """The images (c, h, w) with the values (c, n) added; None: the first values.
+
+        The first values of a whole image are not copied: the result is a view of them.
+        """
+        if images is None and self.are_all and values.flags.writeable:
+            return values.reshape(-1, *self.shape)
+        if images is None:
+            images = np.zeros((len(values), *self.shape), np.float32)
+        in_blocks(_add, len(images), values, self.flat, self._runs, images.reshape(len(images), -1), smallest=1)
+        return images
 
 
 @cached_njit(nogil=True, error_model="numpy")
@@ -113,12 +132,26 @@ class Halves:
 
         `sums` are those of the halves, (c, h, w) each; `out` are the same arrays, or arrays of zeros.
         """
-        if len(sums) == 1:
-            np.divide(sums[0], self.total, out=out[0])
-            return
         flat = [x.reshape(len(x), -1) for x in (*sums, *out)]
+        if len(sums) == 1:
+            in_blocks(_write_mean, len(flat[0]), *flat, self.total.ravel(), smallest=1)
+            return
         factors = self.of_a.ravel(), self.of_b.ravel(), self.total.ravel()
         in_blocks(_write_mean_and_error, len(flat[0]), *flat, *factors, smallest=1)
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _write_mean(start, stop, sums, mean, total):  # type: ignore[no-untyped-def]
+    """The means of `Halves` without halves; sums (c, n), total (n,). Channels without any light are left out."""
+    n = sums.shape[1]
+    for c in range(start, stop):
+        added, whole = sums[c], mean[c]
+        lit = 0
+        while lit < n and added[lit] == 0:
+            lit += 1
+        if lit < n:
+            for i in range(n):
+                whole[i] = added[i] / total[i]
 
 
 @cached_njit(nogil=True, error_model="numpy")
@@ -167,7 +200,7 @@ class Estimate:
         self.shape = rig.camera.height, rig.camera.width
         self.halves = [Sums(*self.shape) for _ in range(1 + has_halves)]
         self.samples = [np.zeros(self.shape, np.uint32) for _ in self.halves]
-        self.tally = np.zeros((len(fields(Tally)), *self.shape), np.float32)
+        self.tally: np.ndarray | None = None
         self.rounds = 0
 
     def sample(self, pixels: np.ndarray, samples: np.ndarray, report: Report) -> None:
@@ -192,16 +225,18 @@ class Estimate:
             now = int(of_tile.sum(dtype=np.int64))
             so_far = partial(report_part, report, done / total, now / total)
             traced = trace(self.view, self.settings, allocation, accumulators, self.launches, so_far)
+            of_image = Pixels(some, self.shape)
             for half, sums in enumerate(self.halves):
                 columns = slice(half * len(some), (half + 1) * len(some))
-                sums.add(some, columns, traced, accumulators)
+                sums.add(of_image, columns, traced, accumulators)
                 self.samples[half].ravel()[some] += allocation.samples[columns]
-                self.tally.reshape(len(self.tally), -1)[:, some] += traced.tally[:, columns]
+                self.tally = of_image.added(traced.tally[:, columns], self.tally)
             done += now
         self.rounds += 1
 
     def mean_tally(self) -> np.ndarray:
         """(6, h, w) float32, means over samples, in the order of the fields of `Tally`."""
+        assert self.tally is not None
         return np.asarray(self.tally / np.asarray(sum(self.samples)).astype(np.float32))
 
     def means(
@@ -218,8 +253,7 @@ class Estimate:
         channels, errors, halves = {}, {}, Halves(self.samples)
         for r in self.responses if responses is None else responses:
             sums = [half.channels[r] for half in self.halves]
-            # In place if no samples follow; but views would keep all memory of the accumulators
-            out = [x if responses is None and x.flags.owndata else np.zeros(x.shape, x.dtype) for x in sums]
+            out = [_place(x, responses is None) for x in sums]
             for begin in range(0, r.channels, CHANNELS_AT_ONCE):
                 some = slice(begin, begin + CHANNELS_AT_ONCE)
                 halves.mean_and_error([x[some] for x in sums], [x[some] for x in out])
@@ -236,8 +270,8 @@ class Estimate:
                 for half in self.halves:
                     del half.channels[r]
                     half.smooth.pop(r, None)
-        sums = [half.radiance for half in self.halves]
-        out = [np.zeros_like(x) for x in sums]
+        sums = [half.radiance for half in self.halves if half.radiance is not None]
+        out = [_place(x, responses is None) for x in sums]
         halves.mean_and_error(sums, out)
         if shared:
             for x in out:
@@ -258,6 +292,15 @@ class Estimate:
         size = max(1, -(-pixels // tiles))
         for begin in range(0, pixels, size):
             yield begin, min(begin + size, pixels)
+
+
+def _place(sums: np.ndarray, is_last: bool) -> np.ndarray:
+    """The array for the means: that of the sums if they are not needed any more, or zeros.
+
+    Sums that are a view of a larger array do not hold means, because these would keep all of its memory.
+    """
+    is_alone = sums.base is None or (isinstance(sums.base, np.ndarray) and sums.base.nbytes == sums.nbytes)
+    return sums if is_last and is_alone else np.zeros(sums.shape, sums.dtype)
 
 
 def projector_light(radiance: Radiance) -> np.ndarray:

@@ -2,7 +2,7 @@
 """Specular chains: light on its way through glass, off mirrors, through thin panes, coats and holes.
 
 Delta interactions scatter nothing, so they do not count towards `max_depth`. They have a limit of their own, a number
-of surfaces in a row. Photons, camera paths and glint share the limit, and walk with the same `RayState`.
+of surfaces in a row. The light of caustics, camera paths and glint share the limit, and walk with the same `RayState`.
 
 Mitsuba's `spawn_ray` starts rays a little off a surface, along its normal: about 0.1 mm at 1 m. So an oblique ray runs
 beside its true line, at a distance of a twentieth of a projector pixel or more, and mirrors and glass pass the error
@@ -42,24 +42,24 @@ class RayState:
 
     previous : Point3f, world, metres, the point that the ray left.
     length : Float, metres, optical length up to there.
-    ior : Float, refractive index along the ray.
+    ior : Float, refractive index along the ray; None if no surface of the scene changes it.
     inside : Medium, along the ray, that scatters; None in scenes without such media.
     sigma_a : Float, 1/m, absorption coefficient along the ray; None in scenes without absorbing bodies.
     """
 
     previous: mi.Point3f
     length: mi.Float
-    ior: mi.Float
+    ior: mi.Float | None
     inside: Medium | None = None
     sigma_a: mi.Float = None
 
     @classmethod
-    def start(cls, traced: TracedScene, lanes: int) -> RayState:
+    def start(cls, traced: TracedScene, lanes: int, refracts: bool = True) -> RayState:
         """The state of light in air whose optical length is 0."""
         return cls(
             dr.zeros(mi.Point3f, lanes),
             dr.zeros(mi.Float, lanes),
-            dr.ones(mi.Float, lanes),
+            dr.ones(mi.Float, lanes) if refracts else None,
             None if traced.media is None else traced.media.none(lanes),
             None if traced.absorbers is None else dr.zeros(mi.Float, lanes),
         )
@@ -76,7 +76,13 @@ class RayState:
 
         `si.t` would be wrong, because rays start off the surface.
         """
-        return dr.select(hit, dr.fma(self.ior, dr.norm(point - self.previous), self.length), self.length)
+        distance = dr.norm(point - self.previous)
+        further = self.length + distance if self.ior is None else dr.fma(self.ior, distance, self.length)
+        return dr.select(hit, further, self.length)
+
+    def power(self, throughput: mi.Float) -> mi.Float:
+        """Fraction of a path's light that is left: radiance over the square of the refractive index."""
+        return throughput if self.ior is None else throughput * dr.square(self.ior)
 
     def unabsorbed(self, traced: TracedScene, point: mi.Point3f, hit: mi.Bool) -> mi.Float:
         """Fraction of the light that absorption leaves on the way to the point; without a `hit` the ray is endless."""
@@ -86,6 +92,8 @@ class RayState:
 
     def refracted(self, bs: mi.BSDFSample3f, where: mi.Bool) -> RayState:
         """The state with the refractive index beyond the surface at which `bs` was sampled."""
+        if self.ior is None:
+            return self
         is_transmitted = where & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
         return replace(self, ior=dr.select(is_transmitted, self.ior * bs.eta, self.ior))
 
@@ -117,8 +125,8 @@ class RayState:
         if inside is not None and traced.media is not None:
             inside = inside.replaced(where, traced.media.none(dr.width(where)))
         sigma_a = None if self.sigma_a is None else dr.select(where, 0, self.sigma_a)
-        length, ior = dr.select(where, 0, self.length), dr.select(where, 1, self.ior)
-        return RayState(self.previous, length, ior, inside, sigma_a)
+        ior = None if self.ior is None else dr.select(where, 1, self.ior)
+        return RayState(self.previous, dr.select(where, 0, self.length), ior, inside, sigma_a)
 
 
 def survival(chain: mi.UInt32, fraction: mi.Float) -> mi.Float:

@@ -22,11 +22,11 @@ from rangesim.response import DIRECT, MULTIPATH, SPECULAR
 class Owner(NamedTuple):
     """Three masks, of which exactly one is true for each light path.
 
-    next_event, photons, glint : Bool.
+    next_event, caustics, glint : Bool.
     """
 
     next_event: mi.Bool
-    photons: mi.Bool
+    caustics: mi.Bool
     glint: mi.Bool
 
 
@@ -37,14 +37,14 @@ def owner(has_vertex: mi.Bool, delta_interactions: mi.UInt32 | int) -> Owner:
     | --------------------- | -------------------------------------------------- | --------------------------- |
     | next-event estimation | a straight segment leads from the projector to a   | direct, specular, multipath |
     |                       | vertex                                             |                             |
-    | caustic photons       | delta interactions lie between the projector and   | caustic                     |
+    | caustics              | delta interactions lie between the projector and   | caustic                     |
     |                       | the vertex next to it                              |                             |
     | glint                 | no vertex at all: the camera sees the projector's  | glint                       |
     |                       | lens, directly or by delta interactions            |                             |
 
-    Next-event estimation is carried out in `loop.py`. Photons start in `photons.py` and fly in `photon_flight.py`
-    before the pass; `photon_maps.py` sorts them, and `loop.py` gathers them. Glint is traced in `glint.py`, beside the
-    pass.
+    Next-event estimation is carried out in `loop.py`. Caustics are triangles of light: `specular_tree.py` follows the
+    projector's light before the pass, `caustic_sheets.py` spans triangles where it lands, and `loop.py` looks up those
+    that cover a vertex (`sheet_scene.py`). Glint is traced in `glint.py`, beside the pass.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def owner(has_vertex: mi.Bool, delta_interactions: mi.UInt32 | int) -> Owner:
     Examples
     --------
     >>> import numpy as np
-    >>> owner(has_vertex=np.array([True, True, False]), delta_interactions=np.array([0, 2, 2])).photons
+    >>> owner(has_vertex=np.array([True, True, False]), delta_interactions=np.array([0, 2, 2])).caustics
     array([False,  True, False])
     """
     is_straight = delta_interactions == 0
@@ -107,7 +107,7 @@ def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
 
 
 def delta_only(mode: mi.TransportMode) -> mi.BSDFContext:
-    """A context in which BSDFs sample delta interactions alone, as photons and glint do."""
+    """A context in which BSDFs sample delta interactions alone, as glint does."""
     context = mi.BSDFContext(mode)
     context.type_mask = mi.BSDFFlags.Delta
     return context

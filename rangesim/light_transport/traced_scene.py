@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scene and the rig as all kernels see them: camera paths, photons, glint and the ground truth."""
+"""The scene and the rig as all kernels see them: camera paths, caustics, glint and the ground truth."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An estimate of the projector's light that a pass leaves out because it ends paths, chains and photons somewhere.
+"""An estimate of the projector's light that a pass leaves out because it ends paths and chains somewhere.
 
 A camera path brings light at each of its vertices. Let T_k be the throughput with which paths arrive at their k-th
 vertex. It falls off geometrically after a few vertices: the ratio t = T_n / T_(n-1) at the last vertex that a pass
@@ -10,8 +10,8 @@ get as much light per throughput as vertices 2 to n get on average:
 
     left out = T_n t / (1 - t) * (light at vertices 2..n) / (T_2 + ... + T_n)
 
-For chains of delta interactions that are cut off, it assumes light as bright as that of all other paths. For photons
-that are cut off, it assumes that they would land where the other photons do.
+For chains of delta interactions that are cut off, it assumes light as bright as that of all other paths. For light of
+caustics whose chains are cut off, it assumes that it would land where the other light of caustics does.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Tally(Generic[Array]):
     cut: Array
 
 
-def estimate_truncation(tally: np.ndarray, energy: EnergySplit, max_depth: int, photons_cut: float) -> Truncation:
+def estimate_truncation(tally: np.ndarray, energy: EnergySplit, max_depth: int, caustics_cut: float) -> Truncation:
     """Fractions of the projector's light that a pass left out.
 
     Parameters
@@ -70,7 +70,7 @@ def estimate_truncation(tally: np.ndarray, energy: EnergySplit, max_depth: int, 
     tally : (6, h, w) float32, in the order of the fields of `Tally`.
     energy : EnergySplit, of the pass.
     max_depth : int, of the pass.
-    photons_cut : ratio of the power of photons that were cut off to the power of photons that landed.
+    caustics_cut : ratio of the power in chains that were cut off to the power of the caustics that landed.
     """
     first, further, before_last, last, indirect, cut = (float(x.sum(dtype=float)) for x in tally)
     seen = sum(float(x.sum(dtype=float)) for x in (energy.direct, energy.multipath, energy.specular, energy.caustic))
@@ -79,8 +79,8 @@ def estimate_truncation(tally: np.ndarray, energy: EnergySplit, max_depth: int, 
         t = min(max(last / before_last, 0.0), MAX_DECAY) if before_last else 0.0
         by_depth = indirect / further * last * t / (1 - t) if further else 0.0
     by_chains = seen * cut / (first + further) if first + further else 0.0
-    by_photons = float(energy.caustic.sum(dtype=float)) * photons_cut
-    parts = np.array([by_depth, by_chains, by_photons])
+    by_caustics = float(energy.caustic.sum(dtype=float)) * caustics_cut
+    parts = np.array([by_depth, by_chains, by_caustics])
     total = seen + np.nansum(parts)
     return Truncation(*(float(x) for x in parts / total)) if total else Truncation(0.0 * by_depth, 0.0, 0.0)
 
@@ -90,7 +90,7 @@ def warn_of_truncation(truncation: Truncation | None, max_depth: int, of: str, s
     if truncation is None or truncation.total <= MAX_LEFT_OUT:
         return
     why = f"a max_depth of {max_depth} ends light paths early; a larger one includes this light"
-    if not truncation.depth > truncation.chains + truncation.photons:
+    if not truncation.depth > truncation.chains + truncation.caustics:
         why = f"it meets more than {MAX_CHAIN} surfaces of glass and mirrors in a row"
     text = f"about {truncation.total:.0%} of the projector's light is left out{of}: {why}."
     warnings.warn(TruncationWarning(text, truncation.total), stacklevel=stacklevel + 1)

@@ -45,17 +45,17 @@ PATHS_PER_CORE_S = 1.1e6
 PATHS_PER_GPU_S = 5e7
 """Camera paths per second on a GPU, measured on `tabletop` with 5 to 50 million paths on an H100, which has no
 ray-tracing cores."""
-PHOTON_S = 3e-6
-"""Seconds per caustic photon. Tracing it and building the maps takes 0.5e-6 s on two cores (docs/caustics.md); the rest
-stands for gathering it."""
+CAUSTICS_S = 1.0
+"""Seconds of a pass to make the triangles of caustics and to look them up, in a scene with glass or mirrors. Measured
+from 64 x 48 to 320 x 240 pixels: 0.5 to 0.8 s of processor time on `tabletop`, 3.5 to 4.3 s on `glassware`."""
 PASS_S = 1.0
 """Seconds to compile the kernels of a pass, independent of the size of the image. Measured on `tabletop` with 64 x 48
-pixels on two busy cores: 2 s for a whole pass, with 500 000 photons."""
+pixels on two busy cores: 2 s for a whole pass."""
 START_S = 4.0
 """Seconds per run to import the packages, load the scene and write the report. A rough value is enough, because it only
 matters for short runs."""
 REPEATED_PASS_S = 0.3
-"""Seconds of each further pass from another place, besides its paths and photons. It compiles nothing again. Measured:
+"""Seconds of each further pass from another place, besides its paths and caustics. It compiles nothing again. Measured:
 0.02 s on `matte`, 0.5 s on `tabletop`."""
 FRAME_S = 100e-9
 """Seconds per pixel of each frame, for its noise and its file."""
@@ -73,8 +73,9 @@ TRUTH_BYTES = 64
 RESULT_BYTES = 200
 """Bytes per pixel of the results of each instrument while the report is written: maps, causes, points, segmentation and
 their pictures."""
-PHOTON_BYTES = 200
-"""Bytes per caustic photon that landed, as stated in `TransportSettings.memory_bytes`."""
+CAUSTICS_BYTES = 1e8
+"""Bytes of the triangles of caustics and of the tree in which they are looked up. The triangles of `tabletop` take
+8e6, those of `glassware` 5e7; the tree is assumed to take as much."""
 TRIAL_S = 60.0
 """Seconds. If the constants predict a longer run, small passes of the scene are timed in a trial, because the constants
 may be wrong by a factor of three. A trial takes a few seconds, so with a smaller value short runs would wait for it;
@@ -95,7 +96,6 @@ class Cost:
     ----------
     light_paths : number of camera paths of all passes.
     segments : largest number of segments of a path.
-    photons : number of caustic photons of all passes.
     passes : number of light-transport passes.
     memory_bytes : bytes of memory at the peak.
     seconds : time on this machine if it is idle.
@@ -104,13 +104,12 @@ class Cost:
 
     Examples
     --------
-    >>> print(Cost(4_900_000, 5, 500_000, 2, int(8e8), 14.0, "2 idle cores"))
-    about 4.9 M light paths of up to 5 segments and 500 k photons in 2 passes, 0.8 GB, 14 s on 2 idle cores
+    >>> print(Cost(4_900_000, 5, 2, int(8e8), 14.0, "2 idle cores"))
+    about 4.9 M light paths of up to 5 segments in 2 passes, 0.8 GB, 14 s on 2 idle cores
     """
 
     light_paths: int
     segments: int
-    photons: int
     passes: int
     memory_bytes: int
     seconds: float
@@ -123,10 +122,9 @@ class Cost:
         return self.seconds > LONG_S or self.memory_bytes > LARGE_BYTES
 
     def __str__(self) -> str:
-        photons = f" and {_count(self.photons)} photons" if self.photons else ""
         disk = f" of memory, {_bytes(self.disk_bytes)} on disk" if self.disk_bytes else ""
         return (
-            f"about {_count(self.light_paths)} light paths of up to {self.segments} segments{photons} in "
+            f"about {_count(self.light_paths)} light paths of up to {self.segments} segments in "
             f"{self.passes} pass{'es' if self.passes > 1 else ''}, {self.memory_bytes / 1e9:.1f} GB{disk}, "
             f"{_duration(self.seconds)}{f' on {self.machine}' if self.machine else ''}"
         )
@@ -179,24 +177,25 @@ def estimate_cost(
     places : number of places that each pass is traced from, such as the views of a scan.
     beside : cost of the work with the signals; None: that of a run.
     """
-    from rangesim.light_transport.photons import has_delta
+    from rangesim.light_transport.delta_surfaces import has_delta
 
-    largest = max(rig.traced.camera.width * rig.traced.camera.height for rig, _ in passes)
-    photons = experiment.transport_settings(()).photons_for(largest) if has_delta(scene.mitsuba) else 0
+    has_caustics = experiment.caustics and has_delta(scene.mitsuba)
     pixels, count = 0, 0
     for rig, instruments in passes:
         size = rig.camera.width * rig.camera.height * TRUTH_BYTES  # the file of a pass, as it is read for a report
         limits.check("bytes", size, "bytes in the results of one pass")
         traced, n = _traced_pixels(experiment, rig, instruments)
         pixels, count = pixels + traced * instruments[0].sensor.n_cameras, count + n
-    paths, all_photons = places * pixels * (experiment.spp or TYPICAL_SPP), places * photons * count
+    paths = places * pixels * (experiment.spp or TYPICAL_SPP)
     beside = beside or _beside_tracing(passes)
     beside_s, again = START_S + beside.seconds, (places - 1) * count
-    seconds = beside_s + count * PASS_S + again * REPEATED_PASS_S + all_photons * PHOTON_S + paths / _paths_per_s()
-    memory = int(BASE_BYTES + max(_tracing_bytes(passes, photons) + beside.held_bytes, beside.peak_bytes))
-    cost = Cost(
-        paths, experiment.max_depth, all_photons, places * count, memory, seconds, _machine(), beside.disk_bytes
-    )
+    seconds = beside_s + count * PASS_S + again * REPEATED_PASS_S + paths / _paths_per_s()
+    tracing = _tracing_bytes(passes)
+    if has_caustics:
+        seconds += places * count * CAUSTICS_S
+        tracing += CAUSTICS_BYTES
+    memory = int(BASE_BYTES + max(tracing + beside.held_bytes, beside.peak_bytes))
+    cost = Cost(paths, experiment.max_depth, places * count, memory, seconds, _machine(), beside.disk_bytes)
     if trial and seconds > TRIAL_S:
         compile_s, fixed_s, path_s = _timed_trial(experiment, scene, passes[0])
         traced_s = (len(passes) - 1) * compile_s + places * count * fixed_s + paths * path_s
@@ -241,7 +240,7 @@ def _beside_tracing(passes: Sequence[tuple[Rig, list[Instrument]]]) -> CostBesid
     return CostBesideTracing(seconds, sum(result_bytes[:-1]), sum(result_bytes), 0)
 
 
-def _tracing_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int) -> float:
+def _tracing_bytes(passes: Sequence[tuple[Rig, list[Instrument]]]) -> float:
     """Bytes of the arrays of a pass that exist at once, at the peak: while it is traced or its frames are exposed."""
     at_once = 0.0
     for rig, instruments in passes:
@@ -253,7 +252,7 @@ def _tracing_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int)
         frames = max(instrument.sensor.n_frames for instrument in instruments)
         exposed = pixels * 14 * frames  # three arrays of float32, and the digital numbers
         judged = pixels * 2 * 4 * largest + exposed  # means and their error, for adaptive sampling
-        tracing = max(tiles, judged) + pixels * (4 * 4 * channels + TRUTH_BYTES) + photons * PHOTON_BYTES
+        tracing = max(tiles, judged) + pixels * (4 * 4 * channels + TRUTH_BYTES)
         exposing = pixels * (2 * 4 * channels + 4 * largest + TRUTH_BYTES) + exposed  # signals with their error
         at_once = max(at_once, tracing, exposing)
     return at_once

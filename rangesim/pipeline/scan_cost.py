@@ -63,7 +63,7 @@ def estimate_scan_cost(settings: ScanSettings, scene: Scene, trial: bool = True)
     views = len(poses_of(settings.path, Viewpoint(rig.T_world_camera, scene.working_distance_m)))
     experiment = Experiment(
         settings.scene, settings.material, settings.unit_m, settings.width, settings.height,
-        instruments=(settings.instrument,), spp=settings.spp, max_depth=settings.max_depth, photons=settings.photons,
+        instruments=(settings.instrument,), spp=settings.spp, max_depth=settings.max_depth, caustics=settings.caustics,
         glint=settings.glint, seed=settings.seed, ambient=settings.ambient,
     )  # fmt: skip
     passes = [(rig, [settings.instrument])]

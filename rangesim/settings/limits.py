@@ -45,7 +45,6 @@ class Limits:
     wraps : candidates of phase unwrapping: the longest path that is searched, divided by the shortest wavelength.
     spp : light paths per pixel.
     depth : segments of a light path.
-    photons : caustic photons of one pass.
     passes : light-transport passes of one sensor in a moving scene; also bands of rows, and samples of an exposure.
     instruments : instruments of one experiment.
     points : vertices, or faces, of one mesh file.
@@ -66,7 +65,6 @@ class Limits:
     wraps: int = 10_000
     spp: int = 1_000_000
     depth: int = 10_000
-    photons: int = 1_000_000_000
     passes: int = 10_000
     instruments: int = 100
     points: int = 100_000_000

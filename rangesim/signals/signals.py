@@ -151,23 +151,23 @@ class Truncation:
     depth : light of paths with more scattering surfaces than `max_depth` allows. NaN if `max_depth` is 2 or less,
         because such a pass computes direct light only.
     chains : light of camera paths with more delta interactions in a row than allowed.
-    photons : light of photons with more delta interactions in a row than allowed.
+    caustics : light that the projector throws onto surfaces with more delta interactions in a row than allowed.
 
     Examples
     --------
     >>> from rangesim.signals import Truncation
-    >>> Truncation(depth=float("nan"), chains=0.01, photons=0.005).total
+    >>> Truncation(depth=float("nan"), chains=0.01, caustics=0.005).total
     0.015
     """
 
     depth: float
     chains: float
-    photons: float
+    caustics: float
 
     @property
     def total(self) -> float:
         """Sum of all parts that are known (not NaN), as a fraction of the emitter's light."""
-        return float(np.nansum([self.depth, self.chains, self.photons]))
+        return float(np.nansum([self.depth, self.chains, self.caustics]))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

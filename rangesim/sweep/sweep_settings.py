@@ -29,7 +29,7 @@ from rangesim.sweep.scene_sources import SceneSource, scene_source
 if TYPE_CHECKING:
     from rangesim.light_transport.transport_settings import TransportSettings
 
-OF_TRANSPORT = ("spp", "max_spp", "max_depth", "photons", "glint", "width", "height")
+OF_TRANSPORT = ("spp", "max_spp", "max_depth", "caustics", "glint", "width", "height")
 """Settings of an experiment that a sweep may vary besides the scene, the seed and the ambient light."""
 MAX_POINTS = 10_000
 """Largest number of points of a sweep. All lie in memory: with two sensors, one takes 8 kB, and 4 ms before the first

@@ -298,7 +298,7 @@ def toml_files(seed: Input, target: str) -> Made:
         "spp 10^30": scene + b"spp = 1" + b"0" * 30,
         "size 10^6": scene + b"width = 1000000\nheight = 1000000\n",
         "depth 10^9": scene + b"max_depth = 1000000000\n",
-        "photons 10^12": scene + b"photons = 1000000000000\n",
+        "nonsense, caustics 2": scene + b"caustics = 2\n",
         "nonsense, seed 2^70": scene + b"seed = 1180591620717411303424\n",
         "nonsense, seed -1": scene + b"seed = -1\n",
         "nonsense, width true": scene + b"width = true\n",

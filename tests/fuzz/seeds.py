@@ -67,9 +67,7 @@ def result_files() -> dict[str, bytes]:
         Instrument("amcw", AmcwToF()),
         Instrument("ideal", IdealToF()),
     )
-    experiment = Experiment(
-        str(SCENES / "plane.xml"), width=32, height=24, spp=1, photons=1000, instruments=instruments
-    )
+    experiment = Experiment(str(SCENES / "plane.xml"), width=32, height=24, spp=1, instruments=instruments)
     with tempfile.TemporaryDirectory() as folder, mock.patch("time.monotonic", itertools.count(0.0, 0.01).__next__):
         run(experiment, Path(folder) / "result")  # times of a clock of our own: the same bytes at every call
         return directory(Path(folder) / "result", "result")
@@ -88,7 +86,7 @@ def scans() -> Seeds:
     from rangesim.sensors import IdealToF
 
     settings = ScanSettings(
-        str(SCENES / "plane.xml"), width=16, height=12, spp=1, photons=1000, voxel_m=0.2,
+        str(SCENES / "plane.xml"), width=16, height=12, spp=1, voxel_m=0.2,
         path=Turntable(views=2), instrument=Instrument("ideal", IdealToF()),
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder, mock.patch("time.monotonic", itertools.count(0.0, 0.01).__next__):
@@ -156,7 +154,7 @@ def experiments() -> Seeds:
 width = 16
 height = 12
 spp = 2
-photons = 1000
+caustics = true
 [ambient]
 illuminant = "sun"
 illuminance_lux = 50e3
@@ -196,7 +194,7 @@ seed = 7
 exposure = 0.001
 tolerance_m = 0.002
 window_px = 32
-photons = 1000
+caustics = true
 ambient.illuminant = "sun"
 [vary]
 scene.distance_m = [0.5, 1.0]

@@ -1,0 +1,447 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiled loops over the cells of the projector's image and the triangles that they make.
+
+The image is divided into blocks. A block has 3 x 3 points, four cells between them, and may be divided into four blocks
+of half the size. `step` is the distance between its points on the finest lattice, `columns` the number of lattice
+points in a row. Landings of the same point are a linked list: `head` of the point, then `after`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pcgraph.kernel_cache import cached_njit
+
+EMPTY = -1
+"""Entry of a hash table that holds no key."""
+HASH = -7046029254386353131
+"""Factor of the hash of 64 bits: 2^64 divided by the golden ratio, rounded to an odd number, as a signed one."""
+MIN_NORMAL_COSINE = 0.9
+"""Smallest cosine between the normals at two points of a cell (26 degrees), so that no triangle lies across an edge of
+the receiver."""
+MIN_TILT_COSINE = 0.7
+"""Smallest cosine between a triangle's normal and the receiver's, so that no triangle reaches from a surface to another
+part of the same shape behind it."""
+MIN_FOOTPRINT = 0.1
+"""Smallest size of a pixel where it lands, as a fraction of its size without glass, for which cells are refined: light
+in a focus is not followed any finer."""
+MAX_SPREAD = 2.0
+"""Largest ratio between the areas over which equal light spreads within a block; with a smaller ratio more blocks are
+divided."""
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def place_in(table, key):  # type: ignore[no-untyped-def]
+    """Place of a key in a hash table, or of the free entry where it belongs."""
+    mask = len(table) - 1
+    mixed = np.int64(key) * np.int64(HASH)
+    i = (mixed ^ (mixed >> np.int64(29))) & mask
+    while table[i] != EMPTY and table[i] != key:
+        i = (i + 1) & mask
+    return i
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def new_points(table, value, x, y, step, columns, first):  # type: ignore[no-untyped-def]
+    """(n,) int64, lattice points of blocks that are not in the table yet; they are put there with the numbers from
+    `first` on."""
+    found = np.empty(9 * len(x), np.int64)
+    n = 0
+    for b in range(len(x)):
+        for q in range(9):
+            point = (y[b] + q // 3 * step) * columns + x[b] + q % 3 * step
+            i = place_in(table, point)
+            if table[i] == EMPTY:
+                table[i] = point
+                value[i] = first + n
+                found[n] = point
+                n += 1
+    return found[:n]
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def larger(table, value, size):  # type: ignore[no-untyped-def]
+    """A copy of a hash table with its values that has `size` entries, a power of two."""
+    keys, values = np.full(size, EMPTY, np.int64), np.empty(size, np.int64)
+    for i in range(len(table)):
+        if table[i] != EMPTY:
+            j = place_in(keys, table[i])
+            keys[j] = table[i]
+            values[j] = value[i]
+    return keys, values
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def linked(point, points):  # type: ignore[no-untyped-def]
+    """The linked lists of the landings of each point: `head` (points,) and `after` (landings,)."""
+    head, after = np.full(points, -1, np.int64), np.empty(len(point), np.int64)
+    for i in range(len(point)):
+        after[i] = head[point[i]]
+        head[point[i]] = i
+    return head, after
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _with_key(head, after, key, point, wanted):  # type: ignore[no-untyped-def]
+    """The landing of a point that has a key; -1 if there is none."""
+    i = head[point]
+    while i >= 0 and key[i] != wanted:
+        i = after[i]
+    return i
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def triangle_area(position, a, b, c):  # type: ignore[no-untyped-def]
+    """Area of the triangle of three landings, m2."""
+    ux, uy, uz = (
+        position[b, 0] - position[a, 0],
+        position[b, 1] - position[a, 1],
+        position[b, 2] - position[a, 2],
+    )
+    vx, vy, vz = (
+        position[c, 0] - position[a, 0],
+        position[c, 1] - position[a, 1],
+        position[c, 2] - position[a, 2],
+    )
+    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    return 0.5 * np.sqrt(x * x + y * y + z * z)
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _cosine(normal, a, b):  # type: ignore[no-untyped-def]
+    return normal[a, 0] * normal[b, 0] + normal[a, 1] * normal[b, 1] + normal[a, 2] * normal[b, 2]
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _is_even(a, b, landings, rule):  # type: ignore[no-untyped-def]
+    """Whether a receiver is so even between two landings that it is hardly higher than the line between them.
+
+    Its height is the length of the line times the angle between the normals over 8.
+    """
+    cosine, line, distance = _cosine(landings.normal, a, b), 0.0, 0.0
+    for k in range(3):
+        line += (landings.position[a, k] - landings.position[b, k]) ** 2
+        distance += (landings.position[a, k] - rule.projector_at[k]) ** 2
+    return cosine >= MIN_NORMAL_COSINE and line * (2 - 2 * cosine) <= 64 * rule.sag * rule.sag * distance
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _off_middle(position, m, a, b):  # type: ignore[no-untyped-def]
+    """Squared distance of landing m from the middle between a and b."""
+    total = 0.0
+    for k in range(3):
+        d = position[m, k] - 0.5 * (position[a, k] + position[b, k])
+        total += d * d
+    return total
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _is_smooth(r, landings, pixels, rule):  # type: ignore[no-untyped-def]
+    """Whether light of one chain is so even over a block that triangles between its nine points describe it.
+
+    r : (9,) int64, landings of the points, row by row.
+    pixels : edge of the block in pixels. rule : Rule. Faint light only has to land on an even receiver.
+    """
+    position, length = landings.position, landings.length
+    for k in (0, 2, 6, 8):
+        if not _is_even(r[k], r[4], landings, rule):
+            return False
+    total, low, high = 0.0, np.inf, 0.0
+    for q in (0, 1, 3, 4):
+        size = triangle_area(position, r[q], r[q + 1], r[q + 4]) + triangle_area(position, r[q], r[q + 4], r[q + 3])
+        total += size
+        low, high = min(low, size), max(high, size)
+    plain = rule.angle * length[r[4]]
+    off = 0.0
+    for m, a, b in ((1, 0, 2), (3, 0, 6), (5, 2, 8), (7, 6, 8), (4, 0, 8), (4, 2, 6)):
+        off = max(off, _off_middle(position, r[m], r[a], r[b]))
+    if landings.part[r[4]] * plain * plain * pixels * pixels < rule.faint * total:
+        return np.sqrt(off) < 0.25 * np.sqrt(total)
+    footprint = min(max(np.sqrt(total) / pixels, MIN_FOOTPRINT * plain), plain)
+    return high <= MAX_SPREAD * low and np.sqrt(off) <= 4 * rule.tolerance * footprint  # cells are half a block
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _name(x, y, size, columns, key):  # type: ignore[no-untyped-def]
+    """Number of a pair of a chain and a block, whose `size` is the distance of its points, or a cell, whose `size` is
+    minus its edge."""
+    level = 0 if size > 0 else 16
+    size = abs(size)
+    while size > 0:
+        level += 1
+        size >>= 1
+    return ((np.int64(y) * columns + x) * 32 + level) << np.int64(32) | np.int64(key)
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def is_taken(taken, x, y, step, columns, coarsest, key):  # type: ignore[no-untyped-def]
+    """Whether the block with points at the distance `step` that holds a lattice point, or a block around it, has made
+    triangles of a chain."""
+    size = step
+    while size <= coarsest:
+        block = 2 * size
+        if taken[place_in(taken, _name(x // block * block, y // block * block, size, columns, key))] != EMPTY:
+            return True
+        size *= 2
+    return False
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _with_room(taken, used):  # type: ignore[no-untyped-def]
+    """The set `taken` with room for more than its `used` entries."""
+    if 2 * used < len(taken):
+        return taken
+    copy = np.full(2 * len(taken), EMPTY, np.int64)
+    for name in taken:
+        if name != EMPTY:
+            copy[place_in(copy, name)] = name
+    return copy
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _longer(array, room):  # type: ignore[no-untyped-def]
+    """The array if it has so many rows, or a copy that is twice as long."""
+    if room <= len(array):
+        return array
+    copy = np.empty((2 * len(array) + room, array.shape[1]), array.dtype)
+    copy[: len(array)] = array
+    return copy
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def smooth_chains(blocks, grid, landings, rule, meets, taken, used):  # type: ignore[no-untyped-def]
+    """Make triangles of the chains that are smooth over a block, and say which blocks are to be divided.
+
+    blocks : Blocks. grid : Lattice. landings : Chains. rule : Rule.
+    meets : (n,) bool, whether some ray through the block meets a delta surface first.
+    taken, used : the set of names of blocks and chains that have triangles, and its size; the new set is returned.
+
+    Returns
+    -------
+    triangles : (t, 3) int64, landings. flux : (t, 1) float64, pixels of the projector.
+    divides : (n,) bool. taken, used : the new set.
+    """
+    x, y, step = blocks.x, blocks.y, blocks.step
+    triangles, flux = np.empty((1024, 3), np.int64), np.empty((1024, 1), np.float64)
+    divides, n = np.zeros(len(x), np.bool_), 0
+    points, r = np.empty(9, np.int64), np.empty(9, np.int64)
+    half_cell = 0.125 * blocks.pixels**2
+    for b in range(len(x)):
+        for q in range(9):
+            points[q] = grid.value[place_in(grid.table, (y[b] + q // 3 * step) * grid.columns + x[b] + q % 3 * step)]
+        wish, is_dark = 0.0, True
+        for q in range(9):
+            i = grid.head[points[q]]
+            is_dark &= i < 0
+            while i >= 0:
+                key, is_new = landings.key[i], True
+                for p in range(q):
+                    if _with_key(grid.head, grid.after, landings.key, points[p], key) >= 0:
+                        is_new = False
+                        break
+                i = grid.after[i]
+                if not is_new or is_taken(taken, x[b], y[b], step, grid.columns, grid.coarsest, key):
+                    continue
+                found, part = 0, 0.0
+                for p in range(9):
+                    r[p] = _with_key(grid.head, grid.after, landings.key, points[p], key)
+                    if r[p] >= 0:
+                        found += 1
+                        part += landings.part[r[p]] / 9
+                if found < 9 or not _is_smooth(r, landings, blocks.pixels, rule):
+                    wish += part
+                else:
+                    triangles, flux = _longer(triangles, n + 8), _longer(flux, n + 8)
+                    for k in (0, 1, 3, 4):
+                        for c, d in ((k + 1, k + 4), (k + 4, k + 3)):
+                            triangles[n, 0], triangles[n, 1], triangles[n, 2] = r[k], r[c], r[d]
+                            light = landings.part[r[k]] + landings.part[r[c]] + landings.part[r[d]]
+                            flux[n, 0] = half_cell * light / 3
+                            n += 1
+                    taken = _with_room(taken, used)
+                    name = _name(x[b], y[b], step, grid.columns, key)
+                    taken[place_in(taken, name)] = name
+                    used += 1
+        # A surface that lies between the points is as good as a chain that is not whole
+        divides[b] = wish > rule.significant or (is_dark and meets[b])
+    return triangles[:n], flux[:n], divides, taken, used
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def cells_of(blocks, grid, landings, rule, dropped, meets, taken, used):  # type: ignore[no-untyped-def]
+    """Make triangles of what is left in the cells of blocks that are not divided.
+
+    dropped : (points,) float32, fraction of the light of each point that was not followed.
+    meets : (4 n,) bool, whether some ray through the cell meets a delta surface first.
+
+    Returns
+    -------
+    triangles, flux, taken, used : as `smooth_chains`.
+    left : (4 n,) float64, fraction of the light of each cell that has made no triangles, as its corners tell.
+    """
+    x, y, step = blocks.x, blocks.y, blocks.step
+    triangles, flux = np.empty((1024, 3), np.int64), np.empty((1024, 1), np.float64)
+    left, n = np.zeros(4 * len(x), np.float64), 0
+    corners, r = np.empty(4, np.int64), np.empty(4, np.int64)
+    half_cell = 0.125 * blocks.pixels**2
+    for cell in range(4 * len(x)):
+        cx, cy = x[cell >> 2] + (cell & 1) * step, y[cell >> 2] + (cell >> 1 & 1) * step
+        for q in range(4):
+            corners[q] = grid.value[place_in(grid.table, (cy + (q >> 1) * step) * grid.columns + cx + (q & 1) * step)]
+        is_dark = True
+        for q in range(4):
+            left[cell] += 0.25 * dropped[corners[q]]
+            i = grid.head[corners[q]]
+            is_dark &= i < 0
+            while i >= 0:
+                key = landings.key[i]
+                this, i = i, grid.after[i]
+                if is_taken(taken, cx, cy, step, grid.columns, grid.coarsest, key):
+                    continue
+                name = _name(cx, cy, -step, grid.columns, key)
+                if taken[place_in(taken, name)] != EMPTY:
+                    continue
+                if q == 0:
+                    is_whole = True
+                    for p in range(4):
+                        r[p] = _with_key(grid.head, grid.after, landings.key, corners[p], key)
+                        is_whole &= r[p] >= 0
+                    if is_whole and _lies_flat(r, landings, rule):
+                        triangles, flux = _longer(triangles, n + 2), _longer(flux, n + 2)
+                        for c, d in ((1, 3), (3, 2)):
+                            triangles[n, 0], triangles[n, 1], triangles[n, 2] = r[0], r[c], r[d]
+                            light = landings.part[r[0]] + landings.part[r[c]] + landings.part[r[d]]
+                            flux[n, 0] = half_cell * light / 3
+                            n += 1
+                        taken = _with_room(taken, used)
+                        taken[place_in(taken, name)] = name
+                        used += 1
+                        continue
+                left[cell] += 0.25 * landings.part[this]
+        if is_dark and meets[cell]:
+            left[cell] = 1.0
+    return triangles[:n], flux[:n], left, taken, used
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _lies_flat(r, landings, rule):  # type: ignore[no-untyped-def]
+    """Whether the two triangles of the corners of a cell lie on the receiver."""
+    position, normal = landings.position, landings.normal
+    for k in (1, 2, 3):
+        if not _is_even(r[0], r[k], landings, rule):
+            return False
+    for c, d in ((1, 3), (3, 2)):
+        ux, uy, uz = position[r[c]] - position[r[0]]
+        vx, vy, vz = position[r[d]] - position[r[0]]
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        n = normal[r[0]]
+        along = abs(nx * n[0] + ny * n[1] + nz * n[2])
+        if not along * along > MIN_TILT_COSINE * MIN_TILT_COSINE * (nx * nx + ny * ny + nz * nz):
+            return False
+    return True
+
+
+# ---- Photons ---------------------------------------------------------------------------------------------
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def sides_of_photons(cells, step, photons, columns, coarsest, landings, taken):  # type: ignore[no-untyped-def]
+    """The landings of photons whose light is in no triangle, and how their light spreads.
+
+    Photon i belongs to cell i of `cells`, and is point 3 i of `photons`; the points 3 i + 1 and 3 i + 2 lie a little to
+    the right of it and below it.
+
+    Parameters
+    ----------
+    cells : (n, 2) int64, lattice coordinates. step : (n,) int64, their edges on the lattice.
+    photons : Lists of the landings of the points. landings : Chains.
+
+    Returns
+    -------
+    which : (m,) int64, landings. right, below : (m,) int64, landings of the same chain beside them; -1 if there are
+        none.
+    """
+    which, n = np.empty((len(landings.key), 3), np.int64), 0
+    for i in range(len(cells)):
+        x, y = cells[i]
+        this = photons.head[3 * i]
+        while this >= 0:
+            key = landings.key[this]
+            name = _name(x, y, -step[i], columns, key)
+            if taken[place_in(taken, name)] == EMPTY and not is_taken(taken, x, y, step[i], columns, coarsest, key):
+                which[n, 0] = this
+                which[n, 1] = _with_key(photons.head, photons.after, landings.key, 3 * i + 1, key)
+                which[n, 2] = _with_key(photons.head, photons.after, landings.key, 3 * i + 2, key)
+                n += 1
+            this = photons.after[this]
+    return which[:n]
+
+
+# ---- Vertices and triangles ------------------------------------------------------------------------------
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def irradiance_of(triangles, flux, position, vertices):  # type: ignore[no-untyped-def]
+    """Irradiance at the vertices (vertices,) float64, what it is to be multiplied by within each triangle (t,) float64,
+    and the area of each triangle (t,) float64, m2.
+
+    A vertex has the flux of its triangles over their area. The irradiance within a triangle is interpolated between its
+    vertices and multiplied by a number, so that the triangle carries exactly its flux.
+    """
+    at_vertex, area_of = np.zeros(vertices), np.zeros(vertices)
+    scale, areas = np.empty(len(triangles)), np.empty(len(triangles))
+    for t in range(len(triangles)):
+        a, b, c = triangles[t]
+        area = triangle_area(position, a, b, c)
+        areas[t] = area
+        for k in range(3):
+            at_vertex[triangles[t, k]] += flux[t]
+            area_of[triangles[t, k]] += area
+    for i in range(vertices):
+        at_vertex[i] = at_vertex[i] / area_of[i] if area_of[i] > 0 else 0.0
+    for t in range(len(triangles)):
+        a, b, c = triangles[t]
+        mean = (at_vertex[a] + at_vertex[b] + at_vertex[c]) / 3
+        scale[t] = flux[t] / (areas[t] * mean) if areas[t] * mean > 0 else 0.0
+    return at_vertex, scale, areas
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def lifted(sheets, scale, level, groups, every, faint, lift, offsets, drawn):  # type: ignore[no-untyped-def]
+    """The triangles of light as a scene of their own, see `sheet_scene`.
+
+    Parameters
+    ----------
+    sheets : Sheets, as a tuple of position, normal, triangles, shape and key.
+    level : (t,) float64, ratio of the irradiance to direct light.
+    lift : (t,) float64, metres, largest distance off the surface. offsets : (groups + 1, 2) float64, metres.
+    drawn : (t,) float64, uniform in 0..1.
+
+    Returns
+    -------
+    corners : (3 k, 3) float32, metres. names : (k, 4) uint32, vertices and shape. factor : (k,) float32.
+    """
+    position, normal, triangles, shape, key = sheets
+    corners, names = np.empty((3 * len(triangles), 3), np.float32), np.empty((len(triangles), 4), np.uint32)
+    factor, n = np.empty(len(triangles), np.float32), 0
+    for t in range(len(triangles)):
+        group, weight = 0, 1.0
+        if level[t] < faint:
+            # The faintest are drawn by lot, and count for those that are not
+            chance = min(level[t] * groups * every / faint, 1.0)
+            if drawn[t] >= chance:
+                continue
+            group, weight = 1 + (key[t] >> 8) % groups, groups * every / chance
+        if not (scale[t] > 0 and np.isfinite(level[t])):
+            continue
+        height = lift[t] * (t * 0.6180339887498949 % 1.0)
+        for k in range(3):
+            v = triangles[t, k]
+            names[n, k] = v
+            for axis in range(3):
+                corners[3 * n + k, axis] = position[v, axis] + height * normal[v, axis]
+                if axis < 2:
+                    corners[3 * n + k, axis] += offsets[group, axis]
+        names[n, 3], factor[n] = shape[t], scale[t] * weight
+        n += 1
+    return corners[: 3 * n], names[:n], factor[:n]

@@ -1,0 +1,464 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The projector's light beyond glass and mirrors, as triangles on the surfaces where it lands.
+
+The projector is a point, so the place where a chain of delta interactions ends is a smooth function of the place in the
+image where it began. A grid of points over the image is traced through the scene (`specular_tree`). Where the points
+around a cell of the grid took the same chain, they span triangles on the surface where they landed. The irradiance of a
+triangle is its flux over its area, and everything else is interpolated between its corners. Cells are divided where
+triangles would be too coarse.
+
+The rest, mostly along the silhouettes of glass, is left to photons: random points of the cells, each of which carries
+the light of its cell over the parallelogram to which the derivatives of the place by the point spread the cell (photon
+differentials: Schjøth et al., GRAPHITE 2007). A chain through a cell belongs either to triangles or to photons, so no
+light is counted twice and none is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import maximum_filter
+
+from rangesim.light_transport.camera_rays import CellGrid, Device
+from rangesim.light_transport.caustic_kernels import (
+    EMPTY,
+    cells_of,
+    larger,
+    linked,
+    new_points,
+    sides_of_photons,
+    smooth_chains,
+)
+from rangesim.light_transport.delta_surfaces import meets_delta
+from rangesim.light_transport.kernel_launches import Launches
+from rangesim.light_transport.sampling import R2, aligned
+from rangesim.light_transport.specular_tree import Landings, SpecularTree
+from rangesim.light_transport.traced_scene import TracedScene
+
+BLOCK_PX = 8.0
+"""Edge of the largest blocks, in pixels of the projector; a block has two cells along each edge. Rays that find glass
+are closer together, so smaller glass is not passed by."""
+MAX_LEVELS = 2
+"""Largest number of times that blocks are divided. With two, the smallest cells have the size of a pixel; with three, a
+third of the light that is left to photons would move to triangles, for three times the time."""
+CAMERA_CELL = 0.5
+"""Edge of the smallest cells in pixels of the camera, if these are larger than two of the projector: nobody sees what
+is finer."""
+TOLERANCE_PX = 0.15
+"""Largest error of the place of a triangle, in pixels of the projector."""
+FAINT = 0.02
+"""Ratio of the irradiance to direct light below which a triangle is faint. Blocks are not divided for faint light, and
+each sample sees one group of faint triangles alone."""
+SIGNIFICANT = 0.05
+"""Fraction of the light of a block whose chains are not smooth, above which it is divided."""
+FEWEST = 0.01
+"""Fraction of the light of a point below which the grid drops a part and leaves it to photons. Light that was reflected
+twice inside glass has 0.0016."""
+FEWEST_OF_PHOTONS = 0.1
+"""Fraction of the light of a photon below which Russian roulette decides about a part. If it were smaller, most of the
+time would go into parts that carry little."""
+LEFT = 0.1
+"""Fraction of the light of a cell that is left to photons, above which it gets one for certain; the others are drawn by
+lot. If it were smaller, many photons would carry little light."""
+PHOTONS, MAX_PARTS = 1 << 13, 8
+"""Number of photons of a pass, as far as cells that are left can be divided into parts of their own, and the largest
+number of parts along an edge. Cells that are more than so many have a photon each. With twice as many photons, their
+noise would be smaller by a third."""
+MAX_SAG = 1e-3
+"""Largest height of a curved receiver over a triangle, as a fraction of its distance from the projector; rays that look
+for triangles (`sheet_scene`) reach as far."""
+MAX_SIDE = 0.025
+"""Longest side of the parallelogram of a photon, as a fraction of its way from the projector. Light that spreads
+farther does not do so evenly."""
+SHIFT_PX = np.array([0.0137, 0.0071])
+"""Largest shift of the lattice against the edges of pixels, in pixels: more than rounding, less than anything seen."""
+MIN_SIDE_M = 1e-12
+"""Smallest length in metres by which another is divided, because light may land in a point."""
+STEP_PX = 0.02
+"""Distance of the points beside a photon that tell how its light spreads, in pixels of the projector. Closer points
+would land within the rounding of single precision; farther ones would miss narrow chains."""
+LENS_POINTS = 8
+"""Number of points of a lens of finite size, each of which has a grid of its own, at the lowest level."""
+MAX_AT_ONCE = 1 << 18
+"""Largest number of points of a launch, so that the weaker parts that it stores take 100 MB at most."""
+
+
+class Blocks(NamedTuple):
+    """Blocks of one size: lattice coordinates of their first points (n,) int64, distance of their points on the
+    lattice, and square root of their area in pixels."""
+
+    x: np.ndarray
+    y: np.ndarray
+    step: int
+    pixels: float
+
+
+class Lattice(NamedTuple):
+    """Points of the image that were traced: hash table of their lattice numbers, their indices, and the linked lists
+    of their landings. `columns` is the number of lattice points in a row, `coarsest` the distance of points in the
+    largest blocks."""
+
+    table: np.ndarray
+    value: np.ndarray
+    head: np.ndarray
+    after: np.ndarray
+    columns: int
+    coarsest: int
+
+
+class Lists(NamedTuple):
+    """Linked lists of the landings of points."""
+
+    head: np.ndarray
+    after: np.ndarray
+
+
+class Rule(NamedTuple):
+    """What decides whether a block is divided, see `TOLERANCE_PX`, `FAINT` and `SIGNIFICANT`; `angle` is that of a
+    pixel in radians, `projector_at` the place of the projector (3,) and `sag` is `MAX_SAG`."""
+
+    angle: float
+    projector_at: np.ndarray
+    sag: float
+    tolerance: float
+    faint: float
+    significant: float
+
+
+class Chains(NamedTuple):
+    """The columns of `Landings` that decide about triangles."""
+
+    key: np.ndarray
+    part: np.ndarray
+    length: np.ndarray
+    position: np.ndarray
+    normal: np.ndarray
+
+
+class Sheets(NamedTuple):
+    """Triangles of light.
+
+    position, slowness : (n, 3) float32, vertices: place where light lands, and its direction of flight times the
+        refractive index there, which is the gradient of the optical length; world.
+    cosine, length, u, v : (n,) float32, vertices: cosine of the direction to the normal (negative from in front),
+        optical length in metres, pixel coordinates of the projector.
+    normal : (n, 3) float32, geometric normals.
+    triangles : (t, 3) int64, vertices. flux : (t,) float64, watts.
+    shape, key : (t,) uint32, number of the shape where it lands, and name of the chain.
+    cut : ratio of the light that was lost in chains that are too long to all light.
+    in_triangles : fraction of the flux that the grid's triangles carry; photons carry the rest.
+    """
+
+    position: np.ndarray
+    slowness: np.ndarray
+    cosine: np.ndarray
+    length: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    normal: np.ndarray
+    triangles: np.ndarray
+    flux: np.ndarray
+    shape: np.ndarray
+    key: np.ndarray
+    cut: float
+    in_triangles: float
+
+
+def trace_sheets(
+    traced: TracedScene,
+    power_w: float,
+    seed: int,
+    pixel_rad: float = 0.0,
+    report: Callable[[], None] = lambda: None,
+) -> Sheets | None:
+    """The projector's light through glass and off mirrors, on the surfaces where it lands; None if there is none.
+
+    Parameters
+    ----------
+    power_w : watts, power of the projector while it shows white.
+    seed : int, 0 to 2^64 - 1, decides about photons.
+    pixel_rad : radians, smallest angle of a camera's pixel; what is finer than half of it is not resolved.
+    report : called after each kernel launch.
+    """
+    assert isinstance(traced.projector, Device)  # beams need no sheets
+    rng = np.random.default_rng(seed)
+    points = [None]
+    if traced.projector.has_lens:
+        points = list(np.mod(np.arange(LENS_POINTS)[:, None] * R2 + rng.random(2), 1))
+    tracing = _Tracing(traced, pixel_rad, report)
+    return joined([tracing.sheets(power_w / len(points), rng, lens) for lens in points])
+
+
+def joined(sheets: Sequence[Sheets]) -> Sheets | None:
+    """Several sheets as one; None if they are all empty."""
+    sheets = [one for one in sheets if len(one.flux)]
+    if len(sheets) < 2:
+        return sheets[0] if sheets else None
+    first = np.cumsum([0, *(len(one.u) for one in sheets)])
+    moved = [one._replace(triangles=one.triangles + begin) for one, begin in zip(sheets, first, strict=False)]
+    columns: list[Any] = [np.concatenate(c) for c in list(zip(*moved, strict=True))[:-2]]
+    flux = np.array([one.flux.sum() for one in sheets])
+    means = (
+        float(np.average([getattr(one, name) for one in sheets], weights=flux)) for name in ("cut", "in_triangles")
+    )
+    return Sheets(*columns, *means)
+
+
+class _Points:
+    """Points of a lattice over the image that were traced, and where their light landed.
+
+    Parameters
+    ----------
+    columns : int, number of lattice points in a row.
+    coarsest : int, distance of the points of the largest blocks.
+    """
+
+    def __init__(self, columns: int, coarsest: int) -> None:
+        self.columns, self.coarsest = columns, coarsest
+        self.table, self.value = np.full(1 << 12, EMPTY, np.int64), np.empty(1 << 12, np.int64)
+        self.numbers, self.dropped = np.empty(0, np.int64), np.empty(0)
+        self.landings: list[Landings] = []
+
+    def new(self, blocks: Blocks) -> np.ndarray:
+        """Lattice numbers of the points of these blocks that were not traced yet."""
+        needed = 2 * (len(self.numbers) + 9 * len(blocks.x))
+        if needed > len(self.table):
+            self.table, self.value = larger(self.table, self.value, 1 << int(np.ceil(np.log2(needed))))
+        return new_points(self.table, self.value, *blocks[:3], self.columns, len(self.numbers))
+
+    def add(self, numbers: np.ndarray, landings: Landings, dropped: np.ndarray) -> tuple[Lattice, Landings]:
+        """Keep the landings of new points; returns all of them."""
+        point = landings.point.astype(np.int64) + len(self.numbers)
+        self.landings = [
+            Landings(*map(np.concatenate, zip(*self.landings, landings._replace(point=point), strict=True)))
+        ]
+        self.numbers, self.dropped = np.concatenate([self.numbers, numbers]), np.concatenate([self.dropped, dropped])
+        head, after = linked(self.landings[0].point, len(self.numbers))
+        return Lattice(self.table, self.value, head, after, self.columns, self.coarsest), self.landings[0]
+
+
+class _Tracing:
+    """Traces sheets of a projector.
+
+    Parameters
+    ----------
+    traced, pixel_rad, report : as for `trace_sheets`.
+    """
+
+    def __init__(self, traced: TracedScene, pixel_rad: float, report: Callable[[], None]) -> None:
+        assert isinstance(traced.projector, Device)
+        self.device, self.report = traced.projector, report
+        self.tree = SpecularTree(traced, Launches())
+        width, height = (int(n[0]) for n in self.device.size)
+        self.angle = 1 / float(np.sqrt(self.device.f.x[0] * self.device.f.y[0]))
+        levels = int(np.log2(0.5 * BLOCK_PX / max(CAMERA_CELL * pixel_rad / self.angle, 1)))
+        self.levels = 0 if self.device.has_lens else min(max(levels, 0), MAX_LEVELS)
+        self.at = np.array([float(c[0]) for c in self.device.centre])
+        self.size_px = np.array([width, height])
+        self.blocks = tuple(int(np.ceil(n / BLOCK_PX)) for n in (width, height))
+        self.coarsest = 1 << self.levels
+        self.step_px = np.array([width, height]) / (2 * self.coarsest * np.array(self.blocks))
+        self.columns = 2 * self.coarsest * self.blocks[0] + 1
+        cells = CellGrid.of(self.device)
+        meets, _ = meets_delta(
+            traced.scene, cells.columns * cells.rows, lambda a, b: self.device.centre_ray(cells.probes(a, b))
+        )
+        self.delta = _Delta(
+            maximum_filter(meets.reshape(cells.rows, cells.columns), 3), 2 * self.coarsest * np.array(self.blocks)
+        )
+
+    def sheets(self, power_w: float, rng: np.random.Generator, lens: np.ndarray | None) -> Sheets:
+        """Sheets of the light through a point of the lens, uniform coordinates in the unit square (2,); None: its
+        centre."""
+        points = _Points(self.columns, self.coarsest)
+        x, y = (
+            c.ravel().astype(np.int64) for c in np.meshgrid(*(2 * self.coarsest * np.arange(n) for n in self.blocks))
+        )
+        taken, used, step = np.full(1 << 14, EMPTY, np.int64), 0, self.coarsest
+        near = self.delta.within(x, y, 2 * step)
+        x, y = x[near], y[near]
+        made, left = [], []
+        rule = Rule(self.angle, self.at, MAX_SAG, TOLERANCE_PX, FAINT, SIGNIFICANT)
+        watts = power_w / self.device.pixels
+        pixels = np.sqrt(self.step_px.prod())
+        landings = _no_landings()
+        while step and len(x):
+            blocks = Blocks(x, y, step, 2 * step * pixels)
+            new = points.new(blocks)
+            lattice, landings = points.add(new, *self._follow(self._pixels(new), lens, FEWEST))
+            chains = Chains(*(getattr(landings, name) for name in Chains._fields))
+            meets = self.delta.within(x, y, 2 * step)
+            triangles, flux, divides, taken, used = smooth_chains(blocks, lattice, chains, rule, meets, taken, used)
+            made.append((triangles, flux))
+            divides &= step > 1
+            whole = Blocks(x[~divides], y[~divides], *blocks[2:])
+            cells = np.column_stack([np.add.outer(c, step * offset).ravel() for c, offset in (
+                (whole.x, np.array([0, 1, 0, 1])), (whole.y, np.array([0, 0, 1, 1])))])  # fmt: skip
+            meets = self.delta.within(cells[:, 0], cells[:, 1], step)
+            triangles, flux, rest, taken, used = cells_of(
+                whole, lattice, chains, rule, points.dropped, meets, taken, used
+            )
+            made.append((triangles, flux))
+            left.append(np.column_stack([cells, np.full(len(cells), step), rest])[rest > 0])
+            x, y, step = x[divides], y[divides], step // 2
+            x, y = (
+                np.concatenate([x, x + 2 * step, x, x + 2 * step]),
+                np.concatenate([y, y, y + 2 * step, y + 2 * step]),
+            )
+        if not made:
+            return _sheets(landings, np.empty((0, 2)), np.empty((0, 3), np.int64), np.empty(0), 0.0)
+        triangles, flux = (np.concatenate(c) for c in zip(*made, strict=True))
+        of_grid = _sheets(landings, self._pixels(points.numbers)[landings.point], triangles, watts * flux[:, 0], 0.0)
+        both = joined([of_grid, self._photons(np.concatenate(left), taken, watts, rng, lens)])
+        if both is None:
+            return of_grid
+        return both._replace(in_triangles=float(of_grid.flux.sum() / both.flux.sum()))
+
+    def _pixels(self, number: np.ndarray) -> np.ndarray:
+        """(n, 2) float64, pixel coordinates of lattice points.
+
+        They are moved a little, by less towards the borders of the image, so that none lies exactly on an edge of a
+        scene that is aligned with the projector.
+        """
+        regular = np.column_stack([number % self.columns, number // self.columns]) * self.step_px
+        return regular + SHIFT_PX * np.sin(np.pi * regular / self.size_px)
+
+    def _photons(
+        self, cells: np.ndarray, taken: np.ndarray, watts: float, rng: np.random.Generator, lens: np.ndarray | None
+    ) -> Sheets:
+        """Sheets of photons: the light of cells that is in no triangle.
+
+        cells : (n, 4) float64, lattice coordinates and edge of cells, and fraction of their light that is left.
+        taken : set of the cells and chains that have triangles. watts : W, power of a pixel.
+        """
+        chance = np.minimum(cells[:, 3] / LEFT, 1)
+        # Each cell is divided into parts x parts, each of which may have a photon
+        parts = int(np.clip(np.sqrt(PHOTONS / max(chance.sum(), 1)), 1, MAX_PARTS))
+        offset = np.indices((parts, parts)).reshape(2, -1).T / parts
+        part = np.tile(offset, (len(cells), 1))
+        cells, chance = np.repeat(cells, parts**2, axis=0), np.repeat(chance, parts**2)
+        chosen = rng.random(len(cells)) < chance
+        cells, chance, part = cells[chosen], chance[chosen], part[chosen]
+        size = cells[:, 2:3] * self.step_px / parts
+        place = (cells[:, :2] + cells[:, 2:3] * part) * self.step_px + rng.random((len(cells), 2)) * size
+        beside = np.repeat(place, 3, axis=0)
+        beside[1::3, 0] += STEP_PX
+        beside[2::3, 1] += STEP_PX
+        # The three points of a photon share their random numbers, and so their chains
+        states = np.repeat(rng.integers(0, 1 << 63, len(cells), dtype=np.uint64), 3)
+        found, lost = self._follow(beside, lens, FEWEST_OF_PHOTONS, states)
+        lists = Lists(*linked(found.point.astype(np.int64), len(beside)))
+        chains = Chains(*(getattr(found, name) for name in Chains._fields))
+        corners, edges = cells[:, :2].astype(np.int64), cells[:, 2].astype(np.int64)
+        which = sides_of_photons(corners, edges, lists, self.columns, self.coarsest, chains, taken)
+        power = watts * size.prod(axis=1) / chance
+        made = _parallelograms(found, which, size, place, power, self.angle, self.at)
+        return made._replace(cut=float((lost[::3] * power).sum() / made.flux.sum()) if len(made.flux) else 0.0)
+
+    def _follow(
+        self, pixels: np.ndarray, lens: np.ndarray | None, fewest: float, states: np.ndarray | None = None
+    ) -> tuple[Landings, np.ndarray]:
+        """Follow the light of points of the image (n, 2), as `SpecularTree.follow`."""
+        found, lost = [_no_landings()], [np.empty(0)]
+        for begin in range(0, len(pixels), MAX_AT_ONCE):
+            some = slice(begin, begin + MAX_AT_ONCE)
+            place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in pixels[some].T))
+            rays = self.device.sample_ray(place, None if lens is None else mi.Point2f(*map(float, lens)))
+            random = None if states is None else mi.UInt64(aligned(states[some], np.uint64))
+            landings, dropped = self.tree.follow(rays, fewest, random)
+            self.report()
+            found.append(landings._replace(point=landings.point + np.uint32(begin)))
+            lost.append(dropped)
+        return Landings(*map(np.concatenate, zip(*found, strict=True))), np.concatenate(lost)
+
+
+def _no_landings() -> Landings:
+    """No landing at all."""
+    whole, real, vector = np.empty(0, np.uint32), np.empty(0, np.float32), np.empty((0, 3), np.float32)
+    return Landings(whole, whole, whole, real, real, real, vector, vector, vector)
+
+
+def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.ndarray, cut: float) -> Sheets:
+    """Sheets whose vertices are these landings; `uv` (n, 2) are pixel coordinates."""
+    cosine = np.einsum("ij,ij->i", landings.direction, landings.normal)
+    u, v = np.asarray(uv, np.float32).T
+    of = triangles[:, 0]
+    slowness = landings.ior[:, None] * landings.direction
+    vertices = landings.position, slowness, cosine, landings.length, u, v, landings.normal
+    return Sheets(*vertices, triangles, flux, landings.shape[of], landings.key[of], cut, 0.0)
+
+
+def _parallelograms(
+    found: Landings,
+    which: np.ndarray,
+    size: np.ndarray,
+    place: np.ndarray,
+    power: np.ndarray,
+    angle: float,
+    projector_at: np.ndarray,
+) -> Sheets:
+    """Sheets of photons, two triangles each.
+
+    Parameters
+    ----------
+    found : Landings of the three points of each photon. which : (m, 3) int64, see `sides_of_photons`.
+    size, place : (n, 2) float64, pixels, sizes of the photons' cells and places of the photons.
+    power : (n,) float64, watts, power that a photon stands for. angle : radians, of a pixel. projector_at : (3,).
+    """
+    this = which[:, 0]
+    photon = found.point[this] // 3
+    edges, centre = size[photon], found.position[this].astype(np.float64)
+    normal = found.normal[this].astype(np.float64)
+    # Where no chain of the same name lies beside a photon, its light spreads as without glass
+    across = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]]))
+    across *= (angle * found.length[this] / np.linalg.norm(across, axis=1))[:, None]
+    plain = np.stack([across, np.cross(normal, across)], axis=1)
+    known = np.all(which[:, 1:] >= 0, axis=1, keepdims=True)
+    sides = (
+        np.where(known[..., None], (found.position[which[:, 1:]] - centre[:, None]) / STEP_PX, plain)
+        * edges[:, :, None]
+    )
+    longest = MAX_SIDE * found.length[this, None]
+    turn = np.linalg.norm(found.normal[which[:, 1:]] - normal[:, None], axis=2) / STEP_PX * edges  # radians over a side
+    length = np.maximum(np.linalg.norm(sides, axis=2), MIN_SIDE_M)
+    sag = MAX_SAG * np.linalg.norm(centre - projector_at, axis=1)[:, None]
+    flat = np.sqrt(4 * sag / np.maximum(np.where(known, turn, 0) * length, MIN_SIDE_M))  # half for each side
+    shrinks = np.minimum(np.minimum(longest / length, flat), 1)
+    sides *= shrinks[..., None]
+    ends = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
+    corners = centre[:, None] + ends @ sides
+    uv = place[photon][:, None] + ends * (edges * shrinks)[:, None]
+    four = Landings(*(np.repeat(column[this], 4, axis=0) for column in found))
+    triangles = (4 * np.arange(len(this))[:, None, None] + np.array([[0, 1, 3], [0, 3, 2]])).reshape(-1, 3)
+    flux = np.repeat(0.5 * found.part[this] * power[photon], 2)
+    # The direction of flight is the gradient of the optical length
+    further = np.einsum("mij,mj->mi", ends @ sides, found.ior[this, None] * found.direction[this]).ravel()
+    moved = np.asarray(corners.reshape(-1, 3), np.float32)
+    four = four._replace(position=moved, length=np.asarray(four.length + further, np.float32))
+    return _sheets(four, uv.reshape(-1, 2), triangles, flux, 0.0)
+
+
+class _Delta:
+    """Where rays through the image meet a delta surface first.
+
+    Parameters
+    ----------
+    meets : (rows, columns) bool, by cell of the image. lattice : (2,) int, size of the lattice over the image.
+    """
+
+    def __init__(self, meets: np.ndarray, lattice: np.ndarray) -> None:
+        rows, columns = meets.shape
+        self.sums = np.zeros((rows + 1, columns + 1), np.int64)
+        self.sums[1:, 1:] = meets.cumsum(0).cumsum(1)
+        self.scale = np.array([columns, rows]) / lattice
+
+    def within(self, x: np.ndarray, y: np.ndarray, edge: int) -> np.ndarray:
+        """(n,) bool, whether some ray through squares of the lattice meets one."""
+        rows, columns = self.sums.shape
+        x0, y0 = (np.floor(c * s).astype(np.int64) for c, s in ((x, self.scale[0]), (y, self.scale[1])))
+        x1, y1 = (np.ceil((c + edge) * s).astype(np.int64) for c, s in ((x, self.scale[0]), (y, self.scale[1])))
+        x1, y1 = np.minimum(np.maximum(x1, x0 + 1), columns - 1), np.minimum(np.maximum(y1, y0 + 1), rows - 1)
+        return self.sums[y1, x1] - self.sums[y0, x1] - self.sums[y1, x0] + self.sums[y0, x0] > 0

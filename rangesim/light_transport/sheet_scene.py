@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Triangles of light as kernels see them: the search for those that cover a point of a surface.
+
+The triangles are a scene of their own. A short ray along the normal of the surface meets all of them that cover the
+point, one after the other. Triangles that lie in one plane would hide each other, so each of them is lifted off the
+surface by a distance of its own.
+
+Faint triangles are many and bring little. They are dealt out to groups, in copies of the scene that lie side by side. A
+sample of a pixel looks into one group, whose light counts for all. The samples of a pixel look into all groups in turn.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rangesim.light_transport.caustic_kernels import irradiance_of, lifted
+from rangesim.light_transport.caustic_sheets import FAINT, MAX_SAG, Sheets
+from rangesim.light_transport.sampling import aligned
+
+LIFT = 2e-4
+"""Largest distance by which a triangle is lifted off its surface, as a fraction of its distance from the projector: a
+thousand times the rounding of single precision, which has to tell all triangles apart that cover a point. A larger
+distance would make triangles on curved surfaces too large."""
+STEP = 1e-7
+"""Step behind a triangle, as a fraction of the coordinates: the rounding of single precision. With a smaller step, a
+ray could meet the same triangle for ever; a larger one would pass triangles by."""
+MARGIN = 1.4
+"""Ratio of the height from which a ray looks, and the depth to which it does, to those of the edges of triangles: the
+middle of a triangle is 4 / 3 times as far from a curved surface as its edges."""
+PERIOD, EVERY = 16, 4
+"""Number of samples after which a pixel has looked into all groups of faint triangles, and the distance of two samples
+that look into one at all. With a longer period, faint light would be noisy in passes of few samples; if every sample
+looked, a pass would take a fifth longer."""
+SPACING = 1.5
+"""Distance between groups of faint triangles, as a multiple of the size of the lit part of the scene, so that groups do
+not touch."""
+MIN_SIZE_M = 1e-6
+"""Metres that are added to the size of the lit part of the scene, which may be a point."""
+MAX_COSINE_DIFFERENCE = 0.35
+"""Largest difference between the cosines of a direction to the normal of a triangle and to that of a point that it may
+light, so that a triangle on one side of a thin part does not light the other side."""
+
+
+@dataclass
+class Place:
+    """A place on a triangle. Loops of Dr.Jit carry it, so it is not frozen.
+
+    triangle : UInt32, index. b1, b2 : Float, barycentric coordinates.
+    """
+
+    triangle: mi.UInt32
+    b1: mi.Float
+    b2: mi.Float
+
+    @classmethod
+    def none(cls, lanes: int) -> Place:
+        """The first corner of the first triangle."""
+        return cls(dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes))
+
+    def replaced(self, where: mi.Bool, found: mi.PreliminaryIntersection3f) -> Place:
+        """The place that a ray found, on the lanes of the mask `where`."""
+        return Place(
+            dr.select(where, found.prim_index, self.triangle),
+            dr.select(where, found.prim_uv.x, self.b1),
+            dr.select(where, found.prim_uv.y, self.b2),
+        )
+
+
+class Light(NamedTuple):
+    """Light of a triangle at a place.
+
+    direction : Vector3f, unit, world, direction of flight.
+    u, v : Float, projector pixel coordinates.
+    length : Float, metres, optical length from the projector.
+    cosine : Float, cosine between direction and geometric normal where it landed.
+    """
+
+    direction: mi.Vector3f
+    u: mi.Float
+    v: mi.Float
+    length: mi.Float
+    cosine: mi.Float
+
+
+class SheetScene:
+    """Triangles of light, ready for kernels.
+
+    Parameters
+    ----------
+    sheets : Sheets, at least one triangle.
+    projector_at : (3,) float, metres, world. irradiance : W/m2, of the projector's direct light at 1 m.
+    samples : int, smallest number of samples of a pixel, which bounds the number of groups.
+    shapes : int, number of entries of tables by shape.
+    """
+
+    def __init__(self, sheets: Sheets, projector_at: np.ndarray, irradiance: float, samples: int) -> None:
+        period = 1 << int(np.log2(max(1, min(samples, PERIOD))))
+        every = min(period, EVERY)
+        groups = period // every
+        at_vertex, scale, area = irradiance_of(sheets.triangles, sheets.flux, sheets.position, len(sheets.u))
+        first = sheets.position[sheets.triangles[:, 0]]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = np.linalg.norm(first - projector_at, axis=1)
+            level = sheets.flux / area * distance**2 / irradiance
+
+        size = float(np.ptp(sheets.position, axis=0).max()) + MIN_SIZE_M
+        across = math.isqrt(groups - 1) + 1  # groups lie in a square
+        offsets = np.array([[0, 0], *([1 + g % across, g // across] for g in range(groups))]) * (SPACING * size)
+        columns = (sheets.position, sheets.normal, sheets.triangles, sheets.shape, sheets.key)
+        lift = LIFT * distance
+        drawn = np.random.default_rng(0).random(len(area))
+        corners, names, factor = lifted(columns, scale, level, groups, every, FAINT, lift, offsets, drawn)
+        mesh = mi.Mesh("light", len(corners), len(names))
+        parameters = mi.traverse(mesh)
+        parameters["vertex_positions"] = mi.Float(aligned(corners, np.float32))
+        parameters["faces"] = mi.UInt32(aligned(np.arange(len(corners)), np.uint32))
+        parameters.update()
+        self.scene = mi.load_dict({"type": "scene", "light": mesh})
+        # Between vertices the length is interpolated with its gradient, which is exact for a quadratic function: the
+        # mean of the values at the vertices and of the tangent planes there
+        along = np.einsum("ij,ij->i", sheets.slowness, sheets.position - projector_at)
+        looks = np.column_stack(
+            [sheets.slowness, sheets.length - 0.5 * along, sheets.u, sheets.v, at_vertex, sheets.cosine]
+        )
+        self.looks, self.names = mi.Float(aligned(looks, np.float32)), mi.UInt32(aligned(names, np.uint32))
+        self.factor, self.offsets = mi.Float(aligned(factor, np.float32)), mi.Float(aligned(offsets, np.float32))
+        self.groups, self.every = dr.opaque(mi.UInt32, groups), dr.opaque(mi.UInt32, every)
+        self.projector_at = mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in projector_at))
+        is_lit = np.zeros(int(sheets.shape.max()) + 1, np.bool_)
+        is_lit[names[:, 3]] = True
+        self.is_lit, self.shapes = mi.Bool(is_lit), dr.opaque(mi.UInt32, len(is_lit))
+
+    def may_light(self, shape: mi.UInt32, active: mi.Bool) -> mi.Bool:
+        """Whether any triangle lies on a shape."""
+        known = active & (shape < self.shapes)
+        return known & dr.gather(mi.Bool, self.is_lit, shape, known)
+
+    def is_turn(self, sample: mi.UInt32, turn: mi.UInt32) -> mi.Bool:
+        """Whether it is the turn of a sample; each turn comes once in `every` samples."""
+        return sample % self.every == turn % self.every
+
+    def ray(
+        self,
+        point: mi.Point3f,
+        normal: mi.Normal3f,
+        sample: mi.UInt32,
+        which: mi.UInt32,
+        way: mi.Float,
+    ) -> tuple[mi.Ray3f, mi.Float]:
+        """The rest of the ray through the triangles that may cover a point, after a way in metres; and the step in
+        metres from a triangle that it meets to where the next one is looked for.
+
+        which : UInt32; 0: through bright triangles, 1: through those of the sample's group of faint ones.
+        """
+        distance = dr.norm(mi.Vector3f(point) - self.projector_at)
+        above = MARGIN * (LIFT + MAX_SAG) * distance
+        group = dr.select(which == 0, 0, sample // self.every % self.groups + 1)
+        offset = dr.gather(mi.Vector2f, self.offsets, group)
+        origin = point + mi.Vector3f(normal) * (above - way) + mi.Vector3f(offset.x, offset.y, 0)
+        ray = mi.Ray3f(origin, -mi.Vector3f(normal))
+        ray.maxt = above + MARGIN * MAX_SAG * distance - way
+        return ray, STEP * (distance + dr.norm(mi.Vector3f(point)) + offset.x + offset.y)
+
+    def next(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
+        """The next triangle on a ray."""
+        return self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+
+    def irradiance(
+        self, found: mi.PreliminaryIntersection3f, shape: mi.UInt32, normal: mi.Normal3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Bool]:
+        """Irradiance (W/m2) of a triangle that was found, and whether it lies on this side of this shape."""
+        names = dr.gather(mi.Vector4u, self.names, found.prim_index, active)
+        is_here = active & (names.w == shape)
+        b1, b2 = found.prim_uv.x, found.prim_uv.y
+        total = mi.Float(0)
+        for index, weight in zip((names.x, names.y, names.z), (1 - b1 - b2, b1, b2), strict=True):
+            total += weight * dr.gather(mi.Float, self.looks, 8 * index + 6, is_here)
+        direction = dr.gather(mi.Vector4f, self.looks, 2 * names.x, is_here).xyz
+        cosine = dr.gather(mi.Float, self.looks, 8 * names.x + 7, is_here)
+        is_here &= dr.abs(dr.dot(dr.normalize(direction), normal) - cosine) < MAX_COSINE_DIFFERENCE
+        total *= dr.gather(mi.Float, self.factor, found.prim_index, is_here)
+        return dr.select(is_here, total, 0), is_here & (total > 0)
+
+    def light(self, place: Place, point: mi.Point3f, active: mi.Bool) -> Light:
+        """The light of a triangle at a place, which is `point` in the world."""
+        names = dr.gather(mi.Vector4u, self.names, place.triangle, active)
+        weights = (1 - place.b1 - place.b2, place.b1, place.b2)
+        first, second = mi.Vector4f(0), mi.Vector4f(0)
+        for index, weight in zip((names.x, names.y, names.z), weights, strict=True):
+            first += weight * dr.gather(mi.Vector4f, self.looks, 2 * index, active)
+            second += weight * dr.gather(mi.Vector4f, self.looks, 2 * index + 1, active)
+        length = first.w + 0.5 * dr.dot(first.xyz, mi.Vector3f(point) - self.projector_at)
+        return Light(dr.normalize(first.xyz), second.x, second.y, length, second.w)

@@ -1,0 +1,359 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trees of specular chains: the light of a point of the projector's image on its way through glass and off mirrors.
+
+At glass a ray splits in two: one part is reflected, the other refracted. Both are followed, each with its fraction of
+the light, so a point of the image always lights the same places. A chain is named by a key, which depends on the
+surfaces that it met and on the choices between reflection and refraction. Chains of the same key through neighbouring
+points differ smoothly.
+
+A launch follows every ray along its stronger part. The weaker parts are stored, and are the rays of the next launch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rangesim.light_transport.camera_rays import Device, PrimaryRay
+from rangesim.light_transport.kernel_launches import Launches
+from rangesim.light_transport.sampling import Continued
+from rangesim.light_transport.scattering import Medium
+from rangesim.light_transport.spectrum import mono
+from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray
+from rangesim.light_transport.strategies import can_be_vertex, is_delta
+from rangesim.light_transport.surfaces import number_of, table_of
+from rangesim.light_transport.traced_scene import TracedScene
+
+PARTS = 6
+"""Largest number of weaker parts that a ray stores in a launch. Light through three panes meets six faces. A part that
+finds no room is dropped by a point of the grid; a photon then follows one of the two parts by chance."""
+LAUNCHES, LAUNCHES_OF_PHOTONS = 3, 2
+"""Largest numbers of launches. In the last one nothing is stored: points of the grid drop weaker parts, and photons
+choose one part by chance. Light that was the weaker part twice carries little."""
+HASH_STEP = 0x9E3779B1
+"""Odd factor of the hash that names chains: 2^32 divided by the golden ratio, rounded to a prime."""
+NORMAL_STEPS = 1000.0
+"""Number of steps per unit to which the normals of flat faces are rounded in a key, so that light through different
+faces of a mesh has different keys; faces closer than 0.06 degrees count as one."""
+EXACT_BSDFS = ("SmoothDielectric", "ThinDielectric", "SmoothConductor", "SmoothPlastic", "Null")
+"""Class names of BSDFs whose delta lobes can be asked for one by one, each with its exact weight; `twosided` around
+them is exact as well. Blends and masks choose by chance."""
+
+
+class Parts(NamedTuple):
+    """Parts of light on their way along specular chains, one in each lane.
+
+    point : UInt32, index of the point of the image from which the light came.
+    part : Float, fraction of the light of the point.
+    origin, direction : Point3f and Vector3f, world.
+    state : RayState.
+    key : UInt32, name of the chain so far.
+    chain : UInt32, number of delta interactions so far.
+    random : UInt64, state of the random numbers; None for points of the grid.
+    """
+
+    point: mi.UInt32
+    part: mi.Float
+    origin: mi.Point3f
+    direction: mi.Vector3f
+    state: RayState
+    key: mi.UInt32
+    chain: mi.UInt32
+    random: mi.UInt64 = None
+
+
+class Landings(NamedTuple):
+    """Where light landed beyond delta interactions; m landings.
+
+    point : (m,) uint32, index of the point of the image.
+    key : (m,) uint32, name of the chain and of the shape that it ends on.
+    shape : (m,) uint32, number of that shape (`surfaces.number_of`).
+    part : (m,) float32, fraction of the light of the point.
+    length : (m,) float32, metres, optical length.
+    ior : (m,) float32, refractive index in front of the surface.
+    position, normal, direction : (m, 3) float32, world; metres, geometric normal, and direction of flight.
+    """
+
+    point: np.ndarray
+    key: np.ndarray
+    shape: np.ndarray
+    part: np.ndarray
+    length: np.ndarray
+    ior: np.ndarray
+    position: np.ndarray
+    normal: np.ndarray
+    direction: np.ndarray
+
+
+class SpecularTree:
+    """Follows the projector's light through the delta surfaces of a scene.
+
+    Parameters
+    ----------
+    traced : TracedScene, whose emitter is a projector.
+    launches : Launches.
+    """
+
+    def __init__(self, traced: TracedScene, launches: Launches) -> None:
+        shapes = traced.scene.shapes()
+        self.traced, self.launches = traced, launches
+        self.is_flat = mi.Bool(table_of(traced.scene, [_is_flat(shape) for shape in shapes]))
+        self.is_exact = mi.Bool(table_of(traced.scene, [_is_exact(shape.bsdf()) for shape in shapes]))
+        self.max_chain = dr.opaque(mi.UInt32, MAX_CHAIN)
+
+    def follow(
+        self, primary: PrimaryRay, fewest: float, random: mi.UInt64 | None = None
+    ) -> tuple[Landings, np.ndarray]:
+        """Follow the light of points of the image to where it lands.
+
+        Parameters
+        ----------
+        primary : PrimaryRay, n rays.
+        fewest : fraction of a point's light below which a part is dropped. Photons keep some of these parts by Russian
+            roulette, so that none is left out in the mean.
+        random : UInt64, states of the random numbers of photons; None for points of the grid, which drop parts and are
+            stopped by surfaces whose lobes cannot be asked for one by one.
+
+        Returns
+        -------
+        landings : Landings.
+        dropped : (n,) float64, fraction of each point's light in parts that were dropped.
+        """
+        traced = self.traced
+        assert isinstance(traced.projector, Device)
+        n = dr.width(primary.direction)
+        one = dr.ones(mi.Float, n)
+        state = RayState.start(traced, n).restarted(True, primary.origin, primary.path_offset + dr.zeros(mi.Float, n))
+        part = one * traced.projector.relative_illumination(primary.direction)
+        if primary.exists is not None:
+            part = dr.select(primary.exists, part, 0)
+        origin = mi.Point3f(primary.origin) + dr.zeros(mi.Point3f, n)
+        none = dr.zeros(mi.UInt32, n)
+        parts = Parts(dr.arange(mi.UInt32, n), part, origin, primary.direction, state, none, mi.UInt32(none),
+                      random)  # fmt: skip
+        # All parts share an increment; their states differ
+        chance = None if random is None else Continued(mi.PCG32(1))
+        self.fewest = dr.opaque(mi.Float, fewest)
+        dropped, found = np.zeros(n), []
+        launches = LAUNCHES if random is None else LAUNCHES_OF_PHOTONS
+        for left in reversed(range(launches)):
+            self.room = dr.opaque(mi.UInt32, PARTS if left else 0)
+            leaves = _leaves(parts)
+            dr.make_opaque(leaves)
+            parts = _rebuilt(parts, list(leaves))
+            lanes = dr.width(parts.part)
+            stored = _Stored(leaves, lanes)
+            landing, lost = _strongest(self, parts, stored, chance)
+            self.launches.evaluate([list(landing), stored.leaves, lost], lanes)
+            dropped += np.bincount(parts.point.numpy(), lost.numpy(), n)  # in the same order on any machine
+            landed = dr.compress(landing.part > 0)
+            columns = [dr.gather(type(x), x, landed) for x in (parts.point, *_leaves(landing))]
+            dr.eval(columns)
+            found.append([x.numpy() for x in columns])
+            rest = dr.compress(stored.part > 0)
+            if not len(rest):
+                break
+            parts = _rebuilt(parts, [dr.gather(type(x), x, rest) for x in stored.leaves])
+        numbers = [np.concatenate(column) for column in zip(*found, strict=True)]
+        vectors = [np.column_stack(numbers[k : k + 3]) for k in (6, 9, 12)]
+        return Landings(*numbers[:6], *vectors), dropped
+
+
+class _Landing(NamedTuple):
+    """A landing in each lane, as in `Landings`; its part is 0 where there is none."""
+
+    key: mi.UInt32
+    shape: mi.UInt32
+    part: mi.Float
+    length: mi.Float
+    ior: mi.Float
+    position: mi.Point3f
+    normal: mi.Vector3f
+    direction: mi.Vector3f
+
+
+class _Stored:
+    """Room for the weaker parts of each lane. Dr.Jit does not look into this class, so loops do not carry the arrays.
+
+    Parameters
+    ----------
+    like : leaves of `Parts`.
+    lanes : int.
+    """
+
+    def __init__(self, like: list[Any], lanes: int) -> None:
+        self.lane, self.lanes = dr.arange(mi.UInt32, lanes), dr.opaque(mi.UInt32, lanes)
+        self.leaves = [dr.empty(type(x), PARTS * lanes) for x in like]
+        self.leaves[PART_LEAF] = dr.zeros(mi.Float, PARTS * lanes)
+
+    @property
+    def part(self) -> mi.Float:
+        """Fraction of the light of each part that was stored; 0 where there is none."""
+        return self.leaves[PART_LEAF]
+
+    def add(self, parts: Parts, number: mi.UInt32, active: mi.Bool) -> None:
+        """Store a part of each lane, after `number` that the lane stored before."""
+        place = dr.fma(number, self.lanes, self.lane)
+        for target, value in zip(self.leaves, _leaves(parts), strict=True):
+            dr.scatter(target, value, place, active)
+
+
+PART_LEAF = 1
+"""Place of `part` among the leaves of `Parts`."""
+
+
+@dr.syntax
+def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
+    """Follow every part along the stronger of the two parts into which surfaces split it.
+
+    Returns
+    -------
+    landing : _Landing.
+    lost : Float, fraction of the light in parts that were dropped.
+    """
+    traced = tree.traced
+    media, absorbers = traced.media, traced.absorbers
+    n = dr.width(parts.part)
+    reflects, transmits, any_lobe = (mi.BSDFContext(mi.TransportMode.Importance) for _ in range(3))
+    reflects.type_mask = mi.BSDFFlags.DeltaReflection
+    transmits.type_mask = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Null
+    any_lobe.type_mask = mi.BSDFFlags.Delta
+
+    origin, direction, state = parts.origin, parts.direction, parts.state
+    part, key, chain, random = parts.part, parts.key, parts.chain, parts.random
+    number = dr.zeros(mi.UInt32, n)  # of parts stored
+    lost, left = dr.zeros(mi.Float, n), tree.max_chain + dr.zeros(mi.UInt32, n)
+    none, vector = dr.zeros(mi.UInt32, n), dr.zeros(mi.Vector3f, n)
+    landing = [none, mi.UInt32(none), *(dr.zeros(mi.Float, n) for _ in range(3)), dr.zeros(mi.Point3f, n), vector,
+               mi.Vector3f(vector)]  # fmt: skip
+    active = part > 0
+    while active:
+        # ---- Next surface ----------------------------------------------------------------------------
+        ray = mi.Ray3f(origin, direction)
+        si = traced.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        hit, crosses = si.is_valid() & active, mi.Bool(False)
+        point = dr.select(chain > 0, corrected_point(si, state.previous, ray.d), si.p)
+        if dr.hint(absorbers is not None, mode="scalar"):
+            part *= state.unabsorbed(traced, point, hit)
+        if dr.hint(media is not None, mode="scalar"):
+            crosses = hit & media.bounded_by(si, hit)
+            part *= dr.select(hit, dr.exp(-state.inside.sigma_t * dr.norm(point - state.previous)), 1)
+        state.length = state.length_to(point, hit)
+        bsdf, shape = si.bsdf(ray), number_of(si.shape)
+        mirrors = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+
+        # ---- Light that the surface scatters lands here ------------------------------------------------
+        lands = hit & can_be_vertex(bsdf) & (chain > 0)
+        here = [(key ^ shape) * HASH_STEP, shape, part, state.length, state.ior, point, mi.Vector3f(si.n), ray.d]
+        landing = _selected(lands, here, landing)
+
+        # ---- The rest splits into a reflected and a refracted part -------------------------------------
+        face = dr.round(si.n * NORMAL_STEPS)
+        face = [mi.UInt32(mi.Int32(x)) for x in (face.x, face.y, face.z)]
+        place = shape + dr.select(dr.gather(mi.Bool, tree.is_flat, shape, hit), _mixed(face), 0)
+        splits = mirrors & (dr.gather(mi.Bool, tree.is_exact, shape, hit) | crosses)
+        bs_r, weight_r = bsdf.sample(reflects, si, mi.Float(0.5), mi.Point2f(0.5, 0.5), splits)
+        bs_t, weight_t = bsdf.sample(transmits, si, mi.Float(0.5), mi.Point2f(0.5, 0.5), splits)
+        part_r, part_t = (dr.select(splits, part * mono(w), 0) for w in (weight_r, weight_t))
+        if dr.hint(numbers is not None, mode="scalar"):
+            rng = numbers.at(random)
+            chosen, weight = bsdf.sample(
+                any_lobe, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), mirrors & ~splits
+            )
+            alone = mirrors & ~splits & is_delta(chosen)
+            part_t = dr.select(alone, part * mono(weight), part_t)
+            bs_t = dr.select(alone, chosen, bs_t)
+            random = rng.state
+        else:
+            lost += dr.select(mirrors & ~splits, part, 0)
+        turns = part_r > part_t
+        d_r, d_t = si.to_world(bs_r.wo), si.to_world(bs_t.wo)
+        start = state.restarted(mirrors, point, state.length)
+        after_r = start.entering(traced, si, d_r, mirrors, mi.Bool(False))
+        after_t = start.refracted(bs_t, mirrors).entering(traced, si, d_t, mirrors, crosses)
+        key_r, key_t = (key ^ place) * HASH_STEP + 1, (key ^ place) * HASH_STEP + 2
+        o_r, o_t = spawn_specular_ray(si, si.p, d_r).o, spawn_specular_ray(si, si.p, d_t).o
+        chain += dr.select(mirrors & ~crosses, mi.UInt32(1), mi.UInt32(0))
+
+        # ---- The weaker one is stored, the stronger one goes on ----------------------------------------
+        weaker, stronger = dr.minimum(part_r, part_t), dr.maximum(part_r, part_t)
+        if dr.hint(numbers is not None, mode="scalar"):
+            rng = numbers.at(random)
+            kept = dr.select(rng.next_float32() * tree.fewest < weaker, dr.maximum(weaker, tree.fewest), 0)
+            stronger = dr.select(rng.next_float32() * tree.fewest < stronger, dr.maximum(stronger, tree.fewest), 0)
+            # Without room for both, one of them stands for both
+            is_full = (kept > 0) & (number >= tree.room)
+            swaps = is_full & (rng.next_float32() * (kept + stronger) < kept)
+            turns ^= swaps
+            stronger = dr.select(is_full, kept + stronger, stronger)
+            kept = dr.select(is_full, 0, kept)
+            random = rng.state
+        else:
+            kept = dr.select((weaker >= tree.fewest) & (number < tree.room), weaker, 0)
+            lost += weaker - kept
+            lost += dr.select(stronger < tree.fewest, stronger, 0)
+            stronger = dr.select(stronger < tree.fewest, 0, stronger)
+        aside = Parts(parts.point, kept, dr.select(turns, o_t, o_r), dr.select(turns, d_t, d_r),
+                      dr.select(turns, after_t, after_r), dr.select(turns, key_t, key_r), chain, random)  # fmt: skip
+        stored.add(aside, number, kept > 0)
+        number += dr.select(kept > 0, mi.UInt32(1), mi.UInt32(0))
+        part, key = stronger, dr.select(turns, key_r, key_t)
+        origin, direction = dr.select(turns, o_r, o_t), dr.select(turns, d_r, d_t)
+        state = dr.select(turns, after_r, after_t)
+        left -= 1
+        lost += dr.select(left == 0, part, 0)
+        active &= mirrors & (part > 0) & (left > 0)
+    return _Landing(*landing), lost
+
+
+def _selected(where: mi.Bool, these: list[Any], others: list[Any]) -> list[Any]:
+    """These arrays on the lanes of the mask `where`, the others elsewhere."""
+    return [dr.select(where, a, b) for a, b in zip(these, others, strict=True)]
+
+
+def _mixed(numbers: list[mi.UInt32]) -> mi.UInt32:
+    """One number from three, so that different triples hardly ever give the same."""
+    a, b, c = numbers
+    return ((a * HASH_STEP ^ b) * HASH_STEP ^ c) * HASH_STEP
+
+
+def _is_flat(shape: mi.Shape) -> bool:
+    """Whether a shape is a mesh whose faces look flat."""
+    is_mesh = shape.shape_type() == mi.ShapeType.Mesh.value
+    return bool(is_mesh and (shape.has_face_normals() or not shape.has_vertex_normals()))
+
+
+def _is_exact(bsdf: mi.BSDF) -> bool:
+    """Whether the delta lobes of a BSDF can be asked for one by one."""
+    parts = mi.traverse(bsdf).hierarchy if bsdf.class_name() == "TwoSidedBRDF" else {bsdf: None}
+    names = {one.class_name() for one in parts if isinstance(one, mi.BSDF)}
+    return names <= {*EXACT_BSDFS, "TwoSidedBRDF"}
+
+
+# ---- Structures as lists of arrays -----------------------------------------------------------------------
+
+
+def _leaves(value: Any) -> list[Any]:
+    """The Dr.Jit arrays with one number per lane that a structure holds, in a fixed order."""
+    if value is None:
+        return []
+    if isinstance(value, (mi.Point3f, mi.Vector3f)):
+        return [value.x, value.y, value.z]
+    if isinstance(value, (RayState, Medium)):
+        return [x for f in fields(value) for x in _leaves(getattr(value, f.name))]
+    return [x for one in value for x in _leaves(one)] if isinstance(value, tuple) else [value]
+
+
+def _rebuilt(like: Any, arrays: list[Any]) -> Any:
+    """A structure like `like` of these arrays, in the order of `_leaves`; takes them from the front of the list."""
+    if like is None:
+        return None
+    if isinstance(like, (mi.Point3f, mi.Vector3f)):
+        return type(like)(arrays.pop(0), arrays.pop(0), arrays.pop(0))
+    if isinstance(like, (RayState, Medium)):
+        return type(like)(*(_rebuilt(getattr(like, f.name), arrays) for f in fields(like)))
+    return type(like)(*(_rebuilt(one, arrays) for one in like)) if isinstance(like, tuple) else arrays.pop(0)
