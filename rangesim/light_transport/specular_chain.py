@@ -76,9 +76,11 @@ class RayState:
 
         `si.t` would be wrong, because rays start off the surface.
         """
-        distance = dr.norm(point - self.previous)
-        further = self.length + distance if self.ior is None else dr.fma(self.ior, distance, self.length)
-        return dr.select(hit, further, self.length)
+        return dr.select(hit, self.further(dr.norm(point - self.previous), self.length), self.length)
+
+    def further(self, distance: mi.Float, length: mi.Float) -> mi.Float:
+        """Optical length at a distance along the ray, in metres, if it is `length` at the start of the ray."""
+        return length + distance if self.ior is None else dr.fma(self.ior, distance, length)
 
     def power(self, throughput: mi.Float) -> mi.Float:
         """Fraction of a path's light that is left: radiance over the square of the refractive index."""
