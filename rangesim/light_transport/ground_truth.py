@@ -25,7 +25,7 @@ from rangesim.signals import GroundTruth
 
 PIXELS_PER_ITERATION = 3
 """Number of pixels whose ground truth takes as long as an iteration of the path loop: 2.2 to 3 on matte, tabletop and
-glassware, with photons and without. It decides on the size of the first launch of the loop, and nothing else."""
+glassware, with caustics and without. It decides on the size of the first launch of the loop, and nothing else."""
 
 
 def ground_truth(

@@ -23,7 +23,7 @@ from rangesim.light_transport.traced_scene import TracedScene
 
 MAX_CHAIN = 128
 """Number of delta interactions in a row after which light is cut off, so that time is bounded. A pane has two faces, a
-hollow glass four. Of the photons that enter a cut diamond of n = 2.4, 0.2 % are cut off (with a limit of 16, it was 5.8
+hollow glass four. Of the light that enters a cut diamond of n = 2.4, 0.2 % is cut off (with a limit of 16, it was 5.8
 %)."""
 ROULETTE_AFTER = 8
 """Number of delta interactions in a row after which Russian roulette may end the light, so that light through a few
