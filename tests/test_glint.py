@@ -78,7 +78,7 @@ def test_in_a_flat_mirror_the_lens_is_its_mirror_image(offset: float) -> None:
     """A lens of intensity I at the unfolded distance d casts R I / d^2, wherever among the pixels its image lies."""
     depth, b = 1.0, BASELINE + offset
     scene, rig = scene_of(mirror=wall(depth, MIRROR)), rig_of(CAMERA, PROJECTOR, (b, 0.0, 0.0))
-    signals = transport(scene, rig, SENSORS, spp=4)
+    signals = transport(scene, rig, SENSORS, spp=64)
     d, tangent = np.hypot(2 * depth, b), b / (2 * depth)
     reflected = fresnel_conductor(2 * depth / d)
     check(signals, reflected * intensity(rig, tangent) / d**2, d)
@@ -93,7 +93,7 @@ def test_a_pixel_that_the_lens_fills_has_the_radiance_of_the_lens() -> None:
     """Intensity over projected area: E / (pi a^2 cos^4), of the part that the mirror reflects."""
     depth, camera = 0.2, Intrinsics.from_fov(64, 48, 2)
     rig = rig_of(camera, PROJECTOR, (0.02, 0.0, 0.0), camera_looks_at=(0.01, 0.0, depth))
-    signals = transport(scene_of(mirror=wall(depth, MIRROR)), rig, SENSORS, spp=4)
+    signals = transport(scene_of(mirror=wall(depth, MIRROR)), rig, SENSORS, spp=64)
     cosine = 2 * depth / np.hypot(2 * depth, 0.02)
     expected = fresnel_conductor(cosine) * rig.projector_irradiance / (np.pi * 2e-3**2) / cosine**4
     assert signals.energy.glint[24, 32] == pytest.approx(expected, rel=5e-3)
