@@ -5,16 +5,17 @@ A reading without detector noise, at the settings a user gets who sets nothing, 
 samples per pixel whose indirect light is not filtered: what is left is sampling, and the bias of the filter; the noise
 of the reference, half the difference of its two readings, is subtracted in quadrature. And a reading of the reference
 through the detector, against that without: the sensor's own noise. All as 1.4826 times the median of |difference|, over
-the matte pixels that are valid in both. For structured light, AMCW and direct time of flight.
+the pixels of a material class that are valid in both. For structured light, AMCW and direct time of flight. With
+`--no-caustics`, all passes leave caustics out: what is left is the noise of camera paths.
 
 The last line is JSON:
 
-    plane, matte, tabletop  sampling sigma over detector sigma, of the worst sensor
+    plane, matte, tabletop  for each material class: sampling sigma over detector sigma, of the worst sensor
     demo_s_ratio            time of `rangesim run` on tabletop over that of the revision `--before`, in turns (median);
                             null without it
 
 Usage: python benchmarks/sampling_noise.py [--scenes plane matte tabletop] [--spp N] [--reference-spp 512]
-           [--width W --height H] [--seeds 2] [--before REVISION]
+           [--width W --height H] [--seeds 2] [--no-caustics] [--before REVISION]
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from rangesim.instrument.instrument import Instrument
 from rangesim.pipeline.shared_passes import group_by_rig
 from rangesim.presets import instrument
 from rangesim.scene import Scene
-from rangesim.scene.materials import MATERIAL_CLASSES
+from rangesim.signals import ALL
 
 ROOT = Path(__file__).resolve().parent.parent
 SENSORS = ("gray-phase", "amcw", "direct-tof")
@@ -53,50 +54,57 @@ def main() -> None:
     parser.add_argument("--width", type=int)
     parser.add_argument("--height", type=int)
     parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--no-caustics", action="store_true")
     parser.add_argument("--before")
     args = parser.parse_args()
 
-    result: dict[str, Any] = {name: worst_ratio(name, args) for name in args.scenes}
+    result: dict[str, Any] = {name: worst_ratios(name, args) for name in args.scenes}
     result["demo_s_ratio"] = demo_ratio(args.before) if args.before else None
     print(json.dumps(result))
 
 
-def worst_ratio(name: str, args: argparse.Namespace) -> float:
-    """Sampling sigma over detector sigma of the worst of the sensors; a line for each."""
+def worst_ratios(name: str, args: argparse.Namespace) -> dict[str, float]:
+    """Sampling sigma over detector sigma of the worst of the sensors by material class; a line for each."""
     instruments = tuple(instrument(sensor) for sensor in SENSORS)
     given = {"width": args.width, "height": args.height, "spp": args.spp, "instruments": instruments}
     experiment = Experiment(name, **{key: value for key, value in given.items() if value is not None})
     scene = load_scene(name)
-    ratios = []
+    worst: dict[str, float] = {}
     for rig, group in group_by_rig(experiment, scene):
         sensors = [one.sensor for one in group]
 
         def traced(seed: int, spp: int, rig: Any = rig, sensors: Any = sensors, **options: Any) -> Signals:
-            return transport(scene, rig, sensors, spp=spp, max_depth=experiment.max_depth, seed=seed, **options)
+            options |= {"max_depth": experiment.max_depth, "caustics": not args.no_caustics}
+            return transport(scene, rig, sensors, spp=spp, seed=seed, **options)
 
         references = [traced(10_000 + i, args.reference_spp, indirect="raw") for i in range(2)]
         passes = [traced(seed, experiment.spp or "auto") for seed in range(args.seeds)]
-        ratios += [ratio_of(one, scene, references, passes) for one in group]
-    return max(ratios)
+        for one in group:
+            for material, ratio in ratios_of(one, scene, references, passes).items():
+                worst[material] = max(worst.get(material, 0.0), ratio)
+    return worst
 
 
-def ratio_of(one: Instrument, scene: Scene, references: list[Signals], passes: list[Signals]) -> float:
-    """Sampling sigma over detector sigma of one instrument; a line that also says the median error, the bias."""
-    matte = np.asarray(references[0].truth.material == MATERIAL_CLASSES.index("matte"))
+def ratios_of(one: Instrument, scene: Scene, references: list[Signals], passes: list[Signals]) -> dict[str, float]:
+    """Sampling sigma over detector sigma of one instrument by material class; lines also say the median error."""
     first, second = (noise_free(one, signals) for signals in references)
     converged = (first + second) / 2
     errors = [noise_free(one, signals) - converged for signals in passes]
-    left_over = spread((first - second)[matte] / 2)
-    sampling = float(np.sqrt(max(0.0, np.mean([spread(e[matte]) ** 2 for e in errors]) - left_over**2)))
-    detector = spread((depth_mm(expose(references[0], one.sensor, one.detector, one.exposure_s, 1)) - first)[matte])
-    bias = statistics.mean(float(np.nanmedian(e[matte])) for e in errors)
-    print(
-        f"{scene.name:9} {one.name:11} sampling {sampling:7.4f} mm  detector {detector:7.4f} mm  "
-        f"ratio {sampling / max(detector, 1e-9):6.3f}  median error {bias:8.4f} mm  noise of the reference "
-        f"{left_over:7.4f} mm",
-        flush=True,
-    )
-    return sampling / max(detector, 1e-9)
+    detected = depth_mm(expose(references[0], one.sensor, one.detector, one.exposure_s, 1))
+    classes, ratios = references[0].truth.classes(), {}
+    classes.pop(ALL)
+    for material, mask in classes.items():
+        left_over = spread((first - second)[mask] / 2)
+        sampling = float(np.sqrt(max(0.0, np.mean([spread(e[mask]) ** 2 for e in errors]) - left_over**2)))
+        detector = spread((detected - first)[mask])
+        bias = statistics.mean(float(np.nanmedian(e[mask])) for e in errors)
+        ratios[material] = round(sampling / max(detector, 1e-9), 3)
+        print(
+            f"{scene.name:9} {one.name:11} {material:11} sampling {sampling:7.4f} mm  detector {detector:7.4f} mm  "
+            f"ratio {ratios[material]:6.3f}  median error {bias:8.4f} mm  noise of the reference {left_over:7.4f} mm",
+            flush=True,
+        )
+    return ratios
 
 
 def spread(errors: np.ndarray) -> float:

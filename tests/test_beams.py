@@ -92,7 +92,7 @@ def obstacle(name: str) -> dict[str, Any]:
 def test_beams_that_tile_a_field_equal_the_light_of_a_projector(name: str, tolerance: float) -> None:
     """Every beam is seen by a receiver of the whole field; together they bring what a projector of all brings.
 
-    Behind glass and mirrors the projector's light comes from caustic photons, so another algorithm agrees. A slab loses
+    Behind glass and mirrors the projector's light comes as caustics, so another algorithm agrees. A slab loses
     1 %: light that comes to the wall by one way and leaves it by another.
     """
     scene = corner_with(**obstacle(name))

@@ -117,7 +117,7 @@ def integrating_sphere(*parts: dict[str, Any], albedo: float) -> float:
     radius = 2.0
     sphere = {"type": "sphere", "radius": radius, "bsdf": matte(albedo)}
     scene = scene_of(sphere=sphere, **{f"part_{i}": part for i, part in enumerate(parts)})
-    camera = Intrinsics.from_fov(24, 24, 90)
+    camera = Intrinsics.from_fov(48, 48, 90)
     rays = camera.directions(camera.pixel_centres())
     solid_angle = np.linalg.norm(rays, axis=-1) ** -3 / (camera.fx * camera.fy)
     received, seen = 0.0, 0.0
@@ -126,7 +126,7 @@ def integrating_sphere(*parts: dict[str, Any], albedo: float) -> float:
         T_world_camera = look_at((0, 0, 0), ahead, up)
         rig = Rig(camera, Intrinsics.from_fov(64, 64, 30), T_world_camera,
                   np.linalg.inv(T_world_camera) @ T_world_projector, projector_power_w=POWER_W)  # fmt: skip
-        signals = transport(scene, rig, [], spp=96, max_depth=40, rr_depth=40, glint=False)
+        signals = transport(scene, rig, [], spp=32, max_depth=40, rr_depth=40, glint=False)
         wall_seen = signals.truth.instance == 0
         radiance = signals.energy.projector
         received += float((radiance * solid_angle)[wall_seen].sum()) * np.pi / albedo * radius**2

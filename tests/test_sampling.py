@@ -12,7 +12,7 @@ import pytest
 
 from rangesim import AmcwToF, DirectToF, Lens, Signals, StructuredLight, decode, expose, load_scene, transport
 from rangesim.environment.backend import select_variant
-from rangesim.light_transport.indirect_filter import Guides, LightFilter, level_weights, mixed_pixels
+from rangesim.light_transport.indirect_filter import FIRST_CHAIN, Guides, LightFilter, level_weights, mixed_pixels
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 
@@ -73,6 +73,53 @@ def test_defocus_blurs_a_plane_without_sampling_noise() -> None:
     assert 1.4826 * np.nanmedian(np.abs(error - np.nanmedian(error))) < 0.02e-3
 
 
+# ---- Choices at glass -----------------------------------------------------------------------------------------------
+
+
+def test_a_number_that_has_decided_is_uniform_again() -> None:
+    select_variant()
+    import mitsuba as mi
+
+    from rangesim.light_transport.sampling import used_up
+
+    number = (np.arange(10_000) + 0.5) / 10_000
+    for low, high in ((0.0, 0.04), (0.04, 1.0), (0.3, 0.55)):
+        some = number[(number >= low) & (number < high)]
+        again = np.sort(used_up(mi.Float(some), mi.Float(high - low)).numpy())
+        np.testing.assert_allclose(again, (np.arange(len(some)) + 0.5) / len(some), atol=1 / len(some))
+
+
+def test_reflection_and_refraction_are_chosen_evenly_over_the_samples() -> None:
+    """A pane passes about 92 %; chosen at random, the passed light would scatter like a binomial distribution."""
+    select_variant()
+    import mitsuba as mi
+
+    move = mi.ScalarTransform4f().translate
+    scene = load_scene(
+        {
+            "type": "scene",
+            "wall": {"type": "rectangle", "bsdf": {"type": "diffuse"}},
+            "pane": {
+                "type": "cube",
+                "to_world": move([0, 0, 0.95]).scale([0.012, 0.012, 0.001]),
+                "bsdf": {"type": "dielectric"},
+            },
+            "camera": {
+                "type": "perspective",
+                "fov": 50,
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 1], [0, 0, 0], [0, 1, 0]),
+            },
+        }
+    )
+    rig = scene.rig(width=64, height=48, baseline_m=0.2)  # the projector lights the wall beside the pane
+    first, second = (
+        transport(scene, rig, [], spp=64, seed=seed, caustics=False, max_depth=2).energy.specular[18:30, 24:40]
+        for seed in range(2)
+    )
+    scatter = np.std(first - second) / np.sqrt(2) / np.mean(first)
+    assert scatter < 0.45 * np.sqrt(0.08 / 0.92 / 64)
+
+
 # ---- Shared indirect light ------------------------------------------------------------------------------------------
 
 
@@ -80,7 +127,8 @@ def plane_guides(h: int = 40, w: int = 50, **changes: Any) -> Guides:
     y, x = np.mgrid[:h, :w].astype(np.float32)
     position = np.stack([x / 500, y / 500, np.ones_like(x)], -1)
     normal = np.broadcast_to(np.float32([0, 0, -1]), (h, w, 3)).copy()
-    guides = Guides(np.zeros((h, w), np.int32), position, normal, np.full((h, w), 0.5, np.float32))
+    reflectance, cosine = np.full((h, w), 0.5, np.float32), np.zeros((h, w), np.float32)
+    guides = Guides(np.zeros((h, w), np.int32), position, normal, reflectance, position, cosine)
     return guides._replace(**changes)
 
 
@@ -133,10 +181,55 @@ def test_pixels_of_their_own_other_normals_and_other_planes_share_nothing() -> N
     behind[:, 20:, 2] += 0.5
     light = np.ones((1, 40, 50), np.float32)
     light[:, :, 20:] = 5
-    for changed in (guides._replace(instance=alone), guides._replace(normal=tilted), guides._replace(position=behind)):
+    apart = guides._replace(position=behind, first=behind)
+    for changed in (guides._replace(instance=alone), guides._replace(normal=tilted), apart):
         after = smoothed(light, changed)
         np.testing.assert_allclose(after, light, rtol=1e-5)
     assert not np.allclose(smoothed(light, guides), light)
+
+
+def test_glossy_pixels_share_light_while_their_normals_are_alike() -> None:
+    angle = np.radians(np.arange(50, dtype=np.float32) / 5)  # a cylinder that turns by 0.2 degrees a pixel
+    normal = np.broadcast_to(np.stack([np.sin(angle), 0 * angle, -np.cos(angle)], -1), (40, 50, 3))
+    noise = np.random.default_rng(1).normal(1, 0.1, (1, 40, 50)).astype(np.float32)
+    left = []
+    for degrees in (0.1, 0.5, 90):
+        cosine = np.full((40, 50), np.cos(np.radians(degrees)), np.float32)
+        left.append(smoothed(noise, plane_guides(normal=normal, cosine=cosine)).std() / noise.std())
+    assert left[0] > 2 * left[2]  # 9 pixels of a column, or all 81
+    assert left[0] > 1.2 * left[1] > 1.2 * 1.2 * left[2]
+
+
+def test_behind_mirrors_and_glass_light_is_shared_along_one_chain_and_not_over_long_ways() -> None:
+    chains = FIRST_CHAIN + two_instances()
+    light = np.where(chains == FIRST_CHAIN, 1.0, 1e6).astype(np.float32)[None]
+    after = smoothed(light, plane_guides(instance=chains))
+    np.testing.assert_allclose(after, light, rtol=1e-5)
+    guides = plane_guides(instance=np.full((40, 50), FIRST_CHAIN, np.int32))
+    noise = np.random.default_rng(1).normal(1, 0.1, (1, 40, 50)).astype(np.float32)
+    assert smoothed(noise, guides).std() < 0.2 * noise.std()
+    far = guides.position * np.float32([100, 100, 1])  # neighbours see points that are 0.2 m apart at 1 to 10 m
+    np.testing.assert_array_equal(smoothed(noise, guides._replace(position=far))[:, :3, :3], noise[:, :3, :3])
+
+
+def test_what_is_seen_in_mirrors_through_glass_and_on_gloss_has_less_noise_and_hardly_another_mean() -> None:
+    """A test of the whole pass: the medians of the errors of multipath, by material class."""
+    scene = load_scene(SCENES / "tabletop.xml")
+    rig = scene.rig(width=160, height=120)
+
+    def multipath(**options: Any) -> np.ndarray:
+        signals = transport(scene, rig, [], caustics=False, glint=False, sampling_error=False, **options)
+        classes.update(signals.truth.classes())
+        return signals.energy.multipath
+
+    classes: dict[str, np.ndarray] = {}
+    raw, filtered = (multipath(spp=16, indirect=name) for name in ("raw", "filtered"))
+    reference = multipath(spp=256, seed=1, indirect="raw")
+    for name, most in {"glossy": 0.65, "mirror": 0.85, "transparent": 0.5}.items():
+        seen = classes[name] & (reference > 0)
+        before, after = (np.median(np.abs(light - reference)[seen]) for light in (raw, filtered))
+        assert after < most * before, name
+        assert filtered[seen].mean() == pytest.approx(reference[seen].mean(), rel=0.05), name
 
 
 def test_textures_are_not_blurred() -> None:

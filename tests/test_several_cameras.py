@@ -74,11 +74,12 @@ def test_each_camera_has_its_own_signals_and_caustics_are_traced_once(
     for one, other in zip(both, alone, strict=True):
         for part in ("z", "instance", "projector_visible"):
             np.testing.assert_array_equal(getattr(one.truth, part), getattr(other.truth, part))
-    # The second camera has random numbers of its own: other noise, the same light
+    # The second camera has random numbers of its own: other noise, the same light. Multipath scatters by 3.6 % from
+    # seed to seed, so 0.15 is three standard deviations of a difference
     assert all_bytes(both[1]) != all_bytes(alone[1])
     for part in ("direct", "multipath", "ambient"):
         one, other = (getattr(x[1].energy, part) for x in (both, alone))
-        assert one.mean() == pytest.approx(other.mean(), rel=0.1), part
+        assert one.mean() == pytest.approx(other.mean(), rel=0.15), part
     # Nor is the noise of one camera that of the other
     a, b = (x.sampling.projector for x in both if x.sampling)
     seen = [x.truth.instance >= 0 for x in both]

@@ -80,7 +80,7 @@ def caustic_light(
     accumulators: Accumulators,
     channels: list[list[mi.Float]],
     vertex: Vertex,
-    sample: mi.UInt32,
+    turn: mi.UInt32,
     pick: mi.Float,
     is_later: mi.Bool,
     place: mi.UInt32,
@@ -91,7 +91,7 @@ def caustic_light(
 
     Parameters
     ----------
-    sample : UInt32, number of the sample in its pixel, which chooses the group of faint triangles.
+    turn : UInt32, number that decides which faint triangles the sample looks for; it grows by 1 from sample to sample.
     pick : Float, uniform number in 0..1 that chooses one of the faint triangles.
     is_later : Bool, whether the vertex is not the first of its path.
     place : UInt32, index of the lane's pixel among those of the accumulators.
@@ -103,15 +103,15 @@ def caustic_light(
     radiance, way, which = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n)
     last, total, chosen = dr.full(mi.UInt32, NONE, n), dr.zeros(mi.Float, n), Place.none(n)
     # Later vertices bring little each, so they look in some samples alone, which count for all
-    is_turn = sheets.is_turn(sample, dr.select(is_later, mi.UInt32(1), 0))
+    is_turn = sheets.is_turn(turn, dr.select(is_later, mi.UInt32(1), 0))
     looks = sheets.may_light(shape, active & (~is_later | is_turn))
     weight_of_bright = dr.select(is_later, mi.Float(sheets.every), 1)
     # What the loop only reads is excluded: Dr.Jit traces a loop twice that carries something without changing it
     while dr.hint(
-        looks, exclude=[si, bsdf, vertex, shape, normal, seen, sample, is_later, place, is_turn, weight_of_bright]
+        looks, exclude=[si, bsdf, vertex, shape, normal, seen, turn, is_later, place, is_turn, weight_of_bright]
     ):
         # ---- The next triangle: each bright one counts, and one of the faint ones stands for all of them -----
-        ray, step = sheets.ray(si.p, normal, sample, which, way)
+        ray, step = sheets.ray(si.p, normal, turn, which, way)
         found = sheets.next(ray, looks)
         hit = looks & found.is_valid()
         is_new = hit & (found.prim_index != last)

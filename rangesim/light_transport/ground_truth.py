@@ -10,22 +10,22 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.cutouts import first_surface
-from rangesim.light_transport.indirect_filter import Guides
+from rangesim.light_transport.first_scatterer import FirstScatterers
+from rangesim.light_transport.indirect_filter import FIRST_CHAIN, Guides
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.loop import Lanes, PathSettings, SampleAllocation, View
 from rangesim.light_transport.sampling import in_pairs
-from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.rig import Rig
 from rangesim.scene import Scene
-from rangesim.scene.materials import MATERIAL_CLASSES, is_matte, transmits
+from rangesim.scene.materials import MATERIAL_CLASSES, transmits
 from rangesim.scene.media import is_boundary
 from rangesim.signals import GroundTruth
 
 PIXELS_PER_ITERATION = 3
 """Number of pixels whose ground truth takes as long as an iteration of the path loop: 2.2 to 3 on matte, tabletop and
-glassware, with photons and without. It decides on the size of the first launch of the loop, and nothing else."""
+glassware, with caustics and without. It decides on the size of the first launch of the loop, and nothing else."""
 
 
 def ground_truth(
@@ -38,38 +38,29 @@ def ground_truth(
     """
     h, w = rig.camera.height, rig.camera.width
     launches, shapes = Launches(), scene.mitsuba.shapes()
-    index_of = mi.Int32(table_of(scene.mitsuba, np.arange(len(shapes), dtype=np.int32)))
+    scatterers = FirstScatterers(scene.mitsuba, traced.surfaces)
     transmits_of = mi.Bool(table_of(scene.mitsuba, [is_boundary(s) or transmits(s.bsdf()) for s in shapes]))
-    matte = np.array([is_matte(s) for s in shapes])
     parts = []
     for begin, end in launches.ranges(h * w):
-        part = _first_surfaces(traced, scene.has_cutouts, index_of, transmits_of, begin, end, has_guides)
+        part = _first_surfaces(traced, scene.has_cutouts, scatterers, transmits_of, begin, end, has_guides)
         of_paths.learn((end - begin) // PIXELS_PER_ITERATION, launches.evaluate(part, end - begin))
         parts.append(part)
 
     def image(name: str) -> np.ndarray:
         """A field of the surfaces as an image, (h, w) or (h, w, components)."""
-        column = np.concatenate([np.asarray(getattr(part, name).numpy()) for part in parts], axis=-1)
-        if column.ndim == 1:
-            return column.reshape(h, w)
-        return np.ascontiguousarray(np.moveaxis(column.reshape(-1, h, w), 0, -1))
+        values = [getattr(part, name) for part in parts]
+        components = values[0].shape[:-1]
+        return np.concatenate([dr.ravel(value).numpy() for value in values]).reshape(h, w, *components)
 
-    hit = image("hit")
-
-    def where_hit(name: str) -> np.ndarray:
-        """The same as `image`, but NaN in pixels that see no surface."""
-        values = image(name)
-        return np.where(hit if values.ndim == 2 else hit[..., None], values, np.float32(np.nan))
-
-    instance = np.where(hit, image("index"), -1).astype(np.int32)
+    instance = image("index")
     materials = np.array([MATERIAL_CLASSES.index(i.material) for i in scene.instances], dtype=np.int32)
     truth = GroundTruth(
-        z=where_hit("z"),
-        range_m=where_hit("range_m"),
-        normal=where_hit("normal"),
+        z=image("z"),
+        range_m=image("range_m"),
+        normal=image("normal"),
         instance=instance,
         material=np.where(instance >= 0, materials[instance], -1).astype(np.int32),
-        projector_uv=where_hit("uv"),
+        projector_uv=image("uv"),
         projector_visible=image("visible"),
         instance_names=tuple(i.name for i in scene.instances),
         material_names=MATERIAL_CLASSES,
@@ -78,20 +69,25 @@ def ground_truth(
     if not has_guides:
         return truth, None
     reflectance = image("reflectance")
-    is_shared = (instance >= 0) & matte[instance] & (reflectance > 0)
+    first, cosine, number = image("position"), scatterers.cosines[image("scatterer")], image("scatterer")
+    if scatterers.has_chains:
+        chain = image("chain")
+        number = np.where(chain > 0, FIRST_CHAIN | (chain % FIRST_CHAIN).astype(np.int32), number)
     guides = Guides(
-        instance=np.where(is_shared, instance, np.int32(-1)),
-        position=image("position"),
+        instance=np.where((cosine >= 0) & (reflectance > 0), number, np.int32(-1)),
+        position=image("scatterer_position") if scatterers.has_chains else first,
         normal=image("shading_normal"),
         reflectance=reflectance,
+        first=first,
+        cosine=cosine,
     )
     return truth, guides
 
 
 @dr.syntax
 def mean_reflectance(view: View, settings: PathSettings, rig: Rig, has_cutouts: bool, samples: int) -> np.ndarray:
-    """(h, w) float32, diffuse reflectance of the first surface, averaged over the first samples of each pixel."""
-    launches, parts = Launches(), []
+    """(h, w) float32, reflectance of the first surface that scatters, averaged over the first samples of each pixel."""
+    launches, parts, scatterers = Launches(), [], FirstScatterers(view.traced.scene, view.traced.surfaces)
     surfaces, camera, shape = view.traced.surfaces, view.traced.camera, (rig.camera.height, rig.camera.width)
     count = np.full(shape[0] * shape[1], samples, np.uint32)
     allocation = SampleAllocation(np.arange(len(count)), count, count, rig.projector_irradiance)
@@ -103,7 +99,8 @@ def mean_reflectance(view: View, settings: PathSettings, rig: Rig, has_cutouts: 
             place, lens = in_pairs(lanes.shift, lanes.lens_shift, sample, lanes.total)
             ray = camera.ray_in(lanes.corner, place, lens)
             si = first_surface(surfaces, mi.Ray3f(ray.origin, ray.direction), has_cutouts)
-            total += mono(si.bsdf().eval_diffuse_reflectance(si, si.is_valid()))
+            seen = scatterers.behind(si, si.is_valid())
+            total += scatterers.reflectance(seen.si, seen.index >= 0)
             sample += 1
         launches.evaluate(total, samples * (end - begin))
         parts.append(total.numpy() / np.float32(samples))
@@ -115,18 +112,21 @@ class FirstSurfaces:
     """The first surface behind the centre of each of n pixels. It is a dataclass, because Dr.Jit does not evaluate
     named tuples.
 
-    hit : Bool, whether there is such a surface. The other fields are valid only there.
-    index : Int32, index of its shape in the scene.
+    index : Int32, index of its shape in the scene; -1 if there is no such surface, in which case z, range_m, uv and
+        normal are NaN, and the other fields mean nothing.
     z, range_m : Float, metres, depth, and distance from the camera.
     visible : Bool, whether the projector lights the side that the camera sees.
     uv : Point2f, projector pixel coordinates.
     normal : Vector3f, unit, world, geometric normal on the side of the camera.
     position : Vector3f, metres, from the camera's centre, along the axes of the world; None without guides, as below.
+    scatterer : Int32, index of the shape that scatters first, behind glass and mirrors; -1 for none. The fields that
+        follow describe it.
+    chain : UInt32, number of the chain up to it, see `Scatterer`.
+    scatterer_position : Vector3f, as `position`.
     shading_normal : Vector3f, unit, world.
-    reflectance : Float, diffuse reflectance.
+    reflectance : Float, see `FirstScatterers.reflectance`.
     """
 
-    hit: mi.Bool
     index: mi.Int32
     z: mi.Float
     range_m: mi.Float
@@ -134,6 +134,9 @@ class FirstSurfaces:
     uv: mi.Point2f
     normal: mi.Vector3f
     position: mi.Vector3f | None
+    scatterer: mi.Int32 | None
+    chain: mi.UInt32 | None
+    scatterer_position: mi.Vector3f | None
     shading_normal: mi.Vector3f | None
     reflectance: mi.Float | None
 
@@ -141,7 +144,7 @@ class FirstSurfaces:
 def _first_surfaces(
     traced: TracedScene,
     has_cutouts: bool,
-    index_of: mi.Int32,
+    scatterers: FirstScatterers,
     transmits_of: mi.Bool,
     begin: int,
     end: int,
@@ -149,7 +152,7 @@ def _first_surfaces(
 ) -> FirstSurfaces:
     """The first surfaces behind the centres of the pixels `begin` to `end` - 1, row by row.
 
-    `index_of` and `transmits_of` are tables (`table_of`): index of a shape, and whether light goes through it.
+    `transmits_of` is a table (`table_of`): whether light goes through a shape.
     """
     camera = traced.camera
     ray = camera.centre_rays(begin, end)
@@ -159,17 +162,19 @@ def _first_surfaces(
     normal = dr.select(dr.dot(si.n, to_camera) < 0, -si.n, si.n)
     pixel = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin)
     link = traced.projector.connect(traced.scene, si, hit, pixel)
-    shape = number_of(si.shape)
-    through = dr.gather(mi.Bool, transmits_of, shape, hit)
+    through = dr.gather(mi.Bool, transmits_of, number_of(si.shape), hit)
+    seen = scatterers.behind(si, hit)  # traced only if its fields are asked for
     return FirstSurfaces(
-        hit=hit,
-        index=dr.gather(mi.Int32, index_of, shape, hit),
-        z=dr.dot(mi.Vector3f(si.p) - camera.centre, camera.z),
-        range_m=dr.norm(to_camera),
+        index=dr.select(hit, scatterers.index(si, hit), -1),
+        z=dr.select(hit, dr.dot(mi.Vector3f(si.p) - camera.centre, camera.z), dr.nan),
+        range_m=dr.select(hit, dr.norm(to_camera), dr.nan),
         visible=link.lit & (through | (dr.dot(normal, link.direction) > 0)),
-        uv=link.uv,
-        normal=mi.Vector3f(normal),
+        uv=dr.select(hit, link.uv, dr.nan),
+        normal=mi.Vector3f(dr.select(hit, normal, dr.nan)),
         position=-to_camera if has_guides else None,
-        shading_normal=mi.Vector3f(dr.normalize(si.sh_frame.n)) if has_guides else None,
-        reflectance=mono(si.bsdf().eval_diffuse_reflectance(si, hit)) if has_guides else None,
+        scatterer=seen.index if has_guides else None,
+        chain=seen.chain if has_guides else None,
+        scatterer_position=mi.Vector3f(seen.si.p) - mi.Vector3f(ray.origin) if has_guides else None,
+        shading_normal=mi.Vector3f(dr.normalize(seen.si.sh_frame.n)) if has_guides else None,
+        reflectance=scatterers.reflectance(seen.si, seen.index >= 0) if has_guides else None,
     )

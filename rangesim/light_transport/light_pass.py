@@ -31,6 +31,7 @@ from rangesim.light_transport.zone_sums import ZoneSums
 from rangesim.response import Response
 from rangesim.rig import Beam, Camera, Intrinsics, Rig, Zones
 from rangesim.scene import Scene
+from rangesim.scene.materials import MATERIAL_CLASSES
 from rangesim.scene.media import body_around, inside_out
 from rangesim.sensor import Sensor
 from rangesim.settings.config import shown
@@ -38,8 +39,8 @@ from rangesim.settings.seeds import derived_seed
 from rangesim.signals import EnergySplit, StillSignals
 
 MATTE_SPP = 16
-"""Samples per pixel for pixels that share their indirect light, if no sampler decides. They need fewer samples than
-others, because sharing averages over many pixels. With twice as many, they would take twice as long."""
+"""Samples per pixel for matte pixels that share their indirect light, if no sampler decides. They need fewer samples
+than others, because sharing averages over many pixels. With twice as many, they would take twice as long."""
 OTHER_SPP = 64
 """Samples per pixel for all other pixels, if no sampler decides. With twice as many, the noise would be lower by a
 factor of 1.4, and the time twice as long."""
@@ -72,8 +73,8 @@ def trace_light(
     ----------
     rigs : rigs with the same emitter and different cameras. The triangles of caustics are made once for all cameras.
     sensors : sensors, or bare responses. Equal responses share their channels.
-    settings : TransportSettings. spp "auto" means `MATTE_SPP` samples where pixels share their indirect light, and
-        `OTHER_SPP` elsewhere.
+    settings : TransportSettings. spp "auto" means `MATTE_SPP` samples where matte pixels share their indirect light,
+        and `OTHER_SPP` elsewhere.
     progress : as for `rangesim.transport`.
 
     Raises
@@ -133,7 +134,10 @@ class _CameraPass:
         elif isinstance(spp, int):
             self.samples = np.full(pixels, spp)
         else:
-            is_shared = np.zeros(pixels, bool) if self.guides is None else self.guides.instance.ravel() >= 0
+            is_shared = np.zeros(pixels, bool)
+            if self.guides is not None:
+                is_matte = self.truth.material == MATERIAL_CLASSES.index("matte")
+                is_shared = (is_matte & (self.guides.instance >= 0)).ravel()
             self.samples = np.where(is_shared, MATTE_SPP, OTHER_SPP)
 
     def trace(

@@ -43,10 +43,13 @@ from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
 from rangesim.light_transport.sampling import (
     Continued,
     Seed,
+    Stream,
     aligned,
+    along_golden,
     in_pairs,
     of_part,
     random_stream,
+    used_up,
 )
 from rangesim.light_transport.scattering import MAX_EVENTS, ROULETTE_BELOW
 from rangesim.light_transport.sheet_scene import SheetScene
@@ -67,6 +70,9 @@ lanes), one vector would hold pixels whose paths differ."""
 ITERATIONS_PER_SAMPLE = 2
 """Number of iterations of the loop per sample that is assumed before any were counted. It need not be exact, because
 only the size of the first launch depends on it; the size of later ones depends on the count."""
+
+TURNS = 1 << 16
+"""Number of different starts in the order in which pixels look for faint triangles; any large number would do."""
 
 Array = TypeVar("Array")
 
@@ -195,6 +201,8 @@ class PathState:
     pdf : Float, 1/sr, density of the BSDF sample that made the ray.
     events : UInt32, scattering events inside media and crossed boundaries so far; None in scenes without media.
     scattered_inside : Bool, whether the path has scattered since it entered the medium; None in scenes without media.
+    choice : Float in 0..1, which decides between reflection and refraction, and between lobes, up to the first vertex.
+        It is spread evenly over the samples of a pixel. None in scenes without delta interactions.
     spot : Spot of the lane's beam; None for a projector, and in scenes with media.
     pencil : Pencil of the lane's beam around the path; None for a projector, and in scenes without delta interactions.
     """
@@ -212,6 +220,7 @@ class PathState:
     pdf: mi.Float
     events: mi.UInt32
     scattered_inside: mi.Bool
+    choice: mi.Float
     spot: Spot | None = None
     pencil: Pencil | None = None
 
@@ -329,6 +338,7 @@ class Lanes:
         self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())  # of the places of samples within the pixel
         on_lens = view.traced.camera.has_lens
         self.lens_shift = mi.Point2f(rng.next_float32(), rng.next_float32()) if on_lens else None
+        self.choice_shift = random_stream(settings.seed, self.pixel, Stream.SECOND).next_uint32()
         self.random = Continued(of_part(rng, self.part))
 
     def number(self, taken: mi.UInt32) -> mi.UInt32:
@@ -341,6 +351,12 @@ class Lanes:
         It depends on the pixel and the seed, as the shift does.
         """
         return mi.sample_tea_float32(dr.reinterpret_array(mi.UInt32, self.shift.x), number)
+
+    def turn(self, number: mi.UInt32) -> mi.UInt32:
+        """Number of a sample among those of its half of the pixel, after a start that differs from pixel to pixel; it
+        decides which faint triangles of light the sample looks for."""
+        in_half = ((number >> 2) << 1) + (number & 1)  # pairs of samples belong to the halves in turn
+        return in_half + (dr.reinterpret_array(mi.UInt32, self.shift.y) >> 4) % TURNS
 
 
 def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes: Lanes) -> LaneState:
@@ -368,6 +384,7 @@ def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes:
             pdf=zeros(settings.ambient),
             events=dr.zeros(mi.UInt32, n) if in_media else None,
             scattered_inside=dr.full(mi.Bool, False, n) if in_media else None,
+            choice=dr.zeros(mi.Float, n) if settings.delta else None,
             spot=Spot.none(n) if is_beam and not in_media else None,
             pencil=Pencil.none(n) if is_beam and settings.delta else None,
         ),
@@ -427,6 +444,8 @@ def walk(
         number = lanes.number(state.sample)
         jitter, lens = in_pairs(lanes.shift, lanes.lens_shift, number, lanes.total)
         primary = camera.ray_in(lanes.corner, jitter, lens)
+        if dr.hint(settings.delta, mode="scalar"):
+            path.choice = dr.select(starts, along_golden(lanes.choice_shift, number), path.choice)
         ray = mi.Ray3f(
             dr.select(starts, primary.origin, path.origin), dr.select(starts, primary.direction, path.direction)
         )
@@ -492,7 +511,7 @@ def walk(
             seen = projector.glint(ray, lanes.pixel, si, comes_back)
             light = dr.select(seen.meets, path.throughput * seen.radiance * lanes.irradiance, 0)
             u, v = (dr.select(seen.meets, x, 0) for x in (seen.uv.x, seen.uv.y))
-            path_length = dr.select(seen.meets, dr.fma(path.ray_state.ior, seen.distance, started), 0)
+            path_length = dr.select(seen.meets, path.ray_state.further(seen.distance, started), 0)
             light_path = LightPath(u, v, path_length, mi.Bool(False), mi.UInt32(GLINT))
             state.channels = accumulators.add(
                 state.channels, light_path, light, lanes.place, seen.meets, mi.Bool(False)
@@ -518,11 +537,14 @@ def walk(
             assert path.pencil is not None
             comes_back = is_vertex & is_own & (path.depth == 1) & (path.chain > 0)
             link = path.pencil.connection(comes_back, ray.d, path.ray_state.length, link)
+        fresh = choice = rng.next_float32()
+        if dr.hint(settings.delta, mode="scalar"):
+            choice = dr.select(path.is_first, path.choice, fresh)
         value, _, bs, bs_weight = bsdf.eval_pdf_sample(
             mi.BSDFContext(),
             si,
             si.to_local(link.direction),
-            rng.next_float32(),
+            choice,
             mi.Point2f(rng.next_float32(), rng.next_float32()),
             at_surface,
         )
@@ -574,7 +596,7 @@ def walk(
                 accumulators,
                 state.channels,
                 vertex,
-                number,
+                lanes.turn(number),
                 lanes.pick(number),
                 is_later,
                 lanes.place,
@@ -610,6 +632,10 @@ def walk(
             # `bs_weight` is that of radiance, which falls by eta^2 on the way into glass; power does not
             turned.fraction *= bs_weight * bs.pdf * dr.square(eta)
             path.pencil = path.pencil.replaced(bends, turned)
+        if dr.hint(settings.delta, mode="scalar"):
+            # Masks do not tell the probability of their decision
+            decided = goes_delta & at_surface & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+            path.choice = dr.select(decided, used_up(path.choice, bs.pdf), fresh)
         path.throughput *= bs_weight
         path.ray_state = path.ray_state.refracted(bs, at_surface)
         if dr.hint(meets_delta, mode="scalar"):

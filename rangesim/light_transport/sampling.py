@@ -40,7 +40,6 @@ class Stream(Enum):
 
     FIRST = "first"
     SECOND = "second"
-    THIRD = "third"
 
 
 def random_stream(seed: Seed, number: mi.UInt32, stream: Stream = Stream.FIRST) -> mi.PCG32:
@@ -50,11 +49,11 @@ def random_stream(seed: Seed, number: mi.UInt32, stream: Stream = Stream.FIRST) 
     algorithm, HPG 2010). TEA maps no two inputs to the same output. A seed of more than 32 bits goes through TEA twice,
     and the upper half of the seed is added in between, so that no two seeds give the same numbers.
     """
-    pair = (number, seed.low) if stream is Stream.THIRD else (seed.low, number)
-    once = [mi.UInt32(x) for x in mi.sample_tea_32(*pair)]
+    once = [mi.UInt32(x) for x in mi.sample_tea_32(seed.low, number)]
     twice = mi.sample_tea_32(once[0] + seed.high, once[1])
     states = [mi.UInt64(dr.select(seed.high == 0, a, b)) for a, b in zip(once, twice, strict=True)]
-    return mi.PCG32(1, *(reversed(states) if stream is Stream.SECOND else states))  # 1: no lane number mixed in
+    # 1: no lane number mixed in
+    return mi.PCG32(1, *(reversed(states) if stream is Stream.SECOND else states))
 
 
 def of_part(rng: mi.PCG32, part: mi.UInt32) -> mi.PCG32:
@@ -114,6 +113,26 @@ def in_pairs(
         return place(stratified(shift, pair)), None
     in_pixel = _sequence(shift, pair, R4[:2])
     return place(in_pixel), place(_sequence(lens_shift, pair, R4[2:]))
+
+
+def along_golden(shift: mi.UInt32, number: mi.UInt32) -> mi.Float:
+    """A number in 0..1 for each sample; those of a pixel fill the interval evenly.
+
+    They are the multiples of the golden ratio modulo 1, the sequence of one dimension with the lowest discrepancy
+    (Niederreiter, "Random Number Generation and Quasi-Monte Carlo Methods", 1992), shifted by `shift` / 2^32.
+    """
+    return mi.Float(shift + number * mi.UInt32(GOLDEN_STEP) >> 8) * 2**-24
+
+
+def used_up(number: mi.Float, probability: mi.Float) -> mi.Float:
+    """A number in 0..1 that is uniform, if `number` is so and has decided for something of this probability.
+
+    All numbers that decide the same way form one interval whose length is the probability. Stretched to a length of 1,
+    wherever it begins, it covers 0..1 once modulo 1. So one number can decide several times, and evenly spread numbers
+    are shared out evenly among all outcomes together.
+    """
+    stretched = number / probability
+    return stretched - dr.floor(stretched)
 
 
 def _sequence(shift: mi.Point2f, number: mi.UInt32, steps: tuple[float, ...]) -> mi.Point2f:

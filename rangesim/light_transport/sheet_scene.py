@@ -100,7 +100,7 @@ class SheetScene:
     """
 
     def __init__(self, sheets: Sheets, projector_at: np.ndarray, irradiance: float, samples: int) -> None:
-        period = 1 << int(np.log2(max(1, min(samples, PERIOD))))
+        period = 1 << int(np.log2(max(1, min(samples // 2, PERIOD))))  # in each half of the samples
         every = min(period, EVERY)
         groups = period // every
         at_vertex, scale, area = irradiance_of(sheets.triangles, sheets.flux, sheets.position, len(sheets.u))
@@ -141,26 +141,26 @@ class SheetScene:
         known = active & (shape < self.shapes)
         return known & dr.gather(mi.Bool, self.is_lit, shape, known)
 
-    def is_turn(self, sample: mi.UInt32, turn: mi.UInt32) -> mi.Bool:
-        """Whether it is the turn of a sample; each turn comes once in `every` samples."""
-        return sample % self.every == turn % self.every
+    def is_turn(self, turn: mi.UInt32, which: mi.UInt32) -> mi.Bool:
+        """Whether it is this turn; each of them comes once in `every` samples."""
+        return turn % self.every == which % self.every
 
     def ray(
         self,
         point: mi.Point3f,
         normal: mi.Normal3f,
-        sample: mi.UInt32,
+        turn: mi.UInt32,
         which: mi.UInt32,
         way: mi.Float,
     ) -> tuple[mi.Ray3f, mi.Float]:
         """The rest of the ray through the triangles that may cover a point, after a way in metres; and the step in
         metres from a triangle that it meets to where the next one is looked for.
 
-        which : UInt32; 0: through bright triangles, 1: through those of the sample's group of faint ones.
+        which : UInt32; 0: through bright triangles, 1: through those of the group of faint ones whose turn it is.
         """
         distance = dr.norm(mi.Vector3f(point) - self.projector_at)
         above = MARGIN * (LIFT + MAX_SAG) * distance
-        group = dr.select(which == 0, 0, sample // self.every % self.groups + 1)
+        group = dr.select(which == 0, 0, turn // self.every % self.groups + 1)
         offset = dr.gather(mi.Vector2f, self.offsets, group)
         origin = point + mi.Vector3f(normal) * (above - way) + mi.Vector3f(offset.x, offset.y, 0)
         ray = mi.Ray3f(origin, -mi.Vector3f(normal))

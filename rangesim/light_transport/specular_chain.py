@@ -23,7 +23,7 @@ from rangesim.light_transport.traced_scene import TracedScene
 
 MAX_CHAIN = 128
 """Number of delta interactions in a row after which light is cut off, so that time is bounded. A pane has two faces, a
-hollow glass four. Of the photons that enter a cut diamond of n = 2.4, 0.2 % are cut off (with a limit of 16, it was 5.8
+hollow glass four. Of the light that enters a cut diamond of n = 2.4, 0.2 % is cut off (with a limit of 16, it was 5.8
 %)."""
 ROULETTE_AFTER = 8
 """Number of delta interactions in a row after which Russian roulette may end the light, so that light through a few
@@ -76,9 +76,11 @@ class RayState:
 
         `si.t` would be wrong, because rays start off the surface.
         """
-        distance = dr.norm(point - self.previous)
-        further = self.length + distance if self.ior is None else dr.fma(self.ior, distance, self.length)
-        return dr.select(hit, further, self.length)
+        return dr.select(hit, self.further(dr.norm(point - self.previous), self.length), self.length)
+
+    def further(self, distance: mi.Float, length: mi.Float) -> mi.Float:
+        """Optical length at a distance along the ray, in metres, if it is `length` at the start of the ray."""
+        return length + distance if self.ior is None else dr.fma(self.ior, distance, length)
 
     def power(self, throughput: mi.Float) -> mi.Float:
         """Fraction of a path's light that is left: radiance over the square of the refractive index."""

@@ -45,9 +45,9 @@ PATHS_PER_CORE_S = 1.1e6
 PATHS_PER_GPU_S = 5e7
 """Camera paths per second on a GPU, measured on `tabletop` with 5 to 50 million paths on an H100, which has no
 ray-tracing cores."""
-CAUSTICS_S = 1.0
-"""Seconds of a pass to make the triangles of caustics and to look them up, in a scene with glass or mirrors. Measured
-from 64 x 48 to 320 x 240 pixels: 0.5 to 0.8 s of processor time on `tabletop`, 3.5 to 4.3 s on `glassware`."""
+CAUSTICS_S = 0.5
+"""Seconds of a pass to make the triangles of caustics and to look them up, in a scene with glass or mirrors. Measured,
+from 64 x 48 to 320 x 240 pixels: 0.1 to 0.5 s of processor time on `tabletop`, 0.2 to 1.2 s on `glassware`."""
 PASS_S = 1.0
 """Seconds to compile the kernels of a pass, independent of the size of the image. Measured on `tabletop` with 64 x 48
 pixels on two busy cores: 2 s for a whole pass."""
@@ -73,9 +73,9 @@ TRUTH_BYTES = 64
 RESULT_BYTES = 200
 """Bytes per pixel of the results of each instrument while the report is written: maps, causes, points, segmentation and
 their pictures."""
-CAUSTICS_BYTES = 1e8
-"""Bytes of the triangles of caustics and of the tree in which they are looked up. The triangles of `tabletop` take
-8e6, those of `glassware` 5e7; the tree is assumed to take as much."""
+CAUSTICS_BYTES = 2e7
+"""Bytes of the triangles of caustics and of the tree in which they are looked up. The triangles of `glassware` take 8e6
+in a pass of 320 x 240 pixels; the tree is assumed to take as much."""
 TRIAL_S = 60.0
 """Seconds. If the constants predict a longer run, small passes of the scene are timed in a trial, because the constants
 may be wrong by a factor of three. A trial takes a few seconds, so with a smaller value short runs would wait for it;

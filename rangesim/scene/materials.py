@@ -34,6 +34,8 @@ ALL_COMPONENTS = 0xFFFFFFFF
 
 _TEXTURE_PARTS = re.compile(r"(\.color[01])*(\.value|\.data)?$")
 """End of a parameter's name, which only says which part of a texture the parameter is."""
+_OF_TEXTURES = re.compile(r"\.(color[01]|data|scale|to_uv)\b")
+"""Parameters that textures have and single numbers have not."""
 _ALPHAS = ("alpha", "alpha_u", "alpha_v")
 """Names of the parameters that hold a microfacet roughness."""
 
@@ -95,6 +97,32 @@ def is_matte(shape: Any) -> bool:
     """Whether a surface is a diffuse reflector only, without holes and without a medium inside."""
     flags = shape.bsdf().flags() & mi.BSDFFlags.All.value
     return bool(flags == flags & mi.BSDFFlags.DiffuseReflection.value != 0) and shape.interior_medium() is None
+
+
+def is_specular(shape: Any) -> bool:
+    """Whether a surface has delta interactions only, as mirrors and glass have, and is no boundary of a medium."""
+    bsdf = shape.bsdf()
+    return _has(bsdf, "DeltaReflection", "DeltaTransmission") and not _has(bsdf, "Smooth")
+
+
+def sharing_cosine(shape: Any) -> float:
+    """Smallest cosine of the angle between the normals of two points of a surface that get similar indirect light.
+
+    It is 0 if the shape scatters light into all directions, whatever the normal: a matte surface, also under a clear
+    coat. Light in a glossy lobe comes from directions that turn with the normal; half the width of the lobe is allowed.
+    It is NaN if points get different light: mirrors, glass, lobes as narrow as a mirror's, textures on gloss.
+    """
+    bsdf = shape.bsdf()
+    if is_matte(shape):
+        return 0.0
+    if material_class(bsdf) != "glossy" or is_cutout(bsdf) or shape.interior_medium() is not None:
+        return np.nan
+    parameters = _numbers(bsdf)
+    is_blend = "weight" in parameters  # perhaps of a matte surface and a mirror
+    if is_blend or any(_OF_TEXTURES.search(name) for name in mi.traverse(bsdf).keys()):  # noqa: SIM118
+        return np.nan
+    alphas = _alphas(parameters)
+    return float(np.cos(np.arctan(min(alphas)) / 2)) if alphas else 0.0
 
 
 def has_texture(bsdf: Any) -> bool:
