@@ -15,7 +15,7 @@ sees straight. Widths are from 10 to 90 % of the edge. The last line is JSON:
     blur_px             standard deviation of the Gaussian that blurs the edge behind the pane besides what the camera's
                         pixels do, in projector pixels
     max_edge_error      largest |width / width by `ptracer` - 1| of an edge
-    flux_in_triangles   fraction of the flux of delta chains that triangles carry; null: the pass has none
+    flux_in_triangles   fraction of the light through the ball that triangles of the grid carry; photons carry the rest
 
 Usage: python benchmarks/caustic_foci.py [--seeds 16] [--edge-spp 512]
 """
@@ -142,6 +142,17 @@ def noise(seeds: int) -> dict[str, float]:
               f"time of ptracer / ours: single pixels {ratios[0]:.3f}, means of blocks {ratios[1]:.3f}; noise of a "
               f"pixel {relative['ours']:.1%}, ptracer {relative['ptracer']:.1%}; mean {off:+.2%}")  # fmt: skip
     return result
+
+
+def flux_in_triangles() -> float:
+    """Fraction of the light through the ball that triangles of the grid carry."""
+    from rangesim.light_transport.caustic_sheets import trace_sheets
+    from rangesim.light_transport.traced_scene import TracedScene
+
+    scene, rig = ball_over_a_plane()
+    sheets = trace_sheets(TracedScene.of(scene.mitsuba, rig), rig.projector_power_w, seed=0)
+    assert sheets is not None
+    return round(sheets.in_triangles, 4)
 
 
 def block_means(stack: np.ndarray, region: np.ndarray) -> np.ndarray:
@@ -277,7 +288,7 @@ def main() -> None:
     parser.add_argument("--edge-spp", type=int, default=512, help="samples of ptracer per pixel, for edges")
     args = parser.parse_args()
     select_variant()
-    print(json.dumps({**noise(args.seeds), **blur(args.edge_spp), "flux_in_triangles": None}))
+    print(json.dumps({**noise(args.seeds), **blur(args.edge_spp), "flux_in_triangles": flux_in_triangles()}))
 
 
 if __name__ == "__main__":
