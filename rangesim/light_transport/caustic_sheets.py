@@ -451,11 +451,11 @@ def _parallelograms(
     ends = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
     hangs = np.arange(len(this))
     for _ in range(HALVINGS):
+        if not len(hangs):
+            break
         corners = (centre[hangs, None] + ends @ sides[hangs]).reshape(-1, 3)
         normals, shapes = (np.repeat(column[this[hangs]], 4, axis=0) for column in (found.normal, found.shape))
         hangs = hangs[~lie_on(corners, normals, shapes).reshape(-1, 4).all(axis=1)]
-        if not len(hangs):
-            break
         sides[hangs] *= 0.5
         shrinks[hangs] *= 0.5
     corners = centre[:, None] + ends @ sides
