@@ -20,7 +20,7 @@ from delta_scenes import (
     wall,
 )
 
-from rangesim import Intrinsics, Rig, Scene, transport
+from rangesim import Intrinsics, Lens, Rig, Scene, transport
 from rangesim.light_transport import caustic_sheets
 from rangesim.light_transport.caustic_sheets import Sheets
 
@@ -195,3 +195,26 @@ def test_light_that_comes_by_several_ways_adds_up() -> None:
     left, right, both = seen(left=mirrors["left"]), seen(right=mirrors["right"]), seen(**mirrors)
     assert left.min() > 0
     np.testing.assert_allclose(both, left + right, rtol=2e-3)
+
+
+def test_a_lens_blurs_the_light_behind_a_pane_and_takes_none_of_it() -> None:
+    """Its points have equal means of u, and the variance of u of a disc, a fourth of its squared radius."""
+    scene = scene_of(pane=wall(0.3, {**GLASS, "type": "thindielectric"}, 2.0), wall=wall(PLANE, matte()))
+    radius_m, focus_m = 4e-3, 0.6
+    pinhole = rig_of(Intrinsics.from_fov(32, 24, 20), PROJECTOR)
+    rig = rig_of(pinhole.camera, PROJECTOR, projector_lens=Lens(radius_m, focus_m))
+    seen = [
+        transport(scene, r, [], spp=8, max_depth=2, glint=False, indirect="raw").energy.caustic for r in (pinhole, rig)
+    ]
+    assert seen[1].mean() == pytest.approx(seen[0].mean(), rel=1e-3)
+    assert (np.abs(seen[1] / seen[0] - 1) < 3e-3).mean() > 0.99
+
+    sheets = light_of(scene, rig)
+    u, x = sheets.u[sheets.triangles].mean(axis=1), sheets.position[sheets.triangles, 0].mean(axis=1, dtype=float)
+    straight = PROJECTOR.cx + PROJECTOR.fx * x / PLANE
+    middle = np.abs(x) < 0.1
+    off_px = np.average(u[middle] - straight[middle], weights=sheets.flux[middle])
+    variance = np.average((u - straight)[middle] ** 2, weights=sheets.flux[middle])
+    blur_px = PROJECTOR.fx * radius_m * (1 / focus_m - 1 / PLANE)
+    assert abs(off_px) < 0.02 * blur_px
+    assert variance == pytest.approx(blur_px**2 / 4, rel=0.02)

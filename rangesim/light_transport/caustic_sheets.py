@@ -35,8 +35,8 @@ from rangesim.light_transport.caustic_kernels import (
 )
 from rangesim.light_transport.delta_surfaces import meets_delta
 from rangesim.light_transport.kernel_launches import Launches
-from rangesim.light_transport.sampling import R2, aligned
-from rangesim.light_transport.specular_tree import Landings, SpecularTree
+from rangesim.light_transport.sampling import aligned
+from rangesim.light_transport.specular_tree import HASH_STEP, Landings, SpecularTree
 from rangesim.light_transport.surfaces import number_of
 from rangesim.light_transport.traced_scene import TracedScene
 
@@ -85,8 +85,11 @@ MIN_SIDE_M = 1e-12
 STEP_PX = 0.02
 """Distance of the points beside a photon that tell how its light spreads, in pixels of the projector. Closer points
 would land within the rounding of single precision; farther ones would miss narrow chains."""
-LENS_POINTS = 8
-"""Number of points of a lens of finite size, each of which has a grid of its own, at the lowest level."""
+LENS_RADIUS, LENS_WEIGHTS = np.sqrt(2 / 3), (1 / 4, *[1 / 8] * 6)
+"""Points of a lens of finite size, each of which has a grid of its own, at the lowest level: its centre and a regular
+hexagon. Radius of the hexagon as a fraction of the lens, and fractions of the light. Means over these points are exact
+for polynomials of the place on the lens up to degree 5 (Stroud, Approximate calculation of multiple integrals, 1971,
+rule S2: 5-1), so light lands where it should on average, and blurs as much."""
 MAX_AT_ONCE = 1 << 18
 """Largest number of points of a launch, so that the weaker parts that it stores take 100 MB at most."""
 
@@ -190,11 +193,19 @@ def trace_sheets(
     """
     assert isinstance(traced.projector, Device)  # beams need no sheets
     rng = np.random.default_rng(seed)
-    points = [None]
-    if traced.projector.has_lens:
-        points = list(np.mod(np.arange(LENS_POINTS)[:, None] * R2 + rng.random(2), 1))
     tracing = _Tracing(traced, pixel_rad, report)
-    return joined([tracing.sheets(power_w / len(points), rng, lens) for lens in points])
+    if not traced.projector.has_lens:
+        return joined([tracing.sheets(power_w, rng, None)])
+    made = [tracing.sheets(power_w * part, rng, p) for part, p in zip(LENS_WEIGHTS, _lens_points(), strict=True)]
+    # Chains through different points of the lens are different chains
+    return joined([one._replace(key=one.key + np.uint32(i * HASH_STEP & 0xFFFFFFFF)) for i, one in enumerate(made)])
+
+
+def _lens_points() -> np.ndarray:
+    """(7, 2) float64, see `LENS_WEIGHTS`, as the places in the unit square that are mapped to them."""
+    angle = np.pi / 3 * np.arange(6)
+    x, y = (mi.Float(np.append(0, LENS_RADIUS * f(angle)).astype(np.float32)) for f in (np.cos, np.sin))
+    return mi.warp.uniform_disk_to_square_concentric(mi.Point2f(x, y)).numpy().T.astype(np.float64)
 
 
 def joined(sheets: Sequence[Sheets]) -> Sheets | None:
