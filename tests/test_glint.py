@@ -78,7 +78,7 @@ def test_in_a_flat_mirror_the_lens_is_its_mirror_image(offset: float) -> None:
     """A lens of intensity I at the unfolded distance d casts R I / d^2, wherever among the pixels its image lies."""
     depth, b = 1.0, BASELINE + offset
     scene, rig = scene_of(mirror=wall(depth, MIRROR)), rig_of(CAMERA, PROJECTOR, (b, 0.0, 0.0))
-    signals = transport(scene, rig, SENSORS, spp=4)
+    signals = transport(scene, rig, SENSORS, spp=64)
     d, tangent = np.hypot(2 * depth, b), b / (2 * depth)
     reflected = fresnel_conductor(2 * depth / d)
     check(signals, reflected * intensity(rig, tangent) / d**2, d)
@@ -93,7 +93,7 @@ def test_a_pixel_that_the_lens_fills_has_the_radiance_of_the_lens() -> None:
     """Intensity over projected area: E / (pi a^2 cos^4), of the part that the mirror reflects."""
     depth, camera = 0.2, Intrinsics.from_fov(64, 48, 2)
     rig = rig_of(camera, PROJECTOR, (0.02, 0.0, 0.0), camera_looks_at=(0.01, 0.0, depth))
-    signals = transport(scene_of(mirror=wall(depth, MIRROR)), rig, SENSORS, spp=4)
+    signals = transport(scene_of(mirror=wall(depth, MIRROR)), rig, SENSORS, spp=64)
     cosine = 2 * depth / np.hypot(2 * depth, 0.02)
     expected = fresnel_conductor(cosine) * rig.projector_irradiance / (np.pi * 2e-3**2) / cosine**4
     assert signals.energy.glint[24, 32] == pytest.approx(expected, rel=5e-3)
@@ -110,7 +110,7 @@ def test_in_a_convex_ball_the_lens_is_demagnified() -> None:
     leg = np.hypot(distance, b / 2)
     expected = fresnel_conductor(distance / leg) * intensity(rig, b / 2 / distance)
     expected /= (2 * leg + 2 * leg**2 / radius) ** 2
-    seeds = [transport(scene, rig, SENSORS, spp=1, seed=s) for s in range(6)]
+    seeds = [transport(scene, rig, SENSORS, spp=64, seed=s) for s in range(6)]
     for signals in seeds:
         np.testing.assert_allclose(lengths(signals), 2 * leg, atol=1e-3)
     assert np.mean([seen(s) for s in seeds]) == pytest.approx(expected, rel=0.04)
@@ -132,7 +132,7 @@ def test_no_seed_misses_a_highlight_on_a_ball(x: float, radius: float, spread: f
     """Balls two to eighteen pixels wide, all over the image; the highlight is down to a thousandth of a pixel wide."""
     ball = {"type": "sphere", "center": [x, 0.07, 0.9], "radius": radius, "bsdf": MIRROR}
     scene, rig = scene_of(ball=ball, wall=wall(2.0, matte())), mirror_rig()
-    found = [seen(transport(scene, rig, [], spp=1, seed=s)) for s in range(4)]
+    found = [seen(transport(scene, rig, [], spp=64, seed=s)) for s in range(4)]
     assert min(found) > 0
     assert max(found) / min(found) < spread
 
@@ -149,7 +149,7 @@ def test_a_projector_in_view_is_seen_straight() -> None:
 def test_through_a_pane_the_lens_is_seen_nearer_and_dimmer() -> None:
     rig = rig_of(CAMERA, PROJECTOR, (0.0, 0.0, 1.5), looks_at=(0.0, 0.0, 0.0))
     scene = scene_of(pane=slab(0.5, 0.55))
-    seeds = [transport(scene, rig, [Lengths()], spp=1, seed=s) for s in range(12)]
+    seeds = [transport(scene, rig, [Lengths()], spp=64, seed=s) for s in range(12)]
     r, apparent = fresnel_dielectric(0.0), 1.5 - 0.05 + 0.05 / 1.5
     values = [seen(s) for s in seeds]
     error = np.std(values, ddof=1) / np.sqrt(len(values))
@@ -218,7 +218,7 @@ def test_the_same_seed_gives_the_same_glint_whatever_the_threads() -> None:
     scene, before, found = scene_of(ball=ball, wall=wall(2.0, matte())), dr.thread_count(), []
     for threads in (1, 2):
         dr.set_thread_count(threads)
-        found.append(transport(scene, mirror_rig(), SENSORS, spp=1, seed=3).energy.glint)
+        found.append(transport(scene, mirror_rig(), SENSORS, spp=64, seed=3).energy.glint)
     dr.set_thread_count(before)
     np.testing.assert_array_equal(*found)
     assert found[0].any()

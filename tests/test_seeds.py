@@ -75,7 +75,7 @@ def caustics(scene: Scene, seed: int) -> list[np.ndarray]:
 
 def glint(scene: Scene, seed: int) -> list[np.ndarray]:
     rig = replace(scene.rig(width=48, height=36), projector_lens=Lens(0.02))
-    found = trace_glint(TracedScene.of(scene.mitsuba, rig), rig, [], seed)
+    found = trace_glint(TracedScene.of(scene.mitsuba, rig), rig, [], seed, 64)
     assert found.radiance.any()
     return [found.radiance]
 

@@ -59,8 +59,9 @@ MAX_PATHS = 1 << 22
 (docs/benchmarks.md)."""
 MIN_PATHS_PER_PIXEL = 64
 """Smallest number of paths per pixel, however many pixels there are, because fewer would make glint noisy."""
-MAX_PATHS_PER_PIXEL = 4096
-"""Largest number of paths per pixel, however few pixels there are, so that a single highlight takes little time."""
+PATHS_PER_SAMPLE, MAX_PATHS_PER_PIXEL = 64, 4096
+"""Largest number of paths per pixel for each of its samples, so that a pass of few samples is quick, and however many
+samples it has, so that a single highlight takes little time."""
 SCREENING = 8
 """Ratio of all paths of a pixel to those that are sent first, a power of two. The number of paths then doubles as long
 as one of them came close, so that pixels which do not see the lens cost little."""
@@ -106,6 +107,7 @@ def trace_glint(
     rig: Rig,
     responses: Sequence[Response],
     seed: int,
+    samples: int,
     report: Callable[[], None] = lambda: None,
 ) -> Glint:
     """The glint that the camera of the rig sees.
@@ -115,6 +117,7 @@ def trace_glint(
     traced, rig : TracedScene and Rig, in coordinates of the renderer.
     responses : the responses whose channels are returned.
     seed : int, 0 to 2^64 - 1.
+    samples : int, number of samples of a pixel in the pass, which bounds its number of paths.
     report : called after each kernel launch.
     """
     view = GlintView(traced, Seed.of(seed))
@@ -123,7 +126,8 @@ def trace_glint(
     if len(pixel) == 0:
         nothing, none = np.zeros(0, np.float32), {r: np.zeros((r.channels, 0), np.float32) for r in responses}
         return Glint(pixel, nothing, none, nothing, none)
-    per_pixel = int(np.clip(MAX_PATHS // len(pixel), MIN_PATHS_PER_PIXEL, MAX_PATHS_PER_PIXEL))
+    most = min(max(PATHS_PER_SAMPLE * samples, MIN_PATHS_PER_PIXEL), MAX_PATHS_PER_PIXEL)
+    per_pixel = int(np.clip(MAX_PATHS // len(pixel), MIN_PATHS_PER_PIXEL, most))
     few = per_pixel // (LANES * SCREENING)  # of each lane
     send = partial(_sums, view, rig, responses, of_lane=SCREENING * few, report=report)
     sums, sent = send(pixel, radius_m, 0, few), np.full(len(pixel), few)

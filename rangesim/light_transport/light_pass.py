@@ -167,7 +167,8 @@ class _CameraPass:
         shared = LightFilter(guides) if guides is not None else None
         at_work = partial(report, 0.0)
         sees_glint = settings.glint and not isinstance(rig.projector, Beam)
-        glints = trace_glint(self.traced, self.here, responses, settings.seed, at_work) if sees_glint else None
+        most = int(self.samples.max())
+        glints = trace_glint(self.traced, self.here, responses, settings.seed, most, at_work) if sees_glint else None
         has_halves = settings.sampling_error and fewest >= MIN_FOR_HALVES
         estimate = Estimate(
             view, of_paths, rig, responses, self.is_filtered, has_halves, settings.memory_bytes, launches
