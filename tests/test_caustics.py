@@ -189,15 +189,15 @@ def test_light_off_a_flat_mirror_is_that_of_the_image_source() -> None:
     assert np.abs(off_px).max() < 0.02
 
 
-def check_faint(ratio: np.ndarray, off_px: np.ndarray) -> None:
-    """Faint light is drawn by lot in every sample, so it is right on average."""
-    assert ratio.mean() == pytest.approx(1, abs=0.01)
-    assert np.abs(off_px.mean(axis=(1, 2))).max() < 0.03
+def check_every_pixel(ratio: np.ndarray, off_px: np.ndarray) -> None:
+    """Where few triangles cover a point, nothing is drawn by lot, however faint they are."""
+    assert np.abs(ratio - 1).max() < 4e-3
+    assert np.abs(off_px).max() < 0.03
 
 
 @pytest.mark.validation
 def test_light_off_polished_plastic_is_fresnel_s_share_of_the_image_source() -> None:
-    check_faint(
+    check_every_pixel(
         *over_image_source(*beside_a_mirror(PLASTIC), lambda d: fresnel_dielectric(np.sqrt(1 - d[..., 0] ** 2)))
     )
 
@@ -207,7 +207,7 @@ def test_light_through_a_pane_and_off_plastic_lands_and_goes_on() -> None:
     """On the plastic light that came through glass both lands and goes on; fractions of either must add up."""
     pane = wall(0.1, {**GLASS, "type": "thindielectric"}, 0.19)
     scene, rig = beside_a_mirror(PLASTIC, pane=pane)
-    check_faint(
+    check_every_pixel(
         *over_image_source(
             scene,
             rig,

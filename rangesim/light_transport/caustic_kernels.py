@@ -25,6 +25,10 @@ part of the same shape behind it."""
 MIN_FOOTPRINT = 0.1
 """Smallest size of a pixel where it lands, as a fraction of its size without glass, for which cells are refined: light
 in a focus is not followed any finer."""
+FLAT_COSINE = 1 - 1e-6
+"""Cosine between the normals at the corners of a triangle, above which its receiver counts as flat: rounding alone."""
+MAX_CUBES = 64
+"""Largest number of cubes to which the area of a triangle is dealt out, see `crowd_of`. Larger triangles are rare."""
 MAX_SPREAD = 2.0
 """Largest ratio between the areas over which equal light spreads within a block; with a smaller ratio more blocks are
 divided."""
@@ -407,41 +411,103 @@ def irradiance_of(triangles, flux, position, vertices):  # type: ignore[no-untyp
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def lifted(sheets, scale, level, groups, every, faint, lift, offsets, drawn):  # type: ignore[no-untyped-def]
+def uniform(a, b):  # type: ignore[no-untyped-def]
+    """A number in 0..1 that depends on two whole numbers alone, as evenly spread as a random one (the last step of
+    SplitMix64: Steele, Lea, Flood: Fast splittable pseudorandom number generators, OOPSLA 2014)."""
+    x = np.uint64(a) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(b)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return np.float64((x ^ (x >> np.uint64(31))) >> np.uint64(11)) / 9007199254740992.0  # 2^53
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _names_of(triangles, key, image):  # type: ignore[no-untyped-def]
+    """(t,) uint64, a number for each triangle that depends on its chain and on its place in the image alone."""
+    names = np.empty(len(triangles), np.uint64)
+    for t in range(len(triangles)):
+        name = np.uint64(key[t])
+        for k in range(2):
+            name = name * np.uint64(0x9E3779B97F4A7C15) + np.uint64(image[triangles[t, k]])
+        names[t] = name
+    return names
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def crowd_of(position, triangles, shape, area, edge):  # type: ignore[no-untyped-def]
+    """(t,) float64, number of triangles that cover the surface around the middle of each of some triangles.
+
+    It is the area of the triangles in a cube over that of a face. The area of a triangle that is larger than a face is
+    dealt out to the cubes in which it lies. `edge` is that of the cubes in metres.
+    """
+    points = np.minimum(area / (edge * edge), MAX_CUBES).astype(np.int64) + 1
+    table = np.full(1 << int(np.log2(2 * points.sum() + 1) + 1), EMPTY, np.int64)
+    inside, crowd = np.zeros(len(table)), np.empty(len(triangles))
+    for t in range(len(triangles)):
+        for p in range(points[t]):
+            cube = _cube(position, triangles[t], shape[t], p, edge)
+            i = place_in(table, cube)
+            table[i] = cube
+            inside[i] += area[t] / points[t]
+    for t in range(len(triangles)):
+        crowd[t] = inside[place_in(table, _cube(position, triangles[t], shape[t], 0, edge))] / (edge * edge)
+    return crowd
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _cube(position, vertices, shape, point, edge):  # type: ignore[no-untyped-def]
+    """Name of the cube that holds a point of a triangle: its middle, or one of a sequence that fills it."""
+    b1, b2 = 1 / 3, 1 / 3
+    if point > 0:
+        b1, b2 = 0.7548776662466927 * point % 1.0, 0.5698402909980532 * point % 1.0
+        if b1 + b2 > 1:
+            b1, b2 = 1 - b1, 1 - b2
+    name = np.int64(shape)
+    for k in range(3):
+        x = (1 - b1 - b2) * position[vertices[0], k] + b1 * position[vertices[1], k] + b2 * position[vertices[2], k]
+        name = name * np.int64(HASH) + np.int64(np.floor(x / edge))
+    return abs(name)
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def lifted(sheets, scale, is_faint, chance, groups, every, lift, flat_lift, offsets, middle):  # type: ignore[no-untyped-def]
     """The triangles of light as a scene of their own, see `sheet_scene`.
 
     Parameters
     ----------
-    sheets : Sheets, as a tuple of position, normal, triangles, shape and key.
-    level : (t,) float64, ratio of the irradiance to direct light.
-    lift : (t,) float64, metres, largest distance off the surface. offsets : (groups + 1, 2) float64, metres.
-    drawn : (t,) float64, uniform in 0..1.
+    sheets : Sheets, as a tuple of position, normal, triangles, shape, key, and the bits of u and v of each vertex in a
+        number.
+    is_faint : (t,) bool. chance : (t,) float64, probability with which a faint triangle is kept.
+    lift, flat_lift : (t,) float64, metres, largest distance of triangles in one place, where the receiver is curved and
+        where it is flat.
+    offsets : (groups + 1, 2) float64, metres, of bright triangles and of the groups of faint ones.
+    middle : (3,) float64, metres, the place from which coordinates count.
 
     Returns
     -------
     corners : (3 k, 3) float32, metres. names : (k, 4) uint32, vertices and shape. factor : (k,) float32.
     """
-    position, normal, triangles, shape, key = sheets
+    position, normal, triangles, shape, key, image = sheets
+    name = _names_of(triangles, key, image)
     corners, names = np.empty((3 * len(triangles), 3), np.float32), np.empty((len(triangles), 4), np.uint32)
     factor, n = np.empty(len(triangles), np.float32), 0
     for t in range(len(triangles)):
         group, weight = 0, 1.0
-        if level[t] < faint:
+        if is_faint[t]:
             # The faintest are drawn by lot, and count for those that are not
-            chance = min(level[t] * groups * every / faint, 1.0)
-            if drawn[t] >= chance:
+            if uniform(name[t], 1) >= chance[t]:
                 continue
-            group, weight = 1 + (key[t] >> 8) % groups, groups * every / chance
-        if not (scale[t] > 0 and np.isfinite(level[t])):
+            group, weight = 1 + (key[t] >> 8) % groups, groups * every / chance[t]
+        if not scale[t] > 0:
             continue
-        height = lift[t] * (t * 0.6180339887498949 % 1.0)
+        a, b, c = triangles[t]
+        bends = min(_cosine(normal, a, b), _cosine(normal, a, c)) < FLAT_COSINE
+        height = (lift if bends else flat_lift)[t] * (uniform(name[t], 2) - 0.5)
         for k in range(3):
             v = triangles[t, k]
             names[n, k] = v
             for axis in range(3):
-                corners[3 * n + k, axis] = position[v, axis] + height * normal[v, axis]
-                if axis < 2:
-                    corners[3 * n + k, axis] += offsets[group, axis]
+                place = position[v, axis] - middle[axis] + height * normal[v, axis]
+                corners[3 * n + k, axis] = place + (offsets[group, axis] if axis < 2 else 0.0)
         names[n, 3], factor[n] = shape[t], scale[t] * weight
         n += 1
     return corners[: 3 * n], names[:n], factor[:n]

@@ -19,17 +19,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.caustic_kernels import irradiance_of, lifted
+from rangesim.light_transport.caustic_kernels import crowd_of, irradiance_of, lifted
 from rangesim.light_transport.caustic_sheets import FAINT, MAX_SAG, Sheets
 from rangesim.light_transport.sampling import aligned
 
-LIFT = 2e-4
-"""Largest distance by which a triangle is lifted off its surface, as a fraction of its distance from the projector: a
-thousand times the rounding of single precision, which has to tell all triangles apart that cover a point. A larger
-distance would make triangles on curved surfaces too large."""
-STEP = 1e-7
+LIFT = 4e-4
+"""Largest distance between two triangles in one place, as a fraction of their distance from the projector: a thousand
+times the rounding of single precision, which has to tell all triangles apart that cover a point. They are lifted off
+their surface to both sides of it, so that they are as large as on the surface on average. A larger distance would make
+triangles on curved surfaces too large or too small."""
+STEP = 6e-8
 """Step behind a triangle, as a fraction of the coordinates: the rounding of single precision. With a smaller step, a
-ray could meet the same triangle for ever; a larger one would pass triangles by."""
+ray could meet the same triangle for ever; a larger one would pass triangles by. Coordinates count from the middle of
+the lit part of the scene, where they are small."""
 MARGIN = 1.4
 """Ratio of the height from which a ray looks, and the depth to which it does, to those of the edges of triangles: the
 middle of a triangle is 4 / 3 times as far from a curved surface as its edges."""
@@ -37,6 +39,9 @@ PERIOD, EVERY = 16, 4
 """Number of samples after which a pixel has looked into all groups of faint triangles, and the distance of two samples
 that look into one at all. With a longer period, faint light would be noisy in passes of few samples; if every sample
 looked, a pass would take a fifth longer."""
+CROWD, CUBES = 2.0, 64
+"""Number of faint triangles over a point from which they are dealt out to groups, because every sample looks for
+fewer of them at little cost; and number of cubes along the lit part of the scene, in which they are counted."""
 SPACING = 1.5
 """Distance between groups of faint triangles, as a multiple of the size of the lit part of the scene, so that groups do
 not touch."""
@@ -109,13 +114,23 @@ class SheetScene:
             distance = np.linalg.norm(first - projector_at, axis=1)
             level = sheets.flux / area * distance**2 / irradiance
 
-        size = float(np.ptp(sheets.position, axis=0).max()) + MIN_SIZE_M
-        across = math.isqrt(groups - 1) + 1  # groups lie in a square
-        offsets = np.array([[0, 0], *([1 + g % across, g // across] for g in range(groups))]) * (SPACING * size)
-        columns = (sheets.position, sheets.normal, sheets.triangles, sheets.shape, sheets.key)
-        lift = LIFT * distance
-        drawn = np.random.default_rng(0).random(len(area))
-        corners, names, factor = lifted(columns, scale, level, groups, every, FAINT, lift, offsets, drawn)
+        low, high = sheets.position.min(axis=0), sheets.position.max(axis=0)
+        size, middle = float((high - low).max()) + MIN_SIZE_M, (0.5 * (low + high)).astype(np.float64)
+        across = math.isqrt(groups) + 1  # all of them lie in a square
+        places = [[g % across, g // across] for g in range(across**2)]
+        places = sorted(places, key=lambda place: np.hypot(*(np.array(place) - across // 2)))
+        offsets = (np.array(places[: groups + 1]) - across // 2) * (SPACING * size)  # bright ones in the middle
+        image = np.column_stack([sheets.u, sheets.v]).view(np.uint64)[:, 0]
+        columns = (sheets.position, sheets.normal, sheets.triangles, sheets.shape, sheets.key, image)
+        flat_lift = (LIFT + 2 * MAX_SAG) * distance  # a flat receiver leaves room that a curved one takes
+        is_faint = level < FAINT
+        weak = np.flatnonzero(is_faint)
+        crowd = crowd_of(sheets.position, sheets.triangles[weak], sheets.shape[weak], area[weak], size / CUBES)
+        is_faint[weak[crowd < CROWD]] = False
+        chance = np.minimum(level * groups * every / FAINT, 1)
+        corners, names, factor = lifted(
+            columns, scale, is_faint, chance, groups, every, LIFT * distance, flat_lift, offsets, middle
+        )
         mesh = mi.Mesh("light", len(corners), len(names))
         parameters = mi.traverse(mesh)
         parameters["vertex_positions"] = mi.Float(aligned(corners, np.float32))
@@ -131,7 +146,9 @@ class SheetScene:
         self.looks, self.names = mi.Float(aligned(looks, np.float32)), mi.UInt32(aligned(names, np.uint32))
         self.factor, self.offsets = mi.Float(aligned(factor, np.float32)), mi.Float(aligned(offsets, np.float32))
         self.groups, self.every = dr.opaque(mi.UInt32, groups), dr.opaque(mi.UInt32, every)
-        self.projector_at = mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in projector_at))
+        self.projector_at, self.middle = (
+            mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in place)) for place in (projector_at, middle)
+        )
         is_lit = np.zeros(int(sheets.shape.max()) + 1, np.bool_)
         is_lit[names[:, 3]] = True
         self.is_lit, self.shapes = mi.Bool(is_lit), dr.opaque(mi.UInt32, len(is_lit))
@@ -159,13 +176,13 @@ class SheetScene:
         which : UInt32; 0: through bright triangles, 1: through those of the group of faint ones whose turn it is.
         """
         distance = dr.norm(mi.Vector3f(point) - self.projector_at)
-        above = MARGIN * (LIFT + MAX_SAG) * distance
+        above = MARGIN * (0.5 * LIFT + MAX_SAG) * distance
         group = dr.select(which == 0, 0, turn // self.every % self.groups + 1)
         offset = dr.gather(mi.Vector2f, self.offsets, group)
-        origin = point + mi.Vector3f(normal) * (above - way) + mi.Vector3f(offset.x, offset.y, 0)
-        ray = mi.Ray3f(origin, -mi.Vector3f(normal))
-        ray.maxt = above + MARGIN * MAX_SAG * distance - way
-        return ray, STEP * (distance + dr.norm(mi.Vector3f(point)) + offset.x + offset.y)
+        place = mi.Point3f(point) - self.middle + mi.Vector3f(offset.x, offset.y, 0)
+        ray = mi.Ray3f(place + mi.Vector3f(normal) * (above - way), -mi.Vector3f(normal))
+        ray.maxt = 2 * above - way
+        return ray, STEP * (dr.norm(mi.Vector3f(place)) + above)
 
     def next(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         """The next triangle on a ray."""

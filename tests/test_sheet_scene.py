@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The search for triangles of light that cover a point: none is passed by, and draws do not depend on the others."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from delta_scenes import matte, scene_of, wall
+
+from rangesim.light_transport.caustic_sheets import Sheets
+from rangesim.light_transport.sheet_scene import SheetScene
+
+CELLS, WAYS = 12, 20
+PROJECTOR_AT = np.array([0.2, 0.6, 0.0])
+
+
+def sheets_over_a_square(level: float) -> Sheets:
+    """Light that comes by `WAYS` chains to the square of 1 m at z = 1, all of it in the same triangles."""
+    v, u = (c.ravel() for c in np.indices((CELLS + 1, CELLS + 1)).astype(np.float32))
+    n = len(u)
+    first = (np.arange(CELLS)[:, None] * (CELLS + 1) + np.arange(CELLS)).ravel()
+    cell = np.concatenate([first[:, None] + [0, 1, CELLS + 2], first[:, None] + [0, CELLS + 2, CELLS + 1]])
+    triangles = np.concatenate([cell + way * n for way in range(WAYS)])
+    position = np.column_stack([u / CELLS - 0.3, v / CELLS + 0.1, np.ones(n)]).astype(np.float32)
+    vertices = (position, [[0, 0, 1]] * n, [-1] * n, [1] * n, u, v, [[0, 0, -1]] * n)
+    columns: list[Any] = [np.concatenate([np.asarray(c, np.float32)] * WAYS) for c in vertices]
+    key = np.repeat(np.arange(WAYS, dtype=np.uint32) << 8, len(cell))
+    flux = np.full(len(triangles), level / len(cell))
+    return Sheets(*columns, triangles, flux, np.zeros(len(triangles), np.uint32), key, 0.0, 1.0)
+
+
+@pytest.fixture(autouse=True)
+def renderer() -> None:
+    """Mitsuba is ready after a scene is loaded."""
+    scene_of(wall=wall(1.0, matte()))
+
+
+@dr.syntax
+def total(light: SheetScene, point: mi.Point3f, turn: mi.UInt32, which: mi.UInt32) -> mi.Float:
+    """Irradiance of all triangles that a sample finds."""
+    n = dr.width(point)
+    way, found_w, last = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.full(mi.UInt32, 0xFFFFFFFF, n)
+    looks = dr.full(mi.Bool, True, n)
+    while looks:
+        ray, step = light.ray(point, mi.Normal3f(0, 0, -1), turn, which, way)
+        found = light.next(ray, looks)
+        looks &= found.is_valid()
+        irradiance, _ = light.irradiance(
+            found, dr.zeros(mi.UInt32, n), mi.Normal3f(0, 0, -1), looks & (found.prim_index != last)
+        )
+        found_w += irradiance
+        last, way = found.prim_index, way + found.t + step
+    return found_w
+
+
+@pytest.mark.parametrize("level", [1.0, 1e-2, 1e-3])
+def test_a_point_gets_the_light_of_all_triangles_that_cover_it(level: float) -> None:
+    """Bright ones are all found in every sample. Faint ones are found in turn, and the faintest are drawn by lot."""
+    light = SheetScene(sheets_over_a_square(level), PROJECTOR_AT, 1.0, samples=32)
+    n, period = 1 << 16, int(light.groups[0]) * int(light.every[0])
+    x, y = np.random.default_rng(0).random((2, n)).astype(np.float32)
+    point = mi.Point3f(mi.Float(x - 0.3), mi.Float(y + 0.1), mi.Float(1.0))
+    faint = level < 0.02
+    turn = mi.UInt32((np.arange(n) % (period // int(light.every[0])) * int(light.every[0])).astype(np.uint32))
+    irradiance = total(light, point, turn, dr.full(mi.UInt32, int(faint), n)).numpy() / (
+        int(light.every[0]) if faint else 1
+    )
+    assert irradiance.mean() == pytest.approx(WAYS * level, rel=0.03 if level == 1e-3 else 2e-3)
+    if not faint:
+        assert (np.abs(irradiance / (WAYS * level) - 1) > 1e-3).mean() < 0.01
+
+
+def test_draws_do_not_depend_on_other_triangles() -> None:
+    """One triangle more, which a rounding brings, changes no other."""
+    all_of_them = sheets_over_a_square(1e-4)
+    some = all_of_them._replace(triangles=all_of_them.triangles[7:], flux=all_of_them.flux[7:],
+                                shape=all_of_them.shape[7:], key=all_of_them.key[7:])  # fmt: skip
+    names = [SheetScene(one, PROJECTOR_AT, 1.0, 32).names.numpy().reshape(-1, 4) for one in (all_of_them, some)]
+    assert 0 < len(names[1]) < 0.5 * len(some.flux)  # the faintest are drawn by lot
+    np.testing.assert_array_equal(names[0][-len(names[1]) :], names[1])
