@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The search for triangles of light that cover a point: none is passed by, and draws do not depend on the others."""
+"""The search for triangles of light that cover a point: none is passed by, and none depends on the others."""
 
 from __future__ import annotations
 
@@ -57,9 +57,9 @@ def total(light: SheetScene, point: mi.Point3f, turn: mi.UInt32, which: mi.UInt3
     return found_w
 
 
-@pytest.mark.parametrize("level", [1.0, 1e-2, 1e-3])
+@pytest.mark.parametrize("level", [1.0, 1e-2, 1e-4])
 def test_a_point_gets_the_light_of_all_triangles_that_cover_it(level: float) -> None:
-    """Bright ones are all found in every sample. Faint ones are found in turn, and the faintest are drawn by lot."""
+    """Bright ones are all found in every sample, and faint ones in turn."""
     light = SheetScene(sheets_over_a_square(level), PROJECTOR_AT, 1.0, samples=32)
     n, period = 1 << 16, int(light.groups[0]) * int(light.every[0])
     x, y = np.random.default_rng(0).random((2, n)).astype(np.float32)
@@ -69,16 +69,17 @@ def test_a_point_gets_the_light_of_all_triangles_that_cover_it(level: float) -> 
     irradiance = total(light, point, turn, dr.full(mi.UInt32, int(faint), n)).numpy() / (
         int(light.every[0]) if faint else 1
     )
-    assert irradiance.mean() == pytest.approx(WAYS * level, rel=0.03 if level == 1e-3 else 2e-3)
+    assert irradiance.mean() == pytest.approx(WAYS * level, rel=2e-3)
     if not faint:
         assert (np.abs(irradiance / (WAYS * level) - 1) > 1e-3).mean() < 0.01
 
 
-def test_draws_do_not_depend_on_other_triangles() -> None:
+def test_heights_do_not_depend_on_other_triangles() -> None:
     """One triangle more, which a rounding brings, changes no other."""
     all_of_them = sheets_over_a_square(1e-4)
     some = all_of_them._replace(triangles=all_of_them.triangles[7:], flux=all_of_them.flux[7:],
                                 shape=all_of_them.shape[7:], key=all_of_them.key[7:])  # fmt: skip
-    names = [SheetScene(one, PROJECTOR_AT, 1.0, 32).names.numpy().reshape(-1, 4) for one in (all_of_them, some)]
-    assert 0 < len(names[1]) < 0.5 * len(some.flux)  # the faintest are drawn by lot
-    np.testing.assert_array_equal(names[0][-len(names[1]) :], names[1])
+    scenes = [SheetScene(one, PROJECTOR_AT, 1.0, 32).scene for one in (all_of_them, some)]
+    corners = [mi.traverse(one)["light.vertex_positions"].numpy() for one in scenes]
+    assert len(np.unique(corners[0][2::3])) > 0.99 * len(corners[0]) // 9  # a height for each
+    np.testing.assert_array_equal(corners[0][63:], corners[1])

@@ -411,10 +411,10 @@ def irradiance_of(triangles, flux, position, vertices):  # type: ignore[no-untyp
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def uniform(a, b):  # type: ignore[no-untyped-def]
-    """A number in 0..1 that depends on two whole numbers alone, as evenly spread as a random one (the last step of
+def uniform(number):  # type: ignore[no-untyped-def]
+    """A number in 0..1 that depends on a whole number alone, as evenly spread as a random one (the last step of
     SplitMix64: Steele, Lea, Flood: Fast splittable pseudorandom number generators, OOPSLA 2014)."""
-    x = np.uint64(a) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(b)
+    x = np.uint64(number)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return np.float64((x ^ (x >> np.uint64(31))) >> np.uint64(11)) / 9007199254740992.0  # 2^53
@@ -469,14 +469,14 @@ def _cube(position, vertices, shape, point, edge):  # type: ignore[no-untyped-de
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def lifted(sheets, scale, is_faint, chance, groups, every, lift, flat_lift, offsets, middle):  # type: ignore[no-untyped-def]
+def lifted(sheets, scale, is_faint, groups, every, lift, flat_lift, offsets, middle):  # type: ignore[no-untyped-def]
     """The triangles of light as a scene of their own, see `sheet_scene`.
 
     Parameters
     ----------
     sheets : Sheets, as a tuple of position, normal, triangles, shape, key, and the bits of u and v of each vertex in a
         number.
-    is_faint : (t,) bool. chance : (t,) float64, probability with which a faint triangle is kept.
+    is_faint : (t,) bool.
     lift, flat_lift : (t,) float64, metres, largest distance of triangles in one place, where the receiver is curved and
         where it is flat.
     offsets : (groups + 1, 2) float64, metres, of bright triangles and of the groups of faint ones.
@@ -493,15 +493,12 @@ def lifted(sheets, scale, is_faint, chance, groups, every, lift, flat_lift, offs
     for t in range(len(triangles)):
         group, weight = 0, 1.0
         if is_faint[t]:
-            # The faintest are drawn by lot, and count for those that are not
-            if uniform(name[t], 1) >= chance[t]:
-                continue
-            group, weight = 1 + (key[t] >> 8) % groups, groups * every / chance[t]
+            group, weight = 1 + (key[t] >> 8) % groups, 1.0 * groups * every
         if not scale[t] > 0:
             continue
         a, b, c = triangles[t]
         bends = min(_cosine(normal, a, b), _cosine(normal, a, c)) < FLAT_COSINE
-        height = (lift if bends else flat_lift)[t] * (uniform(name[t], 2) - 0.5)
+        height = (lift if bends else flat_lift)[t] * (uniform(name[t]) - 0.5)
         for k in range(3):
             v = triangles[t, k]
             names[n, k] = v

@@ -49,7 +49,7 @@ CAMERA_CELL = 0.5
 is finer."""
 TOLERANCE_PX = 0.15
 """Largest error of the place of a triangle, in pixels of the projector."""
-FAINT = 0.02
+FAINT = 0.05
 """Ratio of the irradiance to direct light below which a triangle is faint. Blocks are not divided for faint light, and
 each sample sees one group of faint triangles alone."""
 SIGNIFICANT = 0.05

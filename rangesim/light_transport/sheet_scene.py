@@ -127,9 +127,8 @@ class SheetScene:
         weak = np.flatnonzero(is_faint)
         crowd = crowd_of(sheets.position, sheets.triangles[weak], sheets.shape[weak], area[weak], size / CUBES)
         is_faint[weak[crowd < CROWD]] = False
-        chance = np.minimum(level * groups * every / FAINT, 1)
         corners, names, factor = lifted(
-            columns, scale, is_faint, chance, groups, every, LIFT * distance, flat_lift, offsets, middle
+            columns, scale, is_faint, groups, every, LIFT * distance, flat_lift, offsets, middle
         )
         mesh = mi.Mesh("light", len(corners), len(names))
         parameters = mi.traverse(mesh)
