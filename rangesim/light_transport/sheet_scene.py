@@ -181,7 +181,8 @@ class SheetScene:
         place = mi.Point3f(point) - self.middle + mi.Vector3f(offset.x, offset.y, 0)
         ray = mi.Ray3f(place + mi.Vector3f(normal) * (above - way), -mi.Vector3f(normal))
         ray.maxt = 2 * above - way
-        return ray, STEP * (dr.norm(mi.Vector3f(place)) + above)
+        # The way along the ray is rounded as well, so in the middle of the scene it counts more than the coordinates
+        return ray, STEP * (dr.norm(mi.Vector3f(place)) + 10 * above)
 
     def next(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         """The next triangle on a ray."""
