@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -174,6 +175,19 @@ def test_a_plate_is_lit_on_one_side_alone(thickness_m: float) -> None:
     assert not lit_through_a_pane((0.3, 0.0, 1.4), (0.0, 0.0, 1.0), plate=plate).any()
     alone = lit_through_a_pane((0.3, 0.0, 0.6), (0.0, 0.0, 1.0), plate=wall(1.0, matte()))
     np.testing.assert_allclose(lit, alone, rtol=2e-3)
+
+
+def test_layers_of_one_mesh_that_face_the_same_way_do_not_light_each_other(tmp_path: Path) -> None:
+    """A camera between two layers that are 0.5 mm apart sees the shadow of the front one."""
+    corners = [(-3, -3, 1.0005), (3, -3, 1.0005), (3, 3, 1.0005), (-3, 3, 1.0005),
+               (-0.2, -0.2, 1), (0.2, -0.2, 1), (0.2, 0.2, 1), (-0.2, 0.2, 1)]  # fmt: skip
+    lines = ["ply", "format ascii 1.0", "element vertex 8", *(f"property float {c}" for c in "xyz"), "element face 4",
+             "property list uchar int vertex_indices", "end_header", *(f"{x} {y} {z}" for x, y, z in corners),
+             "3 0 2 1", "3 0 3 2", "3 4 6 5", "3 4 7 6"]  # fmt: skip
+    (tmp_path / "layers.ply").write_text("\n".join(lines) + "\n")
+    layers = {"type": "ply", "filename": str(tmp_path / "layers.ply"), "face_normals": True, "bsdf": matte()}
+    lit = lit_through_a_pane((0.3, 0.0, 0.6), (0.0, 0.0, 1.0), layers=layers).mean()
+    assert lit_through_a_pane((0.05, 0.02, 1.0002), (0.05, 0.02, 1.0005), layers=layers).mean() < 0.1 * lit
 
 
 def test_light_that_comes_by_several_ways_adds_up() -> None:

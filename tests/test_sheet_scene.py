@@ -46,11 +46,16 @@ def total(light: SheetScene, point: mi.Point3f, turn: mi.UInt32, which: mi.UInt3
     way, found_w, last = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.full(mi.UInt32, 0xFFFFFFFF, n)
     looks = dr.full(mi.Bool, True, n)
     while looks:
-        ray, step = light.ray(point, mi.Normal3f(0, 0, -1), turn, which, way)
+        ray, step, above = light.ray(point, mi.Normal3f(0, 0, -1), turn, which, way)
         found = light.next(ray, looks)
         looks &= found.is_valid()
         irradiance, _ = light.irradiance(
-            found, dr.zeros(mi.UInt32, n), mi.Normal3f(0, 0, -1), looks & (found.prim_index != last)
+            found,
+            ray.maxt - found.t - above,
+            above,
+            dr.zeros(mi.UInt32, n),
+            mi.Normal3f(0, 0, -1),
+            looks & (found.prim_index != last),
         )
         found_w += irradiance
         last, way = found.prim_index, way + found.t + step

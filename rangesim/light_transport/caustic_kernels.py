@@ -484,12 +484,14 @@ def lifted(sheets, scale, is_faint, groups, every, lift, flat_lift, offsets, mid
 
     Returns
     -------
-    corners : (3 k, 3) float32, metres. names : (k, 4) uint32, vertices and shape. factor : (k,) float32.
+    corners : (3 k, 3) float32, metres. names : (k, 4) uint32, vertices and shape.
+    terms : (k, 3) float32, what the irradiance at the vertices is multiplied by, height over the surface in metres, and
+        1 where the receiver is flat.
     """
     position, normal, triangles, shape, key, image = sheets
     name = _names_of(triangles, key, image)
     corners, names = np.empty((3 * len(triangles), 3), np.float32), np.empty((len(triangles), 4), np.uint32)
-    factor, n = np.empty(len(triangles), np.float32), 0
+    terms, n = np.empty((len(triangles), 3), np.float32), 0
     for t in range(len(triangles)):
         group, weight = 0, 1.0
         if is_faint[t]:
@@ -505,6 +507,7 @@ def lifted(sheets, scale, is_faint, groups, every, lift, flat_lift, offsets, mid
             for axis in range(3):
                 place = position[v, axis] - middle[axis] + height * normal[v, axis]
                 corners[3 * n + k, axis] = place + (offsets[group, axis] if axis < 2 else 0.0)
-        names[n, 3], factor[n] = shape[t], scale[t] * weight
+        names[n, 3] = shape[t]
+        terms[n, 0], terms[n, 1], terms[n, 2] = scale[t] * weight, height, 0.0 if bends else 1.0
         n += 1
-    return corners[: 3 * n], names[:n], factor[:n]
+    return corners[: 3 * n], names[:n], terms[:n]

@@ -80,6 +80,9 @@ HALVINGS = 4
 hangs over an edge is lost; with four, it is a sixteenth of what it would be with none."""
 SHIFT_PX = np.array([0.0137, 0.0071])
 """Largest shift of the lattice against the edges of pixels, in pixels: more than rounding, less than anything seen."""
+BEND = 0.01
+"""Difference in radians between the normals at the sides of a photon's parallelogram: enough to tell that its receiver
+may be curved (`sheet_scene`), and too little to change anything else."""
 MIN_SIDE_M = 1e-12
 """Smallest length in metres by which another is divided, because light may land in a point."""
 STEP_PX = 0.02
@@ -477,7 +480,10 @@ def _parallelograms(
     # The direction of flight is the gradient of the optical length
     further = np.einsum("mij,mj->mi", ends @ sides, found.ior[this, None] * found.direction[this]).ravel()
     moved = np.asarray(corners.reshape(-1, 3), np.float32)
-    four = four._replace(position=moved, length=np.asarray(four.length + further, np.float32))
+    # A receiver may bend within a parallelogram, so the normals at the corners differ
+    bends = BEND * plain / np.linalg.norm(plain, axis=2, keepdims=True)
+    normals = np.asarray((normal[:, None] + ends @ bends).reshape(-1, 3), np.float32)
+    four = four._replace(position=moved, normal=normals, length=np.asarray(four.length + further, np.float32))
     return _sheets(four, uv.reshape(-1, 2), triangles, flux, 0.0)
 
 

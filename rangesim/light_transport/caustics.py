@@ -111,11 +111,11 @@ def caustic_light(
         looks, exclude=[si, bsdf, vertex, shape, normal, seen, turn, is_later, place, is_turn, weight_of_bright]
     ):
         # ---- The next triangle: each bright one counts, and one of the faint ones stands for all of them -----
-        ray, step = sheets.ray(si.p, normal, turn, which, way)
+        ray, step, above = sheets.ray(si.p, normal, turn, which, way)
         found = sheets.next(ray, looks)
         hit = looks & found.is_valid()
         is_new = hit & (found.prim_index != last)
-        irradiance, is_here = sheets.irradiance(found, shape, normal, is_new)
+        irradiance, is_here = sheets.irradiance(found, ray.maxt - found.t - above, above, shape, normal, is_new)
         irradiance *= dr.select(which == 0, weight_of_bright, 1)
         total += irradiance
         fraction = dr.select(is_here, irradiance / total, 0)

@@ -28,6 +28,9 @@ LIFT = 4e-4
 times the rounding of single precision, which has to tell all triangles apart that cover a point. They are lifted off
 their surface to both sides of it, so that they are as large as on the surface on average. A larger distance would make
 triangles on curved surfaces too large or too small."""
+FLAT = 0.02
+"""Largest distance of a point from the plane of a triangle on a flat receiver, as a fraction of the distance to which
+rays look: a hundred times the rounding of single precision."""
 STEP = 6e-8
 """Step behind a triangle, as a fraction of the coordinates: the rounding of single precision. With a smaller step, a
 ray could meet the same triangle for ever; a larger one would pass triangles by. Coordinates count from the middle of
@@ -127,7 +130,7 @@ class SheetScene:
         weak = np.flatnonzero(is_faint)
         crowd = crowd_of(sheets.position, sheets.triangles[weak], sheets.shape[weak], area[weak], size / CUBES)
         is_faint[weak[crowd < CROWD]] = False
-        corners, names, factor = lifted(
+        corners, names, terms = lifted(
             columns, scale, is_faint, groups, every, LIFT * distance, flat_lift, offsets, middle
         )
         mesh = mi.Mesh("light", len(corners), len(names))
@@ -143,7 +146,7 @@ class SheetScene:
             [sheets.slowness, sheets.length - 0.5 * along, sheets.u, sheets.v, at_vertex, sheets.cosine]
         )
         self.looks, self.names = mi.Float(aligned(looks, np.float32)), mi.UInt32(aligned(names, np.uint32))
-        self.factor, self.offsets = mi.Float(aligned(factor, np.float32)), mi.Float(aligned(offsets, np.float32))
+        self.terms, self.offsets = mi.Float(aligned(terms, np.float32)), mi.Float(aligned(offsets, np.float32))
         self.groups, self.every = dr.opaque(mi.UInt32, groups), dr.opaque(mi.UInt32, every)
         self.projector_at, self.middle = (
             mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in place)) for place in (projector_at, middle)
@@ -168,9 +171,10 @@ class SheetScene:
         turn: mi.UInt32,
         which: mi.UInt32,
         way: mi.Float,
-    ) -> tuple[mi.Ray3f, mi.Float]:
+    ) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
         """The rest of the ray through the triangles that may cover a point, after a way in metres; and the step in
-        metres from a triangle that it meets to where the next one is looked for.
+        metres from a triangle that it meets to where the next one is looked for; and the distance from the point to
+        which rays look, in metres.
 
         which : UInt32; 0: through bright triangles, 1: through those of the group of faint ones whose turn it is.
         """
@@ -182,18 +186,29 @@ class SheetScene:
         ray = mi.Ray3f(place + mi.Vector3f(normal) * (above - way), -mi.Vector3f(normal))
         ray.maxt = 2 * above - way
         # The way along the ray is rounded as well, so in the middle of the scene it counts more than the coordinates
-        return ray, STEP * (dr.norm(mi.Vector3f(place)) + 10 * above)
+        return ray, STEP * (dr.norm(mi.Vector3f(place)) + 10 * above), above
 
     def next(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         """The next triangle on a ray."""
         return self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
     def irradiance(
-        self, found: mi.PreliminaryIntersection3f, shape: mi.UInt32, normal: mi.Normal3f, active: mi.Bool
+        self,
+        found: mi.PreliminaryIntersection3f,
+        height: mi.Float,
+        above: mi.Float,
+        shape: mi.UInt32,
+        normal: mi.Normal3f,
+        active: mi.Bool,
     ) -> tuple[mi.Float, mi.Bool]:
-        """Irradiance (W/m2) of a triangle that was found, and whether it lies on this side of this shape."""
+        """Irradiance (W/m2) of a triangle that was found, and whether it lies on this side of this shape.
+
+        height, above : metres, height of the triangle over the point, and distance to which rays look.
+        """
         names = dr.gather(mi.Vector4u, self.names, found.prim_index, active)
-        is_here = active & (names.w == shape)
+        terms = dr.gather(mi.Vector3f, self.terms, found.prim_index, active)
+        # On a flat receiver a triangle is as high as it was lifted; otherwise it lies on another part of the shape
+        is_here = active & (names.w == shape) & (dr.abs(height - terms.y) < dr.select(terms.z > 0, FLAT * above, above))
         b1, b2 = found.prim_uv.x, found.prim_uv.y
         total = mi.Float(0)
         for index, weight in zip((names.x, names.y, names.z), (1 - b1 - b2, b1, b2), strict=True):
@@ -201,7 +216,7 @@ class SheetScene:
         direction = dr.gather(mi.Vector4f, self.looks, 2 * names.x, is_here).xyz
         cosine = dr.gather(mi.Float, self.looks, 8 * names.x + 7, is_here)
         is_here &= dr.abs(dr.dot(dr.normalize(direction), normal) - cosine) < MAX_COSINE_DIFFERENCE
-        total *= dr.gather(mi.Float, self.factor, found.prim_index, is_here)
+        total *= terms.x
         return dr.select(is_here, total, 0), is_here & (total > 0)
 
     def light(self, place: Place, point: mi.Point3f, active: mi.Bool) -> Light:
