@@ -130,6 +130,19 @@ def test_light_is_the_same_however_much_of_it_triangles_carry(monkeypatch: pytes
     assert thrown[1] == pytest.approx(thrown[0], rel=0.02)
 
 
+def test_photons_do_not_hang_over_the_edges_of_a_receiver() -> None:
+    """Their light would be lost there. The grid's triangles lie on the receiver, because their corners do."""
+    half = 0.03
+    plate = {"type": "cube", "to_world": transform().translate([0.02, 0.01, 1.3]).scale(half), "bsdf": matte()}
+    ball = {"type": "sphere", "center": [0.0, 0.0, 0.6], "radius": 0.1, "bsdf": GLASS}
+    sheets = light_of(scene_of(plate=plate, ball=ball), rig_of(CAMERA, Intrinsics.from_fov(80, 60, 40)))
+    n = number_of_grid(sheets)
+    assert sheets.flux[n:].sum() > 0.05 * sheets.flux.sum()
+    corners = sheets.position[sheets.triangles[n:]] - [0.02, 0.01, 1.3]
+    hangs = (np.abs(corners) > 1.001 * half).any(axis=2).any(axis=1)
+    assert sheets.flux[n:][hangs].sum() < 0.1 * sheets.flux[n:].sum()
+
+
 # ---- Receivers --------------------------------------------------------------------------------------
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -36,6 +37,7 @@ from rangesim.light_transport.delta_surfaces import meets_delta
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import R2, aligned
 from rangesim.light_transport.specular_tree import Landings, SpecularTree
+from rangesim.light_transport.surfaces import number_of
 from rangesim.light_transport.traced_scene import TracedScene
 
 BLOCK_PX = 8.0
@@ -73,6 +75,9 @@ for triangles (`sheet_scene`) reach as far."""
 MAX_SIDE = 0.025
 """Longest side of the parallelogram of a photon, as a fraction of its way from the projector. Light that spreads
 farther does not do so evenly."""
+HALVINGS = 4
+"""Largest number of times that the parallelogram of a photon is halved until all of it lies on the receiver. Light that
+hangs over an edge is lost; with four, it is a sixteenth of what it would be with none."""
 SHIFT_PX = np.array([0.0137, 0.0071])
 """Largest shift of the lattice against the edges of pixels, in pixels: more than rounding, less than anything seen."""
 MIN_SIDE_M = 1e-12
@@ -355,8 +360,21 @@ class _Tracing:
         corners, edges = cells[:, :2].astype(np.int64), cells[:, 2].astype(np.int64)
         which = sides_of_photons(corners, edges, lists, self.columns, self.coarsest, chains, taken)
         power = watts * size.prod(axis=1) / chance
-        made = _parallelograms(found, which, size, place, power, self.angle, self.at)
+        made = _parallelograms(found, which, size, place, power, self.angle, self.at, self._lie_on)
         return made._replace(cut=float((lost[::3] * power).sum() / made.flux.sum()) if len(made.flux) else 0.0)
+
+    def _lie_on(self, points: np.ndarray, normal: np.ndarray, shape: np.ndarray) -> np.ndarray:
+        """(n,) bool, whether points (n, 3), metres, lie on shapes of these numbers (n,), as far as one looks along
+        their normals (n, 3)."""
+        reach = mi.Float(aligned(MAX_SAG * np.linalg.norm(points - self.at, axis=1), np.float32))
+        p, n = (mi.Vector3f(*(mi.Float(aligned(c, np.float32)) for c in rows.T)) for rows in (points, normal))
+        found, here = dr.zeros(mi.Bool, len(points)), mi.UInt32(aligned(shape, np.uint32))
+        for side in (n, -n):  # something may stand on the shape
+            ray = mi.Ray3f(mi.Point3f(p + reach * side), -side)
+            ray.maxt = 2 * reach
+            met = self.tree.traced.scene.ray_intersect_preliminary(ray, coherent=False)
+            found |= met.is_valid() & (number_of(met.shape) == here)
+        return found.numpy()
 
     def _follow(
         self, pixels: np.ndarray, lens: np.ndarray | None, fewest: float, states: np.ndarray | None = None
@@ -399,6 +417,7 @@ def _parallelograms(
     power: np.ndarray,
     angle: float,
     projector_at: np.ndarray,
+    lie_on: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
 ) -> Sheets:
     """Sheets of photons, two triangles each.
 
@@ -407,6 +426,7 @@ def _parallelograms(
     found : Landings of the three points of each photon. which : (m, 3) int64, see `sides_of_photons`.
     size, place : (n, 2) float64, pixels, sizes of the photons' cells and places of the photons.
     power : (n,) float64, watts, power that a photon stands for. angle : radians, of a pixel. projector_at : (3,).
+    lie_on : function that says whether points with normals lie on shapes.
     """
     this = which[:, 0]
     photon = found.point[this] // 3
@@ -429,6 +449,15 @@ def _parallelograms(
     shrinks = np.minimum(np.minimum(longest / length, flat), 1)
     sides *= shrinks[..., None]
     ends = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
+    hangs = np.arange(len(this))
+    for _ in range(HALVINGS):
+        if not len(hangs):
+            break
+        corners = (centre[hangs, None] + ends @ sides[hangs]).reshape(-1, 3)
+        normals, shapes = (np.repeat(column[this[hangs]], 4, axis=0) for column in (found.normal, found.shape))
+        hangs = hangs[~lie_on(corners, normals, shapes).reshape(-1, 4).all(axis=1)]
+        sides[hangs] *= 0.5
+        shrinks[hangs] *= 0.5
     corners = centre[:, None] + ends @ sides
     uv = place[photon][:, None] + ends * (edges * shrinks)[:, None]
     four = Landings(*(np.repeat(column[this], 4, axis=0) for column in found))
