@@ -218,7 +218,7 @@ def test_launches_of_any_size_give_the_same_bytes(
     monkeypatch.setattr(kernel_launches, "evaluate", evaluate)
     monkeypatch.setattr(kernel_launches, "MAX_GROWTH", 1.0)
     assert trace() == expected
-    assert (number > 40) == (units < 1 << 30)
+    assert (number > 20) == (units < 1 << 30)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 7, 100, 255, 256, 1200, 5003])

@@ -101,6 +101,8 @@ class SpecularTree:
     def __init__(self, traced: TracedScene, launches: Launches) -> None:
         shapes = traced.scene.shapes()
         self.traced, self.launches = traced, launches
+        # Keys name shapes by their order in the scene: their own numbers depend on what else the process has loaded
+        self.order = mi.UInt32(table_of(traced.scene, np.arange(len(shapes), dtype=np.uint32)))
         self.is_flat = mi.Bool(table_of(traced.scene, [_is_flat(shape) for shape in shapes]))
         self.is_exact = mi.Bool(table_of(traced.scene, [_is_exact(shape.bsdf()) for shape in shapes]))
         self.max_chain = dr.opaque(mi.UInt32, MAX_CHAIN)
@@ -244,17 +246,18 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
             part *= dr.select(hit, dr.exp(-state.inside.sigma_t * dr.norm(point - state.previous)), 1)
         state.length = state.length_to(point, hit)
         bsdf, shape = si.bsdf(ray), number_of(si.shape)
+        order = dr.gather(mi.UInt32, tree.order, shape, hit)
         mirrors = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
 
         # ---- Light that the surface scatters lands here ------------------------------------------------
         lands = hit & can_be_vertex(bsdf) & (chain > 0)
-        here = [(key ^ shape) * HASH_STEP, shape, part, state.length, state.ior, point, mi.Vector3f(si.n), ray.d]
+        here = [(key ^ order) * HASH_STEP, shape, part, state.length, state.ior, point, mi.Vector3f(si.n), ray.d]
         landing = _selected(lands, here, landing)
 
         # ---- The rest splits into a reflected and a refracted part -------------------------------------
         face = dr.round(si.n * NORMAL_STEPS)
         face = [mi.UInt32(mi.Int32(x)) for x in (face.x, face.y, face.z)]
-        place = shape + dr.select(dr.gather(mi.Bool, tree.is_flat, shape, hit), _mixed(face), 0)
+        place = order + dr.select(dr.gather(mi.Bool, tree.is_flat, shape, hit), _mixed(face), 0)
         splits = mirrors & (dr.gather(mi.Bool, tree.is_exact, shape, hit) | crosses)
         bs_r, weight_r = bsdf.sample(reflects, si, mi.Float(0.5), mi.Point2f(0.5, 0.5), splits)
         bs_t, weight_t = bsdf.sample(transmits, si, mi.Float(0.5), mi.Point2f(0.5, 0.5), splits)
