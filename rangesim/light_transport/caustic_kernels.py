@@ -469,14 +469,15 @@ def _cube(position, vertices, shape, point, edge):  # type: ignore[no-untyped-de
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def lifted(sheets, scale, is_faint, groups, every, lift, flat_lift, offsets, middle):  # type: ignore[no-untyped-def]
+def lifted(sheets, scale, is_faint, chance, salt, groups, every, lift, flat_lift, offsets, middle):  # type: ignore[no-untyped-def]
     """The triangles of light as a scene of their own, see `sheet_scene`.
 
     Parameters
     ----------
     sheets : Sheets, as a tuple of position, normal, triangles, shape, key, and the bits of u and v of each vertex in a
         number.
-    is_faint : (t,) bool.
+    is_faint : (t,) bool. chance : (t,) float64, probability with which a faint triangle is kept; it then counts for
+        those that are not. salt : uint64, a random number of the pass.
     lift, flat_lift : (t,) float64, metres, largest distance of triangles in one place, where the receiver is curved and
         where it is flat.
     offsets : (groups + 1, 2) float64, metres, of bright triangles and of the groups of faint ones.
@@ -495,7 +496,9 @@ def lifted(sheets, scale, is_faint, groups, every, lift, flat_lift, offsets, mid
     for t in range(len(triangles)):
         group, weight = 0, 1.0
         if is_faint[t]:
-            group, weight = 1 + (key[t] >> 8) % groups, 1.0 * groups * every
+            if uniform(np.uint64(name[t]) ^ salt) >= chance[t]:
+                continue
+            group, weight = 1 + (key[t] >> 8) % groups, groups * every / chance[t]
         if not scale[t] > 0:
             continue
         a, b, c = triangles[t]

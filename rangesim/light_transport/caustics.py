@@ -50,11 +50,12 @@ def caustic_sheets(
     return trace_sheets(traced, rigs[0].projector_power_w, settings.seed, pixel_rad, report)
 
 
-def sheet_scene(sheets: Sheets | None, rig: Rig, samples: int) -> SheetScene | None:
-    """The triangles as kernels see them; None if there are none. `samples` is the smallest number of a pixel."""
+def sheet_scene(sheets: Sheets | None, rig: Rig, samples: int, seed: int) -> SheetScene | None:
+    """The triangles as kernels see them; None if there are none. `samples` is the smallest number of a pixel, and
+    `seed` that of the pass."""
     if sheets is None or not len(sheets.flux):
         return None
-    return SheetScene(sheets, rig.T_world_projector[:3, 3], rig.projector_irradiance, samples)
+    return SheetScene(sheets, rig.T_world_projector[:3, 3], rig.projector_irradiance, samples, seed)
 
 
 class Vertex(NamedTuple):

@@ -45,6 +45,9 @@ looked, a pass would take a fifth longer."""
 CROWD, CUBES = 2.0, 64
 """Number of faint triangles over a point from which they are dealt out to groups, because every sample looks for
 fewer of them at little cost; and number of cubes along the lit part of the scene, in which they are counted."""
+FAINTEST = 1e-3
+"""Ratio of the irradiance to direct light below which faint triangles are drawn by lot, anew for each seed. There are
+many of them, and together they bring a few thousandths of the light."""
 SPACING = 1.5
 """Distance between groups of faint triangles, as a multiple of the size of the lit part of the scene, so that groups do
 not touch."""
@@ -104,10 +107,13 @@ class SheetScene:
     sheets : Sheets, at least one triangle.
     projector_at : (3,) float, metres, world. irradiance : W/m2, of the projector's direct light at 1 m.
     samples : int, smallest number of samples of a pixel, which bounds the number of groups.
+    seed : int, decides which of the faintest triangles are kept.
     shapes : int, number of entries of tables by shape.
     """
 
-    def __init__(self, sheets: Sheets, projector_at: np.ndarray, irradiance: float, samples: int) -> None:
+    def __init__(
+        self, sheets: Sheets, projector_at: np.ndarray, irradiance: float, samples: int, seed: int = 0
+    ) -> None:
         period = 1 << int(np.log2(max(1, min(samples // 2, PERIOD))))  # in each half of the samples
         every = min(period, EVERY)
         groups = period // every
@@ -130,8 +136,10 @@ class SheetScene:
         weak = np.flatnonzero(is_faint)
         crowd = crowd_of(sheets.position, sheets.triangles[weak], sheets.shape[weak], area[weak], size / CUBES)
         is_faint[weak[crowd < CROWD]] = False
+        chance = np.minimum(level / FAINTEST, 1)
+        salt = np.random.default_rng(seed).integers(1 << 63, dtype=np.uint64)
         corners, names, terms = lifted(
-            columns, scale, is_faint, groups, every, LIFT * distance, flat_lift, offsets, middle
+            columns, scale, is_faint, chance, salt, groups, every, LIFT * distance, flat_lift, offsets, middle
         )
         mesh = mi.Mesh("light", len(corners), len(names))
         parameters = mi.traverse(mesh)
