@@ -213,6 +213,17 @@ def _longer(array, room):  # type: ignore[no-untyped-def]
 
 
 @cached_njit(nogil=True, error_model="numpy")
+def _write(triangles, flux, n, a, b, c, part, half_cell):  # type: ignore[no-untyped-def]
+    """Write the triangle of three landings and its flux to row n; returns the number of the next row.
+
+    `half_cell` is the area of the triangle in the image, in pixels.
+    """
+    triangles[n, 0], triangles[n, 1], triangles[n, 2] = a, b, c
+    flux[n, 0] = half_cell * (part[a] + part[b] + part[c]) / 3
+    return n + 1
+
+
+@cached_njit(nogil=True, error_model="numpy")
 def smooth_chains(blocks, grid, landings, rule, meets, taken, used):  # type: ignore[no-untyped-def]
     """Make triangles of the chains that are smooth over a block, and say which blocks are to be divided.
 
@@ -258,10 +269,7 @@ def smooth_chains(blocks, grid, landings, rule, meets, taken, used):  # type: ig
                     triangles, flux = _longer(triangles, n + 8), _longer(flux, n + 8)
                     for k in (0, 1, 3, 4):
                         for c, d in ((k + 1, k + 4), (k + 4, k + 3)):
-                            triangles[n, 0], triangles[n, 1], triangles[n, 2] = r[k], r[c], r[d]
-                            light = landings.part[r[k]] + landings.part[r[c]] + landings.part[r[d]]
-                            flux[n, 0] = half_cell * light / 3
-                            n += 1
+                            n = _write(triangles, flux, n, r[k], r[c], r[d], landings.part, half_cell)
                     taken = _with_room(taken, used)
                     name = _name(x[b], y[b], step, grid.columns, key)
                     taken[place_in(taken, name)] = name
@@ -275,7 +283,7 @@ def smooth_chains(blocks, grid, landings, rule, meets, taken, used):  # type: ig
 def cells_of(blocks, grid, landings, rule, dropped, meets, taken, used):  # type: ignore[no-untyped-def]
     """Make triangles of what is left in the cells of blocks that are not divided.
 
-    dropped : (points,) float32, fraction of the light of each point that was not followed.
+    dropped : (points,) float64, fraction of the light of each point that was not followed.
     meets : (4 n,) bool, whether some ray through the cell meets a delta surface first.
 
     Returns
@@ -313,10 +321,7 @@ def cells_of(blocks, grid, landings, rule, dropped, meets, taken, used):  # type
                     if is_whole and _lies_flat(r, landings, rule):
                         triangles, flux = _longer(triangles, n + 2), _longer(flux, n + 2)
                         for c, d in ((1, 3), (3, 2)):
-                            triangles[n, 0], triangles[n, 1], triangles[n, 2] = r[0], r[c], r[d]
-                            light = landings.part[r[0]] + landings.part[r[c]] + landings.part[r[d]]
-                            flux[n, 0] = half_cell * light / 3
-                            n += 1
+                            n = _write(triangles, flux, n, r[0], r[c], r[d], landings.part, half_cell)
                         taken = _with_room(taken, used)
                         taken[place_in(taken, name)] = name
                         used += 1
@@ -362,8 +367,7 @@ def sides_of_photons(cells, step, photons, columns, coarsest, landings, taken): 
 
     Returns
     -------
-    which : (m,) int64, landings. right, below : (m,) int64, landings of the same chain beside them; -1 if there are
-        none.
+    which : (m, 3) int64, landings, and those of the same chain to their right and below them; -1 if there are none.
     """
     which, n = np.empty((len(landings.key), 3), np.int64), 0
     for i in range(len(cells)):

@@ -65,10 +65,11 @@ time would go into parts that carry little."""
 LEFT = 0.1
 """Fraction of the light of a cell that is left to photons, above which it gets one for certain; the others are drawn by
 lot. If it were smaller, many photons would carry little light."""
-PHOTONS, MAX_PARTS = 1 << 13, 8
-"""Number of photons of a pass, as far as cells that are left can be divided into parts of their own, and the largest
-number of parts along an edge. Cells that are more than so many have a photon each. With twice as many photons, their
-noise would be smaller by a third."""
+PHOTONS = 1 << 13
+"""Number of photons of a pass, as far as cells that are left can be divided into parts of their own. If there are more
+cells than this, each has a photon. With twice as many photons, their noise would be smaller by a third."""
+MAX_PARTS = 8
+"""Largest number of parts along the edge of a cell that is left; an eighth of a pixel is finer than anything seen."""
 MAX_SAG = 1e-3
 """Largest height of a curved receiver over a triangle, as a fraction of its distance from the projector; rays that look
 for triangles (`sheet_scene`) reach as far."""
@@ -128,8 +129,9 @@ class Lists(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """What decides whether a block is divided, see `TOLERANCE_PX`, `FAINT` and `SIGNIFICANT`; `angle` is that of a
-    pixel in radians, `projector_at` the place of the projector (3,) and `sag` is `MAX_SAG`."""
+    """The numbers that decide whether a block is divided, see `TOLERANCE_PX`, `FAINT` and `SIGNIFICANT`.
+
+    `angle` is that of a pixel in radians, `projector_at` the place of the projector (3,) and `sag` is `MAX_SAG`."""
 
     angle: float
     projector_at: np.ndarray
@@ -488,7 +490,7 @@ def _parallelograms(
 
 
 class _Delta:
-    """Where rays through the image meet a delta surface first.
+    """The part of the image whose rays meet a delta surface first.
 
     Parameters
     ----------

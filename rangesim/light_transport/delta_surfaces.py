@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which surfaces have delta interactions (glass, mirrors, thin panes, coats, holes), and which rays meet them first."""
+"""Surfaces that have delta interactions (glass, mirrors, thin panes, coats, holes), and rays that meet them first."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ most of it: at each delta surface it takes the more likely way, off the surface 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -42,19 +43,19 @@ class FirstScatterers:
     ----------
     scene : mitsuba.Scene
     surfaces : the scene itself or its `Surfaces`, to intersect rays with.
-
-    Attributes
-    ----------
-    cosines : (shapes + 1,) float32, `rangesim.scene.materials.sharing_cosine` of each shape; NaN for none (index -1).
     """
 
     def __init__(self, scene: mi.Scene, surfaces: mi.Scene | Surfaces) -> None:
-        shapes, self.surfaces = scene.shapes(), surfaces
+        shapes, self.scene, self.surfaces = scene.shapes(), scene, surfaces
         matte, specular = [is_matte(s) for s in shapes], [is_specular(s) for s in shapes]
-        self.cosines = np.array([*map(sharing_cosine, shapes), np.nan], np.float32)
         self.has_chains = any(specular)
         self.index_of = mi.Int32(table_of(scene, np.arange(len(shapes), dtype=np.int32)))
         self.matte_of, self.specular_of = (mi.Bool(table_of(scene, of)) for of in (matte, specular))
+
+    @cached_property
+    def cosines(self) -> np.ndarray:
+        """(shapes + 1,) float32, `rangesim.scene.materials.sharing_cosine` of each shape; NaN for none (index -1)."""
+        return np.array([*map(sharing_cosine, self.scene.shapes()), np.nan], np.float32)
 
     def index(self, si: mi.SurfaceInteraction3f, hit: mi.Bool) -> mi.Int32:
         """Index of the shape of each surface in the scene; -1 without a `hit`."""

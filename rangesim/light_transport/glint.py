@@ -59,9 +59,10 @@ MAX_PATHS = 1 << 22
 (docs/benchmarks.md)."""
 MIN_PATHS_PER_PIXEL = 64
 """Smallest number of paths per pixel, however many pixels there are, because fewer would make glint noisy."""
-PATHS_PER_SAMPLE, MAX_PATHS_PER_PIXEL = 64, 4096
-"""Largest number of paths per pixel for each of its samples, so that a pass of few samples is quick, and however many
-samples it has, so that a single highlight takes little time."""
+PATHS_PER_SAMPLE = 64
+"""Largest number of paths per pixel for each of its samples, so that a pass of few samples is quick."""
+MAX_PATHS_PER_PIXEL = 4096
+"""Largest number of paths per pixel, however few pixels there are, so that a single highlight takes little time."""
 SCREENING = 8
 """Ratio of all paths of a pixel to those that are sent first, a power of two. The number of paths then doubles as long
 as one of them came close, so that pixels which do not see the lens cost little."""

@@ -38,13 +38,18 @@ the lit part of the scene, where they are small."""
 MARGIN = 1.4
 """Ratio of the height from which a ray looks, and the depth to which it does, to those of the edges of triangles: the
 middle of a triangle is 4 / 3 times as far from a curved surface as its edges."""
-PERIOD, EVERY = 16, 4
-"""Number of samples after which a pixel has looked into all groups of faint triangles, and the distance of two samples
-that look into one at all. With a longer period, faint light would be noisy in passes of few samples; if every sample
-looked, a pass would take a fifth longer."""
-CROWD, CUBES = 2.0, 64
+PERIOD = 16
+"""Largest number of samples after which a half of a pixel's samples has looked into all groups of faint triangles. With
+a longer period, faint light would be noisy in passes of few samples."""
+EVERY = 4
+"""Largest number of samples of which one looks for faint triangles. If every sample looked, a pass would take a fifth
+longer."""
+CROWD = 2.0
 """Number of faint triangles over a point from which they are dealt out to groups, because every sample looks for
-fewer of them at little cost; and number of cubes along the lit part of the scene, in which they are counted."""
+fewer of them at little cost."""
+CUBES = 64
+"""Number of cubes along the lit part of the scene, in which faint triangles are counted. With fewer cubes, the count of
+a small spot would be that of its surroundings."""
 FAINTEST = 1e-3
 """Ratio of the irradiance to direct light below which faint triangles are drawn by lot, anew for each seed. There are
 many of them, and together they bring a few thousandths of the light."""
@@ -108,7 +113,6 @@ class SheetScene:
     projector_at : (3,) float, metres, world. irradiance : W/m2, of the projector's direct light at 1 m.
     samples : int, smallest number of samples of a pixel, which bounds the number of groups.
     seed : int, decides which of the faintest triangles are kept.
-    shapes : int, number of entries of tables by shape.
     """
 
     def __init__(
@@ -169,7 +173,7 @@ class SheetScene:
         return known & dr.gather(mi.Bool, self.is_lit, shape, known)
 
     def is_turn(self, turn: mi.UInt32, which: mi.UInt32) -> mi.Bool:
-        """Whether it is this turn; each of them comes once in `every` samples."""
+        """True where it is this turn; each turn comes once in `every` samples."""
         return turn % self.every == which % self.every
 
     def ray(

@@ -11,7 +11,7 @@ A launch follows every ray along its stronger part. The weaker parts are stored,
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -21,7 +21,6 @@ import numpy as np
 from rangesim.light_transport.camera_rays import Device, PrimaryRay
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import Continued
-from rangesim.light_transport.scattering import Medium
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray
 from rangesim.light_transport.strategies import can_be_vertex, is_delta
@@ -31,9 +30,12 @@ from rangesim.light_transport.traced_scene import TracedScene
 PARTS = 6
 """Largest number of weaker parts that a ray stores in a launch. Light through three panes meets six faces. A part that
 finds no room is dropped by a point of the grid; a photon then follows one of the two parts by chance."""
-LAUNCHES, LAUNCHES_OF_PHOTONS = 3, 2
-"""Largest numbers of launches. In the last one nothing is stored: points of the grid drop weaker parts, and photons
-choose one part by chance. Light that was the weaker part twice carries little."""
+LAUNCHES = 3
+"""Largest number of launches for points of the grid. In the last one nothing is stored: weaker parts are dropped,
+because light that was the weaker part twice carries little."""
+LAUNCHES_OF_PHOTONS = 2
+"""Largest number of launches for photons. In the last one they choose one part by chance, because most of their light
+is in the first."""
 HASH_STEP = 0x9E3779B1
 """Odd factor of the hash that names chains: 2^32 divided by the golden ratio, rounded to a prime."""
 NORMAL_STEPS = 1000.0
@@ -67,7 +69,7 @@ class Parts(NamedTuple):
 
 
 class Landings(NamedTuple):
-    """Where light landed beyond delta interactions; m landings.
+    """The m places where light landed beyond delta interactions.
 
     point : (m,) uint32, index of the point of the image.
     key : (m,) uint32, name of the chain and of the shape that it ends on.
@@ -150,7 +152,7 @@ class SpecularTree:
             lanes = dr.width(parts.part)
             stored = _Stored(leaves, lanes)
             landing, lost = _strongest(self, parts, stored, chance)
-            self.launches.evaluate([list(landing), stored.leaves, lost], lanes)
+            self.launches.evaluate([landing, stored.leaves, lost], lanes)
             dropped += np.bincount(parts.point.numpy(), lost.numpy(), n)  # in the same order on any machine
             landed = dr.compress(landing.part > 0)
             columns = [dr.gather(type(x), x, landed) for x in (parts.point, *_leaves(landing))]
@@ -165,8 +167,9 @@ class SpecularTree:
         return Landings(*numbers[:6], *vectors), dropped
 
 
-class _Landing(NamedTuple):
-    """A landing in each lane, as in `Landings`; its part is 0 where there is none."""
+@dataclass
+class _Landing:
+    """A landing in each lane, as in `Landings`; its part is 0 where there is none. Loops of Dr.Jit carry it."""
 
     key: mi.UInt32
     shape: mi.UInt32
@@ -230,8 +233,10 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
     number = dr.zeros(mi.UInt32, n)  # of parts stored
     lost, left = dr.zeros(mi.Float, n), tree.max_chain + dr.zeros(mi.UInt32, n)
     none, vector = dr.zeros(mi.UInt32, n), dr.zeros(mi.Vector3f, n)
-    landing = [none, mi.UInt32(none), *(dr.zeros(mi.Float, n) for _ in range(3)), dr.zeros(mi.Point3f, n), vector,
-               mi.Vector3f(vector)]  # fmt: skip
+    part_0, length_0, ior_0 = (dr.zeros(mi.Float, n) for _ in range(3))
+    landing = _Landing(
+        none, mi.UInt32(none), part_0, length_0, ior_0, dr.zeros(mi.Point3f, n), vector, mi.Vector3f(vector)
+    )
     active = part > 0
     while active:
         # ---- Next surface ----------------------------------------------------------------------------
@@ -251,8 +256,9 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
 
         # ---- Light that the surface scatters lands here ------------------------------------------------
         lands = hit & can_be_vertex(bsdf) & (chain > 0)
-        here = [(key ^ order) * HASH_STEP, shape, part, state.length, state.ior, point, mi.Vector3f(si.n), ray.d]
-        landing = _selected(lands, here, landing)
+        name = (key ^ order) * HASH_STEP
+        here = _Landing(name, shape, part, state.length, state.ior, point, mi.Vector3f(si.n), ray.d)
+        landing = dr.select(lands, here, landing)
 
         # ---- The rest splits into a reflected and a refracted part -------------------------------------
         face = dr.round(si.n * NORMAL_STEPS)
@@ -310,12 +316,7 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
         left -= 1
         lost += dr.select(left == 0, part, 0)
         active &= mirrors & (part > 0) & (left > 0)
-    return _Landing(*landing), lost
-
-
-def _selected(where: mi.Bool, these: list[Any], others: list[Any]) -> list[Any]:
-    """These arrays on the lanes of the mask `where`, the others elsewhere."""
-    return [dr.select(where, a, b) for a, b in zip(these, others, strict=True)]
+    return landing, lost
 
 
 def _mixed(numbers: list[mi.UInt32]) -> mi.UInt32:
@@ -331,7 +332,9 @@ def _is_flat(shape: mi.Shape) -> bool:
 
 
 def _is_exact(bsdf: mi.BSDF) -> bool:
-    """Whether the delta lobes of a BSDF can be asked for one by one."""
+    """Whether a BSDF has delta lobes, which can be asked for one by one."""
+    if not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta):
+        return False
     parts = mi.traverse(bsdf).hierarchy if bsdf.class_name() == "TwoSidedBRDF" else {bsdf: None}
     names = {one.class_name() for one in parts if isinstance(one, mi.BSDF)}
     return names <= {*EXACT_BSDFS, "TwoSidedBRDF"}
@@ -346,7 +349,7 @@ def _leaves(value: Any) -> list[Any]:
         return []
     if isinstance(value, (mi.Point3f, mi.Vector3f)):
         return [value.x, value.y, value.z]
-    if isinstance(value, (RayState, Medium)):
+    if is_dataclass(value):
         return [x for f in fields(value) for x in _leaves(getattr(value, f.name))]
     return [x for one in value for x in _leaves(one)] if isinstance(value, tuple) else [value]
 
@@ -357,6 +360,7 @@ def _rebuilt(like: Any, arrays: list[Any]) -> Any:
         return None
     if isinstance(like, (mi.Point3f, mi.Vector3f)):
         return type(like)(arrays.pop(0), arrays.pop(0), arrays.pop(0))
-    if isinstance(like, (RayState, Medium)):
-        return type(like)(*(_rebuilt(getattr(like, f.name), arrays) for f in fields(like)))
+    if is_dataclass(like):
+        of: Any = type(like)
+        return of(*(_rebuilt(getattr(like, f.name), arrays) for f in fields(like)))
     return type(like)(*(_rebuilt(one, arrays) for one in like)) if isinstance(like, tuple) else arrays.pop(0)
