@@ -245,20 +245,44 @@ def test_a_thin_pane_dims_the_light_and_does_not_shift_it() -> None:
         assert np.abs(x / a - y / b).max() < 0.02
 
 
-def test_light_through_a_cut_out_hole_arrives_undimmed_and_counts_as_caustic() -> None:
+@pytest.mark.parametrize(
+    ("opacity", "nested"),
+    [(0.0, matte()), (0.5, matte()), *to_validate((0.5, PLASTIC), (0.5, MIRROR))],
+    ids=lambda part: str(part["type"]) if isinstance(part, dict) else str(part),
+)
+def test_holes_pass_light_straight_and_without_noise(opacity: float, nested: dict[str, Any]) -> None:
+    """Light through a hole is direct light, in every pixel and in its projector coordinates."""
     free = before_the_projector()
-    hole = {"type": "mask", "opacity": 0.0, "bsdf": matte()}
-    through = before_the_projector(hole=wall(0.2, hole, 0.15, x=0.3))
-    assert (through.energy.projector / free.energy.direct).mean() == pytest.approx(1, abs=0.01)
-    np.testing.assert_array_equal(through.energy.caustic, through.energy.projector)
-
-
-@pytest.mark.parametrize("nested", [matte(), *to_validate(PLASTIC, MIRROR)], ids=lambda bsdf: str(bsdf["type"]))
-def test_half_a_hole_passes_half_the_light(nested: dict[str, Any]) -> None:
-    free = before_the_projector()
-    veil = {"type": "mask", "opacity": 0.5, "bsdf": nested}
+    veil = {"type": "mask", "opacity": opacity, "bsdf": nested}
     through = before_the_projector(hole=wall(0.2, veil, 0.15, x=0.3))
-    assert (through.energy.projector / free.energy.direct).mean() == pytest.approx(0.5, abs=0.01)
+    np.testing.assert_allclose(through.energy.direct, (1 - opacity) * free.energy.direct, rtol=1e-5)
+    coordinates = [s.channels[ProjectorCoordinates()] for s in (through, free)]
+    np.testing.assert_allclose(coordinates[0], (1 - opacity) * coordinates[1], rtol=2e-3)
+    assert through.truth.projector_visible.all()
+
+
+def test_the_light_of_a_perforated_sheet_is_its_pattern() -> None:
+    """A checkerboard of holes of two projector pixels, whose open area no grid over the image could tell."""
+    cells, half, at = 240, 0.15, 0.2
+    pattern = {"type": "checkerboard", "color0": 0.0, "color1": 1.0, "to_uv": transform().scale([cells / 2] * 2 + [1])}
+    sheet = {"type": "mask", "opacity": pattern, "bsdf": matte()}
+    free, through = before_the_projector(), before_the_projector(sheet=wall(at, sheet, half, x=0.3))
+    ratio = through.energy.direct / free.energy.direct
+    within = np.random.default_rng(0).uniform(-0.5 / CAMERA.fx, 0.5 / CAMERA.fx, (4096, 1, 1, 2))
+    on_sheet = (points_on_the_plane(free.rig)[..., :2] + within - [0.3, 0.0]) * at + half
+    is_open = (np.floor(on_sheet * cells / (2 * half)).sum(axis=-1) % 2 == 1).mean(axis=0)
+    assert is_open.std() > 0.15
+    assert (ratio - is_open).std() < 0.04  # 64 samples a pixel
+    assert ratio.mean() == pytest.approx(0.5, abs=3e-3)
+    assert not through.energy.caustic.any()
+
+
+def test_light_through_a_hole_and_a_pane_is_that_through_the_pane() -> None:
+    pane = wall(0.3, {**GLASS, "type": "thindielectric"}, 0.25, x=0.3)
+    hole = wall(0.2, {"type": "mask", "opacity": 0.0, "bsdf": matte()}, 0.15, x=0.3)
+    alone, both = before_the_projector(pane=pane), before_the_projector(pane=pane, hole=hole)
+    assert (both.energy.caustic / alone.energy.caustic).mean() == pytest.approx(1, abs=0.01)
+    assert not both.energy.direct.any()
 
 
 # ---- Shading normals --------------------------------------------------------------------------------

@@ -285,7 +285,10 @@ class _Tracing:
         self.columns = 2 * self.coarsest * self.blocks[0] + 1
         cells = CellGrid.of(self.device)
         meets, _ = meets_delta(
-            traced.scene, cells.columns * cells.rows, lambda a, b: self.device.centre_ray(cells.probes(a, b))
+            traced.scene,
+            cells.columns * cells.rows,
+            lambda a, b: self.device.centre_ray(cells.probes(a, b)),
+            traced.cutouts,
         )
         self.delta = _Delta(
             maximum_filter(meets.reshape(cells.rows, cells.columns), 3), 2 * self.coarsest * np.array(self.blocks)

@@ -54,7 +54,7 @@ class Parts(NamedTuple):
     origin, direction : Point3f and Vector3f, world.
     state : RayState.
     key : UInt32, name of the chain so far.
-    chain : UInt32, number of delta interactions so far.
+    chain : UInt32, number of delta interactions so far, holes and boundaries of media aside.
     random : UInt64, state of the random numbers; None for points of the grid.
     """
 
@@ -286,7 +286,11 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
         after_t = start.refracted(bs_t, mirrors).entering(traced, si, d_t, mirrors, crosses)
         key_r, key_t = (key ^ place) * HASH_STEP + 1, (key ^ place) * HASH_STEP + 2
         o_r, o_t = spawn_specular_ray(si, si.p, d_r).o, spawn_specular_ray(si, si.p, d_t).o
-        chain += dr.select(mirrors & ~crosses, mi.UInt32(1), mi.UInt32(0))
+        # Next-event estimation owns the light that went through nothing but holes
+        passes = mi.Bool(crosses)
+        if dr.hint(traced.cutouts is not None, mode="scalar"):
+            passes |= traced.cutouts.passed(si, bs_t, mirrors)
+        chain_r, chain_t = (chain + dr.select(w, mi.UInt32(1), mi.UInt32(0)) for w in (mirrors, mirrors & ~passes))
 
         # ---- The weaker one is stored, the stronger one goes on ----------------------------------------
         weaker, stronger = dr.minimum(part_r, part_t), dr.maximum(part_r, part_t)
@@ -307,10 +311,11 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
             lost += dr.select(stronger < tree.fewest, stronger, 0)
             stronger = dr.select(stronger < tree.fewest, 0, stronger)
         aside = Parts(parts.point, kept, dr.select(turns, o_t, o_r), dr.select(turns, d_t, d_r),
-                      dr.select(turns, after_t, after_r), dr.select(turns, key_t, key_r), chain, random)  # fmt: skip
+                      dr.select(turns, after_t, after_r), dr.select(turns, key_t, key_r),
+                      dr.select(turns, chain_t, chain_r), random)  # fmt: skip
         stored.add(aside, number, kept > 0)
         number += dr.select(kept > 0, mi.UInt32(1), mi.UInt32(0))
-        part, key = stronger, dr.select(turns, key_r, key_t)
+        part, key, chain = stronger, dr.select(turns, key_r, key_t), dr.select(turns, chain_r, chain_t)
         origin, direction = dr.select(turns, o_r, o_t), dr.select(turns, d_r, d_t)
         state = dr.select(turns, after_r, after_t)
         left -= 1
