@@ -144,6 +144,17 @@ def test_photons_do_not_hang_over_the_edges_of_a_receiver() -> None:
     assert sheets.flux[n:][hangs].sum() < 0.1 * sheets.flux[n:].sum()
 
 
+def test_the_order_of_the_shapes_changes_no_light() -> None:
+    """Light through a pane and light off it land on two walls, whose numbers in the scene differ in all ways."""
+    rig, small = rig_of(CAMERA, Intrinsics.from_fov(80, 60, 40)), wall(5.0, matte(), 0.01)
+    pane = wall(0.3, {**GLASS, "type": "thindielectric"}, 1.0)
+    behind = {**wall(-1.0, matte()), "to_world": transform().translate([0, 0, -1]).scale([5, 5, 1])}
+    for between in range(8):
+        others = {f"{number}": small for number in range(between)}
+        scene = scene_of(pane=pane, wall=wall(1.0, matte()), **others, behind=behind)
+        assert thrown_w(scene, rig) == pytest.approx(1, abs=1e-4)
+
+
 # ---- Receivers --------------------------------------------------------------------------------------
 
 

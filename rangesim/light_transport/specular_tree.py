@@ -38,6 +38,8 @@ LAUNCHES_OF_PHOTONS = 2
 is in the first."""
 HASH_STEP = 0x9E3779B1
 """Odd factor of the hash that names chains: 2^32 divided by the golden ratio, rounded to a prime."""
+HASH_FACTOR = 0x85EBCA6B
+"""A second odd factor of this hash, whose bits have nothing to do with those of the first (MurmurHash3, Appleby)."""
 NORMAL_STEPS = 1000.0
 """Number of steps per unit to which the normals of flat faces are rounded in a key, so that light through different
 faces of a mesh has different keys; faces closer than 0.06 degrees count as one."""
@@ -256,8 +258,7 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
 
         # ---- Light that the surface scatters lands here ------------------------------------------------
         lands = hit & can_be_vertex(bsdf) & (chain > 0)
-        name = (key ^ order) * HASH_STEP
-        here = _Landing(name, shape, part, state.length, state.ior, point, mi.Vector3f(si.n), ray.d)
+        here = _Landing(_named(key, 3 * order), shape, part, state.length, state.ior, point, mi.Vector3f(si.n), ray.d)
         landing = dr.select(lands, here, landing)
 
         # ---- The rest splits into a reflected and a refracted part -------------------------------------
@@ -284,7 +285,7 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
         start = state.restarted(mirrors, point, state.length)
         after_r = start.entering(traced, si, d_r, mirrors, mi.Bool(False))
         after_t = start.refracted(bs_t, mirrors).entering(traced, si, d_t, mirrors, crosses)
-        key_r, key_t = (key ^ place) * HASH_STEP + 1, (key ^ place) * HASH_STEP + 2
+        key_r, key_t = _named(key, 3 * place + 1), _named(key, 3 * place + 2)
         o_r, o_t = spawn_specular_ray(si, si.p, d_r).o, spawn_specular_ray(si, si.p, d_t).o
         # Next-event estimation owns the light that went through nothing but holes
         passes = mi.Bool(crosses)
@@ -322,6 +323,17 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
         lost += dr.select(left == 0, part, 0)
         active &= mirrors & (part > 0) & (left > 0)
     return landing, lost
+
+
+def _named(key: mi.UInt32, step: mi.UInt32) -> mi.UInt32:
+    """Name of a chain after a further step, so mixed that two chains hardly ever have the same name.
+
+    Without the shifts, light that is reflected and light that is refracted would have one name on two shapes whose
+    numbers differ in their last bits.
+    """
+    x = (key ^ step * HASH_STEP) * HASH_FACTOR
+    x = (x ^ (x >> 15)) * HASH_STEP
+    return x ^ (x >> 16)
 
 
 def _mixed(numbers: list[mi.UInt32]) -> mi.UInt32:
