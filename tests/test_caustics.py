@@ -245,6 +245,14 @@ def test_a_thin_pane_dims_the_light_and_does_not_shift_it() -> None:
         assert np.abs(x / a - y / b).max() < 0.02
 
 
+def test_light_through_a_pane_right_before_the_projector_counts_once() -> None:
+    """A protective window, at 1 mm from the lens for a wall at 5 m."""
+    pane, rig = wall(1e-3, {**GLASS, "type": "thindielectric"}, 2e-3), rig_of(CAMERA, PROJECTOR, camera_at=(0.3, 0, 0))
+    energy = transport(scene_of(wall=wall(5.0, matte()), pane=pane), rig, [], spp=4, max_depth=2, glint=False).energy
+    assert energy.caustic.any()
+    assert not energy.direct.any()
+
+
 @pytest.mark.parametrize(
     ("opacity", "nested"),
     [(0.0, matte()), (0.5, matte()), *to_validate((0.5, PLASTIC), (0.5, MIRROR))],

@@ -18,6 +18,7 @@ import numpy as np
 from rangesim.light_transport.cutouts import Cutouts
 from rangesim.light_transport.sampling import GOLDEN_STEP
 from rangesim.light_transport.scattering import Media, Medium
+from rangesim.light_transport.surfaces import ray_to_emitter
 from rangesim.rig import Intrinsics, Lens, Rig
 from rangesim.rig.camera_model import CameraModel, appears, distort, project, unproject
 
@@ -92,11 +93,11 @@ def lit_from(
     if cutouts is not None and not cutouts.exist:
         cutouts = None
     if media is not None and inside is not None:
-        fraction, _ = media.transmittance(scene, si, emitter, inside, active, cutouts=cutouts)
+        fraction, _ = media.transmittance(scene, si, emitter, inside, active, cutouts=cutouts, ray_to=ray_to_emitter)
     elif cutouts is not None:
         fraction = cutouts.transmittance(si, emitter, active)
     else:
-        return active & ~scene.ray_test(si.spawn_ray_to(emitter), coherent=False, active=active), geometry
+        return active & ~scene.ray_test(ray_to_emitter(si, emitter), coherent=False, active=active), geometry
     return active & (fraction > 0), geometry * fraction
 
 

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.spectrum import mono
-from rangesim.light_transport.surfaces import Surfaces, number_of, table_of
+from rangesim.light_transport.surfaces import Surfaces, number_of, ray_to_emitter, table_of
 from rangesim.scene.materials import holes
 from rangesim.scene.media import is_boundary
 
@@ -51,14 +51,14 @@ class Cutouts:
         return dr.select(has_holes, _openness(si, has_holes), 0)
 
     @dr.syntax
-    def transmittance(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> mi.Float:
-        """Fraction of the light that goes straight from `si` to `target` through holes; 1 where nothing is between."""
-        ray, fraction, going = mi.Ray3f(si.spawn_ray_to(target)), dr.select(active, mi.Float(1), 0), mi.Bool(active)
+    def transmittance(self, si: mi.SurfaceInteraction3f, emitter: mi.Point3f, active: mi.Bool) -> mi.Float:
+        """Fraction of the light that goes straight from `si` to an emitter through holes; 1 if nothing is between."""
+        ray, fraction, going = mi.Ray3f(ray_to_emitter(si, emitter)), dr.select(active, mi.Float(1), 0), mi.Bool(active)
         while going:
             found = self.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=going)
             hit = going & found.is_valid()
             fraction *= dr.select(hit, self.openness(found, hit), 1)
-            ray = found.spawn_ray_to(target)
+            ray = ray_to_emitter(found, emitter)
             going = hit & (fraction > 0)
         return fraction
 

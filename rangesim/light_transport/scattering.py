@@ -10,6 +10,7 @@ Media that only absorb, inside bodies that refract, are in `rangesim.light_trans
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import drjit as dr
@@ -144,6 +145,7 @@ class Media:
         active: mi.Bool,
         around: mi.Float = None,
         cutouts: Cutouts | None = None,
+        ray_to: Callable[[mi.SurfaceInteraction3f, mi.Point3f], mi.Ray3f] | None = None,
     ) -> tuple[mi.Float, mi.Bool]:
         """Transmittance of the straight way from `si` to `target`, and whether the way crosses a boundary.
 
@@ -154,9 +156,11 @@ class Media:
         inside : Medium, in which the way starts.
         around : Float, 1/m, absorption coefficient outside the media that scatter; None: 0.
         cutouts : Cutouts, holes that the way may go through; None: it goes through none.
+        ray_to : function that returns the ray from a surface to the target; None: Mitsuba's, for one on a surface.
         """
         start = mi.Point3f(si.p)
-        ray = mi.Ray3f(si.spawn_ray_to(target))
+        ray_to = ray_to or mi.SurfaceInteraction3f.spawn_ray_to
+        ray = mi.Ray3f(ray_to(si, target))
         sigma_t, thickness = mi.Float(inside.sigma_t), dr.zeros(mi.Float, dr.width(active))
         if dr.hint(around is not None, mode="scalar"):
             sigma_t = dr.select(sigma_t > 0, sigma_t, around)
@@ -184,7 +188,7 @@ class Media:
                 sigma_t = dr.select(crosses & (sigma_t == 0), around, sigma_t)
             crossed |= crosses
             start = dr.select(passes, found.p, start)
-            ray = found.spawn_ray_to(target)
+            ray = ray_to(found, target)
             going = passes & (thickness < OPAQUE)
         return dr.select(free & (thickness < OPAQUE), fraction * dr.exp(-thickness), 0), crossed
 
