@@ -155,6 +155,23 @@ def test_the_order_of_the_shapes_changes_no_light() -> None:
         assert thrown_w(scene, rig) == pytest.approx(1, abs=1e-4)
 
 
+@pytest.mark.parametrize("at_m", [0.2, 0.8], ids=["before the pane", "behind it"])
+def test_thin_things_between_points_of_the_grid_take_their_light(at_m: float) -> None:
+    """A wire of two projector pixels takes two columns of the light, wherever it stands; points are four apart."""
+    rig, pixel_m = rig_of(CAMERA, PROJECTOR), at_m / PROJECTOR.fx
+    pane = wall(0.3, {**GLASS, "type": "thindielectric"}, 1.0)
+    half, passed = 0.5 * 2 * pixel_m, []
+    for shift in range(4):
+        place = transform().translate([(10.3 + shift) * pixel_m, 0, at_m]).scale([half, 1, -1])
+        scene = scene_of(pane=pane, wall=wall(PLANE, matte()), wire={**wall(0, matte()), "to_world": place})
+        sheets = light_of(scene, rig)
+        on_wall = sheets.flux[np.isclose(sheets.position[sheets.triangles[:, 0], 2], PLANE)]
+        passed.append(on_wall.sum())
+    whole = light_of(scene_of(pane=pane, wall=wall(PLANE, matte())), rig).flux.sum()
+    taken = 1 - np.array(passed) / whole
+    assert np.abs(taken / (2 / PROJECTOR.width) - 1).max() < 0.1
+
+
 # ---- Receivers --------------------------------------------------------------------------------------
 
 

@@ -79,6 +79,7 @@ class Landings(NamedTuple):
     part : (m,) float32, fraction of the light of the point.
     length : (m,) float32, metres, optical length.
     ior : (m,) float32, refractive index in front of the surface.
+    last : (m,) float32, metres, distance from the last delta interaction.
     position, normal, direction : (m, 3) float32, world; metres, geometric normal, and direction of flight.
     """
 
@@ -88,6 +89,7 @@ class Landings(NamedTuple):
     part: np.ndarray
     length: np.ndarray
     ior: np.ndarray
+    last: np.ndarray
     position: np.ndarray
     normal: np.ndarray
     direction: np.ndarray
@@ -165,8 +167,8 @@ class SpecularTree:
                 break
             parts = _rebuilt(parts, [dr.gather(type(x), x, rest) for x in stored.leaves])
         numbers = [np.concatenate(column) for column in zip(*found, strict=True)]
-        vectors = [np.column_stack(numbers[k : k + 3]) for k in (6, 9, 12)]
-        return Landings(*numbers[:6], *vectors), dropped
+        vectors = [np.column_stack(numbers[k : k + 3]) for k in (7, 10, 13)]
+        return Landings(*numbers[:7], *vectors), dropped
 
 
 @dataclass
@@ -178,6 +180,7 @@ class _Landing:
     part: mi.Float
     length: mi.Float
     ior: mi.Float
+    last: mi.Float
     position: mi.Point3f
     normal: mi.Vector3f
     direction: mi.Vector3f
@@ -235,9 +238,9 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
     number = dr.zeros(mi.UInt32, n)  # of parts stored
     lost, left = dr.zeros(mi.Float, n), tree.max_chain + dr.zeros(mi.UInt32, n)
     none, vector = dr.zeros(mi.UInt32, n), dr.zeros(mi.Vector3f, n)
-    part_0, length_0, ior_0 = (dr.zeros(mi.Float, n) for _ in range(3))
+    part_0, length_0, ior_0, last_0 = (dr.zeros(mi.Float, n) for _ in range(4))
     landing = _Landing(
-        none, mi.UInt32(none), part_0, length_0, ior_0, dr.zeros(mi.Point3f, n), vector, mi.Vector3f(vector)
+        none, mi.UInt32(none), part_0, length_0, ior_0, last_0, dr.zeros(mi.Point3f, n), vector, mi.Vector3f(vector)
     )
     active = part > 0
     while active:
@@ -258,7 +261,8 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
 
         # ---- Light that the surface scatters lands here ------------------------------------------------
         lands = hit & can_be_vertex(bsdf) & (chain > 0)
-        here = _Landing(_named(key, 3 * order), shape, part, state.length, state.ior, point, mi.Vector3f(si.n), ray.d)
+        last, normal = dr.norm(point - state.previous), mi.Vector3f(si.n)
+        here = _Landing(_named(key, 3 * order), shape, part, state.length, state.ior, last, point, normal, ray.d)
         landing = dr.select(lands, here, landing)
 
         # ---- The rest splits into a reflected and a refracted part -------------------------------------
