@@ -28,7 +28,7 @@ from delta_scenes import (
 from tiers import to_validate
 
 import rangesim
-from rangesim import AmcwToF, IdealToF, Intrinsics, Rig, Scene, StructuredLight, transport
+from rangesim import AmcwToF, IdealToF, Intrinsics, Lens, Rig, Scene, StructuredLight, transport
 from rangesim.response import SPEED_OF_LIGHT, DenseResponse, Fringes, Images, LightPath, TransientHistogram
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
@@ -414,6 +414,16 @@ def test_a_far_wall_does_not_blur_near_fringes_behind_a_pane(wall_z: float) -> N
     behind = fringe_contrast(*board_behind_a_pane(wall_z, pane=pane))
     assert behind == pytest.approx(alone, abs=0.005)
     assert behind == pytest.approx(free, abs=0.01)  # light reflected to and fro between pane and board takes 0.006
+
+
+def test_fringes_in_focus_are_as_sharp_behind_a_pane_as_before_it() -> None:
+    """A projector with a lens shows each pixel over its whole width, also behind glass; docs/optics.md."""
+    lens, pane, contrast = Lens(1e-5, focus_m=PLANE), wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3), []
+    for parts in ({}, {"pane": pane}):
+        rig = rig_of(Intrinsics.from_fov(64, 8, 10), PROJECTOR, (0.3, 0.0, 0.0), (0.0, 0.0, 1.0), projector_lens=lens)
+        signals = transport(scene_of(wall=wall(PLANE, matte()), **parts), rig, [Fringes(0, 8.0)], spp=64, max_depth=2)
+        contrast.append((np.hypot(*signals.channels[Fringes(0, 8.0)]) / signals.energy.projector).mean())
+    assert contrast[1] == pytest.approx(contrast[0], rel=3e-3)  # without the width of pixels 1 / sinc(1 / 8) = 1.026
 
 
 @pytest.mark.parametrize("turned", [False, True], ids=["columns", "rows"])
