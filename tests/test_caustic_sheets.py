@@ -172,6 +172,16 @@ def test_thin_things_between_points_of_the_grid_take_their_light(at_m: float) ->
     assert np.abs(taken / (2 / PROJECTOR.width) - 1).max() < 0.1
 
 
+def test_no_light_comes_from_outside_the_image() -> None:
+    """Photons are as large as their cells, also at the border of the image; patterns have no pixels beyond it."""
+    ball = {"type": "sphere", "center": [0.0, 0.0, 0.5], "radius": 0.1, "bsdf": GLASS}
+    rig = rig_of(CAMERA, Intrinsics.from_fov(320, 240, 30), projector_lens=Lens(4e-3, focus_m=0.8))
+    sheets = light_of(scene_of(ball=ball, wall=wall(PLANE, matte())), rig)
+    for place, size in ((sheets.u, 320), (sheets.v, 240)):
+        assert place.min() >= 0
+        assert place.max() <= size
+
+
 # ---- Receivers --------------------------------------------------------------------------------------
 
 

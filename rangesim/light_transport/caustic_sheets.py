@@ -451,7 +451,10 @@ class _Tracing:
         which = sides_of_photons(corners, edges, lists, self.columns, self.coarsest, chains, taken)
         power = watts * size.prod(axis=1) / chance
         made = _parallelograms(found, which, size, place, power, self.angle, self.at, self._lie_on)
-        return made._replace(cut=float((lost[::3] * power).sum() / made.flux.sum()) if len(made.flux) else 0.0)
+        # Nothing outside the image may reach a pattern
+        u, v = (np.clip(c, 0, np.float32(n)) for c, n in zip((made.u, made.v), self.size_px, strict=True))
+        cut = float((lost[::3] * power).sum() / made.flux.sum()) if len(made.flux) else 0.0
+        return made._replace(u=u, v=v, cut=cut)
 
     def _lie_on(self, points: np.ndarray, normal: np.ndarray, shape: np.ndarray) -> np.ndarray:
         """(n,) bool, whether points (n, 3), metres, lie on shapes of these numbers (n,), as far as one looks along
