@@ -416,6 +416,18 @@ def test_a_far_wall_does_not_blur_near_fringes_behind_a_pane(wall_z: float) -> N
     assert behind == pytest.approx(free, abs=0.01)  # light reflected to and fro between pane and board takes 0.006
 
 
+def test_a_coarse_emitter_has_sharp_shadows_behind_a_pane() -> None:
+    """The pixels of a flood illuminator are only coordinates; here each is as wide as nine pixels of the camera."""
+    rig = rig_of(Intrinsics.from_fov(64, 48, 20), Intrinsics.from_fov(8, 6, 26), (0.3, 0.0, 0.0), (0.0, 0.0, 1.0))
+    parts = {"wall": wall(PLANE, matte()), "card": wall(0.7, matte(), 0.03, x=0.13)}
+    options: dict[str, Any] = {"spp": 16, "max_depth": 2, "glint": False, "indirect": "raw"}
+    free = transport(scene_of(**parts), rig, [], **options).energy.direct
+    pane = wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3)
+    behind = transport(scene_of(**parts, pane=pane), rig, [], **options).energy.caustic
+    assert (free < 0.01 * free.max()).mean() > 0.05  # the shadow
+    assert (np.abs(behind / pane_transmittance(np.array(0.1)) - free) > 0.05 * free.max()).mean() < 0.03
+
+
 def test_fringes_in_focus_are_as_sharp_behind_a_pane_as_before_it() -> None:
     """A projector with a lens shows each pixel over its whole width, also behind glass; docs/optics.md."""
     lens, pane, contrast = Lens(1e-5, focus_m=PLANE), wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3), []

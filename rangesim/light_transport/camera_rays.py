@@ -310,11 +310,14 @@ class CellGrid(NamedTuple):
     pixels_per_cell: float
 
     @classmethod
-    def of(cls, device: Device) -> CellGrid:
-        """The cells of a device's image: its pixels, or squares of them if there are more than `MAX_CELLS` pixels."""
+    def of(cls, device: Device, fineness: float = 1.0) -> CellGrid:
+        """The cells of a device's image: its pixels, or squares of them if there are more than `MAX_CELLS` pixels.
+
+        Of a coarse device each pixel is divided into `fineness` cells along each axis.
+        """
         w, h = (int(n[0]) for n in device.size)
-        edge = max(1, math.ceil(math.sqrt(w * h / MAX_CELLS)))
-        columns, rows = -(-w // edge), -(-h // edge)
+        edge = max(1, math.ceil(math.sqrt(w * h * fineness**2 / MAX_CELLS))) / fineness
+        columns, rows = math.ceil(w / edge), math.ceil(h / edge)
         size = mi.Point2f(dr.opaque(mi.Float, w / columns), dr.opaque(mi.Float, h / rows))
         return cls(columns, rows, size, w * h / (columns * rows))
 

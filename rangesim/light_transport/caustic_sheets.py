@@ -73,6 +73,10 @@ PHOTONS = 1 << 13
 cells than this, each has a photon. With twice as many photons, their noise would be smaller by a third."""
 MAX_PARTS = 8
 """Largest number of parts along the edge of a cell that is left; an eighth of a pixel is finer than anything seen."""
+MAX_PIXELS = 1 << 18
+"""Largest number of pixels into which the image of a coarse projector is divided. A flood illuminator has few pixels of
+its own, which are only coordinates; without the division its light would have edges as coarse as these. With more,
+the grid would take longer than for a projector of images."""
 MAX_SAG = 1e-3
 """Largest height of a curved receiver over a triangle, as a fraction of its distance from the projector; rays that look
 for triangles (`sheet_scene`) reach as far."""
@@ -305,19 +309,22 @@ class _Tracing:
         self.device, self.report = traced.projector, report
         self.tree = SpecularTree(traced, Launches())
         self.is_glass = mi.Bool(table_of(traced.scene, list(map(is_specular, traced.scene.shapes()))))
-        width, height = (int(n[0]) for n in self.device.size)
-        self.angle = 1 / float(np.sqrt(self.device.f.x[0] * self.device.f.y[0]))
+        size = np.array([int(n[0]) for n in self.device.size])
+        angle = 1 / float(np.sqrt(self.device.f.x[0] * self.device.f.y[0]))
+        coarseness = angle / pixel_rad if pixel_rad else 1.0
+        # All lengths here are in these pixels, which are smaller than the projector's if those are coarse
+        self.fineness = float(np.clip(coarseness, 1, max(1, np.sqrt(MAX_PIXELS / size.prod()))))
+        self.angle, self.size_px = angle / self.fineness, size * self.fineness
         self.finest_px = max(CAMERA_CELL * pixel_rad / self.angle, 1)
         levels = int(np.log2(0.5 * BLOCK_PX / self.finest_px))
         self.levels = 0 if self.device.has_lens else min(max(levels, 0), MAX_LEVELS)
         self.at = np.array([float(c[0]) for c in self.device.centre])
         self.rule = Rule(self.angle, self.at, MAX_SAG, TOLERANCE_PX, FAINT, SIGNIFICANT)
-        self.size_px = np.array([width, height])
-        self.blocks = tuple(int(np.ceil(n / BLOCK_PX)) for n in (width, height))
+        self.blocks = tuple(int(np.ceil(n / BLOCK_PX)) for n in self.size_px)
         self.coarsest = 1 << self.levels
-        self.step_px = np.array([width, height]) / (2 * self.coarsest * np.array(self.blocks))
+        self.step_px = self.size_px / (2 * self.coarsest * np.array(self.blocks))
         self.columns = 2 * self.coarsest * self.blocks[0] + 1
-        cells = CellGrid.of(self.device)
+        cells = CellGrid.of(self.device, self.fineness)
         meets, _ = meets_delta(
             traced.scene,
             cells.columns * cells.rows,
@@ -337,7 +344,7 @@ class _Tracing:
         near = self.delta.within(x, y, 2 * step)
         x, y = x[near], y[near]
         made, left = [], []
-        watts = power_w / self.device.pixels
+        watts = power_w / self.size_px.prod()
         pixels = np.sqrt(self.step_px.prod())
         landings = _no_landings()
         while step and len(x):
@@ -374,9 +381,8 @@ class _Tracing:
         triangles, flux = (np.concatenate(c) for c in zip(*made, strict=True))
         of_grid = _sheets(landings, self._pixels(points.numbers)[landings.point], triangles, watts * flux[:, 0], 0.0)
         both = joined([of_grid, self._photons(np.concatenate(left), taken, watts, rng, lens)])
-        if both is None:
-            return of_grid
-        return both._replace(in_triangles=float(of_grid.flux.sum() / both.flux.sum()))
+        every = of_grid if both is None else both._replace(in_triangles=float(of_grid.flux.sum() / both.flux.sum()))
+        return every._replace(u=every.u / np.float32(self.fineness), v=every.v / np.float32(self.fineness))
 
     def _are_clear(self, pairs: Pairs, chains: Chains, cell_px: float, fills: np.ndarray) -> np.ndarray:
         """(p,) bool, whether all light between the points of pairs takes their way, as far as rays between them tell.
@@ -476,7 +482,7 @@ class _Tracing:
         found, lost = [_no_landings()], [np.empty(0)]
         for begin in range(0, len(pixels), MAX_AT_ONCE):
             some = slice(begin, begin + MAX_AT_ONCE)
-            place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in pixels[some].T))
+            place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in (pixels[some] / self.fineness).T))
             rays = self.device.sample_ray(place, None if lens is None else mi.Point2f(*map(float, lens)))
             random = None if states is None else mi.UInt64(aligned(states[some], np.uint64))
             landings, dropped = self.tree.follow(rays, fewest, random)
