@@ -245,6 +245,18 @@ def test_a_thin_pane_dims_the_light_and_does_not_shift_it() -> None:
         assert np.abs(x / a - y / b).max() < 0.02
 
 
+def test_light_that_lands_on_a_coat_stays_there_although_its_reflection_lands_elsewhere() -> None:
+    """A plastic wall behind a pane is as bright as in direct light, times the pane's transmittance."""
+    rig = rig_of(CAMERA, PROJECTOR, (0.3, 0.0, 0.0), (0.0, 0.0, 1.0))
+    behind = {**wall(0, matte()), "to_world": transform().translate([0, 0, -2]).scale([5, 5, 1])}
+    parts, options = {"wall": wall(PLANE, PLASTIC), "behind": behind}, {"spp": 16, "max_depth": 2, "glint": False}
+    free = transport(scene_of(**parts), rig, [], **options).energy.direct
+    pane = wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3)
+    dimmed = transport(scene_of(**parts, pane=pane), rig, [], **options).energy.caustic
+    off = np.abs(dimmed / free / pane_transmittance(np.array(0.2)) - 1)
+    assert np.percentile(off, 95) < 0.01  # some pixels see what the pane throws back, in the coat
+
+
 def test_light_through_a_pane_right_before_the_projector_counts_once() -> None:
     """A protective window, at 1 mm from the lens for a wall at 5 m."""
     pane, rig = wall(1e-3, {**GLASS, "type": "thindielectric"}, 2e-3), rig_of(CAMERA, PROJECTOR, camera_at=(0.3, 0, 0))

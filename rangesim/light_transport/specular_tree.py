@@ -30,6 +30,11 @@ from rangesim.light_transport.traced_scene import TracedScene
 PARTS = 6
 """Largest number of weaker parts that a ray stores in a launch. Light through three panes meets six faces. A part that
 finds no room is dropped by a point of the grid; a photon then follows one of the two parts by chance."""
+EARLIER = 3
+"""Largest number of landings of a lane before its last one, in scenes with coats: light that met four coats has less
+than a hundred-thousandth left, unless it grazes them."""
+LANDED_PART = 2
+"""Place of `part` among the leaves of a landing."""
 LAUNCHES = 3
 """Largest number of launches for points of the grid. In the last one nothing is stored: weaker parts are dropped,
 because light that was the weaker part twice carries little."""
@@ -111,7 +116,8 @@ class SpecularTree:
         self.order = mi.UInt32(table_of(traced.scene, np.arange(len(shapes), dtype=np.uint32)))
         self.is_flat = mi.Bool(table_of(traced.scene, [_is_flat(shape) for shape in shapes]))
         self.is_exact = mi.Bool(table_of(traced.scene, [_is_exact(shape.bsdf()) for shape in shapes]))
-        self.max_chain = dr.opaque(mi.UInt32, MAX_CHAIN)
+        self.lands_twice = sum(_lands_and_goes_on(shape.bsdf()) for shape in shapes) > 0
+        self.max_chain, self.earlier = dr.opaque(mi.UInt32, MAX_CHAIN), dr.opaque(mi.UInt32, EARLIER)
 
     def follow(
         self, primary: PrimaryRay, fewest: float, random: mi.UInt64 | None = None
@@ -154,14 +160,17 @@ class SpecularTree:
             dr.make_opaque(leaves)
             parts = _rebuilt(parts, list(leaves))
             lanes = dr.width(parts.part)
-            stored = _Stored(leaves, lanes)
-            landing, lost = _strongest(self, parts, stored, chance)
-            self.launches.evaluate([landing, stored.leaves, lost], lanes)
-            dropped += np.bincount(parts.point.numpy(), lost.numpy(), n)  # in the same order on any machine
-            landed = dr.compress(landing.part > 0)
-            columns = [dr.gather(type(x), x, landed) for x in (parts.point, *_leaves(landing))]
-            dr.eval(columns)
-            found.append([x.numpy() for x in columns])
+            stored = _Stored(parts, lanes, PARTS)
+            earlier = _Stored(_Landing.none(lanes), lanes, EARLIER) if self.lands_twice else None
+            landing, lost = _strongest(self, parts, stored, earlier, chance)
+            self.launches.evaluate([landing, stored.leaves, lost, earlier.leaves if earlier else []], lanes)
+            point = parts.point.numpy()
+            dropped += np.bincount(point, lost.numpy(), n)  # in the same order on any machine
+            for leaves in [_leaves(landing), *([earlier.leaves] if earlier else [])]:
+                landed = dr.compress(leaves[LANDED_PART] > 0)
+                columns = [dr.gather(type(x), x, landed) for x in leaves]
+                dr.eval(columns)
+                found.append([point[landed.numpy() % lanes], *(x.numpy() for x in columns)])
             rest = dr.compress(stored.part > 0)
             if not len(rest):
                 break
@@ -185,44 +194,48 @@ class _Landing:
     normal: mi.Vector3f
     direction: mi.Vector3f
 
+    @classmethod
+    def none(cls, lanes: int) -> _Landing:
+        """No landing on any lane."""
+        whole, real = [dr.zeros(mi.UInt32, lanes) for _ in range(2)], [dr.zeros(mi.Float, lanes) for _ in range(4)]
+        return cls(*whole, *real, *(dr.zeros(kind, lanes) for kind in (mi.Point3f, mi.Vector3f, mi.Vector3f)))
+
 
 class _Stored:
-    """Room for the weaker parts of each lane. Dr.Jit does not look into this class, so loops do not carry the arrays.
+    """Room for `Parts` or landings of each lane. Dr.Jit does not look into this class, so loops do not carry the
+    arrays.
 
     Parameters
     ----------
-    like : leaves of `Parts`.
-    lanes : int.
+    like : a structure as those to be stored.
+    lanes : int. room : largest number of structures of a lane.
     """
 
-    def __init__(self, like: list[Any], lanes: int) -> None:
+    def __init__(self, like: Parts | _Landing, lanes: int, room: int) -> None:
         self.lane, self.lanes = dr.arange(mi.UInt32, lanes), dr.opaque(mi.UInt32, lanes)
-        self.leaves = [dr.empty(type(x), PARTS * lanes) for x in like]
-        self.leaves[PART_LEAF] = dr.zeros(mi.Float, PARTS * lanes)
+        self.leaves = [dr.empty(type(x), room * lanes) for x in _leaves(like)]
+        self.place = next(i for i, x in enumerate(_leaves(like)) if x is like.part)
+        self.leaves[self.place] = dr.zeros(mi.Float, room * lanes)
 
     @property
     def part(self) -> mi.Float:
-        """Fraction of the light of each part that was stored; 0 where there is none."""
-        return self.leaves[PART_LEAF]
+        """Fraction of the light of each structure that was stored; 0 where there is none."""
+        return self.leaves[self.place]
 
-    def add(self, parts: Parts, number: mi.UInt32, active: mi.Bool) -> None:
-        """Store a part of each lane, after `number` that the lane stored before."""
+    def add(self, parts: Parts | _Landing, number: mi.UInt32, active: mi.Bool) -> None:
+        """Store a structure of each lane, after `number` that the lane stored before."""
         place = dr.fma(number, self.lanes, self.lane)
         for target, value in zip(self.leaves, _leaves(parts), strict=True):
             dr.scatter(target, value, place, active)
 
 
-PART_LEAF = 1
-"""Place of `part` among the leaves of `Parts`."""
-
-
 @dr.syntax
-def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
+def _strongest(tree, parts, stored, earlier, numbers):  # type: ignore[no-untyped-def]
     """Follow every part along the stronger of the two parts into which surfaces split it.
 
     Returns
     -------
-    landing : _Landing.
+    landing : _Landing, the last of each lane; those before it are in `earlier`.
     lost : Float, fraction of the light in parts that were dropped.
     """
     traced = tree.traced
@@ -237,11 +250,7 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
     part, key, chain, random = parts.part, parts.key, parts.chain, parts.random
     number = dr.zeros(mi.UInt32, n)  # of parts stored
     lost, left = dr.zeros(mi.Float, n), tree.max_chain + dr.zeros(mi.UInt32, n)
-    none, vector = dr.zeros(mi.UInt32, n), dr.zeros(mi.Vector3f, n)
-    part_0, length_0, ior_0, last_0 = (dr.zeros(mi.Float, n) for _ in range(4))
-    landing = _Landing(
-        none, mi.UInt32(none), part_0, length_0, ior_0, last_0, dr.zeros(mi.Point3f, n), vector, mi.Vector3f(vector)
-    )
+    landing, landings = _Landing.none(n), dr.zeros(mi.UInt32, n)
     active = part > 0
     while active:
         # ---- Next surface ----------------------------------------------------------------------------
@@ -263,6 +272,10 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
         lands = hit & can_be_vertex(bsdf) & (chain > 0)
         last, normal = dr.norm(point - state.previous), mi.Vector3f(si.n)
         here = _Landing(_named(key, 3 * order), shape, part, state.length, state.ior, last, point, normal, ray.d)
+        if dr.hint(earlier is not None, mode="scalar"):
+            again = lands & (landing.part > 0) & (landings < tree.earlier)
+            earlier.add(landing, landings, again)
+            landings += dr.select(again, mi.UInt32(1), mi.UInt32(0))
         landing = dr.select(lands, here, landing)
 
         # ---- The rest splits into a reflected and a refracted part -------------------------------------
@@ -350,6 +363,11 @@ def _is_flat(shape: mi.Shape) -> bool:
     """Whether a shape is a mesh whose faces look flat."""
     is_mesh = shape.shape_type() == mi.ShapeType.Mesh.value
     return bool(is_mesh and (shape.has_face_normals() or not shape.has_vertex_normals()))
+
+
+def _lands_and_goes_on(bsdf: mi.BSDF) -> bool:
+    """Whether a BSDF both scatters light and has delta lobes, as a polished coat."""
+    return bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
 
 
 def _is_exact(bsdf: mi.BSDF) -> bool:
