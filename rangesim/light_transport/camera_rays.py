@@ -285,7 +285,7 @@ class Device:
 
 
 class CellGrid(NamedTuple):
-    """Cells of equal size that make up a device's image.
+    """Cells of equal size that make up the image of a projector.
 
     columns, rows : int, number of cells along x and y.
     size : Point2f, pixels, size of a cell.
@@ -298,9 +298,8 @@ class CellGrid(NamedTuple):
     pixels_per_cell: float
 
     @classmethod
-    def of(cls, device: Device) -> CellGrid:
-        """The cells of a device's image: its pixels, or squares of them if there are more than `MAX_CELLS` pixels."""
-        w, h = (int(n[0]) for n in device.size)
+    def of(cls, w: int, h: int) -> CellGrid:
+        """The cells of an image of w x h pixels: its pixels, or squares of them if there are more than `MAX_CELLS`."""
         edge = max(1, math.ceil(math.sqrt(w * h / MAX_CELLS)))
         columns, rows = -(-w // edge), -(-h // edge)
         size = mi.Point2f(dr.opaque(mi.Float, w / columns), dr.opaque(mi.Float, h / rows))

@@ -155,7 +155,7 @@ def _is_smooth(r, landings, pixels, rule):  # type: ignore[no-untyped-def]
         size = triangle_area(position, r[q], r[q + 1], r[q + 4]) + triangle_area(position, r[q], r[q + 4], r[q + 3])
         total += size
         low, high = min(low, size), max(high, size)
-    plain = rule.angle * length[r[4]]
+    plain = rule.pixel_m + rule.pixel_rad * length[r[4]]
     off = 0.0
     for m, a, b in ((1, 0, 2), (3, 0, 6), (5, 2, 8), (7, 6, 8), (4, 0, 8), (4, 2, 6)):
         off = max(off, _off_middle(position, r[m], r[a], r[b]))

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The projector's light beyond glass and mirrors, as triangles on the surfaces where it lands.
+"""Light beyond glass and mirrors, as triangles on the surfaces where it lands.
 
 The projector is a point, so the place where a chain of delta interactions ends is a smooth function of the place in the
-image where it began. A grid of points over the image is traced through the scene (`specular_tree`). Where the points
-around a cell of the grid took the same chain, they span triangles on the surface where they landed. The irradiance of a
-triangle is its flux over its area, and everything else is interpolated between its corners. Cells are divided where
-triangles would be too coarse.
+image where it began. The same holds for all sources without extent (`delta_sources`). A grid of points over the image
+is traced through the scene (`specular_tree`). Where the points around a cell of the grid took the same chain, they span
+triangles on the surface where they landed. The irradiance of a triangle is its flux over its area, and everything else
+is interpolated between its corners. Cells are divided where triangles would be too coarse.
 
 The rest, mostly along the silhouettes of glass, is left to photons: random points of the cells, each of which carries
 the light of its cell over the parallelogram to which the derivatives of the place by the point spread the cell (photon
@@ -33,6 +33,7 @@ from rangesim.light_transport.caustic_kernels import (
     sides_of_photons,
     smooth_chains,
 )
+from rangesim.light_transport.delta_sources import DeltaSource, ProjectorSource
 from rangesim.light_transport.delta_surfaces import meets_delta
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import aligned
@@ -89,11 +90,6 @@ MIN_SIDE_M = 1e-12
 STEP_PX = 0.02
 """Distance of the points beside a photon that tell how its light spreads, in pixels of the projector. Closer points
 would land within the rounding of single precision; farther ones would miss narrow chains."""
-LENS_RADIUS, LENS_WEIGHTS = np.sqrt(2 / 3), (1 / 4, *[1 / 8] * 6)
-"""Points of a lens of finite size, each of which has a grid of its own, at the lowest level: its centre and a regular
-hexagon. Radius of the hexagon as a fraction of the lens, and fractions of the light. Means over these points are exact
-for polynomials of the place on the lens up to degree 5 (Stroud, Approximate calculation of multiple integrals, 1971,
-rule S2: 5-1), so light lands where it should on average, and blurs as much."""
 MAX_AT_ONCE = 1 << 18
 """Largest number of points of a launch, so that the weaker parts that it stores take 100 MB at most."""
 
@@ -131,9 +127,11 @@ class Lists(NamedTuple):
 class Rule(NamedTuple):
     """The numbers that decide whether a block is divided, see `TOLERANCE_PX`, `FAINT` and `SIGNIFICANT`.
 
-    `angle` is that of a pixel in radians, `projector_at` the place of the projector (3,) and `sag` is `MAX_SAG`."""
+    `pixel_m` and `pixel_rad` tell the size of a pixel's light, see `DeltaSource`; `projector_at` is the place of the
+    projector (3,) and `sag` is `MAX_SAG`."""
 
-    angle: float
+    pixel_m: float
+    pixel_rad: float
     projector_at: np.ndarray
     sag: float
     tolerance: float
@@ -160,6 +158,7 @@ class Sheets(NamedTuple):
         optical length in metres, pixel coordinates of the projector.
     normal : (n, 3) float32, geometric normals.
     triangles : (t, 3) int64, vertices. flux : (t,) float64, watts.
+    direct : (t,) float64, W/m2, irradiance that the source would make there on a surface that faces it.
     shape, key : (t,) uint32, number of the shape where it lands, and name of the chain.
     cut : ratio of the light that was lost in chains that are too long to all light.
     in_triangles : fraction of the flux that the grid's triangles carry; photons carry the rest.
@@ -174,6 +173,7 @@ class Sheets(NamedTuple):
     normal: np.ndarray
     triangles: np.ndarray
     flux: np.ndarray
+    direct: np.ndarray
     shape: np.ndarray
     key: np.ndarray
     cut: float
@@ -197,20 +197,34 @@ def trace_sheets(
     report : called after each kernel launch.
     """
     assert isinstance(traced.projector, Device)  # beams need no sheets
-    rng = np.random.default_rng(seed)
-    tracing = _Tracing(traced, pixel_rad, report)
-    if not traced.projector.has_lens:
-        return joined([tracing.sheets(power_w, rng, None)])
-    made = [tracing.sheets(power_w * part, rng, p) for part, p in zip(LENS_WEIGHTS, _lens_points(), strict=True)]
-    # Chains through different points of the lens are different chains
-    return joined([one._replace(key=one.key + np.uint32(i * HASH_STEP & 0xFFFFFFFF)) for i, one in enumerate(made)])
+    source = ProjectorSource(traced.projector, power_w, CAMERA_CELL * pixel_rad)
+    return sheets_of(SpecularTree(traced, Launches()), source, source.at, np.random.default_rng(seed), report)
 
 
-def _lens_points() -> np.ndarray:
-    """(7, 2) float64, see `LENS_WEIGHTS`, as the places in the unit square that are mapped to them."""
-    angle = np.pi / 3 * np.arange(6)
-    x, y = (mi.Float(np.append(0, LENS_RADIUS * f(angle)).astype(np.float32)) for f in (np.cos, np.sin))
-    return mi.warp.uniform_disk_to_square_concentric(mi.Point2f(x, y)).numpy().T.astype(np.float64)
+def sheets_of(
+    tree: SpecularTree,
+    source: DeltaSource,
+    projector_at: np.ndarray,
+    rng: np.random.Generator,
+    report: Callable[[], None] = lambda: None,
+) -> Sheets | None:
+    """The light of a source through glass and off mirrors, on the surfaces where it lands; None if there is none.
+
+    Parameters
+    ----------
+    tree : SpecularTree of the scene.
+    projector_at : (3,) float64, metres, world, the place from which distances count, see `MAX_SAG`.
+    rng : decides about photons.
+    """
+    tracing = _Tracing(tree, source, projector_at, report)
+    lenses = [None] if source.lens is None else list(source.lens)
+    made = [tracing.sheets(part, rng, lens) for part, lens in zip(source.lens_weights, lenses, strict=True)]
+    return joined(apart(made))
+
+
+def apart(sheets: Sequence[Sheets]) -> list[Sheets]:
+    """Sheets whose keys tell them apart: chains from different places are different chains."""
+    return [one._replace(key=one.key + np.uint32(i * HASH_STEP & 0xFFFFFFFF)) for i, one in enumerate(sheets)]
 
 
 def joined(sheets: Sequence[Sheets]) -> Sheets | None:
@@ -262,38 +276,34 @@ class _Points:
 
 
 class _Tracing:
-    """Traces sheets of a projector.
+    """Traces sheets of a source.
 
     Parameters
     ----------
-    traced, pixel_rad, report : as for `trace_sheets`.
+    tree, source, projector_at, report : as for `sheets_of`.
     """
 
-    def __init__(self, traced: TracedScene, pixel_rad: float, report: Callable[[], None]) -> None:
-        assert isinstance(traced.projector, Device)
-        self.device, self.report = traced.projector, report
-        self.tree = SpecularTree(traced, Launches())
-        width, height = (int(n[0]) for n in self.device.size)
-        self.angle = 1 / float(np.sqrt(self.device.f.x[0] * self.device.f.y[0]))
-        levels = int(np.log2(0.5 * BLOCK_PX / max(CAMERA_CELL * pixel_rad / self.angle, 1)))
-        self.levels = 0 if self.device.has_lens else min(max(levels, 0), MAX_LEVELS)
-        self.at = np.array([float(c[0]) for c in self.device.centre])
-        self.size_px = np.array([width, height])
-        self.blocks = tuple(int(np.ceil(n / BLOCK_PX)) for n in (width, height))
+    def __init__(
+        self, tree: SpecularTree, source: DeltaSource, projector_at: np.ndarray, report: Callable[[], None]
+    ) -> None:
+        self.tree, self.source, self.at, self.report = tree, source, projector_at, report
+        largest = 0.5 * BLOCK_PX
+        self.levels = min(int(np.log2(largest / np.clip(source.finest_px, 1, largest))), MAX_LEVELS)
+        self.size_px = np.array([source.width, source.height])
+        self.blocks = tuple(int(np.ceil(n / BLOCK_PX)) for n in self.size_px)
         self.coarsest = 1 << self.levels
-        self.step_px = np.array([width, height]) / (2 * self.coarsest * np.array(self.blocks))
+        self.step_px = self.size_px / (2 * self.coarsest * np.array(self.blocks))
         self.columns = 2 * self.coarsest * self.blocks[0] + 1
-        cells = CellGrid.of(self.device)
-        meets, _ = meets_delta(
-            traced.scene, cells.columns * cells.rows, lambda a, b: self.device.centre_ray(cells.probes(a, b))
+        cells = CellGrid.of(source.width, source.height)
+        meets, exists = meets_delta(
+            tree.traced.scene, cells.columns * cells.rows, lambda a, b: source.rays(cells.probes(a, b))[0]
         )
-        self.delta = _Delta(
-            maximum_filter(meets.reshape(cells.rows, cells.columns), 3), 2 * self.coarsest * np.array(self.blocks)
-        )
+        meets = maximum_filter((meets & exists).reshape(cells.rows, cells.columns), 3)
+        self.delta = _Delta(meets, 2 * self.coarsest * np.array(self.blocks))
 
-    def sheets(self, power_w: float, rng: np.random.Generator, lens: np.ndarray | None) -> Sheets:
-        """Sheets of the light through a point of the lens, uniform coordinates in the unit square (2,); None: its
-        centre."""
+    def sheets(self, weight: float, rng: np.random.Generator, lens: np.ndarray | None) -> Sheets:
+        """Sheets of a fraction of the light through a point of the lens, uniform coordinates in the unit square (2,);
+        None: its centre."""
         points = _Points(self.columns, self.coarsest)
         x, y = (
             c.ravel().astype(np.int64) for c in np.meshgrid(*(2 * self.coarsest * np.arange(n) for n in self.blocks))
@@ -302,8 +312,9 @@ class _Tracing:
         near = self.delta.within(x, y, 2 * step)
         x, y = x[near], y[near]
         made, left = [], []
-        rule = Rule(self.angle, self.at, MAX_SAG, TOLERANCE_PX, FAINT, SIGNIFICANT)
-        watts = power_w / self.device.pixels
+        source = self.source
+        rule = Rule(source.pixel_m, source.pixel_rad, self.at, MAX_SAG, TOLERANCE_PX, FAINT, SIGNIFICANT)
+        watts = weight * source.watts
         pixels = np.sqrt(self.step_px.prod())
         landings = _no_landings()
         while step and len(x):
@@ -336,7 +347,8 @@ class _Tracing:
         both = joined([of_grid, self._photons(np.concatenate(left), taken, watts, rng, lens)])
         if both is None:
             return of_grid
-        return both._replace(in_triangles=float(of_grid.flux.sum() / both.flux.sum()))
+        direct = source.direct(both.position[both.triangles[:, 0]])
+        return both._replace(direct=direct, in_triangles=float(of_grid.flux.sum() / both.flux.sum()))
 
     def _pixels(self, number: np.ndarray) -> np.ndarray:
         """(n, 2) float64, pixel coordinates of lattice points.
@@ -376,7 +388,7 @@ class _Tracing:
         corners, edges = cells[:, :2].astype(np.int64), cells[:, 2].astype(np.int64)
         which = sides_of_photons(corners, edges, lists, self.columns, self.coarsest, chains, taken)
         power = watts * size.prod(axis=1) / chance
-        made = _parallelograms(found, which, size, place, power, self.angle, self.at, self._lie_on)
+        made = _parallelograms(found, which, size, place, power, self.source, self.at, self._lie_on)
         return made._replace(cut=float((lost[::3] * power).sum() / made.flux.sum()) if len(made.flux) else 0.0)
 
     def _lie_on(self, points: np.ndarray, normal: np.ndarray, shape: np.ndarray) -> np.ndarray:
@@ -400,9 +412,9 @@ class _Tracing:
         for begin in range(0, len(pixels), MAX_AT_ONCE):
             some = slice(begin, begin + MAX_AT_ONCE)
             place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in pixels[some].T))
-            rays = self.device.sample_ray(place, None if lens is None else mi.Point2f(*map(float, lens)))
+            on_lens = None if lens is None else mi.Point2f(*map(float, lens))
             random = None if states is None else mi.UInt64(aligned(states[some], np.uint64))
-            landings, dropped = self.tree.follow(rays, fewest, random)
+            landings, dropped = self.tree.follow(self.source, place, on_lens, fewest, random)
             self.report()
             found.append(landings._replace(point=landings.point + np.uint32(begin)))
             lost.append(dropped)
@@ -422,7 +434,8 @@ def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.
     of = triangles[:, 0]
     slowness = landings.ior[:, None] * landings.direction
     vertices = landings.position, slowness, cosine, landings.length, u, v, landings.normal
-    return Sheets(*vertices, triangles, flux, landings.shape[of], landings.key[of], cut, 0.0)
+    untold = np.full(len(triangles), np.nan)
+    return Sheets(*vertices, triangles, flux, untold, landings.shape[of], landings.key[of], cut, 0.0)
 
 
 def _parallelograms(
@@ -431,7 +444,7 @@ def _parallelograms(
     size: np.ndarray,
     place: np.ndarray,
     power: np.ndarray,
-    angle: float,
+    source: DeltaSource,
     projector_at: np.ndarray,
     lie_on: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
 ) -> Sheets:
@@ -441,7 +454,7 @@ def _parallelograms(
     ----------
     found : Landings of the three points of each photon. which : (m, 3) int64, see `sides_of_photons`.
     size, place : (n, 2) float64, pixels, sizes of the photons' cells and places of the photons.
-    power : (n,) float64, watts, power that a photon stands for. angle : radians, of a pixel. projector_at : (3,).
+    power : (n,) float64, watts, power that a photon stands for. projector_at : (3,).
     lie_on : function that says whether points with normals lie on shapes.
     """
     this = which[:, 0]
@@ -450,7 +463,8 @@ def _parallelograms(
     normal = found.normal[this].astype(np.float64)
     # Where no chain of the same name lies beside a photon, its light spreads as without glass
     across = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]]))
-    across *= (angle * found.length[this] / np.linalg.norm(across, axis=1))[:, None]
+    spread = source.pixel_m + source.pixel_rad * found.length[this]
+    across *= (spread / np.linalg.norm(across, axis=1))[:, None]
     plain = np.stack([across, np.cross(normal, across)], axis=1)
     known = np.all(which[:, 1:] >= 0, axis=1, keepdims=True)
     sides = (

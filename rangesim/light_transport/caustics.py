@@ -55,7 +55,7 @@ def sheet_scene(sheets: Sheets | None, rig: Rig, samples: int, seed: int) -> She
     `seed` that of the pass."""
     if sheets is None or not len(sheets.flux):
         return None
-    return SheetScene(sheets, rig.T_world_projector[:3, 3], rig.projector_irradiance, samples, seed)
+    return SheetScene(sheets, rig.T_world_projector[:3, 3], samples, seed)
 
 
 class Vertex(NamedTuple):

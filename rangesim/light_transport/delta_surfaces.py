@@ -17,10 +17,10 @@ from rangesim.scene.media import is_boundary
 
 def has_delta(scene: mi.Scene) -> bool:
     """Whether some surface of a mitsuba.Scene has a delta interaction. Without one there are no caustics."""
-    return any(map(_is_delta, scene.shapes()))
+    return any(map(is_delta_surface, scene.shapes()))
 
 
-def _is_delta(shape: mi.Shape) -> bool:
+def is_delta_surface(shape: mi.Shape) -> bool:
     """Whether the surface of a shape has a delta interaction, and is not the boundary of a medium."""
     return bool(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta)) and not is_boundary(shape)
 
@@ -40,7 +40,7 @@ def meets_delta(
     exists : (count,) bool, whether the lens sends such a ray at all.
     """
     launches, meets, exists = Launches(), np.zeros(count, dtype=bool), np.ones(count, dtype=bool)
-    table = mi.Bool(table_of(scene, list(map(_is_delta, scene.shapes()))))
+    table = mi.Bool(table_of(scene, list(map(is_delta_surface, scene.shapes()))))
     for begin, end in launches.ranges(count):
         rays = rays_of(begin, end)
         found = scene.ray_intersect_preliminary(mi.Ray3f(rays.origin, rays.direction))
