@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +14,10 @@ from rangesim.light_transport.camera_rays import PrimaryRay
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.scene.media import is_boundary
+
+MAX_BOUNDARIES = 8
+"""Number of boundaries of media in a row behind which glass is looked for, so that the time is bounded. Glass behind
+more of them, such as in the fifth of five bodies of milk, throws no caustics."""
 
 
 def has_delta(scene: mi.Scene) -> bool:
@@ -28,7 +33,7 @@ def is_delta_surface(shape: mi.Shape) -> bool:
 def meets_delta(
     scene: mi.Scene, count: int, rays_of: Callable[[int, int], PrimaryRay]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the first surface that each of `count` rays meets has a delta interaction.
+    """Whether the first surface that each of `count` rays meets, boundaries of media aside, has a delta interaction.
 
     Parameters
     ----------
@@ -41,12 +46,43 @@ def meets_delta(
     """
     launches, meets, exists = Launches(), np.zeros(count, dtype=bool), np.ones(count, dtype=bool)
     table = mi.Bool(table_of(scene, list(map(is_delta_surface, scene.shapes()))))
+    boundaries = boundaries_of(scene)
     for begin, end in launches.ranges(count):
         rays = rays_of(begin, end)
-        found = scene.ray_intersect_preliminary(mi.Ray3f(rays.origin, rays.direction))
-        delta = dr.gather(mi.Bool, table, number_of(found.shape), found.is_valid())
+        met = first_shape(scene, mi.Ray3f(rays.origin, rays.direction), boundaries)
+        delta = dr.gather(mi.Bool, table, met.number, met.exists)
         launches.evaluate([delta, rays.exists], end - begin)
         meets[begin:end] = delta.numpy()
         if rays.exists is not None:  # a distorted lens
             exists[begin:end] = rays.exists.numpy()
     return meets, exists
+
+
+class FirstShape(NamedTuple):
+    """The shape that a ray meets first, boundaries of media aside.
+
+    number : UInt32, its number (`surfaces.number_of`). exists : Bool, whether the ray meets one.
+    """
+
+    number: mi.UInt32
+    exists: mi.Bool
+
+
+def boundaries_of(scene: mi.Scene) -> mi.Bool | None:
+    """Table (`table_of`) of the shapes that are boundaries of media; None if there are none."""
+    are_boundaries = list(map(is_boundary, scene.shapes()))
+    return mi.Bool(table_of(scene, are_boundaries)) if any(are_boundaries) else None
+
+
+def first_shape(scene: mi.Scene, ray: mi.Ray3f, boundaries: mi.Bool | None) -> FirstShape:
+    """The shape that each ray meets first, behind up to `MAX_BOUNDARIES` of the boundaries of media."""
+    found = scene.ray_intersect_preliminary(ray, coherent=False)
+    number, exists = number_of(found.shape), found.is_valid()
+    for _ in range(MAX_BOUNDARIES if boundaries is not None else 0):
+        passes = exists & dr.gather(mi.Bool, boundaries, number, exists)
+        si = found.compute_surface_interaction(ray, mi.RayFlags.Minimal, passes)
+        ray = dr.select(passes, si.spawn_ray(ray.d), ray)
+        behind = scene.ray_intersect_preliminary(ray, coherent=False, active=passes)
+        found = dr.select(passes, behind, found)
+        number, exists = number_of(found.shape), dr.select(passes, behind.is_valid(), exists)
+    return FirstShape(number, exists)
