@@ -110,20 +110,14 @@ class SheetScene:
     Parameters
     ----------
     sheets : Sheets, at least one triangle.
-    projector_at : (3,) float, metres, world. irradiance : W/m2, of the projector's direct light at 1 m.
+    projector_at : (3,) float, metres, world.
     samples : int, smallest number of samples of a pixel, which bounds the number of groups.
     seed : int, decides which of the faintest triangles are kept.
     blur_px : blur of the light of every triangle, see `rangesim.response.LightPath`.
     """
 
     def __init__(
-        self,
-        sheets: Sheets,
-        projector_at: np.ndarray,
-        irradiance: float,
-        samples: int,
-        seed: int = 0,
-        blur_px: float | None = None,
+        self, sheets: Sheets, projector_at: np.ndarray, samples: int, seed: int = 0, blur_px: float | None = None
     ) -> None:
         self.blur_px = None if blur_px is None else mi.Float(blur_px)
         period = 1 << int(np.log2(max(1, min(samples // 2, PERIOD))))  # in each half of the samples
@@ -133,7 +127,7 @@ class SheetScene:
         first = sheets.position[sheets.triangles[:, 0]]
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.linalg.norm(first - projector_at, axis=1)
-            level = sheets.flux / area * distance**2 / irradiance
+            level = sheets.flux / area / sheets.direct
 
         low, high = sheets.position.min(axis=0), sheets.position.max(axis=0)
         size, middle = float((high - low).max()) + MIN_SIZE_M, (0.5 * (low + high)).astype(np.float64)
