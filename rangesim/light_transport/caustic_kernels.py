@@ -29,6 +29,9 @@ FLAT_COSINE = 1 - 1e-6
 """Cosine between the normals at the corners of a triangle, above which its receiver counts as flat: rounding alone."""
 MAX_CUBES = 64
 """Largest number of cubes to which the area of a triangle is dealt out, see `crowd_of`. Larger triangles are rare."""
+MAX_UNEVENNESS = 0.05
+"""Largest difference between the fraction of the light that is left in the middle of a line and its mean at the ends,
+relative to it, within a block, so that a picture in coloured glass is as sharp as pixels."""
 MAX_SPREAD = 2.0
 """Largest ratio between the areas over which equal light spreads within a block; with a smaller ratio more blocks are
 divided."""
@@ -156,7 +159,7 @@ def _is_smooth(r, landings, pixels, rule):  # type: ignore[no-untyped-def]
     r : (9,) int64, landings of the points, row by row.
     pixels : edge of the block in pixels. rule : Rule. Faint light only has to land on an even receiver.
     """
-    position, length = landings.position, landings.length
+    position, length, part = landings.position, landings.length, landings.part
     for k in (0, 2, 6, 8):
         if not _is_even(r[k], r[4], landings, rule):
             return False
@@ -166,12 +169,15 @@ def _is_smooth(r, landings, pixels, rule):  # type: ignore[no-untyped-def]
         total += size
         low, high = min(low, size), max(high, size)
     plain = rule.pixel_m + rule.pixel_rad * length[r[4]]
-    off = 0.0
+    off, uneven = 0.0, 0.0
     for m, a, b in ((1, 0, 2), (3, 0, 6), (5, 2, 8), (7, 6, 8), (4, 0, 8), (4, 2, 6)):
         off = max(off, _off_middle(position, r[m], r[a], r[b]))
+        uneven = max(uneven, abs(part[r[m]] - 0.5 * (part[r[a]] + part[r[b]])))
     if _is_faint(r, landings, pixels, rule):
         return np.sqrt(off) < 0.25 * np.sqrt(total)
     footprint = min(max(np.sqrt(total) / pixels, MIN_FOOTPRINT * plain), plain)
+    if uneven > MAX_UNEVENNESS * part[r[4]]:
+        return False
     return high <= MAX_SPREAD * low and np.sqrt(off) <= 4 * rule.tolerance * footprint  # cells are half a block
 
 
