@@ -159,7 +159,7 @@ class _CameraPass:
         settings, rig, guides = self.settings, self.rig, self.guides
         sampler = settings.spp if isinstance(settings.spp, Sampler) else None
         fewest = int(self.samples.min())
-        view = View(self.traced, sheet_scene(sheets, self.here, fewest, settings.seed))
+        view = View(self.traced, sheet_scene(sheets, self.here, settings.seed))
         of_paths = PathSettings.of(self.scene, settings)
         if guides is not None and self.scene.has_matte_textures:
             few = min(fewest, TEXTURE_SAMPLES)

@@ -591,7 +591,7 @@ def walk(
         # ---- Caustics: light that reached this point through glass or off mirrors --------------------
         if dr.hint(sheets is not None, mode="scalar"):
             vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, path.is_first & ~link.lit)
-            state.channels, light = caustic_light(
+            state.channels, sharp, smooth = caustic_light(
                 sheets,
                 accumulators,
                 state.channels,
@@ -602,9 +602,9 @@ def walk(
                 lanes.place,
                 is_vertex & ~scatters,
             )
-            radiance.caustic += dr.select(is_later, 0, light)
-            radiance.smooth_caustic += dr.select(is_later, light, 0)
-            tally.indirect += dr.select(is_later, light, 0)
+            radiance.caustic += sharp
+            radiance.smooth_caustic += smooth
+            tally.indirect += dr.select(is_later, smooth, 0)
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
         if dr.hint(settings.ambient, mode="scalar"):
