@@ -38,10 +38,10 @@ the lit part of the scene, where they are small."""
 MARGIN = 1.4
 """Ratio of the height from which a ray looks, and the depth to which it does, to those of the edges of triangles: the
 middle of a triangle is 4 / 3 times as far from a curved surface as its edges."""
-GROUPS = 8
+GROUPS = 4
 """Number of groups of faint triangles; a power of 2. With more groups, samples would find fewer of them at little cost,
 but faint light would be noisier."""
-EVERY = 4
+EVERY = 8
 """Number of samples of which one looks for faint triangles. If every sample looked, a pass would take a fifth
 longer."""
 FAINTEST = 1e-3
@@ -114,14 +114,15 @@ class SheetScene:
     seed : int, decides which of the faintest triangles are kept.
     """
 
-    def __init__(
-        self, sheets: Sheets, projector_at: np.ndarray, irradiance: float, seed: int = 0
-    ) -> None:
+    def __init__(self, sheets: Sheets, projector_at: np.ndarray, irradiance: float, seed: int = 0) -> None:
         at_vertex, scale, area = irradiance_of(sheets.triangles, sheets.flux, sheets.position, len(sheets.u))
         first = sheets.position[sheets.triangles[:, 0]]
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.linalg.norm(first - projector_at, axis=1)
             level = sheets.flux / area * distance**2 / irradiance
+            # A faint triangle lies in more groups the brighter it is, so that each one found brings about as much
+            copies = np.clip(2 ** np.ceil(np.log2(GROUPS * level / FAINT)), 1, GROUPS)
+        copies = np.where(level < FAINT, copies, 0).astype(np.int64)
 
         low, high = sheets.position.min(axis=0), sheets.position.max(axis=0)
         size, middle = float((high - low).max()) + MIN_SIZE_M, (0.5 * (low + high)).astype(np.float64)
@@ -132,9 +133,6 @@ class SheetScene:
         image = np.column_stack([sheets.u, sheets.v]).view(np.uint64)[:, 0]
         columns = (sheets.position, sheets.normal, sheets.triangles, sheets.shape, sheets.key, image)
         flat_lift = (LIFT + 2 * MAX_SAG) * distance  # a flat receiver leaves room that a curved one takes
-        # A faint triangle lies in more groups the brighter it is, so that each one that is found brings about as much
-        copies = np.where(level < FAINT, np.minimum(2 ** np.ceil(np.log2(GROUPS / FAINT * level)), GROUPS), 0)
-        copies = np.where(level < FAINT, np.maximum(copies, 1), 0).astype(np.int64)
         chance = np.minimum(level / FAINTEST, 1)
         salt = np.random.default_rng(seed).integers(1 << 63, dtype=np.uint64)
         corners, names, terms, faint = lifted(
