@@ -28,17 +28,20 @@ from rangesim.light_transport.caustic_kernels import (
     EMPTY,
     cells_of,
     larger,
+    last_ways,
     linked,
     new_points,
     sides_of_photons,
     smooth_chains,
+    with_names,
 )
 from rangesim.light_transport.delta_surfaces import meets_delta
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import aligned
 from rangesim.light_transport.specular_tree import HASH_STEP, Landings, SpecularTree
-from rangesim.light_transport.surfaces import number_of
+from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
+from rangesim.scene.materials import is_specular
 
 BLOCK_PX = 8.0
 """Edge of the largest blocks, in pixels of the projector; a block has two cells along each edge. Rays that find glass
@@ -70,6 +73,10 @@ PHOTONS = 1 << 13
 cells than this, each has a photon. With twice as many photons, their noise would be smaller by a third."""
 MAX_PARTS = 8
 """Largest number of parts along the edge of a cell that is left; an eighth of a pixel is finer than anything seen."""
+MAX_PIXELS = 1 << 18
+"""Largest number of pixels into which the image of a coarse projector is divided. A flood illuminator has few pixels of
+its own, which are only coordinates; without the division its light would have edges as coarse as these. With more,
+the grid would take longer than for a projector of images."""
 MAX_SAG = 1e-3
 """Largest height of a curved receiver over a triangle, as a fraction of its distance from the projector; rays that look
 for triangles (`sheet_scene`) reach as far."""
@@ -79,6 +86,12 @@ farther does not do so evenly."""
 HALVINGS = 4
 """Largest number of times that the parallelogram of a photon is halved until all of it lies on the receiver. Light that
 hangs over an edge is lost; with four, it is a sixteenth of what it would be with none."""
+NEAREST = 0.02
+"""Fraction of the way from glass to the receiver after which rays look for things in between, so that they start beyond
+the glass even where it is curved. Things nearer to the glass are found by points of the grid alone."""
+FLAT = 0.02
+"""Largest distance of a flat receiver from where light between points of the grid lands, as a fraction of `MAX_SAG`:
+ten times the rounding of single precision."""
 SHIFT_PX = np.array([0.0137, 0.0071])
 """Largest shift of the lattice against the edges of pixels, in pixels: more than rounding, less than anything seen."""
 BEND = 0.01
@@ -145,10 +158,32 @@ class Chains(NamedTuple):
     """The columns of `Landings` that decide about triangles."""
 
     key: np.ndarray
+    shape: np.ndarray
     part: np.ndarray
     length: np.ndarray
+    last: np.ndarray
     position: np.ndarray
     normal: np.ndarray
+    direction: np.ndarray
+
+
+class Pairs(NamedTuple):
+    """Pairs of a block or a cell and a chain that may make triangles, see `smooth_chains`."""
+
+    triangles: np.ndarray
+    flux: np.ndarray
+    names: np.ndarray
+    parts: np.ndarray
+
+    def triangles_of(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Triangles and flux of the pairs in a mask (p,)."""
+        each = len(self.triangles) // max(len(self.names), 1)
+        rows = np.repeat(chosen, each)
+        return self.triangles[rows], self.flux[rows]
+
+    def parts_of(self, chosen: np.ndarray, n: int) -> np.ndarray:
+        """(n,) float64, fraction of the light of each block or cell in its pairs in a mask (p,)."""
+        return np.bincount(self.names[chosen, 0], self.parts[chosen, 0], n)
 
 
 class Sheets(NamedTuple):
@@ -273,23 +308,30 @@ class _Tracing:
         assert isinstance(traced.projector, Device)
         self.device, self.report = traced.projector, report
         self.tree = SpecularTree(traced, Launches())
-        width, height = (int(n[0]) for n in self.device.size)
-        self.angle = 1 / float(np.sqrt(self.device.f.x[0] * self.device.f.y[0]))
-        levels = int(np.log2(0.5 * BLOCK_PX / max(CAMERA_CELL * pixel_rad / self.angle, 1)))
+        self.is_glass = mi.Bool(table_of(traced.scene, list(map(is_specular, traced.scene.shapes()))))
+        size = np.array([int(n[0]) for n in self.device.size])
+        angle = 1 / float(np.sqrt(self.device.f.x[0] * self.device.f.y[0]))
+        coarseness = angle / pixel_rad if pixel_rad else 1.0
+        # All lengths here are in these pixels, which are smaller than the projector's if those are coarse
+        self.fineness = float(np.clip(coarseness, 1, max(1, np.sqrt(MAX_PIXELS / size.prod()))))
+        self.angle, self.size_px = angle / self.fineness, size * self.fineness
+        self.finest_px = max(CAMERA_CELL * pixel_rad / self.angle, 1)
+        levels = int(np.log2(0.5 * BLOCK_PX / self.finest_px))
         self.levels = 0 if self.device.has_lens else min(max(levels, 0), MAX_LEVELS)
         self.at = np.array([float(c[0]) for c in self.device.centre])
-        self.size_px = np.array([width, height])
-        self.blocks = tuple(int(np.ceil(n / BLOCK_PX)) for n in (width, height))
+        self.rule = Rule(self.angle, self.at, MAX_SAG, TOLERANCE_PX, FAINT, SIGNIFICANT)
+        self.blocks = tuple(int(np.ceil(n / BLOCK_PX)) for n in self.size_px)
         self.coarsest = 1 << self.levels
-        self.step_px = np.array([width, height]) / (2 * self.coarsest * np.array(self.blocks))
+        self.step_px = self.size_px / (2 * self.coarsest * np.array(self.blocks))
         self.columns = 2 * self.coarsest * self.blocks[0] + 1
-        cells = CellGrid.of(self.device)
+        cells = CellGrid.of(self.device, self.fineness)
         meets, _ = meets_delta(
-            traced.scene, cells.columns * cells.rows, lambda a, b: self.device.centre_ray(cells.probes(a, b))
+            traced.scene,
+            cells.columns * cells.rows,
+            lambda a, b: self.device.centre_ray(cells.probes(a, b)),
+            traced.cutouts,
         )
-        self.delta = _Delta(
-            maximum_filter(meets.reshape(cells.rows, cells.columns), 3), 2 * self.coarsest * np.array(self.blocks)
-        )
+        self.delta = _Delta(meets.reshape(cells.rows, cells.columns), 2 * self.coarsest * np.array(self.blocks))
 
     def sheets(self, power_w: float, rng: np.random.Generator, lens: np.ndarray | None) -> Sheets:
         """Sheets of the light through a point of the lens, uniform coordinates in the unit square (2,); None: its
@@ -302,8 +344,7 @@ class _Tracing:
         near = self.delta.within(x, y, 2 * step)
         x, y = x[near], y[near]
         made, left = [], []
-        rule = Rule(self.angle, self.at, MAX_SAG, TOLERANCE_PX, FAINT, SIGNIFICANT)
-        watts = power_w / self.device.pixels
+        watts = power_w / self.size_px.prod()
         pixels = np.sqrt(self.step_px.prod())
         landings = _no_landings()
         while step and len(x):
@@ -311,18 +352,24 @@ class _Tracing:
             new = points.new(blocks)
             lattice, landings = points.add(new, *self._follow(self._pixels(new), lens, FEWEST))
             chains = Chains(*(getattr(landings, name) for name in Chains._fields))
-            meets = self.delta.within(x, y, 2 * step)
-            triangles, flux, divides, taken, used = smooth_chains(blocks, lattice, chains, rule, meets, taken, used)
-            made.append((triangles, flux))
-            divides &= step > 1
+            *found, rest, is_dark = smooth_chains(blocks, lattice, chains, self.rule, taken)
+            pairs = Pairs(*found)
+            is_clear = self._are_clear(pairs, chains, step * pixels, self.delta.fills(x, y, 2 * step))
+            rest += pairs.parts_of(~is_clear, len(rest))
+            taken, used = with_names(pairs.names[is_clear], x, y, step, self.columns, taken, used)
+            made.append(pairs.triangles_of(is_clear))
+            # A surface that lies between the points is as good as a chain that is not whole
+            divides = ((rest > SIGNIFICANT) | (is_dark & self.delta.within(x, y, 2 * step))) & (step > 1)
             whole = Blocks(x[~divides], y[~divides], *blocks[2:])
             cells = np.column_stack([np.add.outer(c, step * offset).ravel() for c, offset in (
                 (whole.x, np.array([0, 1, 0, 1])), (whole.y, np.array([0, 0, 1, 1])))])  # fmt: skip
-            meets = self.delta.within(cells[:, 0], cells[:, 1], step)
-            triangles, flux, rest, taken, used = cells_of(
-                whole, lattice, chains, rule, points.dropped, meets, taken, used
-            )
-            made.append((triangles, flux))
+            *found, rest, is_dark = cells_of(whole, lattice, chains, self.rule, points.dropped, taken)
+            pairs, (cx, cy) = Pairs(*found), cells.T.copy()
+            is_clear = self._are_clear(pairs, chains, step * pixels, self.delta.fills(cx, cy, step))
+            rest += pairs.parts_of(~is_clear, len(rest))
+            rest[is_dark & self.delta.within(cx, cy, step)] = 1.0
+            taken, used = with_names(pairs.names[is_clear], cx, cy, -step, self.columns, taken, used)
+            made.append(pairs.triangles_of(is_clear))
             left.append(np.column_stack([cells, np.full(len(cells), step), rest])[rest > 0])
             x, y, step = x[divides], y[divides], step // 2
             x, y = (
@@ -334,9 +381,42 @@ class _Tracing:
         triangles, flux = (np.concatenate(c) for c in zip(*made, strict=True))
         of_grid = _sheets(landings, self._pixels(points.numbers)[landings.point], triangles, watts * flux[:, 0], 0.0)
         both = joined([of_grid, self._photons(np.concatenate(left), taken, watts, rng, lens)])
-        if both is None:
-            return of_grid
-        return both._replace(in_triangles=float(of_grid.flux.sum() / both.flux.sum()))
+        every = of_grid if both is None else both._replace(in_triangles=float(of_grid.flux.sum() / both.flux.sum()))
+        return every._replace(u=every.u / np.float32(self.fineness), v=every.v / np.float32(self.fineness))
+
+    def _are_clear(self, pairs: Pairs, chains: Chains, cell_px: float, fills: np.ndarray) -> np.ndarray:
+        """(p,) bool, whether all light between the points of pairs takes their way, as far as rays between them tell.
+
+        What hides the glass from the projector, what stands before the receiver, and holes in the receiver may lie
+        between the points. Faint light is taken as it is.
+
+        Parameters
+        ----------
+        cell_px : edge of a cell, pixels. fills : (n,) bool, whether all rays through a block or cell meet a delta
+            surface first.
+        """
+        is_clear = pairs.names[:, 2] > 0
+        looks = ~is_clear & fills[pairs.names[:, 0]]
+        if not looks.any():
+            return is_clear
+        side = int(np.ceil(cell_px / self.finest_px))
+        triangles, _ = pairs.triangles_of(looks)
+        rays = last_ways(triangles, chains, self.rule, side, NEAREST, FLAT)
+        lands, shapes = np.empty(len(rays), bool), np.repeat(chains.shape[triangles[::2, 0]], side * side)
+        for begin in range(0, len(rays), MAX_AT_ONCE):
+            some = slice(begin, begin + MAX_AT_ONCE)
+            x, y, z, *direction, way, most = (mi.Float(aligned(c, np.float32)) for c in rays[some].T)
+            ray, here = (
+                mi.Ray3f(mi.Point3f(x, y, z), mi.Vector3f(*direction)),
+                mi.UInt32(aligned(shapes[some], np.uint32)),
+            )
+            met = self.tree.traced.scene.ray_intersect_preliminary(ray, coherent=False)
+            is_here = (number_of(met.shape) == here) & (dr.abs(met.t - way) < most)
+            # Glass on the way is that which the light leaves: the ray starts inside it where it is curved
+            is_glass = dr.gather(mi.Bool, self.is_glass, number_of(met.shape), met.is_valid())
+            lands[some] = (met.is_valid() & (is_here | is_glass)).numpy()
+        is_clear[looks] = lands.reshape(looks.sum(), -1).all(axis=1)
+        return is_clear
 
     def _pixels(self, number: np.ndarray) -> np.ndarray:
         """(n, 2) float64, pixel coordinates of lattice points.
@@ -377,7 +457,10 @@ class _Tracing:
         which = sides_of_photons(corners, edges, lists, self.columns, self.coarsest, chains, taken)
         power = watts * size.prod(axis=1) / chance
         made = _parallelograms(found, which, size, place, power, self.angle, self.at, self._lie_on)
-        return made._replace(cut=float((lost[::3] * power).sum() / made.flux.sum()) if len(made.flux) else 0.0)
+        # Nothing outside the image may reach a pattern
+        u, v = (np.clip(c, 0, np.float32(n)) for c, n in zip((made.u, made.v), self.size_px, strict=True))
+        cut = float((lost[::3] * power).sum() / made.flux.sum()) if len(made.flux) else 0.0
+        return made._replace(u=u, v=v, cut=cut)
 
     def _lie_on(self, points: np.ndarray, normal: np.ndarray, shape: np.ndarray) -> np.ndarray:
         """(n,) bool, whether points (n, 3), metres, lie on shapes of these numbers (n,), as far as one looks along
@@ -399,7 +482,7 @@ class _Tracing:
         found, lost = [_no_landings()], [np.empty(0)]
         for begin in range(0, len(pixels), MAX_AT_ONCE):
             some = slice(begin, begin + MAX_AT_ONCE)
-            place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in pixels[some].T))
+            place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in (pixels[some] / self.fineness).T))
             rays = self.device.sample_ray(place, None if lens is None else mi.Point2f(*map(float, lens)))
             random = None if states is None else mi.UInt64(aligned(states[some], np.uint64))
             landings, dropped = self.tree.follow(rays, fewest, random)
@@ -412,7 +495,7 @@ class _Tracing:
 def _no_landings() -> Landings:
     """No landing at all."""
     whole, real, vector = np.empty(0, np.uint32), np.empty(0, np.float32), np.empty((0, 3), np.float32)
-    return Landings(whole, whole, whole, real, real, real, vector, vector, vector)
+    return Landings(whole, whole, whole, real, real, real, real, vector, vector, vector)
 
 
 def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.ndarray, cut: float) -> Sheets:
@@ -499,14 +582,24 @@ class _Delta:
 
     def __init__(self, meets: np.ndarray, lattice: np.ndarray) -> None:
         rows, columns = meets.shape
-        self.sums = np.zeros((rows + 1, columns + 1), np.int64)
-        self.sums[1:, 1:] = meets.cumsum(0).cumsum(1)
+        self.near, self.all = (np.zeros((rows + 1, columns + 1), np.int64) for _ in range(2))
+        self.near[1:, 1:] = maximum_filter(meets, 3).cumsum(0, np.int64).cumsum(1)
+        self.all[1:, 1:] = meets.cumsum(0, np.int64).cumsum(1)
         self.scale = np.array([columns, rows]) / lattice
 
     def within(self, x: np.ndarray, y: np.ndarray, edge: int) -> np.ndarray:
-        """(n,) bool, whether some ray through squares of the lattice meets one."""
-        rows, columns = self.sums.shape
+        """(n,) bool, whether some ray through squares of the lattice, or right beside them, meets one."""
+        return self._number(self.near, x, y, edge)[0] > 0
+
+    def fills(self, x: np.ndarray, y: np.ndarray, edge: int) -> np.ndarray:
+        """(n,) bool, whether all rays through squares of the lattice meet one."""
+        number, cells = self._number(self.all, x, y, edge)
+        return number == cells
+
+    def _number(self, sums: np.ndarray, x: np.ndarray, y: np.ndarray, edge: int) -> tuple[np.ndarray, np.ndarray]:
+        """Sum over the cells of the image that squares of the lattice touch, and number of these cells; (n,) int64."""
+        rows, columns = sums.shape
         x0, y0 = (np.floor(c * s).astype(np.int64) for c, s in ((x, self.scale[0]), (y, self.scale[1])))
         x1, y1 = (np.ceil((c + edge) * s).astype(np.int64) for c, s in ((x, self.scale[0]), (y, self.scale[1])))
         x1, y1 = np.minimum(np.maximum(x1, x0 + 1), columns - 1), np.minimum(np.maximum(y1, y0 + 1), rows - 1)
-        return self.sums[y1, x1] - self.sums[y0, x1] - self.sums[y1, x0] + self.sums[y0, x0] > 0
+        return sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0], (x1 - x0) * (y1 - y0)

@@ -16,7 +16,7 @@ import mitsuba as mi
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.beams import BeamDevice
 from rangesim.light_transport.caustic_sheets import Sheets, trace_sheets
-from rangesim.light_transport.delta_surfaces import has_delta
+from rangesim.light_transport.delta_surfaces import throws_caustics
 from rangesim.light_transport.sheet_scene import EVERY, Place, SheetScene
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.surfaces import number_of
@@ -36,15 +36,15 @@ any amount of light. A smaller bound would darken caustics beside edges where fa
 def caustic_sheets(
     traced: TracedScene, rigs: Sequence[Rig], settings: TransportSettings, report: Callable[[], None] = lambda: None
 ) -> Sheets | None:
-    """Triangles of light for a pass of any camera; None if the caller wants none, no surface has a delta interaction,
-    or no light landed. A beam needs none, see `rangesim.light_transport.beams`.
+    """Triangles of light for a pass of any camera; None if the caller wants none, no surface has a delta interaction
+    other than holes, or no light landed. A beam needs none, see `rangesim.light_transport.beams`.
 
     Parameters
     ----------
     rigs : rigs of the pass, which share their emitter.
     report : called after each kernel launch.
     """
-    if not settings.caustics or not has_delta(traced.scene) or isinstance(traced.projector, BeamDevice):
+    if not settings.caustics or not throws_caustics(traced.scene) or isinstance(traced.projector, BeamDevice):
         return None
     pixel_rad = min(rig.camera.angle_of(1) for rig in rigs)
     return trace_sheets(traced, rigs[0].projector_power_w, settings.seed, pixel_rad, report)
@@ -54,7 +54,9 @@ def sheet_scene(sheets: Sheets | None, rig: Rig, seed: int) -> SheetScene | None
     """The triangles as kernels see them; None if there are none. `seed` is that of the pass."""
     if sheets is None or not len(sheets.flux):
         return None
-    return SheetScene(sheets, rig.T_world_projector[:3, 3], rig.projector_irradiance, seed)
+    # Points of a lens are sharp, so that light has the blur of the pixels alone
+    blur_px = None if rig.projector_lens.focus_m is None else 0.0
+    return SheetScene(sheets, rig.T_world_projector[:3, 3], rig.projector_irradiance, seed, blur_px)
 
 
 class Vertex(NamedTuple):
@@ -138,7 +140,8 @@ def caustic_light(
             is_smooth = is_later | (which == 1)
             sharp += dr.select(is_smooth, 0, brought)
             smooth += dr.select(is_smooth, brought, 0)
-            path = LightPath(light.u, light.v, vertex.length + light.length, vertex.is_first, mi.UInt32(CAUSTIC))
+            length = vertex.length + light.length
+            path = LightPath(light.u, light.v, length, vertex.is_first, mi.UInt32(CAUSTIC), sheets.blur_px)
             channels = accumulators.add(channels, path, brought, place, on_one_side, is_smooth)
         total = dr.select(counts, 0, total)
         last = dr.select(hit, found.prim_index, last)

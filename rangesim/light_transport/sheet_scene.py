@@ -112,9 +112,18 @@ class SheetScene:
     sheets : Sheets, at least one triangle.
     projector_at : (3,) float, metres, world. irradiance : W/m2, of the projector's direct light at 1 m.
     seed : int, decides which of the faintest triangles are kept.
+    blur_px : blur of the light of every triangle, see `rangesim.response.LightPath`.
     """
 
-    def __init__(self, sheets: Sheets, projector_at: np.ndarray, irradiance: float, seed: int = 0) -> None:
+    def __init__(
+        self,
+        sheets: Sheets,
+        projector_at: np.ndarray,
+        irradiance: float,
+        seed: int = 0,
+        blur_px: float | None = None,
+    ) -> None:
+        self.blur_px = None if blur_px is None else mi.Float(blur_px)
         at_vertex, scale, area = irradiance_of(sheets.triangles, sheets.flux, sheets.position, len(sheets.u))
         first = sheets.position[sheets.triangles[:, 0]]
         with np.errstate(divide="ignore", invalid="ignore"):
