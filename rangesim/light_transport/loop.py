@@ -149,7 +149,7 @@ class SampleAllocation:
             samples=2 * (pairs + 1 - half >> 1) - odd * ((pairs - 1 & 1) == half),
             total=twice(self.total),
             irradiance=self.irradiance,
-            first=self.first + 2 * half,
+            first=(self.first if isinstance(self.first, int) else twice(self.first)) + 2 * half,
             stride=2 * self.stride,
             part=2 * self.part + half,
         )
