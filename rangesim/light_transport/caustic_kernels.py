@@ -518,7 +518,9 @@ def _names_of(triangles, key, image):  # type: ignore[no-untyped-def]
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def lifted(sheets, scale, copies, chance, salt, groups, every, lift, flat_lift, offsets, middle):  # type: ignore[no-untyped-def]
+def lifted(  # type: ignore[no-untyped-def]
+    sheets, scale, copies, chance, salt, groups, every, lift, flat_lift, offsets, middle
+):
     """The triangles of light as a scene of their own, see `sheet_scene`.
 
     Parameters
@@ -526,7 +528,8 @@ def lifted(sheets, scale, copies, chance, salt, groups, every, lift, flat_lift, 
     sheets : Sheets, as a tuple of position, normal, triangles, shape, key, and the bits of u and v of each vertex in a
         number.
     copies : (t,) int64, number of groups in which a triangle lies, a power of 2; 0 for bright ones.
-    chance : (t,) float64, probability with which a faint triangle is kept; it then counts for those that are not. salt : uint64, a random number of the pass.
+    chance : (t,) float64, probability with which a faint triangle is kept; it then counts for those that are not.
+    salt : uint64, a random number of the pass.
     lift, flat_lift : (t,) float64, metres, largest distance of triangles in one place, where the receiver is curved and
         where it is flat.
     offsets : (groups + 1, 2) float64, metres, of bright triangles and of the groups of faint ones.
