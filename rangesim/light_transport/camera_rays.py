@@ -297,7 +297,7 @@ class Device:
 
 
 class CellGrid(NamedTuple):
-    """Cells of equal size that make up a device's image.
+    """Cells of equal size that make up the image of a projector.
 
     columns, rows : int, number of cells along x and y.
     size : Point2f, pixels, size of a cell.
@@ -310,12 +310,11 @@ class CellGrid(NamedTuple):
     pixels_per_cell: float
 
     @classmethod
-    def of(cls, device: Device, fineness: float = 1.0) -> CellGrid:
-        """The cells of a device's image: its pixels, or squares of them if there are more than `MAX_CELLS` pixels.
+    def of(cls, w: int, h: int, fineness: float = 1.0) -> CellGrid:
+        """The cells of an image of w x h pixels: its pixels, or squares of them if there are more than `MAX_CELLS`.
 
-        Of a coarse device each pixel is divided into `fineness` cells along each axis.
+        Each pixel is divided into `fineness` cells along each axis.
         """
-        w, h = (int(n[0]) for n in device.size)
         edge = max(1, math.ceil(math.sqrt(w * h * fineness**2 / MAX_CELLS))) / fineness
         columns, rows = math.ceil(w / edge), math.ceil(h / edge)
         size = mi.Point2f(dr.opaque(mi.Float, w / columns), dr.opaque(mi.Float, h / rows))

@@ -145,7 +145,7 @@ def _off_middle(position, m, a, b):  # type: ignore[no-untyped-def]
 @cached_njit(nogil=True, error_model="numpy")
 def _is_faint(r, landings, pixels, rule):  # type: ignore[no-untyped-def]
     """Whether the light of one chain over a block is faint. r : (9,) int64, landings. pixels : edge of the block."""
-    area, plain = 0.0, rule.angle * landings.length[r[4]] * pixels
+    area, plain = 0.0, (rule.pixel_m + rule.pixel_rad * landings.length[r[4]]) * pixels
     for q in (0, 1, 3, 4):
         area += triangle_area(landings.position, r[q], r[q + 1], r[q + 4])
         area += triangle_area(landings.position, r[q], r[q + 4], r[q + 3])
@@ -168,7 +168,7 @@ def _is_smooth(r, landings, pixels, rule):  # type: ignore[no-untyped-def]
         size = triangle_area(position, r[q], r[q + 1], r[q + 4]) + triangle_area(position, r[q], r[q + 4], r[q + 3])
         total += size
         low, high = min(low, size), max(high, size)
-    plain = rule.angle * length[r[4]]
+    plain = rule.pixel_m + rule.pixel_rad * length[r[4]]
     off = 0.0
     for m, a, b in ((1, 0, 2), (3, 0, 6), (5, 2, 8), (7, 6, 8), (4, 0, 8), (4, 2, 6)):
         off = max(off, _off_middle(position, r[m], r[a], r[b]))

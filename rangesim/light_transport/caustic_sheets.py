@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The projector's light beyond glass and mirrors, as triangles on the surfaces where it lands.
+"""Light beyond glass and mirrors, as triangles on the surfaces where it lands.
 
 The projector is a point, so the place where a chain of delta interactions ends is a smooth function of the place in the
-image where it began. A grid of points over the image is traced through the scene (`specular_tree`). Where the points
-around a cell of the grid took the same chain, they span triangles on the surface where they landed. The irradiance of a
-triangle is its flux over its area, and everything else is interpolated between its corners. Cells are divided where
-triangles would be too coarse.
+image where it began. The same holds for all sources without extent (`delta_sources`). A grid of points over the image
+is traced through the scene (`specular_tree`). Where the points around a cell of the grid took the same chain, they span
+triangles on the surface where they landed. The irradiance of a triangle is its flux over its area, and everything else
+is interpolated between its corners. Cells are divided where triangles would be too coarse.
 
 The rest, mostly along the silhouettes of glass, is left to photons: random points of the cells, each of which carries
 the light of its cell over the parallelogram to which the derivatives of the place by the point spread the cell (photon
@@ -35,6 +35,7 @@ from rangesim.light_transport.caustic_kernels import (
     smooth_chains,
     with_names,
 )
+from rangesim.light_transport.delta_sources import DeltaSource, ProjectorSource
 from rangesim.light_transport.delta_surfaces import meets_delta
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import aligned
@@ -73,10 +74,6 @@ PHOTONS = 1 << 13
 cells than this, each has a photon. With twice as many photons, their noise would be smaller by a third."""
 MAX_PARTS = 8
 """Largest number of parts along the edge of a cell that is left; an eighth of a pixel is finer than anything seen."""
-MAX_PIXELS = 1 << 18
-"""Largest number of pixels into which the image of a coarse projector is divided. A flood illuminator has few pixels of
-its own, which are only coordinates; without the division its light would have edges as coarse as these. With more,
-the grid would take longer than for a projector of images."""
 MAX_SAG = 1e-3
 """Largest height of a curved receiver over a triangle, as a fraction of its distance from the projector; rays that look
 for triangles (`sheet_scene`) reach as far."""
@@ -102,11 +99,6 @@ MIN_SIDE_M = 1e-12
 STEP_PX = 0.02
 """Distance of the points beside a photon that tell how its light spreads, in pixels of the projector. Closer points
 would land within the rounding of single precision; farther ones would miss narrow chains."""
-LENS_RADIUS, LENS_WEIGHTS = np.sqrt(2 / 3), (1 / 4, *[1 / 8] * 6)
-"""Points of a lens of finite size, each of which has a grid of its own, at the lowest level: its centre and a regular
-hexagon. Radius of the hexagon as a fraction of the lens, and fractions of the light. Means over these points are exact
-for polynomials of the place on the lens up to degree 5 (Stroud, Approximate calculation of multiple integrals, 1971,
-rule S2: 5-1), so light lands where it should on average, and blurs as much."""
 MAX_AT_ONCE = 1 << 18
 """Largest number of points of a launch, so that the weaker parts that it stores take 100 MB at most."""
 
@@ -144,9 +136,11 @@ class Lists(NamedTuple):
 class Rule(NamedTuple):
     """The numbers that decide whether a block is divided, see `TOLERANCE_PX`, `FAINT` and `SIGNIFICANT`.
 
-    `angle` is that of a pixel in radians, `projector_at` the place of the projector (3,) and `sag` is `MAX_SAG`."""
+    `pixel_m` and `pixel_rad` tell the size of a pixel's light, see `DeltaSource`; `projector_at` is the place of the
+    projector (3,) and `sag` is `MAX_SAG`."""
 
-    angle: float
+    pixel_m: float
+    pixel_rad: float
     projector_at: np.ndarray
     sag: float
     tolerance: float
@@ -195,6 +189,7 @@ class Sheets(NamedTuple):
         optical length in metres, pixel coordinates of the projector.
     normal : (n, 3) float32, geometric normals.
     triangles : (t, 3) int64, vertices. flux : (t,) float64, watts.
+    direct : (t,) float64, W/m2, irradiance that the source would make there on a surface that faces it.
     shape, key : (t,) uint32, number of the shape where it lands, and name of the chain.
     cut : ratio of the light that was lost in chains that are too long to all light.
     in_triangles : fraction of the flux that the grid's triangles carry; photons carry the rest.
@@ -209,6 +204,7 @@ class Sheets(NamedTuple):
     normal: np.ndarray
     triangles: np.ndarray
     flux: np.ndarray
+    direct: np.ndarray
     shape: np.ndarray
     key: np.ndarray
     cut: float
@@ -232,20 +228,34 @@ def trace_sheets(
     report : called after each kernel launch.
     """
     assert isinstance(traced.projector, Device)  # beams need no sheets
-    rng = np.random.default_rng(seed)
-    tracing = _Tracing(traced, pixel_rad, report)
-    if not traced.projector.has_lens:
-        return joined([tracing.sheets(power_w, rng, None)])
-    made = [tracing.sheets(power_w * part, rng, p) for part, p in zip(LENS_WEIGHTS, _lens_points(), strict=True)]
-    # Chains through different points of the lens are different chains
-    return joined([one._replace(key=one.key + np.uint32(i * HASH_STEP & 0xFFFFFFFF)) for i, one in enumerate(made)])
+    source = ProjectorSource(traced.projector, power_w, CAMERA_CELL * pixel_rad, pixel_rad)
+    return sheets_of(SpecularTree(traced, Launches()), source, source.at, np.random.default_rng(seed), report)
 
 
-def _lens_points() -> np.ndarray:
-    """(7, 2) float64, see `LENS_WEIGHTS`, as the places in the unit square that are mapped to them."""
-    angle = np.pi / 3 * np.arange(6)
-    x, y = (mi.Float(np.append(0, LENS_RADIUS * f(angle)).astype(np.float32)) for f in (np.cos, np.sin))
-    return mi.warp.uniform_disk_to_square_concentric(mi.Point2f(x, y)).numpy().T.astype(np.float64)
+def sheets_of(
+    tree: SpecularTree,
+    source: DeltaSource,
+    projector_at: np.ndarray,
+    rng: np.random.Generator,
+    report: Callable[[], None] = lambda: None,
+) -> Sheets | None:
+    """The light of a source through glass and off mirrors, on the surfaces where it lands; None if there is none.
+
+    Parameters
+    ----------
+    tree : SpecularTree of the scene.
+    projector_at : (3,) float64, metres, world, the place from which distances count, see `MAX_SAG`.
+    rng : decides about photons.
+    """
+    tracing = _Tracing(tree, source, projector_at, report)
+    lenses = [None] if source.lens is None else list(source.lens)
+    made = [tracing.sheets(part, rng, lens) for part, lens in zip(source.lens_weights, lenses, strict=True)]
+    return joined(apart(made))
+
+
+def apart(sheets: Sequence[Sheets]) -> list[Sheets]:
+    """Sheets whose keys tell them apart: chains from different places are different chains."""
+    return [one._replace(key=one.key + np.uint32(i * HASH_STEP & 0xFFFFFFFF)) for i, one in enumerate(sheets)]
 
 
 def joined(sheets: Sequence[Sheets]) -> Sheets | None:
@@ -297,45 +307,43 @@ class _Points:
 
 
 class _Tracing:
-    """Traces sheets of a projector.
+    """Traces sheets of a source.
 
     Parameters
     ----------
-    traced, pixel_rad, report : as for `trace_sheets`.
+    tree, source, projector_at, report : as for `sheets_of`.
     """
 
-    def __init__(self, traced: TracedScene, pixel_rad: float, report: Callable[[], None]) -> None:
-        assert isinstance(traced.projector, Device)
-        self.device, self.report = traced.projector, report
-        self.tree = SpecularTree(traced, Launches())
-        self.is_glass = mi.Bool(table_of(traced.scene, list(map(is_specular, traced.scene.shapes()))))
-        size = np.array([int(n[0]) for n in self.device.size])
-        angle = 1 / float(np.sqrt(self.device.f.x[0] * self.device.f.y[0]))
-        coarseness = angle / pixel_rad if pixel_rad else 1.0
-        # All lengths here are in these pixels, which are smaller than the projector's if those are coarse
-        self.fineness = float(np.clip(coarseness, 1, max(1, np.sqrt(MAX_PIXELS / size.prod()))))
-        self.angle, self.size_px = angle / self.fineness, size * self.fineness
-        self.finest_px = max(CAMERA_CELL * pixel_rad / self.angle, 1)
-        levels = int(np.log2(0.5 * BLOCK_PX / self.finest_px))
-        self.levels = 0 if self.device.has_lens else min(max(levels, 0), MAX_LEVELS)
-        self.at = np.array([float(c[0]) for c in self.device.centre])
-        self.rule = Rule(self.angle, self.at, MAX_SAG, TOLERANCE_PX, FAINT, SIGNIFICANT)
+    def __init__(
+        self, tree: SpecularTree, source: DeltaSource, projector_at: np.ndarray, report: Callable[[], None]
+    ) -> None:
+        self.tree, self.source, self.at, self.report = tree, source, projector_at, report
+        self.is_glass = mi.Bool(table_of(tree.traced.scene, list(map(is_specular, tree.traced.scene.shapes()))))
+        # All lengths here are in parts of pixels, see `DeltaSource.fineness`
+        largest, self.fineness = 0.5 * BLOCK_PX, source.fineness
+        self.finest_px = float(np.clip(source.finest_px * self.fineness, 1, largest))
+        self.levels = min(int(np.log2(largest / self.finest_px)), MAX_LEVELS)
+        self.between_px = 1.0 if source.lens is not None else self.finest_px  # between rays that look for thin things
+        self.size_px = np.array([source.width, source.height]) * self.fineness
+        pixel = source.pixel_m / self.fineness, source.pixel_rad / self.fineness
+        self.rule = Rule(*pixel, self.at, MAX_SAG, TOLERANCE_PX, FAINT, SIGNIFICANT)
         self.blocks = tuple(int(np.ceil(n / BLOCK_PX)) for n in self.size_px)
         self.coarsest = 1 << self.levels
         self.step_px = self.size_px / (2 * self.coarsest * np.array(self.blocks))
         self.columns = 2 * self.coarsest * self.blocks[0] + 1
-        cells = CellGrid.of(self.device, self.fineness)
-        meets, _ = meets_delta(
-            traced.scene,
+        cells = CellGrid.of(source.width, source.height, self.fineness)
+        meets, exists = meets_delta(
+            tree.traced.scene,
             cells.columns * cells.rows,
-            lambda a, b: self.device.centre_ray(cells.probes(a, b)),
-            traced.cutouts,
+            lambda a, b: source.rays(cells.probes(a, b))[0],
+            source.shines_through_holes,
         )
-        self.delta = _Delta(meets.reshape(cells.rows, cells.columns), 2 * self.coarsest * np.array(self.blocks))
+        meets = (meets & exists).reshape(cells.rows, cells.columns)
+        self.delta = _Delta(meets, 2 * self.coarsest * np.array(self.blocks))
 
-    def sheets(self, power_w: float, rng: np.random.Generator, lens: np.ndarray | None) -> Sheets:
-        """Sheets of the light through a point of the lens, uniform coordinates in the unit square (2,); None: its
-        centre."""
+    def sheets(self, weight: float, rng: np.random.Generator, lens: np.ndarray | None) -> Sheets:
+        """Sheets of a fraction of the light through a point of the lens, uniform coordinates in the unit square (2,);
+        None: its centre."""
         points = _Points(self.columns, self.coarsest)
         x, y = (
             c.ravel().astype(np.int64) for c in np.meshgrid(*(2 * self.coarsest * np.arange(n) for n in self.blocks))
@@ -344,7 +352,7 @@ class _Tracing:
         near = self.delta.within(x, y, 2 * step)
         x, y = x[near], y[near]
         made, left = [], []
-        watts = power_w / self.size_px.prod()
+        watts = weight * self.source.watts / self.fineness**2
         pixels = np.sqrt(self.step_px.prod())
         landings = _no_landings()
         while step and len(x):
@@ -382,7 +390,10 @@ class _Tracing:
         of_grid = _sheets(landings, self._pixels(points.numbers)[landings.point], triangles, watts * flux[:, 0], 0.0)
         both = joined([of_grid, self._photons(np.concatenate(left), taken, watts, rng, lens)])
         every = of_grid if both is None else both._replace(in_triangles=float(of_grid.flux.sum() / both.flux.sum()))
-        return every._replace(u=every.u / np.float32(self.fineness), v=every.v / np.float32(self.fineness))
+        direct = self.source.direct(every.position[every.triangles[:, 0]])
+        return every._replace(
+            u=every.u / np.float32(self.fineness), v=every.v / np.float32(self.fineness), direct=direct
+        )
 
     def _are_clear(self, pairs: Pairs, chains: Chains, cell_px: float, fills: np.ndarray) -> np.ndarray:
         """(p,) bool, whether all light between the points of pairs takes their way, as far as rays between them tell.
@@ -399,7 +410,7 @@ class _Tracing:
         looks = ~is_clear & fills[pairs.names[:, 0]]
         if not looks.any():
             return is_clear
-        side = int(np.ceil(cell_px / self.finest_px))
+        side = int(np.ceil(cell_px / self.between_px))
         triangles, _ = pairs.triangles_of(looks)
         rays = last_ways(triangles, chains, self.rule, side, NEAREST, FLAT)
         lands, shapes = np.empty(len(rays), bool), np.repeat(chains.shape[triangles[::2, 0]], side * side)
@@ -456,7 +467,7 @@ class _Tracing:
         corners, edges = cells[:, :2].astype(np.int64), cells[:, 2].astype(np.int64)
         which = sides_of_photons(corners, edges, lists, self.columns, self.coarsest, chains, taken)
         power = watts * size.prod(axis=1) / chance
-        made = _parallelograms(found, which, size, place, power, self.angle, self.at, self._lie_on)
+        made = _parallelograms(found, which, size, place, power, self.rule, self._lie_on)
         # Nothing outside the image may reach a pattern
         u, v = (np.clip(c, 0, np.float32(n)) for c, n in zip((made.u, made.v), self.size_px, strict=True))
         cut = float((lost[::3] * power).sum() / made.flux.sum()) if len(made.flux) else 0.0
@@ -483,9 +494,9 @@ class _Tracing:
         for begin in range(0, len(pixels), MAX_AT_ONCE):
             some = slice(begin, begin + MAX_AT_ONCE)
             place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in (pixels[some] / self.fineness).T))
-            rays = self.device.sample_ray(place, None if lens is None else mi.Point2f(*map(float, lens)))
+            on_lens = None if lens is None else mi.Point2f(*map(float, lens))
             random = None if states is None else mi.UInt64(aligned(states[some], np.uint64))
-            landings, dropped = self.tree.follow(rays, fewest, random)
+            landings, dropped = self.tree.follow(self.source, place, on_lens, fewest, random)
             self.report()
             found.append(landings._replace(point=landings.point + np.uint32(begin)))
             lost.append(dropped)
@@ -505,7 +516,8 @@ def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.
     of = triangles[:, 0]
     slowness = landings.ior[:, None] * landings.direction
     vertices = landings.position, slowness, cosine, landings.length, u, v, landings.normal
-    return Sheets(*vertices, triangles, flux, landings.shape[of], landings.key[of], cut, 0.0)
+    untold = np.full(len(triangles), np.nan)
+    return Sheets(*vertices, triangles, flux, untold, landings.shape[of], landings.key[of], cut, 0.0)
 
 
 def _parallelograms(
@@ -514,8 +526,7 @@ def _parallelograms(
     size: np.ndarray,
     place: np.ndarray,
     power: np.ndarray,
-    angle: float,
-    projector_at: np.ndarray,
+    rule: Rule,
     lie_on: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
 ) -> Sheets:
     """Sheets of photons, two triangles each.
@@ -524,7 +535,7 @@ def _parallelograms(
     ----------
     found : Landings of the three points of each photon. which : (m, 3) int64, see `sides_of_photons`.
     size, place : (n, 2) float64, pixels, sizes of the photons' cells and places of the photons.
-    power : (n,) float64, watts, power that a photon stands for. angle : radians, of a pixel. projector_at : (3,).
+    power : (n,) float64, watts, power that a photon stands for. rule : Rule.
     lie_on : function that says whether points with normals lie on shapes.
     """
     this = which[:, 0]
@@ -533,7 +544,8 @@ def _parallelograms(
     normal = found.normal[this].astype(np.float64)
     # Where no chain of the same name lies beside a photon, its light spreads as without glass
     across = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]]))
-    across *= (angle * found.length[this] / np.linalg.norm(across, axis=1))[:, None]
+    spread = rule.pixel_m + rule.pixel_rad * found.length[this]
+    across *= (spread / np.linalg.norm(across, axis=1))[:, None]
     plain = np.stack([across, np.cross(normal, across)], axis=1)
     known = np.all(which[:, 1:] >= 0, axis=1, keepdims=True)
     sides = (
@@ -543,7 +555,7 @@ def _parallelograms(
     longest = MAX_SIDE * found.length[this, None]
     turn = np.linalg.norm(found.normal[which[:, 1:]] - normal[:, None], axis=2) / STEP_PX * edges  # radians over a side
     length = np.maximum(np.linalg.norm(sides, axis=2), MIN_SIDE_M)
-    sag = MAX_SAG * np.linalg.norm(centre - projector_at, axis=1)[:, None]
+    sag = rule.sag * np.linalg.norm(centre - rule.projector_at, axis=1)[:, None]
     flat = np.sqrt(4 * sag / np.maximum(np.where(known, turn, 0) * length, MIN_SIDE_M))  # half for each side
     shrinks = np.minimum(np.minimum(longest / length, flat), 1)
     sides *= shrinks[..., None]

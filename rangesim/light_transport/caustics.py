@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The projector's light beyond glass and mirrors, as camera paths gather it.
+"""Light beyond glass and mirrors, as camera paths gather it.
 
 This module has the triangles of light made for a pass, and computes the light that they bring to a vertex of a camera
 path.
@@ -12,11 +12,13 @@ from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.beams import BeamDevice
-from rangesim.light_transport.caustic_sheets import Sheets, trace_sheets
+from rangesim.light_transport.caustic_sheets import CAMERA_CELL, Sheets, trace_sheets
 from rangesim.light_transport.delta_surfaces import throws_caustics
+from rangesim.light_transport.lamps import lamp_sheets
 from rangesim.light_transport.sheet_scene import EVERY, Place, SheetScene
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.surfaces import number_of
@@ -50,13 +52,33 @@ def caustic_sheets(
     return trace_sheets(traced, rigs[0].projector_power_w, settings.seed, pixel_rad, report)
 
 
+def lamp_caustics(
+    traced: TracedScene,
+    rigs: Sequence[Rig],
+    ranges_m: Sequence[float],
+    settings: TransportSettings,
+    report: Callable[[], None] = lambda: None,
+) -> Sheets | None:
+    """Triangles of the light of lamps without extent, for a pass of any camera; None as for `caustic_sheets`.
+
+    Parameters
+    ----------
+    ranges_m : metres, typical distance of what each camera sees; NaN if it sees nothing.
+    """
+    pixels_m = [rig.camera.angle_of(1) * range_m for rig, range_m in zip(rigs, ranges_m, strict=True)]
+    if not settings.caustics or np.isnan(pixels_m).all():
+        return None
+    camera_at, projector_at = rigs[0].T_world_camera[:3, 3], rigs[0].T_world_projector[:3, 3]
+    return lamp_sheets(traced, CAMERA_CELL * float(np.nanmin(pixels_m)), camera_at, projector_at, settings.seed, report)
+
+
 def sheet_scene(sheets: Sheets | None, rig: Rig, seed: int) -> SheetScene | None:
     """The triangles as kernels see them; None if there are none. `seed` is that of the pass."""
     if sheets is None or not len(sheets.flux):
         return None
     # Points of a lens are sharp, so that light has the blur of the pixels alone
     blur_px = None if rig.projector_lens.focus_m is None else 0.0
-    return SheetScene(sheets, rig.T_world_projector[:3, 3], rig.projector_irradiance, seed, blur_px)
+    return SheetScene(sheets, rig.T_world_projector[:3, 3], seed, blur_px)
 
 
 class Vertex(NamedTuple):

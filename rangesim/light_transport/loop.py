@@ -246,10 +246,12 @@ class LaneState:
 
 
 class View(NamedTuple):
-    """Everything that the lanes read: the scene with its devices, and the triangles of light (None: there are none)."""
+    """Everything that the lanes read: the scene with its devices, and the triangles of light, of the projector and of
+    lamps of the scene (None: there are none)."""
 
     traced: TracedScene
     sheets: SheetScene | None = None
+    of_lamps: SheetScene | None = None
 
 
 def trace(
@@ -419,7 +421,7 @@ def walk(
     max_iterations: mi.UInt32,
 ) -> tuple[LaneState, mi.UInt32]:
     """The state of the lanes after at most `max_iterations` of the loop, and the number of iterations of each lane."""
-    traced, sheets = view
+    traced, sheets, of_lamps = view
     scene, surfaces, camera, projector, media, cutouts, absorbers = traced
     n = dr.width(state.sample)
     is_beam = isinstance(projector, BeamDevice)
@@ -427,6 +429,7 @@ def walk(
     sees_glint, meets_delta = state.radiance.glint is not None, state.path.left_delta is not None
     flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if has_pencil else mi.RayFlags.All
     left = max_iterations + dr.zeros(mi.UInt32, n)  # iterations
+    nothing = Accumulators((), 1)  # the light of lamps is in no channel
     active = (state.sample < lanes.samples) & (left > 0)
 
     while active:
@@ -621,6 +624,20 @@ def walk(
                         traced, bsdf, si, ray.d, path.ray_state, scatters, xi, is_vertex
                     )
                 radiance.ambient += path.throughput * light
+            if dr.hint(of_lamps is not None, mode="scalar"):
+                vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, mi.Bool(False))
+                _, sharp, smooth = caustic_light(
+                    of_lamps,
+                    nothing,
+                    [],
+                    vertex,
+                    lanes.turn(number),
+                    lanes.pick(number),
+                    is_later,
+                    lanes.place,
+                    is_vertex & ~scatters,
+                )
+                radiance.ambient += sharp + smooth
 
         # ---- Next direction --------------------------------------------------------------------------
         goes_delta = is_delta(bs)

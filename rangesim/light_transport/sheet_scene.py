@@ -110,25 +110,18 @@ class SheetScene:
     Parameters
     ----------
     sheets : Sheets, at least one triangle.
-    projector_at : (3,) float, metres, world. irradiance : W/m2, of the projector's direct light at 1 m.
+    projector_at : (3,) float, metres, world.
     seed : int, decides which of the faintest triangles are kept.
     blur_px : blur of the light of every triangle, see `rangesim.response.LightPath`.
     """
 
-    def __init__(
-        self,
-        sheets: Sheets,
-        projector_at: np.ndarray,
-        irradiance: float,
-        seed: int = 0,
-        blur_px: float | None = None,
-    ) -> None:
+    def __init__(self, sheets: Sheets, projector_at: np.ndarray, seed: int = 0, blur_px: float | None = None) -> None:
         self.blur_px = None if blur_px is None else mi.Float(blur_px)
         at_vertex, scale, area = irradiance_of(sheets.triangles, sheets.flux, sheets.position, len(sheets.u))
         first = sheets.position[sheets.triangles[:, 0]]
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.linalg.norm(first - projector_at, axis=1)
-            level = sheets.flux / area * distance**2 / irradiance
+            level = sheets.flux / area / sheets.direct
             # A faint triangle lies in more groups the brighter it is, so that each one found brings about as much
             copies = np.clip(2 ** np.ceil(np.log2(GROUPS * level / FAINT)), 1, GROUPS)
         copies = np.where(level < FAINT, copies, 0).astype(np.int64)

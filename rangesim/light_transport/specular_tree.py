@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trees of specular chains: the light of a point of the projector's image on its way through glass and off mirrors.
+"""Trees of specular chains: the light of a point of a source's image on its way through glass and off mirrors.
 
 At glass a ray splits in two: one part is reflected, the other refracted. Both are followed, each with its fraction of
 the light, so a point of the image always lights the same places. A chain is named by a key, which depends on the
@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.camera_rays import Device, PrimaryRay
+from rangesim.light_transport.delta_sources import DeltaSource
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import Continued
 from rangesim.light_transport.spectrum import mono
@@ -101,11 +101,11 @@ class Landings(NamedTuple):
 
 
 class SpecularTree:
-    """Follows the projector's light through the delta surfaces of a scene.
+    """Follows light through the delta surfaces of a scene.
 
     Parameters
     ----------
-    traced : TracedScene, whose emitter is a projector.
+    traced : TracedScene
     launches : Launches.
     """
 
@@ -120,13 +120,18 @@ class SpecularTree:
         self.max_chain, self.earlier = dr.opaque(mi.UInt32, MAX_CHAIN), dr.opaque(mi.UInt32, EARLIER)
 
     def follow(
-        self, primary: PrimaryRay, fewest: float, random: mi.UInt64 | None = None
+        self,
+        source: DeltaSource,
+        pixel: mi.Point2f,
+        lens: mi.Point2f | None,
+        fewest: float,
+        random: mi.UInt64 | None = None,
     ) -> tuple[Landings, np.ndarray]:
         """Follow the light of points of the image to where it lands.
 
         Parameters
         ----------
-        primary : PrimaryRay, n rays.
+        pixel, lens : n points of the image, and the point of the lens, as for `DeltaSource.rays`.
         fewest : fraction of a point's light below which a part is dropped. Photons keep some of these parts by Russian
             roulette, so that none is left out in the mean.
         random : UInt64, states of the random numbers of photons; None for points of the grid, which drop parts and are
@@ -137,14 +142,11 @@ class SpecularTree:
         landings : Landings.
         dropped : (n,) float64, fraction of each point's light in parts that were dropped.
         """
-        traced = self.traced
-        assert isinstance(traced.projector, Device)
+        primary, fraction = source.rays(pixel, lens)
         n = dr.width(primary.direction)
-        one = dr.ones(mi.Float, n)
-        state = RayState.start(traced, n).restarted(True, primary.origin, primary.path_offset + dr.zeros(mi.Float, n))
-        part = one * traced.projector.relative_illumination(primary.direction)
-        if primary.exists is not None:
-            part = dr.select(primary.exists, part, 0)
+        state = source.start(self.traced, n)
+        state = state.restarted(True, primary.origin, primary.path_offset + dr.zeros(mi.Float, n))
+        part = dr.ones(mi.Float, n) * fraction
         origin = mi.Point3f(primary.origin) + dr.zeros(mi.Point3f, n)
         none = dr.zeros(mi.UInt32, n)
         parts = Parts(dr.arange(mi.UInt32, n), part, origin, primary.direction, state, none, mi.UInt32(none),
@@ -152,6 +154,7 @@ class SpecularTree:
         # All parts share an increment; their states differ
         chance = None if random is None else Continued(mi.PCG32(1))
         self.fewest = dr.opaque(mi.Float, fewest)
+        self.passes_holes = source.shines_through_holes and self.traced.cutouts is not None
         dropped, found = np.zeros(n), []
         launches = LAUNCHES if random is None else LAUNCHES_OF_PHOTONS
         for left in reversed(range(launches)):
@@ -306,7 +309,7 @@ def _strongest(tree, parts, stored, earlier, numbers):  # type: ignore[no-untype
         o_r, o_t = spawn_specular_ray(si, si.p, d_r).o, spawn_specular_ray(si, si.p, d_t).o
         # Next-event estimation owns the light that went through nothing but holes
         passes = mi.Bool(crosses)
-        if dr.hint(traced.cutouts is not None, mode="scalar"):
+        if dr.hint(tree.passes_holes, mode="scalar"):
             passes |= traced.cutouts.passed(si, bs_t, mirrors)
         chain_r, chain_t = (chain + dr.select(w, mi.UInt32(1), mi.UInt32(0)) for w in (mirrors, mirrors & ~passes))
 
