@@ -444,9 +444,12 @@ def test_a_far_wall_does_not_blur_near_fringes_behind_a_pane(wall_z: float) -> N
     assert behind == pytest.approx(free, abs=0.01)  # light reflected to and fro between pane and board takes 0.006
 
 
-def test_a_coarse_emitter_has_sharp_shadows_behind_a_pane() -> None:
-    """The pixels of a flood illuminator are only coordinates; here each is as wide as nine pixels of the camera."""
-    rig = rig_of(Intrinsics.from_fov(64, 48, 20), Intrinsics.from_fov(8, 6, 26), (0.3, 0.0, 0.0), (0.0, 0.0, 1.0))
+@pytest.mark.parametrize("size", [(8, 6), (160, 1)], ids=["flood", "stripes"])
+def test_a_coarse_emitter_has_sharp_shadows_behind_a_pane(size: tuple[int, int]) -> None:
+    """The pixels of a flood illuminator are only coordinates, and those of a projector of stripes are lines."""
+    f = np.array(size) * Intrinsics.from_fov(160, 120, 26).fx / [160, 120]
+    projector = Intrinsics(*size, *f, size[0] / 2, size[1] / 2)
+    rig = rig_of(Intrinsics.from_fov(64, 48, 20), projector, (0.3, 0.0, 0.0), (0.0, 0.0, 1.0))
     parts = {"wall": wall(PLANE, matte()), "card": wall(0.7, matte(), 0.03, x=0.13)}
     options: dict[str, Any] = {"spp": 16, "max_depth": 2, "glint": False, "indirect": "raw"}
     free = transport(scene_of(**parts), rig, [], **options).energy.direct

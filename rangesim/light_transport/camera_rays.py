@@ -310,13 +310,14 @@ class CellGrid(NamedTuple):
     pixels_per_cell: float
 
     @classmethod
-    def of(cls, w: int, h: int, fineness: float = 1.0) -> CellGrid:
+    def of(cls, w: int, h: int, fineness: np.ndarray) -> CellGrid:
         """The cells of an image of w x h pixels: its pixels, or squares of them if there are more than `MAX_CELLS`.
 
-        Each pixel is divided into `fineness` cells along each axis.
+        Each pixel is divided into `fineness` (2,) cells along x and y.
         """
-        edge = max(1, math.ceil(math.sqrt(w * h * fineness**2 / MAX_CELLS))) / fineness
-        columns, rows = math.ceil(w / edge), math.ceil(h / edge)
+        w_fine, h_fine = w * fineness[0], h * fineness[1]
+        edge = max(1, math.ceil(math.sqrt(w_fine * h_fine / MAX_CELLS)))
+        columns, rows = math.ceil(w_fine / edge), math.ceil(h_fine / edge)
         size = mi.Point2f(dr.opaque(mi.Float, w / columns), dr.opaque(mi.Float, h / rows))
         return cls(columns, rows, size, w * h / (columns * rows))
 

@@ -326,12 +326,14 @@ class _Tracing:
         self.is_glass = mi.Bool(table_of(tree.traced.scene, list(map(is_specular, tree.traced.scene.shapes()))))
         # All lengths here are in parts of pixels, see `DeltaSource.fineness`
         largest, self.fineness = 0.5 * BLOCK_PX, source.fineness
-        self.finest_px = float(np.clip(source.finest_px * self.fineness, 1, largest))
+        parts = float(np.sqrt(self.fineness.prod()))  # of a pixel, along the edge of a square of its area
+        self.finest_px = float(np.clip(source.finest_px * parts, 1, largest))
         self.levels = min(int(np.log2(largest / self.finest_px)), MAX_LEVELS)
         self.between_px = 1.0 if source.lens is not None else self.finest_px  # between rays that look for thin things
         self.size_px = np.array([source.width, source.height]) * self.fineness
-        pixel = source.pixel_m / self.fineness, source.pixel_rad / self.fineness
-        self.rule = Rule(*pixel, self.at, MAX_SAG, TOLERANCE_PX, FAINT, SIGNIFICANT)
+        self.rule = Rule(
+            source.pixel_m / parts, source.pixel_rad / parts, self.at, MAX_SAG, TOLERANCE_PX, FAINT, SIGNIFICANT
+        )
         self.blocks = tuple(int(np.ceil(n / BLOCK_PX)) for n in self.size_px)
         self.coarsest = 1 << self.levels
         self.step_px = self.size_px / (2 * self.coarsest * np.array(self.blocks))
@@ -357,7 +359,7 @@ class _Tracing:
         near = self.delta.within(x, y, 2 * step)
         x, y = x[near], y[near]
         made, left = [], []
-        watts = weight * self.source.watts / self.fineness**2
+        watts = weight * self.source.watts / self.fineness.prod()
         pixels = np.sqrt(self.step_px.prod())
         landings = _no_landings()
         while step and len(x):
@@ -397,7 +399,7 @@ class _Tracing:
         every = of_grid if both is None else both._replace(in_triangles=float(of_grid.flux.sum() / both.flux.sum()))
         direct = self.source.direct(every.position[every.triangles[:, 0]])
         return every._replace(
-            u=every.u / np.float32(self.fineness), v=every.v / np.float32(self.fineness), direct=direct
+            u=every.u / np.float32(self.fineness[0]), v=every.v / np.float32(self.fineness[1]), direct=direct
         )
 
     def _are_clear(self, pairs: Pairs, chains: Chains, cell_px: float, fills: np.ndarray) -> np.ndarray:

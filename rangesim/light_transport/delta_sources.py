@@ -38,7 +38,7 @@ class DeltaSource(ABC):
     pixel_m, pixel_rad : metres and radians. After a way of l metres without glass, the light of a pixel is
         pixel_m + pixel_rad * l wide.
     finest_px : pixels, edge of the smallest part of the image that is worth to be told apart.
-    fineness : number of parts into which pixels are divided along each axis, because they are coarse.
+    fineness : (2,) float, number of parts into which pixels are divided along x and y, because they are coarse.
     shines_through_holes : whether next-event estimation finds the source's light through holes.
     lens : (k, 2) float, points of the source's lens, as places in the unit square. None: the source is a point.
     lens_weights : (k,) fractions of the light that comes from each of them.
@@ -50,7 +50,7 @@ class DeltaSource(ABC):
     pixel_m: float
     pixel_rad: float
     finest_px: float = 1.0
-    fineness: float = 1.0
+    fineness: np.ndarray = np.ones(2)
     shines_through_holes: bool = False
     lens: np.ndarray | None = None
     lens_weights: tuple[float, ...] = (1.0,)
@@ -92,8 +92,12 @@ class ProjectorSource(DeltaSource):
         self.watts = power_w / device.pixels
         self.pixel_m, self.pixel_rad = 0.0, 1 / float(np.sqrt(device.f.x[0] * device.f.y[0]))
         self.finest_px = finest_rad / self.pixel_rad
-        coarseness = self.pixel_rad / camera_rad if camera_rad else 1.0
-        self.fineness = float(np.clip(coarseness, 1, max(1, np.sqrt(MAX_PIXELS / device.pixels))))
+        if camera_rad:
+            # Pixels may be lines: those of a projector of stripes are as high as its image
+            angles = np.array([1 / float(device.f.x[0]), 1 / float(device.f.y[0])])
+            wanted = np.maximum(angles / camera_rad, 1)
+            too_many = np.sqrt(device.pixels * wanted.prod() / MAX_PIXELS)
+            self.fineness = np.maximum(wanted / max(too_many, 1), 1)
         self.at = np.array([float(c[0]) for c in device.centre])
         if device.has_lens:
             self.finest_px, self.lens, self.lens_weights = np.inf, _lens_points(), LENS_WEIGHTS
