@@ -206,6 +206,9 @@ def _windows(
     """The rectangles through which a lamp lights a target; none if it does not."""
     if mi.has_flag(lamp.flags(), mi.EmitterFlags.DeltaDirection):
         sample, irradiance = lamp.sample_direction(dr.zeros(mi.SurfaceInteraction3f, 1), mi.Point2f(0.5), True)
+        strength = float(mono(irradiance)[0])
+        if not strength > 0:
+            return
         axes = _axes(-np.array(sample.d, np.float64).ravel())
         places = target.corners.reshape(-1, 3) @ axes.T
         low, high = places.min(axis=0), places.max(axis=0)
@@ -215,7 +218,7 @@ def _windows(
             target.corners if traced.media is None else np.array([box.min, box.max], np.float64)[CORNERS, range(3)]
         )
         front = float((in_front @ axes[2]).min()) - NEAR * target.size_m
-        make = partial(Sun, traced, target, float(mono(irradiance)[0]), axes, front)
+        make = partial(Sun, traced, target, strength, axes, front)
         yield _Window(low[:2], high[:2], np.inf, finest_m, make)
         return
     at = _place_of(lamp)
