@@ -17,7 +17,7 @@ import numpy as np
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.beams import BeamDevice
 from rangesim.light_transport.caustic_sheets import CAMERA_CELL, Sheets, trace_sheets
-from rangesim.light_transport.delta_surfaces import has_delta
+from rangesim.light_transport.delta_surfaces import throws_caustics
 from rangesim.light_transport.lamps import lamp_sheets
 from rangesim.light_transport.sheet_scene import Place, SheetScene
 from rangesim.light_transport.spectrum import mono
@@ -38,15 +38,15 @@ any amount of light. A smaller bound would darken caustics beside edges where fa
 def caustic_sheets(
     traced: TracedScene, rigs: Sequence[Rig], settings: TransportSettings, report: Callable[[], None] = lambda: None
 ) -> Sheets | None:
-    """Triangles of light for a pass of any camera; None if the caller wants none, no surface has a delta interaction,
-    or no light landed. A beam needs none, see `rangesim.light_transport.beams`.
+    """Triangles of light for a pass of any camera; None if the caller wants none, no surface has a delta interaction
+    other than holes, or no light landed. A beam needs none, see `rangesim.light_transport.beams`.
 
     Parameters
     ----------
     rigs : rigs of the pass, which share their emitter.
     report : called after each kernel launch.
     """
-    if not settings.caustics or not has_delta(traced.scene) or isinstance(traced.projector, BeamDevice):
+    if not settings.caustics or not throws_caustics(traced.scene) or isinstance(traced.projector, BeamDevice):
         return None
     pixel_rad = min(rig.camera.angle_of(1) for rig in rigs)
     return trace_sheets(traced, rigs[0].projector_power_w, settings.seed, pixel_rad, report)
@@ -77,7 +77,9 @@ def sheet_scene(sheets: Sheets | None, rig: Rig, samples: int, seed: int) -> She
     `seed` that of the pass."""
     if sheets is None or not len(sheets.flux):
         return None
-    return SheetScene(sheets, rig.T_world_projector[:3, 3], samples, seed)
+    # Points of a lens are sharp, so that light has the blur of the pixels alone
+    blur_px = None if rig.projector_lens.focus_m is None else 0.0
+    return SheetScene(sheets, rig.T_world_projector[:3, 3], samples, seed, blur_px)
 
 
 class Vertex(NamedTuple):
@@ -157,7 +159,8 @@ def caustic_light(
             on_one_side = counts & (seen * lit * si.wi.z * wo.z > 0)  # for both normals, or for neither
             brought = dr.select(on_one_side, vertex.throughput * total * mono(value) / cosine, 0)
             radiance += brought
-            path = LightPath(light.u, light.v, vertex.length + light.length, vertex.is_first, mi.UInt32(CAUSTIC))
+            length = vertex.length + light.length
+            path = LightPath(light.u, light.v, length, vertex.is_first, mi.UInt32(CAUSTIC), sheets.blur_px)
             channels = accumulators.add(channels, path, brought, place, on_one_side, is_later)
         total = dr.select(counts, 0, total)
         last = dr.select(hit, found.prim_index, last)

@@ -17,6 +17,10 @@ from rangesim.light_transport.camera_rays import Device, PrimaryRay
 from rangesim.light_transport.specular_chain import RayState
 from rangesim.light_transport.traced_scene import TracedScene
 
+MAX_PIXELS = 1 << 18
+"""Largest number of pixels into which the image of a coarse projector is divided. A flood illuminator has few pixels of
+its own, which are only coordinates; without the division its light would have edges as coarse as these. With more,
+the grid would take longer than for a projector of images."""
 LENS_RADIUS, LENS_WEIGHTS = np.sqrt(2 / 3), (1 / 4, *[1 / 8] * 6)
 """Points of a lens of finite size, each of which has a grid of its own, at the lowest level: its centre and a regular
 hexagon. Radius of the hexagon as a fraction of the lens, and fractions of the light. Means over these points are exact
@@ -34,6 +38,8 @@ class DeltaSource(ABC):
     pixel_m, pixel_rad : metres and radians. After a way of l metres without glass, the light of a pixel is
         pixel_m + pixel_rad * l wide.
     finest_px : pixels, edge of the smallest part of the image that is worth to be told apart.
+    fineness : number of parts into which pixels are divided along each axis, because they are coarse.
+    shines_through_holes : whether next-event estimation finds the source's light through holes.
     lens : (k, 2) float, points of the source's lens, as places in the unit square. None: the source is a point.
     lens_weights : (k,) fractions of the light that comes from each of them.
     """
@@ -44,6 +50,8 @@ class DeltaSource(ABC):
     pixel_m: float
     pixel_rad: float
     finest_px: float = 1.0
+    fineness: float = 1.0
+    shines_through_holes: bool = False
     lens: np.ndarray | None = None
     lens_weights: tuple[float, ...] = (1.0,)
 
@@ -72,15 +80,20 @@ class ProjectorSource(DeltaSource):
     ----------
     device : Device
     power_w : W, power while it shows white.
-    finest_px : see `DeltaSource`.
+    finest_rad : radians, angle of `finest_px`.
+    camera_rad : radians, smallest angle of a camera's pixel; 0: not known.
     """
 
-    def __init__(self, device: Device, power_w: float, finest_rad: float) -> None:
+    shines_through_holes = True
+
+    def __init__(self, device: Device, power_w: float, finest_rad: float, camera_rad: float = 0.0) -> None:
         self.device = device
         self.width, self.height = (int(n[0]) for n in device.size)
         self.watts = power_w / device.pixels
         self.pixel_m, self.pixel_rad = 0.0, 1 / float(np.sqrt(device.f.x[0] * device.f.y[0]))
         self.finest_px = finest_rad / self.pixel_rad
+        coarseness = self.pixel_rad / camera_rad if camera_rad else 1.0
+        self.fineness = float(np.clip(coarseness, 1, max(1, np.sqrt(MAX_PIXELS / device.pixels))))
         self.at = np.array([float(c[0]) for c in device.centre])
         if device.has_lens:
             self.finest_px, self.lens, self.lens_weights = np.inf, _lens_points(), LENS_WEIGHTS

@@ -13,6 +13,7 @@ import numpy as np
 from rangesim.light_transport.camera_rays import PrimaryRay
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.surfaces import number_of, table_of
+from rangesim.scene.materials import is_cutout
 from rangesim.scene.media import is_boundary
 
 MAX_BOUNDARIES = 8
@@ -21,8 +22,14 @@ more of them, such as in the fifth of five bodies of milk, throws no caustics.""
 
 
 def has_delta(scene: mi.Scene) -> bool:
-    """Whether some surface of a mitsuba.Scene has a delta interaction. Without one there are no caustics."""
+    """Whether some surface of a mitsuba.Scene has a delta interaction."""
     return any(map(is_delta_surface, scene.shapes()))
+
+
+def throws_caustics(scene: mi.Scene) -> bool:
+    """Whether some surface of a mitsuba.Scene has a delta interaction that is no hole. Without one there are no
+    caustics."""
+    return any(map(_deflects, scene.shapes()))
 
 
 def is_delta_surface(shape: mi.Shape) -> bool:
@@ -30,14 +37,21 @@ def is_delta_surface(shape: mi.Shape) -> bool:
     return bool(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta)) and not is_boundary(shape)
 
 
+def _deflects(shape: mi.Shape) -> bool:
+    """Whether the surface of a shape has a delta interaction that is no hole; thin glass reflects as well."""
+    lobes = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission
+    return any(mi.has_flag(shape.bsdf().flags(), lobe) for lobe in lobes)
+
+
 def meets_delta(
-    scene: mi.Scene, count: int, rays_of: Callable[[int, int], PrimaryRay]
+    scene: mi.Scene, count: int, rays_of: Callable[[int, int], PrimaryRay], through_holes: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Whether the first surface that each of `count` rays meets, boundaries of media aside, has a delta interaction.
 
     Parameters
     ----------
     rays_of : function that returns the rays from one number up to another, such as those through pixels' centres.
+    through_holes : whether rays go on through surfaces whose only delta interactions are holes, as boundaries do.
 
     Returns
     -------
@@ -45,11 +59,11 @@ def meets_delta(
     exists : (count,) bool, whether the lens sends such a ray at all.
     """
     launches, meets, exists = Launches(), np.zeros(count, dtype=bool), np.ones(count, dtype=bool)
-    table = mi.Bool(table_of(scene, list(map(is_delta_surface, scene.shapes()))))
-    boundaries = boundaries_of(scene)
+    table = mi.Bool(table_of(scene, list(map(_deflects if through_holes else is_delta_surface, scene.shapes()))))
+    passed = boundaries_of(scene, through_holes)
     for begin, end in launches.ranges(count):
         rays = rays_of(begin, end)
-        met = first_shape(scene, mi.Ray3f(rays.origin, rays.direction), boundaries)
+        met = first_shape(scene, mi.Ray3f(rays.origin, rays.direction), passed)
         delta = dr.gather(mi.Bool, table, met.number, met.exists)
         launches.evaluate([delta, rays.exists], end - begin)
         meets[begin:end] = delta.numpy()
@@ -68,10 +82,13 @@ class FirstShape(NamedTuple):
     exists: mi.Bool
 
 
-def boundaries_of(scene: mi.Scene) -> mi.Bool | None:
-    """Table (`table_of`) of the shapes that are boundaries of media; None if there are none."""
-    are_boundaries = list(map(is_boundary, scene.shapes()))
-    return mi.Bool(table_of(scene, are_boundaries)) if any(are_boundaries) else None
+def boundaries_of(scene: mi.Scene, and_holes: bool = False) -> mi.Bool | None:
+    """Table (`table_of`) of the shapes that are boundaries of media; None if there are none.
+
+    `and_holes` says whether shapes whose only delta interactions are holes count as well.
+    """
+    passed = [is_boundary(s) or (and_holes and is_cutout(s.bsdf()) and not _deflects(s)) for s in scene.shapes()]
+    return mi.Bool(table_of(scene, passed)) if any(passed) else None
 
 
 def first_shape(scene: mi.Scene, ray: mi.Ray3f, boundaries: mi.Bool | None) -> FirstShape:

@@ -535,7 +535,7 @@ def walk(
             # The boundaries of media, which nothing bends at, may lie between a mirror and the vertex
             via_delta = path.chain > 0 if settings.delta else mi.Bool(False) if media is None else path.left_delta
             is_connected &= beam_connects((path.depth == 1) & is_own, via_delta, has_spot)
-        link = projector.connect(scene, si, is_connected, lanes.pixel, media, path.ray_state.inside)
+        link = projector.connect(scene, si, is_connected, lanes.pixel, media, path.ray_state.inside, cutouts)
         if dr.hint(has_pencil, mode="scalar"):
             assert path.pencil is not None
             comes_back = is_vertex & is_own & (path.depth == 1) & (path.chain > 0)

@@ -113,9 +113,13 @@ class SheetScene:
     projector_at : (3,) float, metres, world.
     samples : int, smallest number of samples of a pixel, which bounds the number of groups.
     seed : int, decides which of the faintest triangles are kept.
+    blur_px : blur of the light of every triangle, see `rangesim.response.LightPath`.
     """
 
-    def __init__(self, sheets: Sheets, projector_at: np.ndarray, samples: int, seed: int = 0) -> None:
+    def __init__(
+        self, sheets: Sheets, projector_at: np.ndarray, samples: int, seed: int = 0, blur_px: float | None = None
+    ) -> None:
+        self.blur_px = None if blur_px is None else mi.Float(blur_px)
         period = 1 << int(np.log2(max(1, min(samples // 2, PERIOD))))  # in each half of the samples
         every = min(period, EVERY)
         groups = period // every
