@@ -245,7 +245,7 @@ def test_a_lamp_in_water_that_absorbs() -> None:
     """Its light comes out of the glass `depth` metres in front of it, straight and by way of the back; on the axis."""
     depth, back, camera_at, n = 0.4, 0.2, 0.6, GLASS["int_ior"]
     tank = {**slab(-back, depth, 0.4), "interior": {"type": "homogeneous", "sigma_t": SIGMA, "albedo": 0.0}}
-    seen = ambient(scene_of(tank=tank, wall=wall(PLANE, matte()), lamp=bulb()), behind(camera_at))
+    seen = ambient(scene_of(tank=tank, wall=wall(PLANE, matte()), lamp=bulb()), behind(camera_at), spp=64)
     r = fresnel_dielectric(0.0)
     light = sum(
         part * np.exp(-SIGMA * way) * (1 - r) / (way + n * (PLANE - depth)) ** 2

@@ -27,8 +27,11 @@ MIN_FOOTPRINT = 0.1
 in a focus is not followed any finer."""
 FLAT_COSINE = 1 - 1e-6
 """Cosine between the normals at the corners of a triangle, above which its receiver counts as flat: rounding alone."""
-MAX_CUBES = 64
-"""Largest number of cubes to which the area of a triangle is dealt out, see `crowd_of`. Larger triangles are rare."""
+MAX_DIVISIONS = 8
+"""Largest number of times that a triangle is divided until it is small as seen from the projector, see
+`lit_directions`: enough for one that is as large as half of the sphere of directions."""
+MAX_WIDTH = 3
+"""Largest difference of the cubes along an axis in which the directions to a small triangle lie."""
 MAX_SPREAD = 2.0
 """Largest ratio between the areas over which equal light spreads within a block; with a smaller ratio more blocks are
 divided."""
@@ -515,51 +518,16 @@ def _names_of(triangles, key, image):  # type: ignore[no-untyped-def]
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def crowd_of(position, triangles, shape, area, edge):  # type: ignore[no-untyped-def]
-    """(t,) float64, number of triangles that cover the surface around the middle of each of some triangles.
-
-    It is the area of the triangles in a cube over that of a face. The area of a triangle that is larger than a face is
-    dealt out to the cubes in which it lies. `edge` is that of the cubes in metres.
-    """
-    points = np.minimum(area / (edge * edge), MAX_CUBES).astype(np.int64) + 1
-    table = np.full(1 << int(np.log2(2 * points.sum() + 1) + 1), EMPTY, np.int64)
-    inside, crowd = np.zeros(len(table)), np.empty(len(triangles))
-    for t in range(len(triangles)):
-        for p in range(points[t]):
-            cube = _cube(position, triangles[t], shape[t], p, edge)
-            i = place_in(table, cube)
-            table[i] = cube
-            inside[i] += area[t] / points[t]
-    for t in range(len(triangles)):
-        crowd[t] = inside[place_in(table, _cube(position, triangles[t], shape[t], 0, edge))] / (edge * edge)
-    return crowd
-
-
-@cached_njit(nogil=True, error_model="numpy")
-def _cube(position, vertices, shape, point, edge):  # type: ignore[no-untyped-def]
-    """Name of the cube that holds a point of a triangle: its middle, or one of a sequence that fills it."""
-    b1, b2 = 1 / 3, 1 / 3
-    if point > 0:
-        b1, b2 = 0.7548776662466927 * point % 1.0, 0.5698402909980532 * point % 1.0
-        if b1 + b2 > 1:
-            b1, b2 = 1 - b1, 1 - b2
-    name = np.int64(shape)
-    for k in range(3):
-        x = (1 - b1 - b2) * position[vertices[0], k] + b1 * position[vertices[1], k] + b2 * position[vertices[2], k]
-        name = name * np.int64(HASH) + np.int64(np.floor(x / edge))
-    return abs(name)
-
-
-@cached_njit(nogil=True, error_model="numpy")
-def lifted(sheets, scale, is_faint, chance, salt, groups, every, lift, flat_lift, offsets, middle):  # type: ignore[no-untyped-def]
+def lifted(sheets, scale, copies, chance, salt, groups, every, lift, flat_lift, offsets, middle):  # type: ignore[no-untyped-def]
     """The triangles of light as a scene of their own, see `sheet_scene`.
 
     Parameters
     ----------
     sheets : Sheets, as a tuple of position, normal, triangles, shape, key, and the bits of u and v of each vertex in a
         number.
-    is_faint : (t,) bool. chance : (t,) float64, probability with which a faint triangle is kept; it then counts for
-        those that are not. salt : uint64, a random number of the pass.
+    copies : (t,) int64, number of groups in which a triangle lies, a power of 2; 0 for bright ones.
+    chance : (t,) float64, probability with which a faint triangle is kept; it then counts for those that are not.
+    salt : uint64, a random number of the pass.
     lift, flat_lift : (t,) float64, metres, largest distance of triangles in one place, where the receiver is curved and
         where it is flat.
     offsets : (groups + 1, 2) float64, metres, of bright triangles and of the groups of faint ones.
@@ -570,29 +538,87 @@ def lifted(sheets, scale, is_faint, chance, salt, groups, every, lift, flat_lift
     corners : (3 k, 3) float32, metres. names : (k, 4) uint32, vertices and shape.
     terms : (k, 3) float32, what the irradiance at the vertices is multiplied by, height over the surface in metres, and
         1 where the receiver is flat.
+    faint : (k,) bool.
     """
     position, normal, triangles, shape, key, image = sheets
     name = _names_of(triangles, key, image)
-    corners, names = np.empty((3 * len(triangles), 3), np.float32), np.empty((len(triangles), 4), np.uint32)
-    terms, n = np.empty((len(triangles), 3), np.float32), 0
+    most = np.maximum(copies, 1).sum()
+    corners, names = np.empty((3 * most, 3), np.float32), np.empty((most, 4), np.uint32)
+    terms, faint, n = np.empty((most, 3), np.float32), np.empty(most, np.bool_), 0
     for t in range(len(triangles)):
-        group, weight = 0, 1.0
-        if is_faint[t]:
+        step, weight = 0, 1.0
+        if copies[t] > 0:
             if uniform(np.uint64(name[t]) ^ salt) >= chance[t]:
                 continue
-            group, weight = 1 + (key[t] >> 8) % groups, groups * every / chance[t]
+            step, weight = groups // copies[t], groups * every / (copies[t] * chance[t])
         if not scale[t] > 0:
             continue
         a, b, c = triangles[t]
         bends = min(_cosine(normal, a, b), _cosine(normal, a, c)) < FLAT_COSINE
         height = (lift if bends else flat_lift)[t] * (uniform(name[t]) - 0.5)
+        for copy in range(max(copies[t], 1)):
+            group = 1 + ((key[t] >> 8) + copy * step) % groups if step > 0 else 0
+            for k in range(3):
+                v = triangles[t, k]
+                names[n, k] = v
+                for axis in range(3):
+                    place = position[v, axis] - middle[axis] + height * normal[v, axis]
+                    corners[3 * n + k, axis] = place + (offsets[group, axis] if axis < 2 else 0.0)
+            names[n, 3] = shape[t]
+            terms[n, 0], terms[n, 1], terms[n, 2] = scale[t] * weight, height, 0.0 if bends else 1.0
+            faint[n] = step > 0
+            n += 1
+    return corners[: 3 * n], names[:n], terms[:n], faint[:n]
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def lit_directions(position, triangles, is_faint, cubes, reach):  # type: ignore[no-untyped-def]
+    """Which directions from the origin lead to triangles, as words of 16 cubes with two bits each (uint32).
+
+    The unit vectors lie in a cube of edge 2, which is divided into `cubes` along each edge. The lower bit of a cube
+    stands for bright triangles, the upper one for faint ones.
+
+    Parameters
+    ----------
+    position : (n, 3) float32, metres, vertices. triangles : (t, 3), their indices. is_faint : (t,) bool.
+    reach : radians by which the direction of a point that a triangle lights may differ from those of the triangle.
+    """
+    words = np.zeros(cubes**3 // 16 + 1, np.uint32)
+    stack = np.empty((3 * MAX_DIVISIONS + 4, 3, 3))
+    depth_of = np.empty(3 * MAX_DIVISIONS + 4, np.int64)
+    low, high, half = np.empty(3, np.int64), np.empty(3, np.int64), np.empty((3, 3))
+    for t in range(len(triangles)):
         for k in range(3):
-            v = triangles[t, k]
-            names[n, k] = v
+            stack[0, k] = position[triangles[t, k]]
+        depth_of[0], n = 0, 1
+        bit = np.uint32(2 if is_faint[t] else 1)
+        while n:
+            n -= 1
+            widest = 0
             for axis in range(3):
-                place = position[v, axis] - middle[axis] + height * normal[v, axis]
-                corners[3 * n + k, axis] = place + (offsets[group, axis] if axis < 2 else 0.0)
-        names[n, 3] = shape[t]
-        terms[n, 0], terms[n, 1], terms[n, 2] = scale[t] * weight, height, 0.0 if bends else 1.0
-        n += 1
-    return corners[: 3 * n], names[:n], terms[:n]
+                least, most = 2.0, -2.0
+                for k in range(3):
+                    x, y, z = stack[n, k]
+                    d = stack[n, k, axis] / np.sqrt(x * x + y * y + z * z)
+                    least, most = min(least, d), max(most, d)
+                low[axis] = max(int((least - reach + 1) * 0.5 * cubes), 0)
+                high[axis] = min(int((most + reach + 1) * 0.5 * cubes), cubes - 1)
+                widest = max(widest, high[axis] - low[axis])
+            if widest > MAX_WIDTH and depth_of[n] < MAX_DIVISIONS:
+                a, b, c = stack[n, 0].copy(), stack[n, 1].copy(), stack[n, 2].copy()
+                half[0], half[1], half[2] = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+                depth = depth_of[n] + 1
+                for q in range(4):
+                    depth_of[n + q] = depth
+                stack[n, 0], stack[n, 1], stack[n, 2] = a, half[0], half[2]
+                stack[n + 1, 0], stack[n + 1, 1], stack[n + 1, 2] = half[0], b, half[1]
+                stack[n + 2, 0], stack[n + 2, 1], stack[n + 2, 2] = half[2], half[1], c
+                stack[n + 3, 0], stack[n + 3, 1], stack[n + 3, 2] = half[0], half[1], half[2]
+                n += 4
+                continue
+            for i in range(low[0], high[0] + 1):
+                for j in range(low[1], high[1] + 1):
+                    for k in range(low[2], high[2] + 1):
+                        cube = (i * cubes + j) * cubes + k
+                        words[cube >> 4] |= bit << np.uint32(2 * (cube & 15))
+    return words

@@ -22,7 +22,7 @@ from rangesim.light_transport.kernel_launches import Launches, Progress, Report,
 from rangesim.light_transport.loop import PathSettings, Radiance, View
 from rangesim.light_transport.narrow_lobes import warn_of_narrow_lobes
 from rangesim.light_transport.ray_tables import camera_device
-from rangesim.light_transport.samples_per_pixel import Sampler
+from rangesim.light_transport.samples_per_pixel import MOST_FOR_CAUSTICS, Sampler, samples_for_caustics
 from rangesim.light_transport.sampling_error import MIN_FOR_HALVES, Estimate
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.transport_settings import TransportSettings
@@ -168,7 +168,7 @@ class _CameraPass:
         settings, rig, guides = self.settings, self.rig, self.guides
         sampler = settings.spp if isinstance(settings.spp, Sampler) else None
         fewest = int(self.samples.min())
-        light, ambient = (sheet_scene(one, self.here, fewest, settings.seed) for one in (sheets, of_lamps))
+        light, ambient = (sheet_scene(one, self.here, settings.seed) for one in (sheets, of_lamps))
         view = View(self.traced, light, ambient)
         of_paths = PathSettings.of(self.scene, settings)
         if guides is not None and self.scene.has_matte_textures:
@@ -196,11 +196,15 @@ class _CameraPass:
         left = 0.5 * PATHS_FRACTION if sampler else 0.0  # assumed, because the sampler's second number is not known yet
         pixels = np.arange(len(self.samples))
         estimate.sample(pixels, self.samples, partial(report_part, report, 0.0, PATHS_FRACTION - left))
+        more = np.zeros_like(self.samples)
         if sampler and sampler.most_spp > fewest:
             more = self._samples(sampler, signals_of).ravel() - self.samples
-            pixels = np.flatnonzero(more)
-            if len(pixels):
-                estimate.sample(pixels, more[pixels], partial(report_part, report, PATHS_FRACTION - left, left))
+        if not isinstance(settings.spp, int) and has_halves and view.sheets is not None:
+            most_spp = sampler.most_spp if sampler else MOST_FOR_CAUSTICS
+            more = np.maximum(more, samples_for_caustics(*estimate.caustics_and_light(), self.samples, most_spp))
+        pixels = np.flatnonzero(more)
+        if len(pixels):
+            estimate.sample(pixels, more[pixels], partial(report_part, report, PATHS_FRACTION - left, left))
         signals = signals_of(None)
         report(1.0)
         cut = sheets.cut if sheets else 0.0

@@ -149,7 +149,7 @@ class SampleAllocation:
             samples=2 * (pairs + 1 - half >> 1) - odd * ((pairs - 1 & 1) == half),
             total=twice(self.total),
             irradiance=self.irradiance,
-            first=self.first + 2 * half,
+            first=(self.first if isinstance(self.first, int) else twice(self.first)) + 2 * half,
             stride=2 * self.stride,
             part=2 * self.part + half,
         )
@@ -594,7 +594,7 @@ def walk(
         # ---- Caustics: light that reached this point through glass or off mirrors --------------------
         if dr.hint(sheets is not None, mode="scalar"):
             vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, path.is_first & ~link.lit)
-            state.channels, light = caustic_light(
+            state.channels, sharp, smooth = caustic_light(
                 sheets,
                 accumulators,
                 state.channels,
@@ -605,9 +605,9 @@ def walk(
                 lanes.place,
                 is_vertex & ~scatters,
             )
-            radiance.caustic += dr.select(is_later, 0, light)
-            radiance.smooth_caustic += dr.select(is_later, light, 0)
-            tally.indirect += dr.select(is_later, light, 0)
+            radiance.caustic += sharp
+            radiance.smooth_caustic += smooth
+            tally.indirect += dr.select(is_later, smooth, 0)
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
         if dr.hint(settings.ambient, mode="scalar"):
@@ -626,7 +626,7 @@ def walk(
                 radiance.ambient += path.throughput * light
             if dr.hint(of_lamps is not None, mode="scalar"):
                 vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, mi.Bool(False))
-                _, light = caustic_light(
+                _, sharp, smooth = caustic_light(
                     of_lamps,
                     nothing,
                     [],
@@ -637,7 +637,7 @@ def walk(
                     lanes.place,
                     is_vertex & ~scatters,
                 )
-                radiance.ambient += light
+                radiance.ambient += sharp + smooth
 
         # ---- Next direction --------------------------------------------------------------------------
         goes_delta = is_delta(bs)

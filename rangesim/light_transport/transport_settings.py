@@ -25,15 +25,15 @@ class TransportSettings:
         samples and then up to 64, until the renderer's noise in the readings of its instruments is small compared with
         the noise of their detectors. "auto" is AdaptiveSampling for the sensors of the pass with their default
         detectors. For bare responses, and without `sampling_error`, "auto" is 16 samples where pixels share their
-        indirect light, and 64 elsewhere.
+        indirect light, and 64 elsewhere. With `sampling_error`, pixels with uneven caustics get more, up to 256.
     max_depth : int >= 1, largest number of segments of a path between surfaces that scatter it, including the last
         segment to the light. 2 means direct light only, as in Mitsuba. Delta interactions (glass, mirrors, thin panes,
         coats, holes) do not count. They have a limit of their own, `rangesim.light_transport.specular_chain.MAX_CHAIN`
         in a row.
     rr_depth : int >= 1, number of surfaces that scatter after which Russian roulette may end a path.
     seed : int, 0 to 2^64 - 1. The same seed gives the same bytes for any number of threads and any memory budget.
-    caustics : whether the projector's light reaches surfaces through glass and off mirrors
-        (`rangesim.light_transport.caustic_sheets`). It costs nothing in a scene without glass and mirrors.
+    caustics : whether the light of the projector, and of lamps without extent, reaches surfaces through glass and off
+        mirrors (`rangesim.light_transport.caustic_sheets`, `rangesim.light_transport.lamps`). It costs nothing in a scene without glass and mirrors.
     glint : whether the camera sees the projector's lens, in a mirror, through glass or directly.
     indirect : "filtered": neighbouring pixels of a matte surface share their multipath, with a small bias and much less
         noise (`rangesim.light_transport.indirect_filter`). "raw": the unbiased sum over each pixel's own paths.
