@@ -518,7 +518,9 @@ def _names_of(triangles, key, image):  # type: ignore[no-untyped-def]
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def lifted(sheets, scale, copies, chance, salt, groups, every, lift, flat_lift, offsets, middle):  # type: ignore[no-untyped-def]
+def lifted(  # type: ignore[no-untyped-def]
+    sheets, scale, copies, chance, salt, groups, every, lift, flat_lift, offsets, middle
+):
     """The triangles of light as a scene of their own, see `sheet_scene`.
 
     Parameters
