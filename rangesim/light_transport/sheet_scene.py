@@ -42,8 +42,8 @@ MARGIN = 1.4
 """Ratio of the height from which a ray looks, and the depth to which it does, to those of the edges of triangles: the
 middle of a triangle is 4 / 3 times as far from a curved surface as its edges."""
 GROUPS = 4
-"""Number of groups of faint triangles, a power of 2. With twice as many groups, a pass of glassware takes as long, because
-there are more copies of triangles."""
+"""Number of groups of faint triangles, a power of 2. With twice as many groups, a pass of glassware takes as long,
+because there are more copies of triangles."""
 EVERY = 8
 """Number of samples of which one looks for faint triangles. At 4 a pass of glassware takes 8 % longer and has 5 % less
 noise; at 16 it is 2 % faster and has 12 % more noise."""
