@@ -343,7 +343,7 @@ class _Tracing:
             tree.traced.scene,
             cells.columns * cells.rows,
             lambda a, b: source.rays(cells.probes(a, b))[0],
-            source.shines_through_holes,
+            through_holes=True,
         )
         meets = (meets & exists).reshape(cells.rows, cells.columns)
         self.delta = _Delta(meets, 2 * self.coarsest * np.array(self.blocks))
