@@ -8,8 +8,8 @@ surface by a distance of its own.
 A table of directions from the projector tells where a search is worth its ray.
 
 Faint triangles are many and bring little. They are dealt out to groups, in copies of the scene that lie side by side.
-One sample of a pixel in a few looks into one group, whose light counts for all, and neighbouring pixels share this light
-(`indirect_filter`).
+One sample of a pixel in a few looks into one group, whose light counts for all, and neighbouring pixels share this
+light (`indirect_filter`).
 """
 
 from __future__ import annotations
