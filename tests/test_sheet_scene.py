@@ -91,6 +91,19 @@ def irradiance_of_level(level: float, seed: int) -> tuple[np.ndarray, bool]:
     return irradiance, faint
 
 
+def test_points_outside_the_lit_part_get_no_light_of_its_copies() -> None:
+    """Copies for groups of faint triangles lie side by side, in the plane of the square as well."""
+    light = SheetScene(sheets_over_a_square(2e-3), PROJECTOR_AT, 1.0, samples=32)
+    x, y = (mi.Float(c.ravel()) for c in np.meshgrid(*[np.linspace(-9, 9, 181, dtype=np.float32)] * 2))
+    point, n = mi.Point3f(x, y, mi.Float(1.0)), 181**2
+    looks = light.may_light(point, dr.zeros(mi.UInt32, n), mi.Bool(True)).numpy()
+    found = [total(light, point, dr.zeros(mi.UInt32, n), dr.full(mi.UInt32, which, n)).numpy() > 0 for which in (0, 1)]
+    on_square = (np.abs(x.numpy() - 0.2) < 0.51) & (np.abs(y.numpy() - 0.6) < 0.51)
+    assert (found[1] & ~on_square).any()
+    assert looks[on_square & found[1]].all()
+    assert not looks[~on_square].any()
+
+
 def test_heights_do_not_depend_on_other_triangles() -> None:
     """One triangle more, which a rounding brings, changes no other."""
     all_of_them = sheets_over_a_square(2e-3)

@@ -105,7 +105,7 @@ def caustic_light(
     last, total, chosen = dr.full(mi.UInt32, NONE, n), dr.zeros(mi.Float, n), Place.none(n)
     # Later vertices bring little each, so they look in some samples alone, which count for all
     is_turn = sheets.is_turn(turn, dr.select(is_later, mi.UInt32(1), 0))
-    looks = sheets.may_light(shape, active & (~is_later | is_turn))
+    looks = sheets.may_light(si.p, shape, active & (~is_later | is_turn))
     weight_of_bright = dr.select(is_later, mi.Float(sheets.every), 1)
     # What the loop only reads is excluded: Dr.Jit traces a loop twice that carries something without changing it
     while dr.hint(

@@ -160,16 +160,19 @@ class SheetScene:
         self.looks, self.names = mi.Float(aligned(looks, np.float32)), mi.UInt32(aligned(names, np.uint32))
         self.terms, self.offsets = mi.Float(aligned(terms, np.float32)), mi.Float(aligned(offsets, np.float32))
         self.groups, self.every = dr.opaque(mi.UInt32, groups), dr.opaque(mi.UInt32, every)
-        self.projector_at, self.middle = (
-            mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in place)) for place in (projector_at, middle)
+        half_size = 0.5 * (high - low) + MARGIN * (0.5 * LIFT + MAX_SAG) * distance.max()
+        self.projector_at, self.middle, self.half_size = (
+            mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in place)) for place in (projector_at, middle, half_size)
         )
         is_lit = np.zeros(int(sheets.shape.max()) + 1, np.bool_)
         is_lit[names[:, 3]] = True
         self.is_lit, self.shapes = mi.Bool(is_lit), dr.opaque(mi.UInt32, len(is_lit))
 
-    def may_light(self, shape: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        """Whether any triangle lies on a shape."""
-        known = active & (shape < self.shapes)
+    def may_light(self, point: mi.Point3f, shape: mi.UInt32, active: mi.Bool) -> mi.Bool:
+        """Whether any triangle lies on a shape, and the point is in the lit part of the scene, beyond which its copies
+        begin."""
+        inside = dr.abs(mi.Vector3f(point) - self.middle) < self.half_size
+        known = active & dr.all(inside) & (shape < self.shapes)
         return known & dr.gather(mi.Bool, self.is_lit, shape, known)
 
     def is_turn(self, turn: mi.UInt32, which: mi.UInt32) -> mi.Bool:
